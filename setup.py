@@ -1,0 +1,14 @@
+"""Builds the compiled parts; everything else is in pyproject.toml."""
+from pathlib import Path
+
+import numpy
+from Cython.Build import cythonize
+from setuptools import Extension, setup
+
+# -ffp-contract=off: the law gives the same bits on every machine that a recording is replayed on.
+setup(ext_modules=cythonize(
+    [Extension(".".join(p.with_suffix("").parts), [str(p)], include_dirs=[numpy.get_include()],
+               extra_compile_args=["-O2", "-ffp-contract=off"],
+               define_macros=[("NPY_NO_DEPRECATED_API", "NPY_1_7_API_VERSION")])
+     for p in sorted(Path("thermoctl").rglob("*.pyx"))],
+    compiler_directives={"language_level": "3"}))
