@@ -29,10 +29,10 @@ _Loader.yaml_implicit_resolvers = {}
 _NUMBER = r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
 for _tag, _regex, _first in (
         ("tag:yaml.org,2002:bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
-        ("tag:yaml.org,2002:null", r"~|null|Null|NULL|", "~nN\0"),
+        ("tag:yaml.org,2002:null", r"~|null|Null|NULL|", "~nN"),
         ("tag:yaml.org,2002:int", r"[-+]?[0-9][0-9_]*", "-+0123456789"),
         ("tag:yaml.org,2002:float", _NUMBER + r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+0123456789.")):
-    _Loader.add_implicit_resolver(_tag, re.compile(f"^(?:{_regex})$"), list(_first))
+    _Loader.add_implicit_resolver(_tag, re.compile(f"^(?:{_regex})$"), [*_first, *([""] if _tag.endswith("null") else [])])
 
 
 @dataclass(frozen=True)
