@@ -1,0 +1,503 @@
+"""Expressions of the plant language: read without eval, differentiated exactly, evaluated with numpy or written as C.
+
+An expression is a graph of interned nodes (the same sub-expression is the same object), so that derivatives share
+their parts and the generated C computes each part once.
+"""
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+FUNCTIONS = {"abs": 1, "sign": 1, "sqrt": 1, "exp": 1, "log": 1, "sin": 1, "cos": 1, "tanh": 1, "min": 2, "max": 2, "step": 1}
+SPECIAL = ("table", "delay", "first")
+COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
+MAX_LENGTH, MAX_DEPTH, MAX_TOKENS = 20_000, 80, 5_000
+ALLOWED = ("+ - * / **, comparisons, numbers, pi, t, the names of the file, and "
+           + " ".join(FUNCTIONS) + " table delay first")
+
+_TOKEN = re.compile(r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
+                    r"|(?P<op>\*\*|<=|>=|==|!=|[-+*/()<>,\[\]]))")
+
+
+class ExpressionError(ValueError):
+    """What is wrong with an expression, in words; the caller adds file and line."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Expr:
+    """One node. `op` is 'num' (value), 'name' (value), '+', '*', '/', '**', 'neg', a comparison, a function's name,
+    'table' (args: x, then the x points, then the y points; value = number of points), 'delay' (args: expression,
+    seconds), 'first' (value: name), or, in derivatives only, 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope', 'bump'
+    (slope of a smoothed step), 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed)."""
+    op: str
+    args: tuple[Expr, ...] = ()
+    value: Any = None
+
+    def __str__(self) -> str:
+        return _text(self, 0)
+
+
+_INTERNED: dict[tuple, Expr] = {}
+
+
+def make(op: str, *args: Expr, value: Any = None) -> Expr:
+    """The one node of this operation and these arguments."""
+    key = (op, tuple(map(id, args)), value)
+    found = _INTERNED.get(key)
+    if found is None:
+        if len(_INTERNED) > 2_000_000:      # a long-lived process that reads very many plants
+            _INTERNED.clear()
+            _INTERNED.update({("num", (), 0.0): ZERO, ("num", (), 1.0): ONE})
+        found = _INTERNED[key] = Expr(op, args, value)
+    return found
+
+
+def num(value: float) -> Expr:
+    """A number."""
+    return make("num", value=float(value))
+
+
+def name(value: str) -> Expr:
+    """A name."""
+    return make("name", value=value)
+
+
+ZERO, ONE = num(0.0), num(1.0)
+
+
+def add(a: Expr, b: Expr) -> Expr:
+    """a + b, simplified."""
+    if a is ZERO:
+        return b
+    if b is ZERO:
+        return a
+    if a.op == b.op == "num":
+        return num(a.value + b.value)
+    return make("+", a, b)
+
+
+def neg(a: Expr) -> Expr:
+    """-a, simplified."""
+    if a.op == "num":
+        return num(-a.value)
+    return a.args[0] if a.op == "neg" else make("neg", a)
+
+
+def mul(a: Expr, b: Expr) -> Expr:
+    """a * b, simplified."""
+    if a is ZERO or b is ZERO:
+        return ZERO
+    if a is ONE:
+        return b
+    if b is ONE:
+        return a
+    if a.op == b.op == "num":
+        return num(a.value * b.value)
+    return make("*", a, b)
+
+
+def div(a: Expr, b: Expr) -> Expr:
+    """a / b, simplified."""
+    if a is ZERO and not (b.op == "num" and b.value == 0):
+        return ZERO
+    if b is ONE:
+        return a
+    if a.op == b.op == "num" and b.value != 0:
+        return num(a.value / b.value)
+    return make("/", a, b)
+
+
+def power(a: Expr, b: Expr) -> Expr:
+    """a ** b, simplified."""
+    if b is ONE:
+        return a
+    if b is ZERO:
+        return ONE
+    if a.op == b.op == "num":
+        try:
+            value = a.value ** b.value
+            if isinstance(value, float) and math.isfinite(value):
+                return num(value)
+        except (OverflowError, ZeroDivisionError):
+            pass
+    return make("**", a, b)
+
+
+# ---------------------------------------------------------------------------------------------------------- reading
+
+def parse(text: str | int | float) -> Expr:
+    """Read an expression. Raises ExpressionError with what stands at fault and what would be allowed."""
+    if isinstance(text, bool) or not isinstance(text, (str, int, float)):
+        raise ExpressionError(f"an expression was expected, not {text!r}")
+    if not isinstance(text, str):
+        return num(text)
+    if len(text) > MAX_LENGTH:
+        raise ExpressionError(f"an expression of {len(text)} characters; at most {MAX_LENGTH} are read")
+    tokens: list[tuple[str, str]] = []
+    at = 0
+    text = text.rstrip()
+    while at < len(text):
+        match = _TOKEN.match(text, at)
+        if not match:
+            raise ExpressionError(f"'{text[at:at + 12].strip()}' is not part of the language; allowed are {ALLOWED}")
+        tokens.append((match.lastgroup or "", match.group(match.lastgroup or 0)))
+        at = match.end()
+    if len(tokens) > MAX_TOKENS:
+        raise ExpressionError(f"an expression of {len(tokens)} words; at most {MAX_TOKENS} are read")
+    if not tokens:
+        raise ExpressionError("an expression was expected, but the text is empty")
+    reader = _Reader(tokens)
+    result = reader.comparison()
+    if reader.at < len(tokens):
+        raise ExpressionError(f"'{tokens[reader.at][1]}' was not expected here; an operator or the end was")
+    return result
+
+
+class _Reader:
+    """Recursive descent with Python's precedences."""
+
+    def __init__(self, tokens: list[tuple[str, str]]):
+        self.tokens, self.at, self.depth = tokens, 0, 0
+
+    def peek(self) -> str:
+        return self.tokens[self.at][1] if self.at < len(self.tokens) else ""
+
+    def take(self, text: str) -> bool:
+        if self.at < len(self.tokens) and self.tokens[self.at] == ("op", text):
+            self.at += 1
+            return True
+        return False
+
+    def need(self, text: str) -> None:
+        if not self.take(text):
+            raise ExpressionError(f"'{text}' was expected" + (f" before '{self.peek()}'" if self.peek() else " at the end"))
+
+    def comparison(self) -> Expr:
+        self.depth += 1
+        if self.depth > MAX_DEPTH:
+            raise ExpressionError(f"nested deeper than {MAX_DEPTH} levels")
+        left = self.sum()
+        if self.peek() in COMPARISONS:
+            op = self.peek()
+            self.at += 1
+            left = make(op, left, self.sum())
+            if self.peek() in COMPARISONS:
+                raise ExpressionError("chained comparisons are not part of the language; use a product of two")
+        self.depth -= 1
+        return left
+
+    def sum(self) -> Expr:
+        left = self.product()
+        while self.peek() in ("+", "-"):
+            op = self.peek()
+            self.at += 1
+            right = self.product()
+            left = add(left, right if op == "+" else neg(right))
+        return left
+
+    def product(self) -> Expr:
+        left = self.unary()
+        while self.peek() in ("*", "/"):
+            op = self.peek()
+            self.at += 1
+            right = self.unary()
+            left = mul(left, right) if op == "*" else div(left, right)
+        return left
+
+    def unary(self) -> Expr:
+        self.depth += 1
+        if self.depth > MAX_DEPTH:
+            raise ExpressionError(f"nested deeper than {MAX_DEPTH} levels")
+        try:
+            if self.take("-"):
+                return neg(self.unary())
+            if self.take("+"):
+                return self.unary()
+            base = self.atom()
+            return power(base, self.unary()) if self.take("**") else base
+        finally:
+            self.depth -= 1
+
+    def atom(self) -> Expr:
+        if self.at >= len(self.tokens):
+            raise ExpressionError("the expression ends where a number, a name or '(' was expected")
+        kind, text = self.tokens[self.at]
+        self.at += 1
+        if kind == "number":
+            value = float(text)
+            if not math.isfinite(value):
+                raise ExpressionError(f"the number {text} is too large")
+            return num(value)
+        if kind == "name":
+            if self.peek() == "(":
+                return self.call(text)
+            return num(math.pi) if text == "pi" else name(text)
+        if text == "(":
+            inner = self.comparison()
+            self.need(")")
+            return inner
+        raise ExpressionError(f"'{text}' was not expected here; a number, a name or '(' was")
+
+    def call(self, function: str) -> Expr:
+        if function not in FUNCTIONS and function not in SPECIAL:
+            raise ExpressionError(f"'{function}' is not a function of the language; allowed are "
+                                  + ", ".join((*FUNCTIONS, *SPECIAL)))
+        self.need("(")
+        if function == "first":
+            kind, text = self.tokens[self.at] if self.at < len(self.tokens) else ("", "")
+            if kind != "name":
+                raise ExpressionError("first() takes the name of an input or an output")
+            self.at += 1
+            self.need(")")
+            return make("first", value=text)
+        args = [self.comparison()]
+        if function == "table":
+            self.need(",")
+            xs = self.list()
+            self.need(",")
+            ys = self.list()
+            self.need(")")
+            if len(xs) != len(ys) or len(xs) < 2:
+                raise ExpressionError(f"table() has {len(xs)} x points and {len(ys)} y points; two or more of each, "
+                                      "alike in number, were expected")
+            numbers = [x.value for x in xs if x.op == "num"]
+            if any(b <= a for a, b in zip(numbers, numbers[1:], strict=False)):
+                raise ExpressionError("the x points of table() must increase")
+            return make("table", args[0], *xs, *ys, value=len(xs))
+        while self.take(","):
+            args.append(self.comparison())
+        self.need(")")
+        if function == "delay":
+            if len(args) != 2:
+                raise ExpressionError("delay() takes an expression and seconds")
+            return make("delay", *args)
+        if function in ("min", "max"):
+            if len(args) < 2:
+                raise ExpressionError(f"{function}() takes two or more arguments")
+            result = args[0]
+            for other in args[1:]:
+                result = make(function, result, other)
+            return result
+        if len(args) != 1:
+            raise ExpressionError(f"{function}() takes one argument, not {len(args)}")
+        return make(function, args[0])
+
+    def list(self) -> list[Expr]:
+        self.need("[")
+        items = [self.comparison()]
+        while self.take(","):
+            items.append(self.comparison())
+        self.need("]")
+        return items
+
+
+# ---------------------------------------------------------------------------------------------------------- looking
+
+def walk(expr: Expr) -> Iterable[Expr]:
+    """Every distinct node, arguments before their users."""
+    seen: set[int] = set()
+    stack = [(expr, False)]
+    while stack:
+        node, done = stack.pop()
+        if done:
+            yield node
+        elif id(node) not in seen:
+            seen.add(id(node))
+            stack.append((node, True))
+            stack.extend((a, False) for a in reversed(node.args))
+
+
+def names(expr: Expr) -> set[str]:
+    """The names an expression reads (those inside first() are not among them)."""
+    return {n.value for n in walk(expr) if n.op == "name"}
+
+
+def substitute(expr: Expr, change: Callable[[Expr], Expr | None]) -> Expr:
+    """A copy in which each node for which `change` returns something is replaced by it (bottom up)."""
+    done: dict[int, Expr] = {}
+    for node in walk(expr):
+        rebuilt = node
+        if node.args:
+            args = tuple(done[id(a)] for a in node.args)
+            if any(a is not b for a, b in zip(args, node.args, strict=True)):
+                rebuilt = _rebuild(node, args)
+        done[id(node)] = change(rebuilt) or rebuilt
+    return done[id(expr)]
+
+
+def _rebuild(node: Expr, args: tuple[Expr, ...]) -> Expr:
+    simple = {"+": add, "*": mul, "/": div, "**": power}
+    if node.op in simple:
+        return simple[node.op](*args)
+    return neg(args[0]) if node.op == "neg" else make(node.op, *args, value=node.value)
+
+
+_PRECEDENCE = {**dict.fromkeys(COMPARISONS, 1), "+": 2, "*": 3, "/": 3, "neg": 4, "**": 5}
+
+
+def _text(e: Expr, outer: int) -> str:
+    if e.op == "num":
+        text = repr(e.value)
+        text = text[:-2] if text.endswith(".0") else text
+        return f"({text})" if e.value < 0 and outer > 2 else text
+    if e.op == "name":
+        return e.value
+    if e.op == "first":
+        return f"first({e.value})"
+    if e.op == "table":
+        k = e.value
+        return (f"table({_text(e.args[0], 0)}, [{', '.join(_text(a, 0) for a in e.args[1:k + 1])}], "
+                f"[{', '.join(_text(a, 0) for a in e.args[k + 1:])}])")
+    p = _PRECEDENCE.get(e.op)
+    if p is None:
+        return f"{e.op}({', '.join(_text(a, 0) for a in e.args)})"
+    if e.op == "neg":
+        text = "-" + _text(e.args[0], p)
+    elif e.op == "+" and e.args[1].op == "neg":
+        text = f"{_text(e.args[0], p)} - {_text(e.args[1].args[0], p + 1)}"
+    elif e.op == "+" and e.args[1].op == "num" and e.args[1].value < 0:
+        text = f"{_text(e.args[0], p)} - {_text(num(-e.args[1].value), p + 1)}"
+    elif e.op == "**":
+        text = f"{_text(e.args[0], p + 1)}**{_text(e.args[1], p)}"
+    else:
+        right = p if e.op in ("+", "*") else p + 1
+        text = f"{_text(e.args[0], p)} {e.op} {_text(e.args[1], right)}"
+    return f"({text})" if p < outer else text
+
+
+# ------------------------------------------------------------------------------------------------------ derivatives
+
+def derivative(expr: Expr, by: str) -> Expr:
+    """d expr / d name, exact; kinks (abs, min, max, table) take one side, jumps the slope of their smooth form."""
+    done: dict[int, Expr] = {}
+    for node in walk(expr):
+        done[id(node)] = _derive(node, by, done)
+    return done[id(expr)]
+
+
+def _derive(e: Expr, by: str, done: Mapping[int, Expr]) -> Expr:
+    if e.op == "name":
+        return ONE if e.value == by else ZERO
+    d = [done[id(a)] for a in e.args]
+    if not d or all(x is ZERO for x in d):
+        return ZERO
+    a = e.args
+    match e.op:
+        case "+":
+            return add(d[0], d[1])
+        case "neg":
+            return neg(d[0])
+        case "*":
+            return add(mul(d[0], a[1]), mul(a[0], d[1]))
+        case "/":
+            return add(div(d[0], a[1]), neg(div(mul(e, d[1]), a[1])))
+        case "**":
+            first = mul(mul(a[1], power(a[0], add(a[1], num(-1.0))) if _whole(a[1]) else make("dpow", a[0], a[1])), d[0])
+            return first if d[1] is ZERO else add(first, mul(mul(e, make("log", make("max", a[0], num(1e-300)))), d[1]))
+        case "abs":
+            return mul(make("side", a[0]), d[0])
+        case "sqrt":
+            return mul(mul(num(0.5), make("dpow", a[0], num(0.5))), d[0])
+        case "exp":
+            return mul(e, d[0])
+        case "log":
+            return div(d[0], a[0])
+        case "sin":
+            return mul(make("cos", a[0]), d[0])
+        case "cos":
+            return neg(mul(make("sin", a[0]), d[0]))
+        case "tanh":
+            return mul(add(ONE, neg(mul(e, e))), d[0])
+        case "min" | "max":
+            use = make("le", *(a if e.op == "min" else a[::-1]))         # 1 where the first is taken
+            return add(mul(use, d[0]), mul(add(ONE, neg(use)), d[1]))
+        case "sign":
+            return mul(mul(num(2.0), make("bump", a[0])), d[0])
+        case "step":
+            return mul(make("bump", a[0]), d[0])
+        case ">" | ">=":
+            return mul(make("bump", add(a[0], neg(a[1]))), add(d[0], neg(d[1])))
+        case "<" | "<=":
+            return mul(make("bump", add(a[1], neg(a[0]))), add(d[1], neg(d[0])))
+        case "==" | "!=" | "le" | "side" | "bump" | "dpow":
+            return ZERO
+        case "table":
+            k = e.value
+            total = mul(make("table_slope", *a, value=k), d[0])
+            for j in range(k):      # weight of the point j at x: the table of a unit vector
+                if d[1 + k + j] is not ZERO:
+                    unit = [ONE if i == j else ZERO for i in range(k)]
+                    total = add(total, mul(make("table", a[0], *a[1:k + 1], *unit, value=k), d[1 + k + j]))
+            return total
+    raise ExpressionError(f"'{e.op}' cannot be differentiated by {by} here")
+
+
+def _whole(e: Expr) -> bool:
+    return e.op == "num" and e.value == int(e.value) and e.value >= 1
+
+
+# --------------------------------------------------------------------------------------------- evaluating with numpy
+
+def evaluate(expr: Expr, values: Mapping[str, Any], first: Callable[[str], float] | None = None,
+             width: Callable[[Expr], float] | None = None) -> Any:
+    """The value with numpy. `values`: name to number or array; `first(name)` serves first(); `width(argument)` is the
+    half width over which a jump is smoothed (0: a true jump)."""
+    done: dict[int, Any] = {}
+    with np.errstate(all="ignore"):
+        for e in walk(expr):
+            done[id(e)] = _value(e, [done[id(a)] for a in e.args], values, first, width)
+    return done[id(expr)]
+
+
+def _value(e: Expr, a: list[Any], values: Mapping[str, Any], first: Callable[[str], float] | None,
+           width: Callable[[Expr], float] | None) -> Any:
+    op = e.op
+    if op == "num":
+        return e.value
+    if op == "name":
+        return values[e.value]
+    if op == "first":
+        if first is None:
+            raise ExpressionError("first() may stand in 'initial' only")
+        return first(e.value)
+    simple: dict[str, Callable] = {
+        "+": np.add, "*": np.multiply, "/": np.divide, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt,
+        "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tanh": np.tanh, "min": np.minimum, "max": np.maximum}
+    if op in simple:
+        return simple[op](*a)
+    if op == "**":
+        return np.power(np.asarray(a[0], float), a[1])
+    if op in ("step", "sign", ">", ">=", "<", "<=", "bump"):
+        z = a[0] if op in ("step", "sign", "bump") else (a[0] - a[1] if op in (">", ">=") else a[1] - a[0])
+        w = width(e) if width else 0.0
+        if op == "bump":
+            return (0.5 / w) * (1 - np.tanh(z / w) ** 2) if w else np.zeros_like(z)
+        if w:
+            smooth = np.tanh(z / w)
+            return smooth if op == "sign" else 0.5 * (1 + smooth)
+        if op == "sign":
+            return np.sign(z)
+        return np.where(z > 0 if op in (">", "<") else z >= 0, 1.0, 0.0)
+    if op in ("==", "!="):
+        return np.where((a[0] == a[1]) == (op == "=="), 1.0, 0.0)
+    if op == "le":
+        return np.where(np.less_equal(a[0], a[1]), 1.0, 0.0)
+    if op == "side":
+        return np.where(np.asarray(a[0]) >= 0, 1.0, -1.0)
+    if op == "dpow":
+        base = np.maximum(a[0], 1e-8)
+        return np.where(np.asarray(a[0]) > 0, np.power(base, a[1] - 1.0), 0.0)
+    if op in ("table", "table_slope"):
+        k = e.value
+        x = np.asarray(a[0], float)
+        xs, ys = np.array(a[1:k + 1], float), np.array(a[k + 1:], float)
+        if op == "table":
+            return np.interp(x, xs, ys)
+        slopes = np.concatenate([[0.0], np.diff(ys) / np.diff(xs), [0.0]])
+        return slopes[np.searchsorted(xs, x, side="right")]
+    raise ExpressionError(f"'{op}' cannot stand here")
