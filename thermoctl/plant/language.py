@@ -23,7 +23,7 @@ from thermoctl.plant.expression import Expr
 from thermoctl.yamlfile import InputError, suggest
 
 if TYPE_CHECKING:
-    from thermoctl.plant.compile import Model
+    from thermoctl.plant.simulate import Model
 
 FORMAT = "thermoctl-plant/1"
 MAX_ITEMS = 2_000                       # inputs, nodes, ... of one file

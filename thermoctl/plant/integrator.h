@@ -1,0 +1,238 @@
+/* The integrator behind every compiled plant. The generated file defines the sizes, the pattern of the Jacobian and the
+   functions rhs_, jac_, sens_, factor_, lower_upper_ and includes this file.
+
+   ESDIRK4(3)6L[2]SA of Kennedy & Carpenter, Appl. Numer. Math. 44 (2003) 139-181: order 4, six stages, first one
+   explicit, L-stable, stiffly accurate, embedded order 3. Each stage X_i solves X_i = base_i + h g f(X_i) by Newton with
+   the exact sparse Jacobian. Sensitivities S = dx/dq are the exact derivative of the converged step:
+       (I - h g J_i) S_i = S_base,i + h g F_p,i          (staggered direct method)                                      */
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define STAGES 6
+static const double G = 0.25;
+static const double C_[STAGES] = {0, 0.5, 83.0 / 250, 31.0 / 50, 17.0 / 20, 1};
+static const double A_[STAGES][STAGES] = {
+  {0},
+  {0.25, 0.25},
+  {8611.0 / 62500, -1743.0 / 31250, 0.25},
+  {5012029.0 / 34652500, -654441.0 / 2922500, 174375.0 / 388108, 0.25},
+  {15267082809.0 / 155376265600.0, -71443401.0 / 120774400, 730878875.0 / 902184768, 2285395.0 / 8070912, 0.25},
+  {82889.0 / 524892, 0, 15625.0 / 83664, 69875.0 / 102672, -2260.0 / 8211, 0.25}};
+static const double BHAT[STAGES] = {4586570599.0 / 29645900160.0, 0, 178811875.0 / 945068544, 814220225.0 / 1159782912,
+                                    -3700637.0 / 11593932, 61727.0 / 225920};
+
+typedef struct { double *k, *xs, *ks, *sb; int nc; } Work;
+
+static void inputs_at(double s, const double *u0, const double *u1, const int *lin, double *u) {
+  for (int j = 0; j < NU; j++) u[j] = lin[j] && u1 ? u0[j] + s * (u1[j] - u0[j]) : u0[j];
+}
+
+static double norm_(const double *e, const double *x, const double *xn, double rtol, const double *atol) {
+  double worst = 0;
+  for (int i = 0; i < NX; i++) {
+    double q = fabs(e[i]) / (atol[i] + rtol * 1e-3 * fmax(fabs(x[i]), fabs(xn[i])));
+    if (!(q <= worst)) worst = q;          /* a NaN is kept */
+  }
+  return worst;
+}
+
+/* One step from (t, x) over h inside the sampling interval [ta, ta + dt]. Returns the error norm, or -1 where Newton
+   failed. k: stages' slopes; xs: stages' states. */
+static double try_step(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
+                       const double *p, const double *w, const double *x, double rtol, const double *atol,
+                       double *k, double *xs, double *xn, double *M, double *hfac) {
+  double u[NU + 1], J[NJ + 1], f[NX + 1], r[NX + 1];
+  inputs_at((t - ta) / dt, u0, u1, lin, u);
+  memcpy(xs, x, NX * sizeof(double));
+  rhs_(t, x, u, p, w, k);
+  for (int s = 1; s < STAGES; s++) {
+    double ts = t + C_[s] * h, *X = xs + s * NX, base[NX + 1];
+    inputs_at((ts - ta) / dt, u0, u1, lin, u);
+    for (int i = 0; i < NX; i++) {
+      double b = 0;
+      for (int q = 0; q < s; q++) b += A_[s][q] * k[q * NX + i];
+      base[i] = x[i] + h * b;
+      X[i] = s == 1 ? x[i] : xs[(s - 1) * NX + i];
+    }
+    double last = 1e300;
+    int it, done = 0;
+    for (it = 0; it < 12 && !done; it++) {
+      rhs_(ts, X, u, p, w, f);
+      for (int i = 0; i < NX; i++) r[i] = base[i] + h * G * f[i] - X[i];
+      if (!LINEAR || *hfac != h) {
+        jac_(ts, X, u, p, w, J);
+        if (!factor_(h * G, J, M)) return -1;
+        *hfac = h;
+      }
+      solve_(M, r);
+      double size = norm_(r, X, X, rtol, atol);
+      if (!(size < 1e12)) return -1;
+      double damp = 1;
+      if (it > 2 && size > 0.9 * last) damp = 0.5;
+      for (int i = 0; i < NX; i++) X[i] += damp * r[i];
+      if (LINEAR || (damp == 1 && size < 1e-3)) done = 1;
+      last = size;
+    }
+    if (!done) { *hfac = 0; return -1; }
+    if (!LINEAR) *hfac = 0;
+    for (int i = 0; i < NX; i++) k[s * NX + i] = (X[i] - base[i]) / (h * G);
+  }
+  double e[NX + 1];
+  memcpy(xn, xs + (STAGES - 1) * NX, NX * sizeof(double));
+  for (int i = 0; i < NX; i++) {
+    e[i] = 0;
+    for (int q = 0; q < STAGES; q++) e[i] += (A_[STAGES - 1][q] - BHAT[q]) * k[q * NX + i];
+    e[i] *= h;
+  }
+  return norm_(e, x, xn, rtol, atol);
+}
+
+/* The sensitivities over the step that try_step accepted; S (NX x nc) is advanced in place. */
+static int sens_step(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
+                     const double *p, const double *w, const double *xs, double *S, int nc, double *ks, double *M,
+                     double *hfac) {
+  double u[NU + 1], J[NJ + 1], V[NV + 1];
+  size_t block = (size_t)NX * nc;
+  for (int s = 0; s < STAGES; s++) {
+    double ts = t + C_[s] * h, *K = ks + s * block, *R = ks + STAGES * block;
+    const double *X = xs + s * NX;
+    inputs_at((ts - ta) / dt, u0, u1, lin, u);
+    sens_(ts, X, u, p, w, V);
+    if (s == 0) {
+      jac_(ts, X, u, p, w, J);
+      memset(K, 0, block * sizeof(double));
+      for (int q = 0; q < NJ; q++) {
+        double *to = K + (size_t)J_ROW[q] * nc;
+        const double *from = S + (size_t)J_COL[q] * nc;
+        for (int c = 0; c < nc; c++) to[c] += J[q] * from[c];
+      }
+      for (int q = 0; q < NV; q++) K[(size_t)V_ROW[q] * nc + V_COL[q]] += V[q];
+      continue;
+    }
+    memcpy(R, S, block * sizeof(double));
+    for (int q = 0; q < s; q++) {
+      double a = h * A_[s][q];
+      const double *Kq = ks + q * block;
+      if (a != 0) for (size_t c = 0; c < block; c++) R[c] += a * Kq[c];
+    }
+    memcpy(K, R, block * sizeof(double));
+    for (int q = 0; q < NV; q++) K[(size_t)V_ROW[q] * nc + V_COL[q]] += h * G * V[q];
+    if (!LINEAR || *hfac != h) {
+      jac_(ts, X, u, p, w, J);
+      if (!factor_(h * G, J, M)) return 0;
+      *hfac = LINEAR ? h : 0;
+    }
+    solve_many_(M, K, nc);
+    if (s == STAGES - 1) { memcpy(S, K, block * sizeof(double)); return 1; }
+    double g = 1 / (h * G);
+    for (size_t c = 0; c < block; c++) K[c] = (K[c] - R[c]) * g;
+  }
+  return 1;
+}
+
+/* Integrate over N samples. Returns 0, or 1 + the index of the interval that could not be integrated. info[0]: steps,
+   info[1]: rejected. X: N x NX, SX: N x NX x nc or NULL (S0: NX x nc). */
+int integrate(int N, const double *t, const double *U, const int *lin, const double *p, const double *w, const double *x0,
+              const double *S0, int nc, double rtol, const double *atol, int max_steps, double *X, double *SX,
+              double *info) {
+  double x[NX + 1], xn[NX + 1], k[STAGES * (NX + 1)], xs[STAGES * (NX + 1)], M[NM + 1];
+  size_t block = (size_t)NX * nc;
+  double *ks = NULL, *S = NULL;
+  double want = 0, hfac = 0, hfac_s = 0, Ms[NM + 1];
+  if (SX) {
+    ks = malloc((STAGES + 2) * (block + 1) * sizeof(double));
+    if (!ks) return -1;
+    S = ks + (STAGES + 1) * block;
+    memcpy(S, S0, block * sizeof(double));
+    memcpy(SX, S0, block * sizeof(double));
+  }
+  memcpy(x, x0, NX * sizeof(double));
+  memcpy(X, x0, NX * sizeof(double));
+  info[0] = info[1] = 0;
+  for (int n = 0; n + 1 < N; n++) {
+    const double *u0 = U + (size_t)n * NU, *u1 = u0 + NU;
+    double ta = t[n], dt = t[n + 1] - ta, at = ta;
+    int steps = 0, failed = 0;
+    while (at < t[n + 1]) {
+      double left = t[n + 1] - at, h = want <= 0 || want >= left * 0.999 ? left : want;
+      if (h < left && 2 * h > left) h = left / 2;
+      int last = h >= left;
+      if (last) h = left;
+      if (last && at == ta && fabs(h - hfac) < 1e-9 * h) h = hfac;  /* a clock equal but for rounding: same factors */
+      if (++steps > max_steps) { free(ks); return n + 1; }
+      double err = try_step(at, h, ta, dt, u0, u1, lin, p, w, x, rtol, atol, k, xs, xn, M, &hfac);
+      if (!(err >= 0 && err <= 1)) {
+        info[1]++;
+        want = err > 1 && err < 1e9 ? h * fmax(0.1, 0.9 * pow(err, -0.25)) : h * 0.1;
+        if (want < 1e-12 * dt || ++failed > 60) { free(ks); return n + 1; }
+        continue;
+      }
+      if (SX && !sens_step(at, h, ta, dt, u0, u1, lin, p, w, xs, S, nc, ks, Ms, &hfac_s)) { free(ks); return n + 1; }
+      memcpy(x, xn, NX * sizeof(double));
+      info[0]++;
+      double grow = h * fmin(4, 0.9 * pow(fmax(err, 1e-6), -0.25));
+      if (!last || grow < want || want <= 0) want = grow; else want = fmax(want, grow);
+      at = last ? t[n + 1] : at + h;
+    }
+    memcpy(X + (size_t)(n + 1) * NX, x, NX * sizeof(double));
+    if (SX) memcpy(SX + (n + 1) * block, S, block * sizeof(double));
+  }
+  free(ks);
+  return 0;
+}
+
+/* Outputs of one list (o = 0: the outputs, 1: the arguments of their delays) at N samples. D: N x ND values of the delays
+   and SD their sensitivities (N x ND x nc), NULL for list 1. Y: N x NYo, SY: N x NYo x nc or NULL. */
+void observe(int o, int N, const double *t, const double *U, const double *p, const double *w, const double *X,
+             const double *SX, int nc, const double *D, const double *SD, double *Y, double *SY) {
+  int ny = o ? ND : NY;
+  for (int n = 0; n < N; n++) {
+    const double *x = X + (size_t)n * NX, *u = U + (size_t)n * NU, *d = D ? D + (size_t)n * ND : 0;
+    double *y = Y + (size_t)n * ny;
+    if (o) delayed_(t[n], x, u, p, w, d, y); else outputs_(t[n], x, u, p, w, d, y);
+    if (!SY) continue;
+    double V[NO + 1], *sy = SY + (size_t)n * ny * nc;
+    int count = o ? NO1 : NO0;
+    const int *row = o ? O1_ROW : O0_ROW, *kind = o ? O1_KIND : O0_KIND, *col = o ? O1_COL : O0_COL;
+    if (o) delayed_slopes_(t[n], x, u, p, w, d, V); else outputs_slopes_(t[n], x, u, p, w, d, V);
+    memset(sy, 0, (size_t)ny * nc * sizeof(double));
+    for (int q = 0; q < count; q++) {
+      double *to = sy + (size_t)row[q] * nc;
+      if (kind[q] == 1) { to[col[q]] += V[q]; continue; }                                  /* by a parameter */
+      const double *from = kind[q] == 0 ? SX + ((size_t)n * NX + col[q]) * nc : SD + ((size_t)n * ND + col[q]) * nc;
+      for (int c = 0; c < nc; c++) to[c] += V[q] * from[c];                                /* by a state or a delay */
+    }
+  }
+}
+
+/* The slopes dx/dt at N samples (for delays in outputs). */
+void slopes(int N, const double *t, const double *U, const double *p, const double *w, const double *X, double *F) {
+  for (int n = 0; n < N; n++) rhs_(t[n], X + (size_t)n * NX, U + (size_t)n * NU, p, w, F + (size_t)n * NX);
+}
+
+/* One period with inputs held; x in place, y out. Returns 0 or 1. */
+int advance(double t, double h, const double *u, const double *p, const double *w, double rtol, const double *atol,
+            double *x, double *y, double *want) {
+  double k[STAGES * (NX + 1)], xs[STAGES * (NX + 1)], xn[NX + 1], M[NM + 1], hfac = 0, at = 0;
+  static const int hold[NU + 1];
+  int steps = 0;
+  if (NX > 0)
+    while (at < h) {
+      double left = h - at, s = *want <= 0 || *want >= left * 0.999 ? left : *want;
+      if (s < left && 2 * s > left) s = left / 2;
+      if (++steps > 100000) return 1;
+      double err = try_step(t + at, s, t, h, u, 0, hold, p, w, x, rtol, atol, k, xs, xn, M, &hfac);
+      if (!(err >= 0 && err <= 1)) {
+        *want = err > 1 && err < 1e9 ? s * fmax(0.1, 0.9 * pow(err, -0.25)) : s * 0.1;
+        if (*want < 1e-12 * h) return 1;
+        continue;
+      }
+      memcpy(x, xn, NX * sizeof(double));
+      double grow = s * fmin(4, 0.9 * pow(fmax(err, 1e-6), -0.25));
+      *want = s < left ? grow : fmax(*want, grow);
+      at = s >= left ? h : at + s;
+    }
+  outputs_(t + h, x, u, p, w, 0, y);
+  return 0;
+}

@@ -1,0 +1,334 @@
+"""Simulation of a compiled plant on a recording's inputs: free run, sensitivities, and one fixed period at a time."""
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermoctl.plant import expression as ex
+from thermoctl.plant.compile import Code
+from thermoctl.plant.language import Plant
+from thermoctl.yamlfile import InputError, suggest
+
+if TYPE_CHECKING:
+    from thermoctl.recording.table import Table
+
+RTOL = 1e-7             # local error a step, as a share of each state's range
+JUMP_WIDTH = 1e-5       # half width of a smoothed jump, as a share of the range of its argument
+MAX_STEPS = 20_000      # steps within one sampling interval
+
+
+class SimulationError(Exception):
+    """The plant could not be integrated (states that run away, a division by zero); says where."""
+
+
+@dataclass
+class Drive:
+    """What one recording gives to a plant: `t` (N,) seconds from its first sample, `u` (N, inputs) with gaps filled
+    (held, or on a straight line for linear inputs), `y` (N, outputs) measured, NaN where missing, `first` the first
+    recorded values, and the scales that a simulation on it uses."""
+    name: str
+    t: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+    first: dict[str, float]
+    linear: np.ndarray
+    scale: np.ndarray | None = None          # (nx,) range of each state
+    width: np.ndarray | None = None          # (jumps,) half width of each smoothed jump
+
+    def part(self, start: int, stop: int) -> Drive:
+        """The samples start..stop-1 (scales kept); time goes on counting from the recording's start."""
+        return dataclasses.replace(self, t=self.t[start:stop], u=self.u[start:stop], y=self.y[start:stop])
+
+
+@dataclass
+class Simulation:
+    """`x` (N, nx), `y` (N, ny) noise-free; with sensitivities `dx` (N, nx, nq) and `dy` (N, ny, nq) by q = (active
+    parameters, uncertain initial states)."""
+    t: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    dx: np.ndarray | None = None
+    dy: np.ndarray | None = None
+    steps: int = 0
+    rejected: int = 0
+
+
+def _p(a: np.ndarray | None) -> int | None:
+    return None if a is None else a.ctypes.data
+
+
+class Model:
+    """A plant and its machine code."""
+
+    def __init__(self, plant: Plant, code: Code):
+        self.plant, self.code = plant, code
+        self.inputs = tuple(plant.inputs)
+        self.parameters, self.active = code.parameters, code.active
+        self.states, self.outputs, self.uncertain = code.states, code.outputs, code.uncertain
+        self.unknowns = (*self.active, *(f"{n} at the start" for n in self.uncertain))
+        self._initial = [n.initial for n in plant.nodes.values()]
+        self._slots = [self.states.index(n) for n in self.uncertain]
+
+    # ------------------------------------------------------------------------------------------------------- inputs
+
+    def drive(self, table: Table) -> Drive:
+        """The recording as this plant reads it. Raises InputError where an input's column is missing or empty."""
+        t = np.ascontiguousarray(table.t - table.t[0], float)
+        u = np.empty((len(t), len(self.code.inputs)))
+        linear = np.zeros(len(self.code.inputs), np.intc)
+        first: dict[str, float] = {}
+        for j, i in enumerate(self.plant.inputs.values()):
+            column = table.columns.get(i.column)
+            if column is None:
+                raise InputError(f"{table.path}: no column '{i.column}', which input '{i.name}' of {self.plant.file} reads"
+                                 f"{suggest(i.column, table.columns)}; columns are {', '.join(list(table.columns)[:40])}")
+            u[:, j] = _filled(t, column, i.linear, f"{table.path}: column '{i.column}' (input '{i.name}')")
+            linear[j] = i.linear
+            first[i.name] = float(column[np.isfinite(column)][0])
+        y = np.full((len(t), len(self.outputs)), np.nan)
+        for j, o in enumerate(self.plant.outputs.values()):
+            if o.column in table.columns:
+                y[:, j] = table.columns[o.column]
+                known = y[np.isfinite(y[:, j]), j]
+                if len(known):
+                    first.setdefault(o.name, float(known[0]))
+        return Drive(table.name, t, u, y, first, linear)
+
+    def vector(self, parameters: Mapping[str, float] | np.ndarray | None, recording: str | None = None) -> np.ndarray:
+        """All parameters in order: the plant's values (those of the recording where it has its own), then changes."""
+        if isinstance(parameters, np.ndarray):
+            return np.ascontiguousarray(parameters, float)
+        out = np.array([p.values.get(recording, p.value) if recording else p.value for p in self.plant.parameters.values()])
+        for key, value in (parameters or {}).items():
+            if key not in self.parameters:
+                raise InputError(f"'{key}' is not a parameter of {self.plant.file}{suggest(key, self.parameters)}")
+            out[self.parameters.index(key)] = value
+        return out
+
+    def _delayed_inputs(self, drive: Drive, p: np.ndarray) -> np.ndarray:
+        """u with the derived columns of delayed inputs: the mean of the held signal over each interval, t - seconds; and
+        the slope of that by the seconds."""
+        if not self.code.input_delays:
+            return drive.u
+        u = drive.u.copy()
+        known = dict(zip(self.parameters, p, strict=True))
+        n = len(self.plant.inputs)
+        columns = {i: u[:, j] for j, i in enumerate(self.plant.inputs)}
+        for j, (signal, seconds) in enumerate(self.code.input_delays.values()):
+            s = np.broadcast_to(np.asarray(ex.evaluate(signal, columns), float), drive.t.shape)
+            td = max(float(ex.evaluate(seconds, known)), 0.0)
+            if all(self.plant.inputs[i].linear for i in ex.names(signal)):
+                u[:, n + j] = np.interp(drive.t - td, drive.t, s)
+                slope = np.interp(drive.t - td + 1e-9, drive.t, s) - u[:, n + j]
+                u[:, n + len(self.code.input_delays) + j] = -slope / 1e-9
+                drive.linear[n + j] = 1
+            else:
+                area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(drive.t))])
+                at = drive.t - td
+
+                def integral(z: np.ndarray, area=area, s=s) -> np.ndarray:      # before the start the first value held
+                    return np.where(z < drive.t[0], (z - drive.t[0]) * s[0], np.interp(z, drive.t, area))
+                dt = np.diff(drive.t)
+                u[:-1, n + j] = np.diff(integral(at)) / dt
+                u[-1, n + j] = u[-2, n + j]
+                k = np.clip(np.searchsorted(drive.t, at, side="right") - 1, 0, len(s) - 1)
+                u[:-1, n + len(self.code.input_delays) + j] = -np.diff(s[k]) / dt
+                u[-1, n + len(self.code.input_delays) + j] = 0.0
+        return np.ascontiguousarray(u)
+
+    def start(self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Initial states (nx,) and their sensitivities (nx, nq). `dx0`: shifts of the uncertain initial states."""
+        values = {**dict(zip(self.plant.inputs, drive.u[0], strict=False)), **dict(zip(self.parameters, p, strict=True))}
+
+        def first(key: str) -> float:
+            if key not in drive.first:
+                raise InputError(f"recording {drive.name}: first({key}) is asked for, but the recording has no value of it")
+            return drive.first[key]
+        x0 = np.array([float(ex.evaluate(e, values, first)) for e in self._initial])
+        s0 = np.zeros((len(self.states), len(self.unknowns)))
+        for i, e in enumerate(self._initial):
+            used = ex.names(e)
+            for c, q in enumerate(self.active):
+                if q in used:
+                    s0[i, c] = float(ex.evaluate(ex.derivative(e, q), values, first))
+        for c, slot in enumerate(self._slots):
+            s0[slot, len(self.active) + c] = 1.0
+            if dx0 is not None:
+                x0[slot] += dx0[c]
+        return x0, s0
+
+    # --------------------------------------------------------------------------------------------------- simulating
+
+    def prepare(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None = None) -> Drive:
+        """Set the drive's scales (ranges of states, widths of smoothed jumps) from trial runs at these parameters."""
+        p = self.vector(parameters, drive.name)
+        jumps = self.code.jumps
+        dt = float(np.median(np.diff(drive.t))) if len(drive.t) > 1 else 1.0
+        width = np.ones(max(len(jumps), 1))
+        for i, (z, kind) in enumerate(jumps):
+            if kind == "time":
+                slope = ex.evaluate(ex.derivative(z, "t"), dict(zip(self.parameters, p, strict=True))) \
+                    if ex.names(ex.derivative(z, "t")) <= set(self.parameters) else 1.0
+                width[i] = 0.5 * dt * max(abs(float(slope)), 1e-12)
+        drive.width = width
+        drive.scale = np.full(len(self.states), np.nan)
+        moving = any(kind == "state" for _, kind in jumps)
+        for share in ((1e-2, JUMP_WIDTH) if moving else (1.0,)):
+            try:
+                run = self._run(drive, p, None, False, 1e-5 if moving else 1e-4)
+                x = run.x
+            except SimulationError:
+                x = np.zeros((len(drive.t), len(self.states)))
+            finite = np.where(np.isfinite(x), x, 0.0)
+            drive.scale = np.ptp(finite, axis=0) + 1e-6 * np.max(np.abs(finite), axis=0, initial=0.0) + 1e-12
+            if moving:
+                values = self._signals(drive, p, finite)
+                for i, (z, kind) in enumerate(jumps):
+                    if kind == "state":
+                        reach = float(np.max(np.abs(np.broadcast_to(ex.evaluate(z, values), drive.t.shape))))
+                        width[i] = max(share * reach, 1e-15)
+        return drive
+
+    def _signals(self, drive: Drive, p: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
+        u = self._delayed_inputs(drive, p)
+        return {**dict(zip(self.code.inputs, u.T, strict=True)), **dict(zip(self.parameters, p, strict=True)),
+                **dict(zip(self.states, x.T, strict=True)), "t": drive.t}
+
+    def run(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None = None, dx0: np.ndarray | None = None,
+            sensitivities: bool = False, rtol: float = RTOL) -> Simulation:
+        """Free run on a drive. Raises SimulationError."""
+        if drive.scale is None:
+            self.prepare(drive, parameters)
+        return self._run(drive, self.vector(parameters, drive.name), dx0, sensitivities, rtol)
+
+    def simulate(self, table: Table, parameters: Mapping[str, float] | None = None, sensitivities: bool = False,
+                 rtol: float = RTOL) -> Simulation:
+        """Free run on a recording's inputs. Raises InputError, SimulationError."""
+        return self.run(self.drive(table), parameters, None, sensitivities, rtol)
+
+    def _run(self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None, sensitivities: bool, rtol: float) -> Simulation:
+        lib, n, nx, nq = self.code.library, len(drive.t), len(self.states), len(self.unknowns)
+        u = self._delayed_inputs(drive, p)
+        width = drive.width if drive.width is not None else np.ones(1)
+        x0, s0 = self.start(drive, p, dx0)
+        x = np.empty((n, nx))
+        dx = np.empty((n, nx, nq)) if sensitivities else None
+        info = np.zeros(2)
+        if nx:
+            if not np.all(np.isfinite(x0)):
+                raise SimulationError(f"{drive.name}: the start of '{self.states[int(np.argmin(np.isfinite(x0)))]}' is not finite")
+            scale = drive.scale if drive.scale is not None and np.all(np.isfinite(drive.scale)) \
+                else np.abs(x0) + 1e-3
+            atol = rtol * scale
+            failed = lib.integrate(n, _p(drive.t), _p(u), _p(drive.linear), _p(p), _p(width), _p(x0), _p(s0), nq, rtol,
+                                   _p(atol), MAX_STEPS, _p(x), _p(dx), _p(info))
+            if failed:
+                at = max(failed - 1, 0)
+                raise SimulationError(f"{drive.name}: the simulation does not get beyond t = {drive.t[at]:.6g} s; states "
+                                      + ", ".join(f"{s} = {v:.3g}" for s, v in zip(self.states, x[at], strict=True)))
+        y, dy = self._observe(drive, u, p, width, x, dx, nq, sensitivities)
+        return Simulation(drive.t, x, y, dx, dy, int(info[0]), int(info[1]))
+
+    def _observe(self, drive: Drive, u: np.ndarray, p: np.ndarray, width: np.ndarray, x: np.ndarray,
+                 dx: np.ndarray | None, nq: int, sensitivities: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        lib, n, ny, nd = self.code.library, len(drive.t), len(self.outputs), len(self.code.output_delays)
+        delayed = slopes = None
+        if nd:
+            g = np.empty((n, nd))
+            dg = np.empty((n, nd, nq)) if sensitivities else None
+            lib.observe(1, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, None, None, _p(g), _p(dg))
+            delayed, slopes = self._shift(drive.t, g, dg, p)
+        y = np.empty((n, ny))
+        dy = np.empty((n, ny, nq)) if sensitivities else None
+        lib.observe(0, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, _p(delayed), _p(slopes), _p(y), _p(dy))
+        return y, dy
+
+    def _shift(self, t: np.ndarray, g: np.ndarray, dg: np.ndarray | None,
+               p: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """The arguments of delays, seconds earlier: cubic between samples (Catmull-Rom slopes), held before the start."""
+        known = dict(zip(self.parameters, p, strict=True))
+        out, dout = np.empty_like(g), None if dg is None else np.empty_like(dg)
+        for j, (_, seconds) in enumerate(self.code.output_delays.values()):
+            td = max(float(ex.evaluate(seconds, known)), 0.0)
+            at = np.maximum(t - td, t[0])
+            k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+            h = t[k + 1] - t[k]
+            s = (at - t[k]) / h
+            basis = ((1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2 * h, s * s * (3 - 2 * s), s * s * (s - 1) * h)
+            rate = np.gradient(g[:, j], t)
+            out[:, j] = basis[0] * g[k, j] + basis[1] * rate[k] + basis[2] * g[k + 1, j] + basis[3] * rate[k + 1]
+            if dg is not None and dout is not None:
+                w = (s[:, None])
+                dout[:, j] = (1 - w) * dg[k, j] + w * dg[k + 1, j]
+                slope = np.where(t - td > t[0], (1 - s) * rate[k] + s * rate[k + 1], 0.0)
+                for c, q in enumerate(self.active):
+                    if q in ex.names(seconds):
+                        dout[:, j, c] -= slope * float(ex.evaluate(ex.derivative(seconds, q), known))
+        return out, dout
+
+    def stepper(self, period_s: float, u0: np.ndarray, parameters: Mapping[str, float] | None = None,
+                first: Mapping[str, float] | None = None, rtol: float = 1e-5) -> Stepper:
+        """One fixed period at a time, for a simulated rig; `u0` (inputs,) are the inputs at the start."""
+        return Stepper(self, period_s, np.asarray(u0, float), parameters, dict(first or {}), rtol)
+
+
+def _filled(t: np.ndarray, column: np.ndarray, linear: bool, what: str) -> np.ndarray:
+    good = np.isfinite(column)
+    if good.all():
+        return column
+    if not good.any():
+        raise InputError(f"{what} has no value at all; a driving signal was expected")
+    if linear:
+        return np.interp(t, t[good], column[good])
+    index = np.maximum.accumulate(np.where(good, np.arange(len(t)), -1))
+    return column[np.where(index < 0, int(np.argmax(good)), index)]
+
+
+@dataclass
+class Stepper:
+    """A plant that lives in steps of one period, its inputs held over each; deterministic."""
+    model: Model
+    period_s: float
+    u0: np.ndarray
+    parameters: Mapping[str, float] | None = None
+    first: dict[str, float] = field(default_factory=dict)
+    rtol: float = 1e-5
+
+    def __post_init__(self) -> None:
+        code = self.model.code
+        if code.input_delays or code.output_delays:
+            raise InputError(f"{self.model.plant.file}: a plant with delay() cannot run as a simulated rig")
+        self.reset(self.u0)
+
+    def reset(self, u0: np.ndarray) -> None:
+        """Back to the start with these inputs (nu,)."""
+        m = self.model
+        self._p = m.vector(self.parameters)
+        named = dict(zip(m.inputs, u0, strict=True))
+        drive = Drive("start", np.zeros(1), np.atleast_2d(np.asarray(u0, float)).copy(), np.empty((1, 0)), {**named, **self.first},
+                      np.zeros(len(m.inputs), np.intc))
+        self.x, _ = m.start(drive, self._p)
+        self.t = 0.0
+        self._u = np.array(u0, float)
+        self._y = np.empty(len(m.outputs))
+        self._want = np.zeros(1)
+        self._width = np.full(max(len(m.code.jumps), 1), 1e-6)
+        self._scale = np.abs(self.x) * 1e-2 + 1e-3
+        self._atol = self.rtol * self._scale
+        self._pointers = [_p(a) for a in (self._u, self._p, self._width)], [_p(a) for a in (self._atol, self.x, self._y, self._want)]
+
+    def step(self, u: np.ndarray) -> np.ndarray:
+        """Advance one period with inputs `u` (nu,) held; returns the outputs (ny,), a view that the next step changes."""
+        self._u[:] = u
+        head, tail = self._pointers
+        if self.model.code.library.advance(self.t, self.period_s, *head, self.rtol, *tail):
+            raise SimulationError(f"the simulated rig cannot be integrated at t = {self.t:.6g} s")
+        self.t += self.period_s
+        return self._y
+
+
+__all__ = ["Drive", "Model", "Simulation", "SimulationError", "Stepper"]
