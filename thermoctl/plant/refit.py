@@ -1,0 +1,364 @@
+"""Refit of a plant's own parameters to recordings: bounded, weighted least squares on the free-run error.
+
+    minimise  sum_k rho((e_k - phi e_(k-1)) / s)  +  sum (dx0 / initial_sigma)^2  +  w sum ((z - z_belief) / 1)^2
+    e = y - yhat(p, x0 + dx0),  p inside its range,  per channel s^2 = sigma^2 (1 - phi^2) + resolution^2 / 12
+
+phi is the channel's noise colour (AR(1), over one median sampling interval), rho Huber's function (outliers), z the
+parameter's place in its range (0..1, on a log scale where the range spans a factor of three or more) and w a weight so
+small that it decides only in flat directions. Gauss-Newton with Levenberg's damping on the normal equations; a parameter
+that meets its bound is held there until the gradient leads back inside. Sensitivities are exact (compile.py).
+"""
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from thermoctl.plant.language import Parameter, Plant
+from thermoctl.plant.simulate import Drive, Model, SimulationError
+from thermoctl.yamlfile import InputError
+
+HUBER = 4.0             # residuals beyond this many sigmas count linearly
+BELIEF_WEIGHT = 0.02    # a whole range away from the belief costs as much as a fiftieth of a sigma, once
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One channel's noise: standard deviation and correlation over one median sampling interval."""
+    sigma: float
+    phi: float = 0.0
+
+
+@dataclass
+class Fit:
+    """What a refit found. `values`: (recordings, parameters) in the model's order; `dx0`: (recordings, uncertain states);
+    `covariance` by `unknowns` (name, recording index or None); `residuals`: per recording (N, outputs), NaN if missing."""
+    model: Model
+    values: np.ndarray
+    dx0: np.ndarray
+    cost: float
+    unknowns: list[tuple[str, int | None]]
+    z: np.ndarray
+    hessian: np.ndarray
+    residuals: list[np.ndarray]
+    noise: tuple[Noise, ...]
+    iterations: int
+    samples: int
+    at_bound: dict[str, str] = field(default_factory=dict)
+
+    def parameters(self, recording: int = 0) -> dict[str, float]:
+        """All parameter values of one recording."""
+        return dict(zip(self.model.parameters, map(float, self.values[recording]), strict=True))
+
+    def rms(self) -> dict[str, float]:
+        """Root-mean-square residual per output over all recordings."""
+        stacked = np.concatenate(self.residuals)
+        return {o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2))) if np.isfinite(stacked[:, j]).any() else float("nan")
+                for j, o in enumerate(self.model.outputs)}
+
+
+class Scale:
+    """A parameter's coordinate z in [0, 1] over its range."""
+
+    def __init__(self, p: Parameter):
+        assert p.range is not None
+        self.low, self.high = p.range
+        self.log = self.low > 0 and self.high >= 3 * self.low
+        self.span = np.log(self.high / self.low) if self.log else self.high - self.low
+
+    def z(self, value: float) -> float:
+        return float(np.log(value / self.low) / self.span if self.log else (value - self.low) / self.span)
+
+    def value(self, z: float) -> float:
+        inside = min(max(z, 0.0), 1.0)
+        raw = self.low * np.exp(inside * self.span) if self.log else self.low + inside * self.span
+        return float(min(max(raw, self.low), self.high))
+
+    def slope(self, value: float) -> float:
+        """d value / d z."""
+        return float(value * self.span if self.log else self.span)
+
+
+def default_noise(plant: Plant, drives: Sequence[Drive] = ()) -> tuple[Noise, ...]:
+    """The plant's own figures; a channel without any gets its second differences' (white part)."""
+    out = []
+    for j, o in enumerate(plant.outputs.values()):
+        sigma = np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12))
+        if sigma <= 0:
+            parts = [d.y[np.isfinite(d.y[:, j]), j] for d in drives]
+            second = np.concatenate([np.diff(y, 2) for y in parts if len(y) > 3] or [np.zeros(1)])
+            sigma = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6)
+            spread = max((float(np.ptp(y)) for y in parts if len(y)), default=1.0)
+            sigma = max(sigma, 1e-4 * spread, 1e-12)
+        out.append(Noise(float(sigma)))
+    return tuple(out)
+
+
+class Problem:
+    """Residuals and Jacobian of a model on several recordings, in the metric of the noise."""
+
+    def __init__(self, model: Model, drives: Sequence[Drive], noise: Sequence[Noise], stride: int = 1):
+        self.model, self.drives, self.noise = model, list(drives), tuple(noise)
+        if not drives:
+            raise InputError("no recording to fit")
+        parameters = model.plant.parameters
+        self.scales = {q: Scale(parameters[q]) for q in model.active if parameters[q].range}
+        self.unknowns: list[tuple[str, int | None]] = []
+        nq = len(model.unknowns)
+        self.columns = np.full((len(drives), nq), -1)
+        for c, q in enumerate(model.active):
+            if q not in self.scales:
+                continue
+            if parameters[q].per_recording:
+                for r in range(len(drives)):
+                    self.columns[r, c] = len(self.unknowns)
+                    self.unknowns.append((q, r))
+            else:
+                self.columns[:, c] = len(self.unknowns)
+                self.unknowns.append((q, None))
+        self.n_parameters = len(self.unknowns)
+        self.sigma0 = []
+        for c, s in enumerate(model.uncertain):
+            for r in range(len(drives)):
+                self.columns[r, len(model.active) + c] = len(self.unknowns)
+                self.unknowns.append((f"{s} at the start", r))
+                self.sigma0.append(model.plant.nodes[s].initial_sigma or 1.0)
+        self.belief = self.start({})
+        self.rows = []
+        self.weights: list[np.ndarray] | None = None
+        for d in drives:
+            dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
+            entry = []
+            for j, n in enumerate(self.noise):
+                index = np.flatnonzero(np.isfinite(d.y[:, j]))
+                gaps = np.diff(d.t[index]) / dt if len(index) > 1 else np.zeros(0)
+                phi = n.phi ** np.clip(gaps, 0.0, 1e4) if n.phi > 0 else np.zeros(len(gaps))
+                scale = np.full(len(index), n.sigma)
+                if len(index):
+                    scale[1:] = n.sigma * np.sqrt(np.maximum(1 - phi ** 2, 1e-9))
+                entry.append((index, phi, scale))
+            self.rows.append(entry)
+        self.samples = sum(len(e[0]) for entry in self.rows for e in entry)
+        if self.samples == 0:
+            raise InputError("no recording has a column that an output of the plant reads; nothing to fit")
+
+    def start(self, changes: Mapping[str, float]) -> np.ndarray:
+        """Unknowns (scaled) at the plant's values, with changes."""
+        out = []
+        for q, r in self.unknowns:
+            if q in self.scales:
+                p = self.model.plant.parameters[q]
+                value = changes.get(q, p.values.get(self.drives[r].name, p.value) if r is not None else p.value)
+                out.append(self.scales[q].z(min(max(value, p.range[0]), p.range[1])))   # type: ignore[index]
+            else:
+                out.append(0.0)
+        return np.array(out)
+
+    def unpack(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values (recordings, parameters) and shifts of initial states (recordings, uncertain states)."""
+        values = np.array([self.model.vector(None, d.name) for d in self.drives])
+        dx0 = np.zeros((len(self.drives), len(self.model.uncertain)))
+        for r in range(len(self.drives)):
+            for c in range(self.columns.shape[1]):
+                k = self.columns[r, c]
+                if k < 0:
+                    continue
+                if c < len(self.model.active):
+                    q = self.model.active[c]
+                    values[r, self.model.parameters.index(q)] = self.scales[q].value(z[k])
+                else:
+                    dx0[r, c - len(self.model.active)] = z[k] * self.sigma0[k - self.n_parameters]
+        return values, dx0
+
+    def whiten(self, r: int, e: np.ndarray) -> np.ndarray:
+        """(N, outputs, ...) errors of recording r to whitened rows (M, ...)."""
+        parts = []
+        for j, (index, phi, scale) in enumerate(self.rows[r]):
+            part = e[index, j]
+            shape = (-1, *([1] * (part.ndim - 1)))
+            if len(index) > 1 and phi.any():
+                part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
+            parts.append(part / scale.reshape(shape))
+        return np.concatenate(parts) if parts else np.zeros((0, *e.shape[2:]))
+
+    def evaluate(self, z: np.ndarray, jacobian: bool) -> tuple[float, np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Cost, gradient/2 and Gauss-Newton matrix by the unknowns, raw residuals. Raises SimulationError."""
+        values, dx0 = self.unpack(z)
+        n = len(z)
+        gradient, matrix = np.zeros(n), np.zeros((n, n))
+        cost = 0.0
+        residuals = []
+        for r, d in enumerate(self.drives):
+            run = self.model.run(d, values[r], dx0[r], sensitivities=jacobian)
+            e = d.y - run.y
+            if not np.all(np.isfinite(run.y)):
+                raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
+            residuals.append(e)
+            w = self.whiten(r, e)
+            a = np.abs(w)
+            cost += float(np.sum(np.where(a <= HUBER, w * w, 2 * HUBER * a - HUBER ** 2)))
+            if not jacobian or run.dy is None:
+                continue
+            used = np.flatnonzero(self.columns[r] >= 0)
+            slope = np.array([self.scales[self.model.active[c]].slope(values[r, self.model.parameters.index(self.model.active[c])])
+                              if c < len(self.model.active) else self.sigma0[self.columns[r, c] - self.n_parameters] for c in used])
+            jac = self.whiten(r, run.dy[:, :, used]) * slope
+            weight = np.where(a <= HUBER, 1.0, HUBER / np.maximum(a, HUBER))
+            k = self.columns[r, used]
+            np.add.at(gradient, k, jac.T @ (weight * w))
+            heavy = jac if weight.min() == 1.0 else jac * np.sqrt(weight)[:, None]
+            matrix[np.ix_(k, k)] += heavy.T @ heavy
+        prior = np.concatenate([np.full(self.n_parameters, BELIEF_WEIGHT ** 2), np.ones(n - self.n_parameters)])
+        away = z - self.belief
+        cost += float(np.sum(prior * away ** 2))
+        return cost, gradient - prior * away, matrix + np.diag(prior), residuals
+
+
+def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = None,
+        start: Mapping[str, float] | np.ndarray | None = None, iterations: int = 40, tolerance: float = 1e-4,
+        tries: int = 0, seed: int = 0, progress: Callable[[str], None] | None = None) -> Fit:
+    """Fit the active parameters that have a range (and uncertain initial states) to the drives.
+
+    `tries`: how many starts drawn over the ranges are looked at besides the given one; the best two are followed.
+    Raises SimulationError where no start can be simulated, InputError where there is nothing to compare."""
+    for d in drives:
+        if d.scale is None:
+            model.prepare(d)
+    problem = Problem(model, drives, noise or default_noise(model.plant, drives))
+    z0 = problem.start(start or {}) if not isinstance(start, np.ndarray) else start
+    starts = [z0]
+    if tries:
+        random = np.random.default_rng(seed)
+        looked = []
+        for _ in range(tries):
+            z = z0.copy()
+            z[:problem.n_parameters] = random.uniform(0.05, 0.95, problem.n_parameters)
+            try:
+                looked.append((problem.evaluate(z, False)[0], z))
+            except SimulationError:
+                continue
+        looked.sort(key=lambda item: item[0])
+        starts += [z for _, z in looked[:2]]
+    best: Fit | None = None
+    failure: SimulationError | None = None
+    for z in starts:
+        try:
+            found = _descend(problem, z, iterations, tolerance)
+        except SimulationError as e:
+            failure = failure or e
+            continue
+        if best is None or found.cost < best.cost - 1e-6:
+            best = found
+        if progress:
+            progress(f"cost {found.cost:.1f} after {found.iterations} iterations")
+    if best is None:
+        raise failure or SimulationError("the plant cannot be simulated")
+    return best
+
+
+def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float) -> Fit:
+    low = np.concatenate([np.zeros(problem.n_parameters), np.full(len(z) - problem.n_parameters, -8.0)])
+    high = np.concatenate([np.ones(problem.n_parameters), np.full(len(z) - problem.n_parameters, 8.0)])
+    z = np.clip(z, low, high)
+    cost, gradient, matrix, residuals = problem.evaluate(z, True)
+    damping, done = 1e-3, 0
+    for done in range(1, iterations + 1):       # noqa: B007 the count is reported
+        held = ((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0))
+        free = np.flatnonzero(~held)
+        if not len(free):
+            break
+        improved = False
+        for _ in range(12):
+            step = np.zeros_like(z)
+            left = free
+            for _ in range(len(free) + 1):              # steps that would leave the box stop at its wall
+                sub = matrix[np.ix_(left, left)]
+                fixed = np.setdiff1d(free, left)
+                rhs = gradient[left] - matrix[np.ix_(left, fixed)] @ step[fixed]
+                step[left] = np.linalg.solve(sub + damping * np.diag(np.diag(sub)), rhs)
+                out = left[(z[left] + step[left] < low[left] - 1e-12) | (z[left] + step[left] > high[left] + 1e-12)]
+                if not len(out):
+                    break
+                step[out] = np.clip(z[out] + step[out], low[out], high[out]) - z[out]
+                left = np.setdiff1d(left, out)
+                if not len(left):
+                    break
+            trial = np.clip(z + step, low, high)
+            predicted = float(2 * gradient @ step - step @ matrix @ step)
+            try:
+                new_cost = problem.evaluate(trial, False)[0]
+            except SimulationError:
+                new_cost = np.inf
+            if new_cost < cost:
+                improved = True
+                damping = max(damping * (0.2 if cost - new_cost > 0.5 * predicted else 1.0), 1e-9)
+                break
+            if predicted < 1e-3 * tolerance * max(cost, 1.0) and np.isfinite(new_cost):
+                break
+            damping = min(damping * 8, 1e8)
+        if not improved:
+            break
+        gain = cost - new_cost
+        z = trial
+        cost, gradient, matrix, residuals = problem.evaluate(z, True)
+        if gain < tolerance * max(1.0, 1e-3 * cost):
+            break
+    values, dx0 = problem.unpack(z)
+    at_bound = {}
+    for k, (q, _) in enumerate(problem.unknowns[:problem.n_parameters]):
+        if z[k] <= 1e-6:
+            at_bound[q] = "low"
+        elif z[k] >= 1 - 1e-6:
+            at_bound[q] = "high"
+    return Fit(problem.model, values, dx0, cost, problem.unknowns, z, matrix, residuals, problem.noise, done, problem.samples,
+               at_bound)
+
+
+# ------------------------------------------------------------------------------------------------------------ reports
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter after a refit. `state`: 'ok', 'at bound', 'dead' (the data do not feel it) or 'flat' (only a
+    combination with others is felt); `trades_with`: parameters correlated with it above 0.95."""
+    name: str
+    value: float
+    sd: float
+    unit: str | None
+    state: str
+    trades_with: tuple[str, ...] = ()
+    recording: str | None = None
+
+
+def report(found: Fit, drives: Sequence[Drive] | None = None) -> list[Estimate]:
+    """Value, standard error and condition of each parameter, from the Gauss-Newton matrix at the fit."""
+    n = sum(1 for q, _ in found.unknowns if q in found.model.active)
+    residual = found.cost / max(found.samples - len(found.z), 1)
+    inverse = np.linalg.pinv(found.hessian, hermitian=True) * max(residual, 1.0)
+    sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    corr = inverse / np.maximum(np.outer(sd, sd), 1e-300)
+    out = []
+    for k, (q, r) in enumerate(found.unknowns[:n]):
+        p = found.model.plant.parameters[q]
+        value = float(found.values[r or 0, found.model.parameters.index(q)])
+        slope = Scale(p).slope(value)
+        felt = np.sqrt(max(found.hessian[k, k] - BELIEF_WEIGHT ** 2, 0.0))
+        trades = tuple(found.unknowns[c][0] for c in np.flatnonzero(np.abs(corr[k, :n]) > 0.95) if c != k)
+        state = "dead" if felt < 0.1 else "at bound" if q in found.at_bound else "flat" if sd[k] > 0.5 else "ok"
+        name = drives[r].name if drives is not None and r is not None else None
+        out.append(Estimate(q, value, float(sd[k] * slope), p.unit, state, trades, name))
+    return out
+
+
+def updated(plant: Plant, found: Fit, drives: Sequence[Drive]) -> Plant:
+    """The plant with the fitted values written in (per recording where it says so)."""
+    parameters = dict(plant.parameters)
+    for q in found.model.active:
+        p = parameters[q]
+        if not p.range:
+            continue
+        column = found.values[:, found.model.parameters.index(q)]
+        values = {d.name: float(v) for d, v in zip(drives, column, strict=True)} if p.per_recording else p.values
+        parameters[q] = dataclasses.replace(p, value=float(np.clip(np.mean(column), *p.range)), values=values)
+    return dataclasses.replace(plant, parameters=parameters)
