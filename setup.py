@@ -1,14 +1,17 @@
-"""Builds the compiled parts; everything else is in pyproject.toml."""
+"""Builds the compiled parts: every .pyx, and every .py with its C types in a .pxd. The rest is in pyproject.toml."""
 from pathlib import Path
 
 import numpy
 from Cython.Build import cythonize
 from setuptools import Extension, setup
 
+root = Path("thermoctl")
+sources = sorted([*root.rglob("*.pyx"), *(p.with_suffix(".py") for p in root.rglob("*.pxd"))])
+
 # -ffp-contract=off: the law gives the same bits on every machine that a recording is replayed on.
 setup(ext_modules=cythonize(
     [Extension(".".join(p.with_suffix("").parts), [str(p)], include_dirs=[numpy.get_include()],
                extra_compile_args=["-O2", "-ffp-contract=off"],
                define_macros=[("NPY_NO_DEPRECATED_API", "NPY_1_7_API_VERSION")])
-     for p in sorted(Path("thermoctl").rglob("*.pyx"))],
+     for p in sources],
     compiler_directives={"language_level": "3"}))

@@ -1,0 +1,43 @@
+"""Arming: OFF -> SAFE -> READY -> ARMED, and FAULT, which latches. A pure state machine, one call per tick.
+
+    state   what it means                           leaves to
+    OFF     warming up, nothing is believed yet      SAFE when the law has run its self-test (`started`)
+    SAFE    amplifier disabled                       READY when nothing speaks against arming
+    READY   amplifier disabled, may be armed         ARMED on the ARM command; SAFE when a trip stands
+    ARMED   amplifier enabled, position controlled   SAFE on DISARM; FAULT on a trip
+    FAULT   amplifier disabled, latched              SAFE on DISARM (acknowledged) once the cause is gone
+
+A critical fault leads to FAULT from every state but OFF. Only READY can become ARMED, only by a command that arrives in
+READY: a command given earlier is not remembered, so power-up, restart and cleared faults never arm by themselves.
+"""
+from __future__ import annotations
+
+OFF, SAFE, READY, ARMED, FAULT = range(5)
+STATES = ("OFF", "SAFE", "READY", "ARMED", "FAULT")
+
+NONE, ARM, DISARM, SETPOINT = range(4)
+"""Commands. SETPOINT does not move the state machine."""
+COMMANDS = ("none", "arm", "disarm", "setpoint")
+
+
+def next_state(state: int, command: int, started: bool, tripped: bool, critical: bool) -> int:
+    """The state after this tick.
+
+    started: the law has run long enough to be believed. tripped: a fault stands that forbids driving. critical: one of
+    them latches from every state (implies tripped).
+    """
+    if not started or state == OFF:
+        return SAFE if started else OFF
+    if critical:
+        return FAULT
+    if state == ARMED:
+        if tripped:
+            return FAULT
+        return SAFE if command == DISARM else ARMED
+    if state == FAULT:
+        return SAFE if command == DISARM and not tripped else FAULT
+    if tripped:
+        return SAFE
+    if state == READY and command == ARM:
+        return ARMED
+    return READY

@@ -1,0 +1,62 @@
+# C types for law.py; see there.
+cimport cython
+from libc.stdint cimport uint8_t
+
+ctypedef unsigned long long bits_t
+
+cdef int _OK, _STALE, _ERROR, _ABSENT, _SETPOINT, _ARMED, _FAULT, _N, _M
+cdef int _POSITION, _VOLTAGE, _CURRENT, _AIR, _COIL, _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT
+cdef int _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS
+cdef int _B_FOLLOWING, _B_HOT, _B_HOT_MODEL, _B_HEATING, _B_DISAGREES, _B_POWER, _B_STUCK, _B_BOUND, _B_SLEWING
+cdef int _B_SATURATED, _B_AMPLIFIER, _B_NOT_FOLLOWING, _B_LATE, _B_NOT_FINITE
+cdef bits_t _TRIP_OTHERS, _CRITICAL
+
+cdef bint finite(double value) noexcept nogil
+cdef double clip(double value, double low, double high) noexcept nogil
+
+cdef class Law:
+    cdef readonly object model, parameters, outputs
+    cdef int n, sensors_used, average_length
+    cdef bint mkf, compensate_on, hold
+    cdef double[:, ::1] A, B, C, K
+    cdef double[::1] b1, b2, dx, e, low, high, rate, stale_s, frozen_s, required, out
+    cdef int[::1] sensors, group
+    cdef double[::1] value
+    cdef uint8_t[::1] fresh, status
+    cdef double b_air, f1, offset_um, expansion_period_s, R_w, R_v, air_filter_s, model_period_s, a1a1, first_gain
+    cdef readonly double period_s, dt
+    cdef double kp, ti_s, td_s, output_limit, setpoint_rate_um_s, setpoint_low_um, setpoint_high_um, bound_um, slew_um_s
+    cdef double following_um, following_limit_s, coil_limit_c, coil_rate_limit, coil_rate_time_s, innovation_limit_c
+    cdef double innovation_time_s, power_limit_w, power_time_s, idle_current_a, idle_power_w, idle_limit_s
+    cdef double saturation_limit_s, amplifier_limit_s, late_s
+    cdef bits_t faults, trips
+    # the state: what snapshot() holds
+    cdef public long long state, tick, average_at, averaged
+    cdef public bits_t latched
+    cdef public double v, eps1, d1, setpoint_um, reference_um, position_um, compensated_um, compensation_um, expansion_um
+    cdef public double power_w, air_c, air_start_c, air_rate_k_s, air_known, innovation_c, innovation_mean_c, kalman_gain, P
+    cdef public double corrected, primed, expansion_before_um, expansion_after_um, phase_s, coil_slow_c, coil_rate_k_s
+    cdef public double coil_elapsed_s, power_mean_w, following_s, idle_s, saturation_s, amplifier_s, enable, drive
+    cdef public double control_v
+    cdef public double[::1] x, T, T_before, average, age, last, same_s, seen, verdict
+
+    cpdef bind(self, double[::1] value, uint8_t[::1] fresh, uint8_t[::1] status)
+    cpdef step(self, double dt, int command=*, double command_value=*, bits_t external=*)
+    @cython.locals(i=cython.int, j=cython.int, m=cython.int, n=cython.int, s=cython.double, scale=cython.double)
+    cpdef estimate(self, double dt)
+    @cython.locals(one=bits_t, m=cython.int, s=cython.double, part=cython.double, target=cython.double, step=cython.double)
+    cpdef compensate(self)
+    @cython.locals(k=cython.int, s=cython.double, step=cython.double, eps=cython.double, change=cython.double, d=cython.double)
+    cpdef control(self, int command, double command_value)
+    @cython.locals(one=bits_t, found=bits_t, reports=cython.bint, driven=cython.bint)
+    cpdef protect(self, int command, bits_t external)
+    @cython.locals(one=bits_t, bit=bits_t, c=cython.int, kind=cython.int, status=cython.int, value=cython.double, elapsed=cython.double)
+    cdef void _judge_readings(self, double dt) noexcept
+    cdef void _power_and_air(self) noexcept
+    @cython.locals(coil_new=cython.bint, i=cython.int, j=cython.int, k=cython.int, c=cython.int, s=cython.double,
+                   elapsed=cython.double, gain=cython.double, prior=cython.double)
+    cdef void _correct(self) noexcept
+    @cython.locals(before=cython.longlong)
+    cdef _arm(self, int command)
+    @cython.locals(o='double[::1]', m=cython.int)
+    cdef void _report(self) noexcept

@@ -1,0 +1,475 @@
+# cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False, freethreading_compatible=True
+"""The law of one tick: estimate, compensate, control, protect. Pure: no I/O, no clock, no configuration, no allocation.
+
+This file is plain Python; `law.pxd` gives every name a C type and Cython compiles both into the module that runs. The
+same source runs compiled in the loop, in simulation and in replay, and interpreted under coverage and mutation tests;
+both give the same bits (IEEE doubles, no contraction, one order of operations).
+
+    estimate    x(n+1) = x(n) + (dt/T) [(A-I) x(n) + B q(n)],  q = [V I, d(air)/dt]           (33), delta form
+                on a new reading: P- = (a1 a1') P + R_w,  k = P-/(P- + R_v),  P = P-(1 - k)    (34), (35)
+                x = x + k zeta (y1 - C1 x)            kind 'mkf'  (36)
+                x = x + K (y - C x)                   kind 'kalman', all new readings at once
+    compensate  yL(n+1) = f1 yL(n) + b1 T(n-1) + b2 T(n) + b_air (air - air at start)          (39)
+                a straight line between its samples, bounded, slewed, frozen while a reading it needs is at fault
+    control     reference follows the setpoint at a limited rate; eps = reference - (position + compensation)
+                v(n) = v(n-1) + Kp [(eps - eps1) + (dt/Ti) eps + Td (d - d1)],  d = (eps - eps1)/dt      (41)
+                With dt constant this is (41) term by term; with a late tick the differences still add up to the state.
+                v is clipped where it is stored, so nothing winds up; gains may change without a jump.
+    protect     every reading's range, rate, age and liveness; following error, coil temperature and heating rate,
+                power, idle current, innovation, saturation, amplifier; arming; and last: every number finite.
+
+A reading that is not valid is never used. The encoder's reading is held for a tick without a new frame (1 to 3 % of the
+ticks of a polled encoder): the differences then come one tick later and nothing is lost.
+"""
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+
+from thermoctl.control import arming, faults
+from thermoctl.control.arming import next_state
+from thermoctl.control.model import CompensatorModel, Parameters
+
+OUTPUTS = ("state", "fault_bits", "setpoint_um", "reference_um", "position_um", "compensated_um", "compensation_um",
+           "expansion_um", "control_v", "drive", "enable", "power_w", "air_rate_k_s",
+           *(name.removesuffix("_c") + "_est_c" for name in faults.TEMPERATURES), "innovation_c", "kalman_gain",
+           "position_age_s", "coil_age_s")
+"""What a tick gives, in the order of `Law.outputs`; each is an attribute of the law, too (the estimates apart)."""
+
+MAX_AVERAGE = 64
+WARM_UP_TICKS = 100
+COMPILED = not __file__.endswith(".py")
+"""False when this module runs interpreted: right for coverage, a hundred times too slow for a rig."""
+
+# Constants that the compiler turns into C numbers (typed in law.pxd).
+_OK, _STALE, _ERROR, _ABSENT = 0, 1, 2, 3                  # status of a reading, as the back ends give it
+_SETPOINT, _ARMED, _FAULT = arming.SETPOINT, arming.ARMED, arming.FAULT
+_N, _M = len(faults.CHANNELS), len(faults.TEMPERATURES)
+_POSITION, _VOLTAGE, _CURRENT, _AIR, _COIL = 0, 2, 3, 4, 5
+_AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT = 18, 2, 3
+_K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS = 0, 1, 2, 3, 4, 5
+_B_FOLLOWING = faults.BIT["following_error"]
+_B_HOT, _B_HOT_MODEL = faults.BIT["coil_overtemperature"], faults.BIT["coil_overtemperature_model"]
+_B_HEATING, _B_DISAGREES = faults.BIT["coil_heating_rate"], faults.BIT["coil_disagrees"]
+_B_POWER, _B_STUCK = faults.BIT["power_limit"], faults.BIT["coil_stuck_on"]
+_B_BOUND, _B_SLEWING = faults.BIT["compensation_bound"], faults.BIT["compensation_slewing"]
+_B_SATURATED, _B_AMPLIFIER = faults.BIT["drive_saturated"], faults.BIT["amplifier_fault"]
+_B_NOT_FOLLOWING, _B_LATE = faults.BIT["amplifier_not_following"], faults.BIT["loop_late"]
+_B_NOT_FINITE = faults.BIT["not_finite"]
+_TRIP_OTHERS = faults.mask("fault", "critical") >> (len(faults.GROUPS) * _KINDS) << (len(faults.GROUPS) * _KINDS)
+_CRITICAL = faults.mask("critical")
+
+_SCALARS = (
+    "state", "tick", "latched", "v", "eps1", "d1", "setpoint_um", "reference_um", "position_um", "compensated_um",
+    "compensation_um", "expansion_um", "power_w", "air_c", "air_start_c", "air_known", "air_rate_k_s", "innovation_c",
+    "innovation_mean_c", "kalman_gain", "P", "corrected", "primed", "expansion_before_um", "expansion_after_um",
+    "phase_s", "coil_slow_c", "coil_rate_k_s", "coil_elapsed_s", "power_mean_w", "following_s", "idle_s",
+    "saturation_s", "amplifier_s", "average_at", "averaged", "enable", "drive")
+_WHOLE = ("state", "tick", "latched", "average_at", "averaged")
+_VECTORS = ("x", "T", "T_before", "average", "age", "last", "same_s", "seen", "verdict")
+
+
+def finite(value):
+    """True for a number that is neither infinite nor NaN."""
+    return value - value == 0.0
+
+
+def clip(value, low, high):
+    """value held inside low..high; NaN stays NaN."""
+    if value < low:
+        return low
+    return high if value > high else value
+
+
+class Law:
+    """The state of the law and its four stages, called in order once per tick; `step` calls all four.
+
+    model: CompensatorModel; parameters: Parameters; period_s: the loop's nominal period, s.
+    `bind` gives the arrays that the readings arrive in. After a tick, `outputs` (float64, order of OUTPUTS) and the
+    attributes of the same names hold the results; `drive` and `enable` are what the amplifier gets.
+    """
+
+    def __init__(self, model: CompensatorModel, parameters: Parameters, period_s: float):
+        self.model = model
+        self.n, self.sensors_used = model.A_minus_I.shape[0], len(model.sensors)
+        self.mkf = model.kind == "mkf"
+        self.A, self.B, self.C, self.K = model.A_minus_I, model.B, model.C, model.gain
+        self.b1, self.b2, self.b_air, self.f1 = model.b1, model.b2, model.b_air, model.f1
+        self.offset_um, self.expansion_period_s = model.offset_um, model.expansion_period_s
+        self.R_w, self.R_v, self.air_filter_s = model.R_w, model.R_v, model.air_filter_s
+        self.model_period_s, self.period_s = model.period_s, period_s
+        first = model.A_minus_I[0].copy()
+        first[0] += 1.0
+        self.a1a1 = float(first @ first)
+        self.sensors = array("i", model.sensors)
+        # The first correction puts the estimate on the coil's reading: along zeta, or along K.
+        along = float(model.C[0] @ model.gain[:, 0])
+        self.first_gain = 1.0 / along if abs(along) > 1e-9 else 0.0
+        self.dx, self.e = np.zeros(self.n), np.zeros(_M)
+        self.group = array("i", faults.GROUP_OF_CHANNEL)
+        self.x, self.T, self.T_before = np.zeros(self.n), np.zeros(_M), np.zeros(_M)
+        self.average = np.zeros(MAX_AVERAGE)
+        self.age, self.last, self.same_s = np.zeros(_N), np.zeros(_N), np.zeros(_N)
+        self.seen, self.verdict = np.zeros(_N), np.zeros(_N)
+        self.state, self.latched, self.tick, self.average_at, self.averaged = arming.OFF, 0, 0, 0, 0
+        self.v = self.eps1 = self.d1 = 0.0
+        self.setpoint_um = self.reference_um = self.position_um = self.compensated_um = 0.0
+        self.power_w = self.power_mean_w = self.air_c = self.air_start_c = self.air_known = self.air_rate_k_s = 0.0
+        self.corrected = self.coil_slow_c = self.coil_rate_k_s = self.coil_elapsed_s = 0.0
+        self.innovation_c = self.innovation_mean_c = self.kalman_gain = 0.0
+        self.P = 1e3 * model.R_v
+        self.primed = self.phase_s = self.expansion_before_um = self.expansion_after_um = 0.0
+        self.expansion_um = self.compensation_um = 0.0
+        self.following_s = self.idle_s = self.saturation_s = self.amplifier_s = 0.0
+        self.enable = self.drive = self.control_v = 0.0
+        self.average_length = 1
+        self.out = np.zeros(len(OUTPUTS))
+        self.outputs = np.asarray(self.out)
+        self.faults = 0
+        self.hold = 0
+        self.configure(parameters)
+        self.bind(np.full(_N, np.nan), np.zeros(_N, dtype=np.uint8), np.full(_N, _ABSENT, dtype=np.uint8))
+
+    def bind(self, value, fresh, status):
+        """The arrays over CHANNELS that hold the readings of each tick: value float64, fresh uint8, status uint8."""
+        self.value, self.fresh, self.status = value, fresh, status
+
+    def configure(self, parameters: Parameters):
+        """Take new gains and limits, all at once, between two ticks; the state stays."""
+        p = self.parameters = parameters
+        self.kp, self.ti_s, self.td_s, self.output_limit = p.kp, p.ti_s, p.td_s, p.output_limit
+        self.setpoint_rate_um_s = p.setpoint_rate_um_s
+        self.setpoint_low_um, self.setpoint_high_um = p.setpoint_low_um, p.setpoint_high_um
+        length = int(min(max(p.moving_average, 1), MAX_AVERAGE))
+        if self.tick > 0 and length != self.average_length:
+            self.average = np.full(MAX_AVERAGE, self.position_um)      # the filter restarts at its own output
+            self.average_at, self.averaged = 0, length
+        self.average_length = length
+        self.compensate_on, self.bound_um, self.slew_um_s = p.compensate > 0.0, p.bound_um, p.slew_um_s
+        self.low, self.high, self.rate = p.low.copy(), p.high.copy(), p.rate.copy()
+        self.stale_s, self.frozen_s, self.required = p.stale_s.copy(), p.frozen_s.copy(), p.required.copy()
+        self.following_um, self.following_limit_s = p.following_um, p.following_s
+        self.coil_limit_c = p.coil_limit_c
+        self.coil_rate_limit, self.coil_rate_time_s = p.coil_rate_k_s, p.coil_rate_time_s
+        self.innovation_limit_c, self.innovation_time_s = p.innovation_limit_c, p.innovation_time_s
+        self.power_limit_w, self.power_time_s = p.power_limit_w, p.power_time_s
+        self.idle_current_a, self.idle_power_w, self.idle_limit_s = p.idle_current_a, p.idle_power_w, p.idle_s
+        self.saturation_limit_s, self.amplifier_limit_s, self.late_s = p.saturation_s, p.amplifier_s, p.late_s
+
+    def snapshot(self) -> np.ndarray:
+        """The whole state as one float64 vector, for replay and for a warm restart."""
+        return np.concatenate([np.array([float(getattr(self, name)) for name in _SCALARS]),
+                               *(np.asarray(getattr(self, name)) for name in _VECTORS)])
+
+    def restore(self, vector: np.ndarray):
+        """Take a state that `snapshot` gave for a model of the same order. Raises ValueError for another length."""
+        size = len(self.snapshot())
+        if len(vector) != size:
+            raise ValueError(f"law: a state of {len(vector)} numbers, expected {size} (another model or version)")
+        for name, number in zip(_SCALARS, vector, strict=False):
+            setattr(self, name, float(number) if name not in _WHOLE else int(number))
+        start = len(_SCALARS)
+        for name in _VECTORS:
+            length = len(np.asarray(getattr(self, name)))
+            setattr(self, name, np.array(vector[start:start + length], dtype=np.float64))
+            start += length
+
+    def step(self, dt, command=0, command_value=0.0, external=0):
+        """One tick, four stages: dt measured, s; command one of arming's; external: fault bits from outside the law."""
+        self.estimate(dt)
+        self.compensate()
+        self.control(command, command_value)
+        self.protect(command, external)
+
+    # ---- estimate -----------------------------------------------------------------------------------------------
+
+    def estimate(self, dt):
+        """Judge the readings, predict the temperatures over the measured dt (s), correct them with new readings."""
+        self.dt = clip(dt, 0.0, 1.0) if finite(dt) else 0.0
+        self.tick += 1
+        self.coil_elapsed_s += self.dt
+        self._judge_readings(dt)
+        self._power_and_air()
+        n = self.n
+        scale = self.dt / self.model_period_s
+        for i in range(n):
+            s = self.B[i, 0] * self.power_w + self.B[i, 1] * self.air_rate_k_s
+            for j in range(n):
+                s += self.A[i, j] * self.x[j]
+            self.dx[i] = s
+        for i in range(n):
+            self.x[i] += scale * self.dx[i]
+        if not self.hold:
+            self._correct()
+        for m in range(_M):
+            s = 0.0
+            for j in range(n):
+                s += self.C[m, j] * self.x[j]
+            self.T[m] = s
+
+    def _judge_readings(self, dt):
+        """verdict[c] = 1 + kind of fault, 0 good; a fresh reading that is out of range or jumped is not used."""
+        self.faults = 0
+        one = 1
+        self.trips = 0
+        self.hold = 0
+        for c in range(_N):
+            self.age[c] += self.dt
+            status = self.status[c]
+            if status == _ABSENT and self.required[c] == 0.0:
+                self.verdict[c] = 1.0 + _K_ERROR
+                continue
+            if status in (_ERROR, _ABSENT):
+                self.verdict[c] = 1.0 + _K_ERROR
+            elif status == _STALE:
+                self.verdict[c] = 1.0 + _K_STALE
+            elif self.fresh[c]:
+                value = self.value[c]
+                elapsed = max(self.age[c], self.period_s)
+                if not (self.low[c] <= value <= self.high[c]) or not finite(value):
+                    self.verdict[c] = 1.0 + _K_RANGE
+                elif self.seen[c] > 0.0 and abs(value - self.last[c]) > self.rate[c] * elapsed:
+                    self.verdict[c] = 1.0 + _K_RATE
+                    self.last[c] = value
+                else:
+                    if self.seen[c] > 0.0 and value == self.last[c]:
+                        self.same_s[c] += elapsed
+                    else:
+                        self.same_s[c] = 0.0
+                    self.verdict[c] = 1.0 + _K_FROZEN if self.same_s[c] > self.frozen_s[c] else 0.0
+                    self.last[c] = value
+                    self.seen[c] = 1.0
+                self.age[c] = 0.0
+            elif self.age[c] > self.stale_s[c] or self.seen[c] == 0.0:
+                self.verdict[c] = 1.0 + _K_STALE
+            if self.verdict[c] > 0.0:
+                kind = _K_ERROR
+                while self.verdict[c] > 1.0 + kind:
+                    kind += 1
+                bit = one << (self.group[c] * _KINDS + kind)
+                self.faults |= bit
+                if self.required[c] > 0.0:
+                    self.trips |= bit
+                    if c in (_VOLTAGE, _CURRENT, _AIR, _COIL):
+                        self.hold = 1
+        if dt > self.late_s:
+            self.faults |= one << _B_LATE
+
+    def _power_and_air(self):
+        """q(n): electrical power, rate of the low-passed air; the last good value while a reading is at fault."""
+        if self.verdict[_VOLTAGE] == 0.0 and self.verdict[_CURRENT] == 0.0:
+            self.power_w = self.value[_VOLTAGE] * self.value[_CURRENT]
+        elif self.enable == 0.0:
+            self.power_w = 0.0
+        self.power_mean_w += (self.power_w - self.power_mean_w) * min(1.0, self.dt / self.power_time_s)
+        self.air_rate_k_s = 0.0
+        if self.verdict[_AIR] == 0.0:
+            if self.air_known == 0.0:
+                self.air_c = self.air_start_c = self.value[_AIR]
+                self.air_known = 1.0
+            self.air_rate_k_s = (self.value[_AIR] - self.air_c) / self.air_filter_s
+            self.air_c += self.air_rate_k_s * self.dt
+
+    def _correct(self):
+        """(35): every new valid reading of a correcting sensor moves the state; the coil's first one starts it."""
+        coil_new = self.fresh[_COIL] and self.verdict[_COIL] == 0.0
+        if self.air_known == 0.0 and coil_new:                  # no air sensor: rises above the first coil reading
+            self.air_c = self.air_start_c = self.value[_COIL]
+            self.air_known = 1.0
+        if self.corrected == 0.0 and not coil_new:
+            return
+        for k in range(self.sensors_used):
+            c = _COIL + self.sensors[k]
+            self.e[k] = 0.0
+            if self.fresh[c] and self.verdict[c] == 0.0:
+                s = self.value[c] - self.air_c
+                for j in range(self.n):
+                    s -= self.C[self.sensors[k], j] * self.x[j]
+                self.e[k] = s
+        if coil_new:
+            elapsed = self.dt if self.corrected == 0.0 else self.coil_elapsed_s
+            self.coil_elapsed_s = 0.0
+            if self.corrected == 0.0:
+                for i in range(self.n):
+                    self.x[i] += self.first_gain * self.K[i, 0] * self.e[0]
+                self.coil_slow_c = self.value[_COIL]
+                self.corrected = 1.0
+                self.primed = 0.0
+                return
+            self.innovation_c = self.e[0]
+            self.innovation_mean_c += (self.e[0] - self.innovation_mean_c) * min(1.0, elapsed / self.innovation_time_s)
+            self.coil_rate_k_s = (self.value[_COIL] - self.coil_slow_c) / self.coil_rate_time_s
+            self.coil_slow_c += self.coil_rate_k_s * min(elapsed, self.coil_rate_time_s)
+        gain = 1.0
+        if self.mkf:
+            if not coil_new:
+                return
+            prior = self.a1a1 * self.P + self.R_w
+            gain = prior / (prior + self.R_v)
+            self.P = prior * (1.0 - gain)
+        self.kalman_gain = gain
+        for k in range(self.sensors_used):
+            if self.e[k] != 0.0:
+                for i in range(self.n):
+                    self.x[i] += gain * self.K[i, k] * self.e[k]
+
+    # ---- compensate ---------------------------------------------------------------------------------------------
+
+    def compensate(self):
+        """The estimated thermal error, um: expansion model, bound, slew; frozen while a needed reading is at fault."""
+        one = 1
+        if self.primed == 0.0:                                        # quasi-steady start at the first temperatures
+            s = self.b_air * (self.air_c - self.air_start_c)
+            for m in range(_M):
+                s += (self.b1[m] + self.b2[m]) * self.T[m]
+                self.T_before[m] = self.T[m]
+            self.expansion_before_um = self.expansion_after_um = s / (1.0 - self.f1)
+            self.phase_s = 0.0
+            self.primed = self.corrected
+        self.phase_s += self.dt
+        if self.phase_s >= self.expansion_period_s:
+            self.phase_s -= self.expansion_period_s
+            s = self.f1 * self.expansion_after_um + self.b_air * (self.air_c - self.air_start_c)
+            for m in range(_M):
+                s += self.b1[m] * self.T_before[m] + self.b2[m] * self.T[m]
+                self.T_before[m] = self.T[m]
+            self.expansion_before_um = self.expansion_after_um
+            self.expansion_after_um = s
+        part = min(1.0, self.phase_s / self.expansion_period_s)
+        self.expansion_um = (self.expansion_before_um + part * (self.expansion_after_um - self.expansion_before_um)
+                             + self.offset_um)
+        target = self.expansion_um if self.compensate_on else 0.0
+        if not (abs(target) <= self.bound_um):                        # also when it is not a number
+            self.faults |= one << _B_BOUND
+            target = clip(target, -self.bound_um, self.bound_um) if finite(target) else self.compensation_um
+        if self.hold:
+            return
+        if self.state == _ARMED:
+            step = self.slew_um_s * self.dt
+            if abs(target - self.compensation_um) > 2.0 * step:
+                self.faults |= one << _B_SLEWING
+            target = clip(target, self.compensation_um - step, self.compensation_um + step)
+        self.compensation_um = target
+
+    # ---- control ------------------------------------------------------------------------------------------------
+
+    def control(self, command, command_value):
+        """Moving average, setpoint limiter, velocity-form PID (41). Not armed: the setpoint follows the stage."""
+        if self.fresh[_POSITION] and self.verdict[_POSITION] == 0.0:
+            if self.averaged == 0.0:
+                for k in range(MAX_AVERAGE):
+                    self.average[k] = self.value[_POSITION]
+            self.averaged = self.average_length
+            self.average[self.average_at] = self.value[_POSITION]
+            self.average_at = self.average_at + 1 if self.average_at + 1 < self.average_length else 0
+            s = 0.0
+            for k in range(self.average_length):
+                s += self.average[k]
+            self.position_um = s / self.average_length
+        self.compensated_um = self.position_um + self.compensation_um
+        if self.state != _ARMED:
+            self.setpoint_um = self.reference_um = self.compensated_um
+            self.v = self.eps1 = self.d1 = 0.0
+            return
+        if command == _SETPOINT and finite(command_value):
+            self.setpoint_um = command_value
+        self.setpoint_um = clip(self.setpoint_um, self.setpoint_low_um, self.setpoint_high_um)
+        step = self.setpoint_rate_um_s * self.dt
+        self.reference_um = clip(self.setpoint_um, self.reference_um - step, self.reference_um + step)
+        eps = self.reference_um - self.compensated_um
+        change = eps - self.eps1
+        d = change / self.dt if self.dt > 0.0 else 0.0
+        self.v = clip(self.v + self.kp * (change + self.dt / self.ti_s * eps + self.td_s * (d - self.d1)),
+                      -self.output_limit, self.output_limit)
+        self.eps1, self.d1 = eps, d
+
+    # ---- protect ------------------------------------------------------------------------------------------------
+
+    def protect(self, command, external):
+        """All limits, the arming machine and the last gate; fills `outputs`, `drive` and `enable`."""
+        one = 1
+        found = external
+        if self.state == _ARMED:
+            self.following_s = self.following_s + self.dt if abs(self.eps1) > self.following_um else 0.0
+            if self.following_s > self.following_limit_s:
+                found |= one << _B_FOLLOWING
+            self.saturation_s = self.saturation_s + self.dt if abs(self.v) >= self.output_limit else 0.0
+            if self.saturation_s > self.saturation_limit_s:
+                found |= one << _B_SATURATED
+            reports = self.status[_AMPLIFIER_STATE] == _OK and self.value[_AMPLIFIER_STATE] != _AMPLIFIER_ENABLED
+            self.amplifier_s = self.amplifier_s + self.dt if reports else 0.0
+            if self.amplifier_s > self.amplifier_limit_s:
+                found |= one << _B_NOT_FOLLOWING
+            self.idle_s = 0.0
+        else:
+            self.following_s = self.saturation_s = self.amplifier_s = 0.0
+            driven = ((self.verdict[_CURRENT] == 0.0 and abs(self.value[_CURRENT]) > self.idle_current_a)
+                      or abs(self.power_w) > self.idle_power_w)
+            self.idle_s = self.idle_s + self.dt if driven else 0.0
+            if self.idle_s > self.idle_limit_s:
+                found |= one << _B_STUCK
+        if self.status[_AMPLIFIER_STATE] == _OK and self.value[_AMPLIFIER_STATE] == _AMPLIFIER_FAULT:
+            found |= one << _B_AMPLIFIER
+        if self.verdict[_COIL] == 0.0 and self.value[_COIL] > self.coil_limit_c:
+            found |= one << _B_HOT
+        if self.T[0] + self.air_c > self.coil_limit_c:
+            found |= one << _B_HOT_MODEL
+        if self.coil_rate_k_s > self.coil_rate_limit:
+            found |= one << _B_HEATING
+        if abs(self.innovation_mean_c) > self.innovation_limit_c:
+            found |= one << _B_DISAGREES
+        if self.power_mean_w > self.power_limit_w:
+            found |= one << _B_POWER
+        if not (finite(self.v) and finite(self.reference_um) and finite(self.compensated_um) and finite(self.T[0])
+                and finite(self.expansion_um) and finite(self.power_w)):
+            found |= one << _B_NOT_FINITE
+        self.faults |= found
+        self.trips |= self.faults & _TRIP_OTHERS
+        self._arm(command)
+        self.control_v = self.v
+        self.enable = 1.0 if self.state == _ARMED and finite(self.v) else 0.0
+        self.drive = clip(self.v, -self.output_limit, self.output_limit) if self.enable > 0.0 else 0.0
+        self._report()
+
+    def _arm(self, command):
+        """The state machine; what tripped stays in `fault_bits` until FAULT is left."""
+        before = self.state
+        started, critical = self.tick > WARM_UP_TICKS, (self.trips & _CRITICAL) != 0
+        self.state = next_state(before, command, started, self.trips != 0, critical)
+        if self.state == _FAULT:
+            self.latched = self.latched | self.trips
+        else:
+            self.latched = 0
+        if before == _ARMED and self.state != _ARMED:
+            self.v = self.eps1 = self.d1 = 0.0
+
+    def _report(self):
+        """Fill `outputs` in the order of OUTPUTS."""
+        o = self.out
+        o[0] = self.state
+        o[1] = self.faults | self.latched
+        o[2] = self.setpoint_um
+        o[3] = self.reference_um
+        o[4] = self.position_um
+        o[5] = self.compensated_um
+        o[6] = self.compensation_um
+        o[7] = self.expansion_um
+        o[8] = self.control_v
+        o[9] = self.drive
+        o[10] = self.enable
+        o[11] = self.power_w
+        o[12] = self.air_rate_k_s
+        for m in range(_M):
+            o[13 + m] = self.T[m] + self.air_c
+        o[25] = self.innovation_c
+        o[26] = self.kalman_gain
+        o[27] = self.age[_POSITION]
+        o[28] = self.age[_COIL]
+
+    @property
+    def fault_bits(self) -> int:
+        """Standing faults, and while FAULT those that led there."""
+        return self.faults | self.latched
+
+
