@@ -46,7 +46,7 @@ TEMPERATURES = ("coil_c", "bobbin_c", "inner_magnet_c", "outer_magnet_c", "inner
 ROLES = ("position_um", "output_reference_um", "voltage_v", "current_a", "air_c", *TEMPERATURES,
          "supply_v", "amplifier_state", "amplifier_fault")
 """What a channel can be to the controller. `voltage_v` and `current_a` are the coil's; `supply_v` the amplifier's DC
-link; `amplifier_state` one of AMP_*; `amplifier_fault` the drive's own error code (CiA-402 object 0x603F), 0: healthy."""
+link; `amplifier_state` one of AMP_*; `amplifier_fault` the error code (CiA-402 object 0x603F, 0 healthy)."""
 
 ROLE = {name: i for i, name in enumerate(ROLES)}
 OK, STALE, ERROR, ABSENT = 0, 1, 2, 3

@@ -1,0 +1,234 @@
+"""Real devices as one back end: what every driver shares, and the keeping up of links.
+
+A driver knows one protocol. Its `connect` may block (opening, configuring); `read` and `write`, called in the tick, may
+not. A link that fails is closed, its channels say ERROR, and a thread connects it again while the tick goes on.
+"""
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from hal.backend import ABSENT, ERROR, OK, ROLE, STALE, HardwareError, Sample
+from hal.profile import Binding, bind, check_rig
+
+RECONNECT_S = 0.25          # between attempts to open a device that is gone
+SLOW_BUSES = ("modbus",)
+
+
+class Device:
+    """What drivers share: bound channels, the check of each reading, counters. Subclasses implement connect,
+    disconnect, and either read (+ write where `drives`) or, where `slow`, poll."""
+
+    def __init__(self, binding: Binding) -> None:
+        self.binding = binding
+        self.name = binding.name
+        self.slow = binding.profile.bus in SLOW_BUSES
+        self.drives = binding.profile.drive is not None
+        self.roles = [ROLE[b.role] for b in binding.bounds]
+        self._bounds = [(ROLE[b.role], b.scale, b.offset, b.low, b.high) for b in binding.bounds]
+        self._stale = [(ROLE[b.role], b.channel.stale_after_s) for b in binding.bounds]
+        self.problems: dict[int, str] = {}
+        self.counts: dict[str, int] = {"frames": 0, "errors": 0, "reconnections": 0}
+        self.up = False
+        self.connected_s = -math.inf        # when the link came up: stale times count from here at the earliest
+
+    def connect(self) -> None:
+        """Open and configure; may block. Raises HardwareError."""
+        raise NotImplementedError
+
+    def disconnect(self) -> None:
+        """Release the port; never raises."""
+        raise NotImplementedError
+
+    def read(self, sample: Sample, now_s: float) -> None:
+        """Take what has arrived into `sample`; never blocks. Raises OSError or HardwareError when the link is gone."""
+        raise NotImplementedError
+
+    def write(self, drive: float, enable: bool, now_s: float) -> None:
+        """Send the command; never blocks. Raises as read does."""
+
+    def poll(self, sample: Sample) -> None:
+        """Slow devices: read every channel once; blocks up to the profile's timeout. Raises as read does."""
+        raise NotImplementedError
+
+    def put(self, sample: Sample, bound: int, raw: float, time_s: float) -> None:
+        """Store reading `raw` of the bound channel number `bound`, scaled; out of range or not finite is ERROR."""
+        role, scale, offset, low, high = self._bounds[bound]
+        value = raw * scale + offset
+        if low <= value <= high and -math.inf < value < math.inf:
+            sample.value[role] = value
+            sample.time_s[role] = time_s
+            sample.fresh[role] = True
+            sample.status[role] = OK
+        else:
+            self.fail(sample, bound, f"reading {value:g} is outside {low:g} .. {high:g}: check sensor and wiring")
+
+    def fail(self, sample: Sample, bound: int, problem: str) -> None:
+        """Mark the bound channel number `bound` as ERROR; the last valid value stays."""
+        role = self._bounds[bound][0]
+        sample.status[role] = ERROR
+        self.problems[role] = f"{self.name} {self.binding.bounds[bound].channel.name}: {problem}"
+
+    def fail_all(self, sample: Sample, problem: str) -> None:
+        """Mark every channel as ERROR."""
+        for i in range(len(self._bounds)):
+            self.fail(sample, i, problem)
+
+    def age(self, sample: Sample, now_s: float) -> None:
+        """Mark readings that are too old as STALE (an ERROR stays one)."""
+        for role, limit in self._stale:
+            if now_s - max(sample.time_s[role], self.connected_s) > limit and sample.status[role] != ERROR:
+                sample.status[role] = STALE
+
+    def explain(self, sample: Sample, role: int) -> str:
+        """One line: why this role is not OK."""
+        if sample.status[role] == ERROR:
+            return self.problems.get(role, f"{self.name}: error")
+        if sample.status[role] == STALE:
+            return f"{self.name}: no new reading on {self.binding.port}: check its power and cable"
+        return ""
+
+
+def make_devices(settings: Any) -> list[Device]:
+    """The drivers of `settings.hal.devices` (yamlfile nodes), not connected. Profiles are relative to the config file.
+    Raises InputError."""
+    folder = Path(settings.path).parent
+    bindings = [bind(node, folder) for node in settings.hal.devices]
+    check_rig(bindings)
+    return [_driver(b) for b in bindings]
+
+
+def _driver(binding: Binding) -> Device:
+    bus = binding.profile.bus
+    if bus == "modbus":
+        from hal.modbus import ModbusDevice
+        return ModbusDevice(binding)
+    if bus.startswith("can"):
+        from hal.can_bus import Cia402Device, DbcDevice
+        return Cia402Device(binding) if bus == "can-cia402" else DbcDevice(binding)
+    from hal.serial_port import SerialDevice
+    return SerialDevice(binding)
+
+
+class DevicesBackend:
+    """`hal.backend.Backend` over real devices. With a board, slow devices are polled by other processes; without, by
+    threads of this one."""
+
+    def __init__(self, fast: list[Device], slow: list[Device], board: Any = None) -> None:
+        self.fast, self.slow, self.board = fast, slow, board
+        self.sample = Sample()
+        self._owner = {role: d for d in [*fast, *slow] for role in d.roles}
+        self._taken = dict.fromkeys((role for d in slow for role in d.roles), -math.inf)
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._repairs: dict[Device, threading.Thread] = {}
+        self._now_s = 0.0
+
+    def open(self) -> None:
+        """Connect every fast device (all failures are reported together) and start the polling of slow ones."""
+        self._stop.clear()
+        failures = []
+        for device in self.fast:
+            try:
+                device.connect()
+                device.up = True
+                device.connected_s = time.monotonic()
+            except (HardwareError, OSError) as e:
+                failures.append(str(e))
+        if failures:
+            self.close()
+            raise HardwareError("; ".join(failures))
+        self.sample.status[:] = ABSENT
+        for device in [*self.fast, *self.slow]:
+            self.sample.status[device.roles] = STALE
+        if self.board is None and self.slow:
+            from hal.board import Board, poll_until
+            self.board = Board.private()
+            for device in self.slow:
+                thread = threading.Thread(target=poll_until, args=(device, self.board, self._stop), daemon=True,
+                                          name=f"poll {device.name}")
+                thread.start()
+                self._threads.append(thread)
+
+    def read(self, now_s: float) -> Sample:
+        """One pass over all devices; see hal.backend."""
+        sample = self.sample
+        self._now_s = now_s
+        sample.fresh[:] = False
+        for device in self.fast:
+            if device.up:
+                try:
+                    device.read(sample, now_s)
+                    device.age(sample, now_s)
+                except (OSError, HardwareError) as e:
+                    self._lost(device, e)
+        if self.slow:
+            self.board.merge(sample, self._taken)
+            for device in self.slow:
+                device.age(sample, now_s)
+        return sample
+
+    def write(self, drive: float, enable: bool) -> None:
+        """Command to the device that drives; see hal.backend."""
+        if not (enable and math.isfinite(drive)):
+            drive, enable = 0.0, False
+        for device in self.fast:
+            if device.drives and device.up:
+                try:
+                    device.write(drive, enable, self._now_s)
+                except (OSError, HardwareError) as e:
+                    self._lost(device, e)
+
+    def close(self) -> None:
+        """Disable and release everything; see hal.backend."""
+        self._stop.set()
+        for repair in list(self._repairs.values()):
+            repair.join(5.0)
+        for device in self.fast:
+            if device.up:
+                if device.drives:
+                    with contextlib.suppress(OSError, HardwareError):
+                        device.write(0.0, False, time.monotonic())
+                device.up = False
+                device.disconnect()
+        for thread in self._threads:
+            thread.join(5.0)
+        if self._threads:
+            self._threads, self.board = [], None
+
+    def problem(self, role: str) -> str:
+        """Why `role` is not OK, in one line, or ''."""
+        i = ROLE[role]
+        if i not in self._owner:
+            return f"{role}: no device of hal.devices has this role"
+        if self.board is not None and self._owner[i].slow and self.sample.status[i] == ERROR:
+            return self.board.problem(i) or self._owner[i].explain(self.sample, i)
+        return self._owner[i].explain(self.sample, i)
+
+    def counters(self) -> dict[str, int]:
+        """`<device>.<what>`: frames, errors, reconnections and what else a driver counts."""
+        return {f"{d.name}.{what}": n for d in [*self.fast, *self.slow] for what, n in d.counts.items()}
+
+    def _lost(self, device: Device, why: Exception) -> None:
+        device.up = False
+        device.fail_all(self.sample, f"lost on {device.binding.port} ({getattr(why, 'strerror', None) or why}); "
+                                     "reconnecting: check cable and power")
+        thread = threading.Thread(target=self._repair, args=(device,), daemon=True, name=f"reconnect {device.name}")
+        self._repairs[device] = thread
+        thread.start()
+
+    def _repair(self, device: Device) -> None:
+        device.disconnect()
+        while not self._stop.wait(RECONNECT_S):
+            try:
+                device.connect()
+            except (HardwareError, OSError):
+                continue
+            device.counts["reconnections"] += 1
+            device.connected_s = time.monotonic()
+            device.up = True
+            return
