@@ -1,0 +1,227 @@
+"""Thermal models with real poles, from data of any length: reduce first, then separable least squares.
+
+A passive heat network (RC) has real poles, so its response to heat u is y(n) = sum_k R_k s_k(n) + sum_k W_k p_k^n with
+s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only the poles are searched.
+
+1. One pass over the samples forms, for blocks of q samples, the mean of each output and the first r moments of each
+   input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block, and both the block's end state and its
+   mean depend on the inputs through weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p), which r = 3 moments carry to 1e-4 of
+   a block's slightest effect: nothing of the slow dynamics is lost by averaging 10 000 samples of 1 ms into one of 10 s.
+2. Variable projection (Golub and Pereyra 1973) with Kaufman's simplification over x_k = ln(time constant):
+   J'J = (dF' P dF) o (T T'), J'r = -diag(dF' r T'), F (J, K) block responses, T the residues, P the projector off F.
+3. The order is the one with the least BIC.
+All models are stable by construction.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from thermoctl.identify import kernels
+from thermoctl.identify.statespace import StateSpace, modal
+from thermoctl.yamlfile import InputError
+
+MOMENTS = 3
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Reduced data: `u` (J, m, r) input moments, `y` (J, l) output means (NaN: no sample), `weight` (J, l) samples in each
+    mean over the block's length, `q` samples per block, `period_s` of the samples, `basis` (r, q) the polynomials."""
+    u: np.ndarray
+    y: np.ndarray
+    weight: np.ndarray
+    q: int
+    period_s: float
+    basis: np.ndarray
+
+
+def gram_polynomials(q: int, r: int = MOMENTS) -> np.ndarray:
+    """(r, q) orthonormal discrete polynomials of degree 0..r-1 on q equidistant places (fewer rows when q < r)."""
+    r = min(r, q)
+    vander = np.polynomial.legendre.legvander(np.linspace(-1, 1, q) if q > 1 else np.zeros(1), r - 1)
+    return np.ascontiguousarray(np.linalg.qr(vander)[0].T)
+
+
+def reduce(chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray, np.ndarray], period_s: float,
+           block_s: float = 10.0) -> Blocks:
+    """One pass over samples: `chunks` is (u (N, m), y (N, l)) or an iterable of such pieces; memory does not grow with N
+    beyond the blocks. A block without any sample of an output gives NaN there; a last, incomplete block is dropped.
+    Raises InputError when an input is missing or the data are shorter than 20 blocks."""
+    q = max(1, round(block_s / period_s))
+    basis = gram_polynomials(q)
+    if isinstance(chunks, tuple):
+        chunks = [chunks]
+    u = y = count = None
+    start = 0
+    for cu, cy in chunks:
+        cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T
+        for k in range(0, len(cu), 100_000):                # small pieces: bounded memory whatever the caller's chunks are
+            z = np.ascontiguousarray(np.hstack([cu[k:k + 100_000], cy[k:k + 100_000]]), dtype=float)
+            if u is None:
+                u, y = np.zeros((64, cu.shape[1], len(basis))), np.zeros((64, cy.shape[1]))
+                count = np.zeros_like(y)
+            m = cu.shape[1]
+            if not np.isfinite(z[:, :m]).all():
+                row = start + int(np.flatnonzero(~np.isfinite(z[:, :m]).all(1))[0])
+                raise InputError(f"an input is missing at sample {row}; identification needs every sample of the inputs")
+            need = (start + len(z)) // q + 1
+            if need > len(u):
+                grow = max(need, 2 * len(u)) - len(u)
+                u, y, count = (np.concatenate([v, np.zeros((grow, *v.shape[1:]))]) for v in (u, y, count))
+            kernels.block_moments(z, m, basis, u, y, count, start)
+            start += len(z)
+    blocks = start // q
+    if u is None or blocks < 20:
+        raise InputError(f"{start} samples of {period_s:g} s are {blocks} blocks of {q * period_s:g} s; at least 20 are needed")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means = y[:blocks] / count[:blocks]
+    return Blocks(u[:blocks], means, count[:blocks] / q, q, period_s, basis)
+
+
+def _responses(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Block-mean responses F (J, columns) and their derivative by ln tau, and each column's pole index.
+
+    Columns by pole: one per input, then (unless `rest`) the free decay."""
+    q, basis, J = blocks.q, blocks.basis, len(blocks.u)
+    i = np.arange(q)
+    F, D, owner = [], [], []
+    p = np.exp(-blocks.period_s / tau)                       # per sample
+    dp = p * blocks.period_s / tau                           # dp/d ln tau
+    pq, dpq = p**q, q * p**(q - 1) * dp
+    for k in range(len(tau)):
+        powers = p[k]**(q - 1 - i)                           # p^(q-1-i)
+        dpowers = (q - 1 - i) * powers / p[k] * dp[k]
+        held = -np.expm1((q - 1 - i) * np.log(p[k])) / -np.expm1(np.log(p[k]))      # (1 - p^(q-1-i)) / (1 - p)
+        dheld = (-dpowers + held * dp[k]) / (1 - p[k])
+        first = -np.expm1(q * np.log(p[k])) / (1 - p[k]) / q                        # mean of p^i over the block
+        dfirst = (-dpq[k] / q + first * dp[k]) / (1 - p[k])
+        # the block's input as moments: its effect on the block's end state and on the block's mean
+        end, dend = blocks.u @ (basis @ powers), blocks.u @ (basis @ dpowers)       # (J, m)
+        mean, dmean = blocks.u @ (basis @ held) / q, blocks.u @ (basis @ dheld) / q
+        for m in range(end.shape[1]):
+            s, ds = kernels.decays(pq[k:k + 1], np.ascontiguousarray(end[:, m])[None])
+            t, _ = kernels.decays(pq[k:k + 1], np.ascontiguousarray(dend[:, m])[None])
+            s, ds = s[0], ds[0] * dpq[k] + t[0]
+            # scaled by (1 - p): every column is then of the input's size, whatever its time constant
+            f = first * s + mean[:, m]
+            df = dfirst * s + first * ds + dmean[:, m]
+            F.append((1 - p[k]) * f)
+            D.append((1 - p[k]) * df - dp[k] * f)
+            owner.append(k)
+        if not rest:
+            n = np.arange(J)
+            decay = pq[k]**n
+            F.append(first * decay)
+            D.append(dfirst * decay + first * n * pq[k]**np.maximum(n - 1, 0) * dpq[k] * (n > 0))
+            owner.append(k)
+    return np.array(F).T, np.array(D).T, np.array(owner)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    tau: np.ndarray
+    theta: np.ndarray        # (columns, l)
+    cost: float
+    iterations: int
+
+
+def _project(F: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Q of F, the residue matrix and the residual; a ridge of 1e-9 keeps nearly equal poles harmless."""
+    n = F.shape[1]
+    norm = np.linalg.norm(F, axis=0)
+    norm[norm == 0] = 1
+    Q, R = linalg.qr(np.vstack([F / norm, 1e-7 * np.eye(n)]), mode="economic", check_finite=False)
+    theta = linalg.solve_triangular(R, Q[:len(F)].T @ Y, check_finite=False) / norm[:, None]
+    return Q[:len(F)], theta, Y - F @ theta
+
+
+def _fit(blocks: Blocks, Y: np.ndarray, weight: np.ndarray, tau: np.ndarray, rest: bool, iterations: int,
+         bounds: tuple[float, float]) -> _Fit:
+    """Levenberg-Marquardt on ln tau. `Y` (J, l) is scaled by each output's noise, `weight` (J,) by row."""
+    x = np.log(tau)
+    lo, hi = np.log(bounds[0]), np.log(bounds[1])
+
+    def evaluate(x: np.ndarray) -> tuple:
+        F, D, owner = _responses(blocks, np.exp(x), rest)
+        F, D = F * weight[:, None], D * weight[:, None]
+        Q, theta, r = _project(F, Y)
+        return float((r**2).sum()), Q, theta, r, D, owner
+
+    cost, Q, theta, r, D, owner = evaluate(x)
+    damping, done = 1e-3, 0
+    for done in range(1, iterations + 1):                   # noqa: B007
+        PD = D - Q @ (Q.T @ D)
+        H = (PD.T @ PD) * (theta @ theta.T)
+        g = -((PD.T @ r) * theta).sum(1)
+        E = np.zeros((len(owner), len(x)))
+        E[np.arange(len(owner)), owner] = 1
+        H, g = E.T @ H @ E, E.T @ g
+        better = False
+        for _ in range(8):
+            step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12 * np.trace(H) + 1e-300), -g)
+            trial = np.sort(np.clip(x + np.clip(step, -1, 1), lo, hi))
+            new = evaluate(trial)
+            if new[0] < cost:
+                better = True
+                break
+            damping *= 10
+        if not better:
+            break
+        gain = (cost - new[0]) / cost
+        x = trial
+        cost, Q, theta, r, D, owner = new
+        damping = max(damping / 10, 1e-9)
+        if gain < 1e-7:
+            break
+    return _Fit(np.exp(x), theta, cost, done)
+
+
+def identify(blocks: Blocks, order: int | None = 8, rest: bool = True, iterations: int = 30,
+             tau_range_s: tuple[float, float] | None = None) -> StateSpace:
+    """Model with `order` real poles per input (None: the least BIC of 1..10) from reduced data, at the blocks' sample period.
+
+    `rest`: the recording begins in thermal equilibrium (output rises are zero); otherwise every output's free decay is
+    estimated too. Rows where an output is missing are left out for all outputs when the others are whole, else filled by
+    two rounds of the model's own output. Raises InputError when an output was never measured."""
+    block_s = blocks.q * blocks.period_s
+    span = len(blocks.u) * block_s
+    bounds = tau_range_s or (0.7 * block_s, 2.5 * span)
+    missing = ~np.isfinite(blocks.y)
+    if missing.all(0).any():
+        raise InputError(f"output {int(np.flatnonzero(missing.all(0))[0]) + 1} has no sample; leave it out")
+    if order is None:
+        fits = [identify(blocks, k, rest, iterations, bounds) for k in range(1, 11)]
+        return min(fits, key=lambda m: m.info["bic"])
+    weight = np.sqrt(np.where(missing, 1, blocks.weight).mean(1))
+    y = blocks.y.copy()
+    gaps = missing.any()
+    if gaps:
+        t = np.arange(len(y))
+        for j in np.flatnonzero(missing.any(0)):
+            y[missing[:, j], j] = np.interp(t[missing[:, j]], t[~missing[:, j]], y[~missing[:, j], j])
+    noise = np.maximum(np.std(np.diff(y, 2, axis=0), axis=0) / np.sqrt(6), 1e-9 * (np.abs(y).max() + 1e-300))
+    noise = np.maximum(noise, 1e-2 * np.median(noise))
+    tau = np.geomspace(max(1.5 * block_s, bounds[0]), min(0.5 * span, bounds[1]), order)
+    for _ in range(3 if gaps else 1):
+        fit = _fit(blocks, y / noise * weight[:, None], weight, tau, rest, iterations, bounds)
+        if gaps:
+            F, _, _ = _responses(blocks, fit.tau, rest)
+            y[missing] = (F @ fit.theta * noise)[missing]
+            tau = fit.tau
+    m = blocks.u.shape[1]
+    p = np.exp(-blocks.period_s / fit.tau)
+    theta = (fit.theta * noise).reshape(order, m + (not rest), -1)
+    residues = np.moveaxis(theta[:, :m], 1, 2) * (1 - p)[:, None, None]
+    free = theta[:, m] if not rest else np.zeros((order, theta.shape[2]))
+    count = int((~missing).sum())
+    parameters = order * (1 + theta.shape[1] * theta.shape[2])
+    F, _, _ = _responses(blocks, fit.tau, rest)
+    residual = np.where(missing, np.nan, blocks.y - F @ fit.theta * noise)
+    info = {"method": "modal", "time_constants_s": fit.tau[::-1].tolist(), "iterations": fit.iterations,
+            "bic": count * np.log(fit.cost / count) + parameters * np.log(count),
+            "residual_rms": np.sqrt(np.nanmean(residual**2, 0)).tolist(), "block_s": block_s}
+    return modal(p, residues, free, blocks.period_s, info)
