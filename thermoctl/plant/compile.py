@@ -292,7 +292,7 @@ def _compiler() -> tuple[list[str], str]:
                 flags = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags")), "")
             except OSError:
                 flags = ""
-            command = [*candidate.split(), "-O2", "-ftree-vectorize", "-march=native", "-fno-math-errno", "-fno-trapping-math",
+            command = [*candidate.split(), "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math",
                        "-fPIC", "-shared", "-w"]
             return command, f"{version}{flags}{command}"
     raise InputError("no C compiler (cc, gcc or clang) was found; install one (Debian: apt-get install gcc) or set CC")
@@ -324,7 +324,7 @@ def _library(key: str, source: str) -> ctypes.CDLL:
 def _build(work: Path, source: str) -> None:
     (work / "plant.c").write_text(source)
     # A large file is dominated by straight-line code that -O1 translates as well in a fraction of the time.
-    command = [("-O1" if a == "-O2" and len(source) > 400_000 else a) for a in _compiler()[0]]
+    command = [("-O1" if a == "-O3" and len(source) > 400_000 else a) for a in _compiler()[0]]
     done = subprocess.run([*command, f"-I{_TEMPLATE.parent}", "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],
                           capture_output=True, text=True)
     if done.returncode:

@@ -99,7 +99,7 @@ def default_noise(plant: Plant, drives: Sequence[Drive] = ()) -> tuple[Noise, ..
 class Problem:
     """Residuals and Jacobian of a model on several recordings, in the metric of the noise."""
 
-    def __init__(self, model: Model, drives: Sequence[Drive], noise: Sequence[Noise], stride: int = 1):
+    def __init__(self, model: Model, drives: Sequence[Drive], noise: Sequence[Noise]):
         self.model, self.drives, self.noise = model, list(drives), tuple(noise)
         if not drives:
             raise InputError("no recording to fit")
@@ -126,8 +126,8 @@ class Problem:
                 self.unknowns.append((f"{s} at the start", r))
                 self.sigma0.append(model.plant.nodes[s].initial_sigma or 1.0)
         self.belief = self.start({})
+        self.buffers: dict[str, np.ndarray] = {}
         self.rows = []
-        self.weights: list[np.ndarray] | None = None
         for d in drives:
             dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
             entry = []
@@ -172,16 +172,14 @@ class Problem:
                     dx0[r, c - len(self.model.active)] = z[k] * self.sigma0[k - self.n_parameters]
         return values, dx0
 
-    def whiten(self, r: int, e: np.ndarray) -> np.ndarray:
-        """(N, outputs, ...) errors of recording r to whitened rows (M, ...)."""
-        parts = []
-        for j, (index, phi, scale) in enumerate(self.rows[r]):
-            part = e[index, j]
-            shape = (-1, *([1] * (part.ndim - 1)))
-            if len(index) > 1 and phi.any():
-                part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
-            parts.append(part / scale.reshape(shape))
-        return np.concatenate(parts) if parts else np.zeros((0, *e.shape[2:]))
+    def whiten(self, r: int, j: int, e: np.ndarray) -> np.ndarray:
+        """(N, ...) errors of output j in recording r to whitened rows (M, ...), missing samples left out."""
+        index, phi, scale = self.rows[r][j]
+        part = e if len(index) == len(e) else e[index]
+        shape = (-1, *([1] * (part.ndim - 1)))
+        if len(index) > 1 and phi.any():
+            part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
+        return part / scale.reshape(shape)
 
     def evaluate(self, z: np.ndarray, jacobian: bool) -> tuple[float, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Cost, gradient/2 and Gauss-Newton matrix by the unknowns, raw residuals. Raises SimulationError."""
@@ -191,25 +189,34 @@ class Problem:
         cost = 0.0
         residuals = []
         for r, d in enumerate(self.drives):
-            run = self.model.run(d, values[r], dx0[r], sensitivities=jacobian)
+            run = self.model.run(d, values[r], dx0[r], sensitivities=jacobian, buffers=self.buffers)
             e = d.y - run.y
             if not np.all(np.isfinite(run.y)):
                 raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
             residuals.append(e)
-            w = self.whiten(r, e)
-            a = np.abs(w)
-            cost += float(np.sum(np.where(a <= HUBER, w * w, 2 * HUBER * a - HUBER ** 2)))
-            if not jacobian or run.dy is None:
-                continue
             used = np.flatnonzero(self.columns[r] >= 0)
+            k = self.columns[r, used]
             slope = np.array([self.scales[self.model.active[c]].slope(values[r, self.model.parameters.index(self.model.active[c])])
                               if c < len(self.model.active) else self.sigma0[self.columns[r, c] - self.n_parameters] for c in used])
-            jac = self.whiten(r, run.dy[:, :, used]) * slope
-            weight = np.where(a <= HUBER, 1.0, HUBER / np.maximum(a, HUBER))
-            k = self.columns[r, used]
-            np.add.at(gradient, k, jac.T @ (weight * w))
-            heavy = jac if weight.min() == 1.0 else jac * np.sqrt(weight)[:, None]
-            matrix[np.ix_(k, k)] += heavy.T @ heavy
+            part_gradient, part_matrix = np.zeros(len(k)), np.zeros((len(k), len(k)))
+            for j in range(len(self.noise)):
+                if not len(self.rows[r][j][0]):
+                    continue
+                w = self.whiten(r, j, e[:, j])
+                a = np.abs(w)
+                cost += float(np.sum(np.where(a <= HUBER, w * w, 2 * HUBER * a - HUBER ** 2)))
+                if not jacobian or run.dy is None:
+                    continue
+                jac = self.whiten(r, j, run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used])
+                if a.max(initial=0.0) > HUBER:
+                    root = np.sqrt(np.where(a <= HUBER, 1.0, HUBER / np.maximum(a, HUBER)))
+                    jac *= root[:, None]
+                    w = w * root
+                part_gradient += jac.T @ w
+                part_matrix += jac.T @ jac
+            if jacobian:
+                np.add.at(gradient, k, part_gradient * slope)
+                matrix[np.ix_(k, k)] += part_matrix * np.outer(slope, slope)
         prior = np.concatenate([np.full(self.n_parameters, BELIEF_WEIGHT ** 2), np.ones(n - self.n_parameters)])
         away = z - self.belief
         cost += float(np.sum(prior * away ** 2))

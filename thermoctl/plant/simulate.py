@@ -57,6 +57,16 @@ class Simulation:
     rejected: int = 0
 
 
+def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]) -> np.ndarray:
+    """An array to fill. Touching new pages costs more than the arithmetic on them, so a caller may keep them."""
+    if kept is None:
+        return np.empty(shape)
+    size = int(np.prod(shape))
+    if key not in kept or kept[key].size < size:
+        kept[key] = np.empty(size)
+    return kept[key][:size].reshape(shape)
+
+
 def _p(a: np.ndarray | None) -> int | None:
     return None if a is None else a.ctypes.data
 
@@ -199,24 +209,26 @@ class Model:
                 **dict(zip(self.states, x.T, strict=True)), "t": drive.t}
 
     def run(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None = None, dx0: np.ndarray | None = None,
-            sensitivities: bool = False, rtol: float = RTOL) -> Simulation:
-        """Free run on a drive. Raises SimulationError."""
+            sensitivities: bool = False, rtol: float = RTOL, buffers: dict[str, np.ndarray] | None = None) -> Simulation:
+        """Free run on a drive. `buffers`: a dict that keeps the large arrays between runs (the next run with it changes
+        what the last one returned). Raises SimulationError."""
         if drive.scale is None:
             self.prepare(drive, parameters)
-        return self._run(drive, self.vector(parameters, drive.name), dx0, sensitivities, rtol)
+        return self._run(drive, self.vector(parameters, drive.name), dx0, sensitivities, rtol, buffers)
 
     def simulate(self, table: Table, parameters: Mapping[str, float] | None = None, sensitivities: bool = False,
                  rtol: float = RTOL) -> Simulation:
         """Free run on a recording's inputs. Raises InputError, SimulationError."""
         return self.run(self.drive(table), parameters, None, sensitivities, rtol)
 
-    def _run(self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None, sensitivities: bool, rtol: float) -> Simulation:
+    def _run(self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None, sensitivities: bool, rtol: float,
+             buffers: dict[str, np.ndarray] | None = None) -> Simulation:
         lib, n, nx, nq = self.code.library, len(drive.t), len(self.states), len(self.unknowns)
         u = self._delayed_inputs(drive, p)
         width = drive.width if drive.width is not None else np.ones(1)
         x0, s0 = self.start(drive, p, dx0)
         x = np.empty((n, nx))
-        dx = np.empty((n, nx, nq)) if sensitivities else None
+        dx = _buffer(buffers, "dx", (n, nx, nq)) if sensitivities else None
         info = np.zeros(2)
         if nx:
             if not np.all(np.isfinite(x0)):
@@ -230,11 +242,12 @@ class Model:
                 at = max(failed - 1, 0)
                 raise SimulationError(f"{drive.name}: the simulation does not get beyond t = {drive.t[at]:.6g} s; states "
                                       + ", ".join(f"{s} = {v:.3g}" for s, v in zip(self.states, x[at], strict=True)))
-        y, dy = self._observe(drive, u, p, width, x, dx, nq, sensitivities)
+        y, dy = self._observe(drive, u, p, width, x, dx, nq, sensitivities, buffers)
         return Simulation(drive.t, x, y, dx, dy, int(info[0]), int(info[1]))
 
     def _observe(self, drive: Drive, u: np.ndarray, p: np.ndarray, width: np.ndarray, x: np.ndarray,
-                 dx: np.ndarray | None, nq: int, sensitivities: bool) -> tuple[np.ndarray, np.ndarray | None]:
+                 dx: np.ndarray | None, nq: int, sensitivities: bool,
+                 buffers: dict[str, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray | None]:
         lib, n, ny, nd = self.code.library, len(drive.t), len(self.outputs), len(self.code.output_delays)
         delayed = slopes = None
         if nd:
@@ -243,7 +256,7 @@ class Model:
             lib.observe(1, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, None, None, _p(g), _p(dg))
             delayed, slopes = self._shift(drive.t, g, dg, p)
         y = np.empty((n, ny))
-        dy = np.empty((n, ny, nq)) if sensitivities else None
+        dy = _buffer(buffers, "dy", (n, ny, nq)) if sensitivities else None
         lib.observe(0, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, _p(delayed), _p(slopes), _p(y), _p(dy))
         return y, dy
 
