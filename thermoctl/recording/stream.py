@@ -1,0 +1,61 @@
+"""Reading an Arrow IPC stream that may end anywhere.
+
+A stream is a schema message, one message a batch, and an end mark (ff ff ff ff 00 00 00 00). A recorder that is killed
+leaves no end mark and perhaps half a message: everything before it is whole, because each message carries its length.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pyarrow as pa
+
+from thermoctl.yamlfile import InputError
+
+END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
+
+
+@dataclass
+class Stream:
+    """An open stream: iterate for its batches. After that `good_bytes` is where the last whole message ends and
+    `whole` says whether the end mark was there (else the writer was killed, or is still writing)."""
+    path: Path
+    schema: pa.Schema
+    _source: pa.NativeFile
+    _reader: pa.RecordBatchReader
+    good_bytes: int = field(default=0)
+    whole: bool = field(default=False)
+
+    def __iter__(self) -> Iterator[pa.RecordBatch]:
+        size = self._source.size()
+        while True:
+            try:
+                batch = self._reader.read_next_batch()
+                batch.validate()
+            except StopIteration:
+                self.whole = self._source.tell() > self.good_bytes and size - self.good_bytes >= len(END)
+                return
+            except (pa.ArrowException, OSError):
+                return
+            self.good_bytes = self._source.tell()
+            yield batch
+
+
+def open_stream(path: str | Path, columns: Iterable[str] | None = None) -> Stream:
+    """Open a stream, decoding `columns` only (None: all). Raises InputError when not even the schema is there."""
+    path = Path(path)
+    try:
+        source = pa.memory_map(str(path))
+        reader = pa.ipc.open_stream(source)
+        if columns is not None:
+            wanted = set(columns)
+            fields = [i for i, name in enumerate(reader.schema.names) if name in wanted]
+            source = pa.memory_map(str(path))
+            reader = pa.ipc.open_stream(source, options=pa.ipc.IpcReadOptions(included_fields=fields))
+    except pa.ArrowException as e:
+        raise InputError(f"{path}: no recording in it ({str(e).splitlines()[0]}): it is not an Arrow stream, or was cut "
+                         "before its first row") from None
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
+    return Stream(path, reader.schema, source, reader, good_bytes=source.tell())
