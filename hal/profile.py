@@ -5,8 +5,8 @@ A profile, `format: thermoctl-device/1`, names vendor, model, bus and channels. 
     reading = raw * scale + offset      in `unit`; outside `range`: error; older than `stale_after_s`: stale
 
 and says where on its bus the raw number is found. Buses: serial-binary (framed bytes), serial-lines (text), can-dbc
-(any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). A binding, one item of `hal.devices`, names
-a profile, a port and which channel plays which role of `hal.backend.ROLES`.
+(any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). A binding, one item of `hal.devices`, is
+profile, port and which channel plays which role of `hal.backend.ROLES`.
 """
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
 A binary frame on the wire:   sync (1..8 bytes) | length (uint8, optional) | payload | CRC-16 over all that follows sync
 
 pyserial opens and configures the line (exclusive, so that a second program is refused); the tick then reads and writes
-the bare descriptor without waiting. Framing resynchronises after garbage: a frame whose length or CRC is wrong costs its
-first byte, and the search goes on from the next one, so a true frame behind a false sync is never lost.
+the bare descriptor without waiting. Framing resynchronises after garbage: a frame whose length or CRC is wrong costs
+its first byte, and the search goes on from the next one, so a true frame behind a false sync is never lost.
 """
 from __future__ import annotations
 

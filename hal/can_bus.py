@@ -1,0 +1,430 @@
+"""CAN: ports that the tick can use without waiting, CiA-402 drives, and devices that a DBC file describes.
+
+Ports ("interface:channel@bitrate", bitrate 1000000 where left out)
+- slcan:/dev/serial/by-id/...   Lawicel ASCII on a serial port, spoken on the bare descriptor (python-can's own
+  slcan reads a byte per call, 150 us a frame)
+- socketcan:can0                python-can opens it and sets the kernel's filters; frames pass on the bare socket
+- virtual:name and any other interface python-can knows: through the library
+
+A CiA-402 drive in the tick: RPDO 1 = control word | command, then SYNC; TPDO 1 answers the SYNC with status word |
+readings and is read one tick later. Heartbeats both ways: the drive stops by itself when ours is missing for
+`watchdog_s`, we say ERROR when its own is. Set-up (identity, heartbeats, mode, PDO mapping, NMT start) runs through
+canopen and the EDS file.
+
+    status word & mask = value -> state          control word that takes the next step towards 'operation enabled'
+      0x4F  0x00  not ready to switch on         -                        (the drive goes on by itself)
+      0x4F  0x40  switch on disabled             0x06 shutdown
+      0x6F  0x21  ready to switch on             0x07 switch on
+      0x6F  0x23  switched on                    0x0F enable operation
+      0x6F  0x27  operation enabled              0x0F
+      0x6F  0x07  quick stop active              0x00 disable voltage
+      0x4F  0x0F  fault reaction active          -
+      0x4F  0x08  fault                          0x80 fault reset (rising edge), only while we do not want to drive
+"""
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import math
+import os
+import re
+import struct
+import threading
+import time
+from typing import Any
+
+import can
+import canopen
+from canopen.objectdictionary import datatypes
+
+from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
+from hal.devices import Device
+from hal.profile import Binding, Cia402, Dbc, LineSettings
+from hal.serial_port import open_port, read_available
+from thermoctl.yamlfile import InputError
+
+SYNC_ID, NMT_ID = 0x080, 0x000
+MAX_PENDING = 4096          # bytes or frames that wait for a bus which takes none: then the link counts as lost
+SDO_TIMEOUT_S = 0.3
+FAULT_RESET_S = 1.0         # between attempts to reset a drive's fault while it is not wanted to drive
+_SLCAN_BITRATES = {10_000: 0, 20_000: 1, 50_000: 2, 100_000: 3, 125_000: 4, 250_000: 5, 500_000: 6, 800_000: 7,
+                   1_000_000: 8}
+_FRAME = struct.Struct("=IB3x8s")                       # struct can_frame of the kernel
+_EXTENDED, _REMOTE, _ERROR_FLAG, _BUS_OFF = 0x8000_0000, 0x4000_0000, 0x2000_0000, 0x40
+_FORMATS = {datatypes.INTEGER8: "b", datatypes.INTEGER16: "h", datatypes.INTEGER32: "i", datatypes.UNSIGNED8: "B",
+            datatypes.UNSIGNED16: "H", datatypes.UNSIGNED32: "I", datatypes.BOOLEAN: "B"}
+
+Frame = tuple[int, bytes]
+
+
+def encode_slcan(can_id: int, data: bytes) -> bytes:
+    """A data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR above 0x7FF."""
+    head = b"t%03X%d" % (can_id, len(data)) if can_id <= 0x7FF else b"T%08X%d" % (can_id, len(data))
+    return head + data.hex().upper().encode() + b"\r"
+
+
+class SlcanParser:
+    """Bytes from an adapter in, data frames out. Acknowledgements (z, Z, CR) pass silently; BEL, which refuses a
+    command, is counted in `refused`, what is no valid message in `bad`. Time stamps after the data are ignored."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self.bad = self.refused = 0
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Frames that `data` completed, in order."""
+        *messages, rest = (self._rest + data).split(b"\r")
+        self._rest = rest if len(rest) <= 64 else b""       # the longest message has 30 bytes
+        self.bad += len(rest) > 64
+        frames = []
+        for message in messages:
+            if b"\a" in message:
+                self.refused += message.count(b"\a")
+                message = message.replace(b"\a", b"")
+            kind = message[:1]
+            if kind not in (b"t", b"T"):
+                self.bad += kind not in (b"", b"z", b"Z", b"r", b"R", b"F", b"V", b"N")
+                continue
+            digits = 3 if kind == b"t" else 8
+            try:
+                size = message[1 + digits] - 48
+                body = message[2 + digits:2 + digits + 2 * size]
+                if not 0 <= size <= 8 or len(body) != 2 * size:
+                    raise ValueError
+                frames.append((int(message[1:1 + digits], 16), bytes.fromhex(body.decode("ascii"))))
+            except (ValueError, IndexError):
+                self.bad += 1
+        return frames
+
+
+class SlcanPort:
+    """A Lawicel adapter on a serial port; `open` sets bitrate and opens the channel."""
+
+    def __init__(self, path: str, bitrate: int) -> None:
+        if bitrate not in _SLCAN_BITRATES:
+            raise HardwareError(f"slcan:{path}: bitrate {bitrate} is not one of {', '.join(map(str, _SLCAN_BITRATES))}")
+        self._port = open_port(path, LineSettings(baud=3_000_000), f"slcan:{path}")
+        self._fd = self._port.fileno()
+        self._parser = SlcanParser()
+        self._out = bytearray()
+        os.write(self._fd, b"\r\rC\rS%d\rO\r" % _SLCAN_BITRATES[bitrate])
+
+    def send(self, *frames: Frame) -> None:
+        """Send without waiting, in one write. Raises OSError when the adapter is gone or takes nothing any more."""
+        self._out += b"".join([encode_slcan(*f) for f in frames])
+        try:
+            del self._out[:os.write(self._fd, self._out)]
+        except BlockingIOError:
+            if len(self._out) > MAX_PENDING:
+                raise OSError(errno.ENOBUFS, "the adapter takes no data") from None
+
+    def receive(self) -> list[Frame]:
+        """What has arrived. Raises OSError when the adapter is gone."""
+        data = read_available(self._fd)
+        return self._parser.feed(data) if data else []
+
+    @property
+    def bad(self) -> int:
+        return self._parser.bad + self._parser.refused
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            os.write(self._fd, b"C\r")
+        with contextlib.suppress(OSError):
+            self._port.close()
+
+
+class LibraryPort:
+    """An interface opened by python-can; SocketCAN frames pass on the bare socket."""
+
+    def __init__(self, interface: str, channel: str, bitrate: int, ids: tuple[int, ...]) -> None:
+        filters = [{"can_id": i, "can_mask": 0x1FFF_FFFF if i > 0x7FF else 0x7FF, "extended": i > 0x7FF} for i in ids]
+        try:
+            self._bus: Any = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=filters,
+                                     **({"ignore_rx_error_frames": False} if interface == "socketcan" else {}))
+        except (can.CanError, OSError, ValueError, ImportError) as e:
+            raise HardwareError(f"{interface}:{channel}: cannot be opened ({e}); is the interface up (ip link set "
+                                f"{channel} up type can bitrate {bitrate})?") from None
+        self._socket = self._bus.socket if interface == "socketcan" else None
+        if self._socket is not None:
+            self._socket.setblocking(False)
+        self.bad = self._pending = 0
+
+    def send(self, *frames: Frame) -> None:
+        """Send without waiting. Raises OSError when the bus is gone or takes nothing any more."""
+        for can_id, data in frames:
+            try:
+                if self._socket is None:
+                    self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=can_id > 0x7FF))
+                else:
+                    flag = _EXTENDED if can_id > 0x7FF else 0
+                    self._socket.send(_FRAME.pack(can_id | flag, len(data), data))
+                self._pending = 0
+            except (BlockingIOError, can.CanOperationError) as e:
+                self._queue_full(e)
+            except OSError as e:
+                if e.errno != errno.ENOBUFS:
+                    raise
+                self._queue_full(e)
+
+    def _queue_full(self, why: Exception) -> None:
+        self.bad += 1
+        self._pending += 1
+        if self._pending > 100:
+            raise OSError(errno.ENOBUFS, f"nobody on the bus takes frames ({why})")
+
+    def receive(self) -> list[Frame]:
+        """What has arrived. Raises OSError: interface down; HardwareError: bus-off."""
+        frames: list[Frame] = []
+        while True:
+            if self._socket is None:
+                message = self._bus.recv(0)
+                if message is None:
+                    return frames
+                frames.append((message.arbitration_id, bytes(message.data)))
+                continue
+            try:
+                raw_id, size, data = _FRAME.unpack(self._socket.recv(16))
+            except BlockingIOError:
+                return frames
+            if raw_id & _ERROR_FLAG:
+                self.bad += 1
+                if raw_id & _BUS_OFF:
+                    raise HardwareError("CAN bus-off: check wiring, termination and bitrate")
+            elif not raw_id & _REMOTE:
+                frames.append((raw_id & 0x1FFF_FFFF, data[:size]))
+
+    def close(self) -> None:
+        with contextlib.suppress(can.CanError, OSError):
+            self._bus.shutdown()
+
+
+def open_can(port: str, ids: tuple[int, ...]) -> SlcanPort | LibraryPort:
+    """Open "interface:channel@bitrate"; `ids` are the frames wanted (the kernel filters where it can)."""
+    match = re.fullmatch(r"(\w+):(.+?)(?:@(\d+))?", port)
+    if match is None:
+        raise HardwareError(f"port '{port}': interface:channel@bitrate was expected, as slcan:/dev/ttyACM0@1000000")
+    bitrate = int(match[3] or 1_000_000)
+    if match[1] == "slcan":
+        return SlcanPort(match[2], bitrate)
+    return LibraryPort(match[1], match[2], bitrate, ids)
+
+
+def drive_state(status_word: int) -> float:
+    """AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED or AMP_FAULT for a CiA-402 status word."""
+    if status_word & 0x4F in (0x0F, 0x08):
+        return AMP_FAULT
+    if status_word & 0x6F == 0x27:
+        return AMP_ENABLED
+    return AMP_OFFLINE if status_word & 0x4F == 0x00 else AMP_DISABLED
+
+
+def next_control_word(status_word: int, enable: bool) -> int:
+    """The control word that takes a drive one step towards the wanted state (table in the module's text)."""
+    if not enable:
+        return 0x06 if status_word & 0x6F in (0x23, 0x27) else 0x00
+    if status_word & 0x4F == 0x40:
+        return 0x06
+    return {0x21: 0x07, 0x23: 0x0F, 0x27: 0x0F}.get(status_word & 0x6F, 0x00)
+
+
+def _format(dictionary: Any, index: int) -> str:
+    """struct letter of an object; KeyError where it is missing or no number of up to 4 bytes."""
+    return _FORMATS[dictionary[index].data_type]
+
+
+class _SetupNetwork(canopen.Network):
+    """canopen over one of our ports, for the time of the set-up: a thread passes frames on."""
+
+    def __init__(self, port: SlcanPort | LibraryPort) -> None:
+        super().__init__()
+        self._port, self._done = port, threading.Event()
+        self._thread = threading.Thread(target=self._pass_on, daemon=True)
+        self.failure: Exception | None = None
+        self._thread.start()
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        self._port.send((can_id, bytes(data)))
+
+    def _pass_on(self) -> None:
+        while not self._done.is_set():
+            try:
+                frames = self._port.receive()
+            except (OSError, HardwareError) as e:
+                self.failure = e
+                return
+            for can_id, data in frames:
+                self.notify(can_id, bytearray(data), time.time())
+            if not frames:
+                self._done.wait(0.0005)
+
+    def finish(self) -> None:
+        self._done.set()
+        self._thread.join(1.0)
+
+
+class Cia402Device(Device):
+    """A CiA-402 drive: takes the command, gives its state, current and DC-link voltage."""
+
+    def __init__(self, binding: Binding) -> None:
+        super().__init__(binding)
+        spec: Cia402 = binding.profile.bus_spec
+        self._spec, self._node = spec, binding.address
+        self._port: SlcanPort | LibraryPort | None = None
+        dictionary = canopen.import_od(str(spec.eds), node_id=self._node)
+        try:
+            self._transmit = struct.Struct("<" + "".join(_format(dictionary, i) for i in spec.transmit))
+            command = _format(dictionary, spec.command)
+        except KeyError as e:
+            raise InputError(f"{binding.profile.file}: {spec.eds}: object {e} of the PDOs is not in it") from None
+        self._receive = struct.Struct("<H" + command)
+        self._command_limit = 2 ** (8 * struct.calcsize(command) - 1) - 1
+        self._dictionary = dictionary
+        if self._transmit.size > 8 or self._receive.size > 8:
+            raise InputError(f"{binding.profile.file}: a PDO has 8 bytes, transmit takes {self._transmit.size}")
+        self._index = [spec.transmit.index(b.channel.source) if b.channel.source in spec.transmit else -1
+                       for b in binding.bounds]
+        self._is_state = [b.channel.source == 0x6041 for b in binding.bounds]
+        self._patience_s = max(3 * spec.heartbeat_s, 0.05)
+        self._ids = (0x080 + self._node, 0x180 + self._node, 0x580 + self._node, 0x700 + self._node)
+        self._status_word = self._fault_code = 0
+        self._heard_s = self._beat_s = self._reset_s = -math.inf
+
+    def connect(self) -> None:
+        """Open the port, check the identity, configure heartbeats, mode and PDOs, start the node; it stays off."""
+        port = open_can(self.binding.port, self._ids)
+        network = _SetupNetwork(port)
+        try:
+            self._set_up(network)
+        except (canopen.SdoAbortedError, canopen.SdoCommunicationError, KeyError, OSError) as e:
+            network.finish()
+            port.close()
+            raise HardwareError(f"{self.name}: {self.binding.port} node {self._node}: set-up failed "
+                                f"({network.failure or e}): check power, node id, bitrate and termination") from None
+        except HardwareError:
+            network.finish()
+            port.close()
+            raise
+        network.finish()
+        self._port = port
+        self._status_word = 0
+        self._heard_s = time.monotonic()
+        self._beat_s = self._reset_s = -math.inf
+
+    def _set_up(self, network: _SetupNetwork) -> None:
+        logging.getLogger("canopen").setLevel(logging.CRITICAL)       # what it would log, we raise
+        spec = self._spec
+        node = network.add_node(self._node, self._dictionary)
+        assert isinstance(node, canopen.RemoteNode)
+        node.sdo.RESPONSE_TIMEOUT, node.sdo.MAX_RETRIES = SDO_TIMEOUT_S, 1
+        network.send_message(NMT_ID, bytes((0x80, self._node)))       # pre-operational: PDOs rest while they are mapped
+        device_type = node.sdo[0x1000].raw
+        if device_type & 0xFFFF != 402:
+            raise HardwareError(f"{self.name}: node {self._node} says device profile {device_type & 0xFFFF}, "
+                                "402 (drive) was expected: is the node id right?")
+        node.sdo[0x1016][1].raw = spec.master_id << 16 | round(spec.watchdog_s * 1000)
+        node.sdo[0x1017].raw = round(spec.heartbeat_s * 1000)
+        node.sdo[0x6040].raw = 0
+        node.sdo[0x6060].raw = spec.mode
+        for index, sub, value in spec.start_up:
+            (node.sdo[index][sub] if sub else node.sdo[index]).raw = value
+        for pdo, cob_id, objects in ((node.tpdo[1], 0x180, spec.transmit),
+                                     (node.rpdo[1], 0x200, (0x6040, spec.command))):
+            pdo.clear()
+            for index in objects:
+                pdo.add_variable(index)
+            pdo.cob_id, pdo.trans_type, pdo.enabled = cob_id + self._node, 1, True
+            pdo.save()
+        self._fault_code = node.sdo[0x603F].raw
+        network.send_message(NMT_ID, bytes((0x01, self._node)))       # operational
+
+    def disconnect(self) -> None:
+        """Close the port."""
+        port, self._port = self._port, None
+        if port is not None:
+            port.close()
+
+    def read(self, sample: Sample, now_s: float) -> None:
+        """Take TPDO 1, emergencies and the drive's heartbeat. HardwareError when the heartbeat is missing."""
+        assert self._port is not None
+        for can_id, data in self._port.receive():
+            kind = can_id - self._node
+            if kind == 0x180 and len(data) == self._transmit.size:
+                values = self._transmit.unpack(data)
+                self._status_word = values[0]
+                self.counts["frames"] += 1
+                state = drive_state(values[0])
+                for i, index in enumerate(self._index):
+                    raw = self._fault_code if index < 0 else values[index]
+                    self.put(sample, i, state if self._is_state[i] else raw, now_s)
+            elif kind == 0x700 and len(data) == 1:
+                if data[0] == 0:                                      # boot-up
+                    raise HardwareError("the drive restarted")        # its PDO mapping and watchdog are gone
+                self._heard_s = now_s
+                if data[0] == 0x7F:                                   # it left operation when our heartbeat was missing
+                    self._port.send((NMT_ID, bytes((0x01, self._node))))
+            elif kind == 0x080 and len(data) == 8:
+                self._fault_code = int.from_bytes(data[:2], "little")
+                self.counts["emergencies"] = self.counts.get("emergencies", 0) + 1
+        self.counts["errors"] = self._port.bad
+        if now_s - self._heard_s > self._patience_s:
+            raise HardwareError(f"no heartbeat of node {self._node} for {self._patience_s * 1e3:.0f} ms")
+
+    def write(self, drive: float, enable: bool, now_s: float) -> None:
+        """RPDO 1, SYNC, and our heartbeat when it is due, in one write."""
+        assert self._port is not None
+        limits = self.binding.profile.drive
+        assert limits is not None
+        word = next_control_word(self._status_word, enable)
+        counts = 0
+        if enable and drive_state(self._status_word) == AMP_ENABLED:
+            counts = round(min(max(drive, limits.limits[0]), limits.limits[1]) / limits.scale)
+            counts = min(max(counts, -self._command_limit), self._command_limit)
+        elif not enable and self._status_word & 0x4F == 0x08 and now_s - self._reset_s >= FAULT_RESET_S:
+            word, self._reset_s = 0x80, now_s
+        frames = [(0x200 + self._node, self._receive.pack(word, counts)), (SYNC_ID, b"")]
+        if now_s - self._beat_s >= self._spec.heartbeat_s:
+            self._beat_s = now_s
+            frames.append((0x700 + self._spec.master_id, b"\x05"))
+        self._port.send(*frames)
+
+
+class DbcDevice(Device):
+    """A device that sends what a DBC file describes; it is only listened to."""
+
+    def __init__(self, binding: Binding) -> None:
+        super().__init__(binding)
+        spec: Dbc = binding.profile.bus_spec
+        self._port: SlcanPort | LibraryPort | None = None
+        self._messages: dict[int, tuple[Any, list[tuple[int, str]]]] = {}
+        for i, b in enumerate(binding.bounds):
+            message = spec.database.get_message_by_name(b.channel.source.message)
+            self._messages.setdefault(message.frame_id, (message, []))[1].append((i, b.channel.source.signal))
+
+    def connect(self) -> None:
+        """Open the port."""
+        self._port = open_can(self.binding.port, tuple(self._messages))
+
+    def disconnect(self) -> None:
+        """Close the port."""
+        port, self._port = self._port, None
+        if port is not None:
+            port.close()
+
+    def read(self, sample: Sample, now_s: float) -> None:
+        """Decode what has arrived."""
+        assert self._port is not None
+        for can_id, data in self._port.receive():
+            entry = self._messages.get(can_id)
+            if entry is None:
+                continue
+            try:
+                values = entry[0].decode(data, decode_choices=False)
+            except (ValueError, KeyError, IndexError):
+                self.counts["errors"] += 1
+                continue
+            self.counts["frames"] += 1
+            for i, signal in entry[1]:
+                if signal in values:
+                    self.put(sample, i, float(values[signal]), now_s)
