@@ -500,4 +500,7 @@ def _value(e: Expr, a: list[Any], values: Mapping[str, Any], first: Callable[[st
             return np.interp(x, xs, ys)
         slopes = np.concatenate([[0.0], np.diff(ys) / np.diff(xs), [0.0]])
         return slopes[np.searchsorted(xs, x, side="right")]
+    if op == "delay" and "t" in values:        # over samples at values["t"], on straight lines
+        t = np.asarray(values["t"], float)
+        return np.interp(t - a[1], t, np.broadcast_to(a[0], t.shape))
     raise ExpressionError(f"'{op}' cannot stand here")

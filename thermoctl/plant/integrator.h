@@ -22,7 +22,9 @@ static const double A_[STAGES][STAGES] = {
 static const double BHAT[STAGES] = {4586570599.0 / 29645900160.0, 0, 178811875.0 / 945068544, 814220225.0 / 1159782912,
                                     -3700637.0 / 11593932, 61727.0 / 225920};
 
-typedef struct { double *k, *xs, *ks, *sb; int nc; } Work;
+/* Forces on dx/dt that are not in the equations: entry e adds q[n * count + e], on a straight line between samples, to the
+   slope of state row[e] in column col[e] of S. With forces, the columns of S are responses to them, not sensitivities. */
+typedef struct { int count; const int *row, *col; const double *q; } Forces;
 
 static void inputs_at(double s, const double *u0, const double *u1, const int *lin, double *u) {
   for (int j = 0; j < NU; j++) u[j] = lin[j] && u1 ? u0[j] + s * (u1[j] - u0[j]) : u0[j];
@@ -91,14 +93,19 @@ static double try_step(double t, double h, double ta, double dt, const double *u
 /* The sensitivities over the step that try_step accepted; S (NX x nc) is advanced in place. */
 static int sens_step(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
                      const double *p, const double *w, const double *xs, double *S, int nc, double *ks, double *M,
-                     double *hfac) {
-  double u[NU + 1], J[NJ + 1], V[NV + 1];
+                     double *hfac, const Forces *force, int n) {
+  double u[NU + 1], J[NJ + 1], own[NV + 1], *V = own;
+  const int nv = force ? force->count : NV, *v_row = force ? force->row : V_ROW, *v_col = force ? force->col : V_COL;
+  if (force) V = ks + (STAGES + 2) * (size_t)NX * nc;
   size_t block = (size_t)NX * nc;
   for (int s = 0; s < STAGES; s++) {
     double ts = t + C_[s] * h, *K = ks + s * block, *R = ks + STAGES * block;
     const double *X = xs + s * NX;
     inputs_at((ts - ta) / dt, u0, u1, lin, u);
-    sens_(ts, X, u, p, w, V);
+    if (force) {
+      const double *q0 = force->q + (size_t)n * nv, *q1 = q0 + nv, part = (ts - ta) / dt;
+      for (int e = 0; e < nv; e++) V[e] = q0[e] + part * (q1[e] - q0[e]);
+    } else sens_(ts, X, u, p, w, V);
     if (s == 0) {
       jac_(ts, X, u, p, w, J);
       memset(K, 0, block * sizeof(double));
@@ -107,7 +114,7 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
         const double *from = S + (size_t)J_COL[q] * nc;
         for (int c = 0; c < nc; c++) to[c] += J[q] * from[c];
       }
-      for (int q = 0; q < NV; q++) K[(size_t)V_ROW[q] * nc + V_COL[q]] += V[q];
+      for (int q = 0; q < nv; q++) K[(size_t)v_row[q] * nc + v_col[q]] += V[q];
       continue;
     }
     memcpy(R, S, block * sizeof(double));
@@ -117,7 +124,7 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
       if (a != 0) for (size_t c = 0; c < block; c++) R[c] += a * Kq[c];
     }
     memcpy(K, R, block * sizeof(double));
-    for (int q = 0; q < NV; q++) K[(size_t)V_ROW[q] * nc + V_COL[q]] += h * G * V[q];
+    for (int q = 0; q < nv; q++) K[(size_t)v_row[q] * nc + v_col[q]] += h * G * V[q];
     if (!LINEAR || *hfac != h) {
       jac_(ts, X, u, p, w, J);
       if (!factor_(h * G, J, M)) return 0;
@@ -135,13 +142,13 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
    info[1]: rejected. X: N x NX, SX: N x NX x nc or NULL (S0: NX x nc). */
 int integrate(int N, const double *t, const double *U, const int *lin, const double *p, const double *w, const double *x0,
               const double *S0, int nc, double rtol, const double *atol, int max_steps, double *X, double *SX,
-              double *info) {
+              double *info, const Forces *force) {
   double x[NX + 1], xn[NX + 1], k[STAGES * (NX + 1)], xs[STAGES * (NX + 1)], M[NM + 1];
   size_t block = (size_t)NX * nc;
   double *ks = NULL, *S = NULL;
   double want = 0, hfac = 0, hfac_s = 0, Ms[NM + 1];
   if (SX) {
-    ks = malloc((STAGES + 2) * (block + 1) * sizeof(double));
+    ks = malloc(((STAGES + 2) * (block + 1) + (force ? force->count : 0)) * sizeof(double));
     if (!ks) return -1;
     S = ks + (STAGES + 1) * block;
     memcpy(S, S0, block * sizeof(double));
@@ -168,7 +175,7 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
         if (want < 1e-12 * dt || ++failed > 60) { free(ks); return n + 1; }
         continue;
       }
-      if (SX && !sens_step(at, h, ta, dt, u0, u1, lin, p, w, xs, S, nc, ks, Ms, &hfac_s)) { free(ks); return n + 1; }
+      if (SX && !sens_step(at, h, ta, dt, u0, u1, lin, p, w, xs, S, nc, ks, Ms, &hfac_s, force, n)) { free(ks); return n + 1; }
       memcpy(x, xn, NX * sizeof(double));
       info[0]++;
       double grow = h * fmin(4, 0.9 * pow(fmax(err, 1e-6), -0.25));
@@ -183,9 +190,10 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
 }
 
 /* Outputs of one list (o = 0: the outputs, 1: the arguments of their delays) at N samples. D: N x ND values of the delays
-   and SD their sensitivities (N x ND x nc), NULL for list 1. Y: N x NYo, SY: N x NYo x nc or NULL. */
+   and SD their sensitivities (N x ND x nc), NULL for list 1. Y: N x NYo, SY: N x NYo x nc or NULL. `own`: the columns of SX
+   are sensitivities, so that the outputs' own slopes by the parameters count. */
 void observe(int o, int N, const double *t, const double *U, const double *p, const double *w, const double *X,
-             const double *SX, int nc, const double *D, const double *SD, double *Y, double *SY) {
+             const double *SX, int nc, const double *D, const double *SD, double *Y, double *SY, int own) {
   int ny = o ? ND : NY;
   for (int n = 0; n < N; n++) {
     const double *x = X + (size_t)n * NX, *u = U + (size_t)n * NU, *d = D ? D + (size_t)n * ND : 0;
@@ -199,7 +207,7 @@ void observe(int o, int N, const double *t, const double *U, const double *p, co
     memset(sy, 0, (size_t)ny * nc * sizeof(double));
     for (int q = 0; q < count; q++) {
       double *to = sy + (size_t)row[q] * nc;
-      if (kind[q] == 1) { to[col[q]] += V[q]; continue; }                                  /* by a parameter */
+      if (kind[q] == 1) { if (own) to[col[q]] += V[q]; continue; }                                  /* by a parameter */
       const double *from = kind[q] == 0 ? SX + ((size_t)n * NX + col[q]) * nc : SD + ((size_t)n * ND + col[q]) * nc;
       for (int c = 0; c < nc; c++) to[c] += V[q] * from[c];                                /* by a state or a delay */
     }

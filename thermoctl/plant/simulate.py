@@ -1,8 +1,9 @@
 """Simulation of a compiled plant on a recording's inputs: free run, sensitivities, and one fixed period at a time."""
 from __future__ import annotations
 
+import ctypes
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,10 @@ class Simulation:
     dy: np.ndarray | None = None
     steps: int = 0
     rejected: int = 0
+
+
+class _Forces(ctypes.Structure):
+    _fields_ = [("count", ctypes.c_int), ("row", ctypes.c_void_p), ("col", ctypes.c_void_p), ("q", ctypes.c_void_p)]
 
 
 def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -237,7 +242,7 @@ class Model:
                 else np.abs(x0) + 1e-3
             atol = rtol * scale
             failed = lib.integrate(n, _p(drive.t), _p(u), _p(drive.linear), _p(p), _p(width), _p(x0), _p(s0), nq, rtol,
-                                   _p(atol), MAX_STEPS, _p(x), _p(dx), _p(info))
+                                   _p(atol), MAX_STEPS, _p(x), _p(dx), _p(info), None)
             if failed:
                 at = max(failed - 1, 0)
                 raise SimulationError(f"{drive.name}: the simulation does not get beyond t = {drive.t[at]:.6g} s; states "
@@ -245,23 +250,47 @@ class Model:
         y, dy = self._observe(drive, u, p, width, x, dx, nq, sensitivities, buffers)
         return Simulation(drive.t, x, y, dx, dy, int(info[0]), int(info[1]))
 
+    def respond(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None, dx0: np.ndarray | None,
+                forces: Sequence[tuple[int, int]], q: np.ndarray, columns: int, rtol: float = 1e-5) -> np.ndarray:
+        """The outputs' first-order response (N, ny, columns) to forces on dx/dt that the plant does not have. Entry e of
+        `forces` is (state, column) and has its values, per second, in q[:, e] (N, entries)."""
+        lib, n, nx = self.code.library, len(drive.t), len(self.states)
+        p = self.vector(parameters, drive.name)
+        if drive.scale is None or drive.width is None:
+            self.prepare(drive, p)
+        assert drive.scale is not None and drive.width is not None
+        u = self._delayed_inputs(drive, p)
+        x0, _ = self.start(drive, p, dx0)
+        rows = np.array([f[0] for f in forces], np.intc)
+        cols = np.array([f[1] for f in forces], np.intc)
+        q = np.ascontiguousarray(q, float)
+        force = _Forces(len(rows), _p(rows), _p(cols), _p(q))
+        x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
+        dx = np.empty((n, nx, columns))
+        atol = rtol * drive.scale
+        if nx and lib.integrate(n, _p(drive.t), _p(u), _p(drive.linear), _p(p), _p(drive.width), _p(x0), _p(s0), columns, rtol,
+                                _p(atol), MAX_STEPS, _p(x), _p(dx), _p(info), ctypes.addressof(force)):
+            raise SimulationError(f"{drive.name}: the plant cannot be simulated")
+        _, dy = self._observe(drive, u, p, drive.width, x, dx, columns, True, None, 0)
+        assert dy is not None
+        return dy
+
     def _observe(self, drive: Drive, u: np.ndarray, p: np.ndarray, width: np.ndarray, x: np.ndarray,
                  dx: np.ndarray | None, nq: int, sensitivities: bool,
-                 buffers: dict[str, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+                 buffers: dict[str, np.ndarray] | None = None, own: int = 1) -> tuple[np.ndarray, np.ndarray | None]:
         lib, n, ny, nd = self.code.library, len(drive.t), len(self.outputs), len(self.code.output_delays)
         delayed = slopes = None
         if nd:
             g = np.empty((n, nd))
             dg = np.empty((n, nd, nq)) if sensitivities else None
-            lib.observe(1, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, None, None, _p(g), _p(dg))
-            delayed, slopes = self._shift(drive.t, g, dg, p)
+            lib.observe(1, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, None, None, _p(g), _p(dg), own)
+            delayed, slopes = self._shift(drive.t, g, dg, p, own)
         y = np.empty((n, ny))
         dy = _buffer(buffers, "dy", (n, ny, nq)) if sensitivities else None
-        lib.observe(0, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, _p(delayed), _p(slopes), _p(y), _p(dy))
+        lib.observe(0, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, _p(delayed), _p(slopes), _p(y), _p(dy), own)
         return y, dy
 
-    def _shift(self, t: np.ndarray, g: np.ndarray, dg: np.ndarray | None,
-               p: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    def _shift(self, t: np.ndarray, g: np.ndarray, dg: np.ndarray | None, p: np.ndarray, own: int) -> tuple[np.ndarray, np.ndarray | None]:
         """The arguments of delays, seconds earlier: cubic between samples (Catmull-Rom slopes), held before the start."""
         known = dict(zip(self.parameters, p, strict=True))
         out, dout = np.empty_like(g), None if dg is None else np.empty_like(dg)
@@ -278,7 +307,7 @@ class Model:
                 w = (s[:, None])
                 dout[:, j] = (1 - w) * dg[k, j] + w * dg[k + 1, j]
                 slope = np.where(t - td > t[0], (1 - s) * rate[k] + s * rate[k + 1], 0.0)
-                for c, q in enumerate(self.active):
+                for c, q in enumerate(self.active if own else ()):
                     if q in ex.names(seconds):
                         dout[:, j, c] -= slope * float(ex.evaluate(ex.derivative(seconds, q), known))
         return out, dout
