@@ -1,0 +1,388 @@
+"""One pass over the catalogue: how much of the residual each effect at each place could explain, without a refit.
+
+    r : whitened residual at the refit,  Q : orthonormal basis of what the plant's own parameters can absorb
+    d : first-order change of the outputs by an effect, whitened;   d' = d - Q Q^T d
+    gain = (d'^T r)^2 / (d'^T d')      (chi-square with one degree of freedom where nothing is missing; k for k amplitudes)
+
+d comes from the effect laid over the plant: its change of the slopes dx/dt along the fitted trajectory drives the linearised
+plant (`Model.respond`), its change of the outputs adds directly. New nodes are integrated alone along that trajectory.
+Rows are sums over blocks of samples (white noise stays white), so that thousands of directions fit in memory.
+"""
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import stats
+
+from thermoctl.diagnose.effects import Candidate, Rig, shape_grid
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Fit, Problem
+from thermoctl.plant.simulate import Drive, Simulation
+
+ROWS = 16_000               # rows of the screening, all recordings together
+EPSILON = 1e-4              # amplitude at which a direction is taken
+CHUNK = 96
+
+
+@dataclass
+class Direction:
+    """One candidate at one shape: how much it would explain and where its refit should start."""
+    candidate: Candidate
+    shape: dict[str, float]
+    gain: float
+    dims: int
+    start: dict[str, float]
+    vector: np.ndarray | None = None        # unit direction in projected space, for likeness between candidates
+    excited: float = 0.0                    # share of the direction that the plant's own parameters leave
+
+    @property
+    def log_p(self) -> float:
+        """log10 of the chance of such a gain where nothing is missing."""
+        return float(stats.chi2.logsf(self.gain, self.dims) / np.log(10))
+
+
+class Metric:
+    """Whitened, blocked rows of a fit: the residual, the basis of the plant's own parameters and how to bring more in."""
+
+    def __init__(self, fitted: Fit, drives: Sequence[Drive]):
+        self.fit, self.drives, self.model = fitted, list(drives), fitted.model
+        self.problem = Problem(self.model, drives, fitted.noise)
+        self.blocks = max(1, int(np.ceil(self.problem.samples / ROWS)))
+        self.runs: list[Simulation] = []
+        columns = []
+        for r, d in enumerate(self.drives):
+            run = self.model.run(d, fitted.values[r], fitted.dx0[r], sensitivities=True)
+            columns.append(run.dy)
+            self.runs.append(Simulation(run.t, run.x, run.y))
+        self.residual = np.concatenate([self.rows(r, d.y - run.y)
+                                        for r, (d, run) in enumerate(zip(self.drives, self.runs, strict=True))])
+        basis = np.zeros((len(self.residual), len(self.problem.unknowns)))
+        at = 0
+        for r, dy in enumerate(columns):
+            assert dy is not None
+            used = np.flatnonzero(self.problem.columns[r] >= 0)
+            block = self.rows(r, dy[:, :, used])
+            basis[at:at + len(block), self.problem.columns[r, used]] = block
+            at += len(block)
+        free = [k for k, (q, _) in enumerate(self.problem.unknowns) if q not in fitted.at_bound]
+        basis = basis[:, free]
+        size = np.linalg.norm(basis, axis=0)
+        keep = size > 1e-9
+        scaled = basis[:, keep] / size[keep]
+        u, s, _ = np.linalg.svd(scaled, full_matrices=False)
+        self.basis = u[:, s > 1e-6 * s[0]] if len(s) else u
+        self.residual = self.residual - self.basis @ (self.basis.T @ self.residual)
+
+    def rows(self, r: int, e: np.ndarray) -> np.ndarray:
+        """(N, outputs, ...) of recording r as whitened rows, summed over blocks."""
+        parts = []
+        for j in range(len(self.problem.noise)):
+            w = self.problem.whiten(r, j, e[:, j])
+            if r == 0 or len(w):
+                w = np.clip(w, -1e6, 1e6)
+            b = self.blocks
+            if b > 1 and len(w):
+                full = len(w) // b * b
+                w = w[:full].reshape(full // b, b, *w.shape[1:]).sum(axis=1) / np.sqrt(b)
+            parts.append(w)
+        return np.concatenate(parts)
+
+    def project(self, d: np.ndarray) -> np.ndarray:
+        """What the plant's own parameters leave of directions (rows, k)."""
+        return d - self.basis @ (self.basis.T @ d)
+
+
+# ------------------------------------------------------------------------------------------------- first-order changes
+
+class Trajectory:
+    """The signals of one recording at the fit, for evaluating changed equations."""
+
+    def __init__(self, metric: Metric, rig: Rig, r: int):
+        d, run = metric.drives[r], metric.runs[r]
+        self.drive, self.run = d, run
+        self.values: dict[str, np.ndarray | float] = {
+            **{c: _hold(rig.columns[r][c]) for c in rig.spare}, **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
+            **dict(zip(metric.model.parameters, map(float, metric.fit.values[r]), strict=True)),
+            **dict(zip(metric.model.states, run.x.T, strict=True)), "t": d.t, "pi": np.pi}
+        self.first = d.first
+
+    def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
+        return np.broadcast_to(np.asarray(ex.evaluate(e, {**self.values, **extra}), float), self.drive.t.shape)
+
+
+def _hold(column: np.ndarray) -> np.ndarray:
+    good = np.isfinite(column)
+    index = np.maximum.accumulate(np.where(good, np.arange(len(column)), -1))
+    return column[np.where(index < 0, int(np.argmax(good)), index)]
+
+
+def changes(base: Plant, extended: Plant, values: Mapping[str, float], at: Trajectory) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+    """What the extension changes along the trajectory: slopes dx/dt by state index, outputs by output index."""
+    extra: dict[str, np.ndarray | float] = {k: v for k, v in values.items()}
+    for n in extended.nodes.values():
+        if n.name not in base.nodes:
+            extra[n.name] = _new_node(extended, n.name, extra, at)
+    touched: dict[str, list[tuple[ex.Expr, float]]] = {}
+    for f in extended.flows.values():
+        old = base.flows.get(f.name)
+        if old is not None and old.rate is f.rate:
+            continue
+        for end, sign in ((f.source, -1.0), (f.target, 1.0)):
+            if end in base.nodes:
+                delta = touched.setdefault(end, [])     # type: ignore[arg-type]
+                delta.append((f.rate, sign))
+                if old is not None:
+                    delta.append((old.rate, -sign))
+    states = list(base.nodes)
+    slopes: dict[int, np.ndarray] = {}
+    for node, terms in touched.items():
+        total = np.zeros(at.drive.t.shape)
+        for e, sign in terms:
+            total += sign * at.value(e, extra)
+        slopes[states.index(node)] = total / at.value(base.nodes[node].storage, extra)
+    for node, n in base.nodes.items():
+        changed = extended.nodes[node]
+        if changed.storage is not n.storage:
+            net = np.zeros(at.drive.t.shape)
+            for f in base.flows.values():
+                if node in (f.source, f.target):
+                    net += (1.0 if f.target == node else -1.0) * at.value(f.rate, extra)
+            slopes[states.index(node)] = net / at.value(changed.storage, extra) - net / at.value(n.storage, extra)
+    outputs = {}
+    for j, (key, o) in enumerate(base.outputs.items()):
+        new = extended.outputs[key]
+        if new.value is not o.value:
+            outputs[j] = at.value(new.value, extra) - at.value(o.value, extra)
+    return slopes, outputs
+
+
+def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], at: Trajectory) -> np.ndarray:
+    """A new node alone, along the trajectory: dn/dt = a(t) - b(t) n, exact for held a and b."""
+    n = plant.nodes[node]
+    net: ex.Expr = ex.ZERO
+    for f in plant.flows.values():
+        if f.target == node:
+            net = ex.add(net, f.rate)
+        if f.source == node:
+            net = ex.add(net, ex.neg(f.rate))
+    first = {**{k: float(np.asarray(v).flat[0]) for k, v in at.values.items()}, **{k: float(np.asarray(v).flat[0]) for k, v in extra.items()}}
+    start = float(ex.evaluate(n.initial, first, lambda key: at.first[key]))
+    t = at.drive.t
+    storage = at.value(n.storage, extra)
+    b = -at.value(ex.derivative(net, node), {**extra, node: start}) / storage
+    a = at.value(net, {**extra, node: 0.0}) / storage
+    if not a.any() and not b.any():
+        return np.full(t.shape, start)
+    h = np.diff(t)
+    mid_a, mid_b = 0.5 * (a[1:] + a[:-1]), np.maximum(0.5 * (b[1:] + b[:-1]), 0.0)
+    decay = np.exp(-mid_b * h)
+    gain = np.where(mid_b * h > 1e-9, -np.expm1(-mid_b * h) / np.maximum(mid_b, 1e-300), h) * mid_a
+    out = np.empty(len(t))
+    value = out[0] = start
+    for k, (c, g) in enumerate(zip(decay.tolist(), gain.tolist(), strict=True), 1):
+        value = value * c + g
+        out[k] = value
+    return out
+
+
+# ---------------------------------------------------------------------------------------------------------- screening
+
+@dataclass
+class _Column:
+    """A direction to be built: per recording its forces and its changes of outputs."""
+    item: tuple
+    forces: list[dict[int, np.ndarray]] = field(default_factory=list)
+    outputs: list[dict[int, np.ndarray]] = field(default_factory=list)
+
+
+def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Sequence[_Column], np.ndarray]]:
+    """Whitened rows (rows, k) of columns, a chunk at a time."""
+    for at in range(0, len(columns), CHUNK):
+        part = columns[at:at + CHUNK]
+        blocks = []
+        for r, d in enumerate(metric.drives):
+            forces, values = [], []
+            for c, column in enumerate(part):
+                for state, q in column.forces[r].items():
+                    forces.append((state, c))
+                    values.append(q)
+            shape = (len(d.t), len(metric.model.outputs), len(part))
+            if forces:
+                q = np.nan_to_num(np.stack(values, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
+                dy = metric.model.respond(d, metric.fit.values[r], metric.fit.dx0[r], forces, q, len(part))
+            else:
+                dy = np.zeros(shape)
+            for c, column in enumerate(part):
+                for j, delta in column.outputs[r].items():
+                    dy[:, j, c] += np.nan_to_num(delta)
+            blocks.append(metric.rows(r, dy))
+        yield part, np.concatenate(blocks)
+
+
+def screen(metric: Metric, rig: Rig, found: Sequence[Candidate], draws: np.ndarray | None = None,
+           progress: Callable[[float], None] | None = None) -> tuple[list[Direction], np.ndarray | None]:
+    """Every candidate's best direction, best first. With `draws` (rows, B) of standard normal noise also, per draw, the
+    smallest log10 p that any candidate would have shown by chance (B,)."""
+    at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
+    columns: list[_Column] = []
+    for c in found:
+        columns += _columns(c, metric, at)
+    best: dict[int, Direction] = {}
+    chance = None if draws is None else np.zeros(draws.shape[1])
+    if draws is not None:
+        draws = metric.project(draws)
+    pending: dict[tuple, list[tuple[_Column, np.ndarray, float]]] = {}
+    done = 0
+    for part, rows in directions(metric, columns):
+        full = np.linalg.norm(rows, axis=0)
+        rows = metric.project(rows)
+        for k, column in enumerate(part):
+            candidate, group, _, count = column.item
+            entries = pending.setdefault((id(candidate), group), [])
+            entries.append((column, rows[:, k].copy(), float(full[k])))
+            if len(entries) < count:
+                continue
+            del pending[id(candidate), group]
+            chance = _score(candidate, entries, metric, best, draws, chance)
+        done += len(part)
+        if progress:
+            progress(done / max(len(columns), 1))
+    return sorted(best.values(), key=lambda d: d.log_p), chance
+
+
+def _columns(c: Candidate, metric: Metric, at: Sequence[Trajectory]) -> list[_Column]:
+    """The columns that one candidate needs. item = (candidate, group, (shape, dim), columns in the group)."""
+    effect = c.effect
+    grids = {key: shape_grid(kind, c, metric.runs) for key, kind in effect.shapes.items() if kind not in ("phases", "windows")}
+    windowed = "windows" in effect.shapes.values()
+    if windowed:
+        duration = max(float(d.t[-1]) for d in metric.drives)
+        grids["window"] = [{"start": float(v), "end": 10 * duration} for v in np.linspace(0, duration, 25)[:-1]]
+    phases = [{"phase": 0.0}, {"phase": float(np.pi / 2)}] if "phases" in effect.shapes.values() else [{}]
+    shapes = [{k: v for part in combination for k, v in part.items()} for combination in itertools.product(*grids.values())] or [{}]
+    amplitudes = [p for p in effect.parameters if p.trial is not None]
+    dims = effect.dims if amplitudes else ((1.0,),)
+    out = []
+    for g, shape in enumerate(shapes):
+        group: tuple = ("all",) if windowed else (g,)
+        count = len(shapes) if windowed else len(dims) * len(phases)
+        for dim in dims:
+            for phase in phases:
+                values = parameter_values(c, {**shape, **phase}, [EPSILON * v for v in dim])
+                column = _Column((c, group, ({**shape, **phase}, dim), count))
+                extended = c.extend(values)
+                own = {c.own(k): v for k, v in values.items()}
+                for trajectory in at:
+                    try:
+                        slopes, outputs = changes(c.rig.plant, extended, own, trajectory)
+                    except (KeyError, ex.ExpressionError):
+                        slopes, outputs = {}, {}
+                    scale = 1 / EPSILON if amplitudes else 1.0
+                    column.forces.append({k: v * scale for k, v in slopes.items() if np.any(v)})
+                    column.outputs.append({k: v * scale for k, v in outputs.items() if np.any(v)})
+                out.append(column)
+    if not any(any(f) or any(o) for column in out for f, o in zip(column.forces, column.outputs, strict=True)):
+        return []
+    return out
+
+
+def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float]) -> dict[str, float]:
+    """The effect's parameters at amplitudes s and a shape."""
+    known = {"s": s[0] if len(s) else 0.0, **{f"s{k + 1}": v for k, v in enumerate(s) if k}, **shape,
+             "first_air": c.rig.drives[0].first.get(c.rig.air or "", 0.0)}
+    out = {}
+    for p in c.effect.parameters:
+        if p.shape:
+            out[p.name] = float(shape.get(p.shape, p.null))
+        elif p.trial is not None:
+            value = float(ex.evaluate(p.trial, known))
+            out[p.name] = value if np.isfinite(value) else p.null
+        else:
+            out[p.name] = p.null
+    return out
+
+
+def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metric: Metric, best: dict[int, Direction],
+           draws: np.ndarray | None, chance: np.ndarray | None) -> np.ndarray | None:
+    rows = np.stack([e[1] for e in entries], axis=1)
+    full = np.array([e[2] for e in entries])
+    shape, dim = entries[0][0].item[2]
+    r = metric.residual
+    g, m = rows.T @ r, rows.T @ rows
+    amplitudes = [p for p in c.effect.parameters if p.trial is not None]
+    windowed = "windows" in c.effect.shapes.values()
+    noise = None if draws is None else rows.T @ draws
+    if windowed:
+        edges = [e[0].item[2][0]["start"] for e in entries]
+        ends = [*edges[1:], 10 * edges[-1]]
+        gains, at = -1.0, (0, 0, 0.0)
+        for a in range(len(edges)):
+            for b in range(a + 1, len(edges) + 1):
+                if b < len(edges):
+                    top, bottom = g[a] - g[b], m[a, a] + m[b, b] - 2 * m[a, b]
+                    z = None if noise is None else noise[a] - noise[b]
+                else:
+                    top, bottom = g[a], m[a, a]
+                    z = None if noise is None else noise[a]
+                if bottom <= 1e-12 * max(full) ** 2:
+                    continue
+                if top * top / bottom > gains:
+                    gains, at = top * top / bottom, (a, b, top / bottom)
+                if chance is not None and z is not None:
+                    chance = np.minimum(chance, stats.chi2.logsf(z * z / bottom, 1) / np.log(10))
+        if gains < 0:
+            return chance
+        a, b, amplitude = at
+        shape = {"start": edges[a], "end": edges[b] if b < len(edges) else max(ends)}
+        vector = rows[:, a] - (rows[:, b] if b < len(edges) else 0)
+        start = parameter_values(c, shape, [amplitude])
+        _keep(best, c, shape, gains, 1, start, vector, np.linalg.norm(vector) / max(full[a], 1e-300))
+        return chance
+    left = np.sqrt(np.maximum(np.diag(m), 0)) / np.maximum(full, 1e-300)
+    useful = (left > 1e-4) & (full > 1e-9)
+    if not useful.any():
+        return chance
+    scale = np.where(useful, np.sqrt(np.maximum(np.diag(m), 1e-300)), 1.0)
+    if noise is not None and chance is not None:
+        sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
+        inverse = np.linalg.pinv(sub, rcond=1e-8, hermitian=True)
+        z = noise[useful] / scale[useful, None]
+        chance = np.minimum(chance, stats.chi2.logsf(np.einsum("kb,kl,lb->b", z, inverse, z), int(useful.sum())) / np.log(10))
+    sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
+    coefficient = np.zeros(len(g))
+    coefficient[useful] = np.linalg.pinv(sub, rcond=1e-8, hermitian=True) @ (g[useful] / scale[useful]) / scale[useful]
+    gain = float(g @ coefficient)
+    if len(g) == 1:
+        p = amplitudes[0] if amplitudes else None
+        allowed = coefficient[0] > 0 if p is None else _allowed(p, coefficient[0])
+        if not allowed:
+            gain = 0.0
+    if "phases" in c.effect.shapes.values():
+        s = [float(np.hypot(*coefficient))]
+        shape = {**{k: v for k, v in shape.items() if k != "phase"}, "phase": float(np.arctan2(coefficient[1], coefficient[0]))}
+    elif amplitudes:
+        s = list(np.array([e[0].item[2][1] for e in entries]).T @ coefficient)
+    else:
+        s = [1.0]
+        factor = float(np.clip(coefficient[0], 0.1, 5.0))
+        shape = {k: v * factor if k == "tau" else v for k, v in shape.items()}
+    _keep(best, c, shape, gain, int(useful.sum()), parameter_values(c, shape, s), rows @ coefficient, float(left[useful].max()))
+    return chance
+
+
+def _allowed(p, coefficient: float) -> bool:
+    at = float(ex.evaluate(p.trial, {"s": coefficient, "tau": 1.0, "first_air": 0.0}))
+    return p.low - 1e-12 <= at <= p.high + 1e-12 or (p.low < p.null < p.high) or \
+        (coefficient > 0 if p.low >= p.null else coefficient < 0 if p.high <= p.null else True)
+
+
+def _keep(best: dict[int, Direction], c: Candidate, shape: dict[str, float], gain: float, dims: int, start: dict[str, float],
+          vector: np.ndarray, excited: float) -> None:
+    old = best.get(id(c))
+    if old is None or gain > old.gain:
+        size = float(np.linalg.norm(vector))
+        best[id(c)] = Direction(c, dict(shape), gain, dims, start, (vector / size).astype(np.float32) if size > 0 else None, excited)
