@@ -140,9 +140,9 @@ class LibraryPort:
 
     def __init__(self, interface: str, channel: str, bitrate: int, ids: tuple[int, ...]) -> None:
         filters = [{"can_id": i, "can_mask": 0x1FFF_FFFF if i > 0x7FF else 0x7FF, "extended": i > 0x7FF} for i in ids]
+        self._bus: Any
         try:
-            self._bus: Any = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=filters,
-                                     **({"ignore_rx_error_frames": False} if interface == "socketcan" else {}))
+            self._bus = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=filters)
         except (can.CanError, OSError, ValueError, ImportError) as e:
             raise HardwareError(f"{interface}:{channel}: cannot be opened ({e}); is the interface up (ip link set "
                                 f"{channel} up type can bitrate {bitrate})?") from None

@@ -1,0 +1,171 @@
+"""The simulated rig: a plant file as hardware, deterministic, at any speed.
+
+The plant advances in periods of the loop with its drive held. A sensor reads the plant's output plus its noise, rounded to
+its resolution (both from the plant file), at its own rate: the encoders every period, the slow ones every
+`sensor_period_s`. The same seed and the same commands at the same times give the same bits.
+
+The plant that plays the hardware may differ from the one that the compensator was built from (`hal.truth`): that is how a
+left-out effect is shown. Outputs play the role of their own name, or the one that `hal.roles` gives them.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hal.backend import (
+    AMP_DISABLED,
+    AMP_ENABLED,
+    ERROR,
+    OK,
+    ROLE,
+    ROLES,
+    STALE,
+    Sample,
+)
+from thermoctl.plant import load
+from thermoctl.yamlfile import InputError, suggest
+
+MAX_CATCH_UP = 1000         # periods in one read; a clock that jumps further (suspend) moves the plant's time instead
+EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
+
+
+class PlantRig:
+    """A plant that lives: `step` advances it, `sense` reads a sensor. Shared by the simulated back end and the virtual
+    rig at the wire."""
+
+    def __init__(self, path: str | Path, period_s: float, drive_input: str, inputs: Mapping[str, float],
+                 roles: Mapping[str, str], seed: int) -> None:
+        """inputs: constants for the plant's other inputs; roles: output -> role where they differ in name.
+        Raises InputError where the plant and these do not fit."""
+        plant = load(path)
+        model = plant.compile(())
+        if drive_input not in model.inputs:
+            raise InputError(f"{path}: no input '{drive_input}' to drive{suggest(drive_input, model.inputs)}; "
+                             f"hal.drive_input must be one of {', '.join(model.inputs)}")
+        for name in inputs:
+            if name not in model.inputs or name == drive_input:
+                raise InputError(f"{path}: hal.inputs: the plant has no free input '{name}'{suggest(name, model.inputs)}")
+        missing = [n for n in model.inputs if n not in inputs and n != drive_input]
+        if missing:
+            raise InputError(f"{path}: hal.inputs must give {', '.join(missing)} a value")
+        self.u = np.array([inputs.get(n, 0.0) for n in model.inputs])
+        self._drive = model.inputs.index(drive_input)
+        self.stepper = model.stepper(period_s, self.u)
+        self._random = np.random.default_rng(seed)
+        self.y = np.array(self.stepper.step(self.u))
+        self.index: dict[str, int] = {}
+        for i, name in enumerate(model.outputs):
+            role = roles.get(name, name)
+            if role in ROLES:
+                self.index[role] = i
+            elif name in roles:
+                raise InputError(f"{path}: hal.roles: '{role}' is no role{suggest(role, ROLES)}")
+        for name in roles:
+            if name not in model.outputs:
+                raise InputError(f"{path}: hal.roles: the plant has no output '{name}'{suggest(name, model.outputs)}")
+        if "position_um" not in self.index:
+            raise InputError(f"{path}: no output plays position_um; name one in hal.roles "
+                             f"(outputs: {', '.join(model.outputs)})")
+        outputs = [plant.outputs[n] for n in model.outputs]
+        self._noise = [o.noise or 0.0 for o in outputs]
+        self._resolution = [o.resolution or 0.0 for o in outputs]
+
+    def step(self, drive: float) -> None:
+        """Advance one period with `drive` held."""
+        self.u[self._drive] = drive
+        self.y = self.stepper.step(self.u)
+
+    def sense(self, role: str) -> float:
+        """What the sensor in this role reads now: output + noise, rounded to its resolution."""
+        return self._sense(self.index[role])
+
+    def _sense(self, i: int) -> float:
+        value = self.y[i]
+        if self._noise[i]:
+            value += self._noise[i] * self._random.standard_normal()
+        step = self._resolution[i]
+        return round(value / step) * step if step else value
+
+
+def make_rig(settings: Any) -> PlantRig:
+    """The plant that `settings.hal` names as the hardware's truth. Paths are relative to the config file."""
+    hal = settings.hal
+    return PlantRig(Path(settings.path).parent / (hal.truth or hal.plant), settings.loop.period_s, hal.drive_input,
+                    hal.inputs, hal.roles, hal.seed)
+
+
+def simulated_backend(settings: Any) -> SimulatedBackend:
+    """Back end `simulated` of `settings`."""
+    return SimulatedBackend(make_rig(settings), settings.loop.period_s, settings.hal.sensor_period_s)
+
+
+class SimulatedBackend:
+    """`hal.backend.Backend` over a PlantRig."""
+
+    def __init__(self, rig: PlantRig, period_s: float, sensor_period_s: float) -> None:
+        self.rig, self.period_s = rig, period_s
+        self.sample = Sample()
+        self._every = max(1, round(sensor_period_s / period_s))
+        self._fast = [(ROLE[r], i) for r, i in rig.index.items() if r in EVERY_PERIOD]
+        self._slow = [(ROLE[r], i) for r, i in rig.index.items() if r not in EVERY_PERIOD]
+        self._steps, self._start_s, self._drive, self._enabled = 0, math.nan, 0.0, False
+        self._shown = -1
+
+    def open(self) -> None:
+        """Nothing to open; channels wait for the first read."""
+        self.sample.status[list(ROLE[r] for r in self.rig.index)] = STALE
+
+    def read(self, now_s: float) -> Sample:
+        """Advance the plant to `now_s` with the last command held, then read the sensors that are due."""
+        sample, rig = self.sample, self.rig
+        sample.fresh[:] = False
+        if math.isnan(self._start_s):
+            self._start_s = now_s
+        due = round((now_s - self._start_s) / self.period_s)
+        if due - self._steps > MAX_CATCH_UP or due < self._steps:
+            self._start_s = now_s - (self._steps + 1) * self.period_s
+            due = self._steps + 1
+        for _ in range(due - self._steps):
+            rig.step(self._drive)
+        slow_due = self._shown < 0 or due // self._every > self._shown // self._every
+        self._steps = self._shown = due
+        for channels, wanted in ((self._fast, True), (self._slow, slow_due)):
+            if wanted:
+                for role, i in channels:
+                    value = rig._sense(i)
+                    sample.fresh[role] = True
+                    if math.isfinite(value):
+                        sample.value[role], sample.time_s[role], sample.status[role] = value, now_s, OK
+                    else:
+                        sample.status[role] = ERROR
+        role = ROLE["amplifier_state"]
+        sample.value[role] = AMP_ENABLED if self._enabled else AMP_DISABLED
+        fault = ROLE["amplifier_fault"]
+        sample.value[fault] = 0.0
+        for role in (role, fault):
+            sample.time_s[role], sample.fresh[role], sample.status[role] = now_s, True, OK
+        return sample
+
+    def write(self, drive: float, enable: bool) -> None:
+        """Hold `drive` from now on; not enabled or not finite: zero."""
+        self._enabled = bool(enable and math.isfinite(drive))
+        self._drive = float(drive) if self._enabled else 0.0
+
+    def close(self) -> None:
+        """The drive goes to zero."""
+        self.write(0.0, False)
+
+    def problem(self, role: str) -> str:
+        """Why a simulated channel is not OK."""
+        status = self.sample.status[ROLE[role]]
+        if status == OK:
+            return ""
+        return f"{role}: the plant's output is not finite" if status == ERROR else f"{role}: not an output of the plant"
+
+    def counters(self) -> dict[str, int]:
+        """Periods simulated."""
+        return {"simulated.periods": self._steps}
