@@ -42,7 +42,13 @@ class Direction:
     @property
     def log_p(self) -> float:
         """log10 of the chance of such a gain where nothing is missing."""
-        return float(stats.chi2.logsf(self.gain, self.dims) / np.log(10))
+        return log_p(self.gain, self.dims)
+
+
+def log_p(gain: float, dims: int) -> float:
+    """log10 of the chi-square tail, also where that is too small for a float."""
+    value = float(stats.chi2.logsf(gain, dims) / np.log(10))
+    return value if np.isfinite(value) else -(gain - (dims - 2) * np.log(max(gain, 1.0))) / (2 * np.log(10))
 
 
 class Metric:
@@ -285,7 +291,7 @@ def _columns(c: Candidate, metric: Metric, at: Sequence[Trajectory]) -> list[_Co
                     column.forces.append({k: v * scale for k, v in slopes.items() if np.any(v)})
                     column.outputs.append({k: v * scale for k, v in outputs.items() if np.any(v)})
                 out.append(column)
-    if not any(any(f) or any(o) for column in out for f, o in zip(column.forces, column.outputs, strict=True)):
+    if not any(f or o for column in out for f, o in zip(column.forces, column.outputs, strict=True)):
         return []
     return out
 

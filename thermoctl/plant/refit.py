@@ -127,6 +127,7 @@ class Problem:
                 self.sigma0.append(model.plant.nodes[s].initial_sigma or 1.0)
         self.belief = self.start({})
         self.buffers: dict[str, np.ndarray] = {}
+        self.huber = np.full(len(self.noise), HUBER)
         self.rows = []
         for d in drives:
             dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
@@ -181,6 +182,18 @@ class Problem:
             part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
         return part / scale.reshape(shape)
 
+    def set_outlier_limits(self, residuals: Sequence[np.ndarray]) -> bool:
+        """Huber's limit of each output from the spread of its residuals: what a plant that lacks physics misses is no
+        outlier. True where a limit changed by more than a half."""
+        new = np.full(len(self.noise), HUBER)
+        for j in range(len(self.noise)):
+            w = np.concatenate([self.whiten(r, j, e[:, j]) for r, e in enumerate(residuals)])
+            if len(w):
+                new[j] = HUBER * max(1.0, 1.4826 * float(np.median(np.abs(w))))
+        changed = bool(np.any((new > 1.5 * self.huber) | (new < self.huber / 1.5)))
+        self.huber = new
+        return changed
+
     def evaluate(self, z: np.ndarray, jacobian: bool) -> tuple[float, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Cost, gradient/2 and Gauss-Newton matrix by the unknowns, raw residuals. Raises SimulationError."""
         values, dx0 = self.unpack(z)
@@ -204,12 +217,13 @@ class Problem:
                     continue
                 w = self.whiten(r, j, e[:, j])
                 a = np.abs(w)
-                cost += float(np.sum(np.where(a <= HUBER, w * w, 2 * HUBER * a - HUBER ** 2)))
+                limit = self.huber[j]
+                cost += float(np.sum(np.where(a <= limit, w * w, 2 * limit * a - limit ** 2)))
                 if not jacobian or run.dy is None:
                     continue
                 jac = self.whiten(r, j, run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used])
-                if a.max(initial=0.0) > HUBER:
-                    root = np.sqrt(np.where(a <= HUBER, 1.0, HUBER / np.maximum(a, HUBER)))
+                if a.max(initial=0.0) > limit:
+                    root = np.sqrt(np.where(a <= limit, 1.0, limit / np.maximum(a, limit)))
                     jac *= root[:, None]
                     w = w * root
                 part_gradient += jac.T @ w
@@ -252,7 +266,12 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
     failure: SimulationError | None = None
     for z in starts:
         try:
-            found = _descend(problem, z, iterations, tolerance)
+            problem.set_outlier_limits(problem.evaluate(z, False)[3])
+            for _ in range(4):
+                found = _descend(problem, z, iterations, tolerance)
+                z = found.z
+                if not problem.set_outlier_limits(found.residuals):
+                    break
         except SimulationError as e:
             failure = failure or e
             continue
