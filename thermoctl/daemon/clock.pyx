@@ -1,0 +1,44 @@
+# cython: language_level=3, cdivision=True
+"""The clock of the loop: CLOCK_MONOTONIC in nanoseconds, and sleeping until a point of it.
+
+Absolute clock_nanosleep keeps the phase whatever a tick took, and is the best of the ways to wait that were measured
+(docs/why-cython.md). Both functions release the interpreter's lock while they wait.
+"""
+from libc.stdint cimport int64_t
+from posix.time cimport CLOCK_MONOTONIC, clock_gettime, timespec
+
+cdef extern from "<time.h>" nogil:
+    int clock_nanosleep(int clock, int flags, const timespec *request, timespec *remain)
+    enum: TIMER_ABSTIME
+
+
+cdef inline int64_t _now() noexcept nogil:
+    cdef timespec t
+    clock_gettime(CLOCK_MONOTONIC, &t)
+    return <int64_t>t.tv_sec * 1000000000 + t.tv_nsec
+
+
+def now_ns() -> int:
+    """CLOCK_MONOTONIC, ns: the clock of `time.monotonic()` and of every process of the daemon."""
+    return _now()
+
+
+def sleep_until(int64_t deadline_ns, int64_t spin_ns=0) -> int:
+    """Sleep until `deadline_ns`, burning the last `spin_ns` of it; returns the time after, ns.
+
+    Returns early only when a signal came, so that Python's handlers run.
+    """
+    cdef timespec t
+    cdef int64_t until = deadline_ns - spin_ns, now
+    with nogil:
+        now = _now()
+        if now < until:
+            t.tv_sec = until // 1000000000
+            t.tv_nsec = until % 1000000000
+            if clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL) != 0:
+                with gil:
+                    return _now()
+        now = _now()
+        while now < deadline_ns:
+            now = _now()
+    return now

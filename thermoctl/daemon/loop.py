@@ -1,0 +1,199 @@
+"""The loop: one tick a period, alone in its process.
+
+    sample -> estimate -> compensate -> control -> protect -> actuate -> publish
+
+Nothing in a tick waits, parses, logs or touches a disk. A tick that takes too long costs the ticks it covered: they are
+skipped, counted and published, and the phase is kept (policy `skip`). Real-time measures (priority, locked memory,
+processor, latency request) are asked for one by one; what the system refuses is one warning each, never a crash.
+"""
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import signal
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from thermoctl.control import arming, faults
+from thermoctl.control.law import Law
+from thermoctl.control.model import CompensatorModel, Parameters
+from thermoctl.daemon.clock import now_ns, sleep_until
+from thermoctl.daemon.ring import pack_readings
+from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
+from thermoctl.signals import INDEX, SIGNALS
+
+RELOAD = float(len(arming.COMMANDS))
+"""The mailbox command that applies the parameter block; the others are arming's."""
+STATE_EVERY = 1000                     # ticks between two snapshots of the law's state
+_CHANNELS, _OUTPUTS = INDEX["position_raw_um"], INDEX["state"]
+_AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
+
+
+class Rig:
+    """Back end, law and record of one rig, and the stages of its tick.
+
+    backend: opened; publish: called with the finished row (a ring's `write`, a list's `append`); mailbox, parameters,
+    state: as in shared.Shared, or None where nobody commands (simulation passes its own).
+    """
+
+    def __init__(self, backend: Any, model: CompensatorModel, parameters: Parameters, period_s: float,
+                 publish: Callable[[np.ndarray], Any], mailbox: Any = None, parameter_box: Any = None,
+                 state_box: Any = None, start_s: float = 0.0):
+        self.backend, self.publish_row, self.mailbox = backend, publish, mailbox
+        self.parameter_box, self.state_box, self.start_s = parameter_box, state_box, start_s
+        self.law = Law(model, parameters, period_s)
+        self.reading: Any = None
+        self.row = np.zeros(len(SIGNALS))
+        self.slips = self.generation = self.external = self.write_failed = 0
+        self.command, self.value = arming.NONE, 0.0
+        self.wall_s: Callable[[], float] = time.time
+
+    def tick(self, now_s: float, dt_s: float, lateness_us: float = 0.0,
+             clock_ns: Callable[[], int] = now_ns) -> None:
+        """One tick that began at `now_s`, `dt_s` after the one before; clock_ns times it."""
+        begin = clock_ns()
+        self.sample(now_s)
+        self.law.estimate(dt_s)
+        self.law.compensate()
+        self.law.control(self.command, self.value)
+        self.law.protect(self.command, self.external)
+        self.actuate()
+        self.publish(now_s, dt_s, lateness_us, (clock_ns() - begin) * 1e-3)
+
+    def sample(self, now_s: float) -> None:
+        """New readings into the law's arrays, and the next command."""
+        reading = self.backend.read(now_s)
+        if reading is not self.reading:                       # the same object every time, by contract
+            self.reading = reading
+            self.law.bind(reading.value, reading.fresh.view(np.uint8), reading.status)
+        self.command, self.value, self.external = arming.NONE, 0.0, self.write_failed
+        if self.mailbox is not None:
+            message = self.mailbox.take()
+            if message is not None:
+                self._obey(*message)
+
+    def _obey(self, kind: float, value: float) -> None:
+        if kind == RELOAD:
+            numbers = self.parameter_box.get()
+            if numbers is not None:
+                self.law.configure(Parameters.unpack(numbers))
+                self.generation += 1
+                self._keep_state()
+        elif kind < RELOAD:
+            self.command, self.value = int(kind), value
+
+    def actuate(self) -> None:
+        """The amplifier's command. A failed write is a fault of the next tick."""
+        try:
+            self.backend.write(self.law.drive, self.law.enable > 0.0)
+            self.write_failed = 0
+        except OSError:
+            self.write_failed = _AMPLIFIER_WRITE
+
+    def publish(self, now_s: float, dt_s: float, lateness_us: float, busy_us: float) -> None:
+        """The finished row, and now and then the law's state (where a replay may start)."""
+        row, reading, law = self.row, self.reading, self.law
+        fresh_bits, status_bits = pack_readings(reading.fresh.view(np.uint8), reading.status)
+        row[:_CHANNELS] = (now_s - self.start_s, self.wall_s(), law.tick, lateness_us, busy_us, self.slips,
+                           self.generation, dt_s, self.command, self.value, self.external)
+        row[_CHANNELS:_OUTPUTS - 2] = reading.value
+        row[_OUTPUTS - 2], row[_OUTPUTS - 1] = fresh_bits, status_bits
+        row[_OUTPUTS:] = law.outputs
+        self.publish_row(row)
+        if law.tick % STATE_EVERY == 1:
+            self._keep_state()
+
+    def _keep_state(self) -> None:
+        if self.state_box is not None:
+            self.state_box.put(np.concatenate(((self.law.tick, self.generation), self.law.snapshot())))
+
+
+def run_loop(settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], bool], warm_up_ticks: int = 100) -> None:
+    """Tick until `stopping()`; the caller has opened the back end and disables the amplifier afterwards."""
+    period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
+    shared.counters[START_S], shared.counters[LOOP_PID] = rig.start_s, os.getpid()
+    add_lateness, add_busy, busy = shared.lateness.add, shared.busy.add, INDEX["busy_us"]
+    before = now_ns()
+    deadline = before + period_ns
+    while not stopping():
+        now = sleep_until(deadline, spin_ns)
+        if now < deadline:                                     # a signal woke us: its handler has run
+            continue
+        lateness_us = (now - deadline) * 1e-3
+        rig.tick(now * 1e-9, (now - before) * 1e-9, lateness_us)
+        if rig.law.tick > warm_up_ticks:
+            add_lateness(lateness_us)
+            add_busy(rig.row[busy])
+        before = now
+        deadline += period_ns
+        late_ns = now_ns() - deadline
+        if late_ns > 0:                                        # skip, and keep the phase
+            skipped = late_ns // period_ns + (1 if late_ns % period_ns else 0)
+            rig.slips += skipped
+            deadline += skipped * period_ns
+
+
+def run_reference(settings: Any, shared: Shared, stopping: Callable[[], bool]) -> None:
+    """An idle loop of the same clock, priority and processor, half a period apart: what the machine gives at best."""
+    period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
+    deadline = now_ns() // period_ns * period_ns + period_ns + period_ns // 2
+    while not stopping():
+        now = sleep_until(deadline, spin_ns)
+        if now >= deadline:
+            shared.reference.add((now - deadline) * 1e-3)
+        while deadline <= now:
+            deadline += period_ns
+
+
+def become_real_time(settings: Any, warn: Callable[[str], None]) -> list[Any]:
+    """Priority, processor, locked memory, latency request and frozen collector, as far as the system allows.
+
+    Returns what must be kept open (the latency request lasts as long as its file). Each refusal is one `warn` line.
+    """
+    kept: list[Any] = []
+    loop = settings.loop
+
+    def attempt(action: Callable[[], Any], what: str, advice: str) -> None:
+        try:
+            action()
+        except (OSError, PermissionError, ValueError, AttributeError) as e:
+            warn(f"{what} refused ({getattr(e, 'strerror', None) or e}): {advice}")
+
+    if loop.cpu is not None and loop.cpu >= 0:
+        attempt(lambda: os.sched_setaffinity(0, {loop.cpu}), f"processor {loop.cpu}",
+                "the loop runs where the scheduler puts it; set loop.cpu to an allowed processor")
+    if loop.priority > 0:
+        attempt(lambda: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(loop.priority)),
+                f"real-time priority {loop.priority}",
+                "expect late ticks; run under the systemd unit or allow it (LimitRTPRIO, CAP_SYS_NICE)")
+    attempt(_lock_memory, "locked memory", "page faults may delay ticks; raise LimitMEMLOCK")
+
+    def hold_latency() -> None:
+        file = os.open("/dev/cpu_dma_latency", os.O_WRONLY)
+        os.write(file, (0).to_bytes(4, "little"))
+        kept.append(file)
+
+    attempt(hold_latency, "/dev/cpu_dma_latency",
+            "deep idle states may double the wake-up latency; give the service's group write access (udev rule)")
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return kept
+
+
+def _lock_memory() -> None:
+    current_and_future = 3
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(current_and_future) != 0:
+        error = ctypes.get_errno()
+        raise OSError(error, os.strerror(error))
+
+
+def die_with_parent(signal_number: int = signal.SIGTERM) -> None:
+    """Ask the kernel to send this process a signal when its parent ends, however it ends."""
+    set_parent_death_signal = 1
+    ctypes.CDLL(None, use_errno=True).prctl(set_parent_death_signal, signal_number, 0, 0, 0)

@@ -1,0 +1,115 @@
+"""The recorder process: moves the ring's rows into a recording, ten times a second.
+
+It is never waited for. When it falls behind by more than the ring holds, the lost ticks are counted, and `status` shows
+them.
+A recording holds the effective configuration, the model, the law's parameters and a state of the law to start a replay
+from; a reload starts a new file, so that one file has one set of parameters.
+"""
+from __future__ import annotations
+
+import base64
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from thermoctl.control.model import CompensatorModel, Parameters
+from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared
+from thermoctl.signals import INDEX
+
+INTERVAL_S = 0.1
+_TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
+_ARRAYS = ("A_minus_I", "B", "C", "gain", "b1", "b2")
+_NUMBERS = ("kind", "period_s", "R_w", "R_v", "f1", "expansion_period_s", "sensors", "b_air", "offset_um",
+            "air_filter_s")
+
+
+def encode(array: np.ndarray) -> str:
+    """A float64 array as text, exact."""
+    return base64.b64encode(np.ascontiguousarray(array, dtype=np.float64).tobytes()).decode()
+
+
+def decode(text: str) -> np.ndarray:
+    """The reverse of `encode` (flat)."""
+    return np.frombuffer(base64.b64decode(text, validate=True))
+
+
+def law_metadata(model: CompensatorModel, parameters: Parameters, period_s: float, generation: int, tick: int,
+                 state: np.ndarray | None) -> str:
+    """What a replay needs besides the rows, as JSON: model, parameters, the law's state after `tick` (None: new)."""
+    return json.dumps({
+        "version": 1, "period_s": period_s, "generation": generation, "tick": tick,
+        "state": None if state is None else encode(state), "parameters": encode(parameters.pack()),
+        "model": {**{name: getattr(model, name) for name in _NUMBERS},
+                  **{name: {"shape": getattr(model, name).shape, "values": encode(getattr(model, name))}
+                     for name in _ARRAYS}}})
+
+
+def read_law_metadata(text: str) -> dict[str, Any]:
+    """The reverse: period_s, generation, tick, state (or None), parameters (Parameters), model (CompensatorModel)."""
+    found = json.loads(text)
+    m = found["model"]
+    values: dict[str, Any] = {name: m[name] for name in _NUMBERS} | {"sensors": tuple(m["sensors"])}
+    values |= {name: decode(m[name]["values"]).reshape(m[name]["shape"]) for name in _ARRAYS}
+    model = CompensatorModel(**values)
+    return {**found, "model": model, "parameters": Parameters.unpack(decode(found["parameters"])),
+            "state": None if found["state"] is None else decode(found["state"])}
+
+
+class Recorder:
+    """Writes rows in order; a new file where the generation changes or the writer wants one.
+
+    open_writer(law_metadata) gives a writer with write(rows) and close().
+    """
+
+    def __init__(self, shared: Shared, model: CompensatorModel, parameters: Parameters, period_s: float,
+                 open_writer: Callable[[str], Any]):
+        self.shared, self.model, self.parameters, self.period_s = shared, model, parameters, period_s
+        self.open_writer = open_writer
+        self.position = shared.ring.head
+        self.generation = -1
+        self.writer: Any = None
+
+    def move(self) -> int:
+        """Write what the ring has; returns the rows written."""
+        rows, self.position, lost = self.shared.ring.read(self.position)
+        self.shared.counters[RECORDER_LOST] += lost
+        written = len(rows)
+        while len(rows):
+            if self.writer is None or rows[0, _GENERATION] != self.generation:
+                self._new_file(rows[0])
+            same = int(np.argmin(rows[:, _GENERATION] == self.generation)) or len(rows)
+            self.writer.write(rows[:same])
+            rows = rows[same:]
+        self.shared.counters[RECORDER_ROWS] += written
+        return written
+
+    def _new_file(self, first: np.ndarray) -> None:
+        self.close()
+        self.generation = int(first[_GENERATION])
+        numbers = self.shared.parameters.get()
+        if numbers is not None and self.generation > 0:
+            self.parameters = Parameters.unpack(numbers)
+        kept = self.shared.state.get()
+        tick, state = 0, None
+        if first[_TICK] > 1 and kept is not None:
+            tick, state = int(kept[0]), kept[2:]
+        self.writer = self.open_writer(
+            law_metadata(self.model, self.parameters, self.period_s, self.generation, tick, state))
+
+    def close(self) -> None:
+        """End the file."""
+        if self.writer is not None:
+            self.writer.close()
+            self.writer = None
+
+
+def record(recorder: Recorder, stopping: Callable[[], bool]) -> None:
+    """Until `stopping()`, then what is left in the ring."""
+    while not stopping():
+        recorder.move()
+        time.sleep(INTERVAL_S)
+    recorder.move()
+    recorder.close()

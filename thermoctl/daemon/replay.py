@@ -1,0 +1,67 @@
+"""Replay: the recorded inputs through the law again, the outputs compared with the recorded ones bit for bit."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.control.law import OUTPUTS, Law
+from thermoctl.daemon.recorder import read_law_metadata
+from thermoctl.daemon.ring import unpack_readings
+from thermoctl.signals import INDEX
+from thermoctl.yamlfile import InputError
+
+_CHANNELS, _OUTPUTS = INDEX["position_raw_um"], INDEX["state"]
+_DT, _COMMAND, _VALUE, _EXTERNAL = (INDEX[n] for n in ("dt_s", "command", "command_value", "external_bits"))
+
+
+@dataclass
+class Replay:
+    """`ticks` compared, `skipped` before the stored state, `differences` {signal: (ticks that differ, first of them,
+    largest difference)}; `outputs` (ticks, len(OUTPUTS)) as the law gave them now."""
+    ticks: int
+    skipped: int
+    differences: dict[str, tuple[int, int, float]]
+    outputs: np.ndarray
+
+
+def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Replay:
+    """Run `rows` (ticks, len(SIGNALS)) through a law made from the recording's own metadata.
+
+    Raises InputError when the metadata is missing or damaged, or ticks are missing.
+    """
+    try:
+        found = read_law_metadata(law_metadata)
+        law = Law(found["model"], found["parameters"], found["period_s"])
+        if found["state"] is not None:
+            law.restore(found["state"])
+    except (ValueError, KeyError, TypeError) as e:
+        raise InputError(f"{name}: holds no usable law to replay ({e}); it was not recorded by this version") from None
+    ticks = rows[:, INDEX["tick"]]
+    skipped = int(np.searchsorted(ticks, found["tick"], side="right"))
+    rows = np.ascontiguousarray(rows[skipped:])
+    if len(rows) and rows[0, INDEX["tick"]] != found["tick"] + 1:
+        raise InputError(f"{name}: the stored state is of tick {found['tick']}, the next row is tick "
+                         f"{rows[0, INDEX['tick']]:.0f}; ticks are missing, so a replay cannot start")
+    missing = np.flatnonzero(np.diff(rows[:, INDEX["tick"]]) != 1)
+    if len(missing):
+        raise InputError(f"{name}: ticks are missing after tick {rows[missing[0], INDEX['tick']]:.0f} (the recorder fell "
+                         "behind); a replay would not start from the same state")
+    n = _OUTPUTS - 2 - _CHANNELS
+    value, fresh, status = np.zeros(n), np.zeros(n, dtype=np.uint8), np.zeros(n, dtype=np.uint8)
+    law.bind(value, fresh, status)
+    given = np.empty((len(rows), len(OUTPUTS)))
+    for k, row in enumerate(rows):
+        value[:] = row[_CHANNELS:_OUTPUTS - 2]
+        unpack_readings(row[_OUTPUTS - 2], row[_OUTPUTS - 1], fresh, status)
+        law.step(row[_DT], int(row[_COMMAND]), row[_VALUE], int(row[_EXTERNAL]))
+        given[k] = law.outputs
+    recorded = np.ascontiguousarray(rows[:, _OUTPUTS:])
+    differences = {}
+    same = given.view(np.uint64) == recorded.view(np.uint64)
+    for j, output in enumerate(OUTPUTS):
+        wrong = np.flatnonzero(~same[:, j])
+        if len(wrong):
+            largest = float(np.nanmax(np.abs(given[wrong, j] - recorded[wrong, j]), initial=0.0))
+            differences[output] = (len(wrong), int(rows[wrong[0], INDEX["tick"]]), largest)
+    return Replay(len(rows), skipped, differences, given)

@@ -1,0 +1,182 @@
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
+"""What the loop writes into shared memory, and how others read it without ever making it wait.
+
+Ring: rows of float64, one a tick. The writer fills a slot, then publishes it by raising `head`; a reader copies rows and
+looks at `head` again: what may have been overwritten meanwhile is dropped and counted. The newest row is the last one.
+Mailbox: (kind, value) commands from one producer to the loop, lock-free, oldest refused when full.
+Box: one vector with a sequence number (odd while written): parameters to the loop, the law's state from it.
+Histogram: counts of whole microseconds.
+"""
+from libc.stdint cimport int64_t, uint64_t
+from libc.string cimport memcpy
+
+import numpy as np
+
+cdef extern from *:
+    """
+    #include <stdint.h>
+    static inline uint64_t load_acquire(uint64_t *p) { return __atomic_load_n(p, __ATOMIC_ACQUIRE); }
+    static inline void store_release(uint64_t *p, uint64_t v) { __atomic_store_n(p, v, __ATOMIC_RELEASE); }
+    static inline void fence(void) { __atomic_thread_fence(__ATOMIC_SEQ_CST); }
+    """
+    uint64_t load_acquire(uint64_t *p) noexcept nogil
+    void store_release(uint64_t *p, uint64_t v) noexcept nogil
+    void fence() noexcept nogil
+
+
+cdef class Ring:
+    """`counter` uint64 (1,), `rows` float64 (slots, columns), both in shared memory."""
+    cdef uint64_t[::1] counter
+    cdef double[:, ::1] rows
+    cdef readonly int slots, columns
+
+    def __init__(self, uint64_t[::1] counter, double[:, ::1] rows):
+        self.counter, self.rows = counter, rows
+        self.slots, self.columns = rows.shape[0], rows.shape[1]
+
+    @property
+    def head(self) -> int:
+        """Rows written since the start."""
+        return load_acquire(&self.counter[0])
+
+    cpdef write(self, double[::1] row):
+        """Append one row (by the loop only)."""
+        cdef uint64_t head = self.counter[0]
+        fence()
+        memcpy(&self.rows[head % self.slots, 0], &row[0], self.columns * sizeof(double))
+        store_release(&self.counter[0], head + 1)
+
+    def read(self, uint64_t position, int limit=1 << 30):
+        """Rows from `position` on: (array (n, columns), next position, rows lost before the first one)."""
+        cdef uint64_t head = load_acquire(&self.counter[0]), first, k, after, keep, lost = 0
+        cdef double[:, ::1] out
+        if position > head:
+            position = head                      # the loop was restarted on a fresh ring
+        first = position
+        if head > <uint64_t>self.slots - 1 and first < head - (self.slots - 1):
+            first = head - (self.slots - 1)
+        if head - first > <uint64_t>limit:
+            head = first + limit
+        array = np.empty((head - first, self.columns))
+        out = array
+        for k in range(first, head):
+            memcpy(&out[k - first, 0], &self.rows[k % self.slots, 0], self.columns * sizeof(double))
+        fence()
+        after = load_acquire(&self.counter[0])
+        keep = first
+        if after > <uint64_t>self.slots - 1 and first < after - (self.slots - 1):
+            keep = min(after - (self.slots - 1), head)
+        return array[keep - first:], head, keep - position
+
+    def newest(self):
+        """A copy of the newest row, or None before the first."""
+        cdef uint64_t head
+        while True:
+            head = load_acquire(&self.counter[0])
+            if head == 0:
+                return None
+            rows, _, lost = self.read(head - 1, 1)
+            if len(rows):
+                return rows[0]
+
+
+cdef class Mailbox:
+    """`counters` uint64 (2,): pushed, taken; `slots` float64 (n, 2)."""
+    cdef uint64_t[::1] counters
+    cdef double[:, ::1] slots
+
+    def __init__(self, uint64_t[::1] counters, double[:, ::1] slots):
+        self.counters, self.slots = counters, slots
+
+    def push(self, double kind, double value=0.0) -> bool:
+        """Add a command (one producer only); False when the box is full."""
+        cdef uint64_t pushed = self.counters[0]
+        if pushed - load_acquire(&self.counters[1]) >= <uint64_t>self.slots.shape[0]:
+            return False
+        self.slots[pushed % self.slots.shape[0], 0] = kind
+        self.slots[pushed % self.slots.shape[0], 1] = value
+        store_release(&self.counters[0], pushed + 1)
+        return True
+
+    @property
+    def taken(self) -> int:
+        return load_acquire(&self.counters[1])
+
+    @property
+    def pushed(self) -> int:
+        return load_acquire(&self.counters[0])
+
+    def take(self):
+        """The oldest command as (kind, value), or None (by the loop only)."""
+        cdef uint64_t taken = self.counters[1]
+        if taken == load_acquire(&self.counters[0]):
+            return None
+        kind, value = self.slots[taken % self.slots.shape[0], 0], self.slots[taken % self.slots.shape[0], 1]
+        store_release(&self.counters[1], taken + 1)
+        return kind, value
+
+
+cdef class Box:
+    """One vector that is replaced whole: `counter` uint64 (1,), `vector` float64 (n,); the first number is its length."""
+    cdef uint64_t[::1] counter
+    cdef double[::1] vector
+
+    def __init__(self, uint64_t[::1] counter, double[::1] vector):
+        self.counter, self.vector = counter, vector
+
+    def put(self, double[::1] numbers):
+        """Replace the content (one writer only). Raises ValueError when it does not fit."""
+        cdef uint64_t before = self.counter[0]
+        if numbers.shape[0] + 1 > self.vector.shape[0]:
+            raise ValueError(f"{numbers.shape[0]} numbers do not fit into a box of {self.vector.shape[0] - 1}")
+        store_release(&self.counter[0], before + 1)
+        fence()
+        self.vector[0] = numbers.shape[0]
+        memcpy(&self.vector[1], &numbers[0], numbers.shape[0] * sizeof(double))
+        fence()
+        store_release(&self.counter[0], before + 2)
+
+    def get(self):
+        """A copy of the content, or None when nothing was put yet or it is being written."""
+        cdef uint64_t before = load_acquire(&self.counter[0])
+        if before == 0 or before & 1:
+            return None
+        copy = np.array(self.vector[1:1 + <int>self.vector[0]])
+        fence()
+        return copy if load_acquire(&self.counter[0]) == before else None
+
+
+cdef class Histogram:
+    """`counts` uint64 (bins + 1,): whole microseconds, the last bin takes everything longer; `extremes` float64 (1,)."""
+    cdef uint64_t[::1] counts
+    cdef double[::1] largest
+
+    def __init__(self, uint64_t[::1] counts, double[::1] largest):
+        self.counts, self.largest = counts, largest
+
+    cpdef add(self, double microseconds):
+        """Count one value."""
+        cdef int last = <int>self.counts.shape[0] - 1
+        cdef int k = 0 if microseconds < 0.0 else (last if microseconds >= last else <int>microseconds)
+        self.counts[k] += 1
+        if microseconds > self.largest[0]:
+            self.largest[0] = microseconds
+
+
+def pack_readings(unsigned char[::1] fresh, unsigned char[::1] status):
+    """(fresh_bits, status_bits): one bit, and two bits, a channel, as whole float64 numbers for the record."""
+    cdef uint64_t f = 0, s = 0
+    cdef int c
+    for c in range(fresh.shape[0]):
+        f |= <uint64_t>(fresh[c] != 0) << c
+        s |= <uint64_t>(status[c] & 3) << (2 * c)
+    return <double>f, <double>s
+
+
+def unpack_readings(double fresh_bits, double status_bits, unsigned char[::1] fresh, unsigned char[::1] status):
+    """The reverse of `pack_readings`, into the given arrays."""
+    cdef uint64_t f = <uint64_t>fresh_bits, s = <uint64_t>status_bits
+    cdef int c
+    for c in range(fresh.shape[0]):
+        fresh[c] = f >> c & 1
+        status[c] = s >> (2 * c) & 3

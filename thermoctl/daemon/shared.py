@@ -1,0 +1,110 @@
+"""The shared memory of one daemon: what the loop publishes and what it is told.
+
+One segment, named after the rig, with a header that says which version and layout it has. The supervisor creates it and
+removes it; a segment left over by a killed daemon is replaced. The object must be kept while its arrays are in use.
+
+    ring        the record of every tick (rows in the order of signals.SIGNALS)
+    mailbox     commands to the loop;  parameters: the block that a RELOAD command applies
+    state       the law's state now and then, with its tick and generation: where a recording's replay starts
+    lateness, busy, reference   histograms, microseconds
+    counters    start time, ticks of the reference loop, process ids
+"""
+from __future__ import annotations
+
+import json
+import zlib
+from multiprocessing import resource_tracker, shared_memory
+
+import numpy as np
+
+from thermoctl.control.model import NAMES
+from thermoctl.daemon.ring import Box, Histogram, Mailbox, Ring
+from thermoctl.signals import SIGNALS
+from thermoctl.yamlfile import InputError
+
+VERSION = 1
+MAGIC = 0x7468726D6F63746C         # 'thrmoctl'
+ROWS = 8192                        # ticks a reader may lag behind
+BINS = 4096                        # us
+STATE_NUMBERS = 1024
+
+_AREAS = (
+    ("header", "u8", (4,)),
+    ("ring_head", "u8", (1,)), ("rows", "f8", (ROWS, len(SIGNALS))),
+    ("mail_counters", "u8", (2,)), ("mail", "f8", (64, 2)),
+    ("parameters_sequence", "u8", (1,)), ("parameters", "f8", (len(NAMES) + 1,)),
+    ("state_sequence", "u8", (1,)), ("state", "f8", (STATE_NUMBERS,)),
+    ("lateness", "u8", (BINS + 1,)), ("busy", "u8", (BINS + 1,)), ("reference", "u8", (BINS + 1,)),
+    ("largest", "f8", (3,)), ("counters", "f8", (16,)),
+)
+START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS = range(5)
+"""Places in `counters`."""
+_LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES]).encode())
+
+
+class Shared:
+    """The segment with its areas; `create` in the supervisor, `attach` elsewhere."""
+
+    def __init__(self, memory: shared_memory.SharedMemory):
+        self._memory = memory
+        at = 0
+        self.areas: dict[str, np.ndarray] = {}
+        for name, kind, shape in _AREAS:
+            array: np.ndarray = np.ndarray(shape, kind, memory.buf, at)
+            self.areas[name] = array
+            at += array.nbytes
+        a = self.areas
+        self.ring = Ring(a["ring_head"], a["rows"])
+        self.mailbox = Mailbox(a["mail_counters"], a["mail"])
+        self.parameters = Box(a["parameters_sequence"], a["parameters"])
+        self.state = Box(a["state_sequence"], a["state"])
+        self.lateness = Histogram(a["lateness"], a["largest"][0:1])
+        self.busy = Histogram(a["busy"], a["largest"][1:2])
+        self.reference = Histogram(a["reference"], a["largest"][2:3])
+        self.counters = a["counters"]
+
+    @classmethod
+    def create(cls, name: str) -> Shared:
+        """A fresh segment; one that a killed daemon left is removed first."""
+        size = sum(int(np.prod(shape)) * 8 for _, _, shape in _AREAS)
+        try:
+            old = shared_memory.SharedMemory(name)
+        except FileNotFoundError:
+            pass
+        else:
+            old.close()
+            old.unlink()
+        shared = cls(shared_memory.SharedMemory(name, create=True, size=size))
+        shared.areas["header"][:] = MAGIC, VERSION, _LAYOUT, size
+        return shared
+
+    @classmethod
+    def attach(cls, name: str) -> Shared:
+        """The segment of a running daemon. Raises InputError when there is none or it has another layout."""
+        try:
+            memory = shared_memory.SharedMemory(name)
+        except FileNotFoundError:
+            raise InputError(f"shared memory '{name}': not there; the daemon is not running (thermoctl start)") from None
+        # An attaching process must not remove the segment when it ends (CPython issue 82300).
+        resource_tracker.unregister(memory._name, "shared_memory")      # type: ignore[attr-defined]
+        header = np.ndarray((4,), "u8", memory.buf)
+        found = tuple(int(h) for h in header)
+        if found[:3] != (MAGIC, VERSION, _LAYOUT):
+            raise InputError(f"shared memory '{name}': of another version; restart the daemon")
+        return cls(memory)
+
+    def remove(self) -> None:
+        """Take the segment away (by its creator)."""
+        try:
+            self._memory.unlink()
+        except FileNotFoundError:
+            resource_tracker.unregister(self._memory._name, "shared_memory")      # type: ignore[attr-defined]
+
+
+def percentiles(counts: np.ndarray, fractions: tuple[float, ...] = (0.5, 0.99, 0.999)) -> list[float]:
+    """Percentiles of a histogram of whole microseconds, us (upper edge of the bin); NaN when it is empty."""
+    total = counts.sum()
+    if total == 0:
+        return [float("nan")] * len(fractions)
+    cumulative = np.cumsum(counts)
+    return [float(np.searchsorted(cumulative, f * total)) + 1.0 for f in fractions]

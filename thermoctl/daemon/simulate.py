@@ -1,0 +1,121 @@
+"""The daemon's own tick in simulated time: as fast as the machine allows, the same rows for the same seed.
+
+Used for experiments, for proofs over hours of rig time, and by tests: `run_simulated` runs a whole schedule,
+`Simulation` one tick at a time.
+"""
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from hal.backend import make_backend
+from thermoctl.control import arming
+from thermoctl.control.model import CompensatorModel, Parameters
+from thermoctl.daemon.assemble import compensator, law_parameters
+from thermoctl.daemon.loop import RELOAD, Rig
+from thermoctl.signals import INDEX, SIGNALS
+
+COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reload": RELOAD}
+
+
+class _Commands(deque):
+    """A mailbox without shared memory."""
+
+    def take(self) -> tuple[float, float] | None:
+        return self.popleft() if self else None
+
+
+class _Parameters:
+    """A parameter box without shared memory."""
+
+    def __init__(self) -> None:
+        self.numbers: np.ndarray | None = None
+
+    def get(self) -> np.ndarray | None:
+        return self.numbers
+
+
+class Simulation:
+    """One rig in simulated time: `command`, `tick`, and `row`, the newest record row (INDEX of signals.py).
+
+    settings: as from settings.load_settings, with hal.backend simulated or replay; model, parameters: default those of
+    the settings. `law` is the law, `backend` the (opened) back end.
+    """
+
+    def __init__(self, settings: Any, model: CompensatorModel | None = None, parameters: Parameters | None = None,
+                 publish: Any = None):
+        self.period_s = settings.loop.period_s
+        self.backend = make_backend(settings)
+        self.backend.open()
+        self.mailbox, self.box = _Commands(), _Parameters()
+        self.rig = Rig(self.backend, model or compensator(settings), parameters or law_parameters(settings),
+                       self.period_s, publish or (lambda row: None), self.mailbox, self.box)
+        self.rig.wall_s = lambda: self.now_s
+        self.law, self.row, self.ticks, self.now_s = self.rig.law, self.rig.row, 0, 0.0
+
+    def command(self, name: str, value: float = 0.0) -> None:
+        """Give arm, disarm, or setpoint (um) for the next tick."""
+        self.mailbox.append((COMMANDS[name], float(value)))
+
+    def reload(self, parameters: Parameters) -> None:
+        """Apply new parameters at the next tick."""
+        self.box.numbers = parameters.pack()
+        self.mailbox.append((RELOAD, 0.0))
+
+    def tick(self, count: int = 1) -> np.ndarray:
+        """Run `count` ticks; returns the newest row (a view)."""
+        for _ in range(count):
+            self.ticks += 1
+            self.now_s = self.ticks * self.period_s
+            self.rig.tick(self.now_s, self.period_s, 0.0, _no_clock)
+        return self.row
+
+    def until(self, condition: Any, limit_s: float) -> bool:
+        """Tick until condition(row) or `limit_s` of simulated time have passed; whether it came true."""
+        return any(condition(self.tick()) for _ in range(round(limit_s / self.period_s)))
+
+    def arm(self, limit_s: float = 20.0) -> None:
+        """Wait for READY and arm. Raises RuntimeError when it does not get there."""
+        state = INDEX["state"]
+        if not self.until(lambda row: row[state] == arming.READY, limit_s):
+            raise RuntimeError(f"not READY within {limit_s} s: state {arming.STATES[int(self.row[state])]}, faults "
+                               f"{int(self.row[INDEX['fault_bits']]):#x}")
+        self.command("arm")
+        self.tick()
+
+    def close(self) -> None:
+        self.backend.write(0.0, False)
+        self.backend.close()
+
+
+def _no_clock() -> int:
+    return 0
+
+
+def run_simulated(settings: Any, schedule: Iterable[tuple], duration_s: float, seed: int | None = None, every: int = 1,
+                  model: CompensatorModel | None = None) -> np.ndarray:
+    """Run `duration_s` of rig time; returns every `every`-th row, (N, len(SIGNALS)).
+
+    schedule: (time_s, command, value) in order of time; command arm, disarm or setpoint (um). seed replaces hal.seed.
+    """
+    if seed is not None:
+        settings = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, seed=seed))
+    simulation = Simulation(settings, model)
+    period_s = simulation.period_s
+    waiting = deque((round(item[0] / period_s), *item[1:]) for item in schedule)
+    ticks = round(duration_s / period_s)
+    rows = np.empty((ticks // every, len(SIGNALS)))
+    try:
+        for k in range(ticks):
+            while waiting and waiting[0][0] <= k:
+                simulation.command(*waiting.popleft()[1:])
+            simulation.tick()
+            if (k + 1) % every == 0:
+                rows[k // every] = simulation.row
+    finally:
+        simulation.close()
+    return rows

@@ -1,0 +1,271 @@
+"""The command socket: a Unix socket, one JSON object a line each way, in a process of its own.
+
+A request is {"command": NAME, ...}; the answer {"ok": true, ...} or {"ok": false, "error": TEXT}. The socket's file
+permissions (owner and group) decide who may connect; who gave a command that moves anything is logged from the
+kernel's peer credentials. A status query reads shared memory and never costs the loop a tick. Every size from outside is limited.
+"""
+from __future__ import annotations
+
+import contextlib
+import grp
+import json
+import math
+import os
+import selectors
+import socket
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from thermoctl.control import arming, faults
+from thermoctl.daemon.loop import RELOAD
+from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared, percentiles
+from thermoctl.signals import INDEX, POINTS, SIGNALS
+from thermoctl.yamlfile import InputError
+
+MAX_LINE = 65536            # bytes of one request
+MAX_CLIENTS = 32
+MAX_BACKLOG = 1 << 20       # unsent bytes of a client that does not read: then it is dropped
+ANSWER_S = 1.0              # how long a command may take to show in the loop
+
+
+def status(shared: Shared) -> dict[str, Any]:
+    """The newest row as `thermoctl status --json` gives it; faults with meaning and remedy."""
+    row = shared.ring.newest()
+    if row is None:
+        return {"state": "OFF", "ticks": 0, "slips": 0, "faults": [], "setpoint_um": None, "position_um": None,
+                "compensation_um": None}
+    number = {name: (float(row[i]) if math.isfinite(row[i]) else None) for name, i in INDEX.items()}
+    busy = percentiles(shared.areas["busy"])
+    return {
+        "state": arming.STATES[int(row[INDEX["state"]])], "ticks": int(row[INDEX["tick"]]),
+        "slips": int(row[INDEX["slips"]]), "generation": int(row[INDEX["generation"]]), "uptime_s": number["t_s"],
+        **{name: number[name] for name in (
+            "setpoint_um", "reference_um", "position_um", "compensated_um", "compensation_um", "expansion_um",
+            "output_reference_um", "control_v", "drive", "enable", "voltage_v", "current_a", "power_w", "air_c",
+            "innovation_c", "kalman_gain", "position_age_s", "coil_age_s", "supply_v", "amplifier_state",
+            "amplifier_fault")},
+        "temperatures_c": {p: number[f"{p}_c"] for p in POINTS},
+        "estimates_c": {p: number[f"{p}_est_c"] for p in POINTS},
+        "lateness_us": number["lateness_us"], "busy_us": number["busy_us"], "busy_p50_us": _or_none(busy[0]),
+        "recorder": {"rows": int(shared.counters[RECORDER_ROWS]), "lost": int(shared.counters[RECORDER_LOST])},
+        "faults": [{"name": f.name, "severity": f.severity, "meaning": f.meaning, "remedy": f.remedy}
+                   for f in faults.decode(row[INDEX["fault_bits"]])],
+    }
+
+
+def latency(shared: Shared, period_s: float) -> dict[str, Any]:
+    """Histograms and percentiles of lateness and busy time, slips, and the reference loop's, us."""
+    row = shared.ring.newest()
+    answer: dict[str, Any] = {"period_us": period_s * 1e6, "ticks": 0 if row is None else int(row[INDEX["tick"]]),
+                              "slips": 0 if row is None else int(row[INDEX["slips"]])}
+    for k, name in enumerate(("lateness", "busy", "reference")):
+        counts = shared.areas[name]
+        p50, p99, p999 = percentiles(counts)
+        answer[name] = {"count": int(counts.sum()), "p50_us": _or_none(p50), "p99_us": _or_none(p99),
+                        "p999_us": _or_none(p999), "largest_us": float(shared.areas["largest"][k]),
+                        "bins_us": [[int(i), int(counts[i])] for i in counts.nonzero()[0]]}
+    return answer
+
+
+def _or_none(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
+class Commands:
+    """What a request does. `reload_settings()` validates the file again and returns (settings, parameters, changed keys,
+    keys that need a restart)."""
+
+    def __init__(self, shared: Shared, settings: Any,
+                 reload_settings: Callable[[Any], tuple[Any, Any, list[str], list[str]]], log: Callable[..., None]):
+        self.shared, self.settings, self.reload_settings, self.log = shared, settings, reload_settings, log
+
+    def answer(self, line: bytes, peer: str) -> dict[str, Any]:
+        """The answer to one request line; never raises for what a client sent."""
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict) or not isinstance(request.get("command"), str):
+                raise ValueError("expected an object with a 'command'")
+        except (ValueError, RecursionError) as e:
+            return {"ok": False, "error": f"not a request: {e}"}
+        name = request["command"]
+        if name == "status":
+            return {"ok": True, **status(self.shared)}
+        if name == "latency":
+            return {"ok": True, **latency(self.shared, self.settings.loop.period_s)}
+        if name == "signals":
+            return {"ok": True, "signals": [[s.name, s.unit, s.meaning] for s in SIGNALS]}
+        action = {"arm": self._arm, "disarm": self._disarm, "setpoint": self._setpoint, "reload": self._reload}.get(name)
+        if action is None:
+            return {"ok": False, "error": f"unknown command '{name[:40]}'; "
+                                          "expected status, latency, signals, arm, disarm, setpoint or reload"}
+        try:
+            answer = action(request)
+        except InputError as e:
+            answer = {"ok": False, "error": str(e)}
+        self.log("command", name=name, peer=peer, ok=answer["ok"], value=request.get("value"),
+                 error=answer.get("error"))
+        return answer
+
+    def _state(self) -> str:
+        return status(self.shared)["state"]
+
+    def _send(self, kind: float, value: float = 0.0) -> None:
+        """Hand a command to the loop and wait until it took it."""
+        if not self.shared.mailbox.push(kind, value):
+            raise InputError("the loop does not take commands: its mailbox is full (is it running?)")
+        position = self.shared.mailbox.pushed
+        head = self.shared.ring.head
+        deadline = time.monotonic() + ANSWER_S
+        while self.shared.mailbox.taken < position or self.shared.ring.head < head + 3:
+            if time.monotonic() > deadline:
+                raise InputError(f"the loop did not take the command within {ANSWER_S} s (is it running?)")
+            time.sleep(0.001)
+
+    def _result(self, wanted: str, refusal: str) -> dict[str, Any]:
+        now = status(self.shared)
+        if now["state"] == wanted:
+            return {"ok": True, "state": now["state"], "setpoint_um": now["setpoint_um"]}
+        causes = "; ".join(f"{f['name']}: {f['meaning']} ({f['remedy']})" for f in now["faults"])
+        return {"ok": False, "state": now["state"],
+                "error": f"{refusal}: the state is {now['state']}{' because of ' + causes if causes else ''}"}
+
+    def _arm(self, request: dict) -> dict[str, Any]:
+        if self._state() == "ARMED":
+            return {"ok": True, "state": "ARMED", "setpoint_um": status(self.shared)["setpoint_um"]}
+        if self._state() == "FAULT":
+            return self._result("ARMED", "not armed, a fault is latched: `thermoctl disarm` acknowledges it once its "
+                                         "cause is gone")
+        self._send(arming.ARM)
+        return self._result("ARMED", "not armed")
+
+    def _disarm(self, request: dict) -> dict[str, Any]:
+        self._send(arming.DISARM)
+        now = self._state()
+        if now in ("SAFE", "READY", "OFF"):
+            return {"ok": True, "state": now}
+        return self._result("SAFE", "the amplifier is disabled, but the fault still stands")
+
+    def _setpoint(self, request: dict) -> dict[str, Any]:
+        value = request.get("value")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise InputError("setpoint: expected a finite number of micrometres as 'value'")
+        control = self.settings.control
+        if not control.setpoint_low_um <= value <= control.setpoint_high_um:
+            raise InputError(f"setpoint {value:g} um: outside control.setpoint_low_um..setpoint_high_um "
+                             f"({control.setpoint_low_um:g}..{control.setpoint_high_um:g})")
+        if self._state() != "ARMED":
+            return self._result("ARMED", "setpoint not taken, it counts only when armed")
+        self._send(arming.SETPOINT, float(value))
+        return self._result("ARMED", "setpoint not taken")
+
+    def _reload(self, request: dict) -> dict[str, Any]:
+        settings, parameters, changed, restart = self.reload_settings(self.settings)
+        self.shared.parameters.put(parameters.pack())
+        before = status(self.shared).get("generation")
+        self._send(RELOAD)
+        self.settings = settings
+        return {"ok": True, "generation": status(self.shared).get("generation"), "before": before,
+                "applied": [c for c in changed if c not in restart], "needs_restart": restart}
+
+
+class _Client:
+    def __init__(self, connection: socket.socket, peer: str):
+        self.connection, self.peer, self.received, self.unsent = connection, peer, b"", b""
+
+
+def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
+    """The listening socket at `path`, for owner and group. Raises InputError where the path or the group is at fault."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileNotFoundError):
+        path.unlink()
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    before = os.umask(0o177)
+    try:
+        listener.bind(str(path))
+        if group:
+            os.chown(path, -1, grp.getgrnam(group).gr_gid)
+        os.chmod(path, mode)
+    except (OSError, KeyError) as e:
+        listener.close()
+        why = f"no group '{group}' on this system" if isinstance(e, KeyError) else e.strerror or str(e)
+        raise InputError(f"{path}: cannot listen: {why}; check socket.path and socket.group") from None
+    finally:
+        os.umask(before)
+    listener.listen(8)
+    listener.setblocking(False)
+    return listener
+
+
+def serve(listener: socket.socket, commands: Commands, stopping: Callable[[], bool]) -> None:
+    """Answer requests until `stopping()`. A client that sends too much or does not read is dropped."""
+    selector = selectors.DefaultSelector()
+    selector.register(listener, selectors.EVENT_READ)
+    while not stopping():
+        for key, events in selector.select(timeout=0.2):
+            if key.fileobj is listener:
+                _accept(listener, selector)
+            else:
+                _serve_client(key.data, events, selector, commands)
+    selector.close()
+
+
+def _accept(listener: socket.socket, selector: selectors.BaseSelector) -> None:
+    try:
+        connection, _ = listener.accept()
+    except OSError:
+        return
+    if len(selector.get_map()) > MAX_CLIENTS:
+        connection.close()
+        return
+    connection.setblocking(False)
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    pid, uid, _ = struct.unpack("3i", credentials)
+    selector.register(connection, selectors.EVENT_READ, _Client(connection, f"uid {uid} pid {pid}"))
+
+
+def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector, commands: Commands) -> None:
+    try:
+        if events & selectors.EVENT_READ:
+            data = client.connection.recv(MAX_LINE)
+            if not data:
+                raise OSError("closed")
+            client.received += data
+            while b"\n" in client.received:
+                line, client.received = client.received.split(b"\n", 1)
+                client.unsent += json.dumps(commands.answer(line, client.peer)).encode() + b"\n"
+            if len(client.received) > MAX_LINE or len(client.unsent) > MAX_BACKLOG:
+                raise OSError("too much")
+        if client.unsent:
+            with contextlib.suppress(BlockingIOError):
+                client.unsent = client.unsent[client.connection.send(client.unsent):]
+        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.unsent else 0)
+        selector.modify(client.connection, wanted, client)
+    except OSError:
+        selector.unregister(client.connection)
+        client.connection.close()
+
+
+def ask(path: Path | str, request: dict[str, Any], timeout_s: float = 3.0) -> dict[str, Any]:
+    """One request to the daemon at `path`. Raises InputError when nobody answers."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(timeout_s)
+        try:
+            connection.connect(str(path))
+            connection.sendall(json.dumps(request).encode() + b"\n")
+            received = b""
+            while not received.endswith(b"\n"):
+                data = connection.recv(1 << 16)
+                if not data:
+                    raise InputError(f"{path}: the daemon closed the connection; see its log")
+                received += data
+        except PermissionError:
+            raise InputError(f"{path}: not allowed; the socket is for its group (see socket.group)") from None
+        except (FileNotFoundError, ConnectionRefusedError):
+            raise InputError(f"{path}: the daemon is not running; `thermoctl start` or `thermoctl run --config FILE`"
+                             ) from None
+        except TimeoutError:
+            raise InputError(f"{path}: no answer within {timeout_s:g} s; see the daemon's log") from None
+    return json.loads(received)

@@ -1,0 +1,345 @@
+"""The supervisor: starts the daemon's processes, watches them, and makes the amplifier safe on every way out.
+
+    supervisor ── loop        reads, controls, drives; alone and real-time
+              ├── poller      one for each slow device (hal.board.run_poller)
+              ├── recorder    ring -> recording
+              ├── commands    the Unix socket
+              └── reference   an idle loop beside it, when loop.reference is on
+
+The loop ends: the amplifier is disabled through a back end of the supervisor's own and the daemon ends with it
+(systemd starts it again, into SAFE). Any other process ends: it is started again, the loop runs on. The supervisor ends:
+the kernel tells every child (PDEATHSIG) and the loop disables the amplifier. The loop stands still: it is killed, as if
+it had ended.
+"""
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import multiprocessing
+import os
+import signal
+import socket as sockets
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hal.backend import HardwareError, make_backend, slow_devices
+from thermoctl.control import arming, faults
+from thermoctl.control.law import COMPILED
+from thermoctl.daemon import loop as loops
+from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
+from thermoctl.daemon.shared import LOOP_PID, WARNINGS, Shared
+from thermoctl.signals import INDEX
+from thermoctl.yamlfile import InputError
+
+READY_S = 60.0              # self-test and warm-up (connecting devices included) end within this
+STALL_S = 1.0               # a loop that made no tick for so long is ended
+STOP_S = 3.0                # a child that was asked to stop is killed after this
+RESTART_S = 0.5             # pause before a child is started again, doubled up to
+RESTART_LONGEST_S = 30.0
+EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_HARDWARE = 0, 1, 2, 3
+
+_fork = multiprocessing.get_context("fork")
+Log = Callable[..., None]
+
+
+def console_log(event: str, **values: Any) -> None:
+    """One line on stderr: event and key=value pairs; systemd's journal adds time and unit."""
+    print(" ".join([f"thermoctl: {event}", *(f"{k}={v}" for k, v in values.items() if v is not None)]),
+          file=sys.stderr, flush=True)
+
+
+class _Stop:
+    """Set by SIGTERM; `SIGINT` is left to the supervisor, which gets it from the terminal as the children do."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        signal.signal(signal.SIGTERM, self._ask)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+    def _ask(self, *_: Any) -> None:
+        self.asked = True
+
+    def __call__(self) -> bool:
+        return self.asked
+
+
+def safe_amplifier(settings: Any, log: Log) -> bool:
+    """Disable the amplifier through a back end of our own: when the loop can no longer do it."""
+    try:
+        backend = make_backend(settings)
+        try:
+            backend.open()
+            backend.write(0.0, False)
+        finally:
+            backend.close()
+        return True
+    except (HardwareError, InputError, OSError) as e:
+        log("the amplifier could not be disabled from here; its own watchdog must do it", error=e)
+        return False
+
+
+def _loop_process(settings: Any, shared: Shared, board: Any) -> int:
+    stop = _Stop()
+    loops.die_with_parent()
+    backend = make_backend(settings, board)
+    backend.open()
+    try:
+        rig = loops.Rig(backend, compensator(settings), law_parameters(settings), settings.loop.period_s,
+                        shared.ring.write, shared.mailbox, shared.parameters, shared.state, time.monotonic())
+
+        def warn(text: str) -> None:
+            shared.counters[WARNINGS] += 1
+            console_log("warning", what=text)
+
+        kept = loops.become_real_time(settings, warn)
+        loops.run_loop(settings, shared, rig, stop)
+        for file in kept:
+            os.close(file)
+    finally:
+        backend.write(0.0, False)
+        backend.close()
+    return EXIT_OK
+
+
+def _recorder_process(settings: Any, shared: Shared, board: Any) -> int:
+    from thermoctl.daemon.recorder import make_recorder, record
+    stop = _Stop()
+    loops.die_with_parent()
+    record(make_recorder(settings, shared, console_log), stop)
+    return EXIT_OK
+
+
+def _command_process(settings: Any, shared: Shared, board: Any) -> int:
+    from thermoctl.daemon.reload import reload_settings
+    from thermoctl.daemon.socket import Commands, listen, serve
+    stop = _Stop()
+    loops.die_with_parent()
+    path = Path(settings.socket.path)
+    listener = listen(path, settings.socket.group)
+    try:
+        serve(listener, Commands(shared, settings, reload_settings, console_log), stop)
+    finally:
+        listener.close()
+        with contextlib.suppress(FileNotFoundError):
+            path.unlink()
+    return EXIT_OK
+
+
+def _reference_process(settings: Any, shared: Shared, board: Any) -> int:
+    stop = _Stop()
+    loops.die_with_parent()
+    loops.become_real_time(settings, lambda text: None)
+    loops.run_reference(settings, shared, stop)
+    return EXIT_OK
+
+
+def _poller_process(settings: Any, shared: Shared, board: Any, device: str) -> int:
+    from hal.board import run_poller
+    loops.die_with_parent()
+    run_poller(settings, device, board.name)
+    return EXIT_OK
+
+
+class _Child:
+    """One process: how it is started, and when it may be started again."""
+
+    def __init__(self, name: str, main: Callable[..., int], *arguments: Any):
+        self.name, self.main, self.arguments = name, main, arguments
+        self.process: Any = None
+        self.again_at, self.pause_s = 0.0, RESTART_S
+
+    def start(self) -> None:
+        self.process = _fork.Process(target=_run_child, args=(self.name, self.main, self.arguments), name=self.name)
+        self.process.start()
+        self.started = time.monotonic()
+
+    @property
+    def alive(self) -> bool:
+        return self.process is not None and self.process.is_alive()
+
+    def end(self, limit_s: float = STOP_S) -> None:
+        """Ask it to stop; kill it when it does not."""
+        if self.alive:
+            self.process.terminate()
+            self.process.join(limit_s)
+            if self.process.is_alive():
+                self.process.kill()
+                self.process.join()
+
+
+def _run_child(name: str, main: Callable[..., int], arguments: tuple) -> None:
+    try:
+        code = main(*arguments)
+    except InputError as e:
+        console_log(f"{name} ended", error=e)
+        code = EXIT_INPUT
+    except HardwareError as e:
+        console_log(f"{name} ended", error=e)
+        code = EXIT_HARDWARE
+    sys.exit(code)
+
+
+class _Notify:
+    """sd_notify without a library: nothing happens where systemd did not start us."""
+
+    def __init__(self) -> None:
+        self.address = os.environ.get("NOTIFY_SOCKET", "")
+
+    def __call__(self, text: str) -> None:
+        if not self.address:
+            return
+        address = "\0" + self.address[1:] if self.address.startswith("@") else self.address
+        with sockets.socket(sockets.AF_UNIX, sockets.SOCK_DGRAM) as s, contextlib.suppress(OSError):
+            s.connect(address)
+            s.sendall(text.encode())
+
+
+class _Watcher:
+    """Puts changes of state and faults into the log, from the ring: the loop itself logs nothing."""
+
+    def __init__(self, shared: Shared, log: Log):
+        self.shared, self.log = shared, log
+        self.position, self.before = 0, (float(arming.OFF), 0.0)
+
+    def look(self) -> None:
+        rows, self.position, _ = self.shared.ring.read(self.position)
+        if not len(rows):
+            return
+        pairs = rows[:, [INDEX["state"], INDEX["fault_bits"]]]
+        changed = np.flatnonzero((np.diff(np.vstack([self.before, pairs]), axis=0) != 0).any(axis=1))
+        for k in changed[:20]:
+            state, bits = pairs[k]
+            before_state, before_bits = self.before if k == 0 else pairs[k - 1]
+            if state != before_state:
+                self.log("state", tick=int(rows[k, INDEX["tick"]]), was=arming.STATES[int(before_state)],
+                         now=arming.STATES[int(state)])
+            for fault in faults.decode(int(bits) & ~int(before_bits)):
+                self.log(fault.severity, tick=int(rows[k, INDEX["tick"]]), name=fault.name, meaning=repr(fault.meaning),
+                         remedy=repr(fault.remedy))
+        self.before = (pairs[-1, 0], pairs[-1, 1])
+
+
+def run(settings: Any, log: Log = console_log) -> int:
+    """Run the daemon until SIGTERM or SIGINT; returns its exit status. Raises InputError when it cannot be started."""
+    if not COMPILED:
+        log("warning", what="the law runs interpreted, not compiled: far too slow for a rig; run `make install`")
+    lock = _only_one(settings)
+    compensator(settings)
+    law_parameters(settings)
+    shared = Shared.create(shared_name(settings))
+    board, pollers = None, []
+    if settings.hal.backend == "devices":
+        from hal.board import Board
+        slow = slow_devices(settings)
+        if slow:
+            board = Board.create(shared_name(settings) + "-board")
+            pollers = [_Child(f"poller {d.name}", _poller_process, settings, shared, board, d.name) for d in slow]
+    loop = _Child("loop", _loop_process, settings, shared, board)
+    others = [*pollers, _Child("recorder", _recorder_process, settings, shared, board),
+              _Child("commands", _command_process, settings, shared, board)]
+    if not settings.recording.enable:
+        others = [c for c in others if c.name != "recorder"]
+    if settings.loop.reference:
+        others.append(_Child("reference", _reference_process, settings, shared, board))
+    try:
+        return _supervise(settings, shared, loop, others, log)
+    finally:
+        shared.remove()
+        if board is not None:
+            board.close()
+        os.close(lock)
+
+
+def _only_one(settings: Any) -> int:
+    path = Path(settings.socket.path).with_suffix(".lock")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise InputError(f"{path}: another daemon runs on this socket; stop it first (thermoctl stop)") from None
+    except OSError as e:
+        raise InputError(f"{path}: cannot be made: {e.strerror}; check socket.path") from None
+    return lock
+
+
+def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child], log: Log) -> int:
+    asked: list[int] = []
+    reload_asked: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda n, _: asked.append(n))
+    signal.signal(signal.SIGHUP, lambda *_: reload_asked.append(1))
+    notify, watcher = _Notify(), _Watcher(shared, log)
+    code, ready, ticks, ticked = EXIT_OK, False, 0, time.monotonic()
+    started = time.monotonic()
+    try:
+        for child in (loop, *others):
+            child.start()
+        while not asked:
+            time.sleep(0.1)
+            watcher.look()
+            now = time.monotonic()
+            head = shared.ring.head
+            if head != ticks:
+                ticks, ticked = head, now
+                if ready:
+                    notify("WATCHDOG=1")
+            if not ready and head > loops.STATE_EVERY // 5:
+                ready = True
+                notify(f"READY=1\nMAINPID={os.getpid()}")
+                log("ready", ticks=head, seconds=round(now - started, 2))
+            if not loop.alive:
+                log("the loop ended", exit=loop.process.exitcode)
+                code = loop.process.exitcode if loop.process.exitcode in (EXIT_INPUT, EXIT_HARDWARE) else EXIT_FAILED
+                break
+            if now - ticked > (STALL_S if ready else READY_S):
+                log("the loop stands still: ended", seconds=round(now - ticked, 1), pid=int(shared.counters[LOOP_PID]))
+                loop.process.kill()
+                loop.process.join()
+                code = EXIT_FAILED
+                break
+            _restart(others, now, log)
+            if reload_asked:
+                reload_asked.clear()
+                _reload(settings, log)
+    finally:
+        notify("STOPPING=1")
+        ended_by_itself = loop.alive
+        loop.end()
+        if not ended_by_itself or loop.process.exitcode != 0:
+            safe_amplifier(settings, log)
+        watcher.look()
+        for child in others:
+            child.end()
+    log("stopped", ticks=shared.ring.head)
+    return code
+
+
+def _restart(children: list[_Child], now: float, log: Log) -> None:
+    for child in children:
+        if child.alive:
+            continue
+        if child.again_at == 0.0:
+            if now - child.started > RESTART_LONGEST_S:
+                child.pause_s = RESTART_S
+            child.again_at = now + child.pause_s
+            log(f"{child.name} ended, started again", exit=child.process.exitcode, after_s=child.pause_s)
+            child.pause_s = min(2.0 * child.pause_s, RESTART_LONGEST_S)
+        elif now >= child.again_at:
+            child.again_at = 0.0
+            child.start()
+
+
+def _reload(settings: Any, log: Log) -> None:
+    from thermoctl.daemon.socket import ask
+    try:
+        answer = ask(settings.socket.path, {"command": "reload"})
+        log("reload", **answer)
+    except InputError as e:
+        log("reload", error=e)
