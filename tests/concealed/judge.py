@@ -1,0 +1,55 @@
+"""How large is an effect? By the signal left after an honest refit, in the metric of the sensors' noise.
+
+All signals are whitened by the known noise spectrum in the DCT domain. With J the whitened derivatives of the outputs
+by the plant's parameters and start values (scaled by a quarter of their ranges, which enter as a ridge of 1) and d the
+whitened difference an effect makes,
+
+    left over:  r = d - J (J'J + I)^-1 J'd,     SNR = |r|
+
+so white noise of sd s on N samples gives SNR = rms(r) sqrt(N) / s, and the SNR is the expected value of an ideal
+single-effect test statistic in standard deviations. Bands: small 3-6, middle 6-15, large above 15. Two
+explanations are `nearly the same` when less than 3.5 of the true one's signal is left after the other, too, is fitted.
+"""
+from __future__ import annotations
+
+import numpy as np
+from scipy.fft import dct
+
+BANDS = {"small": (3.0, 6.0), "middle": (6.0, 15.0), "large": (15.0, 60.0)}
+TELL_APART = 3.5
+
+
+class Judge:
+    """Whitening and projection for one rig: `spectra[run][channel]` (N,) per-bin noise variances."""
+
+    def __init__(self, spectra: list[np.ndarray]):
+        self.scale = [1 / np.sqrt(s) for s in spectra]
+
+    def whiten(self, runs: list[np.ndarray]) -> np.ndarray:
+        """Signals of all runs, each (m, N, ny), to whitened rows (m, sum N*ny)."""
+        rows = [(dct(y, axis=1, norm="ortho") * s).reshape(len(y), y.shape[1] * y.shape[2]) for y, s in zip(runs, self.scale, strict=True)]
+        return np.concatenate(rows, axis=1)
+
+    def set_parameters(self, derivatives: np.ndarray) -> None:
+        """Whitened derivatives (np, M), each already times a quarter of the parameter's range."""
+        padded = np.concatenate([derivatives, np.eye(len(derivatives))], axis=1)
+        _, r = np.linalg.qr(padded.T)
+        self.basis = np.linalg.solve(r.T, derivatives)
+        self.solve = r
+
+    def left_over(self, d: np.ndarray) -> np.ndarray:
+        """What a refit leaves of the whitened signals d (m, M), in coordinates (m, M + np) that carry the ridge."""
+        c = d @ self.basis.T
+        inner = np.linalg.solve(self.solve, c.T).T
+        return np.concatenate([d - c @ self.basis, -inner], axis=1)
+
+
+def snr(left: np.ndarray) -> np.ndarray:
+    """Norms of left-over rows."""
+    return np.linalg.norm(left, axis=-1)
+
+
+def beyond(left: np.ndarray, rival: np.ndarray) -> float:
+    """What is left of one signal (M,) after the rival's rows (k, M) are fitted to it as well."""
+    q, _ = np.linalg.qr(rival[snr(rival) > 1e-9].T)
+    return float(np.linalg.norm(left - q @ (q.T @ left)))
