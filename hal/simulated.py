@@ -1,16 +1,18 @@
 """The simulated rig: a plant file as hardware, deterministic, at any speed.
 
-The plant advances in periods of the loop with its drive held. A sensor reads the plant's output plus its noise, rounded to
-its resolution (both from the plant file), at its own rate: the encoders every period, the slow ones every
+The plant advances in periods of the loop with its drive held. A sensor reads the plant's output plus its noise, rounded
+to its resolution (both from the plant file), at its own rate: the encoders every period, the slow ones every
 `sensor_period_s`. The same seed and the same commands at the same times give the same bits.
 
-The plant that plays the hardware may differ from the one that the compensator was built from (`hal.truth`): that is how a
-left-out effect is shown. Outputs play the role of their own name, or the one that `hal.roles` gives them.
+The plant that plays the hardware may differ from the one that the compensator was built from (`hal.truth`): that is how
+a left-out effect is shown. Outputs play the role of their own name, or the one that `hal.roles` gives them. The plant's
+other inputs (the chamber's air) follow `hal.inputs`: mean + swing * sin(2 pi t / period_s).
 """
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,38 +28,70 @@ from hal.backend import (
     STALE,
     Sample,
 )
+from hal.profile import Section
 from thermoctl.plant import load
-from thermoctl.yamlfile import InputError, suggest
+from thermoctl.yamlfile import InputError, Node, suggest
 
 MAX_CATCH_UP = 1000         # periods in one read; a clock that jumps further (suspend) moves the plant's time instead
 EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
+
+
+@dataclass(frozen=True)
+class Surrounding:
+    """A plant input that nobody commands, and the sensor that measures it."""
+    mean: float
+    swing: float = 0.0
+    period_s: float = 86400.0
+    noise: float = 0.0
+    resolution: float = 0.0
+
+    def at(self, t: float) -> float:
+        """Its value t seconds after the start."""
+        return self.mean + self.swing * math.sin(2 * math.pi * t / self.period_s)
+
+
+def surroundings(node: Node | None) -> dict[str, Surrounding]:
+    """`hal.inputs`: name -> {mean, swing, period_s, noise, resolution}. Raises InputError."""
+    if node is None:
+        return {}
+    found = {}
+    for name, item in Section(node, "inputs").node.value.items():
+        s = Section(item, name)
+        found[name] = Surrounding(s.number("mean"), s.number("swing", 0.0), s.number("period_s", 86400.0, 1.0),
+                                  s.number("noise", 0.0, 0.0), s.number("resolution", 0.0, 0.0))
+        s.end()
+    return found
 
 
 class PlantRig:
     """A plant that lives: `step` advances it, `sense` reads a sensor. Shared by the simulated back end and the virtual
     rig at the wire."""
 
-    def __init__(self, path: str | Path, period_s: float, drive_input: str, inputs: Mapping[str, float],
+    def __init__(self, path: str | Path, period_s: float, drive_input: str, surroundings: Mapping[str, Surrounding],
                  roles: Mapping[str, str], seed: int) -> None:
-        """inputs: constants for the plant's other inputs; roles: output -> role where they differ in name.
+        """surroundings: the plant's inputs other than the drive; roles: output -> role where they differ in name.
         Raises InputError where the plant and these do not fit."""
         plant = load(path)
         model = plant.compile(())
         if drive_input not in model.inputs:
             raise InputError(f"{path}: no input '{drive_input}' to drive{suggest(drive_input, model.inputs)}; "
                              f"hal.drive_input must be one of {', '.join(model.inputs)}")
-        for name in inputs:
-            if name not in model.inputs or name == drive_input:
-                raise InputError(f"{path}: hal.inputs: the plant has no free input '{name}'{suggest(name, model.inputs)}")
-        missing = [n for n in model.inputs if n not in inputs and n != drive_input]
+        free = [n for n in model.inputs if n != drive_input]
+        for name in surroundings:
+            if name not in free:
+                raise InputError(f"{path}: hal.inputs: the plant has no free input '{name}'{suggest(name, free)}")
+        missing = [n for n in free if n not in surroundings]
         if missing:
-            raise InputError(f"{path}: hal.inputs must give {', '.join(missing)} a value")
-        self.u = np.array([inputs.get(n, 0.0) for n in model.inputs])
+            raise InputError(f"{path}: hal.inputs must say what {', '.join(missing)} is")
         self._drive = model.inputs.index(drive_input)
+        self._surroundings = [(model.inputs.index(n), s) for n, s in surroundings.items()]
+        self.u = np.zeros(len(model.inputs))
+        for i, s in self._surroundings:
+            self.u[i] = s.at(0.0)
         self.stepper = model.stepper(period_s, self.u)
         self._random = np.random.default_rng(seed)
-        self.y = np.array(self.stepper.step(self.u))
-        self.index: dict[str, int] = {}
+        self.y = self.stepper.step(self.u)
+        self.index: dict[str, int] = {}             # role -> output; after the outputs come the surroundings
         for i, name in enumerate(model.outputs):
             role = roles.get(name, name)
             if role in ROLES:
@@ -71,20 +105,35 @@ class PlantRig:
             raise InputError(f"{path}: no output plays position_um; name one in hal.roles "
                              f"(outputs: {', '.join(model.outputs)})")
         outputs = [plant.outputs[n] for n in model.outputs]
-        self._noise = [o.noise or 0.0 for o in outputs]
-        self._resolution = [o.resolution or 0.0 for o in outputs]
+        self._noise = [o.noise or 0.0 for o in outputs] + [s.noise for _, s in self._surroundings]
+        self._resolution = [o.resolution or 0.0 for o in outputs] + [s.resolution for _, s in self._surroundings]
+        for k, name in enumerate(surroundings):
+            role = next((r for r in (name, plant.inputs[name].column) if r in ROLES), "")
+            if role and role not in self.index:
+                self.index[role] = len(outputs) + k
 
     def step(self, drive: float) -> None:
         """Advance one period with `drive` held."""
         self.u[self._drive] = drive
+        for i, s in self._surroundings:
+            self.u[i] = s.at(self.stepper.t)
         self.y = self.stepper.step(self.u)
 
     def sense(self, role: str) -> float:
         """What the sensor in this role reads now: output + noise, rounded to its resolution."""
-        return self._sense(self.index[role])
+        return self.read_sensor(self.index[role])
 
-    def _sense(self, i: int) -> float:
-        value = self.y[i]
+    def true(self, role: str) -> float:
+        """What it would read without noise and steps."""
+        return self._value(self.index[role])
+
+    def _value(self, i: int) -> float:
+        n = len(self.y)
+        return float(self.y[i] if i < n else self.u[self._surroundings[i - n][0]])
+
+    def read_sensor(self, i: int) -> float:
+        """`sense` by number (`index[role]`)."""
+        value = self._value(i)
         if self._noise[i]:
             value += self._noise[i] * self._random.standard_normal()
         step = self._resolution[i]
@@ -95,7 +144,7 @@ def make_rig(settings: Any) -> PlantRig:
     """The plant that `settings.hal` names as the hardware's truth. Paths are relative to the config file."""
     hal = settings.hal
     return PlantRig(Path(settings.path).parent / (hal.truth or hal.plant), settings.loop.period_s, hal.drive_input,
-                    hal.inputs, hal.roles, hal.seed)
+                    surroundings(hal.inputs), hal.roles, hal.seed)
 
 
 def simulated_backend(settings: Any) -> SimulatedBackend:
@@ -136,17 +185,17 @@ class SimulatedBackend:
         for channels, wanted in ((self._fast, True), (self._slow, slow_due)):
             if wanted:
                 for role, i in channels:
-                    value = rig._sense(i)
+                    value = rig.read_sensor(i)
                     sample.fresh[role] = True
                     if math.isfinite(value):
                         sample.value[role], sample.time_s[role], sample.status[role] = value, now_s, OK
                     else:
                         sample.status[role] = ERROR
-        role = ROLE["amplifier_state"]
-        sample.value[role] = AMP_ENABLED if self._enabled else AMP_DISABLED
+        state = ROLE["amplifier_state"]
+        sample.value[state] = AMP_ENABLED if self._enabled else AMP_DISABLED
         fault = ROLE["amplifier_fault"]
         sample.value[fault] = 0.0
-        for role in (role, fault):
+        for role in (state, fault):
             sample.time_s[role], sample.fresh[role], sample.status[role] = now_s, True, OK
         return sample
 

@@ -44,9 +44,9 @@ def _dictionary(node: int) -> dict[tuple[int, int], Entry]:
 
 @dataclass
 class Cia402Drive:
-    """The drive. The rig sets readings in `od[index, 0].value` and takes `command` (counts of the active target object).
+    """The drive. The rig sets readings in `od[index, 0].value` and takes `command` (counts of the target).
 
-    `command_object` is the target that drives (0x2071 or 0x6071). `alive` False: unpowered, answers nothing;
+    `command_object` is the target that drives (0x2071, 0x6071); `alive` False: unpowered, mute;
     `heartbeat` False: its own heartbeat is off."""
     node: int
     command_object: int = 0x2071
