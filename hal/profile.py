@@ -479,6 +479,12 @@ _SOURCES: dict[str, Any] = {
     "can-dbc": _dbc_source, "can-cia402": _cia402_source, "modbus": _register}
 
 
+def resolve_port(port: str, folder: Path) -> str:
+    """A port whose path is relative ('../run/encoder', 'slcan:./can') with that path taken from `folder`."""
+    match = re.fullmatch(r"((?:slcan:|rtu:)?)(\.\.?/.*)", port)
+    return f"{match[1]}{(folder / match[2]).resolve().parent / Path(match[2]).name}" if match else port
+
+
 def bind(node: Node, folder: Path) -> Binding:
     """One item of `hal.devices`: {profile, port, roles: {channel: role}, name?, address?}; `profile` is relative to
     `folder`. Raises InputError: unknown channel, unknown role, unit that does not fit the role."""
@@ -497,8 +503,8 @@ def bind(node: Node, folder: Path) -> Binding:
             raise role.error(f"roles: '{role.value}' is no role{suggest(role.value, ROLES)}; roles: {', '.join(ROLES)}")
         bounds.append(_bound(role, profile.channels[name]))
     default = getattr(profile.bus_spec, "node_id", getattr(profile.bus_spec, "unit_id", 0))
-    binding = Binding(s.text("name", profile.model), profile, s.text("port"), s.integer("address", default, 0, 247),
-                      tuple(bounds), node.place)
+    binding = Binding(s.text("name", profile.model), profile, resolve_port(s.text("port"), folder),
+                      s.integer("address", default, 0, 247), tuple(bounds), node.place)
     s.end()
     return binding
 

@@ -65,7 +65,7 @@ class Framer:
         self._buffer = bytearray()
         names = [n for n, _ in spec.fields]
         self._sequence = names.index(spec.sequence) if spec.sequence else -1
-        self._modulus = 256 ** struct.calcsize(self._payload.format[1 + self._sequence]) if spec.sequence else 0
+        self.modulus = 256 ** struct.calcsize(self._payload.format[1 + self._sequence]) if spec.sequence else 0
         self.newest: tuple = ()
         self.frames = self.bad = self.skipped = self.lost = 0
 
@@ -105,7 +105,7 @@ class Framer:
                 continue
             values = self._payload.unpack_from(buffer, at + self._head)
             if self._sequence >= 0 and self.newest:
-                self.lost += (values[self._sequence] - self.newest[self._sequence] - 1) % self._modulus
+                self.lost += (values[self._sequence] - self.newest[self._sequence] - 1) % self.modulus
             self.newest = values
             good += 1
             at = end

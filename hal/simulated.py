@@ -133,7 +133,10 @@ class PlantRig:
 
     def read_sensor(self, i: int) -> float:
         """`sense` by number (`index[role]`)."""
-        value = self._value(i)
+        return self.measured(i, self._value(i))
+
+    def measured(self, i: int, value: float) -> float:
+        """What sensor number i makes of a true value: noise added, rounded to its resolution."""
         if self._noise[i]:
             value += self._noise[i] * self._random.standard_normal()
         step = self._resolution[i]
