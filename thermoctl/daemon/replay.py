@@ -45,8 +45,8 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
                          f"{rows[0, INDEX['tick']]:.0f}; ticks are missing, so a replay cannot start")
     missing = np.flatnonzero(np.diff(rows[:, INDEX["tick"]]) != 1)
     if len(missing):
-        raise InputError(f"{name}: ticks are missing after tick {rows[missing[0], INDEX['tick']]:.0f} (the recorder fell "
-                         "behind); a replay would not start from the same state")
+        raise InputError(f"{name}: ticks are missing after tick {rows[missing[0], INDEX['tick']]:.0f} (the recorder "
+                         "fell behind); a replay would not start from the same state")
     n = _OUTPUTS - 2 - _CHANNELS
     value, fresh, status = np.zeros(n), np.zeros(n, dtype=np.uint8), np.zeros(n, dtype=np.uint8)
     law.bind(value, fresh, status)

@@ -84,7 +84,7 @@ class Shared:
         try:
             memory = shared_memory.SharedMemory(name)
         except FileNotFoundError:
-            raise InputError(f"shared memory '{name}': not there; the daemon is not running (thermoctl start)") from None
+            raise InputError(f"shared memory '{name}': not there: no daemon runs (thermoctl start)") from None
         # An attaching process must not remove the segment when it ends (CPython issue 82300).
         resource_tracker.unregister(memory._name, "shared_memory")      # type: ignore[attr-defined]
         header = np.ndarray((4,), "u8", memory.buf)

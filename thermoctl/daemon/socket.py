@@ -2,7 +2,8 @@
 
 A request is {"command": NAME, ...}; the answer {"ok": true, ...} or {"ok": false, "error": TEXT}. The socket's file
 permissions (owner and group) decide who may connect; who gave a command that moves anything is logged from the
-kernel's peer credentials. A status query reads shared memory and never costs the loop a tick. Every size from outside is limited.
+kernel's peer credentials. A status query reads shared memory and never costs the loop a tick. Every size from outside
+is limited.
 """
 from __future__ import annotations
 
@@ -47,6 +48,7 @@ def status(shared: Shared) -> dict[str, Any]:
             "output_reference_um", "control_v", "drive", "enable", "voltage_v", "current_a", "power_w", "air_c",
             "innovation_c", "kalman_gain", "position_age_s", "coil_age_s", "supply_v", "amplifier_state",
             "amplifier_fault")},
+        "channels": _channels(int(row[INDEX["status_bits"]])),
         "temperatures_c": {p: number[f"{p}_c"] for p in POINTS},
         "estimates_c": {p: number[f"{p}_est_c"] for p in POINTS},
         "lateness_us": number["lateness_us"], "busy_us": number["busy_us"], "busy_p50_us": _or_none(busy[0]),
@@ -54,6 +56,11 @@ def status(shared: Shared) -> dict[str, Any]:
         "faults": [{"name": f.name, "severity": f.severity, "meaning": f.meaning, "remedy": f.remedy}
                    for f in faults.decode(row[INDEX["fault_bits"]])],
     }
+
+
+def _channels(status_bits: int) -> dict[str, str]:
+    return {name: ("OK", "STALE", "ERROR", "ABSENT")[status_bits >> (2 * c) & 3]
+            for c, name in enumerate(faults.CHANNELS)}
 
 
 def latency(shared: Shared, period_s: float) -> dict[str, Any]:
@@ -75,8 +82,8 @@ def _or_none(number: float) -> float | None:
 
 
 class Commands:
-    """What a request does. `reload_settings()` validates the file again and returns (settings, parameters, changed keys,
-    keys that need a restart)."""
+    """What a request does. `reload_settings(settings)` validates the file again and returns (settings, parameters,
+    changed keys, keys that need a restart)."""
 
     def __init__(self, shared: Shared, settings: Any,
                  reload_settings: Callable[[Any], tuple[Any, Any, list[str], list[str]]], log: Callable[..., None]):
@@ -97,7 +104,8 @@ class Commands:
             return {"ok": True, **latency(self.shared, self.settings.loop.period_s)}
         if name == "signals":
             return {"ok": True, "signals": [[s.name, s.unit, s.meaning] for s in SIGNALS]}
-        action = {"arm": self._arm, "disarm": self._disarm, "setpoint": self._setpoint, "reload": self._reload}.get(name)
+        actions = {"arm": self._arm, "disarm": self._disarm, "setpoint": self._setpoint, "reload": self._reload}
+        action = actions.get(name)
         if action is None:
             return {"ok": False, "error": f"unknown command '{name[:40]}'; "
                                           "expected status, latency, signals, arm, disarm, setpoint or reload"}
@@ -177,7 +185,7 @@ class _Client:
 
 
 def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
-    """The listening socket at `path`, for owner and group. Raises InputError where the path or the group is at fault."""
+    """The listening socket at `path`, for owner and group. Raises InputError where it cannot be made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileNotFoundError):
         path.unlink()

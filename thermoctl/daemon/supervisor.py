@@ -7,9 +7,9 @@
               └── reference   an idle loop beside it, when loop.reference is on
 
 The loop ends: the amplifier is disabled through a back end of the supervisor's own and the daemon ends with it
-(systemd starts it again, into SAFE). Any other process ends: it is started again, the loop runs on. The supervisor ends:
-the kernel tells every child (PDEATHSIG) and the loop disables the amplifier. The loop stands still: it is killed, as if
-it had ended.
+(systemd starts it again, into SAFE). Any other process ends: it is started again, the loop runs on. The supervisor
+ends: the kernel tells every child (PDEATHSIG) and the loop disables the amplifier. The loop stands still: it is killed,
+as if it had ended.
 """
 from __future__ import annotations
 

@@ -1,0 +1,207 @@
+"""What the commands print: each function is one command of the command line, given the configuration's path.
+
+Exit status as in cli.py. The configuration is found by --config, else $THERMOCTL_CONFIG, else config/simulated.yaml here,
+else /etc/thermoctl/rig.yaml.
+"""
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from thermoctl.daemon.socket import ask
+from thermoctl.settings import load_settings
+from thermoctl.yamlfile import InputError
+
+
+def find_config(given: str | None) -> str:
+    """The configuration's path. Raises InputError when there is none."""
+    candidates = [given] if given else [os.environ.get("THERMOCTL_CONFIG"), "config/simulated.yaml",
+                                        "/etc/thermoctl/rig.yaml"]
+    for path in candidates:
+        if path and (given or Path(path).exists()):
+            return path
+    raise InputError("no configuration found; give one with --config FILE or in THERMOCTL_CONFIG")
+
+
+def settings_of(config: str | None) -> Any:
+    """The validated settings of `find_config(config)`."""
+    return load_settings(find_config(config))
+
+
+def run(config: str | None) -> int:
+    """The daemon in the foreground."""
+    from thermoctl.daemon.supervisor import run as supervise
+    return supervise(settings_of(config))
+
+
+def service(config: str | None, action: str) -> int:
+    """start, stop or restart."""
+    from thermoctl.daemon import service as services
+    return getattr(services, action)(settings_of(config))
+
+
+def request(config: str | None, command: str, value: float | None = None, as_json: bool = False) -> int:
+    """arm, disarm, setpoint or reload; 0, or 1 when the daemon refuses."""
+    answer = ask(settings_of(config).socket.path, {"command": command, "value": value})
+    if as_json:
+        print(json.dumps(answer))
+    elif not answer["ok"]:
+        print(f"thermoctl: {answer['error']}", file=sys.stderr)
+    elif command == "reload":
+        print("applied: " + (", ".join(answer["applied"]) or "nothing changed"))
+        if answer["needs_restart"]:
+            print("needs a restart: " + ", ".join(answer["needs_restart"]))
+    else:
+        setpoint = answer.get("setpoint_um")
+        print(answer["state"] + (f", setpoint {setpoint:.3f} um" if command != "disarm" and setpoint is not None else ""))
+    return 0 if answer["ok"] else 1
+
+
+def status(config: str | None, as_json: bool = False) -> int:
+    """The daemon's state; 0, or 1 when it does not run or a fault stands."""
+    try:
+        answer = ask(settings_of(config).socket.path, {"command": "status"})
+    except InputError as e:
+        if as_json:
+            print(json.dumps({"ok": False, "state": "OFF", "error": str(e)}))
+        else:
+            print(f"thermoctl: {e}", file=sys.stderr)
+        return 1
+    faulty = any(f["severity"] != "warning" for f in answer["faults"])
+    if as_json:
+        print(json.dumps(answer))
+        return 1 if faulty else 0
+    if not answer["ticks"]:
+        print("OFF, starting")
+        return 1
+    print(f"{answer['state']}   {answer['ticks']} ticks in {answer['uptime_s']:.1f} s, {answer['slips']} slips, "
+          f"busy {answer['busy_us']:.0f} us")
+    print(f"setpoint {_number(answer['setpoint_um'])} um   position {_number(answer['position_um'])} um   "
+          f"compensation {_number(answer['compensation_um'])} um   output {_number(answer['output_reference_um'])} um")
+    print(f"drive {_number(answer['drive'])}   power {_number(answer['power_w'])} W   air {_number(answer['air_c'], 2)} C   "
+          f"coil {_number(answer['temperatures_c']['coil'], 2)} C, estimated {_number(answer['estimates_c']['coil'], 2)} C")
+    bad = {role: state for role, state in answer["channels"].items() if state not in ("OK", "ABSENT")}
+    if bad:
+        print("readings: " + ", ".join(f"{role} {state}" for role, state in bad.items()))
+    if answer["recorder"]["lost"]:
+        print(f"recorder: {answer['recorder']['lost']} ticks lost")
+    for fault in answer["faults"]:
+        print(f"{fault['severity']} {fault['name']}: {fault['meaning']}\n    -> {fault['remedy']}")
+    return 1 if faulty else 0
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def latency(config: str | None, as_json: bool = False) -> int:
+    """Histograms of lateness and busy time, slips, and the reference loop's lateness of the same run."""
+    answer = ask(settings_of(config).socket.path, {"command": "latency"})
+    if as_json:
+        print(json.dumps(answer))
+        return 0
+    period = answer["period_us"]
+    print(f"{answer['ticks']} ticks of {period:g} us, {answer['slips']} slips "
+          f"({1000.0 * answer['slips'] / max(answer['ticks'], 1):.2f} in 1000)")
+    print(f"{'':24}{'p50':>9}{'p99':>9}{'p99.9':>9}{'largest':>10}   us")
+    for name, label in (("lateness", "wake-up lateness"), ("busy", "busy time"), ("reference", "idle loop's lateness")):
+        h = answer[name]
+        if h["count"]:
+            print(f"{label:24}{h['p50_us']:9.0f}{h['p99_us']:9.0f}{h['p999_us']:9.0f}{h['largest_us']:10.0f}")
+        else:
+            print(f"{label:24}  none (loop.reference is off)" if name == "reference" else f"{label:24}  none yet")
+    busy = answer["busy"]
+    if busy["count"]:
+        print(f"{'busy share of the tick':24}" + "".join(f"{100.0 * busy[k] / period:8.1f}%"
+                                                       for k in ("p50_us", "p99_us", "p999_us")))
+    for name in ("lateness", "busy"):
+        print(f"\n{name}, us")
+        print(_bars(answer[name]["bins_us"]))
+    return 0
+
+
+def _bars(bins: list[list[int]], width: int = 50) -> str:
+    """A histogram of whole microseconds in bins that double."""
+    edges = [0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 1 << 30]
+    counts = [sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)]
+    top = max(counts, default=0) or 1
+    return "\n".join(f"{low:6d} .. {str(high) if high < 1 << 30 else '':5} {count:9d} {'#' * round(width * count / top)}"
+                     for low, high, count in zip(edges, edges[1:], counts, strict=False) if count)
+
+
+def check(config: str) -> int:
+    """Validate the configuration, the model, the plant and the profiles; no hardware is touched."""
+    from hal.backend import make_backend
+    from thermoctl.daemon.assemble import compensator, law_parameters
+    settings = load_settings(config)
+    law_parameters(settings)
+    model = compensator(settings)
+    make_backend(settings)
+    print(f"{config}: good. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, model "
+          f"{settings.compensation.model or 'none'} ({model.kind}, order {len(model.A_minus_I)})")
+    return 0
+
+
+def doctor(config: str, seconds: float = 2.0) -> int:
+    """Connect, read every channel for `seconds`, show values with units and rates; nothing is driven. 1 when one is bad."""
+    from hal.backend import OK, ROLES, STATUS_NAMES, HardwareError, make_backend
+    from thermoctl.daemon.loop import become_real_time
+    from thermoctl.signals import SIGNALS
+    settings = load_settings(config)
+    backend = make_backend(settings)
+    units = {s.name: s.unit for s in SIGNALS}
+    try:
+        backend.open()
+        counts = dict.fromkeys(ROLES, 0)
+        begin = now = time.monotonic()
+        while now < begin + seconds:
+            sample = backend.read(now)
+            for role, fresh in zip(ROLES, sample.fresh, strict=True):
+                counts[role] += int(fresh)
+            time.sleep(settings.loop.period_s)
+            now = time.monotonic()
+        print(f"{'channel':24}{'value':>14} {'unit':8}{'status':8}{'rate':>10}")
+        bad = 0
+        for k, role in enumerate(ROLES):
+            state = STATUS_NAMES[sample.status[k]]
+            if state == "ABSENT" and role not in settings.protection.required:
+                continue
+            bad += sample.status[k] != OK
+            unit = units.get("position_raw_um" if role == "position_um" else role, "")
+            print(f"{role:24}{sample.value[k]:14.4f} {unit:8}{state:8}{counts[role] / seconds:7.1f} Hz"
+                  + (f"   {backend.problem(role)}" if sample.status[k] != OK else ""))
+    except HardwareError as e:
+        print(f"thermoctl: {e}", file=sys.stderr)
+        return 3
+    finally:
+        backend.close()
+    print("\nreal time:")
+    refused: list[str] = []
+    become_real_time(settings, refused.append)
+    for line in refused or ["priority, locked memory, processor and latency request are all granted"]:
+        print(f"  {line}")
+    return 1 if bad else 0
+
+
+def replay(recording: str) -> int:
+    """Run a recording's inputs through the law; 1 when an output differs in one bit."""
+    import numpy as np
+
+    from thermoctl.daemon.replay import replay as run_replay
+    from thermoctl.recording.reader import read_rows
+    rows, metadata = read_rows(recording)
+    begin = time.perf_counter()
+    result = run_replay(rows, metadata, recording)
+    seconds = time.perf_counter() - begin
+    print(f"{recording}: {result.ticks} ticks replayed in {seconds:.2f} s"
+          + (f", {result.skipped} before the stored state skipped" if result.skipped else ""))
+    for name, (count, first, largest) in result.differences.items():
+        print(f"  {name}: differs in {count} ticks, first in tick {first}, by at most {largest:g}")
+    if result.differences:
+        return 1
+    print(f"  all {np.size(result.outputs)} outputs are the recorded ones, bit for bit")
+    return 0
