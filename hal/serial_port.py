@@ -159,6 +159,9 @@ def open_port(path: str, line: LineSettings, what: str) -> serial.Serial:
         raise HardwareError(f"{what}: {path}: {hint}") from None
     if line.latency_timer_ms:
         set_latency_timer(path, line.latency_timer_ms)
+    settings = termios.tcgetattr(port.fileno())
+    settings[6][termios.VMIN] = 1           # so that 'nothing yet' (EAGAIN) differs from 'gone' (no bytes)
+    termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
     os.set_blocking(port.fileno(), False)
     return port
 

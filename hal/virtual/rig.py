@@ -1,8 +1,8 @@
 """The virtual rig: the devices of a configuration at the other end of their wires, in real time.
 
-`hal.devices` says what the daemon talks to; this program plays those devices by the same profiles: a pty with a
-symbolic link at each serial port's path, a Lawicel adapter with a CiA-402 drive (or the sender of a DBC file) behind it, Modbus
-TCP servers and RTU units. One plant feeds them all; the drive's current moves it. In `hal.run_dir` stand
+`hal.devices` says what the daemon talks to; this program plays those devices by the same profiles: a pty with
+a symbolic link at each serial port's path, a Lawicel adapter with a CiA-402 drive (or the sender of a DBC file) behind
+it, Modbus TCP servers and RTU units. One plant feeds them all; the drive's current moves it. In `hal.run_dir` stand
 
     reference.csv   what the daemon never sees: the output's reference encoder and the true state, 100 rows a second,
                     `t` on the machine's monotonic clock
@@ -150,9 +150,12 @@ class EncoderStream(VirtualDevice):
     def tick(self, now_s: float, tick: int) -> None:
         if self.mute:
             return
-        fields = dict.fromkeys(self._names, 0.0)
+        fields: dict[str, float] = dict.fromkeys(self._names, 0)
         if not self.freeze:
-            self._held = {b.channel.source: round(self.reading(b) or 0.0) for b in self.binding.bounds}
+            self._held = {b.channel.source: self.reading(b) or 0.0 for b in self.binding.bounds}
+            for name, kind in self._spec.fields:
+                if name in self._held and not kind.startswith("float"):
+                    self._held[name] = round(self._held[name])
         fields.update(self._held)
         if self._spec.sequence:
             self._sequence = (self._sequence + 1) % self._framer.modulus
@@ -402,7 +405,7 @@ _KINDS: dict[str, type[VirtualDevice]] = {"serial-binary": EncoderStream, "seria
 
 
 def virtual_device(binding: Binding, rig: PlantRig) -> VirtualDevice:
-    """The device that plays `binding`. Raises InputError for a CAN port that is not slcan: nobody can play that here."""
+    """The device that plays `binding`. Raises InputError for a CAN port that is not slcan."""
     if binding.profile.bus.startswith("can") and not binding.port.startswith("slcan:"):
         raise InputError(f"{binding.place}: the virtual rig plays CAN devices on slcan ports only, "
                          f"found '{binding.port}'")
