@@ -1,0 +1,147 @@
+"""Where simulation and recording part: one smooth unknown input at a time, at each node and on each sensor.
+
+A node's unknown flow q(t) (straight lines between knots) drives the linearised plant; a sensor's unknown error adds to its
+output alone. Which one explains most of the residual, at equal freedom, is where the mismatch sits: a sensor's fault does not
+propagate, a node's does. The best node's flow is then recovered on a finer grid, and compared with the recorded signals.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.diagnose.screen import Metric, _Column, directions, log_p
+from thermoctl.plant import expression as ex
+
+COARSE, FINE = 10, 40       # knots a recording
+
+
+@dataclass
+class Suspect:
+    """A node or an output with an unknown smooth input: how much of the residual it explains."""
+    kind: str               # 'node' or 'output'
+    name: str
+    gain: float
+    dims: int
+
+    @property
+    def log_p(self) -> float:
+        """log10 of the chance of such a gain by noise."""
+        return log_p(self.gain, self.dims)
+
+
+@dataclass
+class Missing:
+    """A recovered unknown flow into a node: per recording its times and values (unit of storage times node per second)."""
+    node: str
+    t: list[np.ndarray]
+    flow: list[np.ndarray]
+    rms: float
+    when: list[list[float]]
+    follows: list[str]
+
+
+def _hats(t: np.ndarray, knots: int) -> np.ndarray:
+    edges = np.linspace(t[0], t[-1], knots)
+    return np.stack([np.interp(t, edges, row) for row in np.eye(knots)])
+
+
+def _columns(metric: Metric, kind: str, index: int, knots: int) -> list[_Column]:
+    out = []
+    n = len(metric.drives)
+    for r, d in enumerate(metric.drives):
+        for hat in _hats(d.t, knots):
+            column = _Column((index,))
+            for q in range(n):
+                column.forces.append({index: hat} if kind == "node" and q == r else {})
+                column.outputs.append({index: hat} if kind == "output" and q == r else {})
+            out.append(column)
+    return out
+
+
+def suspects(metric: Metric) -> list[Suspect]:
+    """Every node and every output with an unknown smooth input, likeliest first."""
+    found = []
+    for kind, names in (("node", metric.model.states), ("output", metric.model.outputs)):
+        for index, label in enumerate(names):
+            columns = _columns(metric, kind, index, COARSE)
+            rows = np.concatenate([metric.project(part) for _, part in directions(metric, columns)], axis=1)
+            gain, dims = _gain(rows, metric.residual)
+            if dims:
+                found.append(Suspect(kind, label, gain, dims))
+    return sorted(found, key=lambda s: s.log_p)
+
+
+def _gain(rows: np.ndarray, r: np.ndarray) -> tuple[float, int]:
+    size = np.linalg.norm(rows, axis=0)
+    keep = size > 1e-9
+    if not keep.any():
+        return 0.0, 0
+    scaled = rows[:, keep] / size[keep]
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    good = values > 1e-6 * values[-1]
+    z = (vectors[:, good].T @ (scaled.T @ r)) / np.sqrt(values[good])
+    return float(z @ z), int(good.sum())
+
+
+def missing_flow(metric: Metric, node: str, signals: dict[str, list[np.ndarray]]) -> Missing:
+    """The unknown flow into a node that the residual asks for: knots of a smooth curve, ridge chosen by cross-validation.
+    `signals`: name to per-recording arrays, to say which the flow follows."""
+    index = metric.model.states.index(node)
+    columns = _columns(metric, "node", index, FINE)
+    rows = np.concatenate([part for _, part in directions(metric, columns)], axis=1)
+    rows = metric.project(rows)
+    gram, g = rows.T @ rows, rows.T @ metric.residual
+    scale = float(np.trace(gram)) / len(gram) or 1.0
+    rough = np.zeros_like(gram)
+    for r in range(len(metric.drives)):
+        second = np.diff(np.eye(FINE), 2, axis=0)
+        rough[r * FINE:(r + 1) * FINE, r * FINE:(r + 1) * FINE] = second.T @ second
+    best = None
+    for ridge in 10.0 ** np.arange(-8, 2):
+        inverse = np.linalg.inv(gram + scale * ridge * rough + 1e-10 * scale * np.eye(len(gram)))
+        q = inverse @ g
+        dof = float(np.trace(inverse @ gram))
+        left = float(metric.residual @ metric.residual - 2 * q @ g + q @ gram @ q)
+        gcv = left / max(len(metric.residual) - 1.4 * dof, 1.0) ** 2
+        if best is None or gcv < best[0]:
+            best = (gcv, q, inverse)
+    assert best is not None
+    _, q, inverse = best
+    storage = metric.model.plant.nodes[node].storage
+    times, flows, when = [], [], []
+    sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    for r, d in enumerate(metric.drives):
+        known = dict(zip(metric.model.parameters, map(float, metric.fit.values[r]), strict=True))
+        mean_x = dict(zip(metric.model.states, metric.runs[r].x.mean(axis=0), strict=True))
+        c = float(ex.evaluate(storage, {**known, **mean_x}))
+        edges = np.linspace(d.t[0], d.t[-1], FINE)
+        part = q[r * FINE:(r + 1) * FINE] * c
+        times.append(edges)
+        flows.append(part)
+        seen = np.abs(part) > np.maximum(3 * sd[r * FINE:(r + 1) * FINE] * c, 0.25 * np.max(np.abs(part)))
+        when.append(_intervals(edges, seen))
+    rms = float(np.sqrt(np.mean(np.concatenate(flows) ** 2)))
+    likeness = {}
+    for key, parts in signals.items():
+        a = np.concatenate([np.interp(edges, d.t, s) for edges, d, s in zip(times, metric.drives, parts, strict=True)])
+        b = np.concatenate(flows)
+        if np.ptp(a) > 0 and np.ptp(b) > 0:
+            likeness[key] = abs(float(np.corrcoef(a, b)[0, 1]))
+    follows = [k for k in sorted(likeness, key=lambda k: -likeness[k]) if likeness[k] > 0.5][:3]
+    return Missing(node, times, flows, rms, [w for part in when for w in part], follows)
+
+
+def _intervals(t: np.ndarray, on: np.ndarray) -> list[list[float]]:
+    out: list[list[float]] = []
+    for k in np.flatnonzero(on):
+        lo, hi = float(t[max(k - 1, 0)]), float(t[min(k + 1, len(t) - 1)])
+        if out and lo <= out[-1][1]:
+            out[-1][1] = hi
+        else:
+            out.append([lo, hi])
+    return out
+
+
+__all__ = ["Missing", "Suspect", "missing_flow", "suspects"]

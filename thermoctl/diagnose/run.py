@@ -1,0 +1,620 @@
+"""From "simulation and recording disagree" to the physics that was left out, and what adding it is worth.
+
+1 refit the plant's own parameters; 2 ask whether anything is wrong; 3 locate; 4 screen the catalogue and refit the best
+entries in full; 5 decide: name, set that cannot be told apart, unknown, or nothing; 6 propose the experiment that would
+separate rivals; 7 show on data that took no part what the finding is worth. `diagnose` does it all and writes the result.
+"""
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnose import locate
+from thermoctl.diagnose.effects import CATALOGUE, Candidate, Rig, candidates, catalogue
+from thermoctl.diagnose.evidence import Colour, channels, white_sigma
+from thermoctl.diagnose.screen import Direction, Metric, screen
+from thermoctl.plant import expression as ex
+from thermoctl.plant import load, save
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Fit, Noise, default_noise, fit, report, updated
+from thermoctl.plant.simulate import Drive, Model, SimulationError
+from thermoctl.recording.table import Table, read_table
+from thermoctl.yamlfile import InputError
+
+MIN_SAMPLES = 40            # fewer measured values than this decide nothing
+FINALISTS = 12
+ACCEPT = 12.0               # an effect must lower the score by this much beyond its parameters' price
+NAME = 0.9                  # one explanation is named alone from this probability on
+CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
+LARGE = 1.6                 # coloured residual beyond this is physics, not a sensor's colour
+TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
+DRAWS = 200                 # draws of noise for the chance that any candidate would look as good
+
+
+@dataclass
+class Explanation:
+    """A plant with some effects added, refitted to all recordings."""
+    plant: Plant
+    effects: list[Candidate]
+    fit: Fit
+    score: float
+    colours: list[Colour]
+    own: list[dict[str, str]] = field(default_factory=list)     # per effect: its parameter to the plant's name
+    direction: Direction | None = None
+    probability: float = 0.0
+
+    @property
+    def last(self) -> Candidate:
+        """The effect added last."""
+        return self.effects[-1]
+
+
+class Case:
+    """The recordings and the plant as they came; refits and scores explanations of them."""
+
+    def __init__(self, plant: Plant, tables: Sequence[Table], noise: Sequence[Noise] | None = None,
+                 progress: Callable[[str], None] | None = None):
+        self.plant, self.tables = plant, list(tables)
+        self.progress = progress or (lambda text: None)
+        self.model = plant.compile()
+        self.drives = [self.model.drive(t) for t in self.tables]
+        counts = {o: sum(int(np.isfinite(d.y[:, j]).sum()) for d in self.drives) for j, o in enumerate(self.model.outputs)}
+        if max(counts.values(), default=0) < MIN_SAMPLES:
+            raise InputError(f"{', '.join(t.path for t in self.tables)}: too little data: "
+                             + (f"at most {max(counts.values())} measured values of one output" if any(counts.values())
+                                else "no column of an output of the plant (" + ", ".join(o.column for o in plant.outputs.values()) + ")")
+                             + f"; {MIN_SAMPLES} or more are needed")
+        self.noise = tuple(noise or default_noise(plant, self.drives))
+
+    def explain(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], iterations: int = 25,
+                tries: int = 0) -> Explanation:
+        """Refit a plant to all recordings and score it."""
+        model = plant.compile()
+        drives = [model.drive(t) for t in self.tables]
+        found = fit(model, drives, self.noise, iterations=iterations, tries=tries)
+        return self.scored(updated(plant, found, drives), effects, own, found)
+
+    def scored(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], found: Fit) -> Explanation:
+        """The score of a fit: coloured -2 log likelihood and the price of its parameters."""
+        colours = channels(found.residuals, [0.95 * n.sigma for n in self.noise])
+        added = sum(len(o) for o in own)
+        price = added * np.log(max(found.samples, 2)) + sum(_surprise(c) for c in effects)
+        return Explanation(plant, list(effects), found, sum(c.score for c in colours) + float(price), colours, list(own))
+
+    def excess(self, e: Explanation) -> dict[str, float]:
+        """Residual rms over sensor noise, per output that was measured."""
+        out = {}
+        for j, (o, n) in enumerate(zip(e.fit.model.outputs, self.noise, strict=True)):
+            parts = np.concatenate([r[:, j] for r in e.fit.residuals])
+            parts = parts[np.isfinite(parts)]
+            if len(parts):
+                out[o] = float(np.sqrt(np.mean(np.minimum(np.abs(parts), 8 * max(n.sigma, np.median(np.abs(parts)))) ** 2)) / n.sigma)
+        return out
+
+
+def _surprise(c: Candidate) -> float:
+    """Prior odds as -2 log: a fault in an input's reading, or physics with a choice of signals, is a little less likely."""
+    return (6.0 if c.place.input and c.effect.where != "drive" else 0.0) + (1.0 if c.variant else 0.0)
+
+
+def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, float]]:
+    """Where a refit may move the effect's parameters: physics' bounds, and wide round the screening's estimate."""
+    out = {}
+    for p in direction.candidate.effect.parameters:
+        value = direction.start[p.name]
+        kind = direction.candidate.effect.shapes.get(p.shape or "", "")
+        if p.shape in ("onset", "start", "end"):
+            if value <= duration:
+                out[p.name] = (0.0, duration)
+            continue
+        if p.shape == "phase":
+            out[p.name] = (-8.0, 8.0)
+            continue
+        if p.shape == "period":
+            out[p.name] = (0.75 * value, 1.33 * value)
+            continue
+        if p.shape == "level":
+            reach = max(abs(value), 1e-9)
+            out[p.name] = (max(p.low, value - 3 * reach), value + 3 * reach) if kind != "small_levels" else (0.0, 5 * reach)
+            continue
+        if p.shape:
+            out[p.name] = (max(p.low, value / 30), min(p.high, value * 30)) if kind != "delays" else (0.0, value * 8)
+            continue
+        reach = 30 * max(abs(value - p.null), 1e-3 * abs(p.null), 1e-12)
+        low, high = max(p.low, p.null - reach), min(p.high, p.null + reach)
+        if p.name == "C" and value > 0:
+            low, high = value / 100, value * 100
+        out[p.name] = (low, high)
+    return out
+
+
+def extend(base: Plant, direction: Direction, drives: Sequence[Drive]) -> tuple[Plant, dict[str, str]]:
+    """The plant with a screened effect at its starting values, and the plant's names of the effect's parameters."""
+    duration = max(float(d.t[-1]) for d in drives)
+    ranges = ranges_of(direction, duration)
+    values: dict[str, Any] = {}
+    for p in direction.candidate.effect.parameters:
+        value = direction.start[p.name] if p.typical is None else p.typical
+        if p.name in ranges:
+            low, high = ranges[p.name]
+            inside = 1e-4 * (high - low)
+            value = float(np.clip(value, low + inside, high - inside))
+        values[p.name] = value
+    plant = direction.candidate.extend(values, ranges)
+    return plant, {p.name: direction.candidate.own(p.name) for p in direction.candidate.effect.parameters
+                   if direction.candidate.own(p.name) in plant.parameters}
+
+
+# ---------------------------------------------------------------------------------------------------- one more effect
+
+@dataclass
+class Round:
+    """One look at the catalogue from one explanation."""
+    base: Explanation
+    metric: Metric
+    rig: Rig
+    directions: list[Direction]
+    chance: np.ndarray | None
+    finalists: list[Explanation] = field(default_factory=list)
+
+    def p_any(self) -> float:
+        """The chance that noise alone makes some candidate look as good as the best one."""
+        if not self.directions or self.chance is None:
+            return 1.0
+        best = self.directions[0].log_p
+        hits = int(np.sum(self.chance <= best))
+        if hits:
+            return (hits + 1) / (len(self.chance) + 1)
+        floor = float(np.quantile(self.chance, 0.1))        # beyond the draws: the tail goes on as it does there
+        return float(min(1 / (len(self.chance) + 1), 0.1 * 10 ** (best - floor)))
+
+
+def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS) -> Round:
+    """Screen the catalogue from an explanation."""
+    model = base.fit.model
+    drives = [model.drive(t) for t in case.tables]
+    for d in drives:
+        model.prepare(d, base.fit.values[drives.index(d)])
+    metric = Metric(base.fit, drives)
+    rig = Rig(base.plant, drives, [t.columns for t in case.tables])
+    found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
+    noise = np.random.default_rng(1).standard_normal((len(metric.residual), draws)) if draws else None
+    ranked, chance = screen(metric, rig, found, noise)
+    return Round(base, metric, rig, ranked, chance)
+
+
+def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direction]:
+    """The best directions, and the best of each effect that is not far behind: one per (effect, place)."""
+    taken: dict[tuple[str, str], Direction] = {}
+    if not ranked:
+        return []
+    best = ranked[0].gain
+    for d in ranked:
+        if d.candidate.key not in taken and d.gain > 12:
+            taken[d.candidate.key] = d
+    ordered = list(taken.values())
+    out = ordered[:count]
+    names = {d.candidate.effect.name for d in out}
+    for d in ordered[count:]:
+        if d.candidate.effect.name not in names and d.gain > 0.3 * best and len(out) < count + 8:
+            out.append(d)
+            names.add(d.candidate.effect.name)
+    return out
+
+
+def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explanation]:
+    """Refit each direction in full; best score first."""
+    def one(direction: Direction) -> Explanation | None:
+        try:
+            plant, own = extend(seen.base.plant, direction, seen.metric.drives)
+            e = case.explain(plant, [*seen.base.effects, direction.candidate], [*seen.base.own, own])
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            return None
+        e.direction = direction
+        return e
+    with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
+        done = [e for e in pool.map(one, chosen) if e is not None]
+    # A shape found on a coarse grid may sit in the wrong valley: the leaders start again from elsewhere.
+    done.sort(key=lambda e: e.score)
+    return done
+
+
+# ------------------------------------------------------------------------------------------------------------ the whole
+
+@dataclass
+class Diagnosis:
+    """All that was found; `result` is the contract's JSON."""
+    verdict: str
+    base: Explanation                       # refit only
+    final: Explanation
+    rivals: list[Explanation]
+    rounds: list[Round]
+    suspects: list[locate.Suspect]
+    missing: locate.Missing | None
+    held: dict[str, Any]
+    notes: list[str]
+    next_experiment: dict[str, Any] | None
+    before: dict[str, float]
+    result: dict[str, Any] = field(default_factory=dict)
+
+
+def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
+    """Run the whole chain on a case, without writing anything."""
+    notes: list[str] = []
+    start = _unfitted(case)
+    case.progress("refitting the plant's own parameters")
+    base = case.explain(case.plant, [], [], iterations=40, tries=0)
+    if max(case.excess(base).values(), default=0.0) > 1.5:
+        again = case.explain(case.plant, [], [], iterations=40, tries=40)
+        if again.score < base.score - 1:
+            base = again
+    _check_noise(case, base, notes)
+    base = case.scored(base.plant, [], [], base.fit)
+    case.progress("screening the catalogue")
+    first = look(case, base, entries)
+    rounds, current = [first], base
+    rivals: list[Explanation] = []
+    while len(current.effects) < most:
+        seen = rounds[-1]
+        if seen.p_any() > 1e-3 and max(case.excess(current).values(), default=0.0) < CLEAN:
+            break
+        chosen = finalists(seen.directions)
+        if not chosen:
+            break
+        case.progress(f"refitting {len(chosen)} explanations")
+        seen.finalists = compete(case, seen, chosen)
+        if not seen.finalists or seen.finalists[0].score > current.score - ACCEPT:
+            break
+        current = seen.finalists[0]
+        rivals = seen.finalists[1:]
+        if len(current.effects) < most:
+            case.progress("screening again")
+            rounds.append(look(case, current, entries))
+    if len(current.effects) > 1:
+        current, rivals = _backward(case, base, current, rivals, entries, rounds)
+    suspects = locate.suspects(first.metric) if first.directions and first.p_any() < 1e-3 else []
+    excess = case.excess(current)
+    worst = max(excess.values(), default=0.0)
+    before_worst = max(case.excess(base).values(), default=0.0)
+    _weigh(current, rivals, case)
+    held = held_out(case, base, current)
+    if current.effects:
+        share = (worst ** 2 - 1) / max(before_worst ** 2 - 1, 1e-9)
+        explained = worst < CLEAN or (share < 0.02 and worst < LARGE)
+        if explained:
+            verdict = "explained" if current.probability >= NAME else "ambiguous"
+        else:
+            verdict = "unexplained"
+            notes.append(f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains")
+    else:
+        verdict = "unexplained" if before_worst > LARGE else "consistent"
+    missing = None
+    if verdict != "consistent":
+        nodes = [s for s in suspects if s.kind == "node"]
+        if nodes:
+            at = rounds[0]
+            missing = locate.missing_flow(at.metric, nodes[0].name, _signals(case, at))
+    return Diagnosis(verdict, base, current, rivals, rounds, suspects, missing, held, notes, None, start)
+
+
+def _unfitted(case: Case) -> dict[str, float]:
+    """Residual rms per output of the plant as it came."""
+    parts = []
+    for d in case.drives:
+        try:
+            parts.append(d.y - case.model.run(d).y)
+        except SimulationError:
+            parts.append(np.full_like(d.y, np.nan))
+    return _rms(case.model, parts)
+
+
+def _rms(model: Model, residuals: Sequence[np.ndarray]) -> dict[str, float]:
+    stacked = np.concatenate(list(residuals))
+    return {o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2))) for j, o in enumerate(model.outputs)
+            if np.isfinite(stacked[:, j]).any()}
+
+
+def _check_noise(case: Case, base: Explanation, notes: list[str]) -> None:
+    """The white part of the residual against what the plant says of its sensors."""
+    changed = []
+    for j, (o, n) in enumerate(zip(case.plant.outputs.values(), case.noise, strict=True)):
+        white = white_sigma([r[:, j] for r in base.fit.residuals])
+        if white > 1.3 * n.sigma:
+            notes.append(f"{o.name}: its white noise is {white:.3g} {o.unit or ''}, more than the plant's {n.sigma:.3g}; "
+                         "the larger figure is used")
+            changed.append(Noise(white))
+        else:
+            changed.append(n)
+    case.noise = tuple(changed)
+
+
+def _signals(case: Case, seen: Round) -> dict[str, list[np.ndarray]]:
+    out: dict[str, list[np.ndarray]] = {}
+    rig = seen.rig
+    for j, i in enumerate(rig.plant.inputs):
+        if i in rig.moving_inputs:
+            out[i] = [d.u[:, j] for d in seen.metric.drives]
+    for k, n in enumerate(seen.metric.model.states):
+        out[n] = [run.x[:, k] for run in seen.metric.runs]
+    for c in rig.spare:
+        out[c] = [np.nan_to_num(t.columns[c]) for t in case.tables]
+    return out
+
+
+def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[Explanation], entries: Mapping[str, Any],
+              rounds: list[Round]) -> tuple[Explanation, list[Explanation]]:
+    """With several effects: take each one out, look again at what would fill its place, and keep the best."""
+    for _ in range(2):
+        changed = False
+        for k in range(len(current.effects)):
+            others = [c for i, c in enumerate(current.effects) if i != k]
+            plant, own = base.plant, []
+            try:
+                for c in others:
+                    values = {p: current.plant.parameters[n].value for p, n in current.own[current.effects.index(c)].items()}
+                    ranges = {p: current.plant.parameters[n].range or (-np.inf, np.inf)
+                              for p, n in current.own[current.effects.index(c)].items()}
+                    again = dataclasses.replace(c, rig=_on(c.rig, plant))
+                    plant = again.extend({**values}, ranges)
+                    own.append(current.own[current.effects.index(c)])
+                without = case.explain(plant, others, own)
+            except (SimulationError, InputError, KeyError):
+                continue
+            if without.score < current.score + ACCEPT / 2:
+                case.progress("one effect is not needed beside the others")
+                return (without, [])
+            seen = look(case, without, entries, draws=0)
+            found = compete(case, seen, finalists(seen.directions, 8))
+            if found and found[0].score < current.score - 2:
+                if found[0].last.key != current.effects[k].key:
+                    changed = True
+                current, rivals = found[0], found[1:]
+            elif found and k == len(current.effects) - 1:
+                rivals = [f for f in found if f.last.key != current.effects[k].key]
+        if not changed:
+            break
+    return current, rivals
+
+
+def _on(rig: Rig, plant: Plant) -> Rig:
+    return Rig(plant, rig.drives, rig.columns)
+
+
+def _weigh(current: Explanation, rivals: Sequence[Explanation], case: Case) -> None:
+    """Posterior over the explanations that were refitted, tempered; the same effect at the same place counts once."""
+    best: dict[tuple, Explanation] = {}
+    for e in [current, *rivals]:
+        key = tuple(sorted(c.key for c in e.effects))
+        if key not in best or e.score < best[key].score:
+            best[key] = e
+    scores = np.array([e.score for e in best.values()])
+    weights = np.exp(-0.5 * (scores - scores.min()) / TEMPERING)
+    weights /= weights.sum()
+    for e, w in zip(best.values(), weights, strict=True):
+        e.probability = float(min(w, 0.995))
+
+
+# ----------------------------------------------------------------------------------------------------------- held out
+
+def folds(case: Case) -> list[tuple[list[int], list[Table], list[Table]]]:
+    """(test recordings, training tables, test tables): each recording in turn, or the last two fifths of a single one."""
+    if len(case.tables) > 1:
+        return [([r], [t for q, t in enumerate(case.tables) if q != r], [case.tables[r]]) for r in range(len(case.tables))]
+    (table,) = case.tables
+    cut = table.t[0] + 0.6 * (table.t[-1] - table.t[0])
+    measured = {o.column for o in case.plant.outputs.values()}
+
+    def masked(keep: np.ndarray) -> Table:
+        columns = {k: np.where(keep, v, np.nan) if k in measured else v for k, v in table.columns.items()}
+        return dataclasses.replace(table, columns=columns)
+    return [([0], [masked(table.t <= cut)], [masked(table.t > cut)])]
+
+
+def held_out(case: Case, base: Explanation, final: Explanation) -> dict[str, Any]:
+    """Fit the plant's own parameters, and those of the explanation, without some of the data; errors on that data."""
+    out: dict[str, list[np.ndarray]] = {"before": [], "refit_only": [], "after": []}
+    for _, train, test in folds(case):
+        for label, plant, refit in (("before", case.plant, False), ("refit_only", base.plant, True), ("after", final.plant, True)):
+            if label == "after" and not final.effects:
+                out["after"].append(out["refit_only"][-1])
+                continue
+            model = plant.compile()
+            drives = [model.drive(t) for t in test]
+            try:
+                p = None
+                if refit:
+                    training = [model.drive(t) for t in train]
+                    found = fit(model, training, case.noise, iterations=15)
+                    p = updated(plant, found, training)
+                    model = Model(p, model.code)
+                parts = [d.y - model.run(model.prepare(d)).y for d in drives]
+                if case.plant.nodes and len(train) == 1 and train[0].path == test[0].path and refit:
+                    parts = [d.y - model.run(model.prepare(d), None, found.dx0[0]).y for d in drives]
+            except SimulationError:
+                parts = [np.full_like(d.y, np.nan) for d in drives]
+            out[label] += parts
+    figures: dict[str, Any] = {f"held_out_{k}": _rms(case.model, v) for k, v in out.items()}
+    figures["gain"] = _gain(case, out["refit_only"], out["after"]) if final.effects else {}
+    return figures
+
+
+def _gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray], draws: int = 400) -> dict[str, Any]:
+    """Per output: held-out rms ratio after / refit only with a 95 % interval by paired block bootstrap."""
+    rng = np.random.default_rng(2)
+    out = {}
+    for j, o in enumerate(case.model.outputs):
+        pairs = []
+        for a, b in zip(before, after, strict=True):
+            good = np.isfinite(a[:, j]) & np.isfinite(b[:, j])
+            if good.sum() < 20:
+                continue
+            block = max(5, int(good.sum()) // 25)
+            x, y = a[good, j] ** 2, b[good, j] ** 2
+            n = len(x) // block
+            pairs += list(zip(x[:n * block].reshape(n, block).mean(1), y[:n * block].reshape(n, block).mean(1), strict=True))
+        if len(pairs) < 4:
+            continue
+        values = np.array(pairs)
+        index = rng.integers(0, len(values), (draws, len(values)))
+        ratio = np.sqrt(values[index, 1].sum(1) / np.maximum(values[index, 0].sum(1), 1e-300))
+        out[o] = {"ratio": float(np.sqrt(values[:, 1].sum() / max(values[:, 0].sum(), 1e-300))),
+                  "interval": [float(np.quantile(ratio, 0.025)), float(np.quantile(ratio, 0.975))]}
+    return out
+
+
+# ------------------------------------------------------------------------------------------------------------- result
+
+def result(case: Case, d: Diagnosis) -> dict[str, Any]:
+    """The contract's JSON (thermoctl-diagnosis/1)."""
+    estimates = {e.name: e for e in report(d.final.fit)}
+    excess = case.excess(d.base)
+    findings = []
+    if d.verdict != "consistent":
+        for c, own in zip(d.final.effects, d.final.own, strict=True):
+            findings.append(_finding(d, c, own, estimates))
+    shown = []
+    if d.final.effects:
+        seen = {tuple(sorted(c.key for c in d.final.effects))}
+        for e in sorted(d.rivals, key=lambda e: -e.probability):
+            key = tuple(sorted(c.key for c in e.effects))
+            if key in seen or e.probability < 0.005:
+                continue
+            seen.add(key)
+            shown.append({"effect": e.last.effect.name, "where": e.last.place.where, "probability": round(e.probability, 4)})
+    mismatch = []
+    for j, (o, x) in enumerate((o, excess[o]) for o in d.base.fit.model.outputs if o in excess):
+        del j
+        if d.verdict == "consistent" or x < 1.1:
+            continue
+        node = next((s.name for s in d.suspects if s.kind == "node"), None)
+        index = d.base.fit.model.outputs.index(o)
+        rms = d.base.fit.rms()[o]
+        entry = {"channel": o, "rms": rms, "expected_rms": case.noise[index].sigma, "node": node}
+        if d.missing is not None:
+            unit = next((f.unit for f in case.plant.flows.values() if d.missing.node in (f.source, f.target) and f.unit), None)
+            entry |= {"missing_flow_rms": d.missing.rms, "missing_flow_unit": unit, "when": d.missing.when,
+                      "follows": d.missing.follows}
+        mismatch.append(entry)
+    mismatch.sort(key=lambda m: -m["rms"] / max(m["expected_rms"], 1e-300))
+    return _clean({
+        "format": "thermoctl-diagnosis/1", "verdict": d.verdict, "findings": findings, "alternatives": shown,
+        "mismatch": mismatch,
+        "fit": {"before": d.before, "refit_only": d.base.fit.rms(), "after": d.final.fit.rms(),
+                **{k: v for k, v in d.held.items() if k.startswith("held_out")}},
+        "held_out_gain": d.held.get("gain", {}),
+        "next_experiment": d.next_experiment,
+        "suspects": [{"kind": s.kind, "name": s.name, "gain": s.gain, "dims": s.dims} for s in d.suspects[:6]],
+        "chance": d.rounds[0].p_any() if d.rounds else 1.0,
+        "not_seen": not_seen(d) if d.verdict == "consistent" else [],
+        "parameters": [dataclasses.asdict(e) for e in report(d.final.fit, case.drives)],
+        "notes": d.notes})
+
+
+def _finding(d: Diagnosis, c: Candidate, own: Mapping[str, str], estimates: Mapping[str, Any]) -> dict[str, Any]:
+    plant = d.final.plant
+    values = {p: plant.parameters[n].value for p, n in own.items()}
+    equation = _equation(d, c)
+    when = None
+    if "T0" in values and "T1" in values:
+        when = [[values["T0"], min(values["T1"], max(float(x.t[-1]) for x in d.rounds[0].metric.drives))]]
+    elif "T0" in values:
+        when = [[values["T0"], max(float(x.t[-1]) for x in d.rounds[0].metric.drives)]]
+    parameters = {n: {"value": plant.parameters[n].value, "sd": estimates[n].sd if n in estimates else 0.0,
+                      "unit": plant.parameters[n].unit} for n in own.values()}
+    figures = ", ".join(f"{p} = {v:.4g}" + (f" {plant.parameters[own[p]].unit}" if plant.parameters[own[p]].unit not in (None, "1") else "")
+                        for p, v in values.items())
+    return {"effect": c.effect.name, "where": c.place.where, "when": when, "probability": round(d.final.probability, 4),
+            "equation": equation, "parameters": parameters,
+            "summary": f"{c.effect.title} at {c.place.where}: {equation} with {figures}."}
+
+
+def _equation(d: Diagnosis, c: Candidate) -> str:
+    before, after = c.rig.plant, d.final.plant
+    new = [f for f in after.flows.values() if f.name not in before.flows and f.name in _changed(c, after)]
+    if new:
+        return str(new[-1].rate)
+    p = c.place
+    if p.output and p.output in after.outputs:
+        return str(after.outputs[p.output].value)
+    if p.flow and p.flow in after.flows:
+        return str(after.flows[p.flow].rate)
+    n = p.nodes.get("T")
+    return str(after.nodes[n].storage) if n in after.nodes else c.effect.title      # type: ignore[index]
+
+
+def _changed(c: Candidate, plant: Plant) -> set[str]:
+    mine = {c.own(p.name) for p in c.effect.parameters}
+    return {f.name for f in plant.flows.values() if ex.names(f.rate) & mine}
+
+
+def not_seen(d: Diagnosis) -> list[dict[str, Any]]:
+    """Per effect and place the smallest size that would have been seen (five sigmas of its amplitude's estimate)."""
+    out = []
+    for direction in d.rounds[0].directions:
+        amplitude = next((p for p in direction.candidate.effect.parameters if p.trial is not None), None)
+        if amplitude is None or direction.gain <= 0:
+            continue
+        size = abs(direction.start[amplitude.name] - amplitude.null) / np.sqrt(direction.gain) * 5
+        out.append({"effect": direction.candidate.effect.name, "where": direction.candidate.place.where,
+                    "smallest": size, "parameter": amplitude.name, "unit": amplitude.unit,
+                    "left_after_refit": direction.excited})
+    return sorted(out, key=lambda e: (e["effect"], e["where"]))
+
+
+def _clean(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _clean(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_clean(v) for v in value]
+    if isinstance(value, (np.floating, float)):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
+
+
+def diagnose(plant_path: str | Path, recording_paths: Sequence[str | Path], out_dir: str | Path,
+             effects: Sequence[Path] = (), progress: Callable[[str], None] | None = None) -> dict[str, Any]:
+    """Diagnose recordings against a plant file and write diagnosis.json, plant.yaml and report.html into `out_dir`,
+    all or nothing. Returns the JSON's content. Raises InputError for unusable inputs."""
+    begun = time.monotonic()
+    plant = load(plant_path)
+    if not recording_paths:
+        raise InputError("no recording was given; one or more were expected")
+    tables = [read_table(p) for p in recording_paths]
+    names = [t.name for t in tables]
+    if len(set(names)) < len(names):
+        tables = [dataclasses.replace(t, name=f"{Path(t.path).parent.name}_{t.name}") for t in tables]
+    case = Case(plant, tables, progress=progress)
+    entries = catalogue((CATALOGUE, *effects))
+    try:
+        found = examine(case, entries)
+    except SimulationError as e:
+        raise InputError(f"{plant_path}: the plant cannot follow these recordings at all: {e}") from None
+    found.result = result(case, found)
+    found.result["seconds"] = round(time.monotonic() - begun, 1)
+    out = Path(out_dir)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent) as folder:
+        part = Path(folder)
+        save(found.final.plant, part / "plant.yaml", note=f"{Path(plant_path).name}, refitted"
+             + "".join(f"; with {c.effect.name} at {c.place.where}" for c in found.final.effects))
+        load(part / "plant.yaml")
+        from thermoctl.diagnose.page import write_report
+        write_report(case, found, part / "report.html")
+        (part / "diagnosis.json").write_text(json.dumps(found.result, indent=1, allow_nan=False) + "\n")
+        out.mkdir(parents=True, exist_ok=True)
+        for name in ("plant.yaml", "report.html", "diagnosis.json"):
+            shutil.move(str(part / name), str(out / name))
+    return found.result
