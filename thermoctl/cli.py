@@ -29,6 +29,49 @@ def _plant_commands(sub: argparse._SubParsersAction) -> None:
 
 def _daemon_commands(sub: argparse._SubParsersAction) -> None:
     """run, demo, start, stop, restart, status, arm, disarm, setpoint, reload, check, doctor, latency, virtual-rig."""
+    config = ("--config", {"metavar": "FILE", "help": "configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, "
+                                                      "/etc/thermoctl/rig.yaml)"})
+    as_json = ("--json", {"action": "store_true", "help": "one JSON object, for programs"})
+
+    def room():
+        from thermoctl.daemon import client
+        return client
+
+    run = _add(sub, "run", "the daemon in the foreground (what systemd starts), or its tick in simulated time",
+               lambda a: room().run(a.config) if a.hours is None else
+               room().run_simulated_time(a.config, a.hours, a.no_compensation, a.out), config)
+    run.add_argument("--simulated-time", action="store_true", help="no clock: run the simulated rig as fast as it goes")
+    run.add_argument("--hours", type=float, metavar="H", help="hours of rig time (with --simulated-time)")
+    run.add_argument("--no-compensation", action="store_true", help="for comparison (with --simulated-time)")
+    run.add_argument("--out", metavar="FILE", help="write the rows, 10 a second, as Parquet (with --simulated-time)")
+    _add(sub, "demo", "the closed loop on the simulated rig with a live view; Ctrl-C stops safely",
+         lambda a: room().demo(a.config, a.seconds), config,
+         ("--seconds", {"type": float, "metavar": "S", "help": "stop by itself after S seconds"}))
+    for action, help in (("start", "start the daemon: by systemd where its unit is installed, else in the background"),
+                         ("stop", "stop it; the amplifier is disabled first"), ("restart", "stop, then start")):
+        _add(sub, action, help, lambda a, action=action: room().service(a.config, action), config)
+    _add(sub, "status", "state, position, compensation, temperatures, faults with remedies; exit 1 when a fault stands",
+         lambda a: room().status(a.config, a.json), config, as_json)
+    for command, help in (("arm", "enable the amplifier, holding the measured position"),
+                          ("disarm", "disable the amplifier; in FAULT: acknowledge"),
+                          ("reload", "validate the configuration and apply it between two ticks")):
+        _add(sub, command, help, lambda a, command=command: room().request(a.config, command, None, a.json), config,
+             as_json)
+    _add(sub, "setpoint", "move the output to VALUE_UM at the limited rate",
+         lambda a: room().request(a.config, "setpoint", a.value, a.json),
+         ("value", {"type": float, "metavar": "VALUE_UM"}), config, as_json)
+    _add(sub, "check", "validate a configuration with its model, plant and profiles; touches no hardware",
+         lambda a: room().check(a.config), ("config", {"metavar": "CONFIG"}))
+    _add(sub, "doctor", "connect, read every channel, show values with units and rates; drives nothing",
+         lambda a: room().doctor(a.config, a.seconds), ("config", {"metavar": "CONFIG"}),
+         ("--seconds", {"type": float, "default": 2.0, "help": "how long to read (default 2)"}))
+    _add(sub, "latency", "histogram of lateness and busy time, slips, and an idle loop's beside it",
+         lambda a: room().latency(a.config, a.json), config, as_json)
+    _add(sub, "replay", "run a recording's inputs through the law; exit 1 when one output bit differs",
+         lambda a: room().replay(a.recording), ("recording", {"metavar": "RECORDING"}))
+    _add(sub, "service", "install or remove the systemd unit, its user and its device rules",
+         lambda a: room().service_files(a.action, a.config, a.root), ("action", {"choices": ["install", "uninstall"]}),
+         config, ("--root", {"default": "/", "metavar": "DIR", "help": "install below this directory"}))
 
 
 def _recording_commands(sub: argparse._SubParsersAction) -> None:
@@ -45,6 +88,11 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
 
 def _people_commands(sub: argparse._SubParsersAction) -> None:
     """dashboard, monitor, calibrate, fleet, completion."""
+    def completion(args: argparse.Namespace) -> None:
+        import shtab
+        print(shtab.complete(parser(), args.shell))
+    _add(sub, "completion", "print the shell completion; source it", completion,
+         ("shell", {"choices": ["bash", "zsh", "tcsh"]}))
 
 
 def parser() -> argparse.ArgumentParser:

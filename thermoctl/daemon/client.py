@@ -1,7 +1,7 @@
 """What the commands print: each function is one command of the command line, given the configuration's path.
 
-Exit status as in cli.py. The configuration is found by --config, else $THERMOCTL_CONFIG, else config/simulated.yaml here,
-else /etc/thermoctl/rig.yaml.
+Exit status as in cli.py. The configuration is found by --config, else $THERMOCTL_CONFIG, else config/simulated.yaml
+here, else /etc/thermoctl/rig.yaml.
 """
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ def request(config: str | None, command: str, value: float | None = None, as_jso
             print("needs a restart: " + ", ".join(answer["needs_restart"]))
     else:
         setpoint = answer.get("setpoint_um")
-        print(answer["state"] + (f", setpoint {setpoint:.3f} um" if command != "disarm" and setpoint is not None else ""))
+        held = command != "disarm" and setpoint is not None
+        print(answer["state"] + (f", setpoint {setpoint:.3f} um" if held else ""))
     return 0 if answer["ok"] else 1
 
 
@@ -80,10 +81,12 @@ def status(config: str | None, as_json: bool = False) -> int:
         return 1
     print(f"{answer['state']}   {answer['ticks']} ticks in {answer['uptime_s']:.1f} s, {answer['slips']} slips, "
           f"busy {answer['busy_us']:.0f} us")
-    print(f"setpoint {_number(answer['setpoint_um'])} um   position {_number(answer['position_um'])} um   "
-          f"compensation {_number(answer['compensation_um'])} um   output {_number(answer['output_reference_um'])} um")
-    print(f"drive {_number(answer['drive'])}   power {_number(answer['power_w'])} W   air {_number(answer['air_c'], 2)} C   "
-          f"coil {_number(answer['temperatures_c']['coil'], 2)} C, estimated {_number(answer['estimates_c']['coil'], 2)} C")
+    print("   ".join(f"{label} {_number(answer[key])} um" for label, key in (
+        ("setpoint", "setpoint_um"), ("position", "position_um"), ("compensation", "compensation_um"),
+        ("output", "output_reference_um"))))
+    coil, estimate = answer["temperatures_c"]["coil"], answer["estimates_c"]["coil"]
+    print(f"drive {_number(answer['drive'])}   power {_number(answer['power_w'])} W   air {_number(answer['air_c'], 2)} C"
+          f"   coil {_number(coil, 2)} C, estimated {_number(estimate, 2)} C")
     bad = {role: state for role, state in answer["channels"].items() if state not in ("OK", "ABSENT")}
     if bad:
         print("readings: " + ", ".join(f"{role} {state}" for role, state in bad.items()))
@@ -147,7 +150,7 @@ def check(config: str) -> int:
 
 
 def doctor(config: str, seconds: float = 2.0) -> int:
-    """Connect, read every channel for `seconds`, show values with units and rates; nothing is driven. 1 when one is bad."""
+    """Connect, read every channel for `seconds`, show values, units and rates; drives nothing. 1 when one is bad."""
     from hal.backend import OK, ROLES, STATUS_NAMES, HardwareError, make_backend
     from thermoctl.daemon.loop import become_real_time
     from thermoctl.signals import SIGNALS
@@ -172,8 +175,8 @@ def doctor(config: str, seconds: float = 2.0) -> int:
                 continue
             bad += sample.status[k] != OK
             unit = units.get("position_raw_um" if role == "position_um" else role, "")
-            print(f"{role:24}{sample.value[k]:14.4f} {unit:8}{state:8}{counts[role] / seconds:7.1f} Hz"
-                  + (f"   {backend.problem(role)}" if sample.status[k] != OK else ""))
+            problem = f"   {backend.problem(role)}" if sample.status[k] != OK else ""
+            print(f"{role:24}{sample.value[k]:14.4f} {unit:8}{state:8}{counts[role] / seconds:7.1f} Hz{problem}")
     except HardwareError as e:
         print(f"thermoctl: {e}", file=sys.stderr)
         return 3
@@ -185,6 +188,27 @@ def doctor(config: str, seconds: float = 2.0) -> int:
     for line in refused or ["priority, locked memory, processor and latency request are all granted"]:
         print(f"  {line}")
     return 1 if bad else 0
+
+
+def service_files(action: str, config: str | None, root: str) -> int:
+    """service install | uninstall."""
+    from thermoctl.daemon import service as services
+    if action == "uninstall":
+        return services.uninstall(Path(root))
+    settings = settings_of(config)
+    return services.install(Path(settings.path), Path(root))
+
+
+def demo(config: str | None, seconds: float | None) -> int:
+    """The live view of a daemon of its own."""
+    from thermoctl.daemon.view import demo as show
+    return show(settings_of(config), seconds)
+
+
+def run_simulated_time(config: str | None, hours: float, no_compensation: bool, out: str | None) -> int:
+    """Hours of rig time without a clock; see simulate.warm_up_proof."""
+    from thermoctl.daemon.simulate import trapezoids
+    return trapezoids(settings_of(config), hours, not no_compensation, out)
 
 
 def replay(recording: str) -> int:

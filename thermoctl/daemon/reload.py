@@ -8,11 +8,13 @@ from thermoctl.daemon.assemble import law_parameters
 from thermoctl.settings import changed, load_settings
 
 
-def reload_settings(current: Any) -> tuple[Any, Parameters, list[str], list[str]]:
-    """(settings, parameters, changed keys, those of them that count only after a restart).
+def reload_settings(current: Any, started: Any) -> tuple[Any, Parameters, list[str], list[str]]:
+    """(settings, parameters, applied keys, keys that count only after a restart).
 
-    The settings that come back are the new ones. Raises InputError for a file that is not valid: nothing is applied then.
+    current: the settings in force; started: those that the daemon was started with. Raises InputError for a file that is
+    not valid: nothing is applied then.
     """
     settings = load_settings(current.path)
-    found = changed(current, settings)
-    return settings, law_parameters(settings), [key for key, _ in found], [key for key, restart in found if restart]
+    applied = [key for key, restart in changed(current, settings) if not restart]
+    waiting = [key for key, restart in changed(started, settings) if restart]
+    return settings, law_parameters(settings), applied, waiting

@@ -82,12 +82,14 @@ def _or_none(number: float) -> float | None:
 
 
 class Commands:
-    """What a request does. `reload_settings(settings)` validates the file again and returns (settings, parameters,
-    changed keys, keys that need a restart)."""
+    """What a request does. `reload_settings(settings in force, settings at the start)` validates the file again and
+    returns (settings, parameters, applied keys, keys that need a restart)."""
 
     def __init__(self, shared: Shared, settings: Any,
-                 reload_settings: Callable[[Any], tuple[Any, Any, list[str], list[str]]], log: Callable[..., None]):
-        self.shared, self.settings, self.reload_settings, self.log = shared, settings, reload_settings, log
+                 reload_settings: Callable[[Any, Any], tuple[Any, Any, list[str], list[str]]],
+                 log: Callable[..., None]):
+        self.shared, self.settings, self.started = shared, settings, settings
+        self.reload_settings, self.log = reload_settings, log
 
     def answer(self, line: bytes, peer: str) -> dict[str, Any]:
         """The answer to one request line; never raises for what a client sent."""
@@ -170,13 +172,12 @@ class Commands:
         return self._result("ARMED", "setpoint not taken")
 
     def _reload(self, request: dict) -> dict[str, Any]:
-        settings, parameters, changed, restart = self.reload_settings(self.settings)
+        settings, parameters, applied, restart = self.reload_settings(self.settings, self.started)
         self.shared.parameters.put(parameters.pack())
-        before = status(self.shared).get("generation")
         self._send(RELOAD)
         self.settings = settings
-        return {"ok": True, "generation": status(self.shared).get("generation"), "before": before,
-                "applied": [c for c in changed if c not in restart], "needs_restart": restart}
+        return {"ok": True, "generation": status(self.shared).get("generation"), "applied": applied,
+                "needs_restart": restart}
 
 
 class _Client:
