@@ -1,0 +1,197 @@
+"""Temperature estimators: the paper's modified Kalman filter, and a Kalman filter with the same one sensor.
+
+MKF    output as state (33), scalar gain of the coil's row (34), (35), mapped to the other points by zeta:
+       zeta = [1, sigma_2/sigma_1 ...], sigma_j = cov(e_1, e_j) over the identification test's error    (36), (37)
+       R_v = (quantisation step)^2/12 + noise^2 of the thermocouple; R_w = (rms error of the coil in the identification
+       test)^2 + R_v, as the paper takes it from both (its 0.46 degC)
+Kalman x(n+1) = A x + B [power, d(air)/dt] + w, y = C x + v, rises above the air. The air's rate is a known input with a known
+       effect: when the air warms by 1 K and nothing else happens every rise falls by 1 K, so C b_air = -1 each K.
+       w: heat of wrong size at the coil (b b'), a drift of everything against the air (b_air b_air'), outside heat into any one
+       body (C+ C+'), and a slowly forgotten outside heat as a disturbance state. Their three variances are taken from the
+       calibration, where all twelve points are measured: those with which the coil alone estimates the twelve best.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy import linalg, optimize
+
+from thermoctl.identify import kernels
+from thermoctl.identify.statespace import StateSpace, _c
+from thermoctl.yamlfile import InputError
+
+
+def sensor_variance(step_k: float, noise_k: float) -> float:
+    """R_v, K^2: quantisation step^2/12 and the sensor's own noise."""
+    return step_k**2 / 12 + noise_k**2
+
+
+@dataclass(frozen=True)
+class Mkf:
+    """alpha (M, M), beta (M, 1), zeta (M,), R_w and R_v K^2; sigma_1 K^2 (the coil's error variance) for the table."""
+    alpha: np.ndarray
+    beta: np.ndarray
+    zeta: np.ndarray
+    r_w: float
+    r_v: float
+    period_s: float
+    sigma_1: float
+
+    def run(self, power_w: np.ndarray, coil_k: np.ndarray, start_k: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Filtered rises (N, M) and gains (N,) for power (N,) and coil rises (N,), NaN where no reading came."""
+        start = np.zeros(len(self.alpha)) if start_k is None else start_k
+        return kernels.mkf_run(_c(self.alpha), _c(self.beta), _c(self.zeta), self.r_w, self.r_v, _c(start), _c(power_w[:, None]),
+                               _c(coil_k))
+
+
+def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: float) -> Mkf:
+    """The paper's filter from the identification test u (N, 1) W, y (N, M) K sampled as the model, to run at `period_s`."""
+    e = y - model.simulate(u, model.x0)
+    e = e[np.isfinite(e).all(1)]
+    centred = e - e.mean(0)
+    sigma = centred[:, :1].T @ centred / len(e)
+    r_w = float((e[:, 0]**2).mean() + r_v)
+    alpha, beta = model.resample(period_s).output_form()
+    # the recursion runs at the filter's period: the residual's variance builds up over the identification's
+    return Mkf(alpha, beta[:, :1], sigma[0] / sigma[0, 0], r_w * period_s / max(model.period_s, period_s), r_v, period_s, float(sigma[0, 0]))
+
+
+def with_air(model: StateSpace) -> StateSpace:
+    """The model with d(air)/dt (K/s) as second input: over one period every rise falls by the air's rise, C b = -1 K."""
+    b = -np.linalg.pinv(model.c, rcond=1e-3) @ np.ones(len(model.c)) * model.period_s
+    return replace(model, b=np.column_stack([model.b[:, 0], b]))
+
+
+@dataclass(frozen=True)
+class Kalman:
+    """Steady filter: `model` with inputs [power W, d(air)/dt K/s], gain (n, s) for `sensors`, covariance p (n, n) K^2."""
+    model: StateSpace
+    gain: np.ndarray
+    sensors: tuple[int, ...]
+    p: np.ndarray
+    noise: np.ndarray
+
+    def run(self, power_w: np.ndarray, air_rate: np.ndarray, measured_k: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
+        """Estimated rises (N, M); measured (N, s) or (N,) with NaN where no reading came."""
+        measured = np.atleast_2d(measured_k.T).T
+        x0 = np.zeros(self.model.order) if x0 is None else x0
+        x = kernels.steady_filter(_c(self.model.a), _c(self.model.b), _c(self.model.c[list(self.sensors)]), _c(self.gain), _c(x0),
+                                  _c(np.column_stack([power_w, air_rate])), _c(measured))
+        return x @ self.model.c.T
+
+
+def disturbed(model: StateSpace, tau_s: float = 3600.0) -> StateSpace:
+    """The model with one disturbance state: outside heat per body (the same K/s everywhere), forgotten over `tau_s`."""
+    n, m = model.b.shape
+    into = np.linalg.pinv(model.c, rcond=1e-3) @ np.ones(len(model.c)) * model.period_s
+    a = np.zeros((n + 1, n + 1))
+    a[:n, :n], a[:n, n], a[n, n] = model.a, into, np.exp(-model.period_s / tau_s)
+    return replace(model, a=a, b=np.vstack([model.b, np.zeros((1, m))]), c=np.column_stack([model.c, np.zeros(len(model.c))]),
+                   x0=np.append(model.x0, 0.0))
+
+
+def process_noise(model: StateSpace, variances: np.ndarray) -> np.ndarray:
+    """Q (n, n) per period from [power error W^2, drift (K/s)^2, outside heat K^2 each body, disturbance state (K/s)^2]."""
+    n = model.order
+    disturbance = int(not model.c[:, -1].any())
+    k = n - disturbance
+    q = np.zeros((n, n))
+    b = model.b[:k]
+    inverse = np.linalg.pinv(model.c[:, :k], rcond=1e-2)
+    q[:k, :k] = (variances[0] * np.outer(b[:, 0], b[:, 0]) + variances[1] * np.outer(b[:, 1], b[:, 1])
+                 + variances[2] * inverse @ inverse.T)
+    if disturbance:
+        q[k, k] = variances[3]
+    return q
+
+
+def steady(model: StateSpace, variances: np.ndarray, r_v: float, sensors: tuple[int, ...] = (0,)) -> Kalman:
+    """Steady Kalman filter by the Riccati equation. Raises InputError when it has no solution."""
+    q = process_noise(model, variances)
+    cs = model.c[list(sensors)]
+    r = r_v * np.eye(len(sensors))
+    try:
+        p = linalg.solve_discrete_are(model.a.T, cs.T, q + 1e-14 * np.trace(q) * np.eye(len(q)), r)
+    except (linalg.LinAlgError, ValueError):
+        raise InputError("the filter's Riccati equation has no solution: lower the model's order") from None
+    gain = p @ cs.T @ np.linalg.inv(cs @ p @ cs.T + r)
+    return Kalman(model, gain, tuple(sensors), p - gain @ cs @ p, q)
+
+
+@dataclass(frozen=True)
+class Record:
+    """One calibration recording at the filter's period: power (N,) W, air_rate (N,) K/s, rises (N, M) K (NaN: no reading)."""
+    power_w: np.ndarray
+    air_rate: np.ndarray
+    rises: np.ndarray
+
+
+def tune(model: StateSpace, records: list[Record], r_v: float, sensors: tuple[int, ...] = (0,), smooth: int = 30,
+         weights: np.ndarray | None = None) -> tuple[Kalman, np.ndarray]:
+    """The filter whose `sensors` estimate all points best over the calibration: (filter, variances).
+
+    The error is averaged over `smooth` samples, so that thermometer noise of the judged points does not count. `weights` (M,)
+    judge the points (default: alike). A weak prior on the logarithms keeps a variance that the data do not speak of where it is."""
+    base = np.array([np.log(1e-2), np.log(1e-10), np.log(1e-6), np.log(1e-13)])
+    used = 4 if not model.c[:, -1].any() else 3
+    w = np.ones(len(model.c)) if weights is None else weights / np.sqrt(np.mean(weights**2))
+    kernel = np.ones(smooth) / smooth
+
+    def cost(x: np.ndarray) -> float:
+        try:
+            f = steady(model, np.exp(np.append(x, base[len(x):])), r_v, sensors)
+        except InputError:
+            return 1e9
+        total, count = 0.0, 0
+        for rec in records:
+            e = (f.run(rec.power_w, rec.air_rate, rec.rises[:, list(sensors)]) - rec.rises) * w
+            e = np.apply_along_axis(np.convolve, 0, np.nan_to_num(e[:len(e) // smooth * smooth]), kernel, "valid")[::smooth]
+            total, count = total + float((e**2).sum()), count + e.size
+        value = total / count
+        return (value if np.isfinite(value) else 1e9) * (1 + 1e-4 * float(((x - base[:len(x)])**2).sum()))
+
+    start = base[:used]
+    best = optimize.minimize(cost, start, method="Nelder-Mead",
+                             options={"maxfev": 140, "xatol": 0.1, "fatol": 1e-7, "initial_simplex": np.vstack([start, start + 3 * np.eye(used)])})
+    variances = np.exp(np.append(best.x, base[used:]))
+    return steady(model, variances, r_v, sensors), variances
+
+
+def choose_sensors(model: StateSpace, variances: np.ndarray, r_v: float, gains_um_k: np.ndarray, most: int = 12,
+                   must: tuple[int, ...] = ()) -> list[tuple[tuple[int, ...], float]]:
+    """For k = 1..`most` sensors the set with the least standard error of the position: [(sensors, um)].
+
+    gains_um_k (M,): static position gain of each point. Forward choice with exchange until nothing improves; k = 1, 2 are
+    exhaustive. `must` are always in (the embedded coil sensor)."""
+    m = len(model.c)
+    out = []
+
+    def error(s: tuple[int, ...]) -> float:
+        g = gains_um_k @ model.c
+        return float(np.sqrt(max(g @ steady(model, variances, r_v, tuple(sorted(s))).p @ g, 0)))
+
+    chosen: tuple[int, ...] = ()
+    for k in range(max(1, len(must)), most + 1):
+        if k <= 2:
+            candidates = [s for s in combinations(range(m), k) if set(must) <= set(s)]
+        else:
+            candidates = [tuple(sorted((*chosen, j))) for j in range(m) if j not in chosen]
+        best = min(candidates, key=error)
+        value = error(best)
+        improved = k > 2
+        while improved:
+            improved = False
+            for out_ in [j for j in best if j not in must]:
+                for in_ in [j for j in range(m) if j not in best]:
+                    trial = tuple(sorted({*best, in_} - {out_}))
+                    e = error(trial)
+                    if e < value * (1 - 1e-6):
+                        best, value, improved = trial, e, True
+                        break
+                if improved:
+                    break
+        chosen = best
+        out.append((best, value))
+    return out

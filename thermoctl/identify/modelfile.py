@@ -1,0 +1,175 @@
+"""Calibrations on disk: one YAML file per calibration in a machine-owned folder, never the user's own files.
+
+A file holds the compensator's coefficients with units and sampling, what they were made from (SHA-256 of each recording), the fit's
+figures, the rig's name and date. `current` in the folder names the one in use; older ones stay for a roll back.
+A file is refused when its own checksum, its shape, its rig or its date do not fit.
+"""
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import tempfile
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from thermoctl.control.model import CompensatorModel
+from thermoctl.yamlfile import InputError, Node, load
+
+FORMAT = "thermoctl-model/1"
+UNITS = {"period_s": "s", "A_minus_I": "1 per period", "B": "K per W, K per (K/s)", "C": "K", "gain": "K/K", "R_w": "K^2", "R_v": "K^2",
+         "b1": "um/K", "b2": "um/K", "b_air": "um/K", "offset_um": "um", "expansion_period_s": "s", "air_filter_s": "s"}
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A model with what it came from: rig name, `created` (UTC), fingerprints {file name: sha256}, figures {name: number}."""
+    model: CompensatorModel
+    rig: str
+    created: str
+    fingerprints: dict[str, str]
+    figures: dict[str, Any]
+
+
+def fingerprint(path: str | Path) -> str:
+    """SHA-256 of a file."""
+    digest = hashlib.sha256()
+    with Path(path).open("rb") as f:
+        while piece := f.read(1 << 20):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+def save_model(path: str | Path, model: CompensatorModel, rig: str, recordings: list[str | Path] = (), figures: dict | None = None) -> Path:  # type: ignore[assignment]
+    """Write a calibration; the file appears whole or not at all. Raises InputError when it exists (a calibration is never
+    overwritten) or the place cannot be written."""
+    path = Path(path)
+    if path.exists():
+        raise InputError(f"{path}: exists; calibrations are never overwritten, choose another name")
+    numbers = {k: _plain(v) for k, v in asdict(model).items()}
+    content: dict[str, Any] = {
+        "format": FORMAT, "rig": rig, "created": datetime.now(UTC).isoformat(timespec="seconds"), "units": UNITS,
+        "fingerprints": {Path(r).name: fingerprint(r) for r in recordings}, "figures": _plain(figures or {}), "model": numbers}
+    content["checksum"] = _checksum(content)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write(path, "# Written by thermoctl; edit nothing here, make another calibration instead.\n"
+               + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+    return path
+
+
+def load_calibration(path: str | Path, rig: str | None = None) -> Calibration:
+    """Read a calibration (a file, or a folder: its current one). Raises InputError for another format, a wrong checksum, missing
+    or extra entries, numbers that do not fit together, and for a rig of another name."""
+    path = Path(path)
+    if path.is_dir():
+        path = current(path)
+    root = load(path)
+    content = root.plain()
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise root.error(f"not a calibration; 'format: {FORMAT}' was expected")
+    lacking = {"rig", "created", "units", "fingerprints", "figures", "model", "checksum"} - set(content)
+    if lacking:
+        raise root.error(f"'{sorted(lacking)[0]}' is missing; the file is not whole")
+    if content["checksum"] != _checksum({k: v for k, v in content.items() if k != "checksum"}):
+        raise root.value["checksum"].error("the checksum does not fit: the file was changed after it was written; "
+                                           "use another calibration ('thermoctl model list')")
+    if rig is not None and content["rig"] != rig:
+        raise root.value["rig"].error(f"the calibration is of rig '{content['rig']}', this one is '{rig}'; calibrate this rig")
+    node: Node = root.value["model"]
+    try:
+        model = CompensatorModel(**{k: tuple(v) if k == "sensors" else v for k, v in content["model"].items()})
+    except (TypeError, ValueError) as e:
+        raise node.error(str(e)) from None
+    return Calibration(model, content["rig"], content["created"], content["fingerprints"], content["figures"])
+
+
+def load_model(path: str | Path, rig: str | None = None) -> CompensatorModel:
+    """The compensator's model of a calibration; what the daemon calls. Raises as `load_calibration`."""
+    return load_calibration(path, rig).model
+
+
+def install(folder: str | Path, model: CompensatorModel, rig: str, recordings: list[str | Path] = (), figures: dict | None = None) -> Path:  # type: ignore[assignment]
+    """Save a calibration as the folder's newest and make it current; the one before stays for a roll back."""
+    folder = Path(folder)
+    number = 1 + max((int(p.stem.split("-")[0]) for p in folder.glob("[0-9]*-*.yaml")), default=0)
+    path = save_model(folder / f"{number:04d}-{datetime.now(UTC):%Y%m%dT%H%M%S}.yaml", model, rig, recordings, figures)
+    _write(folder / "current", path.name + "\n")
+    return path
+
+
+def current(folder: str | Path) -> Path:
+    """The calibration in use in a folder. Raises InputError when there is none."""
+    marker = Path(folder) / "current"
+    try:
+        name = marker.read_text(encoding="utf-8").strip()
+    except OSError:
+        raise InputError(f"{folder}: no calibration is current; make one with 'thermoctl identify'") from None
+    if not _NAME.fullmatch(name) or not (Path(folder) / name).is_file():
+        raise InputError(f"{marker}: names '{name}', which is not there; 'thermoctl model rollback' chooses another")
+    return Path(folder) / name
+
+
+def history(folder: str | Path) -> list[Path]:
+    """All calibrations of a folder, oldest first."""
+    return sorted(Path(folder).glob("[0-9]*-*.yaml"))
+
+
+def roll_back(folder: str | Path, name: str | None = None) -> Path:
+    """Make an older calibration current: `name`, or the one before the present. It is read and checked first."""
+    files = history(folder)
+    now = current(folder)
+    if name is None:
+        older = [p for p in files if p.name < now.name]
+        if not older:
+            raise InputError(f"{folder}: {now.name} is the oldest calibration; there is nothing to go back to")
+        path = older[-1]
+    else:
+        path = Path(folder) / name
+        if path not in files:
+            raise InputError(f"{folder}: no calibration '{name}'; there are {', '.join(p.name for p in files) or 'none'}")
+    load_calibration(path)
+    _write(Path(folder) / "current", path.name + "\n")
+    return path
+
+
+def _write(path: Path, text: str) -> None:
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-")
+    with os.fdopen(handle, "w", encoding="utf-8") as f:
+        f.write(text)
+        f.flush()
+        os.fsync(f.fileno())
+    os.replace(name, path)
+
+
+def _plain(v: Any) -> Any:
+    if isinstance(v, np.ndarray):
+        return v.tolist()
+    if isinstance(v, np.generic):
+        return v.item()
+    if isinstance(v, dict):
+        return {str(k): _plain(w) for k, w in v.items()}
+    if isinstance(v, list | tuple):
+        return [_plain(w) for w in v]
+    return v
+
+
+def _checksum(content: dict) -> str:
+    return hashlib.sha256(repr(_canonical(content)).encode()).hexdigest()
+
+
+def _canonical(v: Any) -> Any:
+    """Numbers by value (1 and 1.0 alike), mappings in order of key."""
+    if isinstance(v, dict):
+        return [(k, _canonical(v[k])) for k in sorted(v)]
+    if isinstance(v, list):
+        return [_canonical(w) for w in v]
+    return float(v) if isinstance(v, int | float) and not isinstance(v, bool) else v
