@@ -24,7 +24,7 @@ from thermoctl.plant.simulate import Drive, Simulation
 CATALOGUE = Path(__file__).parents[2] / "config" / "effects"
 _KEYS = ("effect", "title", "where", "needs", "change", "variants", "shapes", "parameters", "dims", "excited_by", "mimics", "source")
 _SHAPES = ("onsets", "windows", "times", "lags", "delays", "periods", "phases", "end_levels", "high_levels", "drive_levels",
-           "small_levels", "speeds", "distances")
+           "small_levels", "speeds", "creep_speeds", "distances")
 TEMPERATURE = {"degC", "K", "kelvin", "celsius", "degree_Celsius", "delta_degC", "°C"}
 
 
@@ -395,6 +395,7 @@ class Candidate:
 def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     """Every effect at every place it can sit, with every choice of the signals it needs."""
     out = []
+    motor_inputs = {u for f in rig.plant.flows.values() if rig.is_motor(f) for u in rig.drives_of(f)}
     for effect in effects.values():
         for place in PLACES[effect.where](rig):
             near = place.nodes.get("v")
@@ -414,6 +415,8 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
                         continue
                     if effect.name == "sensor_gain" and place.where == rig.air:
                         continue
+                    if effect.name in ("sensor_delay", "sensor_saturation") and place.input in motor_inputs:
+                        continue        # a drive that acts late or is clipped is the actuator's entry
                     out.append(candidate)
     return out
 
@@ -671,9 +674,11 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
         if kind == "phases":
             return [{"phase": 0.0}, {"phase": float(np.pi / 2)}]
         return [{"distance": float(v)} for v in np.geomspace(1e-3 * span, 0.5 * span, 8)]
-    if kind == "speeds":
+    if kind in ("speeds", "creep_speeds"):
         v = np.abs(signal(symbols["v"]))
         top = float(np.nanmax(v)) or 1.0
+        if kind == "creep_speeds":      # the speed below which dry friction gives way smoothly
+            return [{"creep": 1e-3 * top}]
         return [{"speed": float(q)} for q in np.geomspace(0.01 * top, 0.6 * top, 8)]
     target = symbols.get("y") or symbols.get("u") or symbols.get("a")
     z = signal(target) if target is not None else np.array([0.0, 1.0])

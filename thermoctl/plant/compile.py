@@ -83,6 +83,9 @@ class Code:
             return change
         self.rates = {f.name: ex.substitute(f.rate, named(self.input_delays, "delayed_input_"))
                       for f in self.plant.flows.values()}
+        for signal, _ in self.input_delays.values():
+            if not ex.names(signal) <= set(self.plant.inputs):
+                raise InputError(f"{self.plant.file}: delay() in a rate may read inputs only, not '{signal}'")
         self.values = [ex.substitute(o.value, named(self.output_delays, "delayed_")) for o in self.plant.outputs.values()]
 
     def _widths(self) -> None:

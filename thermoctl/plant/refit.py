@@ -11,6 +11,7 @@ that meets its bound is held there until the gradient leads back inside. Sensiti
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -239,10 +240,10 @@ class Problem:
 
 def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = None,
         start: Mapping[str, float] | np.ndarray | None = None, iterations: int = 40, tolerance: float = 1e-4,
-        tries: int = 0, seed: int = 0, progress: Callable[[str], None] | None = None) -> Fit:
+        tries: int = 0, seed: int = 0, seconds: float = 600.0, progress: Callable[[str], None] | None = None) -> Fit:
     """Fit the active parameters that have a range (and uncertain initial states) to the drives.
 
-    `tries`: how many starts drawn over the ranges are looked at besides the given one; the best two are followed.
+    `seconds`: after which no further iteration is begun. `tries`: how many starts drawn over the ranges are looked at besides the given one; the best two are followed.
     Raises SimulationError where no start can be simulated, InputError where there is nothing to compare."""
     for d in drives:
         if d.scale is None:
@@ -264,11 +265,12 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
         starts += [z for _, z in looked[:2]]
     best: Fit | None = None
     failure: SimulationError | None = None
+    deadline = time.monotonic() + seconds
     for z in starts:
         try:
             problem.set_outlier_limits(problem.evaluate(z, False)[3])
             for _ in range(4):
-                found = _descend(problem, z, iterations, tolerance)
+                found = _descend(problem, z, iterations, tolerance, deadline)
                 z = found.z
                 if not problem.set_outlier_limits(found.residuals):
                     break
@@ -284,7 +286,7 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
     return best
 
 
-def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float) -> Fit:
+def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float, deadline: float) -> Fit:
     low = np.concatenate([np.zeros(problem.n_parameters), np.full(len(z) - problem.n_parameters, -8.0)])
     high = np.concatenate([np.ones(problem.n_parameters), np.full(len(z) - problem.n_parameters, 8.0)])
     z = np.clip(z, low, high)
@@ -293,7 +295,7 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float)
     for done in range(1, iterations + 1):       # noqa: B007 the count is reported
         held = ((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0))
         free = np.flatnonzero(~held)
-        if not len(free):
+        if not len(free) or time.monotonic() > deadline:
             break
         improved = False
         for _ in range(12):

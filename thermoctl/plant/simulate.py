@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 RTOL = 1e-7             # local error a step, as a share of each state's range
 JUMP_WIDTH = 1e-5       # half width of a smoothed jump, as a share of the range of its argument
-MAX_STEPS = 20_000      # steps within one sampling interval
+MAX_STEPS = 2_000      # steps within one sampling interval
 
 
 class SimulationError(Exception):
