@@ -85,8 +85,8 @@ def status(config: str | None, as_json: bool = False) -> int:
         ("setpoint", "setpoint_um"), ("position", "position_um"), ("compensation", "compensation_um"),
         ("output", "output_reference_um"))))
     coil, estimate = answer["temperatures_c"]["coil"], answer["estimates_c"]["coil"]
-    print(f"drive {_number(answer['drive'])}   power {_number(answer['power_w'])} W   air {_number(answer['air_c'], 2)} C"
-          f"   coil {_number(coil, 2)} C, estimated {_number(estimate, 2)} C")
+    print(f"drive {_number(answer['drive'])}   power {_number(answer['power_w'])} W   air {_number(answer['air_c'], 2)}"
+          f" C   coil {_number(coil, 2)} C, estimated {_number(estimate, 2)} C")
     bad = {role: state for role, state in answer["channels"].items() if state not in ("OK", "ABSENT")}
     if bad:
         print("readings: " + ", ".join(f"{role} {state}" for role, state in bad.items()))
@@ -150,7 +150,7 @@ def check(config: str) -> int:
 
 
 def doctor(config: str, seconds: float = 2.0) -> int:
-    """Connect, read every channel for `seconds`, show values, units and rates; drives nothing. 1 when one is bad."""
+    """Connect, read every channel for `seconds`, show value, unit and rate; drives nothing. 1 when one is bad."""
     from hal.backend import OK, ROLES, STATUS_NAMES, HardwareError, make_backend
     from thermoctl.daemon.loop import become_real_time
     from thermoctl.signals import SIGNALS

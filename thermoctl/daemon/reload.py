@@ -11,8 +11,8 @@ from thermoctl.settings import changed, load_settings
 def reload_settings(current: Any, started: Any) -> tuple[Any, Parameters, list[str], list[str]]:
     """(settings, parameters, applied keys, keys that count only after a restart).
 
-    current: the settings in force; started: those that the daemon was started with. Raises InputError for a file that is
-    not valid: nothing is applied then.
+    current: the settings in force; started: those that the daemon was started with. Raises InputError for a file that
+    is not valid: nothing is applied then.
     """
     settings = load_settings(current.path)
     applied = [key for key, restart in changed(current, settings) if not restart]

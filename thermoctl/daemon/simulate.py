@@ -119,3 +119,45 @@ def run_simulated(settings: Any, schedule: Iterable[tuple], duration_s: float, s
     finally:
         simulation.close()
     return rows
+
+
+SETTLE_S = 0.5              # after the reference has arrived
+STROKE_UM, CYCLE_S = 200.0, 75.0
+
+
+def trapezoids(settings: Any, hours: float, compensate: bool, out: str | None = None) -> int:
+    """`hours` of rig time in trapezoids of 75 s (the paper's test 4B): how far the output stayed from the setpoint.
+
+    Judged by the reference encoder, which the law never reads, wherever the reference has stood for SETTLE_S. Prints mean
+    and largest deviation; `out`: ten rows a second as Parquet. Returns 0 when every deviation is within 0.5 um, else 1.
+    """
+    parameters = dataclasses.replace(law_parameters(settings), compensate=float(compensate))
+    simulation = Simulation(settings, parameters=parameters)
+    simulation.arm()
+    half, steps = round(CYCLE_S / 2 / simulation.period_s), round(hours * 3600.0 / simulation.period_s)
+    keep = max(1, round(0.1 / simulation.period_s))
+    rows = np.empty((steps // keep, len(SIGNALS)))
+    standing = round(SETTLE_S / simulation.period_s)
+    setpoint, reference, output = (INDEX[n] for n in ("setpoint_um", "reference_um", "output_reference_um"))
+    stood, settled = 0, np.zeros(len(rows), dtype=bool)
+    for k in range(steps):
+        if k % half == 0:
+            simulation.command("setpoint", STROKE_UM if k // half % 2 == 0 else -STROKE_UM)
+        row = simulation.tick()
+        stood = stood + 1 if row[setpoint] == row[reference] else 0
+        if k % keep == keep - 1:
+            rows[k // keep], settled[k // keep] = row, stood > standing
+    state = arming.STATES[int(simulation.row[INDEX["state"]])]
+    simulation.close()
+    error = (rows[:, output] - rows[:, setpoint])[settled]
+    coil = rows[:, INDEX["coil_est_c"]]
+    print(f"{hours:g} h of rig time, compensation {'on' if compensate else 'off'}: state {state}, coil "
+          f"{coil[0]:.1f} to {coil.max():.1f} C, compensation up to "
+          f"{np.abs(rows[:, INDEX['compensation_um']]).max():.2f} um")
+    print(f"output minus setpoint, {settled.sum()} settled samples: mean {error.mean():+.3f} um, 2 sigma "
+          f"{2 * error.std():.3f} um, largest {np.abs(error).max():.3f} um")
+    if out:
+        from thermoctl.recording.table import Table, write_table
+        columns = {s.name: np.ascontiguousarray(rows[:, i]) for i, s in enumerate(SIGNALS) if s.name != "t_s"}
+        write_table(out, Table(name="simulated", path=out, t=rows[:, INDEX["t_s"]].copy(), columns=columns))
+    return 0 if np.abs(error).max() <= 0.5 and state == "ARMED" else 1
