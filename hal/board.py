@@ -6,11 +6,12 @@ takes the row at its next tick.
 """
 from __future__ import annotations
 
+import mmap
 import os
 import signal
 import threading
 import time
-from multiprocessing import shared_memory
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,58 +20,58 @@ from hal.backend import ABSENT, ERROR, ROLES, HardwareError, Sample
 from hal.devices import RECONNECT_S, Device, make_devices
 
 _ROW = np.dtype([("sequence", "u8"), ("value", "f8"), ("time_s", "f8"), ("status", "u8"), ("text", "S200")])
+_SIZE = _ROW.itemsize * len(ROLES)
+SHARED_MEMORY = Path("/dev/shm")
 
 
 class Board:
     """Newest readings by role. Make it with `create`, `attach` (another process) or `private` (threads of one)."""
 
-    def __init__(self, buffer: Any, memory: shared_memory.SharedMemory | None, owner: bool) -> None:
-        self._memory, self._owner = memory, owner          # the memory object must live as long as the array
+    def __init__(self, buffer: Any, path: Path | None, owner: bool) -> None:
+        self._path, self._owner, self._buffer = path, owner, buffer
         self.rows: Any = np.ndarray(len(ROLES), _ROW, buffer)
         self._sequence, self._status = self.rows["sequence"], self.rows["status"]
         self._value, self._time_s = self.rows["value"], self.rows["time_s"]
+        if owner:
+            self.rows["sequence"] = 0
+            self.rows["value"], self.rows["time_s"], self.rows["status"] = np.nan, -np.inf, ABSENT
 
     @classmethod
-    def create(cls, name: str | None = None) -> Board:
-        """A new board in shared memory; `board.name` is what `attach` takes. A board left over is replaced."""
-        size = _ROW.itemsize * len(ROLES)
+    def create(cls, name: str) -> Board:
+        """A new board in shared memory, for this user only; one left over under the same name is replaced."""
+        path = SHARED_MEMORY / name
+        path.unlink(missing_ok=True)
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
-            memory = shared_memory.SharedMemory(name, create=True, size=size)
-        except FileExistsError:
-            old = shared_memory.SharedMemory(name)
-            old.close()
-            old.unlink()
-            memory = shared_memory.SharedMemory(name, create=True, size=size)
-        board = cls(memory.buf, memory, True)
-        board._clear()
-        return board
+            os.ftruncate(fd, _SIZE)
+            return cls(mmap.mmap(fd, _SIZE), path, True)
+        finally:
+            os.close(fd)
 
     @classmethod
     def attach(cls, name: str) -> Board:
         """The board that another process created. Raises HardwareError where there is none."""
+        path = SHARED_MEMORY / name
         try:
-            memory = shared_memory.SharedMemory(name)
-        except FileNotFoundError:
-            raise HardwareError(f"board '{name}': not there; the supervisor creates it before any poller") from None
-        # The resource tracker of an attaching process would unlink the segment at exit (CPython issue 82300).
-        from multiprocessing import resource_tracker
-        resource_tracker.unregister(memory._name, "shared_memory")      # type: ignore[attr-defined]
-        return cls(memory.buf, memory, False)
+            fd = os.open(path, os.O_RDWR)
+        except OSError as e:
+            raise HardwareError(f"board '{name}': {e.strerror}; the supervisor creates it before any poller") from None
+        try:
+            return cls(mmap.mmap(fd, _SIZE), path, False)
+        except ValueError:
+            raise HardwareError(f"board '{name}': of another version; restart the daemon") from None
+        finally:
+            os.close(fd)
 
     @classmethod
     def private(cls) -> Board:
         """A board for threads of this process only."""
-        board = cls(bytearray(_ROW.itemsize * len(ROLES)), None, True)
-        board._clear()
-        return board
+        return cls(bytearray(_SIZE), None, True)
 
     @property
     def name(self) -> str:
-        return self._memory.name if self._memory else ""
-
-    def _clear(self) -> None:
-        self.rows["sequence"] = 0
-        self.rows["value"], self.rows["time_s"], self.rows["status"] = np.nan, -np.inf, ABSENT
+        """What `attach` takes."""
+        return self._path.name if self._path else ""
 
     def post(self, sample: Sample, device: Device) -> None:
         """Write the device's roles from `sample`."""
@@ -100,12 +101,9 @@ class Board:
         return bytes(self.rows[role]["text"]).decode("utf-8", "replace")
 
     def close(self) -> None:
-        """Let go of the memory; the creator also removes it."""
-        del self.rows, self._sequence, self._status, self._value, self._time_s
-        if self._memory is not None:
-            self._memory.close()
-            if self._owner:
-                self._memory.unlink()
+        """The creator removes the name; the memory goes with its last user."""
+        if self._path is not None and self._owner:
+            self._path.unlink(missing_ok=True)
 
 
 def poll_until(device: Device, board: Board, stop: threading.Event) -> None:

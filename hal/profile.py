@@ -509,9 +509,13 @@ def bind(node: Node, folder: Path) -> Binding:
     return binding
 
 
+def role_units(role: str) -> dict[str, tuple[float, float]]:
+    """Units that convert to a role's own: unit -> (factor, offset)."""
+    return _UNITS.get(role.rsplit("_", 1)[-1], _UNITS[""])
+
+
 def _bound(role: Node, channel: Channel) -> Bound:
-    suffix = role.value.rsplit("_", 1)[1]
-    units = _UNITS.get(suffix, _UNITS[""])
+    units = role_units(role.value)
     if channel.unit not in units:
         raise role.error(f"roles: channel '{channel.name}' is in {channel.unit}, the role {role.value} takes "
                          f"{' or '.join(units)}")

@@ -155,7 +155,9 @@ def open_port(path: str, line: LineSettings, what: str) -> serial.Serial:
         hint = {errno.ENOENT: "no such device: is it plugged in? prefer a name of /dev/serial/by-id",
                 errno.EACCES: "permission denied: add the user to the group of the device (dialout)",
                 errno.EAGAIN: "in use by another program: stop it first",
-                errno.EBUSY: "in use by another program: stop it first"}.get(code or 0, str(e))
+                errno.EBUSY: "in use by another program: stop it first",
+                errno.EINVAL:
+                f"cannot do {line.baud} baud, parity {line.parity}: see the profile's 'line'"}.get(code or 0, str(e))
         raise HardwareError(f"{what}: {path}: {hint}") from None
     if line.latency_timer_ms:
         set_latency_timer(path, line.latency_timer_ms)

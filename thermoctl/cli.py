@@ -27,6 +27,12 @@ def _plant_commands(sub: argparse._SubParsersAction) -> None:
     """simulate, refit, plant show, plant linearise, plant check."""
 
 
+def _virtual_rig(config: str, line: str) -> int:
+    from hal.virtual.rig import main
+    from thermoctl.settings import load_settings
+    return main(load_settings(config), line)
+
+
 def _daemon_commands(sub: argparse._SubParsersAction) -> None:
     """run, demo, start, stop, restart, status, arm, disarm, setpoint, reload, check, doctor, latency, virtual-rig."""
     config = ("--config", {"metavar": "FILE", "help": "configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, "
@@ -69,6 +75,10 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
          lambda a: room().latency(a.config, a.json), config, as_json)
     _add(sub, "replay", "run a recording's inputs through the law; exit 1 when one output bit differs",
          lambda a: room().replay(a.recording), ("recording", {"metavar": "RECORDING"}))
+    _add(sub, "virtual-rig", "play the devices of a configuration at the other end of their wires, in real time",
+         lambda a: _virtual_rig(a.config, a.tell), ("--config", {"metavar": "FILE", "default": "config/wire.yaml"}),
+         ("--tell", {"metavar": "LINE", "default": "", "help": "tell a running one to break or mend something, as "
+                                                              "'encoder unplug' ('help' lists all)"}))
     _add(sub, "service", "install or remove the systemd unit, its user and its device rules",
          lambda a: room().service_files(a.action, a.config, a.root), ("action", {"choices": ["install", "uninstall"]}),
          config, ("--root", {"default": "/", "metavar": "DIR", "help": "install below this directory"}))

@@ -137,6 +137,8 @@ class HalSettings:
     seed: int = option("seed of the simulated noise", 1, "1", 0, 2**31, restart=True)
     sensor_period_s: float = option("period of the simulated slow sensors", 0.1, "s", 1e-3, 60.0, restart=True)
     recording: str = option("the recording that back end `replay` plays, relative to this file", "", restart=True)
+    run_dir: str = option("where the virtual rig keeps its control socket and reference recording, relative to this file",
+                          "../run/wire", restart=True)
     devices: tuple[Node, ...] = option("bindings of profile, port and channel roles", (), restart=True)
     faults: tuple[Node, ...] = option("faults to inject, for tests", (), restart=True)
 

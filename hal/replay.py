@@ -1,0 +1,116 @@
+"""A recording as hardware: its samples arrive when the clock reaches their times; commands go nowhere.
+
+Columns play the role of their own name, or what `hal.roles` says: `column: role`, with its unit in brackets
+where it differs from the role's, as `q: position_um [m]`. A missing cell is a sensor that had nothing new. After the last row
+every channel is stale and `finished` is True.
+"""
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hal.backend import OK, ROLE, ROLES, STALE, Sample
+from hal.profile import role_units
+from thermoctl.recording.table import Table, read_table
+from thermoctl.yamlfile import InputError, suggest
+
+STALE_PERIODS = 5           # a channel is stale after so many of its usual periods without a sample
+
+
+def replay_backend(settings: Any) -> ReplayBackend:
+    """Back end `replay` of `settings`. Raises InputError: no such file, no column that plays a role."""
+    return ReplayBackend(read_table(Path(settings.path).parent / settings.hal.recording), settings.hal.roles)
+
+
+class ReplayBackend:
+    """`hal.backend.Backend` over a Table."""
+
+    def __init__(self, table: Table, roles: Mapping[str, str]) -> None:
+        for column in roles:
+            if column not in table.columns:
+                raise InputError(f"{table.path}: no column '{column}' for hal.roles{suggest(column, table.columns)}; "
+                                 f"columns: {', '.join(table.columns)}")
+        self.sample, self.finished = Sample(), False
+        self._t = table.t - table.t[0]
+        self._channels: list[tuple[int, np.ndarray, float]] = []       # role, values (N,), stale after s
+        for column, values in table.columns.items():
+            role, factor, shift = self._role(table, column, roles.get(column, column))
+            if role in ROLES:
+                times = self._t[np.isfinite(values)]
+                period = float(np.median(np.diff(times))) if len(times) > 1 else math.inf
+                self._channels.append((ROLE[role], values * factor + shift, STALE_PERIODS * period))
+        if not self._channels:
+            raise InputError(f"{table.path}: no column plays a role; say which in hal.roles "
+                             f"(columns: {', '.join(table.columns)}; roles: {', '.join(ROLES)})")
+        taken = [r for r, _, _ in self._channels]
+        if twice := {ROLES[r] for r in taken if taken.count(r) > 1}:
+            raise InputError(f"{table.path}: hal.roles gives {', '.join(sorted(twice))} to two columns")
+        self._next, self._start_s = 0, math.nan
+
+    @staticmethod
+    def _role(table: Table, column: str, text: str) -> tuple[str, float, float]:
+        match = re.fullmatch(r"(\w+)(?: \[([^]]+)\])?", text.strip())
+        role = match[1] if match else text
+        if text != column and role not in ROLES:
+            raise InputError(f"{table.path}: hal.roles: '{role}' is no role{suggest(role, ROLES)}; "
+                             f"roles: {', '.join(ROLES)}")
+        if match is None or match[2] is None:
+            return role, 1.0, 0.0
+        units = role_units(role)
+        if match[2] not in units:
+            raise InputError(f"{table.path}: hal.roles: column '{column}' in {match[2]}: {role} takes "
+                             f"{' or '.join(units)}")
+        return role, *units[match[2]]
+
+    def open(self) -> None:
+        """From the first row."""
+        self._next, self._start_s, self.finished = 0, math.nan, False
+        for role, _, _ in self._channels:
+            self.sample.status[role] = STALE
+
+    def read(self, now_s: float) -> Sample:
+        """The samples up to `now_s`; the first read takes the first row."""
+        sample = self.sample
+        sample.fresh[:] = False
+        if math.isnan(self._start_s):
+            self._start_s = now_s
+        begin, t = self._next, now_s - self._start_s + 1e-9
+        end = begin + 1 if begin < len(self._t) and self._t[begin] <= t else begin
+        if end < len(self._t) and self._t[end] <= t:                   # more than one row since the last read
+            end = int(np.searchsorted(self._t, t, "right"))
+        self._next = end
+        self.finished = end == len(self._t) and t > self._t[-1] + 2e-9
+        for role, values, stale_s in self._channels:
+            for i in range(end - 1, begin - 1, -1):
+                value = values[i]
+                if value == value:
+                    sample.value[role], sample.time_s[role] = value, self._start_s + self._t[i]
+                    sample.fresh[role], sample.status[role] = True, OK
+                    break
+            if self.finished or now_s - sample.time_s[role] > stale_s:
+                sample.status[role] = STALE
+        return sample
+
+    def write(self, drive: float, enable: bool) -> None:
+        """A recording takes no command."""
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def problem(self, role: str) -> str:
+        """Why a channel has nothing."""
+        status = self.sample.status[ROLE[role]]
+        if status == OK:
+            return ""
+        if status == STALE:
+            return f"{role}: the recording {'has ended' if self.finished else 'has no sample here'}"
+        return f"{role}: not in the recording"
+
+    def counters(self) -> dict[str, int]:
+        """Rows played."""
+        return {"replay.rows": self._next}
