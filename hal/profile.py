@@ -482,7 +482,10 @@ _SOURCES: dict[str, Any] = {
 def resolve_port(port: str, folder: Path) -> str:
     """A port whose path is relative ('../run/encoder', 'slcan:./can') with that path taken from `folder`."""
     match = re.fullmatch(r"((?:slcan:|rtu:)?)(\.\.?/.*)", port)
-    return f"{match[1]}{(folder / match[2]).resolve().parent / Path(match[2]).name}" if match else port
+    if match is None:
+        return port
+    path = Path(match[2])                   # the last part may be a link: it is the link that is meant
+    return f"{match[1]}{(folder / path.parent).resolve() / path.name}"
 
 
 def bind(node: Node, folder: Path) -> Binding:
