@@ -45,6 +45,7 @@ from hal.serial_port import open_port, read_available
 from thermoctl.yamlfile import InputError
 
 SYNC_ID, NMT_ID = 0x080, 0x000
+HEARTBEAT_LOST = 0x8130     # CiA 301 error code of a missing heartbeat
 MAX_PENDING = 4096          # bytes or frames that wait for a bus which takes none: then the link counts as lost
 SDO_TIMEOUT_S = 0.3
 FAULT_RESET_S = 1.0         # between attempts to reset a drive's fault while it is not wanted to drive
@@ -337,12 +338,18 @@ class Cia402Device(Device):
             pdo.cob_id, pdo.trans_type, pdo.enabled = cob_id + self._node, 1, True
             pdo.save()
         self._fault_code = node.sdo[0x603F].raw
+        if self._fault_code == HEARTBEAT_LOST:      # it missed us while we were away: no news
+            node.sdo[0x6040].raw = 0x80
+            node.sdo[0x6040].raw = 0
+            self._fault_code = node.sdo[0x603F].raw
         network.send_message(NMT_ID, bytes((0x01, self._node)))       # operational
 
     def disconnect(self) -> None:
-        """Close the port."""
+        """Send the drive back to its power-on state and close the port."""
         port, self._port = self._port, None
         if port is not None:
+            with contextlib.suppress(OSError):      # reset communication: PDOs and watchdog are forgotten, it is off
+                port.send((NMT_ID, bytes((0x82, self._node))))
             port.close()
 
     def read(self, sample: Sample, now_s: float) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import os
 import re
 import select
@@ -34,6 +35,7 @@ from thermoctl.yamlfile import InputError, suggest
 MAX_STEPS = 50              # periods caught up at once; a longer stop of this program shifts the plant's time
 REFERENCE_HZ = 100
 SUPPLY_V = 24.0
+PRIORITY = 70               # below the daemon's loop
 _REFERENCE = ("output_reference_um", "position_um", "coil_c", "air_c")
 
 
@@ -430,6 +432,11 @@ class VirtualRig:
     def run(self, announce: Callable[[str], None]) -> None:
         """Plug everything in and live in real time until `stopping`; everything is unplugged afterwards."""
         self.run_dir.mkdir(parents=True, exist_ok=True)
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        except (OSError, AttributeError):
+            announce("no real-time priority (CAP_SYS_NICE): frames may come late when the machine is busy")
+        gc.freeze()
         control = _listen(self.run_dir / "control.sock")
         try:
             for device in self.devices.values():

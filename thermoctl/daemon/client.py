@@ -165,6 +165,7 @@ def doctor(config: str, seconds: float = 2.0) -> int:
             sample = backend.read(now)
             for role, fresh in zip(ROLES, sample.fresh, strict=True):
                 counts[role] += int(fresh)
+            backend.write(0.0, False)                      # a drive answers to its SYNC; it stays disabled
             time.sleep(settings.loop.period_s)
             now = time.monotonic()
         print(f"{'channel':24}{'value':>14} {'unit':8}{'status':8}{'rate':>10}")
