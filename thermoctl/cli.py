@@ -94,6 +94,18 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
 
 def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
     """diagnose, prove, demo-concealed, effects."""
+    def prove(args: argparse.Namespace) -> int:
+        from thermoctl.diagnose.prove import command
+        return command(args)
+    _add(sub, "prove", "diagnose a folder of cases, open the answers, score", prove,
+         ("cases", {"metavar": "CASES", "help": "folder of cases: plant.yaml and recordings each"}),
+         ("--out", {"required": True, "metavar": "DIR"}),
+         ("--answers", {"metavar": "DIR", "help": "NAME.yaml each (default: answer.yaml inside the case)"}),
+         ("--number", {"type": int, "metavar": "N", "help": "only the first N cases"}),
+         ("--workers", {"type": int, "metavar": "N", "help": "local processes (default: one a core)"}),
+         ("--scheduler", {"metavar": "ADDRESS", "help": "a Dask scheduler (tcp://...) instead; it must see the same files"}),
+         ("--real", {"action": "store_true", "help": "real recordings without answers: name, place, held-out error"}),
+         ("--apart", {"metavar": "NAMES", "help": "with --real: folders whose recordings are of different rigs"}))
 
 
 def _people_commands(sub: argparse._SubParsersAction) -> None:

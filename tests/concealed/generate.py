@@ -3,9 +3,10 @@
     python -m tests.concealed.generate --out DIR --number N --seed S [--smoke] [--answers DIR] [--families a,b]
 
 DIR/NNNN/{plant.yaml,run_1.csv,run_2.csv}; answers in --answers (default DIR/../<name>_answers) as NNNN.yaml with
-`manifest.sha256`; `--answers inside` puts answer.yaml into each case instead (a set to develop on). A case is a function
-of (seed, number) alone: any part of a set can be made again.
+`manifest.sha256`; `--answers inside` puts answer.yaml into each case instead (a set to develop on). A case is a
+function of (seed, number) alone: any part of a set can be made again.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -28,9 +29,48 @@ FAMILIES = {f.name: f for f in (Heater(), FreeStage(), Drive(), Flexure(), Tanks
 SCHEDULES = ("production-like", "designed", "warm-up", "designed")
 SIZES = 10.0 ** np.arange(-2.0, 1.51, 0.5)
 # one period of kinds: 600 cases hold 150 of nothing missing, 360 single effects, 45 unknown, 30 pairs, 15 that cancel
-KINDS = ("one", "none", "one", "one", "none", "one", "one", "unknown", "one", "none", "one", "pair", "one", "one", "none",
-         "one", "one", "unknown", "one", "none", "one", "one", "pair", "one", "none", "one", "one", "one", "none", "one",
-         "unknown", "one", "one", "none", "one", "cancel", "one", "none", "one", "one")
+KINDS = (
+    "one",
+    "none",
+    "one",
+    "one",
+    "none",
+    "one",
+    "one",
+    "unknown",
+    "one",
+    "none",
+    "one",
+    "pair",
+    "one",
+    "one",
+    "none",
+    "one",
+    "one",
+    "unknown",
+    "one",
+    "none",
+    "one",
+    "one",
+    "pair",
+    "one",
+    "none",
+    "one",
+    "one",
+    "one",
+    "none",
+    "one",
+    "unknown",
+    "one",
+    "one",
+    "none",
+    "one",
+    "cancel",
+    "one",
+    "none",
+    "one",
+    "one",
+)
 
 
 class Bench:
@@ -44,8 +84,9 @@ class Bench:
         spectra = []
         for run in scene.runs:
             n = len(run["t"])
-            spectra.append(np.stack([x.spectrum(n) + r**2 / 12 for x, r in zip(self.noise, scene.resolution, strict=True)],
-                                    axis=1))
+            spectra.append(
+                np.stack([x.spectrum(n) + r**2 / 12 for x, r in zip(self.noise, scene.resolution, strict=True)], axis=1)
+            )
         self.judge = Judge(spectra)
 
     def measure(self, pool: list[Suspect], rivals: list[Suspect]) -> None:
@@ -69,9 +110,11 @@ class Bench:
         tangents = [d[k][1:n_theta] / np.array(steps)[:, None, None] for k in range(len(runs))]
         scale = np.array([(h - lo) / 4 for lo, h in scene.ranges.values()])
         whole = [self.judge.whiten([x * scale[:, None, None] for x in tangents])] if len(scale) else []
-        for k in range(len(runs)):                       # each run has its own start
-            alone = [np.zeros_like(d[j][n_theta:n_nuisance]) if j != k else d[j][n_theta:n_nuisance] / 0.1
-                     for j in range(len(runs))]
+        for k in range(len(runs)):  # each run has its own start
+            alone = [
+                np.zeros_like(d[j][n_theta:n_nuisance]) if j != k else d[j][n_theta:n_nuisance] / 0.1
+                for j in range(len(runs))
+            ]
             if n_nuisance > n_theta:
                 whole.append(self.judge.whiten(alone))
         self.judge.set_parameters(np.concatenate(whole))
@@ -79,9 +122,9 @@ class Bench:
         at = 0
         self.curve = []
         for s, sizes in sized:
-            self.curve.append((s, np.array(sizes), left[at:at + len(sizes)]))
+            self.curve.append((s, np.array(sizes), left[at : at + len(sizes)]))
             at += len(sizes)
-        self.rivals = [(s, left[at + 2 * i:at + 2 * i + 2]) for i, s in enumerate(rivals)]
+        self.rivals = [(s, left[at + 2 * i : at + 2 * i + 2]) for i, s in enumerate(rivals)]
 
     def left_of(self, effects: list[tuple[str, str, dict]]) -> tuple[np.ndarray, list[np.ndarray]]:
         """Left-over row (M,) and readings of the truth with these effects."""
@@ -91,8 +134,11 @@ class Bench:
 
     def like(self, left: np.ndarray, truth: Suspect) -> list[tuple[str, str]]:
         """Rivals after which too little of the signal is left to tell them from the truth."""
-        return [(s.effect, s.where) for s, row in self.rivals
-                if (s.effect, s.where) != (truth.effect, truth.where) and beyond(left, row) < TELL_APART]
+        return [
+            (s.effect, s.where)
+            for s, row in self.rivals
+            if (s.effect, s.where) != (truth.effect, truth.where) and beyond(left, row) < TELL_APART
+        ]
 
 
 def _size_for(curve: tuple, target: float) -> float | None:
@@ -104,11 +150,13 @@ def _size_for(curve: tuple, target: float) -> float | None:
     k = int(np.argmax(s >= target))
     if k == 0:
         return float(sizes[0] * target / s[0]) if suspect.top > 1 else float(sizes[0])
-    x = np.interp(np.log(target), np.log(s[k - 1:k + 1] + 1e-12), np.log(sizes[k - 1:k + 1]))
+    x = np.interp(np.log(target), np.log(s[k - 1 : k + 1] + 1e-12), np.log(sizes[k - 1 : k + 1]))
     return float(np.exp(x))
 
 
-def make_case(seed: int, number: int, families: list[str], short: bool) -> tuple[dict, list[list[tuple[str, np.ndarray]]], dict]:
+def make_case(
+    seed: int, number: int, families: list[str], short: bool
+) -> tuple[dict, list[list[tuple[str, np.ndarray]]], dict]:
     """Case `number` of a set: (plant, columns of each run, answer)."""
     for attempt in range(20):
         rng = np.random.default_rng([seed, number, attempt])
@@ -122,15 +170,22 @@ def make_case(seed: int, number: int, families: list[str], short: bool) -> tuple
             break
     else:
         raise RuntimeError(f"case {number}: no visible effect in 20 draws")
-    answer = {"verdict": "consistent" if kind == "none" else "unexplained" if kind == "unknown" else "explained",
-              "effects": [["?" if e.startswith("?") else e, w] for e, w, _ in effects],
-              "nearly_the_same": sorted({e for e, _ in told["alike"] if e not in {x for x, _, _ in effects}}),
-              "nearly_the_same_places": [list(x) for x in sorted(set(told["alike"]))],
-              "family": family, "schedule": schedule, "kind": kind, "colour": bench.colour, "band": told["band"],
-              "snr": [round(float(s), 2) for s in told["snr"]], "onset": told["onset"],
-              "also_right": [list(x) for x in told["aliases"]],
-              "parameters": [{k: float(v) for k, v in p.items()} for _, _, p in effects],
-              "true_parameters": {k: float(f"{v:.6g}") for k, v in scene.theta.items()}}
+    answer = {
+        "verdict": "consistent" if kind == "none" else "unexplained" if kind == "unknown" else "explained",
+        "effects": [["?" if e.startswith("?") else e, w] for e, w, _ in effects],
+        "nearly_the_same": sorted({e for e, _ in told["alike"] if e not in {x for x, _, _ in effects}}),
+        "nearly_the_same_places": [list(x) for x in sorted(set(told["alike"]))],
+        "family": family,
+        "schedule": schedule,
+        "kind": kind,
+        "colour": bench.colour,
+        "band": told["band"],
+        "snr": [round(float(s), 2) for s in told["snr"]],
+        "onset": told["onset"],
+        "also_right": [list(x) for x in told["aliases"]],
+        "parameters": [{k: float(v) for k, v in p.items()} for _, _, p in effects],
+        "true_parameters": {k: float(f"{v:.6g}") for k, v in scene.theta.items()},
+    }
     if kind == "unknown":
         answer["outside_catalogue"] = [e for e, _, _ in effects]
     dirt_kind = rng.choice(["clean", "outliers", "gaps", "slow"], p=[0.55, 0.15, 0.2, 0.1])
@@ -145,7 +200,7 @@ def make_case(seed: int, number: int, families: list[str], short: bool) -> tuple
                 dirt = {"every": 5}
             y = sensors.record(runs[k][:, j], bench.noise[j], scene.sd[j], scene.resolution[j], dirt, rng)
             columns.append((c, y))
-            oracle.append((scene.outputs[j], np.sqrt(np.nanmean((y - runs[k][:, j])**2))))
+            oracle.append((scene.outputs[j], np.sqrt(np.nanmean((y - runs[k][:, j]) ** 2))))
         tables.append(columns)
     answer["dirt"] = str(dirt_kind)
     answer["oracle_rms"] = {o: float(f"{np.mean([r for n, r in oracle if n == o]):.5g}") for o in scene.outputs}
@@ -153,15 +208,15 @@ def make_case(seed: int, number: int, families: list[str], short: bool) -> tuple
 
 
 def _conceal(scene: Scene, kind: str, rng: np.random.Generator, number: int):
-    """Choose effects and sizes: (effects, readings of each run, what the answer tells, bench), or None when not visible."""
+    """Choose effects and sizes: (effects, readings by run, what the answer tells, bench), or None when not visible."""
     bench = Bench(scene, rng)
     told: dict = {"alike": [], "band": None, "snr": [], "onset": None, "aliases": []}
     if kind == "none":
         bench.base = [scene.outputs_of(k, [Variant()])[0] for k in range(len(scene.runs))]
         return [], bench.base, told, bench
     pool = scene.unknowns if kind == "unknown" else scene.suspects
-    names = sorted({s.effect for s in pool})                # every effect alike, whatever its number of places
-    picks = list(rng.permutation(names))[:4 if kind in ("one", "unknown") else 8]
+    names = sorted({s.effect for s in pool})  # every effect alike, whatever its number of places
+    picks = list(rng.permutation(names))[: 4 if kind in ("one", "unknown") else 8]
     chosen = [options[rng.integers(len(options))] for options in ([s for s in pool if s.effect == e] for e in picks)]
     bench.measure(chosen, scene.suspects)
     if kind in ("one", "unknown"):
@@ -176,8 +231,13 @@ def _conceal(scene: Scene, kind: str, rng: np.random.Generator, number: int):
             left, runs = bench.left_of(effects)
             if not low <= snr(left) < high * (4 if band == "large" else 1):
                 continue
-            told |= {"band": band, "snr": [snr(left)], "alike": bench.like(left, s),
-                     "onset": effects[0][2].get(s.onset) if s.onset else None, "aliases": [(s.effect, w) for w in s.aliases]}
+            told |= {
+                "band": band,
+                "snr": [snr(left)],
+                "alike": bench.like(left, s),
+                "onset": effects[0][2].get(s.onset) if s.onset else None,
+                "aliases": [(s.effect, w) for w in s.aliases],
+            }
             return effects, runs, told, bench
         return None
     return _two(bench, kind, rng, told)
@@ -187,7 +247,7 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
     """Two effects at once: each large, or so that their signals largely cancel and each is still large alone."""
     best = None
     for i, first in enumerate(bench.curve):
-        for second in bench.curve[i + 1:]:
+        for second in bench.curve[i + 1 :]:
             if first[0].onset and second[0].onset:
                 continue
             sizes = [_size_for(c, rng.uniform(18, 50)) for c in (first, second)]
@@ -207,8 +267,12 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
     if snr(left) < 6 or min(snr(a) for a in alone) < 10:
         return None
     onset = next((e[2][s.onset] for e, s in zip(effects, (one, two), strict=True) if s.onset), None)
-    told |= {"band": "large", "snr": [snr(left), *(snr(a) for a in alone)], "onset": onset,
-             "alike": [x for s, a in zip((one, two), alone, strict=True) for x in bench.like(a, s)]}
+    told |= {
+        "band": "large",
+        "snr": [snr(left), *(snr(a) for a in alone)],
+        "onset": onset,
+        "alike": [x for s, a in zip((one, two), alone, strict=True) for x in bench.like(a, s)],
+    }
     return effects, runs, told, bench
 
 
@@ -256,12 +320,17 @@ def main(argv: list[str] | None = None) -> int:
         write_case(a.out / name, plant, tables)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(yaml.safe_dump(_plain(answer), sort_keys=False))
-        print(f"{name} {answer['family']:9s} {answer['schedule']:15s} {answer['kind']:7s} {answer['band'] or '':6s} "
-              f"{answer['snr']} {answer['effects']} ~ {answer['nearly_the_same']}", file=sys.stderr, flush=True)
+        print(
+            f"{name} {answer['family']:9s} {answer['schedule']:15s} {answer['kind']:7s} {answer['band'] or '':6s} "
+            f"{answer['snr']} {answer['effects']} ~ {answer['nearly_the_same']}",
+            file=sys.stderr,
+            flush=True,
+        )
     if not inside:
         files = sorted(answers.glob("[0-9]*.yaml"))
-        (answers / "manifest.sha256").write_text("".join(
-            f"{hashlib.sha256(f.read_bytes()).hexdigest()}  {f.name}\n" for f in files))
+        (answers / "manifest.sha256").write_text(
+            "".join(f"{hashlib.sha256(f.read_bytes()).hexdigest()}  {f.name}\n" for f in files)
+        )
     return 0
 
 

@@ -10,6 +10,7 @@ so white noise of sd s on N samples gives SNR = rms(r) sqrt(N) / s, and the SNR 
 single-effect test statistic in standard deviations. Bands: small 3-6, middle 6-15, large above 15. Two
 explanations are `nearly the same` when less than 3.5 of the true one's signal is left after the other, too, is fitted.
 """
+
 from __future__ import annotations
 
 import numpy as np
@@ -27,7 +28,10 @@ class Judge:
 
     def whiten(self, runs: list[np.ndarray]) -> np.ndarray:
         """Signals of all runs, each (m, N, ny), to whitened rows (m, sum N*ny)."""
-        rows = [(dct(y, axis=1, norm="ortho") * s).reshape(len(y), y.shape[1] * y.shape[2]) for y, s in zip(runs, self.scale, strict=True)]
+        rows = [
+            (dct(y, axis=1, norm="ortho") * s).reshape(len(y), y.shape[1] * y.shape[2])
+            for y, s in zip(runs, self.scale, strict=True)
+        ]
         return np.concatenate(rows, axis=1)
 
     def set_parameters(self, derivatives: np.ndarray) -> None:

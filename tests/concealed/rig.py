@@ -1,4 +1,5 @@
 """What the generator needs to know of a rig family, and helpers to write its plant file."""
+
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -12,14 +13,14 @@ from tests.concealed.thermal import Variant
 
 @dataclass(frozen=True)
 class Suspect:
-    """An effect at a place. `make(size)` gives its parameters at `size` (1: typical); `top` is the largest sensible size."""
+    """An effect at a place. `make(size)` gives its parameters at `size` (1: typical); `top` the largest sensible."""
 
     effect: str
     where: str
     make: Callable[[float], dict]
     top: float = 8.0
     onset: str | None = None
-    aliases: tuple[str, ...] = ()                     # other places that name the same thing
+    aliases: tuple[str, ...] = ()  # other places that name the same thing
 
 
 @dataclass
@@ -28,15 +29,15 @@ class Scene:
 
     plant: dict
     theta: dict[str, float]
-    ranges: dict[str, tuple[float, float]]            # of the parameters a refit may move
-    starts: dict[str, float]                          # initial_sigma by node
-    runs: list[dict]                                  # t, inputs and everything the truth wants
-    columns: dict[str, str]                           # recorded input column -> key in run
+    ranges: dict[str, tuple[float, float]]  # of the parameters a refit may move
+    starts: dict[str, float]  # initial_sigma by node
+    runs: list[dict]  # t, inputs and everything the truth wants
+    columns: dict[str, str]  # recorded input column -> key in run
     outputs: list[str]
     output_columns: list[str]
     sd: np.ndarray
     resolution: np.ndarray
-    outputs_of: Callable[[int, list[Variant]], np.ndarray]    # (run, rows) -> (m, N, ny) readings without noise
+    outputs_of: Callable[[int, list[Variant]], np.ndarray]  # (run, rows) -> (m, N, ny) readings without noise
     suspects: list[Suspect] = field(default_factory=list)
     unknowns: list[Suspect] = field(default_factory=list)
 
@@ -73,13 +74,17 @@ def room(t: np.ndarray, rng: np.random.Generator, swing: float) -> np.ndarray:
     span = t[-1]
     air = rng.uniform(19.5, 23.5) + swing * rng.uniform(-1, 1) * t / span
     for _ in range(3):
-        air = air + swing * rng.uniform(0.1, 0.5) * np.sin(2 * np.pi * t / (span * rng.uniform(0.2, 1.2)) + rng.uniform(0, 6))
+        air = air + swing * rng.uniform(0.1, 0.5) * np.sin(
+            2 * np.pi * t / (span * rng.uniform(0.2, 1.2)) + rng.uniform(0, 6)
+        )
     return np.round(air, 5)
 
 
-def levels(t: np.ndarray, rng: np.random.Generator, schedule: str, top: float, hold: float, quiet: float = 0.1) -> np.ndarray:
-    """A drive level (N,) of steps: warm-up (one long hold, then rest), production-like (cycles round one level), designed
-    (many levels and lengths, with rests)."""
+def levels(
+    t: np.ndarray, rng: np.random.Generator, schedule: str, top: float, hold: float, quiet: float = 0.1
+) -> np.ndarray:
+    """A drive level (N,) of steps: warm-up (one long hold, then rest), production-like (cycles round one level),
+    designed (many levels and lengths, with rests)."""
     span = t[-1]
     out = np.zeros(len(t))
     if schedule == "warm-up":

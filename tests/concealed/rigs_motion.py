@@ -1,15 +1,15 @@
 """Two motion families, integrated by splitting: a free linear stage, and a flexure stage with coil heat and voltage.
 
 One substep h: half a step of position, a whole step of velocity with the smooth forces held at the midpoint (exact for
-the linear damper), the Coulomb force as a set-valued law (the velocity is held at zero when the dry friction can hold it,
-else the exact impulse is taken off, never through zero), half a step of position. Memory forces (Bouc-Wen, Maxwell) take
-exact or midpoint steps. Four substeps a sample; many variants (rows) go through together as columns of numbers.
+the linear damper), the Coulomb force as a set-valued law (the velocity is held at zero when the dry friction can hold
+it, else the exact impulse is taken off, never through zero), half a step of position. Memory forces (Bouc-Wen, Maxwell)
+take exact or midpoint steps. Four substeps a sample; many variants (rows) go through together as columns of numbers.
 """
+
 from __future__ import annotations
 
 import numpy as np
 
-from tests.concealed import sensors
 from tests.concealed.rig import Scene, Suspect, clock, levels, room
 from tests.concealed.rigs_thermal import _draw, _fault, _parameter_block, sensor_suspects
 from tests.concealed.thermal import Variant
@@ -17,14 +17,37 @@ from tests.concealed.thermal import Variant
 SUBSTEPS = 4
 
 # effect parameters as columns of numbers; the value is the neutral one
-_NEUTRAL = {"viscous_friction.B": 0.0, "coulomb_friction.F": 0.0, "stribeck_friction.FC": 0.0, "stribeck_friction.FS": 0.0,
-            "stribeck_friction.VS": 1.0, "directional_friction.FP": 0.0, "directional_friction.FM": 0.0,
-            "directional_friction.BP": 0.0, "directional_friction.BM": 0.0, "constant_load.F": 0.0,
-            "quadratic_drag.B": 0.0, "cubic_stiffness.K": 0.0, "cogging.A": 0.0, "cogging.P": 1.0, "cogging.PHI": 0.0,
-            "backlash_hysteresis.F": 0.0, "backlash_hysteresis.X": 1.0, "creep.K": 0.0, "creep.TAU": 1.0,
-            "force_constant_temperature.B": 0.0, "position_dependent_force_constant.A": 0.0, "actuator_saturation.U": 1e9,
-            "actuator_dead_zone.U": 0.0, "actuator_delay.TD": 0.0, "?sticky_zone.F": 0.0, "?sticky_zone.X": 0.0,
-            "?second_mass.K": 0.0, "?second_mass.M": 1.0, "?one_way_gain.A": 0.0}
+_NEUTRAL = {
+    "viscous_friction.B": 0.0,
+    "coulomb_friction.F": 0.0,
+    "stribeck_friction.FC": 0.0,
+    "stribeck_friction.FS": 0.0,
+    "stribeck_friction.VS": 1.0,
+    "directional_friction.FP": 0.0,
+    "directional_friction.FM": 0.0,
+    "directional_friction.BP": 0.0,
+    "directional_friction.BM": 0.0,
+    "constant_load.F": 0.0,
+    "quadratic_drag.B": 0.0,
+    "cubic_stiffness.K": 0.0,
+    "cogging.A": 0.0,
+    "cogging.P": 1.0,
+    "cogging.PHI": 0.0,
+    "backlash_hysteresis.F": 0.0,
+    "backlash_hysteresis.X": 1.0,
+    "creep.K": 0.0,
+    "creep.TAU": 1.0,
+    "force_constant_temperature.B": 0.0,
+    "position_dependent_force_constant.A": 0.0,
+    "actuator_saturation.U": 1e9,
+    "actuator_dead_zone.U": 0.0,
+    "actuator_delay.TD": 0.0,
+    "?sticky_zone.F": 0.0,
+    "?sticky_zone.X": 0.0,
+    "?second_mass.K": 0.0,
+    "?second_mass.M": 1.0,
+    "?one_way_gain.A": 0.0,
+}
 
 
 def columns(rows: list[Variant]) -> dict[str, np.ndarray]:
@@ -39,28 +62,40 @@ def columns(rows: list[Variant]) -> dict[str, np.ndarray]:
 
 
 def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarray]:
-    """Position m, velocity m/s, coil temperature degC, each (m, N). `theta`: gain N/V or N/A, mass, damping, stiffness, and
-    for a heated coil R, C_coil, G_coil."""
+    """Position m, velocity m/s, coil temperature degC, each (m, N). `theta`: gain N/V or N/A, mass, damping, stiffness,
+    and for a heated coil R, C_coil, G_coil."""
     m, t, u = len(rows), run["t"], run["drive"]
     full = [{**theta, **row.theta} for row in rows]
 
     def par(name: str, default: float = 0.0) -> np.ndarray:
         return np.array([p.get(name, default) for p in full])
+
     gain, mass, damping, stiffness = par("gain"), par("mass"), par("damping"), par("stiffness")
     ohm, heat_c, heat_g = par("R"), par("C_coil", 1.0), par("G_coil")
     e = columns(rows)
-    copper = np.array([any(x == "copper_resistance" for x, _, _ in row.effects) or theta.get("knows_copper", 0) for row in rows])
+    copper = np.array(
+        [any(x == "copper_resistance" for x, _, _ in row.effects) or theta.get("knows_copper", 0) for row in rows]
+    )
     on = {k: bool(np.any(v != _NEUTRAL[k])) for k, v in e.items()}
-    dry = any(on[k] for k in ("coulomb_friction.F", "stribeck_friction.FC", "stribeck_friction.FS", "directional_friction.FP",
-                              "directional_friction.FM", "?sticky_zone.F"))
+    dry = any(
+        on[k]
+        for k in (
+            "coulomb_friction.F",
+            "stribeck_friction.FC",
+            "stribeck_friction.FS",
+            "directional_friction.FP",
+            "directional_friction.FM",
+            "?sticky_zone.F",
+        )
+    )
     x = np.array([row.start.get("position", 0.0) for row in rows]) + run.get("start", 0.0)
     v = np.zeros(m)
     air = run["air"]
     coil = np.full(m, air[0]) + np.array([row.start.get("coil", 0.0) for row in rows]) + run.get("start_coil", 0.0)
-    rest = x.copy()                                      # creep: position of the damper in series
+    rest = x.copy()  # creep: position of the damper in series
     bouc = np.zeros(m)
     x2, v2 = x.copy(), np.zeros(m)
-    stays = bool(run.get("held"))                        # input holds between samples, else straight lines
+    stays = bool(run.get("held"))  # input holds between samples, else straight lines
     out = {k: np.empty((m, len(t))) for k in ("position", "velocity", "coil")}
     heated = "C_coil" in theta
     delayed = on["actuator_delay.TD"]
@@ -69,7 +104,7 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
         if k == len(t) - 1:
             break
         h = (t[k + 1] - t[k]) / SUBSTEPS
-        decay_rate = (damping + e["viscous_friction.B"])
+        decay_rate = damping + e["viscous_friction.B"]
         for s in range(SUBSTEPS):
             x = x + v * (h / 2)
             now = t[k] + (s + 0.5) * h
@@ -96,7 +131,7 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
                 force = force + e["cogging.A"] * np.sin(2 * np.pi * x / e["cogging.P"] + e["cogging.PHI"])
             if on["quadratic_drag.B"]:
                 force = force - e["quadratic_drag.B"] * v * np.abs(v)
-            if on["backlash_hysteresis.F"]:              # Bouc-Wen, n = 1: dz = (v - |v| z sign(v z)...) / X, midpoint
+            if on["backlash_hysteresis.F"]:  # Bouc-Wen, n = 1: dz = (v - |v| z sign(v z)...) / X, midpoint
                 half = bouc + (v - 0.5 * (np.abs(v) * bouc + v * np.abs(bouc))) / e["backlash_hysteresis.X"] * (h / 2)
                 bouc = bouc + (v - 0.5 * (np.abs(v) * half + v * np.abs(half))) / e["backlash_hysteresis.X"] * h
                 force = force - e["backlash_hysteresis.F"] * bouc
@@ -104,7 +139,9 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
                 rest = x + (rest - x) * np.exp(-h / e["creep.TAU"])
                 force = force - e["creep.K"] * (x - rest)
             if on["?second_mass.K"]:
-                pull = e["?second_mass.K"] * (x2 - x) + 0.02 * np.sqrt(e["?second_mass.K"] * e["?second_mass.M"]) * (v2 - v)
+                pull = e["?second_mass.K"] * (x2 - x) + 0.02 * np.sqrt(e["?second_mass.K"] * e["?second_mass.M"]) * (
+                    v2 - v
+                )
                 v2 = v2 - pull / e["?second_mass.M"] * h
                 x2 = x2 + v2 * h
                 force = force + pull
@@ -115,10 +152,13 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
             push = np.where(rate > 1e-9, (1 - free) / np.maximum(rate, 1e-9), h / mass)
             new = v * free + push * force
             if dry:
-                limit = (e["coulomb_friction.F"] + e["stribeck_friction.FC"] + e["stribeck_friction.FS"]
-                         * np.exp(-(v / e["stribeck_friction.VS"])**2) + np.where(
-                             new > 0, e["directional_friction.FP"], e["directional_friction.FM"])
-                         + e["?sticky_zone.F"] * (x > e["?sticky_zone.X"]))
+                limit = (
+                    e["coulomb_friction.F"]
+                    + e["stribeck_friction.FC"]
+                    + e["stribeck_friction.FS"] * np.exp(-((v / e["stribeck_friction.VS"]) ** 2))
+                    + np.where(new > 0, e["directional_friction.FP"], e["directional_friction.FM"])
+                    + e["?sticky_zone.F"] * (x > e["?sticky_zone.X"])
+                )
                 new = np.sign(new) * np.maximum(np.abs(new) - push * limit, 0.0)
             v = new
             x = x + v * (h / 2)
@@ -137,13 +177,17 @@ def _delayed(run: dict, when: np.ndarray, held: bool) -> np.ndarray:
 
 
 def friction_suspects(force: float, pace: float, travel: float) -> list[Suspect]:
-    """Friction and force effects at the node `velocity`; `force` N, `pace` m/s and `travel` m are the rig's usual sizes."""
+    """Friction and force effects at the node `velocity`; `force` N, `pace` m/s and `travel` m are usual sizes."""
     f = 0.12 * force
     return [
         Suspect("coulomb_friction", "velocity", lambda s: {"F": f * s}, top=4),
         Suspect("stribeck_friction", "velocity", lambda s: {"FC": f * s, "FS": 0.6 * f * s, "VS": 0.15 * pace}, top=4),
-        Suspect("directional_friction", "velocity", lambda s: {"FP": f * s, "FM": 1.6 * f * s, "BP": 0.05 * f / pace * s,
-                                                               "BM": 0.4 * f / pace * s}, top=4),
+        Suspect(
+            "directional_friction",
+            "velocity",
+            lambda s: {"FP": f * s, "FM": 1.6 * f * s, "BP": 0.05 * f / pace * s, "BM": 0.4 * f / pace * s},
+            top=4,
+        ),
         Suspect("constant_load", "velocity", lambda s: {"F": 0.5 * f * s}, top=6),
         Suspect("quadratic_drag", "velocity", lambda s: {"B": 2 * f / pace**2 * s}, top=10),
         Suspect("cogging", "velocity", lambda s: {"A": f * s, "P": travel * 0.13, "PHI": 0.7}, top=6),
@@ -183,13 +227,24 @@ class FreeStage:
             limit = 0.4
             while now < t[-1]:
                 length = rng.uniform(0.4, 1.6) * (2 if schedule == "warm-up" else 1)
-                push = {"warm-up": 1.4, "production-like": rng.choice([1.2, 1.5, 0.0]), "designed": rng.uniform(0, 2.0)}[schedule]
+                push = {
+                    "warm-up": 1.4,
+                    "production-like": rng.choice([1.2, 1.5, 0.0]),
+                    "designed": rng.uniform(0, 2.0),
+                }[schedule]
                 sign = -np.sign(at) if abs(at) > limit else rng.choice([-1, 1])
                 drive[(t >= now) & (t < now + length)] = push * sign
                 at += push * sign * length * 0.15
                 now += length
-            runs.append({"t": t, "drive": np.round(drive, 6), "held": True, "air": np.full(n, 22.0),
-                         "start": rng.normal(0, 3e-4)})
+            runs.append(
+                {
+                    "t": t,
+                    "drive": np.round(drive, 6),
+                    "held": True,
+                    "air": np.full(n, 22.0),
+                    "start": rng.normal(0, 3e-4),
+                }
+            )
         lost = "" if damped else " without a damper"
         flows = {"motor": {"into": "velocity", "rate": "gain * drive", "unit": "N"}}
         if damped:
@@ -197,16 +252,24 @@ class FreeStage:
         flows["travel"] = {"into": "position", "rate": "velocity", "unit": "m/s"}
         fine = rng.random() < 0.5
         noise = 0.02 if not fine else 0.005
-        plant = {"format": "thermoctl-plant/1", "title": f"Linear stage with a free carriage{lost}",
-                 "inputs": {"drive": {"unit": "V"}}, "parameters": _parameter_block(belief),
-                 "nodes": {"velocity": {"unit": "m/s", "storage": "mass", "initial": 0},
-                           "position": {"unit": "m", "storage": 1, "initial": 0, "initial_sigma": 0.001}},
-                 "flows": flows,
-                 "outputs": {"encoder": {"value": "position * 1e3", "unit": "mm", "noise": noise} | (
-                     {"resolution": 0.01} if fine else {})}}
+        plant = {
+            "format": "thermoctl-plant/1",
+            "title": f"Linear stage with a free carriage{lost}",
+            "inputs": {"drive": {"unit": "V"}},
+            "parameters": _parameter_block(belief),
+            "nodes": {
+                "velocity": {"unit": "m/s", "storage": "mass", "initial": 0},
+                "position": {"unit": "m", "storage": 1, "initial": 0, "initial_sigma": 0.001},
+            },
+            "flows": flows,
+            "outputs": {
+                "encoder": {"value": "position * 1e3", "unit": "mm", "noise": noise}
+                | ({"resolution": 0.01} if fine else {})
+            },
+        }
 
         def outputs_of(k: int, rows: list[Variant]) -> np.ndarray:
-            with np.errstate(over="ignore", invalid="ignore"):       # a rival too large for the rig: its row is not finite
+            with np.errstate(over="ignore", invalid="ignore"):  # a rival too large for the rig: its row is not finite
                 states = simulate(theta, runs[k], rows)
             out = np.empty((len(rows), n, 1))
             for r in range(len(rows)):
@@ -220,13 +283,30 @@ class FreeStage:
             suspects = [s for s in suspects if s.effect not in ("directional_friction", "stribeck_friction")]
             suspects.append(Suspect("viscous_friction", "velocity", lambda s: {"B": 60 * size * s}))
         faults = sensor_suspects("encoder", period, runs[0]["t"][-1], 100.0, False, rng)
-        suspects += [s for s in faults if s.effect in ("sensor_lag", "sensor_delay", "sensor_offset_step", "sensor_drift")]
+        suspects += [
+            s for s in faults if s.effect in ("sensor_lag", "sensor_delay", "sensor_offset_step", "sensor_drift")
+        ]
         suspects.append(Suspect("cyclic_error", "encoder", lambda s: {"A": 0.05 * s, "P": 0.02, "PHI": 0.4}))
-        unknowns = [Suspect("?sticky_zone", "velocity", lambda s: {"F": 0.2 * force * s, "X": 0.02}, top=4),
-                    Suspect("?second_mass", "velocity", lambda s: {"M": 12 * size * s, "K": 12 * size * s * 900}, top=3),
-                    Suspect("?one_way_gain", "motor", lambda s: {"A": 0.12 * s}, top=4, aliases=("velocity",))]
-        return Scene(plant, theta, ranges, {"position": 0.001}, runs, {"drive": "drive"}, ["encoder"], ["encoder"],
-                     np.array([noise]), np.array([0.01 if fine else 0.0]), outputs_of, suspects, unknowns)
+        unknowns = [
+            Suspect("?sticky_zone", "velocity", lambda s: {"F": 0.2 * force * s, "X": 0.02}, top=4),
+            Suspect("?second_mass", "velocity", lambda s: {"M": 12 * size * s, "K": 12 * size * s * 900}, top=3),
+            Suspect("?one_way_gain", "motor", lambda s: {"A": 0.12 * s}, top=4, aliases=("velocity",)),
+        ]
+        return Scene(
+            plant,
+            theta,
+            ranges,
+            {"position": 0.001},
+            runs,
+            {"drive": "drive"},
+            ["encoder"],
+            ["encoder"],
+            np.array([noise]),
+            np.array([0.01 if fine else 0.0]),
+            outputs_of,
+            suspects,
+            unknowns,
+        )
 
 
 class Flexure:
@@ -235,11 +315,19 @@ class Flexure:
     name = "flexure"
 
     def scene(self, rng: np.random.Generator, schedule: str, short: bool) -> Scene:
-        knows = {e: bool(rng.random() < 0.65) for e in ("back_emf", "inductance", "resistance_temperature", "copper_resistance")}
+        knows = {
+            e: bool(rng.random() < 0.65)
+            for e in ("back_emf", "inductance", "resistance_temperature", "copper_resistance")
+        }
         damped = rng.random() < 0.8
         belief: dict[str, tuple] = {
-            "gain": (9.0, "N/A"), "mass": (0.6, "kg", 0.3, 1.2), "stiffness": (900.0, "N/m", 300, 2500),
-            "R": (4.0, "ohm", 2.5, 6.5), "C_coil": (9.0, "J/K", 4, 20), "G_coil": (0.35, "W/K", 0.12, 1.0)}
+            "gain": (9.0, "N/A"),
+            "mass": (0.6, "kg", 0.3, 1.2),
+            "stiffness": (900.0, "N/m", 300, 2500),
+            "R": (4.0, "ohm", 2.5, 6.5),
+            "C_coil": (9.0, "J/K", 4, 20),
+            "G_coil": (0.35, "W/K", 0.12, 1.0),
+        }
         if damped:
             belief["damping"] = (7.0, "N*s/m", 1.5, 30)
         if knows["back_emf"]:
@@ -255,22 +343,43 @@ class Flexure:
         for _ in range(2):
             t = clock(n, period, rng)
             hold = levels(t, rng, schedule, 1.6, 4.0) * (1 if schedule == "warm-up" else 1)
-            tones = sum(rng.uniform(0.2, 0.5) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in
-                        rng.uniform(0.3, 6.0, 5))
-            current = np.convolve(hold * rng.choice([-1, 1]) + 0.5 * tones * (hold > 0), np.hanning(41) / np.hanning(41).sum(),
-                                  "same")
-            runs.append({"t": t, "drive": np.round(current, 6), "held": False, "air": room(t, rng, 0.3),
-                         "start": rng.normal(0, 3e-6), "start_coil": rng.normal(0, 0.1)})
+            tones = sum(
+                rng.uniform(0.2, 0.5) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in rng.uniform(0.3, 6.0, 5)
+            )
+            current = np.convolve(
+                hold * rng.choice([-1, 1]) + 0.5 * tones * (hold > 0), np.hanning(41) / np.hanning(41).sum(), "same"
+            )
+            runs.append(
+                {
+                    "t": t,
+                    "drive": np.round(current, 6),
+                    "held": False,
+                    "air": room(t, rng, 0.3),
+                    "start": rng.normal(0, 3e-6),
+                    "start_coil": rng.normal(0, 0.1),
+                }
+            )
         grow = " * (1 + 0.00393 * (coil - 20))"
-        flows = {"motor": {"into": "velocity", "rate": "gain * current", "unit": "N"},
-                 "spring": {"from": "velocity", "rate": "stiffness * position", "unit": "N"}}
+        flows = {
+            "motor": {"into": "velocity", "rate": "gain * current", "unit": "N"},
+            "spring": {"from": "velocity", "rate": "stiffness * position", "unit": "N"},
+        }
         if damped:
             flows["damper"] = {"from": "velocity", "rate": "damping * velocity", "unit": "N"}
-        flows |= {"travel": {"into": "position", "rate": "velocity", "unit": "m/s"},
-                  "joule": {"into": "coil", "rate": "R * current**2" + (grow if knows["copper_resistance"] else ""), "unit": "W"},
-                  "coil_to_air": {"from": "coil", "rate": "G_coil * (coil - air)", "unit": "W"}}
-        volts = "R * current" + (grow if knows["resistance_temperature"] else "") + (
-            " + K_e * velocity" if knows["back_emf"] else "")
+        flows |= {
+            "travel": {"into": "position", "rate": "velocity", "unit": "m/s"},
+            "joule": {
+                "into": "coil",
+                "rate": "R * current**2" + (grow if knows["copper_resistance"] else ""),
+                "unit": "W",
+            },
+            "coil_to_air": {"from": "coil", "rate": "G_coil * (coil - air)", "unit": "W"},
+        }
+        volts = (
+            "R * current"
+            + (grow if knows["resistance_temperature"] else "")
+            + (" + K_e * velocity" if knows["back_emf"] else "")
+        )
         inputs = {"current": {"unit": "A", "between_samples": "linear"}}
         if knows["inductance"]:
             inputs["current_rate"] = {"unit": "A/s"}
@@ -278,15 +387,23 @@ class Flexure:
         inputs["air"] = {"unit": "degC", "column": "air_temperature", "between_samples": "linear"}
         outputs = ["position_read", "voltage", "coil_temperature"]
         sd = np.array([0.002, 0.01, 0.15])
-        plant = {"format": "thermoctl-plant/1", "title": "Voice-coil stage on flexures",
-                 "inputs": inputs, "parameters": _parameter_block(belief),
-                 "nodes": {"velocity": {"unit": "m/s", "storage": "mass", "initial": 0},
-                           "position": {"unit": "m", "storage": 1, "initial": 0, "initial_sigma": 1e-5},
-                           "coil": {"unit": "degC", "storage": "C_coil", "initial": "air", "initial_sigma": 0.2}},
-                 "flows": flows,
-                 "outputs": {"position_read": {"value": "position * 1e3", "unit": "mm", "noise": 0.002},
-                             "voltage": {"value": volts, "unit": "V", "noise": 0.01},
-                             "coil_temperature": {"value": "coil", "unit": "degC", "noise": 0.15}}}
+        plant = {
+            "format": "thermoctl-plant/1",
+            "title": "Voice-coil stage on flexures",
+            "inputs": inputs,
+            "parameters": _parameter_block(belief),
+            "nodes": {
+                "velocity": {"unit": "m/s", "storage": "mass", "initial": 0},
+                "position": {"unit": "m", "storage": 1, "initial": 0, "initial_sigma": 1e-5},
+                "coil": {"unit": "degC", "storage": "C_coil", "initial": "air", "initial_sigma": 0.2},
+            },
+            "flows": flows,
+            "outputs": {
+                "position_read": {"value": "position * 1e3", "unit": "mm", "noise": 0.002},
+                "voltage": {"value": volts, "unit": "V", "noise": 0.01},
+                "coil_temperature": {"value": "coil", "unit": "degC", "noise": 0.15},
+            },
+        }
         for run in runs:
             run["current_rate"] = np.round(np.append(np.diff(run["drive"]) / np.diff(run["t"]), 0.0), 5)
 
@@ -302,8 +419,15 @@ class Flexure:
                 ohm = p["R"] * np.ones(n)
                 if knows["resistance_temperature"] or "resistance_temperature" in present:
                     ohm = ohm * (1 + 0.00393 * (coil - 20))
-                volt = ohm * run["drive"] + (p["K_e"] if knows["back_emf"] else present.get("back_emf", {}).get("K", 0.0)) * v
-                volt = volt + (p["L"] if knows["inductance"] else present.get("inductance", {}).get("L", 0.0)) * run["current_rate"]
+                volt = (
+                    ohm * run["drive"]
+                    + (p["K_e"] if knows["back_emf"] else present.get("back_emf", {}).get("K", 0.0)) * v
+                )
+                volt = (
+                    volt
+                    + (p["L"] if knows["inductance"] else present.get("inductance", {}).get("L", 0.0))
+                    * run["current_rate"]
+                )
                 local = run | {"position": states["position"][r]}
                 for j, y in enumerate((1e3 * states["position"][r], volt, coil)):
                     out[r, :, j] = _fault(rows, r, outputs[j], local, y, j == 2)
@@ -315,20 +439,38 @@ class Flexure:
         suspects.append(Suspect("creep", "velocity", lambda s: {"K": 120.0 * s, "TAU": 3.0}, top=4))
         suspects.append(Suspect("force_constant_temperature", "motor", lambda s: {"B": 0.0012 * s}, top=6))
         for effect, suspect in {
-                "back_emf": Suspect("back_emf", "voltage", lambda s: {"K": 9.0 * s}, top=3),
-                "inductance": Suspect("inductance", "voltage", lambda s: {"L": 4e-3 * s}, top=4),
-                "resistance_temperature": Suspect("resistance_temperature", "voltage", lambda s: {"A": 0.00393}, top=1),
-                "copper_resistance": Suspect("copper_resistance", "joule", lambda s: {"A": 0.00393}, top=1)}.items():
+            "back_emf": Suspect("back_emf", "voltage", lambda s: {"K": 9.0 * s}, top=3),
+            "inductance": Suspect("inductance", "voltage", lambda s: {"L": 4e-3 * s}, top=4),
+            "resistance_temperature": Suspect("resistance_temperature", "voltage", lambda s: {"A": 0.00393}, top=1),
+            "copper_resistance": Suspect("copper_resistance", "joule", lambda s: {"A": 0.00393}, top=1),
+        }.items():
             if not knows[effect]:
                 suspects.append(suspect)
         if not damped:
             suspects = [s for s in suspects if s.effect not in ("directional_friction", "stribeck_friction")]
             suspects.append(Suspect("viscous_friction", "velocity", lambda s: {"B": 3.0 * s}))
         for output, swing, air in zip(outputs, (8.0, 5.0, 15.0), (False, False, True), strict=True):
-            suspects += [s for s in sensor_suspects(output, period, span, swing, air, rng) if s.effect != "sensor_gain" or air]
+            suspects += [
+                s for s in sensor_suspects(output, period, span, swing, air, rng) if s.effect != "sensor_gain" or air
+            ]
         suspects.append(Suspect("cyclic_error", "position_read", lambda s: {"A": 0.004 * s, "P": 5e-4, "PHI": 0.4}))
-        unknowns = [Suspect("?sticky_zone", "velocity", lambda s: {"F": 0.1 * force * s, "X": 0.002}, top=6),
-                    Suspect("?one_way_gain", "motor", lambda s: {"A": 0.05 * s}, top=4, aliases=("velocity",))]
+        unknowns = [
+            Suspect("?sticky_zone", "velocity", lambda s: {"F": 0.1 * force * s, "X": 0.002}, top=6),
+            Suspect("?one_way_gain", "motor", lambda s: {"A": 0.05 * s}, top=4, aliases=("velocity",)),
+        ]
         columns_ = {"current": "drive", "current_rate": "current_rate", "air_temperature": "air"}
-        return Scene(plant, theta, ranges, {"position": 1e-5, "coil": 0.2}, runs, columns_, outputs, outputs, sd,
-                     np.zeros(3), outputs_of, suspects, unknowns)
+        return Scene(
+            plant,
+            theta,
+            ranges,
+            {"position": 1e-5, "coil": 0.2},
+            runs,
+            columns_,
+            outputs,
+            outputs,
+            sd,
+            np.zeros(3),
+            outputs_of,
+            suspects,
+            unknowns,
+        )

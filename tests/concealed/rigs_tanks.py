@@ -1,4 +1,5 @@
 """Cascaded tanks, integrated by scipy's LSODA between the samples, event by event: pump in, two or three levels."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -20,7 +21,7 @@ class Tanks:
         belief |= {f"k_{n}": (0.06, "V**0.5/s", 0.015, 0.25) for n in names}
         theta, ranges = _draw(belief, rng)
         seen = names[1:] if rng.random() < 0.6 else names
-        if seen != names:                                # without the upper level only k_pump fixes its scale
+        if seen != names:  # without the upper level only k_pump fixes its scale
             belief["k_pump"] = (theta["k_pump"], "1/s")
             ranges.pop("k_pump")
         n, period = (800 if short else 1600), 3.0
@@ -31,17 +32,22 @@ class Tanks:
             pump = levels(t, rng, schedule, top, 160.0, 0.05) * (1 if schedule == "warm-up" else 0.9)
             pump = np.round(pump + 0.25 * top, 4)
             start = {k: float(np.round(rng.uniform(1.5, 4.0), 3)) for k in names}
-            runs.append({"t": t, "pump": pump, "air": np.full(n, 22.0)} | {f"{k}_start": np.full(n, start[k]) for k in names})
+            runs.append(
+                {"t": t, "pump": pump, "air": np.full(n, 22.0)} | {f"{k}_start": np.full(n, start[k]) for k in names}
+            )
         flows: dict = {"pumped": {"into": "upper", "rate": "k_pump * pump", "unit": "V/s"}}
         for k, name in enumerate(names):
             ends = {"from": name, "into": names[k + 1]} if k + 1 < len(names) else {"from": name}
             flows[f"{name}_outflow"] = {**ends, "rate": f"k_{name} * sqrt(max({name}, 0))", "unit": "V/s"}
-        plant = {"format": "thermoctl-plant/1", "title": f"{len(names)} tanks in cascade",
-                 "inputs": {"pump": {"unit": "V"}} | {f"{k}_start": {"unit": "V"} for k in names},
-                 "parameters": _parameter_block(belief),
-                 "nodes": {k: {"unit": "V", "storage": 1, "initial": f"{k}_start", "initial_sigma": 0.03} for k in names},
-                 "flows": flows,
-                 "outputs": {f"level_{k}": {"value": k, "unit": "V", "noise": 0.02, "resolution": 0.005} for k in seen}}
+        plant = {
+            "format": "thermoctl-plant/1",
+            "title": f"{len(names)} tanks in cascade",
+            "inputs": {"pump": {"unit": "V"}} | {f"{k}_start": {"unit": "V"} for k in names},
+            "parameters": _parameter_block(belief),
+            "nodes": {k: {"unit": "V", "storage": 1, "initial": f"{k}_start", "initial_sigma": 0.03} for k in names},
+            "flows": flows,
+            "outputs": {f"level_{k}": {"value": k, "unit": "V", "noise": 0.02, "resolution": 0.005} for k in seen},
+        }
 
         def outputs_of(k: int, rows: list[Variant]) -> np.ndarray:
             out = np.empty((len(rows), n, len(seen)))
@@ -53,22 +59,41 @@ class Tanks:
 
         calm = [outputs_of(k, [Variant()])[0] for k in range(2)]
         high = float(max(np.quantile(y, 0.97) for y in calm))
-        peak = {x: float(max(_integrate(names, theta, Variant(), r)[:, names.index(x)].max() for r in runs)) for x in names}
+        peak = {
+            x: float(max(_integrate(names, theta, Variant(), r)[:, names.index(x)].max() for r in runs)) for x in names
+        }
         span = runs[0]["t"][-1]
-        suspects = [Suspect("overflow", x, lambda s, x=x: {"HMAX": peak[x] * max(1.0 - 0.12 * s, 0.4), "A": 0.7}, top=5)
-                    for x in names]
+        suspects = [
+            Suspect("overflow", x, lambda s, x=x: {"HMAX": peak[x] * max(1.0 - 0.12 * s, 0.4), "A": 0.7}, top=5)
+            for x in names
+        ]
         suspects += [Suspect("orifice_exponent", f"{x}_outflow", lambda s: {"N": 0.5 + 0.04 * s}, top=6) for x in names]
         for x in seen:
             suspects += [s for s in sensor_suspects(f"level_{x}", period, span, 4.0, False, rng, top_value=high)]
-        suspects.append(Suspect("actuator_saturation", "pumped", lambda s: {"U": top * max(1.3 - 0.15 * s, 0.5)}, top=4))
+        suspects.append(
+            Suspect("actuator_saturation", "pumped", lambda s: {"U": top * max(1.3 - 0.15 * s, 0.5)}, top=4)
+        )
         suspects.append(Suspect("actuator_dead_zone", "pumped", lambda s: {"U": 0.25 * top * (1 + 0.05 * s)}, top=4))
         suspects.append(Suspect("actuator_delay", "pumped", lambda s: {"TD": 4 * period * s}, top=6))
         unknowns = [Suspect("?siphon", x, lambda s: {"A": 0.25 * s}, top=4, aliases=(f"{x}_outflow",)) for x in names]
-        unknowns += [Suspect("?clogging", f"{x}_outflow", lambda s: {"A": 0.12 * s}, top=4, aliases=(x,)) for x in names]
-        scene = Scene(plant, theta, ranges, {x: 0.03 for x in names}, runs,
-                      {"pump": "pump"} | {f"{x}_start": f"{x}_start" for x in names}, [f"level_{x}" for x in seen],
-                      [f"level_{x}" for x in seen], np.full(len(seen), 0.02), np.full(len(seen), 0.005), outputs_of, suspects,
-                      unknowns)
+        unknowns += [
+            Suspect("?clogging", f"{x}_outflow", lambda s: {"A": 0.12 * s}, top=4, aliases=(x,)) for x in names
+        ]
+        scene = Scene(
+            plant,
+            theta,
+            ranges,
+            {x: 0.03 for x in names},
+            runs,
+            {"pump": "pump"} | {f"{x}_start": f"{x}_start" for x in names},
+            [f"level_{x}" for x in seen],
+            [f"level_{x}" for x in seen],
+            np.full(len(seen), 0.02),
+            np.full(len(seen), 0.005),
+            outputs_of,
+            suspects,
+            unknowns,
+        )
         for run in runs:
             run["off"] = rng.normal(0, 0.015, len(names))
         return scene
@@ -108,7 +133,7 @@ def _integrate(names: list[str], theta: dict, row: Variant, run: dict) -> np.nda
     def rate(x: np.ndarray, now: float, u: float) -> np.ndarray:
         x = np.maximum(x, 0.0)
         flow = k * x**power
-        if special:                                      # a siphon that starts above 5 V; a filter that clogs in cycles
+        if special:  # a siphon that starts above 5 V; a filter that clogs in cycles
             flow = flow * (1 + siphon / (1 + np.exp(-(x - 4.0) / 0.05))) * (1 - clog * ((now % 700.0) / 700.0))
         spill = np.maximum(x - rim, 0.0) * 5.0
         d = -flow - spill
@@ -116,7 +141,7 @@ def _integrate(names: list[str], theta: dict, row: Variant, run: dict) -> np.nda
         d[1:] += flow[:-1] + share * spill[:-1]
         return d
 
-    change = np.flatnonzero(np.diff(sent)) + 1            # the input is constant from change to change
+    change = np.flatnonzero(np.diff(sent)) + 1  # the input is constant from change to change
     edges = np.concatenate([[0.0], t[change] + late, [t[-1] + late + 1]])
     values = np.concatenate([[sent[0]], sent[change]])
     for i, u in enumerate(values):
@@ -124,8 +149,11 @@ def _integrate(names: list[str], theta: dict, row: Variant, run: dict) -> np.nda
         if end <= begin:
             continue
         inside = np.flatnonzero((t > begin) & (t <= end))
-        grid = np.concatenate([[begin], t[inside], [end]]) if not len(inside) or t[inside[-1]] < end else np.concatenate(
-            [[begin], t[inside]])
+        grid = (
+            np.concatenate([[begin], t[inside], [end]])
+            if not len(inside) or t[inside[-1]] < end
+            else np.concatenate([[begin], t[inside]])
+        )
         grid, first = np.unique(grid, return_index=True)
         y = odeint(rate, x_now, grid, args=(u,), rtol=1e-8, atol=1e-8, hmax=20.0, mxstep=5000)
         out[inside] = y[np.searchsorted(grid, t[inside])]

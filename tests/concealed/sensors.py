@@ -3,6 +3,7 @@
 Noise of a channel = white + AR(1) + 1/f; `spectrum` is its variance per orthonormal DCT-II bin, which the judge uses to
 whiten. The faults are those of the catalogue's table "Sensors".
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from scipy.signal import lfilter
 
 @dataclass(frozen=True)
 class Noise:
-    """Random error of one channel: standard deviations of the white, AR(1) (with lag-one correlation rho) and 1/f part."""
+    """Random error of one channel: standard deviations of the white, AR(1) (lag-one correlation rho) and 1/f part."""
 
     white: float
     ar: float = 0.0
@@ -31,8 +32,11 @@ class Noise:
         innovation = rng.standard_normal(n) * self.ar * np.sqrt(1 - self.rho**2)
         innovation[0] = rng.standard_normal() * self.ar
         coloured = lfilter([1.0], [1.0, -self.rho], innovation)
-        return self.white * rng.standard_normal(n) + coloured + self.flicker * _idct(
-            rng.standard_normal(n) * np.sqrt(_flicker_shape(n)))
+        return (
+            self.white * rng.standard_normal(n)
+            + coloured
+            + self.flicker * _idct(rng.standard_normal(n) * np.sqrt(_flicker_shape(n)))
+        )
 
 
 def _flicker_shape(n: int) -> np.ndarray:
@@ -44,6 +48,7 @@ def _flicker_shape(n: int) -> np.ndarray:
 
 def _idct(x: np.ndarray) -> np.ndarray:
     from scipy.fft import idct
+
     return idct(x, norm="ortho")
 
 
@@ -52,12 +57,16 @@ def draw_noise(sd: float, rng: np.random.Generator, colour: str) -> Noise:
     total = sd * rng.uniform(0.92, 1.05)
     share = {"white": 0.0, "ar": rng.uniform(0.1, 0.4), "flicker": rng.uniform(0.1, 0.3)}[colour]
     flicker = rng.uniform(0.005, 0.03) if colour == "flicker" else 0.0
-    return Noise(white=total * np.sqrt(1 - share - flicker), ar=total * np.sqrt(share), rho=rng.uniform(0.3, 0.9),
-                 flicker=total * np.sqrt(flicker))
+    return Noise(
+        white=total * np.sqrt(1 - share - flicker),
+        ar=total * np.sqrt(share),
+        rho=rng.uniform(0.3, 0.9),
+        flicker=total * np.sqrt(flicker),
+    )
 
 
 def lag(t: np.ndarray, y: np.ndarray, tau: float) -> np.ndarray:
-    """First-order lag of y (N,) known at t and straight between, starting in equilibrium. Exact for every step length."""
+    """First-order lag of y (N,) known at t and straight between, starting in equilibrium. Exact for every step."""
     out = np.empty_like(y)
     out[0] = z = y[0]
     h = np.diff(t)
@@ -69,8 +78,9 @@ def lag(t: np.ndarray, y: np.ndarray, tau: float) -> np.ndarray:
     return out
 
 
-def apply_fault(effect: str, p: dict, t: np.ndarray, y: np.ndarray, air: np.ndarray | None, x: np.ndarray | None,
-                thermal: bool) -> np.ndarray:
+def apply_fault(
+    effect: str, p: dict, t: np.ndarray, y: np.ndarray, air: np.ndarray | None, x: np.ndarray | None, thermal: bool
+) -> np.ndarray:
     """The reading (N,) that a sensor with the named fault gives for the true value y (N,)."""
     s = t - t[0]
     if effect == "sensor_lag":
@@ -92,11 +102,21 @@ def apply_fault(effect: str, p: dict, t: np.ndarray, y: np.ndarray, air: np.ndar
     raise KeyError(effect)
 
 
-SENSOR_FAULTS = ("sensor_lag", "sensor_delay", "sensor_gain", "sensor_offset_step", "sensor_drift",
-                 "cold_junction_drift", "sensor_saturation", "cyclic_error")
+SENSOR_FAULTS = (
+    "sensor_lag",
+    "sensor_delay",
+    "sensor_gain",
+    "sensor_offset_step",
+    "sensor_drift",
+    "cold_junction_drift",
+    "sensor_saturation",
+    "cyclic_error",
+)
 
 
-def record(y: np.ndarray, noise: Noise, sd: float, resolution: float, dirt: dict, rng: np.random.Generator) -> np.ndarray:
+def record(
+    y: np.ndarray, noise: Noise, sd: float, resolution: float, dirt: dict, rng: np.random.Generator
+) -> np.ndarray:
     """A recorded column (N,): true reading plus noise, outliers, steps of the converter, gaps (NaN)."""
     n = len(y)
     out = y + noise.draw(n, rng)
@@ -109,5 +129,5 @@ def record(y: np.ndarray, noise: Noise, sd: float, resolution: float, dirt: dict
         out[np.arange(n) % dirt["every"] != 0] = np.nan
     for _ in range(dirt.get("gaps", 0)):
         start = rng.integers(n // 20, n)
-        out[start:start + rng.integers(n // 400 + 2, n // 100 + 4)] = np.nan
+        out[start : start + rng.integers(n // 400 + 2, n // 100 + 4)] = np.nan
     return out

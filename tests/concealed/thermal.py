@@ -6,9 +6,10 @@ spread over all, the sensor reads the mean. With x the volumes' temperatures
     C dx/dt = -L x + f(x, t)            L: conduction inside and between bodies and to the air, constant
     z+ = exp(-lam h) z + phi1 F(z) ;  z+ += phi2 (F(z+) - F(z))      ETD2RK in the eigenvectors of C^-1/2 L C^-1/2
 
-All that is not linear and constant (changed parameters, effects) is in f. Many variants (rows) go through together: each
-is a dict of arrays, and effects are numbers in them, zero when absent.
+All that is not linear and constant (changed parameters, effects) is in f. Many variants (rows) go through together;
+effects are arrays of numbers, zero when absent.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -41,15 +42,16 @@ class Network:
     stiffness: float = 150.0
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a rival too large for the rig runs away: its row is not finite
 def simulate(net: Network, theta: dict, run: dict, rows: list[Variant]) -> np.ndarray:
-    """Mean temperatures (m, N, bodies) of every variant; `run` holds t (s), air, the heats' columns, velocity, position."""
+    """Mean temperatures (m, N, bodies), degC, of every variant; `run`: t (s), air, heats (W), velocity, position."""
     names, flows = list(net.bodies), list(net.edges)
     nb, ne, m, cells = len(names), len(flows), len(rows), net.cells
     at = {n: i for i, n in enumerate(names)}
     c0 = np.array([theta[p] for p in net.bodies.values()])
     g0 = np.array([theta[net.edges[f][0]] for f in flows])
     a = np.array([at[net.edges[f][1]] for f in flows])
-    b = np.array([at.get(net.edges[f][2], nb) for f in flows])          # nb stands for the air
+    b = np.array([at.get(net.edges[f][2], nb) for f in flows])  # nb stands for the air
     into = np.zeros((ne, nb + 1))
     into[np.arange(ne), a] -= 1
     into[np.arange(ne), b] += 1
@@ -72,17 +74,17 @@ def simulate(net: Network, theta: dict, run: dict, rows: list[Variant]) -> np.nd
         g = net.stiffness * max(touching[k], 1e-3) * cells
         for c in range(cells - 1):
             i = surface[k] + c
-            lin[i:i + 2, i:i + 2] += g * np.array([[1, -1], [-1, 1]])
+            lin[i : i + 2, i : i + 2] += g * np.array([[1, -1], [-1, 1]])
     root = np.sqrt(np.repeat(c0 / cells, cells))
     lam, vec = np.linalg.eigh(lin / np.outer(root, root))
     lam = np.maximum(lam, 1e-9)
-    to_surface = (vec[surface] / root[surface, None]).T                 # modes -> surface temperatures
+    to_surface = (vec[surface] / root[surface, None]).T  # modes -> surface temperatures
     mean = np.zeros((nb, n))
     for k in range(nb):
-        mean[k, surface[k]:surface[k] + cells] = 1 / cells
+        mean[k, surface[k] : surface[k] + cells] = 1 / cells
     to_mean = ((mean / root) @ vec).T
     read = np.concatenate([to_surface, to_mean], axis=1)
-    from_force = np.concatenate([to_surface.T, to_mean.T], axis=0)      # W at the surfaces, W spread over bodies
+    from_force = np.concatenate([to_surface.T, to_mean.T], axis=0)  # W at the surfaces, W spread over bodies
 
     v = _Arrays(net, theta, rows, names, flows, run)
     t, air = run["t"], run["air"]
@@ -137,8 +139,10 @@ class _Arrays:
         self.g = np.array([[p[net.edges[f][0]] for f in flows] for p in full])
         self.c = np.array([[p[c] for c in net.bodies.values()] for p in full])
         self.start = np.array([[r.start.get(n, 0.0) for n in names] for r in rows])
-        body = {k: np.zeros((m, nb)) for k in ("rad", "nat", "q", "eddy", "hyst", "cap", "base", "hid_g", "hid_air",
-                                               "melt", "burst")}
+        body = {
+            k: np.zeros((m, nb))
+            for k in ("rad", "nat", "q", "eddy", "hyst", "cap", "base", "hid_g", "hid_air", "melt", "burst")
+        }
         edge = {k: np.zeros((m, ne)) for k in ("temp", "pos", "step", "fan", "fatigue")}
         edge["forced"] = np.zeros((m, ne))
         self.hid_c = np.ones((m, nb))
@@ -182,11 +186,11 @@ class _Arrays:
                     edge["step"][r, j], self.t0[r] = p["A"], p["T0"]
                 elif effect == "forced_convection":
                     edge["forced"][r, j] = p["A"]
-                elif effect == "?melting":                   # latent heat round 38 degC
+                elif effect == "?melting":  # latent heat round 38 degC
                     body["melt"][r, i] = p["A"]
-                elif effect == "?fan":                       # conductance jumps at 8 K of excess, with hysteresis
+                elif effect == "?fan":  # conductance jumps at 8 K of excess, with hysteresis
                     edge["fan"][r, j] = p["A"]
-                elif effect == "?boiling":                   # bursts of loss, every 240 s for 40 s, when warm
+                elif effect == "?boiling":  # bursts of loss, every 240 s for 40 s, when warm
                     body["burst"][r, i] = p["A"]
                 elif effect in sensors.SENSOR_FAULTS or effect in OUTPUT_EFFECTS:
                     pass
@@ -214,7 +218,7 @@ class _Arrays:
         if "step" in self.edge:
             g = g * (1 + self.edge["step"] * (now >= self.t0))
         if "forced" in self.edge:
-            g = g * (1 + self.edge["forced"] * abs(self.run["velocity"][k])**0.5)
+            g = g * (1 + self.edge["forced"] * abs(self.run["velocity"][k]) ** 0.5)
         if "pos" in self.edge:
             g = g * (1 + self.edge["pos"] * self.run["position"][k])
         if "fan" in self.edge:
@@ -227,7 +231,7 @@ class _Arrays:
         """Storages (m, bodies), J/K."""
         c = self.c * np.maximum(1 + self.cap * (tm - 20), 0.1)
         if np.any(self.melt):
-            c = c * (1 + self.melt * np.exp(-0.5 * ((tm - self.run["melt_at"]) / 1.0)**2))
+            c = c * (1 + self.melt * np.exp(-0.5 * ((tm - self.run["melt_at"]) / 1.0) ** 2))
         return c
 
     def extra(self, ts, tm, hidden, k, air, now, heats):
@@ -236,13 +240,13 @@ class _Arrays:
         b = self.body
         rise = ts - air
         if "rad" in b:
-            w -= b["rad"] * ((ts + KELVIN)**4 - (air + KELVIN)**4)
+            w -= b["rad"] * ((ts + KELVIN) ** 4 - (air + KELVIN) ** 4)
         if "nat" in b:
-            w -= b["nat"] * rise * np.abs(rise)**0.25
+            w -= b["nat"] * rise * np.abs(rise) ** 0.25
         if "q" in b:
             w += b["q"] * ((now >= self.t0) & (now < self.t1))
         if "eddy" in b:
-            w += b["eddy"] * self.run["velocity"][k]**2
+            w += b["eddy"] * self.run["velocity"][k] ** 2
         if "hyst" in b:
             w += b["hyst"] * abs(self.run["velocity"][k])
         if "base" in b:
@@ -266,5 +270,14 @@ class _Arrays:
         return w, heat, rate
 
 
-OUTPUT_EFFECTS = ("missing_member", "quadratic_expansion", "bending", "scale_expansion", "expansion_lag",
-                  "resistance_temperature", "back_emf", "inductance", "?output_memory")
+OUTPUT_EFFECTS = (
+    "missing_member",
+    "quadratic_expansion",
+    "bending",
+    "scale_expansion",
+    "expansion_lag",
+    "resistance_temperature",
+    "back_emf",
+    "inductance",
+    "?output_memory",
+)

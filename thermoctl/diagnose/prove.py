@@ -1,0 +1,531 @@
+"""Proof on a folder of cases: run the diagnosis on each, then open the answers and score.
+
+A case is a folder with plant.yaml and recordings. Answers lie apart (DIR/NAME.yaml, checked against manifest.sha256) or
+as answer.yaml inside the case; they are read after the last diagnosis has ended. Diagnoses run through Dask in separate
+processes; a case that is done (OUT/cases/NAME/run.json of the same inputs) is not run again, and the case of a worker
+that dies is given to another.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import html
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from thermoctl import __version__
+from thermoctl.diagnose import score as scoring
+from thermoctl.yamlfile import InputError, load
+
+RECORDINGS = (".csv", ".parquet", ".arrow")
+RETRIES = 3  # how many workers may die over one case
+
+
+@dataclass(frozen=True)
+class Job:
+    """One diagnosis to run: `inputs` are the plant and the recordings."""
+
+    name: str
+    plant: str
+    recordings: tuple[str, ...]
+
+    def fingerprint(self) -> str:
+        """Of the contents of all inputs."""
+        digest = hashlib.sha256()
+        for path in (self.plant, *self.recordings):
+            digest.update(hashlib.sha256(Path(path).read_bytes()).digest())
+        return digest.hexdigest()
+
+
+def find_jobs(folder: str | Path, number: int | None = None, apart: Sequence[str] = ()) -> list[Job]:
+    """The cases in a folder, in order of their names. `apart`: folders whose recordings are of different rigs and are
+    diagnosed one at a time. Raises InputError where there is none."""
+    root = Path(folder)
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder; expected a folder of cases, each with plant.yaml and recordings")
+    jobs = []
+    for plant in sorted(root.glob("*/plant.yaml")):
+        runs = tuple(str(p) for p in sorted(plant.parent.iterdir()) if p.suffix in RECORDINGS)
+        name = plant.parent.name
+        if not runs:
+            raise InputError(
+                f"{plant.parent}: plant.yaml without a recording; expected run_1.csv or the like beside it"
+            )
+        if name in apart:
+            jobs += [Job(f"{name}-{Path(r).stem}", str(plant), (r,)) for r in runs]
+        else:
+            jobs.append(Job(name, str(plant), runs))
+    if not jobs:
+        raise InputError(f"{root}: no case in it; expected folders with plant.yaml and recordings")
+    return jobs[:number]
+
+
+def run_one(job: Job, out: str) -> dict[str, Any]:
+    """Diagnose one case in this process and leave OUT/run.json when all else is written. Never raises for bad cases."""
+    from thermoctl.diagnose.run import diagnose
+
+    begun, cpu = time.monotonic(), time.process_time()
+    told: dict[str, Any] = {"name": job.name, "fingerprint": job.fingerprint(), "version": __version__, "error": None}
+    try:
+        diagnose(job.plant, list(job.recordings), out)
+    except InputError as e:
+        told["error"] = str(e)
+    except Exception as e:  # a crash is a result of the proof, not the end of it
+        told["error"] = f"{type(e).__name__}: {e}"
+    told |= {"seconds": round(time.monotonic() - begun, 2), "cpu_s": round(time.process_time() - cpu, 2)}
+    Path(out).mkdir(parents=True, exist_ok=True)
+    part = Path(out) / f".run-{os.getpid()}.json"
+    part.write_text(json.dumps(told) + "\n")
+    os.replace(part, Path(out) / "run.json")
+    return told
+
+
+def done(job: Job, out: Path) -> bool:
+    """Whether this case, with these inputs, has been run into `out`."""
+    try:
+        told = json.loads((out / "run.json").read_text())
+    except (OSError, ValueError):
+        return False
+    return told.get("fingerprint") == job.fingerprint()
+
+
+@contextmanager
+def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
+    """A Dask client: of the scheduler at the address, else of local single-threaded processes."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # two BLAS threads on busy cores wait for each other
+        os.environ.setdefault(name, "1")
+    with dask.config.set(
+        {
+            "distributed.scheduler.allowed-failures": RETRIES,
+            "distributed.worker.daemon": False,
+            "distributed.comm.timeouts.connect": "60s",
+        }
+    ):
+        if scheduler:
+            with Client(scheduler) as client:
+                yield client
+            return
+        with (
+            LocalCluster(
+                n_workers=workers or os.cpu_count(),
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                memory_limit=0,
+                silence_logs=50,
+            ) as local,
+            Client(local) as client,
+        ):
+            yield client
+
+
+def run_all(
+    jobs: Sequence[Job],
+    out: Path,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    task: Callable[[Job, str], dict[str, Any]] = run_one,
+    progress: Callable[[int, int, dict], None] | None = None,
+) -> int:
+    """Run every case that is not done yet; returns how many were run. `task` is called in a worker."""
+    waiting = [j for j in jobs if not done(j, out / "cases" / j.name)]
+    if not waiting:
+        return 0
+    from distributed import as_completed
+
+    with cluster(scheduler, workers) as client:
+        futures = {
+            client.submit(task, j, str(out / "cases" / j.name), pure=False, key=f"case-{j.name}"): j for j in waiting
+        }
+        for count, future in enumerate(as_completed(list(futures)), 1):
+            job = futures[future]
+            if future.status == "error":  # its workers died again and again
+                told = {
+                    "name": job.name,
+                    "fingerprint": job.fingerprint(),
+                    "version": __version__,
+                    "seconds": None,
+                    "error": f"{type(future.exception()).__name__}: {future.exception()}",
+                }
+                folder = out / "cases" / job.name
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / "run.json").write_text(json.dumps(told) + "\n")
+            else:
+                told = future.result()
+            if progress:
+                progress(count, len(waiting), told)
+    return len(waiting)
+
+
+def read_answers(jobs: Sequence[Job], answers: Path | None) -> dict[str, dict[str, Any]]:
+    """The answers by case. Apart, they must match manifest.sha256 where there is one. Raises InputError."""
+    sealed: dict[str, str] = {}
+    if answers is not None and (answers / "manifest.sha256").exists():
+        for line in (answers / "manifest.sha256").read_text().splitlines():
+            digest, name = line.split(maxsplit=1)
+            sealed[name] = digest
+    found = {}
+    for job in jobs:
+        path = answers / f"{job.name}.yaml" if answers is not None else Path(job.plant).parent / "answer.yaml"
+        if not path.exists():
+            raise InputError(f"{path}: no answer for case {job.name}; give the folder of answers with --answers")
+        content = path.read_bytes()
+        if sealed and sealed.get(path.name) != hashlib.sha256(content).hexdigest():
+            raise InputError(f"{path}: the answer is not the one that was sealed (manifest.sha256); make the set again")
+        answer = load(path).plain()
+        if not isinstance(answer, dict):
+            raise InputError(f"{path}: expected a mapping with verdict, effects and nearly_the_same")
+        found[job.name] = answer
+    return found
+
+
+def _outcome(job: Job, out: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+    folder = out / "cases" / job.name
+    told = json.loads((folder / "run.json").read_text())
+    path = folder / "diagnosis.json"
+    return (json.loads(path.read_text()) if not told["error"] and path.exists() else None), told
+
+
+def _duration(job: Job) -> float | None:
+    from thermoctl.recording.table import read_table
+
+    try:
+        t = read_table(job.recordings[0], columns=["t"]).t
+    except InputError:
+        return None
+    return float(t[-1] - t[0])
+
+
+def prove(
+    cases: str | Path,
+    out_dir: str | Path,
+    answers: str | Path | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    number: int | None = None,
+    progress: Callable[[int, int, dict], None] | None = None,
+) -> dict[str, Any]:
+    """Run and score a set; writes OUT/proof.json and OUT/proof.html and returns the JSON's content."""
+    out = Path(out_dir)
+    jobs = find_jobs(cases, number)
+    run_all(jobs, out, scheduler, workers, progress=progress)
+    told = read_answers(jobs, Path(answers) if answers is not None else None)
+    rows = []
+    for job in jobs:
+        result, run = _outcome(job, out)
+        answer = told[job.name]
+        rows.append(
+            scoring.score(
+                job.name,
+                answer,
+                result,
+                run["seconds"],
+                run["error"],
+                _duration(job) if answer.get("onset") is not None else None,
+            )
+        )
+    content = {
+        "format": "thermoctl-proof/1",
+        "version": __version__,
+        "commit": _commit(),
+        "machine": platform.machine(),
+        "cpus": os.cpu_count(),
+        **scoring.summary(rows),
+        "rows": scoring.plain(rows),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "proof.json").write_text(json.dumps(content, indent=1) + "\n")
+    (out / "proof.html").write_text(page(content, rows))
+    return content
+
+
+def _commit() -> str | None:
+    run = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True
+    )
+    return run.stdout.strip() or None
+
+
+# --- for people ------------------------------------------------------------------------------------------
+_TITLES = {
+    "false_alarms": "false alarms on nothing missing",
+    "detected_large": "detected, large",
+    "detected_middle": "detected, middle",
+    "detected_small": "detected, small",
+    "exact_name": "exact name",
+    "name_or_its_like": "name, or one the data cannot tell from it",
+    "right_when_named": "right when it names (or its like)",
+    "right_when_named_exactly": "right when it names, exactly",
+    "inside_the_set": "truth (or its like) inside the set",
+    "inside_the_set_exactly": "truth itself inside the set",
+    "place_right": "place right",
+    "onset_within_2_percent": "onset within 2 % of the record",
+    "unknown_called_unknown": "unknown called unknown",
+    "confidently_misnamed": "unknown named with confidence",
+    "pairs_both_right": "pairs: both right",
+    "pairs_one_right": "pairs: at least one right",
+    "interval_coverage": "95 % intervals that hold the parameter",
+    "failed": "diagnosis failed",
+}
+_NUMBERS = {
+    "calibration_error": "calibration error of the probabilities",
+    "gain_median": "held-out gain, share of the oracle's, median",
+    "gain_worst_tenth": "held-out gain, worst tenth",
+    "parameter_error_median": "effect parameter error, median",
+    "set_size_when_ambiguous": "names in an ambiguous set",
+    "seconds_median": "seconds a case, median",
+    "seconds_longest": "seconds a case, longest",
+}
+
+
+def table(content: dict[str, Any]) -> Any:
+    """The figures as a rich table."""
+    from rich.table import Table
+
+    t = Table(title=f"{content['figures']['cases']} cases, thermoctl {content['version']} ({content['commit']})")
+    for title, side in (
+        ("figure", "left"),
+        ("is", "right"),
+        ("95 % interval", "right"),
+        ("of", "right"),
+        ("goal", "right"),
+    ):
+        t.add_column(title, justify=side)  # type: ignore[arg-type]
+    for line in _lines(content):
+        t.add_row(*line[:5], style={True: None, False: "red", None: None}[line[5]])
+    return t
+
+
+def _lines(content: dict[str, Any]) -> Iterator[tuple[str, str, str, str, str, bool | None]]:
+    def goal(key: str, percent: bool) -> tuple[str, bool | None]:
+        g = content["goals"].get(key)
+        if g is None:
+            return "", None
+        sign = "≥" if g["at"] == "least" else "≤"
+        return (f"{sign} {100 * g['goal']:.0f} %" if percent else f"{sign} {g['goal']:g}"), g["reached"]
+
+    for key, title in _TITLES.items():
+        s = content["shares"][key]
+        if s["n"]:
+            text, reached = goal(key, True)
+            yield (
+                title,
+                f"{100 * s['share']:.1f} %",
+                f"{100 * s['low']:.0f}–{100 * s['high']:.0f} %",
+                f"{s['k']}/{s['n']}",
+                text,
+                reached,
+            )
+    for key, title in _NUMBERS.items():
+        value = content["figures"][key]
+        if value is not None:
+            text, reached = goal(key, False)
+            yield title, f"{value:.3g}", "", "", text, reached
+
+
+def page(content: dict[str, Any], rows: Sequence[scoring.Row]) -> str:
+    """One self-contained HTML page: figures, reliability, confusion, what went wrong case by case."""
+    e = html.escape
+    figures = "".join(
+        f"<tr{' class=bad' if reached is False else ''}>" + "".join(f"<td>{e(c)}</td>" for c in cells) + "</tr>"
+        for *cells, reached in _lines(content)
+    )
+    called = sorted({c for row in content["confusion"].values() for c in row})
+    head = "".join(f"<th class=up><span>{e(c)}</span></th>" for c in called)
+    confusion = "".join(
+        f"<tr><th>{e(t)}</th>"
+        + "".join(
+            f"<td class='{'hit' if c.removeprefix('ambiguous: ') == t else 'miss'}'>{row[c]}</td>"
+            if c in row
+            else "<td></td>"
+            for c in called
+        )
+        + "</tr>"
+        for t, row in content["confusion"].items()
+    )
+    families = "".join(
+        f"<tr><td>{e(k)}</td>" + "".join(f"<td>{v}</td>" for v in b.values()) + "</tr>"
+        for part in ("by_family", "by_effect")
+        for k, b in content[part].items()
+    )
+    heads = "".join(f"<th>{e(k)}</th>" for k in next(iter(content["by_family"].values()), {}))
+    wrong = "".join(
+        f"<tr><td>{e(r.case)}</td><td>{e(r.family)}</td><td>{e(r.kind)} {e(r.band or '')}</td>"
+        f"<td>{e(_names(r.truth))}</td>"
+        f"<td>{e(r.verdict)}</td><td>{e(_names(r.findings))}</td><td>{e(r.error or '')}</td></tr>"
+        for r in rows
+        if not (
+            r.alike
+            and r.placed is not False
+            or r.kind == "none"
+            and not r.detected
+            or r.kind == "unknown"
+            and r.verdict == "unexplained"
+        )
+    )
+    return _PAGE.format(
+        cases=content["figures"]["cases"],
+        version=e(f"{content['version']} {content['commit'] or ''}"),
+        figures=figures,
+        plots=_plots(content, rows),
+        head=head,
+        confusion=confusion,
+        heads=heads,
+        families=families,
+        wrong=wrong,
+    )
+
+
+def _names(effects: Sequence[tuple[str, str]]) -> str:
+    return ", ".join(f"{a} at {b}" for a, b in effects) or "nothing"
+
+
+_PAGE = """<!doctype html><html lang=en><meta charset=utf-8><title>Proof on concealed cases</title><style>
+body{{font:15px/1.4 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#222}}
+table{{border-collapse:collapse;margin:1rem 0}}td,th{{border:1px solid #ddd;padding:.2rem .5rem;text-align:left}}
+.bad td{{color:#b00020}}.hit{{background:#cfe8cf}}.miss{{background:#f6d5d5}}.up{{height:11rem;vertical-align:bottom}}
+.up span{{writing-mode:vertical-rl}}.wide{{overflow-x:auto}}svg{{max-width:100%;height:auto}}</style>
+<h1>Proof on {cases} concealed cases</h1><p>thermoctl {version}. Answers were opened after the last diagnosis.</p>
+<table><tr><th>figure<th>is<th>95 % interval<th>of<th>goal</tr>{figures}</table>{plots}
+<h2>Called (columns) against true (rows)</h2><div class=wide><table><tr><th></th>{head}</tr>{confusion}</table></div>
+<h2>By rig family and effect</h2><table><tr><th></th>{heads}</tr>{families}</table>
+<h2>Not right</h2><table><tr><th>case<th>rig<th>kind<th>true<th>verdict<th>found<th>error</tr>{wrong}</table></html>
+"""
+
+
+def _plots(content: dict[str, Any], rows: Sequence[scoring.Row]) -> str:
+    """Reliability diagram, held-out gain and time as one SVG."""
+    import io
+
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    left.plot([0, 1], [0, 1], color="0.8")
+    bins = content["reliability"]
+    left.scatter([b["probability"] for b in bins], [b["right"] for b in bins], s=[10 + 2 * b["n"] for b in bins])
+    left.set(xlabel="probability given", ylabel="share right", title="Reliability")
+    gains = [r.gain for r in rows if r.gain is not None and r.detected]
+    middle.hist([max(min(g, 1.2), -0.2) for g in gains], bins=28, range=(-0.2, 1.2))
+    middle.set(xlabel="share of the oracle's held-out gain", ylabel="cases", title="Held-out gain")
+    right.hist([r.seconds for r in rows if r.seconds is not None], bins=30)
+    right.set(xlabel="seconds", ylabel="cases", title="Time per case")
+    text = io.StringIO()
+    figure.savefig(text, format="svg")
+    return re.sub(r"^.*?(?=<svg)", "", text.getvalue(), flags=re.S)
+
+
+def real(
+    folder: str | Path,
+    out_dir: str | Path,
+    apart: Sequence[str] = (),
+    scheduler: str | None = None,
+    workers: int | None = None,
+    progress: Callable[[int, int, dict], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Diagnose every folder of real recordings; one entry each: what, where, held-out rms before and after, and the
+    README's lines on published figures. Writes OUT/real.json."""
+    out = Path(out_dir)
+    jobs = find_jobs(folder, apart=apart)
+    run_all(jobs, out, scheduler, workers, progress=progress)
+    entries = []
+    for job in jobs:
+        result, run = _outcome(job, out)
+        readme = Path(job.plant).parent / "README.md"
+        published = (
+            [
+                line.strip("- ").strip()
+                for line in readme.read_text().splitlines()
+                if re.search(r"publish|publication|benchmark's|upstream reports", line, re.I)
+            ]
+            if readme.exists()
+            else []
+        )
+        fit = (result or {}).get("fit", {})
+        entries.append(
+            {
+                "name": job.name,
+                "verdict": (result or {}).get("verdict", "failed"),
+                "findings": [(f["effect"], f["where"], f["probability"]) for f in (result or {}).get("findings", [])],
+                "held_out": {
+                    o: (fit.get("held_out_before", {}).get(o), fit.get("held_out_refit_only", {}).get(o), after)
+                    for o, after in (fit.get("held_out_after") or {}).items()
+                },
+                "gain": (result or {}).get("held_out_gain"),
+                "published": published,
+                "seconds": run["seconds"],
+                "error": run["error"],
+            }
+        )
+    (out / "real.json").write_text(json.dumps(entries, indent=1) + "\n")
+    return entries
+
+
+def real_table(entries: Sequence[dict[str, Any]]) -> Any:
+    """The real recordings as a rich table; under each the lines on published figures."""
+    from rich.table import Table
+
+    t = Table(title="Real recordings, each from its naive plant")
+    for title in (
+        "recording",
+        "verdict",
+        "effect at place (probability)",
+        "held-out rms: as it was → refit → extended",
+        "s",
+    ):
+        t.add_column(title)
+    for x in entries:
+        found = "\n".join(f"{a} at {b} ({p:.2f})" for a, b, p in x["findings"]) or (x["error"] or "")
+        rms = "\n".join(
+            f"{o}: " + " → ".join("–" if v is None else f"{v:.4g}" for v in three) for o, three in x["held_out"].items()
+        )
+        t.add_row(x["name"], x["verdict"], found, rms, f"{x['seconds'] or 0:.0f}")
+        for line in x["published"]:
+            t.add_row("", "", f"[dim]README: {line[:110]}[/dim]", "", "")
+    return t
+
+
+class Reporter:
+    """Progress on stderr: one line a case with the time that is left."""
+
+    def __init__(self, stream: Any = None):
+        self.begun, self.stream = time.monotonic(), stream or sys.stderr
+
+    def __call__(self, count: int, total: int, told: dict[str, Any]) -> None:
+        left = (time.monotonic() - self.begun) / count * (total - count)
+        what = f" {told['error']}" if told["error"] else ""
+        print(
+            f"[{count}/{total}] {told['name']} {told['seconds'] or 0:.0f} s, {left / 60:.1f} min left{what}",
+            file=self.stream,
+            flush=True,
+        )
+
+
+def command(args: Any) -> int:
+    """`thermoctl prove`: 0 when every goal that could be measured is reached, else 1."""
+    from rich.console import Console
+
+    console = Console()
+    if args.real:
+        entries = real(
+            args.cases, args.out, args.apart.split(",") if args.apart else (), args.scheduler, args.workers, Reporter()
+        )
+        console.print(real_table(entries))
+        return 0
+    content = prove(args.cases, args.out, args.answers, args.scheduler, args.workers, args.number, Reporter())
+    console.print(table(content))
+    console.print(f"written: {Path(args.out) / 'proof.json'}, {Path(args.out) / 'proof.html'}")
+    return 0 if all(g["reached"] is not False for g in content["goals"].values()) else 1
