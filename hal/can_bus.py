@@ -287,7 +287,7 @@ class Cia402Device(Device):
         self._index = [spec.transmit.index(b.channel.source) if b.channel.source in spec.transmit else -1
                        for b in binding.bounds]
         self._is_state = [b.channel.source == 0x6041 for b in binding.bounds]
-        self._patience_s = max(3 * spec.heartbeat_s, 0.05)
+        self._patience_s = max(3 * spec.heartbeat_s, spec.watchdog_s)
         self._ids = (0x080 + self._node, 0x180 + self._node, 0x580 + self._node, 0x700 + self._node)
         self._status_word = self._fault_code = 0
         self._heard_s = self._beat_s = self._reset_s = -math.inf

@@ -11,6 +11,7 @@ it, Modbus TCP servers and RTU units. One plant feeds them all; the drive's curr
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import gc
 import os
@@ -428,14 +429,16 @@ class VirtualRig:
         self.period_s = settings.loop.period_s
         self.stopping = False
         self.tick = self.slips = 0
+        self.latest_s = 0.0         # the longest that a tick came late
 
     def run(self, announce: Callable[[str], None]) -> None:
         """Plug everything in and live in real time until `stopping`; everything is unplugged afterwards."""
         self.run_dir.mkdir(parents=True, exist_ok=True)
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-        except (OSError, AttributeError):
+        except OSError:
             announce("no real-time priority (CAP_SYS_NICE): frames may come late when the machine is busy")
+        ctypes.CDLL(None).mlockall(3)           # current and future pages; refused without CAP_IPC_LOCK, and that is fine
         gc.freeze()
         control = _listen(self.run_dir / "control.sock")
         try:
@@ -448,6 +451,7 @@ class VirtualRig:
                     announce(f"{device.name}: {device.binding.port}")
                 announce(f"control: {self.run_dir / 'control.sock'}; reference: {reference.name}; ready")
                 self._live(control, reference)
+            announce(f"{self.tick} periods, at most {self.latest_s * 1e3:.1f} ms late, {self.slips} left out")
         finally:
             for device in self.devices.values():
                 device.unplug()
@@ -461,6 +465,8 @@ class VirtualRig:
         while not self.stopping:
             now_s = time.monotonic()
             due = int((now_s - deadline) / self.period_s) + 1 if now_s >= deadline else 0
+            if due:
+                self.latest_s = max(self.latest_s, now_s - deadline)
             if due > MAX_STEPS:
                 self.slips += due - MAX_STEPS
                 deadline += (due - MAX_STEPS) * self.period_s
