@@ -15,7 +15,7 @@ All models are stable by construction.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg
@@ -82,7 +82,13 @@ def reduce(chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray, n
     return Blocks(u[:blocks], means, count[:blocks] / q, q, period_s, basis)
 
 
-def _responses(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _responses(records: list[Blocks], tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stacked `_response` of several recordings: the poles and residues are common, each starts on its own."""
+    parts = [_response(b, tau, rest) for b in records]
+    return np.vstack([f for f, _, _ in parts]), np.vstack([d for _, d, _ in parts]), parts[0][2]
+
+
+def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Block-mean responses F (J, columns) and their derivative by ln tau, and each column's pole index.
 
     Columns by pole: one per input, then (unless `rest`) the free decay."""
@@ -139,7 +145,7 @@ def _project(F: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     return Q[:len(F)], theta, Y - F @ theta
 
 
-def _fit(blocks: Blocks, Y: np.ndarray, weight: np.ndarray, tau: np.ndarray, rest: bool, iterations: int,
+def _fit(blocks: list[Blocks], Y: np.ndarray, weight: np.ndarray, tau: np.ndarray, rest: bool, iterations: int,
          bounds: tuple[float, float]) -> _Fit:
     """Levenberg-Marquardt on ln tau. `Y` (J, l) is scaled by each output's noise, `weight` (J,) by row."""
     x = np.log(tau)
@@ -180,21 +186,27 @@ def _fit(blocks: Blocks, Y: np.ndarray, weight: np.ndarray, tau: np.ndarray, res
     return _Fit(np.exp(x), theta, cost, done)
 
 
-def identify(blocks: Blocks, order: int | None = 8, rest: bool = True, iterations: int = 30,
+def identify(records: Blocks | list[Blocks], order: int | None = 8, rest: bool = True, iterations: int = 30,
              tau_range_s: tuple[float, float] | None = None) -> StateSpace:
     """Model with `order` real poles per input (None: the least BIC of 1..10) from reduced data, at the blocks' sample period.
 
+    Several recordings (of one block length) are fitted together; they must begin at `rest`.
     `rest`: the recording begins in thermal equilibrium (output rises are zero); otherwise every output's free decay is
     estimated too. Rows where an output is missing are left out for all outputs when the others are whole, else filled by
     two rounds of the model's own output. Raises InputError when an output was never measured."""
+    records = [records] if isinstance(records, Blocks) else records
+    blocks = replace(records[0], y=np.vstack([b.y for b in records]), weight=np.vstack([b.weight for b in records]),
+                     u=np.concatenate([b.u for b in records]))
+    if len(records) > 1 and not rest or len({(b.q, b.period_s) for b in records}) > 1:
+        raise InputError("recordings that are fitted together must begin at rest and have blocks of one length")
     block_s = blocks.q * blocks.period_s
-    span = len(blocks.u) * block_s
+    span = max(len(b.u) for b in records) * block_s
     bounds = tau_range_s or (0.7 * block_s, 2.5 * span)
     missing = ~np.isfinite(blocks.y)
     if missing.all(0).any():
         raise InputError(f"output {int(np.flatnonzero(missing.all(0))[0]) + 1} has no sample; leave it out")
     if order is None:
-        fits = [identify(blocks, k, rest, iterations, bounds) for k in range(1, 11)]
+        fits = [identify(records, k, rest, iterations, bounds) for k in range(1, 11)]
         return min(fits, key=lambda m: m.info["bic"])
     weight = np.sqrt(np.where(missing, 1, blocks.weight).mean(1))
     y = blocks.y.copy()
@@ -207,9 +219,9 @@ def identify(blocks: Blocks, order: int | None = 8, rest: bool = True, iteration
     noise = np.maximum(noise, 1e-2 * np.median(noise))
     tau = np.geomspace(max(1.5 * block_s, bounds[0]), min(0.5 * span, bounds[1]), order)
     for _ in range(3 if gaps else 1):
-        fit = _fit(blocks, y / noise * weight[:, None], weight, tau, rest, iterations, bounds)
+        fit = _fit(records, y / noise * weight[:, None], weight, tau, rest, iterations, bounds)
         if gaps:
-            F, _, _ = _responses(blocks, fit.tau, rest)
+            F, _, _ = _responses(records, fit.tau, rest)
             y[missing] = (F @ fit.theta * noise)[missing]
             tau = fit.tau
     m = blocks.u.shape[1]
@@ -219,7 +231,7 @@ def identify(blocks: Blocks, order: int | None = 8, rest: bool = True, iteration
     free = theta[:, m] if not rest else np.zeros((order, theta.shape[2]))
     count = int((~missing).sum())
     parameters = order * (1 + theta.shape[1] * theta.shape[2])
-    F, _, _ = _responses(blocks, fit.tau, rest)
+    F, _, _ = _responses(records, fit.tau, rest)
     residual = np.where(missing, np.nan, blocks.y - F @ fit.theta * noise)
     info = {"method": "modal", "time_constants_s": fit.tau[::-1].tolist(), "iterations": fit.iterations,
             "bic": count * np.log(fit.cost / count) + parameters * np.log(count),

@@ -1,0 +1,136 @@
+"""The chain from recordings to position residuals, by the paper's method and by the better one.
+
+calibrate(test 2, test 3, test 4A) gives estimators; estimate(test 4) gives each one's position error estimate; what is left of the
+measured error is judged over test 4B. Estimators:
+  siso     coil alone, first order, recursion (5)
+  paper    N4SID of order 12 at 10 s with (26), MKF, recursion (5)
+  better   real poles by separable least squares, Kalman filter with the coil alone and the air's rate as input, output error
+  twelve   the same filter and expansion model with all twelve thermometers: what more sensors would buy
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import signal
+
+from thermoctl.identify import expansion, filter, modal, subspace
+from thermoctl.identify.statespace import StateSpace
+
+STEP_K, NOISE_K = 0.25, 0.06
+AIR_FILTER_S = 60.0
+ESTIMATORS = ("siso", "paper", "better", "twelve")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the calibration gave. `paper_model`, `mkf`, `paper_um`, `siso_um`; `model`, `kalman`, `better_um`, `twelve`, `twelve_um`."""
+    paper_model: StateSpace
+    mkf: filter.Mkf
+    paper_um: expansion.Expansion
+    siso_um: expansion.Expansion
+    model: StateSpace
+    kalman: filter.Kalman
+    better_um: expansion.Expansion
+    twelve: filter.Kalman
+    twelve_um: expansion.Expansion
+    variances: np.ndarray
+
+
+def rises(r: Any) -> np.ndarray:
+    """Measured rises above the measured air (N, 12), K."""
+    return r.temperatures - smooth_air(r.air_c)[:, None]
+
+
+def smooth_air(air_c: np.ndarray) -> np.ndarray:
+    """The air after a first-order low-pass of AIR_FILTER_S, as the law takes it; (N,) degC at 1 s."""
+    f = np.exp(-1 / AIR_FILTER_S)
+    return signal.lfilter([1 - f], [1, -f], air_c, zi=[f * air_c[0]])[0]
+
+
+def air_rate(air_c: np.ndarray) -> np.ndarray:
+    """d(air)/dt of the low-passed air, K/s, held over the following second."""
+    a = smooth_air(air_c)
+    return np.append(np.diff(a), 0.0)
+
+
+def filled(y: np.ndarray) -> np.ndarray:
+    """Missing readings held (for methods that need every sample)."""
+    out = y.copy()
+    t = np.arange(len(y))
+    for j in range(y.shape[1]):
+        ok = np.isfinite(y[:, j])
+        out[:, j] = y[np.maximum.accumulate(np.where(ok, t, t[ok][0])), j]
+    return out
+
+
+def block_mean(v: np.ndarray, q: int) -> np.ndarray:
+    """Means over blocks of q rows; an incomplete last block is dropped."""
+    return v[:len(v) // q * q].reshape(len(v) // q, q, -1).mean(1)
+
+
+def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = 8) -> Calibration:
+    """All estimators from the three calibration tests (evaluate.rigs.Recorded or alike, 1 s)."""
+    r_v = filter.sensor_variance(STEP_K, NOISE_K)
+    y2 = rises(test_2)
+    # the paper's way
+    u10, y10 = block_mean(test_2.power_w[:, None], 10), block_mean(filled(y2), 10)
+    paper_model = subspace.identify(u10, y10, 10.0, 12, 20, "paper")
+    mkf = filter.mkf(paper_model, u10, y10, r_v, 10.0)
+    paper_t = estimate_mkf(mkf, test_4a)
+    y4 = test_4a.error_um
+    paper_um = expansion.recursive(paper_t, y4, 1.0)
+    coil = filled(rises(test_4a)[:, :1])
+    siso_um = expansion.recursive(coil, y4, 1.0)
+    # the better way
+    model = identify_better([test_2, test_3, test_4a], order)
+    plant = filter.disturbed(filter.with_air(model))
+    records = [filter.Record(t.power_w, air_rate(t.air_c), rises(t)) for t in (test_2, test_3, test_4a)]
+    kalman, variances = filter.tune(plant, records, r_v)
+    better_um = fit_expansion(kalman, test_4a)
+    twelve = filter.steady(plant, variances, r_v, tuple(range(12)))
+    twelve_um = fit_expansion(twelve, test_4a)
+    return Calibration(paper_model, mkf, paper_um, siso_um, model, kalman, better_um, twelve, twelve_um, variances)
+
+
+def identify_better(tests: list[Any], order: int | None) -> StateSpace:
+    """Real-pole model from all calibration tests together, with the air's own movement taken out of the data: a change of the air
+    shifts every rise by C b_air, known up to the model, so it is simulated with the model of the round before and subtracted."""
+    moved = [0.0] * len(tests)
+    for round_ in range(3):
+        model = modal.identify([modal.reduce((t.power_w[:, None], rises(t) - m), 1.0) for t, m in zip(tests, moved, strict=True)], order)
+        if round_ < 2:
+            air = filter.with_air(model)
+            alone = StateSpace(air.a, air.b[:, 1:], air.c, air.period_s, np.zeros(air.order))
+            moved = [alone.simulate(air_rate(t.air_c)[:, None]) for t in tests]
+    return model
+
+
+def estimate_mkf(mkf: filter.Mkf, r: Any) -> np.ndarray:
+    """The MKF at its period over a 1 s recording; held between its steps: rises (N, 12)."""
+    q = round(mkf.period_s)
+    coil = block_mean(filled(rises(r)[:, :1]), q)[:, 0]
+    t, _ = mkf.run(block_mean(r.power_w[:, None], q)[:, 0], coil)
+    return np.repeat(t, q, axis=0)[np.minimum(np.arange(len(r.power_w)), len(t) * q - 1)]
+
+
+def run_kalman(k: filter.Kalman, r: Any) -> np.ndarray:
+    """Estimated rises (N, 12) over a recording from rest."""
+    return k.run(r.power_w, air_rate(r.air_c), rises(r)[:, list(k.sensors)])
+
+
+def fit_expansion(k: filter.Kalman, r: Any) -> expansion.Expansion:
+    """Output error on the filter's own estimates, its error as the inputs' uncertainty."""
+    sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", k.model.c, k.p, k.model.c), 0))
+    return expansion.output_error(run_kalman(k, r), r.error_um, 1.0, sigma, smooth_air(r.air_c), output_step_um=0.005)
+
+
+def estimates(c: Calibration, r: Any) -> dict[str, np.ndarray]:
+    """Each estimator's position error (N,) um over a recording."""
+    air = smooth_air(r.air_c)
+    start = {k: getattr(c, f"{k}_um").info.get("start_um", 0.0) for k in ESTIMATORS}
+    return {"siso": c.siso_um.predict(filled(rises(r)[:, :1])),
+            "paper": c.paper_um.predict(estimate_mkf(c.mkf, r)),
+            "better": c.better_um.predict(run_kalman(c.kalman, r), air, start["better"]),
+            "twelve": c.twelve_um.predict(run_kalman(c.twelve, r), air, start["twelve"])}

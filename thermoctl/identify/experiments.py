@@ -1,0 +1,235 @@
+"""Experiments: what the setpoint does over time, as data from a file; run on the daemon's own tick.
+
+A schedule is a list of (seconds, um) corners, joined by straight lines; the law's own rate limiter makes the ramps. Running it
+gives a recording. It runs under all protections: a fault ends it, nothing recorded is lost, and it can be resumed where it stood.
+"""
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import cycle, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoctl.yamlfile import InputError, Node, load, suggest
+
+FORMAT = "thermoctl-experiments/1"
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Corners t_s (K,) and setpoint_um (K,), ends at duration_s."""
+    name: str
+    title: str
+    t_s: np.ndarray
+    setpoint_um: np.ndarray
+    duration_s: float
+
+    def at(self, t_s: np.ndarray) -> np.ndarray:
+        """Setpoint at times (the ramps drawn as the rate limiter makes them)."""
+        return np.interp(t_s, self.t_s, self.setpoint_um)
+
+    def commands(self) -> list[tuple[float, str, float]]:
+        """(time s, 'setpoint', um) for the daemon: the target of every ramp at the ramp's start."""
+        out, now = [], None
+        for k in range(len(self.t_s) - 1):
+            target = float(self.setpoint_um[k + 1])
+            if target != now:
+                out.append((float(self.t_s[k]), "setpoint", target))
+                now = target
+        return out
+
+
+def load_experiments(path: str | Path) -> dict[str, Schedule]:
+    """All experiments of a file. Raises InputError with the line of a wrong entry."""
+    root = load(path)
+    top = _keys(root, "the file", {"format", "rate_um_s", "experiments"})
+    if top["format"].value != FORMAT:
+        raise top["format"].error(f"'{FORMAT}' was expected")
+    rate = _number(top["rate_um_s"], 0.01, 1e5)
+    out = {}
+    for name, node in top["experiments"].value.items():
+        e = _keys(node, f"experiment '{name}'", {"title", "parts"})
+        corners = [(0.0, 0.0)]
+        _parts(e["parts"], rate, corners)
+        t, v = np.array(corners).T
+        out[name] = Schedule(name, str(e["title"].value), t, v, float(t[-1]))
+    return out
+
+
+def _parts(node: Node, rate: float, corners: list[tuple[float, float]]) -> None:
+    if not isinstance(node.value, list) or not node.value:
+        raise node.error("a list of parts was expected: hold, trapezoid, pulses or repeat")
+    for part in node.value:
+        p = part.value if isinstance(part.value, dict) else {}
+        if "repeat" in p:
+            _keys(part, "a repeated part", {"repeat", "parts"})
+            for _ in range(int(_number(p["repeat"], 1, 1000))):
+                _parts(p["parts"], rate, corners)
+        elif "hold" in p:
+            _keys(part, "a part", {"hold"})
+            for pair in p["hold"].value:
+                if not isinstance(pair.value, list) or len(pair.value) != 2:
+                    raise pair.error("[seconds, um] was expected")
+                _hold(corners, _number(pair.value[0], 0, 1e6), _number(pair.value[1], -1e6, 1e6), rate)
+        elif "trapezoid" in p:
+            z = _keys(p["trapezoid"], "trapezoid", {"low_um", "high_um", "hold_s", "duration_s"})
+            low, high, duration = (_number(z[k], -1e6, 1e6) for k in ("low_um", "high_um", "duration_s"))
+            holds = [_number(h, 0, 1e6) for h in z["hold_s"].value]
+            end = corners[-1][0] + duration
+            for hold in cycle(holds):
+                if corners[-1][0] + 2 * hold + 2 * abs(high - low) / rate > end + 1e-9:
+                    break
+                _hold(corners, hold + abs(high - corners[-1][1]) / rate, high, rate)
+                _hold(corners, hold + abs(low - corners[-1][1]) / rate, low, rate)
+            if corners[-1][0] < end:
+                _hold(corners, end - corners[-1][0], low, rate)
+        elif "pulses" in p:
+            z = _keys(p["pulses"], "pulses", {"count", "high_um", "active_s", "cutoff_hz", "least_s"})
+            widths, gaps = design_pulses(int(_number(z["count"], 1, 6)), _number(z["active_s"], 10, 1e6),
+                                         _number(z["cutoff_hz"], 1e-6, 10), _number(z["least_s"], 1, 1e6))
+            for width, gap in zip(widths, gaps, strict=True):
+                _hold(corners, width, _number(z["high_um"], -1e6, 1e6), rate)
+                _hold(corners, gap, 0.0, rate)
+        else:
+            raise part.error("a part is one of hold, trapezoid, pulses, repeat")
+
+
+def _hold(corners: list[tuple[float, float]], seconds: float, value: float, rate: float) -> None:
+    """Go to `value` at the rate limit, then stay until `seconds` have passed."""
+    t, now = corners[-1]
+    ramp = min(abs(value - now) / rate, seconds)
+    if ramp > 0:
+        corners.append((t + ramp, value))
+    if seconds > ramp:
+        corners.append((t + seconds, value))
+
+
+def design_pulses(count: int, active_s: float, cutoff_hz: float, least_s: float) -> tuple[list[float], list[float]]:
+    """Widths and gaps of `count` power pulses that fill `active_s`, none shorter than `least_s`, with the largest part of their
+    alternating power below `cutoff_hz` spread over the band: maximises the geometric mean of power over four bands below it.
+
+    Raises InputError when they do not fit."""
+    unit = active_s / (4 * count)
+    lengths = [v for v in (0.5 * unit, unit, 1.5 * unit, 2 * unit, 3 * unit, 4 * unit) if v >= least_s]
+    best, found = -np.inf, None
+    for parts in product(lengths, repeat=2 * count):
+        if abs(sum(parts) - active_s) > 1e-6 * active_s:
+            continue
+        power = _pulse_power(parts[::2], parts[1::2], np.geomspace(cutoff_hz / 10, cutoff_hz, 24))
+        above = _pulse_power(parts[::2], parts[1::2], np.geomspace(cutoff_hz * 1.05, cutoff_hz * 5, 24)).mean()
+        score = np.log(power.reshape(4, 6).mean(1)).mean() - 0.5 * np.log(above)
+        if score > best + 1e-12:
+            best, found = score, parts
+    if found is None:
+        raise InputError(f"{count} pulses of at least {least_s:g} s with gaps do not fit into {active_s:g} s")
+    return list(found[::2]), list(found[1::2])
+
+
+def _pulse_power(widths: tuple, gaps: tuple, f: np.ndarray) -> np.ndarray:
+    """|Fourier transform|^2 of rectangular pulses of height 1 at frequencies f."""
+    total, t = np.zeros(len(f), complex), 0.0
+    for w, g in zip(widths, gaps, strict=True):
+        total += (np.exp(-2j * np.pi * f * t) - np.exp(-2j * np.pi * f * (t + w))) / (2j * np.pi * f)
+        t += w + g
+    return np.abs(total)**2
+
+
+def spectrum(t_s: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One-sided power spectrum (f Hz, density) of an equidistant signal, its mean removed, padded fourfold."""
+    n, dt = len(power), t_s[1] - t_s[0]
+    x = np.fft.rfft(power - power.mean(), 4 * n)
+    return np.fft.rfftfreq(4 * n, dt), np.abs(x)**2 * dt / n * 2
+
+
+def share_below(t_s: np.ndarray, power: np.ndarray, cutoff_hz: float) -> float:
+    """Part of the alternating power that lies below `cutoff_hz`."""
+    f, s = spectrum(t_s, power)
+    return float(s[f <= cutoff_hz].sum() / s.sum())
+
+
+@dataclass
+class Progress:
+    """How far a run is: simulated or real seconds done of duration, wall seconds used, and the estimate of what is left."""
+    done_s: float
+    duration_s: float
+    used_s: float
+
+    @property
+    def percent(self) -> float:
+        return 100 * self.done_s / self.duration_s
+
+    @property
+    def eta_s(self) -> float:
+        return self.used_s * (self.duration_s - self.done_s) / max(self.done_s, 1e-9)
+
+
+class Aborted(Exception):
+    """The run ended before its time: `reason`; what was recorded is kept, `done_s` says how far it came."""
+
+    def __init__(self, reason: str, done_s: float):
+        super().__init__(reason)
+        self.reason, self.done_s = reason, done_s
+
+
+def run(simulation: Any, schedule: Schedule, every: int = 100, start_s: float = 0.0,
+        progress: Callable[[Progress], None] | None = None, stop: Callable[[], bool] = lambda: False) -> Iterator[np.ndarray]:
+    """Run a schedule on a `daemon.simulate.Simulation` (armed here); yields blocks of record rows, every `every`-th tick.
+
+    Resumes at `start_s` of the schedule. Each block is given out before the next is computed, so an abort loses nothing.
+    Raises Aborted when the law leaves ARMED (the fault bits are named) or `stop()` turns true."""
+    from thermoctl.control import arming
+    from thermoctl.control.faults import FAULTS
+    from thermoctl.signals import INDEX
+    period = simulation.period_s
+    waiting = [c for c in schedule.commands() if c[0] >= start_s]
+    before = [c for c in schedule.commands() if c[0] < start_s]
+    waiting = ([(start_s, *before[-1][1:])] if before else []) + waiting
+    ticks = round((schedule.duration_s - start_s) / period)
+    block, began, nxt = [], time.monotonic(), 0
+    state, bits = INDEX["state"], INDEX["fault_bits"]
+    if simulation.row[state] != arming.ARMED:
+        simulation.arm()
+    for k in range(ticks):
+        while nxt < len(waiting) and round((waiting[nxt][0] - start_s) / period) <= k:
+            simulation.command(waiting[nxt][1], waiting[nxt][2])
+            nxt += 1
+        row = simulation.tick()
+        if (k + 1) % every == 0:
+            block.append(row.copy())
+        if len(block) == 1000 or k == ticks - 1:
+            if block:
+                yield np.array(block)
+            block = []
+            done = start_s + (k + 1) * period
+            if progress is not None:
+                progress(Progress(done, schedule.duration_s, time.monotonic() - began))
+            if stop():
+                raise Aborted("stopped on request", done)
+        if row[state] != arming.ARMED:
+            if block:
+                yield np.array(block)
+            standing = [f.name for f in FAULTS if int(row[bits]) >> f.bit & 1]
+            raise Aborted(f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", start_s + (k + 1) * period)
+
+
+def _keys(node: Node, what: str, allowed: set[str]) -> dict[str, Node]:
+    if not isinstance(node.value, dict):
+        raise node.error(f"{what}: a mapping with {', '.join(sorted(allowed))} was expected")
+    for key, value in node.value.items():
+        if key not in allowed:
+            raise value.error(f"{what}: '{key}' is not known{suggest(key, allowed)}; {', '.join(sorted(allowed))} are")
+    for key in allowed:
+        if key not in node.value:
+            raise node.error(f"{what}: '{key}' is missing")
+    return node.value
+
+
+def _number(node: Node, low: float, high: float) -> float:
+    v = node.value
+    if isinstance(v, bool) or not isinstance(v, int | float) or not low <= v <= high:
+        raise node.error(f"{v!r}: a number from {low:g} to {high:g} was expected")
+    return float(v)
