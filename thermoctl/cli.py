@@ -86,6 +86,25 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
 
 def _recording_commands(sub: argparse._SubParsersAction) -> None:
     """recordings list, info, export, recover."""
+    def to(name: str) -> Callable[[argparse.Namespace], int | None]:
+        def run(args: argparse.Namespace) -> int | None:
+            from thermoctl.recording import commands
+            return getattr(commands, name)(args)
+        return run
+    top = sub.add_parser("recordings", help="list, look into, export or mend recordings")
+    own = top.add_subparsers(metavar="WHAT", required=True)
+    json_too = ("--json", {"action": "store_true", "help": "for programs"})
+    _add(own, "list", "the recordings of a folder", to("list_recordings"),
+         ("directory", {"nargs": "?", "default": "recordings", "help": "the folder (recordings)"}), json_too)
+    _add(own, "info", "what a recording holds: span, signals, configuration, model", to("show_info"),
+         ("file", {"help": "an .arrows file"}), json_too)
+    _add(own, "export", "write a recording as Parquet, CSV, MDF4 or MCAP; the suffix of OUT decides",
+         to("export_recording"), ("file", {"help": "any recording"}), ("out", {"help": "OUT.parquet, .csv, .mf4, .mcap"}),
+         ("--columns", {"help": "only these signals, separated by commas"}),
+         ("--from", {"dest": "begin", "type": float, "default": float("-inf"), "metavar": "S", "help": "from this t"}),
+         ("--to", {"dest": "end", "type": float, "default": float("inf"), "metavar": "S", "help": "before this t"}))
+    _add(own, "recover", "write a closed copy of a recording that was cut", to("recover_recording"),
+         ("file", {"help": "the .arrows file"}), ("--out", {"help": "the copy (FILE.recovered.arrows)"}))
 
 
 def _identify_commands(sub: argparse._SubParsersAction) -> None:

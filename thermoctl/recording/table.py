@@ -85,7 +85,7 @@ def write_table(path: str | Path, table: Table) -> None:
         raise InputError(f"{path}: a table is written as .csv, .parquet or .arrow, not '{path.suffix}'")
     arrow = to_arrow(table)
     try:
-        with _whole(path) as temporary:
+        with whole_file(path) as temporary:
             if kind == ".csv":
                 pa.csv.write_csv(arrow, temporary, pa.csv.WriteOptions(quoting_style="needed"))
             elif kind == ".parquet":
@@ -105,7 +105,7 @@ def to_arrow(table: Table) -> pa.Table:
     return arrow.replace_schema_metadata(table.meta or None)
 
 
-class _whole:
+class whole_file:
     """A temporary file beside `path` that takes its name when the block ends well and vanishes otherwise."""
 
     def __init__(self, path: Path):
@@ -309,7 +309,21 @@ def _read_arrow(path: Path, want: list[str] | None) -> _Raw:
     return _from_arrow(path, pa.Table.from_batches(batches, schema), want)
 
 
+def _read_mdf(path: Path, want: list[str] | None) -> _Raw:
+    from thermoctl.recording.formats import read_mdf
+    return _foreign(path, read_mdf(path), want)
+
+
+def _read_tdms(path: Path, want: list[str] | None) -> _Raw:
+    from thermoctl.recording.formats import read_tdms
+    return _foreign(path, read_tdms(path), want)
+
+
+def _foreign(path: Path, columns: dict[str, np.ndarray], want: list[str] | None) -> _Raw:
+    return _Raw({n: columns[n] for n in _picked(path, list(columns), want)}, {}, lambda row: f"{path}: row {row + 1}")
+
+
 _READERS: dict[str, Callable[[Path, list[str] | None], _Raw]] = {
     ".csv": _read_csv, ".parquet": _read_parquet, ".arrow": _read_arrow, ".arrows": _read_arrow,
-    ".feather": _read_arrow}
+    ".feather": _read_arrow, ".mf4": _read_mdf, ".mdf": _read_mdf, ".tdms": _read_tdms}
 FORMATS = ", ".join(_READERS)

@@ -1,0 +1,137 @@
+"""History for a plot: any signal over hours or days, as the least, mean and largest value of each pixel's span.
+
+Long spans come from the 10 Hz tier, short ones (FULL_SPAN_S and less) from the full rate. Files that are complete are
+reduced to one second once and kept in memory, so that a day is drawn again in milliseconds.
+"""
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from thermoctl.recording.stream import open_stream
+from thermoctl.recording.writer import FULL, NAME, TIER, recording_files
+from thermoctl.signals import INDEX, NAMES
+from thermoctl.yamlfile import InputError, suggest
+
+FULL_SPAN_S = 60.0          # at and below this the full rate is shown
+COARSE_SPAN_S = 7200.0      # above this, one second is fine enough
+MAX_POINTS = 4000
+_CLOCK = "wall_s"
+
+
+@dataclass(frozen=True)
+class History:
+    """`t` (n,) seconds since 1970, the middle of each bucket that holds a sample; low, mean, high (n,) in the signal's
+    unit; `source` 'full' or 'tier'; `files` that were read."""
+    t: np.ndarray
+    low: np.ndarray
+    mean: np.ndarray
+    high: np.ndarray
+    source: str
+    files: int
+
+
+def history(directory: str | Path, signal: str, begin_s: float, end_s: float, points: int = 800) -> History:
+    """The signal from begin_s to end_s (seconds since 1970) in at most `points` buckets; empty where nothing is recorded.
+
+    Raises InputError for an unknown signal, a span that is empty, or points out of 2..MAX_POINTS.
+    """
+    if signal not in INDEX:
+        raise InputError(f"history: no signal '{signal[:60]}'{suggest(signal, NAMES)}")
+    if not (np.isfinite([begin_s, end_s]).all() and 0.0 <= begin_s < end_s <= 1e11):
+        raise InputError("history: a span of seconds since 1970 with its begin before its end was expected")
+    if not 2 <= points <= MAX_POINTS:
+        raise InputError(f"history: 2 to {MAX_POINTS} points were expected, not {points}")
+    span_s = end_s - begin_s
+    kind = FULL if span_s <= FULL_SPAN_S else TIER
+    step_s = 1.0 if span_s > COARSE_SPAN_S else 0.0
+    paths = _within(Path(directory), kind, begin_s, end_s)
+    parts = [_samples(path, signal, kind, step_s) for path in paths]
+    empty = np.empty(0)
+    wall, low, mean, high = (np.concatenate([p[k] for p in parts]) if parts else empty for k in range(4))
+    inside = (wall >= begin_s) & (wall <= end_s) & np.isfinite(mean)
+    bucket = np.minimum((wall[inside] - begin_s) / span_s * points, points - 1).astype(np.int64)
+    which, low, mean, high = reduce(bucket, low[inside], mean[inside], high[inside])
+    return History(begin_s + (which + 0.5) / points * span_s, low, mean, high, "full" if kind == FULL else "tier",
+                   len(paths))
+
+
+def reduce(bucket: np.ndarray, low: np.ndarray, mean: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Samples of the same bucket number become one: (numbers, least, mean, largest). The clock may have stepped: the
+    buckets need not be in order."""
+    if not len(bucket):
+        return bucket, low, mean, high
+    if (np.diff(bucket) < 0).any():
+        order = np.argsort(bucket, kind="stable")
+        bucket, low, mean, high = bucket[order], low[order], mean[order], high[order]
+    starts = np.concatenate(([0], np.flatnonzero(np.diff(bucket)) + 1))
+    count = np.diff(np.concatenate((starts, [len(bucket)])))
+    return (bucket[starts], np.fmin.reduceat(low, starts), np.add.reduceat(mean, starts) / count,
+            np.fmax.reduceat(high, starts))
+
+
+def recorded_rigs(directory: str | Path) -> dict[str, list[Path]]:
+    """The full-rate recordings in a folder by the rig's name, oldest first."""
+    rigs: dict[str, list[Path]] = {}
+    for path in recording_files(Path(directory), FULL):
+        rigs.setdefault(_match(path)["rig"], []).append(path)
+    return rigs
+
+
+def _match(path: Path) -> re.Match[str]:
+    found = NAME.match(path.name)
+    assert found is not None                # recording_files gives only such names
+    return found
+
+
+def _start_s(path: Path) -> float:
+    return datetime.strptime(_match(path)["start"], "%Y%m%dT%H%M%S.%fZ").replace(tzinfo=UTC).timestamp()
+
+
+def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Path]:
+    """The files that may hold a part of the span: a file lasts at most until it was written last."""
+    try:
+        paths = recording_files(directory, kind)
+    except OSError:
+        return []                           # nothing was recorded yet
+    chosen = []
+    for path in paths:
+        try:
+            if _start_s(path) <= end_s and path.stat().st_mtime + 1.0 >= begin_s:
+                chosen.append(path)
+        except FileNotFoundError:           # went with the budget meanwhile
+            continue
+    return chosen
+
+
+def _samples(path: Path, signal: str, kind: str, step_s: float) -> tuple[np.ndarray, ...]:
+    """(wall, low, mean, high) of one file, reduced to `step_s` (0: as recorded); a broken file gives nothing."""
+    try:
+        size = path.stat().st_size
+        return _reduced(path, size, signal, kind, step_s) if step_s else _read(path, signal, kind)
+    except (InputError, OSError):
+        return (np.empty(0),) * 4
+
+
+@lru_cache(maxsize=512)
+def _reduced(path: Path, size: int, signal: str, kind: str, step_s: float) -> tuple[np.ndarray, ...]:
+    wall, low, mean, high = _read(path, signal, kind)
+    there = np.isfinite(mean) & np.isfinite(wall)
+    which, low, mean, high = reduce(np.floor(wall[there] / step_s).astype(np.int64), low[there], mean[there], high[there])
+    return (which + 0.5) * step_s, low, mean, high
+
+
+def _read(path: Path, signal: str, kind: str) -> tuple[np.ndarray, ...]:
+    ranged = kind == TIER and not signal.endswith("_bits") and signal != "t_s"
+    names = [f"{signal}_min", signal, f"{signal}_max"] if ranged else [signal] * 3
+    batches = [{n: batch.column(n).to_numpy(zero_copy_only=False) for n in {_CLOCK, *names}}
+               for batch in open_stream(path, {_CLOCK, *names})]
+    if not batches:
+        return (np.empty(0),) * 4
+    columns = {n: np.concatenate([b[n] for b in batches]) for n in {_CLOCK, *names}}
+    return columns[_CLOCK], *(columns[n] for n in names)

@@ -1,0 +1,177 @@
+"""What our own recordings hold: rows for a replay, a summary, a mended copy, an export."""
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from thermoctl.recording import formats
+from thermoctl.recording.stream import END, open_stream
+from thermoctl.recording.table import read_table, to_arrow, whole_file
+from thermoctl.signals import NAMES
+from thermoctl.yamlfile import InputError, suggest
+
+
+@dataclass(frozen=True)
+class Info:
+    """A recording in short. `whole`: it was closed; else its writer was killed or is still writing."""
+    path: str
+    rows: int
+    begins_s: float               # t of the first and last row; NaN without rows
+    ends_s: float
+    begins_wall_s: float          # NaN where the wall clock is not recorded
+    bytes: int
+    readable_bytes: int
+    whole: bool
+    columns: tuple[tuple[str, str, str], ...]      # name, unit, meaning
+    meta: dict[str, str]
+
+
+def info(path: str | Path) -> Info:
+    """Look through a recording, decoding its times only. Raises InputError."""
+    path = Path(path)
+    fields = open_stream(path).schema
+    clock = next((n for n in ("t", "t_s") if n in fields.names), None)
+    if clock is None:
+        raise InputError(f"{path}: no column 't' or 't_s'; it is no recording")
+    stream = open_stream(path, [clock, "wall_s"])
+    rows, begins, ends, wall = 0, np.nan, np.nan, np.nan
+    for batch in stream:
+        if batch.num_rows:
+            t = batch.column(clock)
+            if not rows:
+                begins = t[0].as_py()
+                wall = batch.column("wall_s")[0].as_py() if "wall_s" in batch.schema.names else np.nan
+            rows, ends = rows + batch.num_rows, t[-1].as_py()
+    said = {f.name: f.metadata or {} for f in fields}
+    columns = tuple((n, m.get(b"unit", b"").decode(), m.get(b"meaning", b"").decode()) for n, m in said.items())
+    meta = {k.decode(): v.decode(errors="replace") for k, v in (fields.metadata or {}).items()}
+    return Info(str(path), rows, begins, ends, wall, path.stat().st_size, stream.good_bytes, stream.whole, columns,
+                meta)
+
+
+def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
+    """(ticks (n, signals) in the order of signals.SIGNALS, the text `law` of the metadata) for a replay.
+
+    Raises InputError when a signal is missing (a tier, or a recording of another version)."""
+    table = read_table(path)
+    if "10 Hz" in table.meta.get("tier", ""):
+        raise InputError(f"{path}: no full-rate recording but its 10 Hz tier; a replay needs every tick")
+    missing = [n for n in NAMES if n not in table.columns]
+    if missing:
+        raise InputError(f"{path}: no full-rate recording of this version: {', '.join(missing[:3])} "
+                         f"{'is' if len(missing) == 1 else 'are'} missing")
+    return np.column_stack([table.columns[n] for n in NAMES]), table.meta.get("law", "")
+
+
+def recover(path: str | Path, out: str | Path) -> Info:
+    """Copy what is whole of a cut recording to `out` and end it properly, so that any Arrow reader opens it; returns
+    what the copy holds. Raises InputError when nothing can be read or `out` exists."""
+    path, out = Path(path), Path(out)
+    stream = open_stream(path)
+    for _ in stream:
+        pass
+    if out.exists():
+        raise InputError(f"{out}: exists already; name another file")
+    try:
+        with whole_file(out) as temporary, open(path, "rb") as source, open(temporary, "wb") as target:
+            left = stream.good_bytes
+            while left:
+                piece = source.read(min(left, 1 << 22))
+                target.write(piece)
+                left -= len(piece)
+            target.write(END)
+    except OSError as e:
+        raise InputError(f"{out}: cannot be written: {e.strerror or e}") from None
+    shutil.copystat(path, out)
+    return info(out)
+
+
+def export(path: str | Path, out: str | Path, columns: Iterable[str] | None = None,
+           begin_s: float = -np.inf, end_s: float = np.inf) -> int:
+    """Write a recording as .parquet, .csv, .mf4 or .mcap; returns the rows written.
+
+    columns: only these (beside the time); begin_s, end_s: the part begin_s <= t < end_s. A recording of ours goes to
+    Parquet and CSV batch by batch, however long. Raises InputError."""
+    path, out = Path(path), Path(out)
+    kind = out.suffix.lower()
+    if kind not in (".parquet", ".csv", ".mf4", ".mcap"):
+        raise InputError(f"{out}: an export is .parquet, .csv, .mf4 or .mcap, not '{out.suffix}'")
+    if begin_s >= end_s:
+        raise InputError(f"{out}: --from {begin_s:g} s is not before --to {end_s:g} s")
+    want = None if columns is None else list(columns)
+    try:
+        with whole_file(out) as temporary:
+            if kind in (".mf4", ".mcap") or path.suffix != ".arrows":
+                return _export_table(path, temporary, kind, want, begin_s, end_s)
+            return _export_stream(path, temporary, kind, want, begin_s, end_s)
+    except OSError as e:
+        raise InputError(f"{out}: cannot be written: {e.strerror or e}") from None
+
+
+def _export_table(path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float) -> int:
+    table = read_table(path, want)
+    a, b = np.searchsorted(table.t, [begin_s, end_s])
+    if a == b:
+        raise InputError(f"{path}: no rows from {begin_s:g} to {end_s:g} s; it holds {table.t[0]:g} to "
+                         f"{table.t[-1]:g} s")
+    table = dataclasses.replace(table, t=table.t[a:b], columns={n: v[a:b] for n, v in table.columns.items()})
+    if kind == ".mcap":
+        formats.write_mcap(out, table)
+    elif kind == ".mf4":
+        from tempfile import TemporaryDirectory             # asammdf insists on its own suffix
+        with TemporaryDirectory(dir=Path(out).parent) as folder:
+            formats.write_mdf(f"{folder}/export.mf4", table)
+            Path(folder, "export.mf4").replace(out)
+    elif kind == ".csv":
+        pa.csv.write_csv(to_arrow(table), out)
+    else:
+        pa.parquet.write_table(to_arrow(table), out, compression="zstd")
+    return len(table)
+
+
+def _export_stream(path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float) -> int:
+    if want is not None:                                    # also says which column there is not
+        read_names = open_stream(path).schema.names
+        for name in want:
+            if name not in read_names:
+                raise InputError(f"{path}: no column '{name}'{suggest(name, read_names)}")
+        want = [*want, "t", "t_s"]
+    stream = open_stream(path, want)
+    clock = "t" if "t" in stream.schema.names else "t_s"
+    rows = 0
+    with ExitStack() as stack:
+        writer = stack.enter_context(pa.csv.CSVWriter(out, stream.schema) if kind == ".csv" else
+                                     pa.parquet.ParquetWriter(out, stream.schema, compression="zstd"))
+        for piece in _pieces(stream, clock, begin_s, end_s):
+            writer.write_table(piece)
+            rows += piece.num_rows
+    if not rows:
+        raise InputError(f"{path}: no rows from {begin_s:g} to {end_s:g} s")
+    return rows
+
+
+def _pieces(batches: Iterable[pa.RecordBatch], clock: str, begin_s: float, end_s: float) -> Iterator[pa.Table]:
+    """Tables of many batches (a row group each), cut to the times asked for, NaN as null."""
+    held: list[pa.RecordBatch] = []
+    rows = 0
+    for batch in batches:
+        t = batch.column(clock).to_numpy()
+        a, b = np.searchsorted(t, [begin_s, end_s])
+        if a < b:
+            held.append(pa.RecordBatch.from_arrays(
+                [pa.array(c.to_numpy()[a:b], from_pandas=True) for c in batch.columns], schema=batch.schema))
+            rows += b - a
+        if rows >= 100_000:
+            yield pa.Table.from_batches(held)
+            held, rows = [], 0
+    if held:
+        yield pa.Table.from_batches(held)

@@ -1,0 +1,290 @@
+"""Writing a recording: every tick at full rate, and a 10 Hz tier of min, mean and max that is kept for months.
+
+Each is an Arrow IPC stream with zstd. A batch goes to the disk, synced, every half second: a power cut loses what came
+after the last one, and what stands before opens (stream.py). Files are named after the rig and the moment they begin,
+`rig-20261121T043000.123Z.arrows` and `.10hz.arrows`; the oldest ones go when the disk budget is used up.
+
+Nothing here raises because of a disk: what could not be written is counted as lost and said once, and the next file is
+tried some seconds later. The daemon goes on.
+"""
+from __future__ import annotations
+
+import errno
+import io
+import os
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from thermoctl.recording.stream import CRC, END, checksums
+from thermoctl.signals import SIGNALS, Signal
+
+BATCH_S = 0.5              # of ticks in one batch of the full rate: what a power cut may cost
+BATCH_ROWS = 4096          # ... and no more than this where time runs faster
+TIER_HZ = 10.0
+TIER_BATCH_ROWS = 100      # 10 s: the full rate holds what a cut costs the tier
+RETRY_S = 5.0
+FULL, TIER = ".arrows", ".10hz.arrows"
+NAME = re.compile(r"^(?P<rig>.+)-(?P<start>\d{8}T\d{6}\.\d{3}Z)(?P<again>-\d+)?(?P<kind>\.10hz)?\.arrows$")
+_COMPRESSED = pa.ipc.IpcWriteOptions(compression="zstd")
+
+
+def schema(signals: Sequence[Signal], metadata: Mapping[str, str]) -> pa.Schema:
+    """float64 columns named as the signals, with unit and meaning; `metadata` is kept in the file."""
+    return pa.schema([pa.field(s.name, pa.float64(), metadata={"unit": s.unit, "meaning": s.meaning}) for s in signals],
+                     metadata=dict(metadata))
+
+
+class StreamFile:
+    """One Arrow stream on disk: a batch is there and synced, or it is not there at all. Raises OSError."""
+
+    def __init__(self, path: Path, columns: pa.Schema):
+        self.path, self.schema = path, columns
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self.bytes = 0
+        self._buffer = io.BytesIO()
+        try:
+            self._stream = pa.ipc.new_stream(self._buffer, columns, options=_COMPRESSED)
+            self._stream.write_table(columns.empty_table())         # brings the schema message out
+            self._put()
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        except OSError:
+            os.close(self._fd)
+            path.unlink(missing_ok=True)
+            raise
+
+    def write(self, rows: np.ndarray) -> None:
+        """Append rows (k, columns) as one batch."""
+        batch = pa.RecordBatch.from_arrays([pa.array(column) for column in np.ascontiguousarray(rows.T)],
+                                           schema=self.schema)
+        self._stream.write_batch(batch, custom_metadata={CRC: checksums(batch)})
+        self._put()
+
+    def _put(self) -> None:
+        data = self._buffer.getvalue()
+        self._buffer.seek(0)
+        self._buffer.truncate()
+        try:
+            _write_all(self._fd, data)
+            os.fdatasync(self._fd)
+        except OSError:
+            os.ftruncate(self._fd, self.bytes)                      # no half batch stays behind
+            os.lseek(self._fd, self.bytes, os.SEEK_SET)
+            raise
+        self.bytes += len(data)
+
+    def close(self) -> None:
+        """Write the end mark and release the file."""
+        try:
+            _write_all(self._fd, END)
+        finally:
+            os.close(self._fd)
+
+
+def _write_all(fd: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(fd, view):]
+
+
+class Tier:
+    """min, mean and max over each tenth of a second; words of bits (`*_bits`) are or-ed. NaN is a missing sample."""
+
+    def __init__(self, signals: Sequence[Signal]):
+        names = [s.name for s in signals]
+        self.clock = names.index("t_s")
+        self.bits = [i for i, n in enumerate(names) if n.endswith("_bits")]
+        self.ranged = [i for i in range(len(names)) if i != self.clock and i not in self.bits]
+        self.signals = (
+            signals[self.clock], *(signals[i] for i in self.bits), *(signals[i] for i in self.ranged),
+            *(Signal(f"{signals[i].name}_{end}", signals[i].unit, f"{end} of {signals[i].meaning}")
+              for end in ("min", "max") for i in self.ranged))
+        self._open = np.empty((0, len(names)))
+
+    def add(self, rows: np.ndarray, last: bool = False) -> np.ndarray:
+        """Rows (k, signals) in, finished rows (m, len(self.signals)) out; `last` finishes the one under way."""
+        rows = np.concatenate((self._open, rows))
+        bins = np.floor(rows[:, self.clock] * TIER_HZ + 1e-6)
+        ends = np.flatnonzero(np.diff(bins)) + 1
+        whole = len(rows) if last else int(ends[-1]) if len(ends) else 0
+        self._open = rows[whole:].copy()
+        if not whole:
+            return np.empty((0, len(self.signals)))
+        rows, starts = rows[:whole], np.concatenate(([0], ends[ends < whole]))
+        data = rows[:, self.ranged]
+        there = ~np.isnan(data)
+        count = np.add.reduceat(there, starts, axis=0, dtype=np.float64)
+        total = np.add.reduceat(np.where(there, data, 0.0), starts, axis=0)
+        with np.errstate(invalid="ignore"):
+            mean = total / np.where(count > 0, count, np.nan)
+        words = np.nan_to_num(rows[:, self.bits]).astype(np.int64)
+        return np.hstack((rows[starts][:, [self.clock]], np.bitwise_or.reduceat(words, starts, axis=0), mean,
+                          np.fmin.reduceat(data, starts, axis=0), np.fmax.reduceat(data, starts, axis=0)))
+
+
+class RecordingWriter:
+    """One recording: a full-rate file and its tier. When it is `full`, close it and open the next.
+
+    settings: directory, file_mb, file_s, budget_gb, tier_budget_gb (settings.RecordingSettings); metadata: what the
+    files say about themselves (configuration, model, law); log(text): told when the disk refuses, once, and when it is
+    well again. `error` is what it refused last, '' when all is well.
+    """
+
+    def __init__(self, settings: Any, metadata: Mapping[str, str], rig: str = "rig", log: Callable[[str], None] = print,
+                 signals: Sequence[Signal] = SIGNALS, clock: Callable[[], float] = time.monotonic,
+                 wall: Callable[[], float] = time.time):
+        self.directory, self.log, self.clock = Path(settings.directory), log, clock
+        self.budget, self.tier_budget = settings.budget_gb * 1e9, settings.tier_budget_gb * 1e9
+        self.file_bytes, self.file_s = min(settings.file_mb * 1e6, self.budget / 4), settings.file_s
+        self.error, self.lost, self._told = "", 0, 0
+        self._waiting: list[np.ndarray] = []
+        self._waiting_rows = 0
+        self._tier = Tier(signals)
+        self._tier_rows: list[np.ndarray] = []
+        self._time = [s.name for s in signals].index("t_s")
+        self._begun = self._failed = clock()
+        self._pruned_at = 0
+        self._full_file: StreamFile | None = None
+        self._tier_file: StreamFile | None = None
+        self._files_of = (re.sub(r"[^\w.-]+", "_", rig) or "rig", schema(signals, {**metadata, "tier": "full"}),
+                          schema(self._tier.signals, {**metadata, "tier": "10 Hz min, mean, max"}), wall)
+        self._open()
+
+    @property
+    def path(self) -> Path | None:
+        """The full-rate file, None while the disk refuses."""
+        return self._full_file.path if self._full_file else None
+
+    @property
+    def full(self) -> bool:
+        """True when the next recording is due: by size, by age, or some seconds after the disk refused."""
+        if self._full_file is None:
+            return self.clock() - self._failed >= RETRY_S
+        return self._full_file.bytes >= self.file_bytes or self.clock() - self._begun >= self.file_s
+
+    def write(self, rows: np.ndarray) -> int:
+        """Append ticks (k, signals) in order of time; returns how many rows were lost since the last call."""
+        if len(rows):
+            self._waiting.append(np.array(rows, dtype=np.float64))
+            self._waiting_rows += len(rows)
+            span = rows[-1, self._time] - self._waiting[0][0, self._time]
+            if span >= BATCH_S or span < 0 or self._waiting_rows >= BATCH_ROWS:
+                self.flush()
+        new, self._told = self.lost - self._told, self.lost
+        return new
+
+    append = write
+
+    def flush(self) -> None:
+        """Bring what waits to the disk now."""
+        if not self._waiting:
+            return
+        rows = np.concatenate(self._waiting)
+        self._waiting, self._waiting_rows = [], 0
+        if self._full_file is None:
+            self.lost += len(rows)
+            return
+        try:
+            try:
+                self._full_file.write(rows)
+            except OSError as e:
+                if e.errno not in (errno.ENOSPC, errno.EDQUOT) or not prune(self.directory, FULL, 0, self.path, 1):
+                    raise
+                self._full_file.write(rows)                          # the oldest file made room
+            self._tier_rows.append(self._tier.add(rows))
+            self._flush_tier(TIER_BATCH_ROWS)
+            if self._full_file.bytes - self._pruned_at > self.budget / 64:
+                self._prune()
+        except OSError as e:
+            self.lost += len(rows)
+            self._fail(e)
+
+    def close(self) -> int:
+        """Flush, write the end marks, release the files; returns the rows lost since the last `write`."""
+        self.flush()
+        try:
+            if self._full_file:
+                self._tier_rows.append(self._tier.add(np.empty((0, len(self._full_file.schema))), last=True))
+                self._flush_tier(1)
+        except OSError as e:
+            self._fail(e)
+        self._release()
+        new, self._told = self.lost - self._told, self.lost
+        return new
+
+    def _flush_tier(self, least: int) -> None:
+        if self._tier_file and sum(map(len, self._tier_rows)) >= least:
+            rows, self._tier_rows = np.concatenate(self._tier_rows), []
+            self._tier_file.write(rows)
+
+    def _open(self) -> None:
+        rig, full, tier, wall = self._files_of
+        stamp = datetime.fromtimestamp(wall(), UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z"
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+            self._prune()
+            for again in ("", *(f"-{i}" for i in range(1, 1000))):
+                stem = self.directory / f"{rig}-{stamp}{again}"
+                try:
+                    self._full_file = StreamFile(stem.with_name(stem.name + FULL), full)
+                    break
+                except FileExistsError:
+                    continue
+            self._tier_file = StreamFile(stem.with_name(stem.name + TIER), tier)
+        except OSError as e:
+            self._fail(e)
+
+    def _prune(self) -> None:
+        self._pruned_at = self._full_file.bytes if self._full_file else 0
+        slack = 1 - 1 / 32                                           # what may come until the next look
+        prune(self.directory, FULL, self.budget * slack, self.path)
+        prune(self.directory, TIER, self.tier_budget * slack, self._tier_file.path if self._tier_file else None)
+
+    def _fail(self, e: OSError) -> None:
+        self.error = f"{self.directory}: nothing is recorded: {e.strerror or e}; trying again every {RETRY_S:g} s"
+        self._failed = self.clock()
+        self.log(self.error)
+        self._release()
+
+    def _release(self) -> None:
+        for f in (self._full_file, self._tier_file):
+            if f is not None:
+                try:
+                    f.close()
+                except OSError as e:                                 # without its end mark it opens all the same
+                    self.log(f"{f.path}: left without an end mark: {e.strerror or e}")
+        self._full_file = self._tier_file = None
+
+
+def recording_files(directory: Path, kind: str) -> list[Path]:
+    """Our files of one kind (FULL or TIER) in a folder, oldest first."""
+    found = [p for p in directory.iterdir() if (m := NAME.match(p.name)) and bool(m["kind"]) == (kind == TIER)]
+    return sorted(found, key=lambda p: (NAME.match(p.name)["start"], len(p.name), p.name))  # type: ignore[index]
+
+
+def prune(directory: Path, kind: str, budget: float, keep: Path | None, at_most: int | None = None) -> int:
+    """Delete the oldest files of a kind until they fit `budget` bytes (never `keep`, `at_most` so many); how many."""
+    sizes = {}
+    for p in recording_files(directory, kind):
+        try:
+            sizes[p] = p.stat().st_size
+        except FileNotFoundError:
+            continue
+    total, gone = sum(sizes.values()), 0
+    for p, size in sizes.items():
+        if total <= budget or gone == at_most:
+            break
+        if p != keep:
+            p.unlink(missing_ok=True)
+            total, gone = total - size, gone + 1
+    return gone
