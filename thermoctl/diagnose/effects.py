@@ -18,7 +18,7 @@ import numpy as np
 from thermoctl import yamlfile
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
-from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
+from thermoctl.plant.language import Flow, Input, Node, Parameter, Plant
 from thermoctl.plant.simulate import Drive, Simulation
 
 CATALOGUE = Path(__file__).parents[2] / "config" / "effects"
@@ -145,7 +145,10 @@ class Rig:
 
     def __init__(self, plant: Plant, drives: Sequence[Drive], columns: Sequence[Mapping[str, np.ndarray]]):
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
-        p = plant
+        # What an observer (observer.py) added is no physics that an effect could sit in.
+        p = dataclasses.replace(plant, inputs={k: v for k, v in plant.inputs.items() if not k.startswith("seen_")},
+                                flows={k: v for k, v in plant.flows.items() if not k.startswith("correct_")})
+        self.physics = p
         self.temperatures = [n.name for n in p.nodes.values() if _dimension(n.unit) == "temperature" and not n.name.endswith("_memory")]
         self.velocities = [n.name for n in p.nodes.values() if _dimension(n.unit) in ("velocity", "rotation")
                            and any(f.target == n.name or f.source == n.name for f in p.flows.values())]
@@ -160,7 +163,7 @@ class Rig:
                             and c not in p.parameters and c not in p.outputs and c not in p.inputs and c not in p.flows
                             and all(np.ptp(t[c][np.isfinite(t[c])]) > 0 for t in columns if np.isfinite(t[c]).any())
                             and all(np.isfinite(t[c]).any() for t in columns))
-        moving = {i for j, i in enumerate(p.inputs) if any(np.ptp(d.u[:, j]) > 0 for d in drives)}
+        moving = {i for j, i in enumerate(plant.inputs) if i in p.inputs and any(np.ptp(d.u[:, j]) > 0 for d in drives)}
         self.moving_inputs = moving
         self.heat_inputs = [i for i in p.inputs if _dimension(p.inputs[i].unit) == "temperature"]
         named = [i for i in self.heat_inputs if re.search(r"air|amb|room|outdoor|chamber|base|environment", i, re.I)
@@ -169,7 +172,7 @@ class Rig:
 
     def _coolest(self) -> str | None:
         """The temperature input that losses of heat are counted from."""
-        for f in self.plant.flows.values():
+        for f in self.physics.flows.values():
             if f.target is None or f.source is None:
                 for i in self.heat_inputs:
                     if i in ex.names(f.rate):
@@ -178,7 +181,7 @@ class Rig:
 
     def signals(self, kind: str, near: str | None = None) -> list[str]:
         """Names that can stand for v, x, i or T: nodes, inputs, recorded columns (which become inputs)."""
-        p = self.plant
+        p = self.physics
         if kind == "v":
             if near in self.velocities:
                 return [near]       # type: ignore[list-item]
@@ -205,8 +208,8 @@ class Rig:
 
     def drives_of(self, f: Flow) -> list[str]:
         """The inputs that drive a flow (temperatures, positions and references aside)."""
-        return [i for i in self.plant.inputs if i in ex.names(f.rate) and i in self.moving_inputs
-                and _dimension(self.plant.inputs[i].unit) not in ("temperature", "length", "velocity")]
+        return [i for i in self.physics.inputs if i in ex.names(f.rate) and i in self.moving_inputs
+                and _dimension(self.physics.inputs[i].unit) not in ("temperature", "length", "velocity")]
 
 
 # ---------------------------------------------------------------------------------------------------------- places
@@ -237,7 +240,7 @@ def _velocity_nodes(rig: Rig) -> Iterator[Place]:
 
 
 def _conductances(rig: Rig) -> Iterator[Place]:
-    for f in rig.plant.flows.values():
+    for f in rig.physics.flows.values():
         read = ex.names(f.rate)
         ends = [e for e in (f.source, f.target) if e in rig.temperatures]
         if ends and read & set(rig.temperatures):
@@ -246,7 +249,7 @@ def _conductances(rig: Rig) -> Iterator[Place]:
 
 
 def _pairs(rig: Rig) -> Iterator[Place]:
-    linked = {frozenset((f.source, f.target)) for f in rig.plant.flows.values()}
+    linked = {frozenset((f.source, f.target)) for f in rig.physics.flows.values()}
     for k, a in enumerate(rig.temperatures):
         for b in rig.temperatures[k + 1:]:
             if frozenset((a, b)) not in linked:
@@ -255,7 +258,7 @@ def _pairs(rig: Rig) -> Iterator[Place]:
 
 def _heated_pairs(rig: Rig) -> Iterator[Place]:
     for a in rig.temperatures:
-        if not _heats(rig.plant, a, rig):
+        if not _heats(rig.physics, a, rig):
             continue
         for b in rig.temperatures:
             if a != b:
@@ -269,7 +272,7 @@ def _heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
 
 
 def _joule_flows(rig: Rig) -> Iterator[Place]:
-    for f in rig.plant.flows.values():
+    for f in rig.physics.flows.values():
         squares = [e for e in ex.walk(f.rate) if (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 2)
                    or (e.op == "*" and e.args[0] is e.args[1])]
         if f.target in rig.temperatures and f.source is None and squares and f.target not in ex.names(f.rate):
@@ -277,30 +280,30 @@ def _joule_flows(rig: Rig) -> Iterator[Place]:
 
 
 def _motors(rig: Rig) -> Iterator[Place]:
-    for f in rig.plant.flows.values():
+    for f in rig.physics.flows.values():
         if rig.is_motor(f):
             yield Place(f.name, {}, {"v": f.target or f.source or ""}, flow=f.name)
 
 
 def _drives(rig: Rig) -> Iterator[Place]:
-    for f in rig.plant.flows.values():
+    for f in rig.physics.flows.values():
         if rig.is_motor(f):
             for u in rig.drives_of(f):
                 yield Place(f.name, {"u": name(u)}, flow=f.name, input=u)
 
 
 def _sensors(rig: Rig, dimension: str | None = None) -> Iterator[Place]:
-    for o in rig.plant.outputs.values():
+    for o in rig.physics.outputs.values():
         if dimension is None or _dimension(o.unit) == dimension:
             yield Place(o.name, {"y": o.value}, output=o.name)
-    for i in rig.plant.inputs.values():
+    for i in rig.physics.inputs.values():
         if i.name in rig.moving_inputs and (dimension is None or _dimension(i.unit) == dimension):
             yield Place(i.name, {"y": name(i.name)}, input=i.name)
 
 
 def _displacements(rig: Rig) -> Iterator[Place]:
     warm = set(rig.temperatures) | set(rig.heat_inputs)
-    for o in rig.plant.outputs.values():
+    for o in rig.physics.outputs.values():
         if _dimension(o.unit) == "length" and ex.names(o.value) & warm:
             yield Place(o.name, {"y": o.value}, output=o.name)
 
@@ -320,39 +323,39 @@ def _bending_pairs(rig: Rig) -> Iterator[Place]:
 
 
 def _voltages(rig: Rig) -> Iterator[Place]:
-    for o in rig.plant.outputs.values():
+    for o in rig.physics.outputs.values():
         if _dimension(o.unit) == "voltage" and not _sources(rig, o.name):
             yield Place(o.name, {"y": o.value}, output=o.name)
-    for n in rig.plant.nodes.values():
+    for n in rig.physics.nodes.values():
         if _dimension(n.unit) == "current":
             yield Place(n.name, {}, {"a": n.name})
 
 
 def _sources(rig: Rig, node: str) -> bool:
     return any(f.source == node and any(e.op in ("sqrt", "**") and node in ex.names(e) for e in ex.walk(f.rate))
-               for f in rig.plant.flows.values())
+               for f in rig.physics.flows.values())
 
 
 def _levels(rig: Rig) -> Iterator[Place]:
-    for n in rig.plant.nodes:
+    for n in rig.physics.nodes:
         if _sources(rig, n):
-            after = next((f.target for f in rig.plant.flows.values() if f.source == n and f.target), None)
+            after = next((f.target for f in rig.physics.flows.values() if f.source == n and f.target), None)
             yield Place(n, {"a": name(n)}, {"a": n, **({"b": after} if after else {})})
 
 
 def _orifices(rig: Rig) -> Iterator[Place]:
-    for f in rig.plant.flows.values():
+    for f in rig.physics.flows.values():
         if f.source and any(e.op == "sqrt" or (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 0.5)
                             for e in ex.walk(f.rate) if f.source in ex.names(e)):
             yield Place(f.name, {}, flow=f.name)
 
 
 def _resistive(rig: Rig) -> Iterator[Place]:
-    ohms = {q for q, p in rig.plant.parameters.items() if p.unit and re.search(r"ohm", p.unit, re.I)}
-    for o in rig.plant.outputs.values():
+    ohms = {q for q, p in rig.physics.parameters.items() if p.unit and re.search(r"ohm", p.unit, re.I)}
+    for o in rig.physics.outputs.values():
         if ex.names(o.value) & ohms:
             yield Place(o.name, {}, output=o.name)
-    for f in rig.plant.flows.values():
+    for f in rig.physics.flows.values():
         if ex.names(f.rate) & ohms and f.target not in rig.temperatures:
             yield Place(f.name, {}, flow=f.name)
 
@@ -395,7 +398,7 @@ class Candidate:
 def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     """Every effect at every place it can sit, with every choice of the signals it needs."""
     out = []
-    motor_inputs = {u for f in rig.plant.flows.values() if rig.is_motor(f) for u in rig.drives_of(f)}
+    motor_inputs = {u for f in rig.physics.flows.values() if rig.is_motor(f) for u in rig.drives_of(f)}
     for effect in effects.values():
         for place in PLACES[effect.where](rig):
             near = place.nodes.get("v")
@@ -574,7 +577,7 @@ class _Builder:
     def _split(self, what: Mapping[str, Any]) -> None:
         share = name(self.c.own(what["share"]))
         a, b = self.c.place.nodes["a"], self.c.place.nodes["b"]
-        for f in _heats(self.base, a, self.rig):
+        for f in _heats(self.rig.physics, a, self.rig):
             self.flows[f.name] = dataclasses.replace(f, rate=ex.mul(f.rate, ex.add(ex.ONE, ex.neg(share))))
             label = f"{f.name}_to_{b}"
             self.flows[label] = Flow(label, ex.mul(f.rate, share), None, b, f.unit)

@@ -6,7 +6,6 @@ propagate, a node's does. The best node's flow is then recovered on a finer grid
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np

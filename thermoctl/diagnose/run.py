@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose import locate
+from thermoctl.diagnose import locate, observer
 from thermoctl.diagnose.effects import CATALOGUE, Candidate, Rig, candidates, catalogue
 from thermoctl.diagnose.evidence import Colour, channels, white_sigma
 from thermoctl.diagnose.screen import Direction, Metric, screen
@@ -37,6 +37,7 @@ FINALISTS = 12
 ACCEPT = 12.0               # an effect must lower the score by this much beyond its parameters' price
 NAME = 0.9                  # one explanation is named alone from this probability on
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
+FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 LARGE = 1.6                 # coloured residual beyond this is physics, not a sensor's colour
 TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
 DRAWS = 200                 # draws of noise for the chance that any candidate would look as good
@@ -265,44 +266,24 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     case.patience = max(4.0, 6 * (time.monotonic() - begun))
     _check_noise(case, base, notes)
     base = case.scored(base.plant, [], [], base.fit)
-    case.progress("screening the catalogue")
-    first = look(case, base, entries)
-    rounds, current = [first], base
-    rivals: list[Explanation] = []
-    while len(current.effects) < most:
-        seen = rounds[-1]
-        if seen.p_any() > 1e-3 and max(case.excess(current).values(), default=0.0) < CLEAN:
-            break
-        chosen = finalists(seen.directions)
-        if not chosen:
-            break
-        case.progress(f"refitting {len(chosen)} explanations")
-        seen.finalists = compete(case, seen, chosen)
-        if not seen.finalists or seen.finalists[0].score > current.score - ACCEPT:
-            break
-        current, rivals = seen.finalists[0], seen.finalists[1:]
-        if len(current.effects) >= most:
-            break
-        case.progress("screening again")
-        rounds.append(look(case, current, entries))
-        if len(current.effects) == 1 and max(case.excess(current).values()) > LARGE and time.monotonic() - case.begun < 40:
-            # A first choice made beside other missing physics can be wrong: the runners-up get their second effect, too.
-            best: Explanation | None = None
-            for other in _runners_up(seen.finalists):
-                again = rounds[-1] if other is current else look(case, other, entries, draws=0)
-                found = compete(case, again, finalists(again.directions, 6))
-                if found and (best is None or found[0].score < best.score):
-                    best, rivals = found[0], found[1:]
-            if best is not None and best.score < current.score - ACCEPT:
-                current = best
-                rounds.append(look(case, current, entries))
-    if len(current.effects) > 1:
-        current, rivals = _backward(case, base, current, rivals, entries, rounds)
+    followed = None
+    if max(case.excess(base).values(), default=0.0) > FAR and Rig(base.plant, case.drives, [t.columns for t in case.tables]).velocities:
+        followed = _following(case, base, entries, most)
+    if followed and max(case.excess(followed[0]).values()) < CLEAN:
+        current, reference, rivals = followed
+        rounds = [look(case, base, entries)]
+    else:
+        current, rivals, rounds = search(case, base, entries, most)
+        reference = current
+        if followed and followed[0].score < current.score - ACCEPT:
+            current, reference, rivals = followed
+    first = rounds[0]
     suspects = locate.suspects(first.metric) if first.directions and first.p_any() < 1e-3 else []
     excess = case.excess(current)
     worst = max(excess.values(), default=0.0)
     before_worst = max(case.excess(base).values(), default=0.0)
-    _weigh(current, rivals, case)
+    _weigh(reference, rivals)
+    current.probability = reference.probability
     held = held_out(case, base, current)
     if current.effects:
         share = (worst ** 2 - 1) / max(before_worst ** 2 - 1, 1e-9)
@@ -324,6 +305,71 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
             at = rounds[0]
             missing = locate.missing_flow(at.metric, nodes[0].name, _signals(case, at))
     return Diagnosis(verdict, base, current, rivals, rounds, suspects, missing, held, notes, None, start)
+
+
+def search(case: Case, base: Explanation, entries: Mapping[str, Any],
+           most: int) -> tuple[Explanation, list[Explanation], list[Round]]:
+    """Add effects while the evidence asks for them; then take each out again. Returns the best explanation, its rivals and
+    the looks that were taken."""
+    case.progress("screening the catalogue")
+    rounds, current = [look(case, base, entries)], base
+    rivals: list[Explanation] = []
+    while len(current.effects) < most:
+        seen = rounds[-1]
+        if seen.p_any() > 1e-3 and max(case.excess(current).values(), default=0.0) < CLEAN:
+            break
+        chosen = finalists(seen.directions)
+        if not chosen:
+            break
+        case.progress(f"refitting {len(chosen)} explanations")
+        seen.finalists = compete(case, seen, chosen)
+        if not seen.finalists or seen.finalists[0].score > current.score - ACCEPT:
+            break
+        current, rivals = seen.finalists[0], seen.finalists[1:]
+        if len(current.effects) >= most:
+            break
+        case.progress("screening again")
+        rounds.append(look(case, current, entries))
+        if len(current.effects) == 1 and max(case.excess(current).values()) > LARGE and time.monotonic() - case.begun < 40:
+            # A first choice made beside other missing physics can be wrong: the runners-up get their second effect, too.
+            best: Explanation | None = None
+            others: list[Explanation] = []
+            for other in _runners_up(seen.finalists):
+                again = rounds[-1] if other is current else look(case, other, entries, draws=0)
+                found = compete(case, again, finalists(again.directions, 6))
+                if found and (best is None or found[0].score < best.score):
+                    best, others = found[0], found[1:]
+            if best is not None and best.score < current.score - ACCEPT:
+                current, rivals = best, others
+                rounds.append(look(case, current, entries))
+    if len(current.effects) > 1:
+        current, rivals = _backward(case, base, current, rivals, entries)
+    return current, rivals, rounds
+
+
+def _following(case: Case, base: Explanation, entries: Mapping[str, Any],
+               most: int) -> tuple[Explanation, Explanation, list[Explanation]] | None:
+    """The search with the plant held to the recordings by an observer, then proved in the free run. Returns (explanation
+    in the free run, the same under the observer, its rivals there)."""
+    case.progress("looking again with the plant held to the recording")
+    for trust in (0.01, 0.1):
+        model = base.plant.compile()
+        plant = observer.follows(base.plant, model, [model.drive(t) for t in case.tables], case.noise, trust)
+        if plant is None:
+            return None
+        try:
+            held = Case(plant, case.tables, case.noise, case.progress)
+            held.patience = case.patience
+            start = held.explain(plant, [], [], iterations=25)
+            found, rivals, _ = search(held, start, entries, most)
+            if not found.effects:
+                continue
+            free = case.explain(observer.without(found.plant), found.effects, found.own, iterations=40)
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            continue
+        if _energy(case, free) < 0.1 * _energy(case, base):
+            return free, found, rivals
+    return None
 
 
 def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanation]:
@@ -384,8 +430,8 @@ def _signals(case: Case, seen: Round) -> dict[str, list[np.ndarray]]:
     return out
 
 
-def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[Explanation], entries: Mapping[str, Any],
-              rounds: list[Round]) -> tuple[Explanation, list[Explanation]]:
+def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[Explanation],
+              entries: Mapping[str, Any]) -> tuple[Explanation, list[Explanation]]:
     """With several effects: take each one out, look again at what would fill its place, and keep the best."""
     for _ in range(2):
         changed = False
@@ -423,7 +469,7 @@ def _on(rig: Rig, plant: Plant) -> Rig:
     return Rig(plant, rig.drives, rig.columns)
 
 
-def _weigh(current: Explanation, rivals: Sequence[Explanation], case: Case) -> None:
+def _weigh(current: Explanation, rivals: Sequence[Explanation]) -> None:
     """Posterior over the explanations that were refitted, tempered; the same effect at the same place counts once."""
     best: dict[tuple, Explanation] = {}
     for e in [current, *rivals]:
