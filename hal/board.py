@@ -19,7 +19,7 @@ import numpy as np
 from hal.backend import ABSENT, ERROR, ROLES, HardwareError, Sample
 from hal.devices import RECONNECT_S, Device, make_devices
 
-_ROW = np.dtype([("sequence", "u8"), ("value", "f8"), ("time_s", "f8"), ("status", "u8"), ("text", "S200")])
+_ROW = np.dtype([("sequence", "u8"), ("value", "f8"), ("time_s", "f8"), ("status", "u8"), ("text", "S400")])
 _SIZE = _ROW.itemsize * len(ROLES)
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -79,7 +79,7 @@ class Board:
             row = self.rows[role]
             row["sequence"] += 1
             row["value"], row["time_s"], row["status"] = sample.value[role], sample.time_s[role], sample.status[role]
-            row["text"] = device.problems.get(role, "").encode()[:200] if sample.status[role] == ERROR else b""
+            row["text"] = device.problems.get(role, "").encode()[:400] if sample.status[role] == ERROR else b""
             row["sequence"] += 1
 
     def merge(self, sample: Sample, taken: dict[int, float]) -> None:

@@ -36,6 +36,7 @@ from typing import Any
 
 import can
 import canopen
+import cantools
 from canopen.objectdictionary import datatypes
 
 from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
@@ -140,10 +141,12 @@ class LibraryPort:
     """An interface opened by python-can; SocketCAN frames pass on the bare socket."""
 
     def __init__(self, interface: str, channel: str, bitrate: int, ids: tuple[int, ...]) -> None:
-        filters = [{"can_id": i, "can_mask": 0x1FFF_FFFF if i > 0x7FF else 0x7FF, "extended": i > 0x7FF} for i in ids]
+        in_kernel = [{"can_id": i, "can_mask": 0x1FFF_FFFF if i > 0x7FF else 0x7FF, "extended": i > 0x7FF}
+                     for i in ids] if interface == "socketcan" else None
+        self._wanted = None if in_kernel or not ids else frozenset(ids)
         self._bus: Any
         try:
-            self._bus = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=filters)
+            self._bus = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=in_kernel)
         except (can.CanError, OSError, ValueError, ImportError) as e:
             raise HardwareError(f"{interface}:{channel}: cannot be opened ({e}); is the interface up (ip link set "
                                 f"{channel} up type can bitrate {bitrate})?") from None
@@ -183,7 +186,8 @@ class LibraryPort:
                 message = self._bus.recv(0)
                 if message is None:
                     return frames
-                frames.append((message.arbitration_id, bytes(message.data)))
+                if self._wanted is None or message.arbitration_id in self._wanted:
+                    frames.append((message.arbitration_id, bytes(message.data)))
                 continue
             try:
                 raw_id, size, data = _FRAME.unpack(self._socket.recv(16))
@@ -428,7 +432,7 @@ class DbcDevice(Device):
                 continue
             try:
                 values = entry[0].decode(data, decode_choices=False)
-            except (ValueError, KeyError, IndexError):
+            except (cantools.database.DecodeError, ValueError):
                 self.counts["errors"] += 1
                 continue
             self.counts["frames"] += 1

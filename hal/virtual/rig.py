@@ -434,12 +434,6 @@ class VirtualRig:
     def run(self, announce: Callable[[str], None]) -> None:
         """Plug everything in and live in real time until `stopping`; everything is unplugged afterwards."""
         self.run_dir.mkdir(parents=True, exist_ok=True)
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-        except OSError:
-            announce("no real-time priority (CAP_SYS_NICE): frames may come late when the machine is busy")
-        ctypes.CDLL(None).mlockall(3)           # current and future pages; refused without CAP_IPC_LOCK, and that is fine
-        gc.freeze()
         control = _listen(self.run_dir / "control.sock")
         try:
             for device in self.devices.values():
@@ -580,5 +574,11 @@ def main(settings: Any, command: str = "") -> int:
         rig.stopping = True
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except OSError:
+        print("no real-time priority (CAP_SYS_NICE): frames may come late when the machine is busy", flush=True)
+    ctypes.CDLL(None).mlockall(3)               # current and future pages; may be refused
+    gc.freeze()
     rig.run(lambda line: print(line, flush=True))
     return 0
