@@ -506,3 +506,12 @@ def test_fault_table():
     assert {f.severity for f in faults.FAULTS} == {"warning", "fault", "critical"}
     assert all(f.meaning and f.remedy for f in faults.FAULTS)
     assert [f.name for f in faults.decode(float(1 << 3 | 1 << 41))] == [faults.FAULTS[3].name, faults.FAULTS[41].name]
+
+
+def test_a_reading_that_was_never_good_keeps_its_first_fault():
+    rig = Rig(parameters_=parameters(**LIMITED))
+    rig.set(coil_c=500.0)
+    rig.tick()
+    rig.fresh[INDEX["coil_c"]] = 0
+    rig.tick(20)
+    assert "coil_range" in rig.faults and "coil_stale" not in rig.faults

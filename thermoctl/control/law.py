@@ -241,7 +241,7 @@ class Law:
                     self.last[c] = value
                     self.seen[c] = 1.0
                 self.age[c] = 0.0
-            elif self.age[c] > self.stale_s[c] or self.seen[c] == 0.0:
+            elif self.age[c] > self.stale_s[c] or (self.seen[c] == 0.0 and self.verdict[c] == 0.0):
                 self.verdict[c] = 1.0 + _K_STALE
             if self.verdict[c] > 0.0:
                 kind = _K_ERROR

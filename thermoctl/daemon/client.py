@@ -216,9 +216,9 @@ def replay(recording: str) -> int:
     """Run a recording's inputs through the law; 1 when an output differs in one bit."""
     import numpy as np
 
+    from thermoctl.daemon.recorder import read_recording
     from thermoctl.daemon.replay import replay as run_replay
-    from thermoctl.recording.reader import read_rows
-    rows, metadata = read_rows(recording)
+    rows, metadata = read_recording(recording)
     begin = time.perf_counter()
     result = run_replay(rows, metadata, recording)
     seconds = time.perf_counter() - begin

@@ -17,7 +17,8 @@ import numpy as np
 
 from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared
-from thermoctl.signals import INDEX
+from thermoctl.signals import INDEX, NAMES
+from thermoctl.yamlfile import InputError
 
 INTERVAL_S = 0.1
 _TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
@@ -68,7 +69,9 @@ class Recorder:
                  open_writer: Callable[[str], Any]):
         self.shared, self.model, self.parameters, self.period_s = shared, model, parameters, period_s
         self.open_writer = open_writer
-        self.position = shared.ring.head
+        kept = shared.state.get()
+        # Row k of the ring is tick k + 1. A recorder that was started again begins after the last kept state.
+        self.position = min(shared.ring.head, int(kept[0])) if kept is not None else 0
         self.generation = -1
         self.writer: Any = None
 
@@ -81,10 +84,26 @@ class Recorder:
             if self.writer is None or rows[0, _GENERATION] != self.generation:
                 self._new_file(rows[0])
             same = int(np.argmin(rows[:, _GENERATION] == self.generation)) or len(rows)
-            self.writer.write(rows[:same])
-            rows = rows[same:]
+            part, rows = rows[:same], rows[same:]
+            split = self._new_file_after(part) if self.writer.full else None
+            if split:
+                self._write(part[:split])
+                self._new_file(part[split])
+                part = part[split:]
+            self._write(part)
         self.shared.counters[RECORDER_ROWS] += written
         return written
+
+    def _write(self, rows: np.ndarray) -> None:
+        self.shared.counters[RECORDER_LOST] += self.writer.write(rows)
+
+    def _new_file_after(self, rows: np.ndarray) -> int | None:
+        """Where in `rows` a new file may begin: after the newest kept state, so that its replay starts there."""
+        kept = self.shared.state.get()
+        if kept is None:
+            return None
+        split = int(np.searchsorted(rows[:, _TICK], kept[0], side="right"))
+        return split if 0 < split < len(rows) else None
 
     def _new_file(self, first: np.ndarray) -> None:
         self.close()
@@ -102,8 +121,35 @@ class Recorder:
     def close(self) -> None:
         """End the file."""
         if self.writer is not None:
-            self.writer.close()
+            self.shared.counters[RECORDER_LOST] += self.writer.close()
             self.writer = None
+
+
+def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Recorder:
+    """The recorder of a daemon: files hold the configuration's text and the law's metadata."""
+    from pathlib import Path
+
+    from thermoctl.daemon.assemble import compensator, law_parameters
+    from thermoctl.recording.writer import RecordingWriter
+
+    def open_writer(law: str) -> RecordingWriter:
+        metadata = {"rig": settings.rig.name, "config": Path(settings.path).read_text(), "law": law}
+        return RecordingWriter(settings.recording, metadata, settings.rig.name, lambda text: log("recorder", what=text))
+
+    return Recorder(shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer)
+
+
+def read_recording(path: str) -> tuple[np.ndarray, str]:
+    """(rows (ticks, len(SIGNALS)), law metadata) of a full-rate recording. Raises InputError for any other file."""
+    from thermoctl.recording.stream import read_batches
+    schema, batches, _ = read_batches(path)
+    metadata = schema.metadata or {}
+    missing = [name for name in NAMES if name not in schema.names]
+    if missing or b"law" not in metadata:
+        raise InputError(f"{path}: not a full-rate recording of the daemon: '{(missing or ['law'])[0]}' is missing")
+    columns = [np.concatenate([b.column(name).to_numpy(zero_copy_only=False) for b in batches]) if batches else []
+               for name in NAMES]
+    return np.ascontiguousarray(np.array(columns).T), metadata[b"law"].decode()
 
 
 def record(recorder: Recorder, stopping: Callable[[], bool]) -> None:

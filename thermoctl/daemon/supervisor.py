@@ -41,6 +41,7 @@ STALL_S = 1.0               # a loop that made no tick for so long is ended
 STOP_S = 3.0                # a child that was asked to stop is killed after this
 RESTART_S = 0.5             # pause before a child is started again, doubled up to
 RESTART_LONGEST_S = 30.0
+TELL_AGAIN_S = 10.0         # a fault that comes and goes is logged once in this time
 EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_HARDWARE = 0, 1, 2, 3
 
 _fork = multiprocessing.get_context("fork")
@@ -206,6 +207,7 @@ class _Watcher:
     def __init__(self, shared: Shared, log: Log):
         self.shared, self.log = shared, log
         self.position, self.before = 0, (float(arming.OFF), 0.0)
+        self.told: dict[str, float] = {}
 
     def look(self) -> None:
         rows, self.position, _ = self.shared.ring.read(self.position)
@@ -220,6 +222,9 @@ class _Watcher:
                 self.log("state", tick=int(rows[k, INDEX["tick"]]), was=arming.STATES[int(before_state)],
                          now=arming.STATES[int(state)])
             for fault in faults.decode(int(bits) & ~int(before_bits)):
+                if rows[k, INDEX["t_s"]] - self.told.get(fault.name, -np.inf) < TELL_AGAIN_S and state == before_state:
+                    continue
+                self.told[fault.name] = rows[k, INDEX["t_s"]]
                 self.log(fault.severity, tick=int(rows[k, INDEX["tick"]]), name=fault.name, meaning=repr(fault.meaning),
                          remedy=repr(fault.remedy))
         self.before = (pairs[-1, 0], pairs[-1, 1])

@@ -1,0 +1,308 @@
+"""The daemon as a whole, its real processes on the simulated rig: commands, reload, and every way of dying."""
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from conftest import ROOT
+
+from thermoctl.cli import main
+from thermoctl.daemon.socket import ask
+from thermoctl.settings import load_settings
+from thermoctl.yamlfile import InputError
+
+LIMIT_S = 30.0
+
+
+def wait(condition, what, limit_s=LIMIT_S):
+    """The first true value of condition(), within the limit."""
+    deadline = time.monotonic() + limit_s
+    while time.monotonic() < deadline:
+        with contextlib.suppress(InputError):
+            found = condition()
+            if found:
+                return found
+        time.sleep(0.02)
+    raise AssertionError(f"{what}: not within {limit_s} s")
+
+
+class Daemon:
+    """`thermoctl run` on a configuration, with its log."""
+
+    def __init__(self, config):
+        self.config, self.settings = config, load_settings(config)
+        self.log_path = Path(config).with_suffix(".log")
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+        with self.log_path.open("w") as log:
+            self.process = subprocess.Popen([sys.executable, "-m", "thermoctl.cli", "run", "--config", str(config)],
+                                            stdout=log, stderr=log, env=environment)
+        try:
+            wait(lambda: self.process.poll() is not None or self.ask("status")["state"] == "READY", "READY")
+        except AssertionError:
+            self.kill()
+            raise
+        self.family = psutil.Process(self.process.pid).children(recursive=True) if self.process.poll() is None else []
+
+    def ask(self, command, **more):
+        return ask(self.settings.socket.path, {"command": command, **more})
+
+    @property
+    def log(self):
+        return self.log_path.read_text()
+
+    def child(self, name):
+        """The pid of a child, from the order that the supervisor starts them in."""
+        children = [p for p in psutil.Process(self.process.pid).children()
+                    if "resource_tracker" not in " ".join(p.cmdline())]
+        return sorted(children, key=lambda p: (p.create_time(), p.pid))[{"loop": 0, "commands": 1, "reference": 2}[name]].pid
+
+    def kill(self):
+        for process in [*getattr(self, "family", []), self.process]:
+            with contextlib.suppress(psutil.Error, OSError):
+                process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def unrecorded(config):
+    config.write_text(config.read_text().replace("recording:", "recording:\n  enable: false"))
+    return config
+
+
+@pytest.fixture
+def daemon(unrecorded):
+    d = Daemon(unrecorded)
+    assert d.process.poll() is None, d.log
+    yield d
+    d.kill()
+
+
+def test_a_session(daemon, capsys, monkeypatch):
+    """Arm, move, reload, read, disarm and stop, as a person would from the command line."""
+    monkeypatch.setenv("THERMOCTL_CONFIG", str(daemon.config))
+    assert main(["setpoint", "5"]) == 1 and "only when armed" in capsys.readouterr().err
+    assert main(["arm"]) == 0 and capsys.readouterr().out.startswith("ARMED, setpoint ")
+    assert main(["setpoint", "4"]) == 0
+    wait(lambda: abs(daemon.ask("status")["compensated_um"] - 4.0) < 0.2, "the stage at 4 um")
+    assert main(["setpoint", "4000"]) == 1 and "control.setpoint_low_um..setpoint_high_um" in capsys.readouterr().err
+    assert main(["status", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {"state", "ticks", "slips", "setpoint_um", "position_um", "compensation_um", "faults"} <= found.keys()
+    assert found["state"] == "ARMED" and found["setpoint_um"] == 4.0 and found["faults"] == []
+    assert main(["latency", "--json"]) == 0
+    latency = json.loads(capsys.readouterr().out)
+    assert latency["lateness"]["count"] > 100 and latency["reference"]["count"] > 100
+    assert main(["latency"]) == 0 and "idle loop's lateness" in capsys.readouterr().out
+    assert main(["disarm"]) == 0
+    wait(lambda: daemon.ask("status")["enable"] == 0.0, "the amplifier disabled")
+    daemon.process.terminate()
+    assert daemon.process.wait(LIMIT_S) == 0
+    assert not Path(daemon.settings.socket.path).exists()
+    assert main(["status"]) == 1 and "not running" in capsys.readouterr().err
+    assert "stopped" in daemon.log and "was=READY now=ARMED" in daemon.log
+
+
+def test_reload_applies_whole_files_only(daemon):
+    daemon.ask("arm")
+    daemon.ask("setpoint", value=3.0)
+    text = daemon.config.read_text()
+    before = daemon.ask("status")["ticks"]
+    daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.008").replace("priority: 80", "priority: 70"))
+    answer = daemon.ask("reload")
+    assert answer["ok"] and answer["applied"] == ["control.kp"] and answer["needs_restart"] == ["loop.priority"]
+    daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.005").replace("ti_s: 0.004", "ti_s: never"))
+    answer = daemon.ask("reload")
+    assert not answer["ok"] and "control.ti_s" in answer["error"] and ":12:9:" in answer["error"]
+    daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.006"))
+    daemon.process.send_signal(signal.SIGHUP)
+    wait(lambda: daemon.ask("status")["generation"] == 2, "the reload by SIGHUP")
+    now = daemon.ask("status")
+    assert now["state"] == "ARMED" and now["ticks"] > before and now["setpoint_um"] == 3.0
+
+
+def test_bad_clients_cost_nothing(daemon):
+    """Garbage, an endless line, a client that never reads, a flood: answered or dropped, and the loop ticks on."""
+    path = daemon.settings.socket.path
+    ticks = daemon.ask("status")["ticks"]
+    for data in (b"\xff\xfe\n", b"[]\n", b'{"command": 3}\n', b'{"command": "fly"}\n', b"[" * 5000 + b"\n",
+                 b'{"command": "setpoint", "value": "NaN"}\n', b'{"command": "setpoint", "value": NaN}\n'):
+        with socket.socket(socket.AF_UNIX) as s:
+            s.connect(path)
+            s.settimeout(5)
+            s.sendall(data)
+            assert json.loads(s.recv(65536))["ok"] is False
+    with socket.socket(socket.AF_UNIX) as endless:
+        endless.connect(path)
+        with pytest.raises(OSError):
+            for _ in range(100):
+                endless.sendall(b"x" * 65536)
+    with socket.socket(socket.AF_UNIX) as deaf:
+        deaf.connect(path)
+        deaf.setblocking(False)
+        with contextlib.suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
+            for _ in range(20000):
+                deaf.send(b'{"command": "latency"}\n')
+        assert daemon.ask("status")["ok"]
+    status = wait(lambda: (s := daemon.ask("status"))["ticks"] > ticks + 100 and s, "the loop ticking on")
+    assert status["state"] == "READY"
+
+
+def test_the_socket_is_for_owner_and_group(daemon):
+    assert Path(daemon.settings.socket.path).stat().st_mode & 0o777 == 0o660
+
+
+def test_a_second_daemon_is_refused(daemon, capsys):
+    assert main(["run", "--config", str(daemon.config)]) == 2
+    assert "another daemon runs" in capsys.readouterr().err
+    assert daemon.ask("status")["ok"]
+
+
+@pytest.mark.parametrize("name", ["commands", "reference"])
+def test_a_helper_that_is_killed_comes_back_and_the_loop_runs_on(daemon, name):
+    daemon.ask("arm")
+    pid, ticks = daemon.child(name), daemon.ask("status")["ticks"]
+    os.kill(pid, signal.SIGKILL)
+    wait(lambda: not psutil.pid_exists(pid) and f"{name} ended, started again" in daemon.log, "its end is noticed")
+    now = wait(lambda: daemon.ask("status"), "an answer")
+    assert now["state"] == "ARMED" and now["ticks"] > ticks and daemon.process.poll() is None
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV])
+def test_a_loop_that_dies_or_stands_still_ends_the_daemon_with_a_safe_amplifier(daemon, how):
+    daemon.ask("arm")
+    os.kill(daemon.child("loop"), how)
+    assert daemon.process.wait(LIMIT_S) == 1
+    assert "the loop" in daemon.log and "could not be disabled" not in daemon.log
+    assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in daemon.family
+                   if "resource_tracker" not in _command(p))
+
+
+def test_a_supervisor_that_is_killed_takes_all_with_it(daemon):
+    daemon.ask("arm")
+    daemon.process.kill()
+    daemon.process.wait()
+    wait(lambda: not any(p.is_running() for p in daemon.family), "all children gone", 10.0)
+    again = Daemon(daemon.config)
+    try:
+        assert again.ask("status")["state"] == "READY"           # never ARMED by itself
+    finally:
+        again.kill()
+
+
+def _command(process):
+    try:
+        return " ".join(process.cmdline())
+    except psutil.Error:
+        return ""
+
+
+def test_the_first_fault_is_logged_with_its_remedy(unrecorded):
+    text = unrecorded.read_text().replace("air_c: 45", "air_c: 10")
+    unrecorded.write_text(text.replace("air_c: 5,", "air_c: 4,"))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen([sys.executable, "-m", "thermoctl.cli", "run", "--config", str(unrecorded)], text=True,
+                          stderr=subprocess.PIPE, env=environment) as process:
+        line = next(line for line in process.stderr if "air_range" in line)
+        assert "remedy=" in line and "protection.low..high" in line
+        path = load_settings(unrecorded).socket.path
+        answer = wait(lambda: ask(path, {"command": "arm"}), "an answer")
+        assert not answer["ok"] and "air_range" in answer["error"] and answer["state"] == "SAFE"
+        process.terminate()
+        process.communicate()
+
+
+def test_start_and_stop_in_the_background(unrecorded, capsys, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    config = ["--config", str(unrecorded)]
+    assert main(["stop", *config]) == 0
+    assert main(["start", *config]) == 0
+    try:
+        assert main(["start", *config]) == 0 and "already running" in capsys.readouterr().out
+        assert main(["status", *config]) == 0
+        assert main(["restart", *config]) == 0
+    finally:
+        assert main(["stop", *config]) == 0
+    assert main(["status", *config]) == 1
+
+
+def test_start_tells_why_it_failed(unrecorded, capsys, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    plant = Path(unrecorded).with_name("plant.yaml")
+    plant.write_text("format: thermoctl-plant/1\ntitle: nothing\n")
+    unrecorded.write_text(unrecorded.read_text().replace(f"{ROOT}/config/plants/actuator.yaml", "plant.yaml"))
+    assert main(["start", "--config", str(unrecorded)]) == 3
+    error = capsys.readouterr().err
+    assert "plant.yaml" in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize("old,new,message", [
+    ("kp: 0.01", "kpp: 0.01", r"unknown option 'control.kpp' (did you mean 'kp'?)"),
+    ("kp: 0.01", "kp: -1", "control.kp: -1 is out of range; expected 0 to 1000"),
+    ("period_s: 1 ms", "period_s: 1 kg", "the unit does not fit"),
+    ("period_s: 1 ms", "period_s: soon", "a number in s was expected"),
+    ("control:", "controll:", "(did you mean 'control'?)"),
+    ("backend: simulated", "backend: simulatd", "(did you mean 'simulated'?)"),
+    ("kp: 0.01", "kp: 0.01\n  kp: 0.02", "stands twice"),
+    ("moving_average: 4", "moving_average: 4.5", "a whole number was expected"),
+    ("enable: true", "enable: maybe", "true or false was expected"),
+    ("required: [position_um", "required: [postion_um", "(did you mean 'position_um'?)"),
+    ("setpoint_high_um: 250", "setpoint_high_um: -300", "must be above"),
+    ("  kp: 0.01\n", "", "'control.kp' is missing"),
+    ("  plant:", "  roles: 7\n  plant:", "a mapping of names was expected"),
+    ("loop:", "loop: 3\nloops:", "a mapping was expected"),
+])
+def test_a_bad_configuration_is_one_good_line(config, old, new, message, capsys):
+    assert old in config.read_text()
+    config.write_text(config.read_text().replace(old, new, 1))
+    assert main(["check", str(config)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and f"{config}:" in error
+    place = error.split(f"{config}:")[1].split(":")
+    assert int(place[0]) > 0 and int(place[1]) > 0
+
+
+def test_check_and_doctor_find_the_example_good(config, capsys):
+    assert main(["check", str(config)]) == 0 and "good" in capsys.readouterr().out
+    assert main(["doctor", str(config), "--seconds", "0.3"]) == 0
+    assert "coil_c" in capsys.readouterr().out
+
+
+def test_what_a_session_recorded_replays_to_the_bit(config, capsys):
+    """A real-time run with arming, motion, a reload and a recorder that is killed: every file replays to the bit."""
+    daemon = Daemon(config)
+    try:
+        daemon.ask("arm")
+        daemon.ask("setpoint", value=3.0)
+        wait(lambda: daemon.ask("status")["reference_um"] == 3.0, "the reference at 3 um")
+        config.write_text(config.read_text().replace("kp: 0.01", "kp: 0.007"))
+        assert daemon.ask("reload")["applied"] == ["control.kp"]
+        wait(lambda: daemon.ask("status")["recorder"]["rows"] > 2500, "some rows")
+        children = sorted((p for p in psutil.Process(daemon.process.pid).children()
+                           if "resource_tracker" not in _command(p)), key=lambda p: (p.create_time(), p.pid))
+        children[1].kill()
+        wait(lambda: "recorder ended, started again" in daemon.log, "its end is noticed")
+        before = daemon.ask("status")["recorder"]["rows"]
+        wait(lambda: daemon.ask("status")["recorder"]["rows"] > before + 1500, "it records again")
+        assert daemon.ask("status")["state"] == "ARMED"
+        daemon.ask("disarm")
+        daemon.process.terminate()
+        assert daemon.process.wait(LIMIT_S) == 0
+    finally:
+        daemon.kill()
+    files = sorted(p for p in Path(daemon.settings.recording.directory).glob("*.arrows") if ".10hz" not in p.name)
+    assert len(files) == 3                          # the start, after the reload, after the kill
+    ticks = 0
+    for path in files:
+        assert main(["replay", str(path)]) == 0
+        out = capsys.readouterr().out
+        assert "bit for bit" in out
+        ticks += int(out.split(": ")[1].split()[0])
+    assert ticks > 3500
+    assert main(["replay", str(config)]) == 2 and "no recording" in capsys.readouterr().err
