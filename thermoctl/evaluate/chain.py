@@ -9,12 +9,13 @@ measured error is judged over test 4B. Estimators:
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import signal
+from scipy import linalg, signal
 
+from thermoctl.control.model import CompensatorModel
 from thermoctl.identify import expansion, filter, modal, subspace
 from thermoctl.identify.statespace import StateSpace
 
@@ -88,9 +89,10 @@ def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = 8) -> 
     plant = filter.disturbed(filter.with_air(model))
     records = [filter.Record(t.power_w, air_rate(t.air_c), rises(t)) for t in (test_2, test_3, test_4a)]
     kalman, variances = filter.tune(plant, records, r_v)
-    better_um = fit_expansion(kalman, test_4a)
+    tests = [test_2, test_3, test_4a]
+    better_um = fit_expansion(kalman, tests)
     twelve = filter.steady(plant, variances, r_v, tuple(range(12)))
-    twelve_um = fit_expansion(twelve, test_4a)
+    twelve_um = fit_expansion(twelve, tests)
     return Calibration(paper_model, mkf, paper_um, siso_um, model, kalman, better_um, twelve, twelve_um, variances)
 
 
@@ -120,10 +122,11 @@ def run_kalman(k: filter.Kalman, r: Any) -> np.ndarray:
     return k.run(r.power_w, air_rate(r.air_c), rises(r)[:, list(k.sensors)])
 
 
-def fit_expansion(k: filter.Kalman, r: Any) -> expansion.Expansion:
-    """Output error on the filter's own estimates, its error as the inputs' uncertainty."""
+def fit_expansion(k: filter.Kalman, tests: list[Any]) -> expansion.Expansion:
+    """Output error on the filter's own estimates over all calibration tests, the filter's error as the inputs' uncertainty."""
     sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", k.model.c, k.p, k.model.c), 0))
-    return expansion.output_error(run_kalman(k, r), r.error_um, 1.0, sigma, smooth_air(r.air_c), output_step_um=0.005)
+    return expansion.output_error([run_kalman(k, t) for t in tests], [t.error_um for t in tests], 1.0, sigma,
+                                  [smooth_air(t.air_c) for t in tests], lags=1, output_step_um=0.005)
 
 
 def estimates(c: Calibration, r: Any) -> dict[str, np.ndarray]:
@@ -134,3 +137,44 @@ def estimates(c: Calibration, r: Any) -> dict[str, np.ndarray]:
             "paper": c.paper_um.predict(estimate_mkf(c.mkf, r)),
             "better": c.better_um.predict(run_kalman(c.kalman, r), air, start["better"]),
             "twelve": c.twelve_um.predict(run_kalman(c.twelve, r), air, start["twelve"])}
+
+
+def compensator(c: Calibration, kind: str, period_s: float = 0.001, sensor_s: float = 0.1) -> CompensatorModel:
+    """What the daemon runs, at its own period: kind 'paper' (MKF and recursion (5)) or 'better'. Sensor readings come every `sensor_s`.
+
+    Process noise is per second, so it scales with the period; a quantised reading ten times a second brings no more information than one
+    a second, so its variance grows in proportion."""
+    if kind == "paper":
+        model = c.paper_model
+        alpha, _ = model.output_form()
+        reduced = StateSpace(alpha, model.c @ model.b, np.eye(len(alpha)), model.period_s, np.zeros(len(alpha)))
+        reduced = _without_noise_poles(reduced)
+        fast = reduced.resample(period_s)
+        um = c.paper_um
+        return CompensatorModel("mkf", period_s, reduced.minus_identity(period_s), np.column_stack([fast.b[:, 0], np.zeros(12)]), np.eye(12),
+                                c.mkf.zeta, c.mkf.r_w * period_s / c.mkf.period_s, c.mkf.r_v, um.f1, um.b1, um.b2, um.period_s,
+                                air_filter_s=AIR_FILTER_S)
+    model, um = c.kalman.model, c.better_um
+    scale = sensor_s / model.period_s
+    at_sensor = _at_period(model, sensor_s)
+    q = c.kalman.noise * scale
+    cs = at_sensor.c[:1]
+    r = np.array([[filter.sensor_variance(STEP_K, NOISE_K) / scale]])
+    p = linalg.solve_discrete_are(at_sensor.a.T, cs.T, q + 1e-16 * np.eye(len(q)), r)
+    gain = (p @ cs.T / (cs @ p @ cs.T + r))[:, 0]
+    fast = _at_period(model, period_s)
+    return CompensatorModel("kalman", period_s, model.minus_identity(period_s), fast.b, model.c, gain, 0.0, float(r[0, 0]), um.f1, um.b1, um.b2,
+                            um.period_s, b_air=um.b_air, offset_um=um.offset_um, air_filter_s=AIR_FILTER_S)
+
+
+def _at_period(model: StateSpace, period_s: float) -> StateSpace:
+    """Resampled, the air's effect (K per K/s over one period) kept exact: it is no rate held into a network but a shift of all rises."""
+    fast = model.resample(period_s)
+    return replace(fast, b=np.column_stack([fast.b[:, 0], model.b[:, 1] * period_s / model.period_s]))
+
+
+def _without_noise_poles(model: StateSpace) -> StateSpace:
+    """The model without modes that no sampled heat network has (real poles at or below 0.05, which the noise put there)."""
+    values, vectors = np.linalg.eig(model.a)
+    keep = np.where((np.abs(values.imag) < 1e-12) & (values.real <= 0.05), 0.05, values)
+    return replace(model, a=np.real(vectors @ np.diag(keep) @ np.linalg.inv(vectors)))

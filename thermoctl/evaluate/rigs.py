@@ -26,7 +26,7 @@ HEATED = ("inner_magnet", "outer_stator", "bracket_1")
 PAPER_SCALE = {"a_bobbin": 1.5, "a_bobbin_connector": 1.5, "a_shaft_1": 1.5, "a_shaft_2": 1.5, "a_bracket_1": 7.5}
 """Expansion of the proving rigs over the plant file's: a longer shaft and a long arm under the encoder's head, so that what is
 left uncompensated (5.7 +- 7.3 um in the paper) and with the coil alone (+-2.3 um) is of the paper's size."""
-HEAT_W, HEAT_TAU_S = 0.02, 1800.0
+HEAT_W, HEAT_TAU_S = 0.012, 1800.0
 DISTURBANCES = ("outside_heat", "fan", "changed_air", "stuck_quantisation", "sensor_lag", "missing_samples", "faster_motion", "aged_joint")
 
 

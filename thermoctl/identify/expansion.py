@@ -12,7 +12,7 @@ ridge            thermometers are noisy: gains g multiply their noise (quantisat
 The time constant itself cannot be told with so many parameters; the prediction can.
 
 The output moves with the bodies' absolute temperatures, the models speak of rises above the air. T_abs = rise + air, so air enters
-with the sum of all gains: b_air = sum(b1 + b2). `air_tied` uses that; a free air regressor is not excited in two hours.
+with the sum of all gains: b_air = sum(b1 + b2). A free air regressor is not excited in two hours.
 """
 from __future__ import annotations
 
@@ -79,36 +79,48 @@ def recursive(rises: np.ndarray, y: np.ndarray, period_s: float, weight: float =
     return _from_theta(theta, period_s, {"method": "recursion (5)", "weight": weight, "own_output": own_output})
 
 
-def output_error(rises: np.ndarray, y: np.ndarray, period_s: float, input_sigma_k: float | np.ndarray = 0.0, air: np.ndarray | None = None,
-                 air_tied: bool = True, tau_range_s: tuple[float, float] | None = None, lags: int = 2, output_step_um: float = 0.0,
-                 weight: np.ndarray | None = None) -> Expansion:
-    """True output error: search over f1 and ridge least squares. NaN in y: not measured there. rises (N, M) K, y (N,) um.
+def output_error(rises: np.ndarray | list[np.ndarray], y: np.ndarray | list[np.ndarray], period_s: float,
+                 input_sigma_k: float | np.ndarray = 0.0, air: np.ndarray | list[np.ndarray] | None = None,
+                 tau_range_s: tuple[float, float] | None = None, lags: int = 2, output_step_um: float = 0.0) -> Expansion:
+    """True output error: search over f1 and ridge least squares. rises (N, M) K, y (N,) um (NaN: not measured there), or lists of
+    recordings, each with an offset and a start of its own. `air` (N,) degC ties b_air to the sum of the gains.
 
     `input_sigma_k`: error of the inputs the model will be driven by (quantisation included), per input or one for all;
-    `output_step_um`: the encoder's step, whose variance floors what a fit may explain; lags 1 uses T(n) alone."""
-    _check(rises, y)
-    here = np.isfinite(y)
-    if here.sum() < 4 * rises.shape[1]:
-        raise InputError(f"{int(here.sum())} measured positions for {rises.shape[1]} temperatures; at least {4 * rises.shape[1]}")
-    n, m = rises.shape
-    drive = rises + (air - air[0])[:, None] if air is not None and air_tied else rises
-    span = n * period_s
-    lo, hi = tau_range_s or (2 * period_s, span / 4)
+    `output_step_um`: the encoder's step, whose variance floors what a fit may explain; lags 1 uses T(n) alone.
+    The offset and start returned are those of the last recording."""
+    many = [rises] if isinstance(rises, np.ndarray) else rises
+    ys = [y] if isinstance(y, np.ndarray) else y
+    airs = [None] * len(many) if air is None else [air] if isinstance(air, np.ndarray) else air
+    for r, v in zip(many, ys, strict=True):
+        _check(r, v)
+    m = many[0].shape[1]
+    measured = np.concatenate(ys)
+    here = np.isfinite(measured)
+    if here.sum() < 4 * m:
+        raise InputError(f"{int(here.sum())} measured positions for {m} temperatures; at least {4 * m}")
+    drives = [r if a is None else r + (a - a[0])[:, None] for r, a in zip(many, airs, strict=True)]
+    lo, hi = tau_range_s or (2 * period_s, max(len(r) for r in many) * period_s / 4)
     sigma2 = np.broadcast_to(np.asarray(input_sigma_k, float)**2, (m,))
+    own = 2 * len(many)
 
     def solve(log_tau: float) -> tuple[float, np.ndarray, float]:
         f = float(np.exp(-period_s / np.exp(log_tau)))
-        columns = [signal.lfilter([0, 1 - f], [1, -f], drive, axis=0)]
-        if lags == 2:
-            columns.insert(0, np.vstack([np.zeros((1, m)), columns[0][:-1]]))
-        z = np.hstack([*columns, np.ones((n, 1)), (f**np.arange(n))[:, None]])[here]
-        g = z.T @ z
-        right = z.T @ y[here]
-        noise = np.concatenate([np.tile(sigma2, lags) * (1 - f) / (1 + f) * here.sum(), [0, 0]])
-        noise += 1e-6 * np.append(np.full(m * lags, np.trace(g[:-2, :-2]) / (m * lags)), [0, 0])
-        noise[-2:] += 1e-9 * here.sum()
+        blocks = []
+        for k, drive in enumerate(drives):
+            z = np.zeros((len(drive), m * lags + own))
+            now = signal.lfilter([0, 1 - f], [1, -f], drive, axis=0)
+            z[:, m * (lags - 1):m * lags] = now
+            if lags == 2:
+                z[1:, :m] = now[:-1]
+            z[:, m * lags + 2 * k] = 1
+            z[:, m * lags + 2 * k + 1] = f**np.arange(len(drive))
+            blocks.append(z)
+        z = np.vstack(blocks)[here]
+        g, right = z.T @ z, z.T @ measured[here]
+        noise = np.concatenate([np.tile(sigma2, lags) * (1 - f) / (1 + f) * here.sum(), np.full(own, 1e-9 * here.sum())])
+        noise[:m * lags] += 1e-6 * np.trace(g[:m * lags, :m * lags]) / (m * lags)
         theta = linalg.solve(g + np.diag(noise), right, assume_a="pos")
-        cost = float(((y[here] - z @ theta)**2).sum() + theta @ (noise * theta)) + here.sum() * output_step_um**2 / 12
+        cost = float(((measured[here] - z @ theta)**2).sum() + theta @ (noise * theta)) + here.sum() * output_step_um**2 / 12
         return cost, theta, f
 
     grid = np.linspace(np.log(lo), np.log(hi), 13)
@@ -119,10 +131,8 @@ def output_error(rises: np.ndarray, y: np.ndarray, period_s: float, input_sigma_
     cost, theta, f = solve(best.x)
     b2 = (1 - f) * theta[m * (lags - 1):m * lags]
     b1 = (1 - f) * theta[:m] if lags == 2 else np.zeros(m)
-    b_air = float((b1 + b2).sum()) if air is not None and air_tied else 0.0
-    model = Expansion(f, b1, b2, period_s, b_air, float(theta[-2]),
-                      {"method": "output error", "start_um": float(theta[-1]), "rms_um": float(np.sqrt(cost / here.sum()))})
-    return model
+    return Expansion(f, b1, b2, period_s, float((b1 + b2).sum()) if air is not None else 0.0, float(theta[-2]),
+                     {"method": "output error", "start_um": float(theta[-1]), "rms_um": float(np.sqrt(cost / here.sum()))})
 
 
 class Bank:
