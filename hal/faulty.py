@@ -89,6 +89,7 @@ class FaultInjector:
         self._random = np.random.default_rng(seed)
         self._start_s = math.nan
         self._t = 0.0
+        self._value, self._time_s = self.sample.value.copy(), self.sample.time_s.copy()     # before this read
         self._held: dict[tuple[int, int], float] = {}                   # (fault, role) -> frozen value
         self._late: dict[tuple[int, int], deque[tuple[float, float]]] = {}
         self._apply = {"drop": self._drop, "delay": self._delay, "duplicate": self._duplicate, "corrupt": self._corrupt,
@@ -105,8 +106,8 @@ class FaultInjector:
         inner, out = self.inner.read(now_s), self.sample
         if math.isnan(self._start_s):
             self._start_s = now_s
-        self._t = now_s - self._start_s
-        # What a drop held back must not show through: only what is new, or has changed status, is passed on.
+        self._t = now_s - self._start_s + 1e-9          # a time on a tick's edge belongs to that tick
+        self._value[:], self._time_s[:] = out.value, out.time_s
         np.copyto(out.value, inner.value, where=inner.fresh)
         np.copyto(out.time_s, inner.time_s, where=inner.fresh)
         out.fresh[:], out.status[:] = inner.fresh, inner.status
@@ -155,14 +156,10 @@ class FaultInjector:
         return fault.probability >= 1.0 or self._random.random() < fault.probability
 
     def _drop(self, fault: Fault, number: int, role: int, now_s: float) -> None:
-        out, key = self.sample, (number, role)
-        if key not in self._held:                      # value and time as they stood when the fault began
-            self._held[key] = -math.inf if out.fresh[role] else out.time_s[role]
-        if out.fresh[role] and not self._hit(fault):
-            self._held[key] = out.time_s[role]
-            return
-        out.fresh[role] = False
-        if now_s - max(self._held[key], self._start_s + fault.at_s) > fault.stale_after_s:
+        out = self.sample
+        if out.fresh[role] and self._hit(fault):
+            out.value[role], out.time_s[role], out.fresh[role] = self._value[role], self._time_s[role], False
+        if now_s - out.time_s[role] > fault.stale_after_s:
             out.status[role] = STALE
 
     def _delay(self, fault: Fault, number: int, role: int, now_s: float) -> None:
@@ -176,8 +173,7 @@ class FaultInjector:
             self._held[number, role] = value
             out.fresh[role] = True
             out.time_s[role] = now_s                   # a late reading looks new: that is what makes it a hazard
-        if (number, role) in self._held:
-            out.value[role] = self._held[number, role]
+        out.value[role] = self._held.get((number, role), self._value[role])
 
     def _duplicate(self, fault: Fault, number: int, role: int, now_s: float) -> None:
         out = self.sample

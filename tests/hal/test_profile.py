@@ -1,0 +1,126 @@
+"""Device profiles and bindings: what ships is good, and every mistake is one line with its place."""
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hal.devices import make_devices
+from hal.profile import bind, check_rig, load_profile, resolve_port
+from hal.virtual.rig import virtual_device
+from tests.hal.conftest import CONFIG
+from thermoctl import yamlfile
+from thermoctl.settings import load_settings
+from thermoctl.yamlfile import InputError
+
+PROFILES = sorted((CONFIG / "devices").glob("*.yaml"))
+ENCODER = (CONFIG / "devices/encoder-serial.yaml").read_text()
+DRIVE = (CONFIG / "devices/drive-cia402.yaml").read_text()
+MODULE = (CONFIG / "devices/thermocouples-modbus-8.yaml").read_text()
+
+
+@pytest.mark.parametrize("path", PROFILES, ids=lambda p: p.stem)
+def test_shipped_profiles_are_good(path):
+    profile = load_profile(path)
+    assert profile.channels and profile.vendor and profile.model
+
+
+@pytest.mark.parametrize("name", ["wire.yaml", "rig.yaml"])
+def test_shipped_rigs_bind(name):
+    devices = make_devices(load_settings(CONFIG / name))
+    roles = [r for d in devices for r in d.roles]
+    assert len(roles) == len(set(roles)) and sum(d.drives for d in devices) == 1
+
+
+CASES = [
+    (ENCODER, "format: thermoctl-device/1", "format: thermoctl-device/9", "'thermoctl-device/1' was expected"),
+    (ENCODER, "bus: serial-binary", "bus: serial-bynary", "did you mean 'serial-binary'"),
+    (ENCODER, "vendor: thermoctl\n", "", "'vendor' is missing"),
+    (ENCODER, "rate_hz: 1000", "rate: 1000", "'rate_hz' is missing"),
+    (ENCODER, "scale: 0.005", "scale: 0", "scale: 0 makes every reading the same"),
+    (ENCODER, "scale: 0.005", "scale: fast", "scale: a number was expected, found 'fast'"),
+    (ENCODER, "[-5000, 5000]", "[5000, -5000]", "is empty"),
+    (ENCODER, "stale_after_s: 0.1", "stale_after_s: 0.0005", "every reading would be stale"),
+    (ENCODER, "field: counts", "field: count", "did you mean 'counts'"),
+    (ENCODER, "type: int32", "type: int33", "did you mean 'int32'"),
+    (ENCODER, "[0xAA, 0x55]", "[0xAA, 0x155]", "is outside 0 .. 255"),
+    (ENCODER, "crc: ccitt-false", "crc: none", "ccitt-false, xmodem, modbus"),
+    (ENCODER, "baud: 921600", "baud: 1", "is outside 50 .. 20000000"),
+    (ENCODER, "channels:\n", "channels:\n  position: {field: counts}\n", "stands twice"),
+    (DRIVE, "eds: drive-cia402.eds", "eds: none.eds", "none.eds cannot be read"),
+    (DRIVE, "[0x6041, 0x6078", "[0x6078, 0x6041", "the status word '0x6041' first"),
+    (DRIVE, "limits: [-2.5, 2.5]", "limits: [1, 2.5]", "must contain 0"),
+    (DRIVE, ", limits: [-2.5, 2.5]", "", "'limits' is missing"),
+    (DRIVE, "watchdog_s: 0.2", "watchdog_s: 0.03", "below two heartbeats"),
+    (DRIVE, "object: 0x6078", "object: 0x6077", "is not sent by the drive"),
+    (MODULE, "register: 0,", "register: 70000,", "is outside 0 .. 65535"),
+    (MODULE, "modbus: {unit_id: 1", "modbus: {unit_id: 300", "is outside 0 .. 247"),
+    (MODULE, "channels:\n", "drive: {unit: A, scale: 1, limits: [-1, 1]}\nchannels:\n", "cannot take the command"),
+]
+
+
+@pytest.mark.parametrize("good,old,new,message", CASES, ids=[c[3][:30] for c in CASES])
+def test_each_mistake_has_its_place_and_a_word(tmp_path, good, old, new, message):
+    assert old in good
+    for name in ("drive-cia402.eds",):
+        (tmp_path / name).write_bytes((CONFIG / "devices" / name).read_bytes())
+    path = tmp_path / "device.yaml"
+    path.write_text(good.replace(old, new, 1))
+    with pytest.raises(InputError) as e:
+        load_profile(path)
+    assert message in str(e.value)
+    assert str(e.value).startswith(f"{path}:") and "\n" not in str(e.value)
+
+
+@given(st.integers(0, len(ENCODER) - 1), st.sampled_from(["", " ", ":", "{", "[", "x", "-", "\t", "0", "'"]))
+def test_a_damaged_profile_is_read_or_refused_never_a_traceback(at, put):
+    from hal.profile import FORMAT
+    path = Path("/tmp") / "thermoctl-damaged-profile.yaml"
+    path.write_text(ENCODER[:at] + put + ENCODER[at + 1:])
+    try:
+        assert load_profile(path).bus and FORMAT
+    except InputError as e:
+        assert str(path) in str(e)
+
+
+@pytest.mark.parametrize("text,message", [
+    ("{profile: none.yaml, port: x, roles: {}}", "none.yaml cannot be read"),
+    ("{profile: encoder-serial.yaml, roles: {position: position_um}}", "'port' is missing"),
+    ("{profile: encoder-serial.yaml, port: x, roles: {positon: position_um}}", "did you mean 'position'"),
+    ("{profile: encoder-serial.yaml, port: x, roles: {position: position}}", "did you mean 'position_um'"),
+    ("{profile: encoder-serial.yaml, port: x, roles: {position: coil_c}}", "the role coil_c takes degC or K"),
+    ("{profile: encoder-serial.yaml, prot: x, port: x, roles: {position: position_um}}", "unknown key 'prot'")])
+def test_mistakes_in_a_binding_are_named(text, message):
+    with pytest.raises(InputError, match=message):
+        bind(yamlfile.loads(text), CONFIG / "devices")
+
+
+def test_two_devices_in_one_role_are_refused():
+    text = "{{name: {0}, profile: encoder-serial.yaml, port: {0}, roles: {{position: position_um}}}}"
+    two = [bind(yamlfile.loads(text.format(n)), CONFIG / "devices") for n in "ab"]
+    with pytest.raises(InputError, match="'position_um' is given by b and by a"):
+        check_rig(two)
+
+
+def test_units_convert_into_the_role(tmp_path):
+    path = tmp_path / "e.yaml"
+    path.write_text(ENCODER.replace("unit: um, scale: 0.005, range: [-5000, 5000]",
+                                    "unit: nm, scale: 5, offset: 100, range: [-5000000, 5000000]"))
+    node = yamlfile.loads("{profile: e.yaml, port: x, roles: {position: position_um}}")
+    bound = bind(node, tmp_path).bounds[0]
+    assert bound.scale == pytest.approx(0.005) and bound.offset == pytest.approx(0.1)
+    assert bound.high == pytest.approx(5000)
+
+
+def test_relative_ports_count_from_the_configuration(tmp_path):
+    (tmp_path / "link").symlink_to("/dev/null")
+    assert resolve_port("./link", tmp_path) == f"{tmp_path}/link"               # the link itself, not its target
+    assert resolve_port("slcan:../can@500000", tmp_path / "config") == f"slcan:{tmp_path}/can@500000"
+    for port in ("/dev/ttyUSB0", "tcp:127.0.0.1:502", "socketcan:can0", "rtu:/dev/x"):
+        assert resolve_port(port, tmp_path) == port
+
+
+def test_the_virtual_rig_refuses_a_bus_it_cannot_play():
+    node = yamlfile.loads("{profile: drive-cia402.yaml, port: 'socketcan:can0', roles: {state: amplifier_state}}")
+    with pytest.raises(InputError, match="slcan ports only"):
+        virtual_device(bind(node, CONFIG / "devices"), None)
