@@ -129,6 +129,30 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
 
 def _people_commands(sub: argparse._SubParsersAction) -> None:
     """dashboard, monitor, calibrate, fleet, completion."""
+    config = ("--config", {"metavar": "FILE", "help": "configuration, found as by `thermoctl status`"})
+
+    def dashboard(args: argparse.Namespace) -> int:
+        from thermoctl.daemon.client import settings_of
+        from thermoctl.daemon.dashboard import dashboard
+        return dashboard(settings_of(args.config), args.listen, args.commands, args.metrics, args.token_file, args.rate,
+                         tuple(args.name))
+    _add(sub, "dashboard", "the rig in the browser: read-only and on this machine only, unless told otherwise", dashboard,
+         config, ("--listen", {"metavar": "ADDRESS:PORT", "default": "127.0.0.1:8765",
+                               "help": "where (default %(default)s); beyond this machine the token is needed to look"}),
+         ("--commands", {"action": "store_true", "help": "take arm, disarm and setpoint, with the token"}),
+         ("--metrics", {"action": "store_true", "help": "Prometheus' metrics at /metrics"}),
+         ("--token-file", {"metavar": "FILE", "help": "the token (else $THERMOCTL_DASHBOARD_TOKEN, else a new one is printed)"}),
+         ("--rate", {"type": float, "default": 20.0, "metavar": "HZ", "help": "frames a second, 1 to 50 (default 20)"}),
+         ("--name", {"action": "append", "default": [], "metavar": "HOST", "help": "a host name it is asked for by"}))
+
+    def monitor(args: argparse.Namespace) -> int:
+        from thermoctl.daemon.client import settings_of
+        from thermoctl.daemon.monitor import monitor
+        return monitor(settings_of(args.config), args.interval, args.once)
+    _add(sub, "monitor", "the rig in the terminal, as over ssh; commands nothing", monitor, config,
+         ("--interval", {"type": float, "default": 0.5, "metavar": "S", "help": "seconds between two looks (default 0.5)"}),
+         ("--once", {"action": "store_true", "help": "one screen; exit 1 when no daemon runs or a fault stands"}))
+
     def completion(args: argparse.Namespace) -> None:
         import shtab
         print(shtab.complete(parser(), args.shell))

@@ -1,0 +1,172 @@
+"""`thermoctl monitor`: the rig on one screen of a terminal, as over ssh. It asks the command socket and commands nothing."""
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from thermoctl.daemon.socket import ask
+from thermoctl.yamlfile import InputError
+
+BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
+KEPT = 240                         # samples of a sparkline
+STYLE = {"ARMED": "bold green", "FAULT": "bold white on red", "READY": "bold yellow"}
+TRAILS = (("compensated", "compensated_um", "um", 3), ("error with", "with", "um", 3), ("error without", "without", "um", 3),
+          ("coil", "coil_c", "C", 2), ("innovation", "innovation_c", "K", 3), ("power", "power_w", "W", 2))
+"""Sparklines: label, key of the trail, unit, digits."""
+
+
+def errors(status: dict[str, Any]) -> tuple[float | None, float | None]:
+    """(what the output errs by with compensation, what it would err by without), um; None unless armed.
+
+    From the proof encoder where there is one, else what the law believes."""
+    reference, output = status.get("reference_um"), status.get("output_reference_um")
+    output = status.get("compensated_um") if output is None else output
+    if status["state"] != "ARMED" or reference is None or output is None:
+        return None, None
+    return output - reference, output - reference + status["compensation_um"]
+
+
+def remember(trails: dict[str, deque[float]], status: dict[str, Any]) -> None:
+    """Add this status' values to the trails (NaN where there is none)."""
+    with_, without = errors(status)
+    coil = (status.get("temperatures_c") or {}).get("coil")
+    values = {**status, "with": with_, "without": without, "coil_c": coil}
+    for _, key, _, _ in TRAILS:
+        value = values.get(key)
+        trails.setdefault(key, deque(maxlen=KEPT)).append(math.nan if value is None else value)
+
+
+def sparkline(values: Iterable[float], width: int, ramp: str = BLOCKS) -> str:
+    """The newest `width` values, lowest to highest as the ramp's characters; blank where there is no value."""
+    newest = list(values)[-width:] if width > 0 else []
+    finite = [v for v in newest if math.isfinite(v)]
+    if not finite:
+        return " " * len(newest)
+    low, span = min(finite), max(finite) - min(finite)
+    return "".join(" " if not math.isfinite(v) else ramp[len(ramp) // 2 if span == 0 else
+                                                         min(len(ramp) - 1, int((v - low) / span * len(ramp)))]
+                   for v in newest)
+
+
+def screen(status: dict[str, Any], latency: dict[str, Any] | None, trails: dict[str, deque[float]], width: int = 80,
+           ramp: str = BLOCKS) -> Group:
+    """The view of one moment from what the command socket answers, for a terminal `width` characters wide."""
+    faults = [Text.assemble((f"{f['severity']} {f['name']}: ", "bold red" if f["severity"] != "warning" else "bold yellow"),
+                            f"{f['meaning']}\n   -> {f['remedy']}") for f in status["faults"]]
+    head = Text.assemble(("thermoctl ", "bold"), (f" {status['state']} ", STYLE.get(status["state"], "bold")))
+    if "channels" not in status:
+        return Group(head, *faults)
+    head.append(f"   {status['ticks']} ticks   {status['slips']} slips   up {_span(status['uptime_s'])}"
+                f"   recorder lost {status['recorder']['lost']}")
+    both = Table.grid(padding=(0, 4))
+    both.add_row(_numbers(status), _temperatures(status))
+    bad = [f"{role} {state}" for role, state in status["channels"].items() if state not in ("OK", "ABSENT")]
+    parts: list[RenderableType] = [head, Text(), both, Text(), _trails(trails, width, ramp)]
+    if latency is not None:
+        parts.append(_timing(latency, ramp))
+    if bad:
+        parts.append(Text("readings: " + ", ".join(bad), style="yellow"))
+    return Group(*parts, *(faults or [Text("no faults", style="green")]))
+
+
+def _numbers(status: dict[str, Any]) -> Table:
+    with_, without = errors(status)
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="dim")
+    table.add_column(justify="right")
+    for label, value, unit in (
+            ("setpoint", status["setpoint_um"], "um"), ("reference", status["reference_um"], "um"),
+            ("position, mean", status["position_um"], "um"), ("compensated", status["compensated_um"], "um"),
+            ("output (proof)", status["output_reference_um"], "um"), ("expansion", status["expansion_um"], "um"),
+            ("compensation", status["compensation_um"], "um"), ("error with it", with_, "um"),
+            ("error without it", without, "um"), ("drive", status["drive"], ""), ("power", status["power_w"], "W"),
+            ("innovation", status["innovation_c"], "K"), ("air", status["air_c"], "C")):
+        table.add_row(label, _number(value, 3), unit)
+    return table
+
+
+def _temperatures(status: dict[str, Any]) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("temperature, C")
+    for title in ("meas.", "est.", "diff."):
+        table.add_column(title, justify="right")
+    for name, measured in status["temperatures_c"].items():
+        estimate = status["estimates_c"][name]
+        difference = None if measured is None or estimate is None else measured - estimate
+        table.add_row(name.replace("_", " "), _number(measured, 2), _number(estimate, 2), _number(difference, 2))
+    return table
+
+
+def _trails(trails: dict[str, deque[float]], width: int, ramp: str) -> Table:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="dim", width=14)
+    long = max(10, min(KEPT, width - 14 - 28 - 4))
+    table.add_column(width=long, no_wrap=True)
+    table.add_column(no_wrap=True)
+    for label, key, unit, digits in TRAILS:
+        newest = [v for v in list(trails.get(key, ()))[-long:] if math.isfinite(v)]
+        bounds = f"{min(newest):.{digits}f} .. {max(newest):.{digits}f} {unit}" if newest else "-"
+        table.add_row(label, Text(sparkline(trails.get(key, ()), long, ramp), style="cyan"), bounds)
+    return table
+
+
+def _timing(latency: dict[str, Any], ramp: str) -> Text:
+    late, busy = latency["lateness"], latency["busy"]
+    bins: list[Sequence[float]] = late["bins_us"]
+    edges = (0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, math.inf)
+    counts = [sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)]
+    shape = sparkline([math.log1p(c) if c else math.nan for c in counts], len(counts), ramp)
+    return Text.assemble(("lateness      ", "dim"), (f"[{shape}]", "cyan"),
+                         f" 0..1000+ us   p50 {_number(late['p50_us'], 0)}  p99 {_number(late['p99_us'], 0)}  largest "
+                         f"{_number(late['largest_us'], 0)} us   busy p99 {_number(busy['p99_us'], 0)}"
+                         f" of {latency['period_us']:.0f} us")
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _span(seconds: float | None) -> str:
+    if seconds is None:
+        return "-"
+    hours, minutes = int(seconds // 3600), int(seconds % 3600 // 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min" if minutes else f"{seconds:.0f} s"
+
+
+def look(path: str, with_latency: bool = True) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """Status and latency from the daemon's socket; without a daemon a status that says so."""
+    try:
+        return ask(path, {"command": "status"}), ask(path, {"command": "latency"}) if with_latency else None
+    except InputError as e:
+        return {"ok": False, "state": "OFF", "ticks": 0, "faults": [
+            {"name": "no daemon", "severity": "warning", "meaning": str(e), "remedy": "it is asked again"}]}, None
+
+
+def monitor(settings: Any, interval_s: float = 0.5, once: bool = False) -> int:
+    """Show the rig until Ctrl-C; `once` (or no terminal): one screen, and 1 when no daemon runs or a fault stands."""
+    if not 0.05 <= interval_s <= 60.0:
+        raise InputError(f"--interval {interval_s:g}: 0.05 to 60 seconds were expected")
+    console = Console()
+    ramp = BLOCKS if console.encoding.lower().startswith("utf") else ASCII
+    trails: dict[str, deque[float]] = {}
+    if once or not console.is_terminal:
+        status, latency = look(settings.socket.path)
+        remember(trails, status)
+        console.print(screen(status, latency, trails, console.width, ramp))
+        return int(not status["ok"] or any(f["severity"] != "warning" for f in status["faults"]))
+    with contextlib.suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False, screen=True) as live:
+        while True:
+            status, latency = look(settings.socket.path)
+            remember(trails, status)
+            live.update(screen(status, latency, trails, console.width, ramp), refresh=True)
+            time.sleep(interval_s)
+    return 0

@@ -1,0 +1,202 @@
+"""What the dashboard shows: a thread that follows the ring and makes a frame a few times a second.
+
+It only reads shared memory: the loop never knows. A daemon that ends is seen (its segment is gone), one that starts
+again is found. Around each new fault the rows of every tick are kept: the capture.
+"""
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thermoctl.control import faults
+from thermoctl.daemon.assemble import compensator, shared_name
+from thermoctl.daemon.shared import Shared
+from thermoctl.daemon.socket import latency, status
+from thermoctl.signals import INDEX
+from thermoctl.yamlfile import InputError
+
+BEFORE_S, AFTER_S = 2.0, 2.0        # of a capture
+CAPTURES = 16
+SILENT_S = 2.0                      # no tick for so long: the rows are shown as old
+RANGED = ("position_raw_um", "compensated_um", "output_reference_um", "lateness_us", "drive", "power_w", "innovation_c")
+"""Signals of which a frame says the least and largest value since the frame before."""
+LATENESS_EDGES_US = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
+
+_T, _WALL, _BITS = INDEX["t_s"], INDEX["wall_s"], INDEX["fault_bits"]
+_TRIPS = faults.mask("fault", "critical")
+
+
+@dataclass
+class Capture:
+    """The rows of every tick from BEFORE_S before a fault to AFTER_S after it: rows (n, len(SIGNALS))."""
+    number: int
+    t_s: float
+    wall_s: float
+    faults: list[str]
+    rows: np.ndarray
+    whole: bool = False
+
+    def summary(self) -> dict[str, Any]:
+        """What a list of captures shows."""
+        return {"number": self.number, "wall_s": self.wall_s, "t_s": self.t_s, "faults": self.faults,
+                "rows": len(self.rows), "whole": self.whole}
+
+
+class Watch:
+    """Follows the ring of `settings`' daemon: `look()` once, or `run()` at `rate_hz` until `stop()`.
+
+    frame: the newest one, a dict ready for JSON; `wait(seen)` gives (number, frame) as soon as its number is not `seen`.
+    captures: newest last.
+    """
+
+    def __init__(self, settings: Any, rate_hz: float = 20.0):
+        self.settings, self.rate_hz = settings, rate_hz
+        self.name = shared_name(settings)
+        self.shared: Shared | None = None
+        self.captures: deque[Capture] = deque(maxlen=CAPTURES)
+        self.number, self.frame = 0, _down()
+        self._changed = threading.Condition()
+        self._stopping = threading.Event()
+        self._recent: deque[np.ndarray] = deque()
+        self._position = self._captured = self._inode = 0
+        self._bits = 0
+        self._moved_s = time.monotonic()
+        model = compensator(settings)
+        self._noise_c2 = model.R_v if settings.compensation.model else math.nan
+        self._gain = float(model.C[0] @ model.gain[:, 0])
+
+    def run(self) -> None:
+        """Look `rate_hz` times a second until `stop()`."""
+        while not self._stopping.wait(1.0 / self.rate_hz):
+            self.look()
+
+    def stop(self) -> None:
+        """End `run`, and everyone who waits for a frame."""
+        self._stopping.set()
+        with self._changed:
+            self._changed.notify_all()
+
+    @property
+    def stopping(self) -> bool:
+        return self._stopping.is_set()
+
+    def wait(self, seen: int, timeout_s: float) -> tuple[int, dict[str, Any]]:
+        """The newest frame, at once or when there is one newer than `seen`, at the latest after timeout_s."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.number != seen or self.stopping, timeout_s)
+            return self.number, self.frame
+
+    def look(self) -> None:
+        """Read what the loop has done since the last look; make a frame."""
+        shared = self._attached()
+        frame = _down() if shared is None else self._follow(shared)
+        with self._changed:
+            self.number, self.frame = self.number + 1, frame
+            self._changed.notify_all()
+
+    def capture(self, number: int) -> Capture | None:
+        """The capture of this number, None when it is gone."""
+        return next((c for c in list(self.captures) if c.number == number), None)
+
+    def latency(self) -> dict[str, Any] | None:
+        """Lateness, busy time and slips (socket.latency), each histogram in LATENESS_EDGES_US; None without a daemon."""
+        shared = self.shared
+        if shared is None:
+            return None
+        answer = latency(shared, self.settings.loop.period_s)
+        for name in ("lateness", "busy", "reference"):
+            bins = answer[name].pop("bins_us")
+            edges = (*LATENESS_EDGES_US, math.inf)
+            answer[name]["counts"] = [sum(c for us, c in bins if low <= us < high)
+                                      for low, high in zip(edges[:-1], edges[1:], strict=True)]
+        return {**answer, "edges_us": list(LATENESS_EDGES_US)}
+
+    def _attached(self) -> Shared | None:
+        """The segment of the daemon that runs now; None when there is none."""
+        try:
+            inode = os.stat(f"/dev/shm/{self.name}").st_ino
+        except OSError:
+            inode = 0
+        if inode != self._inode and self.shared is not None:
+            memory = self.shared._memory
+            vars(self.shared).clear()
+            self.shared = None
+            with contextlib.suppress(BufferError):      # a request still reads it: it goes with that
+                memory.close()
+        if self.shared is None and inode:
+            try:
+                shared = Shared.attach(self.name)
+            except InputError:
+                return None
+            self.shared, self._inode = shared, inode
+            self._position, self._bits = max(0, shared.ring.head - 1), 0
+            self._recent.clear()
+        return self.shared
+
+    def _follow(self, shared: Shared) -> dict[str, Any]:
+        rows, self._position, _ = shared.ring.read(self._position)
+        now = time.monotonic()
+        if len(rows):
+            self._moved_s = now
+            self._keep(rows)
+        frame = {**status(shared), "ok": True, "silent_s": round(now - self._moved_s, 1)}
+        frame["stale"] = frame["silent_s"] > SILENT_S
+        newest = rows[-1] if len(rows) else shared.ring.newest()
+        if newest is not None:
+            frame.update(wall_s=float(newest[_WALL]), position_raw_um=_finite(newest[INDEX["position_raw_um"]]),
+                         innovation_sigma_c=self._sigma(newest))
+        if len(rows):
+            with np.errstate(all="ignore"):
+                frame["range"] = {n: [_finite(np.fmin.reduce(rows[:, INDEX[n]])), _finite(np.fmax.reduce(rows[:, INDEX[n]]))]
+                                  for n in RANGED}
+        return frame
+
+    def _sigma(self, row: np.ndarray) -> float | None:
+        """Standard deviation of the innovation that the filter expects, K: S = R_v / (1 - C K), from (35)."""
+        share = self._gain * row[INDEX["kalman_gain"]]
+        return _finite(math.sqrt(self._noise_c2 / (1.0 - share))) if 0.0 <= share < 1.0 else None
+
+    def _keep(self, rows: np.ndarray) -> None:
+        """Rows into the captures under way; a capture begins where a fault that trips is new."""
+        for capture in self.captures:
+            if not capture.whole:
+                after = rows[rows[:, _T] <= capture.t_s + AFTER_S]
+                capture.rows = np.concatenate((capture.rows, after))
+                capture.whole = len(after) < len(rows)
+        bits = rows[:, _BITS].astype(np.int64) & _TRIPS
+        before = np.concatenate(([self._bits], bits[:-1]))
+        for k in np.flatnonzero(bits & ~before):
+            names = [f.name for f in faults.decode(int(bits[k] & ~before[k]))]
+            self._begin_capture(rows, int(k), names)
+        self._bits = int(bits[-1])
+        self._recent.append(rows)
+        while self._recent[0][-1, _T] < rows[-1, _T] - BEFORE_S:
+            self._recent.popleft()
+
+    def _begin_capture(self, rows: np.ndarray, k: int, names: list[str]) -> None:
+        newest = self.captures[-1] if self.captures else None
+        t_s = float(rows[k, _T])
+        if newest is not None and newest.t_s <= t_s <= newest.t_s + AFTER_S:
+            newest.faults = [*newest.faults, *(n for n in names if n not in newest.faults)]      # a consequence
+            return
+        known = np.concatenate((*self._recent, rows))
+        known = known[(known[:, _T] >= t_s - BEFORE_S) & (known[:, _T] <= t_s + AFTER_S)]
+        self._captured += 1
+        self.captures.append(Capture(self._captured, t_s, float(rows[k, _WALL]), names, known,
+                                     bool(rows[-1, _T] > t_s + AFTER_S)))
+
+
+def _down() -> dict[str, Any]:
+    return {"ok": False, "state": "OFF", "faults": [], "error": "the daemon is not running: `thermoctl start`"}
+
+
+def _finite(number: float) -> float | None:
+    return float(number) if math.isfinite(number) else None
