@@ -152,7 +152,7 @@ class Rig:
         self.temperatures = [n.name for n in p.nodes.values() if _dimension(n.unit) == "temperature" and not n.name.endswith("_memory")]
         self.velocities = [n.name for n in p.nodes.values() if _dimension(n.unit) in ("velocity", "rotation")
                            and any(f.target == n.name or f.source == n.name for f in p.flows.values())]
-        self.position_of = {}
+        self.position_of: dict[str, str] = {}
         for f in p.flows.values():
             for v in self.velocities:
                 if f.target and f.target != v and ex.names(f.rate) == {v}:
@@ -439,7 +439,7 @@ class _Builder:
         y = place.symbols.get("y")
         if y is not None:
             warm = self._unit_of_y() in TEMPERATURE and self.rig.air
-            self.symbols["reference"] = name(self.rig.air) if warm and self.rig.air not in ex.names(y) else num(0.0)
+            self.symbols["reference"] = name(self.rig.air or "") if warm and self.rig.air not in ex.names(y) else num(0.0)
         dts = [float(np.median(np.diff(d.t))) for d in self.rig.drives if len(d.t) > 1]
         self.symbols["sample"] = num(float(f"{min(dts):.6g}") if dts else 1.0)
         for e in c.effect.parameters:

@@ -97,7 +97,7 @@ def missing_flow(metric: Metric, node: str, signals: dict[str, list[np.ndarray]]
     for r in range(len(metric.drives)):
         second = np.diff(np.eye(FINE), 2, axis=0)
         rough[r * FINE:(r + 1) * FINE, r * FINE:(r + 1) * FINE] = second.T @ second
-    best = None
+    best: tuple[float, np.ndarray, np.ndarray] | None = None
     for ridge in 10.0 ** np.arange(-8, 2):
         inverse = np.linalg.inv(gram + scale * ridge * rough + 1e-10 * scale * np.eye(len(gram)))
         q = inverse @ g
@@ -107,7 +107,7 @@ def missing_flow(metric: Metric, node: str, signals: dict[str, list[np.ndarray]]
         if best is None or gcv < best[0]:
             best = (gcv, q, inverse)
     assert best is not None
-    _, q, inverse = best
+    q, inverse = best[1], best[2]
     storage = metric.model.plant.nodes[node].storage
     times, flows, when = [], [], []
     sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))

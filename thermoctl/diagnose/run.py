@@ -40,7 +40,7 @@ CLEAN = 1.25                # residual rms over sensor noise up to which the sen
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 LARGE = 1.6                 # coloured residual beyond this is physics, not a sensor's colour
 TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
-DRAWS = 200                 # draws of noise for the chance that any candidate would look as good
+DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
 
 
 @dataclass
@@ -570,15 +570,14 @@ def result(case: Case, d: Diagnosis) -> dict[str, Any]:
                 continue
             seen.add(key)
             shown.append({"effect": e.last.effect.name, "where": e.last.place.where, "probability": round(e.probability, 4)})
-    mismatch = []
-    for j, (o, x) in enumerate((o, excess[o]) for o in d.base.fit.model.outputs if o in excess):
-        del j
+    mismatch: list[dict[str, Any]] = []
+    for o, x in excess.items():
         if d.verdict == "consistent" or x < 1.1:
             continue
         node = next((s.name for s in d.suspects if s.kind == "node"), None)
         index = d.base.fit.model.outputs.index(o)
         rms = d.base.fit.rms()[o]
-        entry = {"channel": o, "rms": rms, "expected_rms": case.noise[index].sigma, "node": node}
+        entry: dict[str, Any] = {"channel": o, "rms": rms, "expected_rms": case.noise[index].sigma, "node": node}
         if d.missing is not None:
             unit = next((f.unit for f in case.plant.flows.values() if d.missing.node in (f.source, f.target) and f.unit), None)
             entry |= {"missing_flow_rms": d.missing.rms, "missing_flow_unit": unit, "when": d.missing.when,

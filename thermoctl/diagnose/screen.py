@@ -23,7 +23,7 @@ from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
 from thermoctl.plant.simulate import Drive, Simulation
 
-ROWS = 16_000               # rows of the screening, all recordings together
+ROWS = 8_000               # rows of the screening, all recordings together
 EPSILON = 1e-4              # amplitude at which a direction is taken
 CHUNK = 96
 

@@ -127,7 +127,7 @@ class Code:
         delays = list(self.output_delays)
         lists = []
         for values, extra in ((self.values, delays), ([a for a, _ in self.output_delays.values()], [])):
-            entries = []
+            entries: list[tuple[int, int, int, Expr]] = []
             for r, g in enumerate(values):
                 entries += [(r, 0, k, d) for k, s in enumerate(self.states) if (d := derivative(g, s)) is not ZERO]
                 entries += [(r, 1, c, d) for c, q in enumerate(self.active) if (d := self._by_parameter(g, q)) is not ZERO]
@@ -143,8 +143,8 @@ class Code:
             _PRELUDE,
             _ints("J_ROW", [i for i, _, _ in jac]), _ints("J_COL", [k for _, k, _ in jac]),
             _ints("V_ROW", [i for i, _, _ in sens]), _ints("V_COL", [c for _, c, _ in sens]),
-            *(_ints(f"O{o}_{field}", [e[j] for e in lists[o][1]]) for o in (0, 1)
-              for j, field in enumerate(("ROW", "KIND", "COL"))),
+            *(_ints(f"O{o}_ROW", [e[0] for e in lists[o][1]]) + _ints(f"O{o}_KIND", [e[1] for e in lists[o][1]])
+              + _ints(f"O{o}_COL", [e[2] for e in lists[o][1]]) for o in (0, 1)),
             f"static void rhs_{args}, double *out) {{\n{self._emit(self.slopes)}}}\n",
             f"static void jac_{args}, double *out) {{\n{self._emit([d for *_, d in jac])}}}\n",
             f"static void sens_{args}, double *out) {{\n{self._emit([d for *_, d in sens])}}}\n"]

@@ -334,7 +334,7 @@ def _check_names(plant: Plant, items: dict) -> None:
     """Every name in every expression exists and may stand where it stands."""
     inputs, parameters, nodes = set(plant.inputs), set(plant.parameters), set(plant.nodes)
     recorded = inputs | set(plant.outputs)
-    rules = []
+    rules: list[tuple[Expr, yamlfile.Node, str, set[str], str | bool, bool]] = []
     for n in plant.nodes.values():
         entry = items["nodes"][n.name]
         rules += [(n.storage, entry["storage"], f"storage of '{n.name}'", parameters | nodes, False, False),
