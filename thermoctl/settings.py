@@ -12,10 +12,12 @@ import dataclasses
 import math
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from thermoctl.signals import SIGNALS
 from thermoctl.yamlfile import InputError, Node, load, suggest
@@ -187,6 +189,17 @@ def changed(old: Settings, new: Settings) -> list[tuple[str, bool]]:
     return found
 
 
+def effective(settings: Settings) -> str:
+    """Every option with the value in force, as YAML that `load_settings` takes back (paths absolute)."""
+    values: dict[str, dict[str, Any]] = {}
+    for key, f, _ in options():
+        section, name = key.split(".")
+        value = _plain(getattr(getattr(settings, section), f.name))
+        if value is not None:
+            values.setdefault(section, {})[name] = dict(value) if isinstance(value, Mapping) else value
+    return yaml.safe_dump(values, sort_keys=False)
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, Node):
         return value.plain()
@@ -283,7 +296,7 @@ def _number(key: str, kind: Any, row: Option, node: Node) -> Any:
 
 def _with_unit(key: str, text: str, row: Option, node: Node) -> float:
     """'5 ms' in the option's own unit."""
-    import pint                                            # slow to import, and rarely needed
+    import pint  # slow to import, and rarely needed
     registry = pint.UnitRegistry()
     number, _, unit = text.strip().partition(" ")
     try:

@@ -127,7 +127,7 @@ def _export_table(path: Path, out: str, kind: str, want: list[str] | None, begin
     if kind == ".mcap":
         formats.write_mcap(out, table)
     elif kind == ".mf4":
-        from tempfile import TemporaryDirectory             # asammdf insists on its own suffix
+        from tempfile import TemporaryDirectory  # asammdf insists on its own suffix
         with TemporaryDirectory(dir=Path(out).parent) as folder:
             formats.write_mdf(f"{folder}/export.mf4", table)
             Path(folder, "export.mf4").replace(out)
