@@ -1,0 +1,226 @@
+"""Everything on the simulated rig, in one report: the paper's numbers, ours with the paper's method, ours with the better method."""
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoctl import plant
+from thermoctl.evaluate import chain, rigs, tables
+from thermoctl.evaluate.iso230 import mean_and_two_s
+from thermoctl.identify import experiments, filter
+from thermoctl.report.page import figure, page, table
+from thermoctl.signals import POINTS
+
+CUTOFF_HZ = 4.3e-4
+CALIBRATION_S = 7200
+
+
+def one_seed(plant_file: str, tests_file: str, seed: int, disturbance: str | None = None, keep: bool = False) -> dict[str, Any]:
+    """All estimators on one rig: {estimator: (mean, 2 s)} over test 4B, temperature errors in test 3, and (`keep`) what the figures need."""
+    tests = experiments.load_experiments(tests_file)
+    rig = rigs.Rig(plant.load(plant_file), seed, disturbance, rigs.PAPER_SCALE)
+    run4 = rigs.joined(tests["test_4a"], tests["test_4b"], "test_4")
+    r2, r3, r4 = rig.run(tests["test_2"], 1), rig.run(tests["test_3"], 2), rig.run(run4, 4)
+    r4a = rigs.Recorded(*(getattr(r4, f.name)[:CALIBRATION_S] for f in dataclasses.fields(r4)))
+    c = chain.calibrate(r2, r3, r4a)
+    with np.errstate(over="ignore", invalid="ignore"):
+        left = {k: r4.true_um - v for k, v in chain.estimates(c, r4).items()}
+        left["uncompensated"] = r4.true_um
+        if disturbance is None:
+            left["bayes"] = r4.true_um - rig.bayes(run4, 4, r4)
+        figures = {}
+        for k, v in left.items():
+            mean, two_s = mean_and_two_s(v[CALIBRATION_S:]) if np.isfinite(v).all() else (np.inf, np.inf)
+            figures[k] = (mean, two_s)
+        air = chain.smooth_air(r3.air_c)
+        truth = r3.true_c - air[:, None]
+        estimate = {"open loop": c.paper_model.simulate(chain.block_mean(r3.power_w[:, None], 10)),
+                    "paper": chain.estimate_mkf(c.mkf, r3), "better": chain.run_kalman(c.kalman, r3)}
+        estimate["open loop"] = np.repeat(estimate["open loop"], 10, axis=0)
+        estimate["open loop"] = np.vstack([estimate["open loop"], estimate["open loop"][-1:]])[:len(truth)]
+        errors = {k: (float(np.abs(v - truth).max()), float(np.abs(v - truth).mean())) for k, v in estimate.items()}
+    out = {"seed": seed, "disturbance": disturbance, "position": figures, "temperature": errors, "stable": c.paper_model.stable}
+    if keep:
+        out["kept"] = {"c": c, "r2": r2, "r3": r3, "r4": r4, "estimate": estimate, "truth": truth, "left": left,
+                       "r1": rig.run(tests["test_1"], 0)}
+    return out
+
+
+def goals(seeds: list[dict[str, Any]], disturbed: list[dict[str, Any]]) -> list[list[Any]]:
+    """[what, measured, wanted, met] for every figure that is promised."""
+    def two_s(k: str) -> np.ndarray:
+        return np.array([s["position"][k][1] for s in seeds])
+
+    def mean(k: str) -> np.ndarray:
+        return np.abs([s["position"][k][0] for s in seeds])
+
+    b, p, s, t, y = (two_s(k) for k in ("better", "paper", "siso", "twelve", "bayes"))
+    u = two_s("uncompensated")
+    rows: list[list[Any]] = []
+
+    def goal(what: str, value: float, low: float, high: float, wanted: str) -> None:
+        rows.append([what, float(value), wanted, "yes" if low <= value <= high else "NO"])
+
+    goal("uncompensated mean, median seed, um", np.median(mean("uncompensated")), 5, 10, "5 to 10")
+    goal("uncompensated 2 s, median seed, um", np.median(u), 5, 15, "5 to 15")
+    goal("paper's method 2 s / SISO 2 s, median", np.median(p / s), 0, 0.45, "about 1/3")
+    goal("largest filtered temperature error, paper's method, median seed, % of range",
+         100 * np.median([x["temperature"]["paper"][0] for x in seeds]) / tables.RANGE_K, 0, 1.8, "<= 1.8")
+    goal("largest filtered temperature error, better method, median seed, % of range",
+         100 * np.median([x["temperature"]["better"][0] for x in seeds]) / tables.RANGE_K, 0, 1.8, "<= 1.8")
+    goal("better 2 s / paper's, median seed", np.median(b / p), 0, 0.45, "<= 0.45")
+    goal("better 2 s / paper's, worst seed", np.max(b / p), 0, 0.6, "<= 0.6")
+    goal("better 2 s / SISO 2 s, median", np.median(b / s), 0, 0.2, "<= 0.2")
+    goal("better |mean| / paper's |mean|, medians", np.median(mean("better")) / np.median(mean("paper")), 0, 0.4, "<= 0.4")
+    goal("better 2 s / that of 12 sensors, median", np.median(b / t), 0, 1.5, "<= 1.5")
+    goal("better 2 s / Bayes bound, median", np.median(b / y), 0, np.inf, "printed")
+    for d in disturbed:
+        q = d["position"]
+        goal(f"{d['disturbance'].replace('_', ' ')}: better 2 s / paper's", q["better"][1] / q["paper"][1] if np.isfinite(q["paper"][1]) else 0.0,
+             0, 1.0, "<= 1")
+    return rows
+
+
+def reproduce(plant_file: str, config: str, out: Path, seeds: int = 12, full: bool = True, say: Any = print) -> bool:
+    """Run everything, write report.html and figures.json into `out`; returns whether every goal is met."""
+    began = time.monotonic()
+    out.mkdir(parents=True, exist_ok=True)
+    tests_file = str(Path(config).parent / "experiments.yaml")
+    with ProcessPoolExecutor(2) as pool:
+        first = pool.submit(one_seed, plant_file, tests_file, 0, None, True)
+        others = [pool.submit(one_seed, plant_file, tests_file, k) for k in range(1, seeds)]
+        bad = [pool.submit(one_seed, plant_file, tests_file, k % seeds, d) for k, d in enumerate(rigs.DISTURBANCES)]
+        results = [first.result(), *(f.result() for f in others)]
+        say(f"{seeds} seeds: {time.monotonic() - began:.0f} s")
+        disturbed = [f.result() for f in bad]
+        say(f"{len(disturbed)} disturbed rigs: {time.monotonic() - began:.0f} s")
+    kept = results[0].pop("kept")
+    whole = None
+    if full:
+        from thermoctl.evaluate import full as full_run
+        whole = full_run.run(config, plant_file, out, say)["figures"]
+    rows = goals(results, disturbed)
+    used = time.monotonic() - began
+    (out / "figures.json").write_text(json.dumps({"goals": rows, "seeds": results, "disturbed": disturbed, "full": whole, "seconds": used}, indent=1,
+                                                 default=float), encoding="utf-8")
+    (out / "report.html").write_text(_report(results, disturbed, kept, rows, whole, used), encoding="utf-8")
+    for what, value, wanted, met in rows:
+        say(f"{met:3s}  {value:9.3g}  {wanted:10s} {what}")
+    if whole:
+        say("full run at 1 ms, mean and 2 s in um: " + ", ".join(f"{k} {v[0]:+.2f} +- {v[1]:.2f}" for k, v in whole.items() if isinstance(v, tuple)))
+    say(f"{out / 'report.html'} ({used:.0f} s)")
+    return all(r[3] == "yes" for r in rows)
+
+
+def _median(results: list[dict], k: str) -> str:
+    m = np.median([r["position"][k][0] for r in results])
+    s = np.median([r["position"][k][1] for r in results])
+    return f"{m:+.2f} ± {s:.2f}"
+
+
+def _report(results: list[dict], disturbed: list[dict], kept: dict, rows: list, whole: dict | None, used: float) -> str:
+    paper = {k: f"{m:+.1f} ± {s:.1f}" for k, (m, s) in tables.POSITION.items()}
+    three = [["uncompensated", paper["uncompensated"], _median(results, "uncompensated"), None],
+             ["coil alone (SISO)", paper["siso"], _median(results, "siso"), None],
+             ["compensated, one sensor", paper["paper"], _median(results, "paper"), _median(results, "better")],
+             ["same filter with 12 sensors", None, None, _median(results, "twelve")],
+             ["Bayes bound, one sensor and the true plant", None, None, _median(results, "bayes")]]
+    sections = [("Position error over test 4B, µm (ISO 230-2: mean ± 2 s)",
+                 table(["", "paper", "ours, paper's method", "ours, better method"], three, f"medians of {len(results)} rigs"))]
+    if whole:
+        names = [k for k in whole if k not in ("agreement",)]
+        sections.append(("The daemon's law at 1 ms on the full plant", table(["", "mean µm", "2 s µm"], [[k, *map(float, whole[k])] for k in names])
+                         + table(["quasi-static against full run, test 2", ""], [[k, float(v)] for k, v in whole["agreement"].items()])))
+    sections.append(("What was promised", table(["", "measured", "wanted", "met"], rows)))
+    each = [[r["seed"], *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in ("uncompensated", "siso", "paper", "better", "twelve",
+             "bayes")), "stable" if r["stable"] else "unstable"] for r in results]
+    sections.append(("Every rig", table(["seed", "uncompensated", "SISO", "paper's", "better", "12 sensors", "Bayes", "paper's model"], each)))
+    dist = [[r["disturbance"].replace("_", " "), *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in
+             ("uncompensated", "siso", "paper", "better", "twelve"))] for r in disturbed]
+    sections.append(("Disturbed rigs", table(["", "uncompensated", "SISO", "paper's", "better", "12 sensors"], dist,
+                                             "the disturbance comes after the calibration, or holds throughout (sensor faults)")))
+    five, six = tables.temperature_rows(kept["estimate"], kept["truth"])
+    head = ["point", "paper open", "paper MKF", "ours open", "ours MKF", "ours better"]
+    sections.append(("Tables IV, V and VI", table(["point", "paper ζ", "ours ζ"], tables.zeta_rows(kept["c"].mkf.zeta), "Table IV, error map")
+                     + table(head, five, "Table V, largest error in test 3, °C") + table(head, six, "Table VI, mean absolute error in test 3, °C")))
+    sections.append(("Figures 10 to 18", "".join(_figures(kept))))
+    c = kept["c"]
+    gains = c.better_um.b1 + c.better_um.b2
+    gains = gains / (1 - c.better_um.f1)
+    choice = filter.choose_sensors(c.kalman.model, c.variances, filter.sensor_variance(chain.STEP_K, chain.NOISE_K), gains, 12)
+    sections.append(("What more sensors would buy", table(["sensors", "which", "standard error of position, µm"], [
+        [len(s), ", ".join(POINTS[j].replace("_", " ") for j in s), e] for s, e in choice])))
+    return page("The paper, reproduced and beaten", sections, f"simulated rigs; {used:.0f} s")
+
+
+def _figures(kept: dict) -> list[str]:
+    import matplotlib
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    c, r1, r2, r3, r4 = (kept[k] for k in ("c", "r1", "r2", "r3", "r4"))
+    out = []
+
+    def axes(n: int = 1, high: float = 2.6) -> Any:
+        fig, ax = plt.subplots(n, 1, figsize=(8, high * n), layout="constrained", squeeze=False)
+        return fig, ax[:, 0]
+
+    fig, (a,) = axes()
+    for j in (0, 10):
+        a.plot(r1.t / 60, r1.temperatures[:, j] - r1.air_c, lw=0.7, label=POINTS[j])
+    a.set(xlabel="min", ylabel="rise, K")
+    a.legend()
+    coil = r1.true_c[:, 0] - r1.air_c
+    tau = float(np.argmax(coil >= 0.632 * coil[-300:].mean()))
+    out.append(figure(fig, f"Fig. 10, test 1: step of power; the coil reaches 63.2 % after {tau:.0f} s, f_c = {1 / (2 * np.pi * tau):.2g} Hz"))
+    fig, (a, b) = axes(2)
+    a.plot(r2.t / 3600, r2.power_w)
+    a.set(xlabel="h", ylabel="power, W")
+    f, s = experiments.spectrum(r2.t, r2.power_w)
+    b.loglog(f[1:3000], s[1:3000])
+    b.axvline(CUTOFF_HZ, ls="--")
+    b.set(xlabel="Hz", ylabel="W²/Hz", ylim=(s[1:3000].max() * 1e-7, None))
+    out.append(figure(fig, f"Fig. 11, test 2: input; {100 * experiments.share_below(r2.t, r2.power_w, CUTOFF_HZ):.0f} % of its alternating power lies "
+                      "below f_c"))
+    fig, (a,) = axes()
+    a.semilogy(np.arange(1, 31), np.array(c.paper_model.info["singular_values"][:30]), "o-")
+    a.set(xlabel="order", ylabel="singular value")
+    out.append(figure(fig, "Singular values of the oblique projection (19); 12 are used, 6 to 8 stand above the noise"))
+    for r, name in ((r2, "Fig. 12, test 2"), (r3, "Fig. 14 and 15, test 3")):
+        fig, (a, b, d) = axes(3)
+        truth = r.true_c - chain.smooth_air(r.air_c)[:, None]
+        paper, better = chain.estimate_mkf(c.mkf, r), chain.run_kalman(c.kalman, r)
+        for j in (0, 2, 5, 8, 10):
+            a.plot(r.t / 3600, truth[:, j], label=POINTS[j])
+            b.plot(r.t / 3600, paper[:, j] - truth[:, j])
+            d.plot(r.t / 3600, better[:, j] - truth[:, j])
+        a.set(ylabel="rise, K")
+        b.set(ylabel="error, MKF, K")
+        d.set(ylabel="error, better, K", xlabel="h")
+        a.legend(ncols=5, fontsize=7)
+        out.append(figure(fig, f"{name}: temperatures; error of the paper's filter; error of the better one"))
+    fig, (a, b) = axes(2)
+    q = round(c.mkf.period_s)
+    coil = chain.block_mean(chain.filled(chain.rises(r3)[:, :1]), q)[:, 0]
+    t, k = c.mkf.run(chain.block_mean(r3.power_w[:, None], q)[:, 0], coil)
+    a.plot(k[:30], "o-")
+    a.set(xlabel="sample", ylabel="gain")
+    b.plot(np.arange(len(t)) * q / 3600, coil - t[:, 0], lw=0.5)
+    b.set(xlabel="h", ylabel="coil error, K")
+    out.append(figure(fig, "Fig. 16: gain of the MKF and its error signal"))
+    fig, (a, b, d) = axes(3)
+    a.plot(r4.t / 3600, r4.setpoint_um, lw=0.5)
+    b.plot(r4.t / 3600, r4.true_um, label="uncompensated")
+    for name in ("siso", "paper", "better"):
+        d.plot(r4.t / 3600, kept["left"][name], label=name, lw=0.8)
+    a.set(ylabel="setpoint, µm")
+    b.set(ylabel="error, µm")
+    d.set(ylabel="left, µm", xlabel="h")
+    d.legend(ncols=3)
+    out.append(figure(fig, "Fig. 17 and 18, test 4: motion, position error, and what each estimator leaves; the first two hours are the calibration"))
+    return out
