@@ -248,7 +248,7 @@ def _factor(tokens: Tokens, at: int) -> tuple[Dimension, int]:
         at += 1
     elif kind == "symbol":
         base = _symbol(text)
-    elif kind == "number":
+    elif kind == "number" and text[0] not in "+-":
         base = ()
     else:
         raise ValueError(f"'{text}' was not expected")
