@@ -1,6 +1,6 @@
 """Write folders of cases with concealed physics; the answers apart, hashed.
 
-    python -m tests.concealed.generate --out DIR --number N --seed S [--smoke] [--answers DIR] [--families a,b]
+    python -m tests.concealed.generate --out DIR --number N --seed S [--smoke] [--answers DIR] [--families a,b] [--kind none]
 
 DIR/NNNN/{plant.yaml,run_1.csv,run_2.csv}; answers in --answers (default DIR/../<name>_answers) as NNNN.yaml with
 `manifest.sha256`; `--answers inside` puts answer.yaml into each case instead (a set to develop on). A case is a
@@ -155,13 +155,14 @@ def _size_for(curve: tuple, target: float) -> float | None:
 
 
 def make_case(
-    seed: int, number: int, families: list[str], short: bool
+    seed: int, number: int, families: list[str], short: bool, kind: str | None = None
 ) -> tuple[dict, list[list[tuple[str, np.ndarray]]], dict]:
-    """Case `number` of a set: (plant, columns of each run, answer)."""
+    """Case `number` of a set: (plant, columns of each run, answer). `kind` asks for one kind instead of the set's turn."""
+    turn = KINDS[(number // len(families) + 7 * (number % len(families))) % len(KINDS)]
+    kind = kind or turn
     for attempt in range(20):
         rng = np.random.default_rng([seed, number, attempt])
         family = families[number % len(families)]
-        kind = KINDS[(number // len(families) + 7 * (number % len(families))) % len(KINDS)]
         schedule = SCHEDULES[(number // 3) % len(SCHEDULES)]
         scene = FAMILIES[family].scene(rng, schedule, short)
         case = _conceal(scene, kind, rng, number)
@@ -307,6 +308,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--smoke", action="store_true", help="short records")
     p.add_argument("--answers", default=None, help="folder for the sealed answers, or 'inside'")
     p.add_argument("--families", default=",".join(FAMILIES))
+    p.add_argument("--kind", choices=sorted(set(KINDS)), help="only cases of this kind")
     a = p.parse_args(argv)
     inside = a.answers == "inside"
     answers = a.out.parent / f"{a.out.name}_answers" if a.answers is None else Path(a.answers)
@@ -316,7 +318,7 @@ def main(argv: list[str] | None = None) -> int:
         target = a.out / name / "answer.yaml" if inside else answers / f"{name}.yaml"
         if target.exists():
             continue
-        plant, tables, answer = make_case(a.seed, number, a.families.split(","), a.smoke)
+        plant, tables, answer = make_case(a.seed, number, a.families.split(","), a.smoke, a.kind)
         write_case(a.out / name, plant, tables)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(yaml.safe_dump(_plain(answer), sort_keys=False))
