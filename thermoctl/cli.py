@@ -113,6 +113,23 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
 
 def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
     """diagnose, prove, demo-concealed, effects."""
+    def diagnose(args: argparse.Namespace) -> int:
+        from thermoctl.diagnose import command
+        return command.diagnose(args)
+
+    def effects(args: argparse.Namespace) -> int:
+        from thermoctl.diagnose import command
+        return command.effects(args)
+    folder = ("--effects", {"action": "append", "metavar": "DIR", "help": "a further folder of effect files (repeatable)"})
+    _add(sub, "diagnose", "where simulation and recordings differ, which physics was left out, and what adding it is worth", diagnose,
+         ("recordings", {"nargs": "+", "metavar": "REC", "help": "recordings: .csv, .parquet or .arrow"}),
+         ("--plant", {"required": True, "metavar": "FILE"}),
+         ("--out", {"required": True, "metavar": "DIR", "help": "for diagnosis.json, plant.yaml and report.html"}),
+         folder, ("--json", {"action": "store_true", "help": "print the result as JSON"}),
+         ("--quiet", {"action": "store_true", "help": "no progress, no summary"}))
+    _add(sub, "effects", "list the catalogue of effects, or `effects show NAME`", effects,
+         ("action", {"nargs": "?", "metavar": "show"}), ("name", {"nargs": "?", "metavar": "NAME"}), folder)
+
     def prove(args: argparse.Namespace) -> int:
         from thermoctl.diagnose.prove import command
         return command(args)

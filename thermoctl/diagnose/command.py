@@ -1,0 +1,133 @@
+"""The commands `diagnose` and `effects`: progress while they work, a summary for a person, JSON for a program."""
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from thermoctl.diagnose.effects import CATALOGUE, catalogue
+from thermoctl.yamlfile import InputError, suggest
+
+# How far along a diagnosis is when a stage begins (share of its whole time, from timed runs): for the estimate of what is left.
+_STAGES = (("refitting the plant", 0.0), ("screening the catalogue", 0.12), ("looking again", 0.35), ("refitting", 0.25),
+           ("screening again", 0.6), ("one effect is not needed", 0.85))
+
+
+class Progress:
+    """Writes each stage with the time gone and, from the second stage on, a rough time left."""
+
+    def __init__(self) -> None:
+        self.begun, self.share = time.monotonic(), 0.0
+
+    def __call__(self, text: str) -> None:
+        gone = time.monotonic() - self.begun
+        self.share = max(self.share, next((share for start, share in _STAGES if text.startswith(start)), 0.0))
+        left = f", about {gone * (1 - self.share) / self.share:.0f} s left" if self.share else ""
+        print(f"{gone:6.1f} s{left}: {text}", file=sys.stderr, flush=True)
+
+
+def diagnose(args: argparse.Namespace) -> int:
+    """`thermoctl diagnose`: runs the diagnosis and prints its summary. Raises InputError for unusable inputs."""
+    from thermoctl.diagnose import run
+    found = run.diagnose(args.plant, args.recordings, args.out, [Path(e) for e in args.effects or ()],
+                         None if args.quiet else Progress())
+    if args.json:
+        print(json.dumps(found, indent=1, allow_nan=False))
+    elif not args.quiet:
+        summary(found, args.out)
+    return 0
+
+
+def effects(args: argparse.Namespace) -> int:
+    """`thermoctl effects [show NAME]`: the catalogue, or one entry in full. Raises InputError for an unknown name."""
+    from rich.console import Console
+    from rich.table import Table
+    found = catalogue((CATALOGUE, *map(Path, args.effects or ())))
+    console = Console(soft_wrap=True)
+    if args.action == "show":
+        if args.name not in found:
+            raise InputError(f"'{args.name}' is not an effect of the catalogue{suggest(str(args.name), found)}; "
+                             "`thermoctl effects` lists them")
+        e = found[args.name]
+        console.print(f"[bold]{e.name}[/]: {e.title}\nplace       {e.where}\nexcited by  {e.excited_by}\n"
+                      f"mimics      {', '.join(e.mimics) or '-'}\nsource      {e.source}")
+        for number, change in enumerate(e.changes):
+            for item in change:
+                for kind, value in item.items():
+                    body = ", ".join(f"{k}: {v}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+                    console.print(f"{'change' if not number else f'variant {number}':11} {kind}: {body}", markup=False)
+        for p in e.parameters:
+            console.print(f"parameter   {p.name} [{p.unit or '1'}] {p.low:g} .. {p.high:g}, absent at {p.null:g}", markup=False)
+        return 0
+    if args.action:
+        raise InputError(f"effects: 'show NAME' or nothing was expected, not '{args.action}'")
+    table = Table("effect", "place", "what it is", box=None, header_style="bold")
+    for e in found.values():
+        table.add_row(e.name, e.where, e.title)
+    console.print(table)
+    return 0
+
+
+def sentence(found: dict[str, Any]) -> str:
+    """The verdict of a result (spec thermoctl-diagnosis/1) in one sentence."""
+    named = " and ".join(f"{f['effect'].replace('_', ' ')} at {f['where']}" for f in found["findings"])
+    sure = f" (probability {found['findings'][0]['probability']:.2f})" if found["findings"] else ""
+    if found["verdict"] == "consistent":
+        return "The recordings agree with the plant, as far as its sensors and its parameters' ranges can tell: nothing is missing."
+    if found["verdict"] == "explained":
+        return f"The plant lacks {named}{sure}; with it the simulation follows the recordings as well as the sensors allow."
+    if found["verdict"] == "ambiguous":
+        others = ", ".join(f"{a['effect'].replace('_', ' ')} at {a['where']}" for a in found["alternatives"][:4])
+        return (f"Something is missing that these recordings cannot name for sure: most likely {named}{sure}"
+                + (f", but also {others} would fit." if others else "."))
+    where = found["mismatch"][0]["node"] or found["mismatch"][0]["channel"] if found["mismatch"] else None
+    return ("Something is missing" + (f", most of it at {where}," if where else "") + " that no entry of the catalogue explains"
+            + (f"; {named} explains a part of it{sure}." if named else "."))
+
+
+def summary(found: dict[str, Any], out: str | Path) -> None:
+    """Print a result for a person."""
+    from rich.console import Console
+    from rich.table import Table
+    console = Console(soft_wrap=True)
+    console.print(f"[bold]{found['verdict']}[/]. {sentence(found)}")
+    if found["findings"]:
+        table = Table("effect", "where", "equation", "parameter", "value", "95 %", box=None, header_style="bold", title_justify="left")
+        for f in found["findings"]:
+            first = [f["effect"], f["where"], f["equation"]]
+            for name, p in f["parameters"].items():
+                table.add_row(*first, name, f"{p['value']:.4g} {p['unit'] or ''}", f"± {1.96 * (p['sd'] or 0):.2g}")
+                first = ["", "", ""]
+        console.print(table)
+    if found["alternatives"]:
+        table = Table("alternative", "where", "probability", box=None, header_style="bold")
+        for a in found["alternatives"][:8]:
+            table.add_row(a["effect"], a["where"], f"{a['probability']:.3f}")
+        console.print(table)
+    if found["mismatch"]:
+        table = Table("misfit of", "rms", "sensor allows", "missing flow", "follows", box=None, header_style="bold")
+        for m in found["mismatch"]:
+            flow = f"{m['missing_flow_rms']:.3g} {m['missing_flow_unit'] or ''} at {m['node']}" if m.get("missing_flow_rms") else "-"
+            table.add_row(m["channel"], f"{m['rms']:.4g}", f"{m['expected_rms']:.4g}", flow, ", ".join(m.get("follows") or ()))
+        console.print(table)
+    table = Table("rms of", "as it came", "refitted", "with the finding", "held out: refitted", "with the finding", "ratio (95 %)",
+                  box=None, header_style="bold")
+    fit, gain = found["fit"], found.get("held_out_gain", {})
+    for o in fit["refit_only"]:
+        g = gain.get(o)
+        table.add_row(o, *(_number(fit.get(k, {}).get(o)) for k in ("before", "refit_only", "after", "held_out_refit_only",
+                                                                    "held_out_after")),
+                      f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else "-")
+    console.print(table)
+    for note in found["notes"]:
+        console.print(f"note: {note}", markup=False)
+    if found["next_experiment"]:
+        console.print(f"next experiment: {found['next_experiment']['profile']}. {found['next_experiment']['why']}", markup=False)
+    console.print(f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json", markup=False)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
