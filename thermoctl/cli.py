@@ -25,6 +25,36 @@ def _add(sub: argparse._SubParsersAction, name: str, help: str, run: Callable[[a
 
 def _plant_commands(sub: argparse._SubParsersAction) -> None:
     """simulate, refit, plant show, plant linearise, plant check."""
+    def to(name: str) -> Callable[[argparse.Namespace], int | None]:
+        def run(args: argparse.Namespace) -> int | None:
+            from thermoctl.plant import commands
+            return getattr(commands, name)(args)
+        return run
+    plant = ("--plant", {"required": True, "metavar": "PLANT", "help": "the plant file"})
+    recordings = ("recordings", {"nargs": "+", "metavar": "REC", "help": "recordings (.csv, .parquet, .arrow)"})
+    _add(sub, "simulate", "run a plant on recorded inputs and compare", to("simulate"), plant, recordings,
+         ("--horizon", {"type": float, "metavar": "S", "help": "predict at most S seconds ahead, re-initialised from the data"}),
+         ("--out", {"metavar": "FILE", "help": "write time series (.csv, .parquet, .arrow)"}),
+         ("--plot", {"metavar": "FILE", "help": "draw measured and simulated outputs (.png, .svg)"}))
+    _add(sub, "refit", "fit a plant's parameters to recordings, inside their ranges", to("refit"), plant, recordings,
+         ("--out", {"metavar": "PLANT2", "help": "write the refitted plant"}),
+         ("--held-out", {"nargs": "+", "metavar": "REC", "help": "recordings that take no part, to judge by"}),
+         ("--noise", {"choices": ["white", "ar1"], "default": "white", "help": "the noise's colour (white); ar1 is measured"}),
+         ("--tries", {"type": int, "default": 0, "metavar": "N", "help": "further starts drawn over the ranges (0)"}))
+    own = sub.add_parser("plant", help="check, show or linearise a plant file").add_subparsers(metavar="WHAT", required=True)
+    _add(own, "check", "read plant files with every check", to("check"), ("plants", {"nargs": "+", "metavar": "PLANT"}))
+    _add(own, "show", "print a plant as tables, or draw its network", to("show"), ("plant", {"metavar": "PLANT"}),
+         ("--out", {"metavar": "FILE", "help": "draw to FILE.svg or FILE.png instead"}))
+    _add(own, "linearise", "make the compensator's model from a thermal plant", to("linearise"), ("plant", {"metavar": "PLANT"}),
+         ("--out", {"metavar": "MODEL", "help": "the model file"}),
+         ("--replace", {"action": "store_true", "help": "overwrite MODEL"}),
+         ("--rig", {"default": "simulated", "metavar": "NAME", "help": "the rig that it is for (simulated)"}),
+         ("--period", {"type": float, "default": 0.001, "metavar": "S", "help": "the loop's period (0.001)"}),
+         ("--sensor-period", {"type": float, "default": 0.1, "metavar": "S", "help": "the thermocouple's period (0.1)"}),
+         ("--kind", {"choices": ["kalman", "mkf"], "default": "kalman", "help": "steady Kalman gain, or the paper's MKF"}),
+         ("--heat-density", {"type": float, "default": 0.05, "metavar": "Q", "help": "unknown heat into each body, W^2 s (0.05)"}),
+         ("--gains", {"metavar": "FILE", "help": "also write the time-varying gain to the coil's innovation"}),
+         ("--samples", {"type": int, "default": 2000, "metavar": "N", "help": "how many of them (2000)"}))
 
 
 def _virtual_rig(config: str, line: str) -> int:

@@ -1,0 +1,253 @@
+"""The commands simulate, refit, plant show, plant linearise and plant check."""
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table as Grid
+
+from thermoctl.plant import Plant, load, save
+from thermoctl.plant.refit import Estimate, Fit, Noise, fit, report, updated
+from thermoctl.plant.simulate import Drive, Model, SimulationError
+from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.yamlfile import InputError
+
+FORGETTING = 0.7        # how much of what was known of the states survives a block, before its own data
+
+
+def simulate(args: argparse.Namespace) -> int:
+    """Free run, or predictions `--horizon` seconds ahead, on one recording or several; figures, file and plot."""
+    plant = load(args.plant)
+    runs: list[tuple[Table, Drive, np.ndarray, np.ndarray]] = []
+    model = (_all_uncertain(plant) if args.horizon else plant).compile(() if args.horizon else None)
+    for path in args.recordings:
+        table = read_table(path)
+        drive = model.drive(table)
+        try:
+            if args.horizon:
+                x, y = ahead(model, drive, args.horizon)
+            else:
+                run = model.run(drive)
+                x, y = run.x, run.y
+        except SimulationError as e:
+            raise InputError(f"{path}: {e}") from None
+        runs.append((table, drive, x, y))
+        grid = Grid(title=f"{path}: " + (f"up to {args.horizon:g} s ahead" if args.horizon else "free run"), title_justify="left")
+        for head in ("output", "samples", "rms error", "largest", "share of the range"):
+            grid.add_column(head, justify="left" if head == "output" else "right")
+        for j, o in enumerate(plant.outputs.values()):
+            e = (drive.y[:, j] - y[:, j])[np.isfinite(drive.y[:, j])]
+            if len(e):
+                spread = np.ptp(drive.y[np.isfinite(drive.y[:, j]), j])
+                rms = float(np.sqrt(np.mean(e ** 2)))
+                grid.add_row(o.name, str(len(e)), f"{rms:.4g} {o.unit or ''}", f"{np.max(np.abs(e)):.4g}",
+                             f"{100 * rms / spread:.2f} %" if spread > 0 else "")
+            else:
+                grid.add_row(o.name, "0", "not measured", "", "")
+        Console().print(grid)
+    for file, write in ((args.out, _write), (args.plot, _plot)):
+        for table, drive, x, y in runs if file else ():
+            name = Path(file) if len(runs) == 1 else Path(file).with_stem(f"{Path(file).stem}_{table.name}")
+            write(name, model, table, drive, x, y)
+            print(name)
+    return 0
+
+
+def _all_uncertain(plant: Plant) -> Plant:
+    nodes = {n.name: dataclasses.replace(n, initial_sigma=n.initial_sigma or 1.0) for n in plant.nodes.values()}
+    return dataclasses.replace(plant, nodes=nodes)
+
+
+def ahead(model: Model, drive: Drive, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`: each block starts from the states that
+    the data before it tell (an extended Kalman filter that takes a block at a time, with forgetting), so that a sample is
+    predicted from data up to `horizon_s` older. The model must have every state uncertain and no active parameter."""
+    if not model.states:
+        run = model.run(drive)
+        return run.x, run.y
+    if drive.scale is None:
+        model.prepare(drive)
+    p = model.vector(None, drive.name)
+    noise = np.array([np.hypot(o.noise or 0.0, (o.resolution or 0.0) / 12 ** 0.5) or 1e-3 * np.nanstd(drive.y[:, j]) or 1e-9
+                      for j, o in enumerate(model.plant.outputs.values())])
+    scale = np.asarray(drive.scale)
+    x, y = np.full((len(drive.t), len(model.states)), np.nan), np.full((len(drive.t), len(model.outputs)), np.nan)
+    state, _ = model.start(drive, p)
+    root = np.array([n.initial_sigma or 1.0 for n in model.plant.nodes.values()])
+    information = np.diag(1 / np.minimum(root, np.maximum(scale, 1e-12)) ** 2)
+    begin = 0
+    while begin < len(drive.t) - 1:
+        stop = min(max(int(np.searchsorted(drive.t, drive.t[begin] + horizon_s, side="right")), begin + 2), len(drive.t))
+        block = drive.part(begin, stop)
+        base, _ = model.start(block, p)
+        run = model.run(block, p, state - base, sensitivities=True)
+        assert run.dx is not None and run.dy is not None
+        new = slice(1 if begin else 0, None)                    # the first sample belongs to the block before
+        x[begin:stop][new], y[begin:stop][new] = run.x[new], run.y[new]
+        matrix, gradient = information.copy(), np.zeros(len(state))
+        for j in range(len(model.outputs)):
+            e = block.y[:, j] - run.y[:, j]
+            seen = np.isfinite(e)
+            seen[0] &= begin == 0
+            e = np.clip(e[seen] / noise[j], -50, 50)
+            h = run.dy[seen, j] / noise[j]
+            matrix += h.T @ h
+            gradient += h.T @ e
+        state = state + np.linalg.solve(matrix, gradient)
+        end = model.run(block, p, state - base)
+        spread = run.dx[-1] @ np.linalg.solve(matrix, run.dx[-1].T) / FORGETTING + np.diag((1e-6 * scale + 1e-15) ** 2)
+        information = np.linalg.inv((spread + spread.T) / 2)
+        state, begin = end.x[-1], stop - 1
+    return x, y
+
+
+def _write(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y: np.ndarray) -> None:
+    columns = {f"{o.column}_simulated": y[:, j] for j, o in enumerate(model.plant.outputs.values())}
+    columns |= {o.column: drive.y[:, j] for j, o in enumerate(model.plant.outputs.values()) if o.column in table.columns}
+    columns |= {f"{s}_state": x[:, i] for i, s in enumerate(model.states)}
+    write_table(name, Table(name.stem, str(name), table.t, columns))
+
+
+def _plot(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y: np.ndarray) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    count = len(model.outputs)
+    figure = Figure(figsize=(10, max(3.0, 1.9 * count)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    for j, (axes, o) in enumerate(zip(panels, model.plant.outputs.values(), strict=True)):
+        seen = np.isfinite(drive.y[:, j])
+        axes.plot(drive.t[seen], drive.y[seen, j], ".", ms=2, color="#7a8894", label="measured")
+        axes.plot(drive.t, y[:, j], lw=1.1, color="#c2410c", label="simulated")
+        axes.set_ylabel(f"{o.name}\n[{o.unit or '?'}]", fontsize=8)
+        axes.grid(alpha=0.3)
+    panels[0].legend(loc="upper right", fontsize=8)
+    panels[0].set_title(f"{model.plant.title}: {table.name}", fontsize=10)
+    panels[-1].set_xlabel("t [s]")
+    try:
+        figure.savefig(name, dpi=120)
+    except (OSError, ValueError) as e:
+        raise InputError(f"{name}: cannot be written: {e}") from None
+
+
+def refit(args: argparse.Namespace) -> int:
+    """Refit a plant's parameters; write the plant; report estimates and the fit before and after."""
+    plant = load(args.plant)
+    model = plant.compile()
+    if not any(p.range for p in plant.parameters.values()):
+        raise InputError(f"{plant.file}: no parameter has a 'range', so there is nothing to refit")
+    drives = [model.drive(read_table(r)) for r in args.recordings]
+    held = [read_table(r) for r in args.held_out or []]
+    try:
+        found = fit(model, drives, tries=args.tries)
+        if args.noise == "ar1":
+            found = fit(model, drives, coloured(found), start=found.z)
+        for d in drives:
+            d.scale = None
+        fitted = updated(plant, found, drives)
+        if args.out:
+            save(fitted, args.out, f"refitted by thermoctl to {', '.join(Path(r).name for r in args.recordings)}")
+        Console().print(_estimates(plant, report(found, drives)))
+        grid = Grid(title="rms error", title_justify="left")
+        for head in ("recording", "took part", "output", "before", "after"):
+            grid.add_column(head, justify="right" if head in ("before", "after") else "left")
+        for part, tables in (("yes", [read_table(r) for r in args.recordings]), ("no", held)):
+            for table in tables:
+                before, after = _errors(plant, table), _errors(fitted, table)
+                for o in plant.outputs:
+                    grid.add_row(table.name, part, o, f"{before[o]:.4g}", f"{after[o]:.4g}")
+        Console().print(grid)
+    except SimulationError as e:
+        raise InputError(f"{plant.file}: {e}") from None
+    return 0
+
+
+def coloured(found: Fit) -> list[Noise]:
+    """Each output's noise as AR(1), measured on a fit's residuals: neighbours' correlation and standard deviation."""
+    out = []
+    for j, n in enumerate(found.noise):
+        pairs = [(r[:-1, j], r[1:, j]) for r in found.residuals if len(r) > 2]
+        a, b = (np.concatenate([p[k] for p in pairs]) for k in (0, 1)) if pairs else (np.zeros(0), np.zeros(0))
+        both = np.isfinite(a) & np.isfinite(b)
+        if both.sum() < 20:
+            out.append(n)
+            continue
+        a, b = a[both], b[both]
+        phi = float(np.clip(np.sum(a * b) / max(np.sqrt(np.sum(a * a) * np.sum(b * b)), 1e-300), 0.0, 0.995))
+        out.append(Noise(max(float(np.sqrt(np.mean(a * a))), 1e-3 * n.sigma), phi))
+    return out
+
+
+def _estimates(plant: Plant, rows: list[Estimate]) -> Grid:
+    grid = Grid(title="parameters", title_justify="left")
+    for head in ("name", "before", "value", "standard error", "unit", "remark"):
+        grid.add_column(head, justify="right" if head in ("before", "value", "standard error") else "left")
+    words = {"ok": "", "dead": "dead: the data do not feel it", "flat": "flat: only a combination with others is felt"}
+    for e in rows:
+        p = plant.parameters[e.name]
+        remark = words.get(e.state, f"at a bound of its range {list(p.range or ())}")
+        if e.trades_with:
+            remark = (remark + "; " if remark else "") + f"trades with {', '.join(e.trades_with[:4])}"
+        grid.add_row(f"{e.name} ({e.recording})" if e.recording else e.name, f"{p.value:.6g}", f"{e.value:.6g}", f"{e.sd:.2g}",
+                     e.unit or "", remark)
+    return grid
+
+
+def _errors(plant: Plant, table: Table) -> dict[str, float]:
+    """Free-run rms error per output; uncertain initial states fitted, parameters held."""
+    model = plant.compile(())
+    drive = model.drive(table)
+    if not np.isfinite(drive.y).any():
+        return {o: float("nan") for o in plant.outputs}
+    if model.uncertain:
+        return fit(model, [drive]).rms()
+    e = drive.y - model.run(drive).y
+    return {o: float(np.sqrt(np.nanmean(e[:, j] ** 2))) if np.isfinite(e[:, j]).any() else float("nan")
+            for j, o in enumerate(plant.outputs)}
+
+
+def show(args: argparse.Namespace) -> int:
+    """The plant's table, and its picture when --out is given."""
+    from thermoctl.plant.show import draw, table
+    plant = load(args.plant)
+    if args.out:
+        draw(plant, args.out)
+        print(args.out)
+    else:
+        console = Console()
+        console.print(f"[bold]{plant.title}[/bold]  ({plant.file})")
+        for part in table(plant):
+            console.print(part)
+    return 0
+
+
+def linearise(args: argparse.Namespace) -> int:
+    """The compensator's model file from a thermal plant."""
+    from thermoctl.identify.modelfile import save_model
+    from thermoctl.plant import linearise as room
+    plant = load(args.plant)
+    model = room.linearise(plant, args.period, args.sensor_period, args.kind, density=args.heat_density)
+    poles = model.meta["time_constants_s"]
+    print(f"{plant.title}: order {len(model.A_minus_I)}, time constants {poles[0]:.4g} to {poles[-1]:.4g} s, coil gain {model.gain[0, 0]:.4g}")
+    if args.gains:
+        sequence = room.gains(room.thermal(plant), args.sensor_period, args.samples, density=args.heat_density)[:, :, 0]
+        t = np.arange(args.samples) * args.sensor_period
+        write_table(args.gains, Table(Path(args.gains).stem, args.gains, t, {n: sequence[:, i] for i, n in enumerate(plant.nodes)}))
+        print(args.gains)
+    if args.out:
+        if args.replace:
+            Path(args.out).unlink(missing_ok=True)
+        print(save_model(args.out, model, args.rig, [args.plant]))
+    return 0
+
+
+def check(args: argparse.Namespace) -> int:
+    """Load each plant file with all its checks."""
+    for path in args.plants:
+        p = load(path)
+        print(f"{path}: good; {len(p.inputs)} inputs, {len(p.parameters)} parameters ({sum(1 for q in p.parameters.values() if q.range)} "
+              f"free), {len(p.nodes)} nodes, {len(p.flows)} flows, {len(p.outputs)} outputs")
+    return 0
