@@ -7,7 +7,7 @@ SOURCES := pyproject.toml setup.py $(shell find thermoctl -name '*.pyx' -o -name
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test lint install clean prove
+.PHONY: run test lint install clean reproduce bench-identification prove
 run: install
 	$(BIN)/thermoctl demo --config config/simulated.yaml
 
@@ -32,6 +32,12 @@ $(VENV)/.installed: $(SOURCES)
 	$(BIN)/python -m pip install --quiet --upgrade pip setuptools wheel
 	$(BIN)/python -m pip install --quiet --editable '.[test]'
 	touch $@
+
+reproduce: install                 # the paper's tests, and the better method beside them
+	$(BIN)/thermoctl reproduce
+
+bench-identification: install
+	$(BIN)/python tests/bench/identification.py
 
 clean:
 	rm -rf $(VENV) build *.egg-info

@@ -139,6 +139,38 @@ def _recording_commands(sub: argparse._SubParsersAction) -> None:
 
 def _identify_commands(sub: argparse._SubParsersAction) -> None:
     """experiment, identify, model, tune, evaluate, reproduce."""
+    config = ("--config", {"metavar": "FILE", "default": "config/simulated.yaml", "help": "configuration (default config/simulated.yaml)"})
+
+    def room():
+        from thermoctl.evaluate import commands
+        return commands
+
+    _add(sub, "experiment", "run one of the tests of experiments.yaml on the simulated rig and record it",
+         lambda a: room().experiment(a.name, a.config, a.out, a.dry_run, a.resume), ("name", {"metavar": "NAME"}), config,
+         ("--out", {"metavar": "FILE", "help": "recording (.parquet, .csv, .arrow); default NAME.parquet"}),
+         ("--dry-run", {"action": "store_true", "help": "show schedule, power and spectrum figures; drive nothing"}),
+         ("--resume", {"action": "store_true", "help": "go on where an aborted recording ends"}))
+    _add(sub, "identify", "calibrate from the recordings of tests 2, 3 and 4A; the calibration goes into the machine's own folder",
+         lambda a: room().identify(a.test_2, a.test_3, a.test_4a, a.config, a.models, a.method, a.order),
+         ("test_2", {"metavar": "TEST_2"}), ("test_3", {"metavar": "TEST_3"}), ("test_4a", {"metavar": "TEST_4A"}), config,
+         ("--models", {"metavar": "DIR", "default": "models", "help": "folder of calibrations (default models)"}),
+         ("--method", {"choices": ("better", "paper"), "default": "better", "help": "which compensator (default better)"}),
+         ("--order", {"type": int, "default": 8, "help": "number of real poles (default 8; 0: by BIC)"}))
+    model = _add(sub, "model", "list, show or roll back calibrations", lambda a: room().model(a.action, a.models, a.name),
+                 ("action", {"choices": ("list", "show", "rollback")}), ("name", {"nargs": "?", "metavar": "NAME"}))
+    model.add_argument("--models", metavar="DIR", default="models", help="folder of calibrations (default models)")
+    _add(sub, "tune", "propose PID gains from an open-loop step on the simulated rig; shown as a difference",
+         lambda a: room().tune(a.config, a.method, a.write), config,
+         ("--method", {"choices": ("imc", "zn", "relay"), "default": "imc", "help": "default imc, with margins"}),
+         ("--write", {"action": "store_true", "help": "write the proposal into the configuration"}))
+    _add(sub, "evaluate", "ISO 230-2 figures of recordings with a reference encoder",
+         lambda a: room().evaluate(a.recordings), ("recordings", {"nargs": "+", "metavar": "RECORDING"}))
+    _add(sub, "reproduce", "the paper's tests on simulated rigs: one report with the paper's numbers, ours by its method, ours by the better one",
+         lambda a: room().reproduce(a.config, a.plant, a.out, a.seeds, a.quick), config,
+         ("--plant", {"metavar": "FILE", "default": "config/plants/actuator_truth.yaml", "help": "the truth"}),
+         ("--out", {"metavar": "DIR", "default": "out/reproduce", "help": "default out/reproduce"}),
+         ("--seeds", {"type": int, "default": 12, "help": "rigs (default 12)"}),
+         ("--quick", {"action": "store_true", "help": "without the full run at the loop's period"}))
 
 
 def _diagnose_commands(sub: argparse._SubParsersAction) -> None:

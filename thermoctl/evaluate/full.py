@@ -30,19 +30,23 @@ def recorded(rows: np.ndarray, schedule: experiments.Schedule | None = None) -> 
     return rigs.Recorded(np.arange(len(rows), dtype=float), col["power_w"], col["air_c"], temperatures, error, nothing, error, col["setpoint_um"])
 
 
-def run_test(config: str, truth: str, names: list[str], model: CompensatorModel | None, every: int = 1000) -> list[np.ndarray]:
+def run_test(config: str, truth: str, names: list[str], model: CompensatorModel | None, every: int = 1000,
+             part: float = 1.0) -> list[np.ndarray]:
     """Each named test from rest, record rows once a second; the compensator `model` acts when given."""
     from thermoctl.daemon.simulate import Simulation
     from thermoctl.settings import load_settings
     settings = load_settings(config)
     settings = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, truth=truth),
                                    compensation=dataclasses.replace(settings.compensation, enable=model is not None, model=""))
+    if model is None:                                        # nothing is estimated yet that the coil could be compared with
+        settings = dataclasses.replace(settings, protection=dataclasses.replace(settings.protection, innovation_limit_c=1e3))
     tests = experiments.load_experiments(Path(config).parent / "experiments.yaml")
     out = []
     for name in names:
         simulation = Simulation(settings, model)
         try:
-            out.append(np.vstack(list(experiments.run(simulation, tests[name], every))))
+            test = dataclasses.replace(tests[name], duration_s=part * tests[name].duration_s)
+            out.append(np.vstack(list(experiments.run(simulation, test, every))))
         finally:
             simulation.close()
     return out
@@ -94,14 +98,14 @@ def run(config: str, plant_file: str, folder: Path, say: Any = print, part: floa
     truth = str(scaled_truth(plant_file, folder / "truth.yaml"))
     tests = experiments.load_experiments(Path(config).parent / "experiments.yaml")
     with ProcessPoolExecutor(2) as pool:
-        a = pool.submit(run_test, config, truth, ["test_2"], None)
-        b = pool.submit(run_test, config, truth, ["test_3", "test_4a"], None)
+        a = pool.submit(run_test, config, truth, ["test_2"], None, 1000, part)
+        b = pool.submit(run_test, config, truth, ["test_3", "test_4a"], None, 1000, part)
         rows = {"test_2": a.result()[0], **dict(zip(("test_3", "test_4a"), b.result(), strict=True))}
         say("full run: calibration tests done")
         r = {k: recorded(v) for k, v in rows.items()}
         calibration = chain.calibrate(r["test_2"], r["test_3"], r["test_4a"])
         models = {k: chain.compensator(calibration, k) for k in ("paper", "better")}
-        futures = {k: pool.submit(run_test, config, truth, ["test_4b"], m) for k, m in models.items()}
+        futures = {k: pool.submit(run_test, config, truth, ["test_4b"], m, 1000, part) for k, m in models.items()}
         for k, f in futures.items():
             rows[f"test_4b_{k}"] = f.result()[0]
         say("full run: compensated tests done")
