@@ -20,6 +20,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Flow, Input, Node, Parameter, Plant
 from thermoctl.plant.simulate import Drive, Simulation
+from thermoctl.plant.units import dimension
 
 CATALOGUE = Path(__file__).parents[2] / "config" / "effects"
 _KEYS = ("effect", "title", "where", "needs", "change", "variants", "shapes", "parameters", "dims", "excited_by", "mimics", "source")
@@ -117,27 +118,20 @@ def _read(root: yamlfile.Node) -> Effect:
 
 # ---------------------------------------------------------------------------------------------------------- the rig
 
+_KINDS = {"temperature": "K", "length": "m", "velocity": "m/s", "current": "A", "time": "s", "rotation": "1/s", "voltage": "V"}
+
+
 @cache
 def _dimension(unit: str | None) -> str:
     if unit is None:
         return ""
     if unit in TEMPERATURE:
         return "temperature"
-    import pint
     try:
-        found = dict(_registry().parse_units(unit.replace("%", "percent")).dimensionality)
-    except (pint.errors.PintError, ValueError, TypeError, AttributeError):
+        found = dimension(unit)
+    except ValueError:
         return ""
-    known = {"temperature": {"[temperature]": 1}, "length": {"[length]": 1}, "velocity": {"[length]": 1, "[time]": -1},
-             "current": {"[current]": 1}, "time": {"[time]": 1}, "rotation": {"[time]": -1},
-             "voltage": {"[mass]": 1, "[length]": 2, "[time]": -3, "[current]": -1}}
-    return next((k for k, d in known.items() if d == found), "")
-
-
-@cache
-def _registry():
-    import pint
-    return pint.UnitRegistry(cache_folder=None)
+    return next((kind for kind, like in _KINDS.items() if dimension(like) == found), "")
 
 
 class Rig:

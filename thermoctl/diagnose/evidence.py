@@ -4,10 +4,15 @@ Each output channel's residual is white noise plus, where the data ask for it, a
     e_k = phi e_(k-1) + w_k - theta w_(k-1),    phi = 0 .. 0.9995
 fitted anew under every explanation. A white likelihood on coloured residuals would call every long drift a discovery.
 
-    score = sum over channels of N log(s^2)      (-2 log likelihood but for constants; smaller is better)
+    score = sum over channels of N log(s^2) + sum over channels and recordings of h(excess)     (smaller is better)
+
+The second sum is the prior that a sensor's colour is about as large as its white noise: excess = (rms / sigma)^2 - 1 costs
+half of itself, and beyond 30 only its logarithm more, since then every explanation is far off. Without it a slow noise
+process would swallow any slow physics of a short record.
 """
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -74,6 +79,21 @@ def white_sigma(parts: Sequence[np.ndarray]) -> float:
     return float(1.4826 * np.median(np.abs(joined)) / np.sqrt(6))
 
 
-def channels(residuals: Sequence[np.ndarray], floors: Sequence[float]) -> list[Colour]:
-    """The colour of every output channel over recordings; residuals: per recording (N, outputs)."""
-    return [colour([r[:, j] for r in residuals], floor) for j, floor in enumerate(floors)]
+def channels(residuals: Sequence[np.ndarray], sigmas: Sequence[float]) -> list[Colour]:
+    """The colour of every output channel over recordings, the prior's price in the score. residuals: per recording
+    (N, outputs); sigmas: white noise per output."""
+    out = []
+    for j, sigma in enumerate(sigmas):
+        found = colour([r[:, j] for r in residuals], 0.95 * sigma)
+        price = sum(_price(r[:, j], sigma) for r in residuals)
+        out.append(dataclasses.replace(found, score=found.score + price))
+    return out
+
+
+def _price(e: np.ndarray, sigma: float) -> float:
+    e = np.abs(e[np.isfinite(e)])
+    if not len(e):
+        return 0.0
+    limit = 8 * max(sigma, 1.5 * float(np.median(e)))
+    excess = max(float(np.mean(np.minimum(e, limit) ** 2)) / sigma ** 2 - 1.0, 0.0)
+    return 0.5 * (excess if excess <= 30 else 30 * (1 + float(np.log(excess / 30))))

@@ -90,7 +90,7 @@ class Case:
 
     def scored(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], found: Fit) -> Explanation:
         """The score of a fit: coloured -2 log likelihood and the price of its parameters."""
-        colours = channels(found.residuals, [0.95 * n.sigma for n in self.noise])
+        colours = channels(found.residuals, [n.sigma for n in self.noise])
         added = sum(len(o) for o in own)
         price = added * np.log(max(found.samples, 2)) + sum(_surprise(c) for c in effects)
         return Explanation(plant, list(effects), found, sum(c.score for c in colours) + float(price), colours, list(own))
