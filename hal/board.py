@@ -1,8 +1,8 @@
 """The board: newest readings of slow devices, written by their poller processes and read by the loop without a wait.
 
-Shared memory holds one row per role: sequence, value, time, status and a line of text on what is wrong. A row has one
-writer. The sequence is odd while a row is being written (a seqlock): a reader that meets an odd or changed sequence
-takes the row at its next tick.
+Shared memory holds one row per role: sequence, value, time, status and a line of text on what is wrong. The rows of a
+device have one writer, and the sequence of its first row guards them: it is odd while they are being written (a seqlock).
+A reader that meets an odd or changed sequence takes the rows at its next tick; an unchanged one costs it a look.
 """
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ class Board:
     def __init__(self, buffer: Any, path: Path | None, owner: bool) -> None:
         self._path, self._owner, self._buffer = path, owner, buffer
         self.rows: Any = np.ndarray(len(ROLES), _ROW, buffer)
-        self._sequence, self._status = self.rows["sequence"], self.rows["status"]
-        self._value, self._time_s = self.rows["value"], self.rows["time_s"]
+        self._sequence = self.rows["sequence"]
         if owner:
             self.rows["sequence"] = 0
             self.rows["value"], self.rows["time_s"], self.rows["status"] = np.nan, -np.inf, ABSENT
@@ -74,27 +73,30 @@ class Board:
         return self._path.name if self._path else ""
 
     def post(self, sample: Sample, device: Device) -> None:
-        """Write the device's roles from `sample`."""
+        """Write the device's roles from `sample`. A device has one writer."""
+        first = device.roles[0]
+        writing = int(self._sequence[first]) | 1        # also after a writer that was killed while it wrote
+        self._sequence[first] = writing
         for role in device.roles:
             row = self.rows[role]
-            row["sequence"] += 1
             row["value"], row["time_s"], row["status"] = sample.value[role], sample.time_s[role], sample.status[role]
             row["text"] = device.problems.get(role, "").encode()[:400] if sample.status[role] == ERROR else b""
-            row["sequence"] += 1
+        self._sequence[first] = writing + 1
 
-    def merge(self, sample: Sample, taken: dict[int, float]) -> None:
-        """Take rows into `sample`; `taken` holds the time of the newest reading shown so far for each role wanted."""
-        for role, shown in taken.items():
-            before = self._sequence[role]
-            if before & 1 or before == 0:
-                continue
-            status, value, time_s = self._status[role], self._value[role], self._time_s[role]
-            if self._sequence[role] != before:
-                continue
-            sample.status[role] = status
-            if time_s > shown:
-                taken[role] = time_s
-                sample.value[role], sample.time_s[role], sample.fresh[role] = value, time_s, True
+    def merge(self, sample: Sample, roles: list[int], seen: int) -> int:
+        """Take one device's rows into `sample` when they are newer than `seen` (what the merge before returned)."""
+        first = roles[0]
+        before = self._sequence[first]
+        if before == seen or before & 1:
+            return seen
+        rows = self.rows[roles]
+        if self._sequence[first] != before:
+            return seen
+        for role, row in zip(roles, rows, strict=True):
+            sample.status[role] = row["status"]
+            if row["time_s"] > sample.time_s[role]:
+                sample.value[role], sample.time_s[role], sample.fresh[role] = row["value"], row["time_s"], True
+        return int(before)
 
     def problem(self, role: int) -> str:
         """The text a poller left on this role."""

@@ -12,7 +12,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from hal.backend import ABSENT, ERROR, OK, ROLE, STALE, HardwareError, Sample
+import numpy as np
+
+from hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, HardwareError, Sample
 from hal.profile import Binding, bind, check_rig
 
 RECONNECT_S = 0.25          # between attempts to open a device that is gone
@@ -30,11 +32,9 @@ class Device:
         self.drives = binding.profile.drive is not None
         self.roles = [ROLE[b.role] for b in binding.bounds]
         self._bounds = [(ROLE[b.role], b.scale, b.offset, b.low, b.high) for b in binding.bounds]
-        self._stale = [(ROLE[b.role], b.channel.stale_after_s) for b in binding.bounds]
         self.problems: dict[int, str] = {}
         self.counts: dict[str, int] = {"frames": 0, "errors": 0, "reconnections": 0}
         self.up = False
-        self.connected_s = -math.inf        # when the link came up: stale times count from here at the earliest
 
     def connect(self) -> None:
         """Open and configure; may block. Raises HardwareError."""
@@ -78,12 +78,6 @@ class Device:
         for i in range(len(self._bounds)):
             self.fail(sample, i, problem)
 
-    def age(self, sample: Sample, now_s: float) -> None:
-        """Mark readings that are too old as STALE (an ERROR stays one)."""
-        for role, limit in self._stale:
-            if now_s - max(sample.time_s[role], self.connected_s) > limit and sample.status[role] != ERROR:
-                sample.status[role] = STALE
-
     def explain(self, sample: Sample, role: int) -> str:
         """One line: why this role is not OK."""
         if sample.status[role] == ERROR:
@@ -122,7 +116,11 @@ class DevicesBackend:
         self.fast, self.slow, self.board = fast, slow, board
         self.sample = Sample()
         self._owner = {role: d for d in [*fast, *slow] for role in d.roles}
-        self._taken = dict.fromkeys((role for d in slow for role in d.roles), -math.inf)
+        self._seen = dict.fromkeys(slow, 0)
+        self._limit_s = np.full(len(ROLES), np.inf)             # age at which a reading is stale
+        for b in (b for d in self._owner.values() for b in d.binding.bounds):
+            self._limit_s[ROLE[b.role]] = b.channel.stale_after_s
+        self._age_s, self._late = np.empty(len(ROLES)), np.empty(len(ROLES), dtype=bool)
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self._repairs: dict[Device, threading.Thread] = {}
@@ -136,7 +134,6 @@ class DevicesBackend:
             try:
                 device.connect()
                 device.up = True
-                device.connected_s = time.monotonic()
             except (HardwareError, OSError) as e:
                 failures.append(str(e))
         if failures:
@@ -163,13 +160,14 @@ class DevicesBackend:
             if device.up:
                 try:
                     device.read(sample, now_s)
-                    device.age(sample, now_s)
                 except (OSError, HardwareError) as e:
                     self._lost(device, e)
-        if self.slow:
-            self.board.merge(sample, self._taken)
-            for device in self.slow:
-                device.age(sample, now_s)
+        for device in self.slow:
+            self._seen[device] = self.board.merge(sample, device.roles, self._seen[device])
+        np.subtract(now_s, sample.time_s, out=self._age_s)
+        np.greater(self._age_s, self._limit_s, out=self._late)
+        if self._late.any():
+            sample.status[self._late & (sample.status == OK)] = STALE       # an ERROR stays one
         return sample
 
     def write(self, drive: float, enable: bool) -> None:
@@ -229,6 +227,5 @@ class DevicesBackend:
             except (HardwareError, OSError):
                 continue
             device.counts["reconnections"] += 1
-            device.connected_s = time.monotonic()
             device.up = True
             return

@@ -80,7 +80,7 @@ class Framer:
         buffer, sync, size, good = self._buffer, self.spec.sync, self._size, 0
         buffer += data
         at = 0
-        while True:
+        while at < len(buffer):
             start = buffer.find(sync, at)
             if start < 0:
                 keep = max(at, len(buffer) - len(sync) + 1)       # the tail may be the beginning of a sync

@@ -18,6 +18,7 @@ from hal.backend import (
     ROLE,
     STALE,
     HardwareError,
+    Sample,
     make_backend,
 )
 from hal.board import Board, poll_until
@@ -214,6 +215,20 @@ def test_poller_through_a_board_in_shared_memory(wire):
         board.close()
     with pytest.raises(HardwareError, match="supervisor creates it"):
         Board.attach(board.name)
+
+
+def test_a_board_survives_a_writer_killed_while_writing(wired):
+    device = next(d for d in make_devices(wired) if d.name == "thermocouples")
+    board, sample, shown = Board.private(), Sample(), Sample()
+    device.put(sample, 0, 2225, 1.0)
+    board.post(sample, device)
+    seen = board.merge(shown, device.roles, 0)
+    assert shown.value[COIL] == 22.25 and shown.fresh[COIL]
+    board.rows["sequence"][device.roles[0]] += 1                      # killed here
+    device.put(sample, 0, 2250, 2.0)
+    assert board.merge(shown, device.roles, seen) == seen and shown.value[COIL] == 22.25
+    board.post(sample, device)                                        # its successor
+    assert board.merge(shown, device.roles, seen) > seen and shown.value[COIL] == 22.5
 
 
 def test_control_socket_answers_nonsense_plainly(wire):
