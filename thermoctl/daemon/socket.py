@@ -275,6 +275,8 @@ def ask(path: Path | str, request: dict[str, Any], timeout_s: float = 3.0) -> di
         except (FileNotFoundError, ConnectionRefusedError):
             raise InputError(f"{path}: the daemon is not running; `thermoctl start` or `thermoctl run --config FILE`"
                              ) from None
+        except ConnectionError:
+            raise InputError(f"{path}: the daemon broke the connection off; see its log") from None
         except TimeoutError:
             raise InputError(f"{path}: no answer within {timeout_s:g} s; see the daemon's log") from None
     return json.loads(received)
