@@ -3,13 +3,22 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := pyproject.toml setup.py $(shell find thermoctl -name '*.pyx' -o -name '*.pxd')
+SOURCES := pyproject.toml setup.py $(shell find thermoctl -name '*.pyx' -o -name '*.pxd') thermoctl/control/law.py
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test lint install clean reproduce bench-identification prove
+.PHONY: run rig-hour bench-law test lint install clean reproduce bench-identification prove
 run: install
 	$(BIN)/thermoctl demo --config config/simulated.yaml
+
+# An hour of rig time in the paper's trapezoids, compensation on and off, judged by the reference encoder.
+rig-hour: install
+	$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1
+	-$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1 --no-compensation
+
+bench-law: install                 # what a call of the law costs, by compiler
+	$(BIN)/python -m pip install --quiet '.[bench]'
+	$(BIN)/python tests/bench/law_call.py
 
 test: install lint
 	$(BIN)/python -m pytest -m "not slow" tests
