@@ -51,7 +51,7 @@ bench-identification: install
 clean:
 	rm -rf $(VENV) build *.egg-info
 	find thermoctl hal -name '*.so' -delete
-	find thermoctl -name '*.pyx' | sed 's/pyx$$/c/' | xargs rm -f
+	find thermoctl -name '*.pyx' -o -name '*.pxd' | sed 's/p.x*d*$$/c/' | xargs rm -f
 
 # The compensator's models that are shipped, computed from the plant file.
 .PHONY: models

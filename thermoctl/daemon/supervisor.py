@@ -36,7 +36,7 @@ from thermoctl.daemon.shared import LOOP_PID, WARNINGS, Shared
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
-READY_S = 60.0              # self-test and warm-up (connecting devices included) end within this
+READY_S = 60.0              # the first tick comes within this: devices connect before it
 STALL_S = 1.0               # a loop that made no tick for so long is ended
 STOP_S = 3.0                # a child that was asked to stop is killed after this
 RESTART_S = 0.5             # pause before a child is started again, doubled up to
@@ -299,11 +299,11 @@ def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child]
                 ready = True
                 notify(f"READY=1\nMAINPID={os.getpid()}")
                 log("ready", ticks=head, seconds=round(now - started, 2))
-            if not loop.alive:
+            if not loop.alive and not asked:                  # a signal to the whole group ends both
                 log("the loop ended", exit=loop.process.exitcode)
                 code = loop.process.exitcode if loop.process.exitcode in (EXIT_INPUT, EXIT_HARDWARE) else EXIT_FAILED
                 break
-            if now - ticked > (STALL_S if ready else READY_S):
+            if now - ticked > (STALL_S if head > 0 else READY_S):
                 log("the loop stands still: ended", seconds=round(now - ticked, 1), pid=int(shared.counters[LOOP_PID]))
                 loop.process.kill()
                 loop.process.join()
