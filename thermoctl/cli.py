@@ -52,7 +52,7 @@ def _plant_commands(sub: argparse._SubParsersAction) -> None:
          ("--period", {"type": float, "default": 0.001, "metavar": "S", "help": "the loop's period (0.001)"}),
          ("--sensor-period", {"type": float, "default": 0.1, "metavar": "S", "help": "the thermocouple's period (0.1)"}),
          ("--kind", {"choices": ["kalman", "mkf"], "default": "kalman", "help": "steady Kalman gain, or the paper's MKF"}),
-         ("--heat-density", {"type": float, "default": 0.05, "metavar": "Q", "help": "unknown heat into each body, W^2 s (0.05)"}),
+         ("--heat-density", {"type": float, "default": 0.05, "metavar": "Q", "help": "unknown heat of a body, W^2 s (0.05)"}),
          ("--gains", {"metavar": "FILE", "help": "also write the time-varying gain to the coil's innovation"}),
          ("--samples", {"type": int, "default": 2000, "metavar": "N", "help": "how many of them (2000)"}))
 
@@ -183,7 +183,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
         from thermoctl.diagnose import command
         return command.effects(args)
     folder = ("--effects", {"action": "append", "metavar": "DIR", "help": "a further folder of effect files (repeatable)"})
-    _add(sub, "diagnose", "where simulation and recordings differ, which physics was left out, and what adding it is worth", diagnose,
+    _add(sub, "diagnose", "where simulation and recordings differ, which physics was left out, what adding it is worth", diagnose,
          ("recordings", {"nargs": "+", "metavar": "REC", "help": "recordings: .csv, .parquet or .arrow"}),
          ("--plant", {"required": True, "metavar": "FILE"}),
          ("--out", {"required": True, "metavar": "DIR", "help": "for diagnosis.json, plant.yaml and report.html"}),

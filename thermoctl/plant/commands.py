@@ -15,7 +15,8 @@ from thermoctl.plant.simulate import Drive, Model, SimulationError
 from thermoctl.recording.table import Table, read_table, write_table
 from thermoctl.yamlfile import InputError
 
-FORGETTING = 0.7        # how much of what was known of the states survives a block, before its own data
+RENEWAL = 0.1           # how far, as a share of its range, a state may have strayed from the plant within a block
+RECENT = 0.25           # share of a block from which its data count in full; older ones fade exponentially
 
 
 def simulate(args: argparse.Namespace) -> int:
@@ -39,11 +40,11 @@ def simulate(args: argparse.Namespace) -> int:
         for head in ("output", "samples", "rms error", "largest", "share of the range"):
             grid.add_column(head, justify="left" if head == "output" else "right")
         for j, o in enumerate(plant.outputs.values()):
-            e = (drive.y[:, j] - y[:, j])[np.isfinite(drive.y[:, j])]
-            if len(e):
+            error = (drive.y[:, j] - y[:, j])[np.isfinite(drive.y[:, j])]
+            if len(error):
                 spread = np.ptp(drive.y[np.isfinite(drive.y[:, j]), j])
-                rms = float(np.sqrt(np.mean(e ** 2)))
-                grid.add_row(o.name, str(len(e)), f"{rms:.4g} {o.unit or ''}", f"{np.max(np.abs(e)):.4g}",
+                rms = float(np.sqrt(np.mean(error ** 2)))
+                grid.add_row(o.name, str(len(e)), f"{rms:.4g} {o.unit or ''}", f"{np.max(np.abs(error)):.4g}",
                              f"{100 * rms / spread:.2f} %" if spread > 0 else "")
             else:
                 grid.add_row(o.name, "0", "not measured", "", "")
@@ -63,7 +64,7 @@ def _all_uncertain(plant: Plant) -> Plant:
 
 def ahead(model: Model, drive: Drive, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`: each block starts from the states that
-    the data before it tell (an extended Kalman filter that takes a block at a time, with forgetting), so that a sample is
+    the data before it tell (an extended Kalman filter that takes a block at a time), so that a sample is
     predicted from data up to `horizon_s` older. The model must have every state uncertain and no active parameter."""
     if not model.states:
         run = model.run(drive)
@@ -87,18 +88,19 @@ def ahead(model: Model, drive: Drive, horizon_s: float) -> tuple[np.ndarray, np.
         assert run.dx is not None and run.dy is not None
         new = slice(1 if begin else 0, None)                    # the first sample belongs to the block before
         x[begin:stop][new], y[begin:stop][new] = run.x[new], run.y[new]
+        recent = np.exp(-(block.t[-1] - block.t) / (2 * RECENT * max(horizon_s, block.t[-1] - block.t[0])))
         matrix, gradient = information.copy(), np.zeros(len(state))
         for j in range(len(model.outputs)):
             e = block.y[:, j] - run.y[:, j]
             seen = np.isfinite(e)
             seen[0] &= begin == 0
-            e = np.clip(e[seen] / noise[j], -50, 50)
-            h = run.dy[seen, j] / noise[j]
+            e = e[seen] / noise[j] * recent[seen]
+            h = run.dy[seen, j] / noise[j] * recent[seen, None]
             matrix += h.T @ h
             gradient += h.T @ e
         state = state + np.linalg.solve(matrix, gradient)
         end = model.run(block, p, state - base)
-        spread = run.dx[-1] @ np.linalg.solve(matrix, run.dx[-1].T) / FORGETTING + np.diag((1e-6 * scale + 1e-15) ** 2)
+        spread = run.dx[-1] @ np.linalg.solve(matrix, run.dx[-1].T) + np.diag((RENEWAL * scale) ** 2)
         information = np.linalg.inv((spread + spread.T) / 2)
         state, begin = end.x[-1], stop - 1
     return x, y
@@ -231,11 +233,13 @@ def linearise(args: argparse.Namespace) -> int:
     plant = load(args.plant)
     model = room.linearise(plant, args.period, args.sensor_period, args.kind, density=args.heat_density)
     poles = model.meta["time_constants_s"]
-    print(f"{plant.title}: order {len(model.A_minus_I)}, time constants {poles[0]:.4g} to {poles[-1]:.4g} s, coil gain {model.gain[0, 0]:.4g}")
+    print(f"{plant.title}: order {len(model.A_minus_I)}, time constants {poles[0]:.4g} to {poles[-1]:.4g} s, "
+          f"coil gain {model.gain[0, 0]:.4g}")
     if args.gains:
         sequence = room.gains(room.thermal(plant), args.sensor_period, args.samples, density=args.heat_density)[:, :, 0]
         t = np.arange(args.samples) * args.sensor_period
-        write_table(args.gains, Table(Path(args.gains).stem, args.gains, t, {n: sequence[:, i] for i, n in enumerate(plant.nodes)}))
+        columns = {n: sequence[:, i] for i, n in enumerate(plant.nodes)}
+        write_table(args.gains, Table(Path(args.gains).stem, args.gains, t, columns))
         print(args.gains)
     if args.out:
         if args.replace:
@@ -248,6 +252,7 @@ def check(args: argparse.Namespace) -> int:
     """Load each plant file with all its checks."""
     for path in args.plants:
         p = load(path)
-        print(f"{path}: good; {len(p.inputs)} inputs, {len(p.parameters)} parameters ({sum(1 for q in p.parameters.values() if q.range)} "
-              f"free), {len(p.nodes)} nodes, {len(p.flows)} flows, {len(p.outputs)} outputs")
+        free = sum(1 for q in p.parameters.values() if q.range)
+        print(f"{path}: good; {len(p.inputs)} inputs, {len(p.parameters)} parameters ({free} free), {len(p.nodes)} nodes, "
+              f"{len(p.flows)} flows, {len(p.outputs)} outputs")
     return 0

@@ -107,7 +107,8 @@ def gains(model: Thermal, sensor_period_s: float, samples: int, sensors: tuple[i
 
 
 def linearise(plant: Plant, period_s: float = 0.001, sensor_period_s: float = 0.1, kind: str = "kalman",
-              sensors: tuple[int, ...] = (0,), density: float = HEAT_DENSITY, expansion_period_s: float = 1.0) -> CompensatorModel:
+              sensors: tuple[int, ...] = (0,), density: float = HEAT_DENSITY,
+              expansion_period_s: float = 1.0) -> CompensatorModel:
     """The compensator's model of a thermal plant; `kind` 'kalman' (steady gain) or 'mkf' (scalar recursion with a map
     zeta = covariance of the steady filter's errors with the coil's). Raises InputError."""
     model = thermal(plant)
@@ -130,4 +131,5 @@ def linearise(plant: Plant, period_s: float = 0.001, sensor_period_s: float = 0.
         kind, period_s, T @ step @ back, T @ B, C @ back, gain, float((C @ noise @ C.T)[0, 0]), float(model.variance[0]),
         0.0, np.zeros(len(C)), b2, expansion_period_s, sensors, model.air_um_k,
         meta={"made_from": "plant linearise", "plant": plant.title, "sensor_period_s": sensor_period_s,
-              "heat_density_w2_s": density, "time_constants_s": [round(float(q), 3) for q in np.sort(-1 / np.linalg.eigvals(model.A).real)]})
+              "heat_density_w2_s": density,
+              "time_constants_s": [round(float(q), 3) for q in np.sort(-1 / np.linalg.eigvals(model.A).real)]})

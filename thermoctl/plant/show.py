@@ -31,6 +31,10 @@ def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, in
         i = len(vertices)
         vertices.append((way, node, "\n".join(flows[:4] + (["..."] if len(flows) > 4 else []))))
         edges.append((i, index[node], "flow", "") if way == "in" else (index[node], i, "flow", ""))
+    for f in plant.flows.values():
+        drawn = {q for q in (f.source, f.target) if q}
+        edges += [(index[n], index[end], "uses", "") for n in sorted(ex.names(f.rate) & set(plant.nodes) - drawn) for end in drawn]
+    edges = list(dict.fromkeys(edges))
     readings: dict[tuple[str, ...], list[str]] = {}
     for o in plant.outputs.values():
         readings.setdefault(tuple(sorted(ex.names(o.value) & set(plant.nodes))), []).append(o.name)
@@ -91,6 +95,7 @@ def draw(plant: Plant, path: str | Path) -> None:
     axes.set_axis_off()
     style = {"node": ("#1b3a5c", "#dce8f5", 9.5), "in": ("#9c3d00", "#fde8d9", 8), "out": ("#4a5560", "#eceff1", 8),
              "read": ("#1d6b3a", "#e2f3e6", 8)}
+    colours = {"flow": "#5a6b7b", "read": "#1d6b3a", "uses": "#9a86b8"}
     boxes = {}
     for i, (kind, _, label) in enumerate(vertices):
         edge, face, size = style[kind]
@@ -100,17 +105,21 @@ def draw(plant: Plant, path: str | Path) -> None:
     margin = 0.45
     axes.set_xlim(x[:, 0].min() - margin, x[:, 0].max() + margin)
     axes.set_ylim(x[:, 1].min() - margin, x[:, 1].max() + margin)
+    figure.canvas.draw()            # gives the boxes their sizes, at which the arrows end
     for a, b, kind, label in edges:
-        line = {"arrowstyle": "-|>" if kind == "flow" else "-", "color": "#1d6b3a" if kind == "read" else "#5a6b7b",
-                "lw": 0.8 if kind == "read" else 1.3, "ls": ":" if kind == "read" else "-", "shrinkA": 0, "shrinkB": 2,
+        line = {"arrowstyle": "-" if kind == "read" else "-|>", "color": colours[kind],
+                "lw": 1.3 if kind == "flow" else 0.8, "ls": {"flow": "-", "read": ":", "uses": "--"}[kind], "shrinkA": 0, "shrinkB": 2,
                 "patchA": boxes[a].get_bbox_patch(), "patchB": boxes[b].get_bbox_patch()}
         axes.annotate("", xy=x[b], xytext=x[a], arrowprops=line, zorder=1)
         if label:
-            axes.text(*(x[a] + x[b]) / 2, textwrap.fill(label, 22), fontsize=6.5, color="#5a6b7b", ha="center", va="center", zorder=2,
-                      bbox={"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85})
+            middle = (x[a] + x[b]) / 2
+            axes.text(middle[0], middle[1], textwrap.fill(label, 22), fontsize=6.5, color="#5a6b7b", ha="center", va="center",
+                      zorder=2, bbox={"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85})
     figure.text(0.02, 0.965, plant.title, fontsize=12, weight="bold", va="center")
-    for k, (kind, word) in enumerate((("node", "stored quantity"), ("in", "flow from outside"), ("out", "flow to outside"), ("read", "reading"))):
-        figure.text(0.98 - 0.9 / figure.get_figwidth() * (4 - k) * 1.35 + 0.02, 0.965, word, fontsize=8, color=style[kind][0], va="center",
+    words = {"node": "stored quantity", "in": "flow from outside", "out": "flow to outside", "read": "reading"}
+    for k, (kind, word) in enumerate(words.items()):
+        at = 1.0 - 1.215 / figure.get_figwidth() * (4 - k)
+        figure.text(at, 0.025 if figure.get_figwidth() < 11 else 0.965, word, fontsize=8, color=style[kind][0], va="center",
                     bbox={"boxstyle": "round,pad=0.25", "fc": style[kind][1], "ec": style[kind][0], "lw": 0.6})
     try:
         figure.savefig(path, dpi=130)
@@ -125,7 +134,8 @@ def table(plant: Plant) -> list:
     def make(title: str, heads: tuple[str, ...], rows: list[tuple]) -> Table:
         made = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
         for head in heads:
-            made.add_column(head, justify="right" if head in ("value", "low", "high", "noise", "step") else "left", overflow="fold")
+            right = head in ("low", "high", "noise", "step") or (head == "value" and title == "Parameters")
+            made.add_column(head, justify="right" if right else "left", overflow="fold")
         for row in rows:
             made.add_row(*("" if q is None else f"{q:.6g}" if isinstance(q, float) else str(q) for q in row))
         return made

@@ -13,7 +13,7 @@ from functools import cache
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Input, Node, Parameter, Plant
 from thermoctl.yamlfile import InputError
 
 Dimension = tuple[tuple[str, Fraction], ...]
@@ -31,8 +31,8 @@ _COMMON = {
 }
 _BASES = {"[length]": "m", "[mass]": "kg", "[time]": "s", "[current]": "A", "[temperature]": "K", "[substance]": "mol",
           "[luminosity]": "cd"}
-_TOKEN = re.compile(r"\s*(?:(?P<power>\*\*|\^)|(?P<op>[*/()·])|(?P<raised>[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)|(?P<number>[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
-                    r"|(?P<symbol>[^\W\d]\w*|%|°C|°))")
+_TOKEN = re.compile(r"\s*(?:(?P<power>\*\*|\^)|(?P<op>[*/()·])|(?P<raised>[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)|"
+                    r"(?P<number>[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)|(?P<symbol>[^\W\d]\w*|%|°C|°))")
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _WRITTEN = {"kg m2 s-2": "J", "kg m2 s-3": "W", "kg m s-2": "N", "kg m2 s-3 A-1": "V", "kg m2 s-3 A-2": "ohm"}
 _MAX_LENGTH, _MAX_EXPONENT = 100, 100
@@ -42,10 +42,11 @@ def check_units(plant: Plant) -> None:
     """Raises InputError (file:line, both dimensions) at the first unit or expression that does not fit."""
     units: dict[str, Dimension | None] = {"t": (("s", Fraction(1)),)}
     readings: dict[str, Dimension | None] = {}
-    for item in (*plant.inputs.values(), *plant.parameters.values(), *plant.nodes.values(), *plant.outputs.values()):
-        readings[item.name] = _declared(plant, item.name, item.unit, item.line)
-        if item.name not in plant.outputs or item.name in plant.inputs:
-            units[item.name] = readings[item.name]
+    named: list[Input | Parameter | Node] = [*plant.inputs.values(), *plant.parameters.values(), *plant.nodes.values()]
+    for item in named:
+        units[item.name] = readings[item.name] = _declared(plant, item.name, item.unit, item.line)
+    for output in plant.outputs.values():
+        readings[output.name] = _declared(plant, output.name, output.unit, output.line)
     check = _Check(plant, units, readings)
     second = (("s", Fraction(1)),)
     rates: dict[str, tuple[Dimension, str]] = {}
