@@ -76,7 +76,8 @@ def sentence(found: dict[str, Any]) -> str:
     named = " and ".join(f"{f['effect'].replace('_', ' ')} at {f['where']}" for f in found["findings"])
     sure = f" (probability {found['findings'][0]['probability']:.2f})" if found["findings"] else ""
     if found["verdict"] == "consistent":
-        return "The recordings agree with the plant, as far as its sensors and its parameters' ranges can tell: nothing is missing."
+        return ("The recordings agree with the plant, as far as its sensors and its parameters' ranges can tell: "
+                "nothing is missing.")
     if found["verdict"] == "explained":
         return f"The plant lacks {named}{sure}; with it the simulation follows the recordings as well as the sensors allow."
     if found["verdict"] == "ambiguous":
@@ -95,7 +96,7 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
     console = Console(soft_wrap=True)
     console.print(f"[bold]{found['verdict']}[/]. {sentence(found)}")
     if found["findings"]:
-        table = Table("effect", "where", "equation", "parameter", "value", "95 %", box=None, header_style="bold", title_justify="left")
+        table = Table("effect", "where", "equation", "parameter", "value", "95 %", box=None, header_style="bold")
         for f in found["findings"]:
             first = [f["effect"], f["where"], f["equation"]]
             for name, p in f["parameters"].items():
@@ -110,11 +111,12 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
     if found["mismatch"]:
         table = Table("misfit of", "rms", "sensor allows", "missing flow", "follows", box=None, header_style="bold")
         for m in found["mismatch"]:
-            flow = f"{m['missing_flow_rms']:.3g} {m['missing_flow_unit'] or ''} at {m['node']}" if m.get("missing_flow_rms") else "-"
+            size, unit = m.get("missing_flow_rms"), m.get("missing_flow_unit")
+            flow = f"{size:.3g} {unit or ''} at {m['node']}" if size else "-"
             table.add_row(m["channel"], f"{m['rms']:.4g}", f"{m['expected_rms']:.4g}", flow, ", ".join(m.get("follows") or ()))
         console.print(table)
-    table = Table("rms of", "as it came", "refitted", "with the finding", "held out: refitted", "with the finding", "ratio (95 %)",
-                  box=None, header_style="bold")
+    table = Table("rms of", "as it came", "refitted", "with the finding", "held out: refitted", "with the finding",
+                  "ratio (95 %)", box=None, header_style="bold")
     fit, gain = found["fit"], found.get("held_out_gain", {})
     for o in fit["refit_only"]:
         g = gain.get(o)
