@@ -297,7 +297,7 @@ def _number(key: str, kind: Any, row: Option, node: Node) -> Any:
 def _with_unit(key: str, text: str, row: Option, node: Node) -> float:
     """'5 ms' in the option's own unit."""
     import pint  # slow to import, and rarely needed
-    registry = pint.UnitRegistry()
+    registry: Any = pint.UnitRegistry()
     number, _, unit = text.strip().partition(" ")
     try:
         return float(registry.Quantity(float(number), unit).to(row.unit if row.unit != "1" else "").magnitude)

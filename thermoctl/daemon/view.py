@@ -119,11 +119,12 @@ def _wait_for_ready(settings: Any, daemon: subprocess.Popen) -> bool:
 
 def _show(settings: Any, console: Console, daemon: subprocess.Popen, seconds: float | None) -> bool:
     """The view until it is time; whether a fault stood at the end."""
-    begin, history, turn = time.monotonic(), [], 0
+    begin, turn = time.monotonic(), 0
+    history: list[tuple[float, float]] = []
     interval_s = 0.25 if console.is_terminal else 1.0
-    live = Live(console=console, auto_refresh=False) if console.is_terminal else contextlib.nullcontext()
     faulty = False
-    with live:
+    with contextlib.ExitStack() as stack:
+        live = stack.enter_context(Live(console=console, auto_refresh=False)) if console.is_terminal else None
         while daemon.poll() is None and (seconds is None or time.monotonic() - begin < seconds):
             status = ask(settings.socket.path, {"command": "status"})
             faulty = any(f["severity"] != "warning" for f in status["faults"])
@@ -133,7 +134,7 @@ def _show(settings: Any, console: Console, daemon: subprocess.Popen, seconds: fl
             with_, without = errors(status)
             if with_ is not None and without is not None:
                 history = [*history, (with_, without)][-60:]
-            if console.is_terminal:
+            if live is not None:
                 latency = ask(settings.socket.path, {"command": "latency"})
                 live.update(screen(status, latency, history), refresh=True)
             else:
