@@ -111,6 +111,7 @@ class Server(ThreadingHTTPServer):
     """At most MAX_CONNECTIONS at a time; one more is closed at once."""
     daemon_threads = True
     allow_reuse_address = True
+    request_queue_size = 64
 
     def __init__(self, address: tuple[str, int], settings: Any, watch: Watch, policy: Policy):
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
@@ -337,6 +338,11 @@ class Handler(BaseHTTPRequestHandler):
         for name, value in headers.items():
             self.send_header(name, value)
         self.end_headers()
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """What the library says of a request that it does not understand."""
+        self.request_version = "HTTP/1.1"
+        self._json({"ok": False, "error": message or HTTPStatus(code).phrase}, HTTPStatus(code))
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not logged: a page asks many times a second, and a log would keep addresses."""

@@ -1,0 +1,618 @@
+"""Dashboard, metrics and monitor on a simulated rig that ticks into a daemon's shared memory, in this process."""
+import contextlib
+import http.client
+import io
+import json
+import os
+import re
+import socket
+import tempfile
+import threading
+import time
+from collections import deque
+from multiprocessing import resource_tracker
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Browser, find
+from rich.console import Console
+
+from hal.backend import ERROR, OK, ROLE, make_backend
+from thermoctl.control.model import CompensatorModel
+from thermoctl.daemon import dashboard, monitor
+from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
+from thermoctl.daemon.loop import Rig
+from thermoctl.daemon.metrics import metrics
+from thermoctl.daemon.shared import Shared
+from thermoctl.daemon.socket import Commands, listen, serve, status
+from thermoctl.daemon.watch import Watch
+from thermoctl.identify.modelfile import save_model
+from thermoctl.plant import load
+from thermoctl.recording.history import history
+from thermoctl.recording.writer import RecordingWriter
+from thermoctl.settings import load_settings
+from thermoctl.signals import INDEX, POINTS, SIGNALS
+from thermoctl.yamlfile import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+PICTURES = os.environ.get("THERMOCTL_PICTURES")          # a folder that keeps the screenshots
+LIMIT_S = 20.0
+TOKEN = "a-token-of-tests-0123456789"
+
+
+def thermal_model(period_s=1e-3):
+    """The plant's own twelve bodies as compensator: conductances from its flows, gains that follow the coil's."""
+    plant = load(ROOT / "config/plants/actuator_thermal.yaml")
+    value = {name: p.value for name, p in plant.parameters.items()}
+    capacity = np.array([value[f"C_{p}"] for p in POINTS])
+    L = np.zeros((12, 12))
+    for name, flow in plant.flows.items():
+        if name.endswith("_to_air"):
+            k = POINTS.index(name.removesuffix("_to_air"))
+            L[k, k] += value[f"H_{POINTS[k]}"]
+        elif flow.source and flow.target:
+            a, b = POINTS.index(flow.source), POINTS.index(flow.target)
+            g = value[f"G_{flow.source}_{flow.target}"]
+            L[a, a] += g
+            L[b, b] += g
+            L[a, b] -= g
+            L[b, a] -= g
+    heat = np.eye(12)[0] / capacity
+    shape = np.linalg.solve(L, np.eye(12)[0])
+    expansion = np.array([value.get(f"a_{p}", 0.0) for p in POINTS])
+    return CompensatorModel("kalman", period_s, -L / capacity[:, None] * period_s, np.column_stack([heat, -np.ones(12)]) *
+                            [period_s, period_s], np.eye(12), 0.02 * shape / shape[0], 1e-6, 0.02, 0.0, np.zeros(12),
+                            expansion, 0.1)
+
+
+class Spoilt:
+    """The back end, with channels that can be set to fail."""
+
+    def __init__(self, inner):
+        self.inner, self.broken = inner, set()
+
+    def read(self, now_s):
+        sample = self.inner.read(now_s)
+        for role in self.broken:
+            sample.status[ROLE[role]], sample.fresh[ROLE[role]] = ERROR, False
+        return sample
+
+    def write(self, drive, enable):
+        self.inner.write(drive, enable)
+
+    def mend(self, role):
+        self.broken.discard(role)
+        self.inner.read(0.0).status[ROLE[role]] = OK
+
+
+class Running:
+    """A daemon's ring, mailbox and command socket, ticked in simulated time by a thread that can be held."""
+
+    def __init__(self, settings):
+        self.settings = settings
+        self.shared = Shared.create(shared_name(settings))
+        backend = make_backend(settings)
+        backend.open()
+        self.backend = Spoilt(backend)
+        self.rig = Rig(self.backend, compensator(settings), law_parameters(settings), settings.loop.period_s,
+                       self._publish, self.shared.mailbox, self.shared.parameters, self.shared.state)
+        self.rig.wall_s = lambda: self.base_s + self.now_s
+        self.base_s, self.now_s, self.record = time.time(), 0.0, None
+        self.lateness = np.random.default_rng(1)
+        self.lock, self.stopping = threading.Lock(), threading.Event()
+        self.threads = [threading.Thread(target=serve, daemon=True, args=(
+            listen(Path(settings.socket.path), None), Commands(self.shared, settings, None, lambda *a, **k: None),
+            self.stopping.is_set))]
+
+    def _publish(self, row):
+        self.shared.ring.write(row)
+        self.shared.lateness.add(row[INDEX["lateness_us"]])
+        self.shared.busy.add(row[INDEX["busy_us"]])
+        if self.record is not None:
+            self.record(row)
+
+    def tick(self, count=1):
+        """So many ticks, at once."""
+        with self.lock:
+            for _ in range(count):
+                self.now_s += self.settings.loop.period_s
+                self.rig.tick(self.now_s, self.settings.loop.period_s, float(self.lateness.gamma(4.0, 15.0)))
+        return self.rig.row
+
+    def run(self, ticks=20, pause_s=0.02):
+        """From now on, tick beside the test."""
+        def pace():
+            while not self.stopping.wait(pause_s):
+                self.tick(ticks)
+        self.threads.append(threading.Thread(target=pace, daemon=True))
+        for thread in self.threads:
+            thread.start()
+
+    def send(self, kind, value=0.0):
+        assert self.shared.mailbox.push(float(kind), value)
+
+    def until(self, condition, what):
+        """Tick until condition(row)."""
+        for _ in range(60000):
+            if condition(self.tick()):
+                return
+        raise AssertionError(what)
+
+    def arm(self):
+        self.until(lambda row: row[INDEX["state"]] == 2, "READY")
+        self.send(1)
+        self.until(lambda row: row[INDEX["state"]] == 3, "ARMED")
+
+    def close(self):
+        self.stopping.set()
+        for thread in self.threads:
+            if thread.ident:
+                thread.join(5.0)
+        self.remove()
+
+    def remove(self):
+        """As at the daemon's end. Whoever attached in this process has told the resource tracker to forget it."""
+        resource_tracker.register("/" + shared_name(self.settings), "shared_memory")
+        self.shared.remove()
+
+
+@pytest.fixture
+def settings():
+    with tempfile.TemporaryDirectory(prefix="thermoctl") as folder:
+        text = (ROOT / "config/simulated.yaml").read_text()
+        for old, new in (("plants/", f"{ROOT}/config/plants/"), ("../run/", f"{folder}/"), ("../recordings", f"{folder}/rec")):
+            text = text.replace(old, new)
+        text = re.sub(r"\n  model: .*", "", text).replace("compensation:\n", f"compensation:\n  model: {folder}/model.yaml\n")
+        save_model(Path(folder) / "model.yaml", thermal_model(), "simulated")
+        path = Path(folder) / "rig.yaml"
+        path.write_text(text)
+        yield load_settings(path)
+
+
+@pytest.fixture
+def running(settings):
+    r = Running(settings)
+    yield r
+    r.close()
+
+
+@contextlib.contextmanager
+def served(settings, follow=True, **more):
+    """(server, watch): the dashboard on a free port of loopback."""
+    watch = Watch(settings, 20.0)
+    server = dashboard.make_server(settings, "127.0.0.1:0", watch, token=TOKEN, **more)
+    threads = [threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)]
+    if follow:
+        threads.append(threading.Thread(target=watch.run, daemon=True))
+    for thread in threads:
+        thread.start()
+    try:
+        yield server, watch
+    finally:
+        watch.stop()
+        server.shutdown()
+        server.server_close()
+        for thread in threads:
+            thread.join(5.0)
+
+
+def fetch(server, path, method="GET", body=None, **headers):
+    """(status, headers, body) of one request; header names with _ for -."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=LIMIT_S)
+    connection.request(method, path, body, {k.replace("_", "-"): v for k, v in headers.items()})
+    answer = connection.getresponse()
+    try:
+        return answer.status, answer.headers, answer.read()
+    finally:
+        connection.close()
+
+
+def raw(server, data, close=False):
+    """What comes back for these bytes."""
+    with socket.create_connection(("127.0.0.1", server.server_address[1]), LIMIT_S) as s:
+        with contextlib.suppress(OSError):
+            s.sendall(data)
+            if close:
+                s.shutdown(socket.SHUT_WR)
+        received = b""
+        with contextlib.suppress(ConnectionResetError):
+            while data := s.recv(65536):
+                received += data
+    return received
+
+
+def frames(server, count, **headers):
+    """So many frames of the live stream."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=LIMIT_S)
+    connection.request("GET", "/api/live", headers=headers)
+    answer = connection.getresponse()
+    assert answer.status == 200 and answer.headers["Content-Type"] == "text/event-stream"
+    found = []
+    while len(found) < count:
+        line = answer.fp.readline()
+        assert line, "the stream ended"
+        if line.startswith(b"data: ") and b'"latency"' not in line[:20]:
+            found.append(json.loads(line[6:]))
+    connection.close()
+    return found
+
+
+# ------------------------------------------------------------------------------------------------------ the browser
+@pytest.fixture
+def browser(tmp_path):
+    program = find()
+    if program is None:
+        pytest.skip("no Chromium on this machine: the page is not driven (apt-get install chromium)")
+    b = Browser(program, tmp_path)
+    yield b
+    b.close()
+
+
+def keep(browser, name):
+    if PICTURES:
+        Path(PICTURES).mkdir(parents=True, exist_ok=True)
+        browser.picture(Path(PICTURES) / f"{name}.png")
+
+
+def choose(browser, select, value):
+    browser.js(f"(s => {{ s.value = '{value}'; s.dispatchEvent(new Event('change')); }})(document.getElementById('{select}'))")
+
+
+def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
+    """From a look at the armed rig to a pulled sensor: numbers, drawing, fault with remedy, capture, history, themes."""
+    folder = Path(settings.recording.directory)
+    folder.mkdir()
+    writer = RecordingWriter(settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: running.base_s)
+    waiting = []
+    running.record = lambda row: waiting.append(row.copy())
+    running.base_s -= 40.0
+    running.arm()
+    running.send(3, 12.5)
+    running.tick(max(0, 40000 - round(running.now_s / settings.loop.period_s)))
+    writer.write(np.array(waiting))
+    writer.close()
+    running.record = None
+    running.run()
+    with served(settings) as (server, watch):
+        browser.dark(False)
+        browser.open(dashboard.url(server))
+        browser.until("document.getElementById('state').textContent === 'ARMED'")
+        shown = browser.until("(t => t.startsWith('12.5') && t)(document.querySelector('[data-v=setpoint_um]').textContent)")
+        assert shown == "12.500 µm"
+        coil = status(running.shared)["temperatures_c"]["coil"]
+        assert abs(float(browser.until("(t => t !== '–' && t)(document.getElementById('m-coil').textContent)")) - coil) < 2.0
+        assert browser.js("document.querySelectorAll('#labels .num').length") == 12
+        assert browser.js("[...document.querySelectorAll('[data-p]')].every(p => p.style.fill)")
+        assert "none" in browser.js("document.getElementById('fault-list').textContent")
+        assert browser.js("document.getElementById('commands').hidden")
+        browser.until("document.getElementById('n-late').textContent.includes('p99.9')")
+        browser.until("/ [1-9]\\d* points from 1 10 Hz file/.test(' ' + document.getElementById('n-history').textContent)"
+                      " || document.getElementById('n-history').textContent.match(/; [1-9]\\d* points/)")
+        browser.until("document.getElementById('err-on').textContent.endsWith('µm')")
+        # Frames come as often as they are made, and the page keeps up.
+        count = "points.length"
+        browser.until(f"{count} > 30")
+        # Keyboard: every control and chart is reached by Tab, a chart read by arrows.
+        reached = set()
+        for _ in range(30):
+            browser.key("Tab")
+            reached.add(browser.js("document.activeElement.id || document.activeElement.className"))
+        assert {"skip", "pause", "theme", "c-position", "c-error", "signal", "span", "c-history"} <= reached
+        browser.js("document.getElementById('c-position').focus()")
+        browser.key("End")
+        browser.until("/reference 12\\.500/.test(document.getElementById('r-position').textContent)")
+        keep(browser, "dashboard-light")
+        # Every tick of the last seconds, and other signals, from the same recording.
+        choose(browser, "signal", "coil_c")
+        browser.until("document.getElementById('n-history').textContent.startsWith('coil: measured')")
+
+        # A pulled sensor.
+        running.backend.broken.add("coil_c")
+        browser.until("document.getElementById('state').textContent === 'FAULT'")
+        fault = browser.until("(t => t.includes('coil error') && t)(document.getElementById('fault-list').textContent)")
+        assert "→ look at `thermoctl status`" in fault
+        assert browser.js("document.getElementById('faults').className") == "w12 alarm"
+        assert browser.js("document.getElementById('fault-list').getAttribute('role')") == "alert"
+        browser.until("!document.getElementById('capture').disabled")
+        browser.until("charts.capture.x.length > 3900 && charts.capture.x[0] < -1.9")
+        steps = browser.js("charts.capture.x.slice(1).map((v, k) => v - charts.capture.x[k])")
+        assert max(steps) < 1.5e-3, "a capture has every tick"
+        choose(browser, "capture-signal", "state")
+        values = browser.until("(v => v[0] === 3 && v)(charts.capture.series[0].y)")
+        assert values[0] == 3.0 and values[-1] == 4.0
+        assert browser.js("charts.capture.x[charts.capture.series[0].y.indexOf(4)]") == 0.0
+        browser.dark(True)
+        browser.until("colours.ink === '#e8edf2'")
+        keep(browser, "dashboard-dark-fault")
+        assert browser.messages == []
+
+        # The daemon goes away: said, and the page lives on.
+        running.remove()
+        browser.until("document.getElementById('state').textContent === 'no daemon'")
+        assert "thermoctl start" in browser.js("document.getElementById('fault-list').textContent")
+
+
+def test_commands_from_the_page(settings, running, browser):
+    running.until(lambda row: row[INDEX["state"]] == 2, "READY")
+    running.run()
+    with served(settings, commands=True) as (server, watch):
+        browser.open(dashboard.url(server))
+        assert TOKEN not in browser.until("document.getElementById('state').textContent === 'READY' && location.href")
+        browser.js("window.confirm = () => true; document.getElementById('arm').focus()")
+        browser.key("Enter")
+        browser.until("document.getElementById('state').textContent === 'ARMED'")
+        browser.js("document.getElementById('setpoint').value = '900'; document.getElementById('go').click()")
+        browser.until("document.getElementById('said').textContent.includes('setpoint_low_um')")
+        browser.js("document.getElementById('setpoint').value = '-3.5'; document.getElementById('go').click()")
+        browser.until("document.querySelector('[data-v=setpoint_um]').textContent === '−3.500 µm'")
+        browser.js("document.getElementById('disarm').click()")
+        browser.until("document.getElementById('state').textContent === 'READY'")
+    assert [m for m in browser.messages if "409" not in m and "ERR_" not in m] == []
+
+
+def test_nothing_from_a_recording_or_a_signal_becomes_markup():
+    page = dashboard.PAGE.read_text()
+    assert "innerHTML" not in page and "document.write" not in page and "insertAdjacentHTML" not in page
+    assert not re.search(r"""(src|href)=["']?(https?:)?//""", page), "the page works offline"
+
+
+# ---------------------------------------------------------------------------------------------------- the requests
+def test_who_may_look_and_command(settings, running):
+    running.until(lambda row: row[INDEX["state"]] == 2, "READY")
+    running.run()
+    body, kind = json.dumps({"command": "arm"}), {"Content_Type": "application/json"}
+    with served(settings) as (server, watch):
+        status, headers, page = fetch(server, "/")
+        assert status == 200 and b"<title>thermoctl" in page
+        policy = headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy and "unsafe" not in policy and headers["X-Content-Type-Options"] == "nosniff"
+        assert fetch(server, "/api/info")[0] == 200                       # loopback: everyone here may look
+        assert fetch(server, "/api/command", "POST", body, Authorization=f"Bearer {TOKEN}", **kind)[0] == 405
+        assert fetch(server, "/metrics")[0] == 404
+        for method in ("PUT", "DELETE", "PATCH", "OPTIONS", "BREW"):
+            assert fetch(server, "/", method)[0] == 405
+    with served(settings, commands=True) as (server, watch):
+        def post(**headers):
+            return fetch(server, "/api/command", "POST", body, **{**kind, **headers})[0]
+        assert post() == post(Authorization="Bearer wrong") == post(Authorization=TOKEN) == 401
+        good = {"Authorization": f"Bearer {TOKEN}"}
+        assert post(**good, Origin="http://evil.example") == post(**good, Sec_Fetch_Site="cross-site") == 403
+        assert post(**good, Host="evil.example") == 421
+        assert post(**good, Content_Type="text/plain") == 415
+        assert running.rig.row[INDEX["state"]] == 2, "not one of them armed the rig"
+        assert fetch(server, "/api/command", "POST", '{"command": "reload"}', **kind, **good)[0] == 400
+        assert fetch(server, "/api/command", "POST", "[" * 1000, **kind, **good)[0] == 400
+        assert fetch(server, "/api/command", "POST", '{"command": "setpoint", "value": 1}', **kind, **good)[0] == 409
+        assert post(**good) == 200 and running.rig.row[INDEX["state"]] == 3
+
+
+def test_beyond_this_machine_the_token_is_needed(settings, running):
+    running.tick(10)
+    watch = Watch(settings)
+    server = dashboard.make_server(settings, "0.0.0.0:0", watch, with_metrics=True, token=TOKEN)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    try:
+        for path in ("/api/info", "/api/live", "/api/history", "/api/captures", "/api/capture", "/metrics"):
+            status, headers, body = fetch(server, path)
+            assert status == 401 and headers["WWW-Authenticate"] == "Bearer" and TOKEN.encode() not in body
+            assert fetch(server, f"{path}?token={TOKEN}")[0] == 401, "never in an address"
+        assert fetch(server, "/api/info", Authorization=f"Bearer {TOKEN}")[0] == 200
+        assert fetch(server, "/api/info", Authorization=f"Bearer {TOKEN}", Host=socket.gethostname())[0] == 200
+        assert fetch(server, "/api/info", Authorization=f"Bearer {TOKEN}", Host="rebound.example")[0] == 421
+        assert f"#token={TOKEN}" in dashboard.url(server)
+    finally:
+        watch.stop()
+        server.shutdown()
+        server.server_close()
+        thread.join(5.0)
+
+
+def test_limits_of_a_request(settings, monkeypatch):
+    monkeypatch.setattr(dashboard, "REQUEST_S", 0.3)
+    with served(settings, follow=False, commands=True) as (server, watch):
+        def code(data, **more):
+            answer = raw(server, data, **more)
+            return int(answer.split()[1]) if answer else None
+        assert code(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * 20000 + b"\r\n\r\n") in (431, None)
+        assert code(b"GET /" + b"a" * 9000) in (431, None)
+        assert code(b"GET / HTTP/1.1\r\nHost: localhost\r\n") == 408       # and then nothing more
+        assert code(b"GET / HTTP/1.1\r\n\r\n") == 421
+        assert code(b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n\r\n") == 421
+        assert code(b"nonsense\r\n\r\n") == 400 and code(b"GET / HTTP/9.9\r\nHost: localhost\r\n\r\n") == 505
+        assert code(b"", close=True) is None
+        head = (b"POST /api/command HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer " + TOKEN.encode()
+                + b"\r\nContent-Type: application/json\r\n")
+        assert code(head + b"Content-Length: 2000\r\n\r\n") == 413
+        assert code(head + b"Content-Length: -1\r\n\r\n") == code(head + b"Transfer-Encoding: chunked\r\n\r\n") == 411
+        assert code(head + b"Content-Length: 20\r\n\r\n{") == 408
+        for path in ("/api/history?signal=nothing", "/api/history?begin=x", "/api/history?points=1e9",
+                     "/api/history?points=0", "/api/history?begin=5&end=4", "/api/history?end=inf", "/api/capture?number=nan",
+                     "/api/history?" + "&".join(f"a{k}=1" for k in range(20)), "/api/history?signal=%ff"):
+            status, _, body = fetch(server, path)
+            assert status == 400 and json.loads(body)["error"], path
+        assert fetch(server, "/api/capture?number=7")[0] == fetch(server, "/../../etc/passwd")[0] == 404
+        # More connections than there are places: the last are closed at once, those that say nothing a little later.
+        monkeypatch.setattr(dashboard, "REQUEST_S", 2.0)
+        crowd = [socket.create_connection(("127.0.0.1", server.server_address[1])) for _ in range(dashboard.MAX_CONNECTIONS + 8)]
+        answers = [s.recv(12) for s in crowd]
+        for s in crowd:
+            s.close()
+        assert 1 <= answers.count(b"") <= 8 and set(answers) == {b"", b"HTTP/1.1 408"}
+        assert fetch(server, "/")[0] == 200
+    with pytest.raises(InputError, match="at least 16"):
+        dashboard.make_server(settings, "127.0.0.1:0", Watch(settings), token="short")
+    for address in ("nowhere:80", "127.0.0.1:99999", "127.0.0.1", "1.2.3.4:0"):
+        with pytest.raises(InputError, match="--listen"):
+            dashboard.make_server(settings, address, Watch(settings))
+
+
+def test_the_stream_and_a_restart(settings, running):
+    """Without a daemon, with one, after it went, and with the next one."""
+    running.remove()
+    with served(settings) as (server, watch):
+        assert frames(server, 2)[1]["ok"] is False
+        second = Running(settings)
+        try:
+            second.run()
+            seen = -1
+            deadline = time.monotonic() + LIMIT_S
+            while not watch.frame.get("ticks") and time.monotonic() < deadline:
+                seen, _ = watch.wait(seen, 1.0)
+            found = frames(server, 5)
+            assert all(f["ok"] and not f["stale"] for f in found)
+            ticks = [f["ticks"] for f in found]
+            assert ticks == sorted(ticks) and ticks[-1] > ticks[0]
+            assert set(found[0]["temperatures_c"]) == set(POINTS)
+        finally:
+            second.close()
+        while watch.frame["ok"] and time.monotonic() < deadline:
+            seen, _ = watch.wait(seen, 1.0)
+        assert watch.frame["ok"] is False and "thermoctl start" in watch.frame["error"]
+
+
+def test_one_capture_for_a_fault_and_its_consequences(settings, running):
+    watch = Watch(settings)
+    watch.look()
+    running.arm()
+    for _ in range(5):
+        running.tick(500)
+        watch.look()
+    running.backend.broken.add("position_um")
+    first = running.tick()[INDEX["t_s"]]
+    for _ in range(6):
+        running.tick(500)
+        watch.look()
+    assert len(watch.captures) == 1
+    capture = watch.captures[0]
+    assert capture.whole and "position_error" in capture.faults
+    t = capture.rows[:, INDEX["t_s"]]
+    assert t[0] == pytest.approx(first - 2.0, abs=2e-3) and t[-1] == pytest.approx(first + 2.0, abs=2e-3)
+    assert np.allclose(np.diff(t), 1e-3) and capture.rows.shape[1] == len(SIGNALS)
+    running.backend.mend("position_um")
+    running.send(2)
+    running.tick(3000)
+    watch.look()
+    running.backend.broken.add("position_um")
+    running.tick(2500)
+    watch.look()
+    assert [c.number for c in watch.captures] == [1, 2]
+
+
+# ---------------------------------------------------------------------------------------------------------- history
+def recorded(settings, hours, wall_s, hertz=1.0):
+    """A recording of slow rows that ends at wall_s: compensation_um is a ramp with one spike."""
+    Path(settings.recording.directory).mkdir(exist_ok=True)
+    n = round(hours * 3600 * hertz)
+    rows = np.zeros((n, len(SIGNALS)))
+    rows[:, INDEX["t_s"]] = np.arange(n) / hertz
+    rows[:, INDEX["wall_s"]] = wall_s - hours * 3600 + rows[:, INDEX["t_s"]]
+    rows[:, INDEX["compensation_um"]] = np.linspace(0.0, 10.0, n)
+    rows[n // 2, INDEX["compensation_um"]] = 77.0
+    rows[n // 3:n // 3 + 900, INDEX["air_c"]] = np.nan
+    writer = RecordingWriter(settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: float(rows[0, INDEX["wall_s"]]))
+    writer.write(rows)
+    writer.close()
+    return rows
+
+
+def test_a_day_of_history_is_decimated_without_losing_a_spike(settings):
+    end = 1.8e9
+    rows = recorded(settings, 24.0, end, 0.25)
+    for path in Path(settings.recording.directory).iterdir():
+        os.utime(path, (end, end))
+    found = history(settings.recording.directory, "compensation_um", end - 86400.0, end, 500)
+    assert 400 <= len(found.t) <= 500 and found.source == "tier" and found.files == 1
+    assert found.high.max() == 77.0 and (found.low <= found.mean + 1e-12).all() and (found.mean <= found.high + 1e-12).all()
+    assert (np.diff(found.t) > 0).all() and found.t[0] >= end - 86400.0 and found.t[-1] <= end
+    edges = end - 86400.0 + np.arange(501) / 500 * 86400.0
+    wall = rows[:, INDEX["wall_s"]]
+    for k in (0, 123, 250, 499):                       # against the rows themselves
+        inside = rows[(wall >= edges[k]) & (wall < edges[k + 1]), INDEX["compensation_um"]]
+        assert found.mean[k] == pytest.approx(inside.mean(), rel=0.02, abs=0.02)
+    zoom = history(settings.recording.directory, "compensation_um", end - 43210.0, end - 43190.0, 500)
+    assert zoom.source == "full" and zoom.high.max() == 77.0 and 5 <= len(zoom.t) <= 6
+    hole = history(settings.recording.directory, "air_c", end - 86400.0, end, 500)
+    assert 480 <= len(hole.t) < 500
+    assert len(history(settings.recording.directory, "air_c", 5.0, 100.0).t) == 0
+    assert len(history(settings.recording.directory + "-none", "air_c", 5.0, 100.0).t) == 0
+    with pytest.raises(InputError, match="did you mean 'air_c'"):
+        history(settings.recording.directory, "air_x", 0.0, 1.0)
+
+
+# ---------------------------------------------------------------------------------------------------------- metrics
+def test_metrics_are_understood_by_prometheus(settings, running):
+    parser = pytest.importorskip("prometheus_client.parser", reason="prometheus_client is not installed")
+    running.arm()
+    running.tick(2000)
+    families = {f.name: f for f in parser.text_string_to_metric_families(metrics(running.shared))}
+    row = running.rig.row
+
+    def value(name, /, **labels):
+        found = [s.value for f in families.values() for s in f.samples if s.name == name and s.labels == labels]
+        assert len(found) == 1, (name, labels, found)
+        return found[0]
+
+    assert value("thermoctl_up") == 1.0 and value("thermoctl_state", state="ARMED") == 1.0
+    assert value("thermoctl_compensated_um") == row[INDEX["compensated_um"]]
+    assert value("thermoctl_temperature_celsius", point="shaft_2", kind="estimated") == row[INDEX["shaft_2_est_c"]]
+    assert value("thermoctl_ticks_total") == row[INDEX["tick"]]
+    assert value("thermoctl_lateness_seconds_count") == running.shared.areas["lateness"].sum()
+    buckets = [s for s in families["thermoctl_lateness_seconds"].samples if s.name.endswith("_bucket")]
+    counts = [s.value for s in buckets]
+    assert counts == sorted(counts) and buckets[-1].labels["le"] == "+Inf" and counts[-1] > 0
+    inside = running.shared.areas["lateness"][:50].sum()
+    assert value("thermoctl_lateness_seconds_bucket", le="5e-05") == inside
+    running.backend.broken.add("coil_c")
+    running.tick(3)
+    families = {f.name: f for f in parser.text_string_to_metric_families(metrics(running.shared))}
+    assert value("thermoctl_fault", name="coil_error", severity="fault") == 1.0
+    assert value("thermoctl_state", state="FAULT") == 1.0
+    assert [f.name for f in parser.text_string_to_metric_families(metrics(None))] == ["thermoctl_up"]
+
+    exported = set(re.findall(r"^(thermoctl_\w+)", metrics(running.shared), re.MULTILINE))
+    grafana = json.loads((ROOT / "config/grafana-dashboard.json").read_text())
+    used = [re.findall(r"thermoctl_\w+", t["expr"]) for p in grafana["panels"] for t in p.get("targets", ())]
+    assert len(used) >= 10 and all(used)
+    assert {name for names in used for name in names} <= exported
+    with served(settings, follow=True, with_metrics=True) as (server, watch):
+        watch.wait(watch.number, LIMIT_S)
+        status, headers, body = fetch(server, "/metrics")
+        assert status == 200 and headers["Content-Type"].startswith("text/plain; version=0.0.4") and b"thermoctl_up 1.0" in body
+
+
+# ---------------------------------------------------------------------------------------------------------- monitor
+def test_sparkline():
+    assert monitor.sparkline([0, 1, 2, 3, 4, 5, 6, 7], 8) == "▁▂▃▄▅▆▇█"
+    assert monitor.sparkline([5, 5, 5], 8) == "▅▅▅" and monitor.sparkline([], 8) == ""
+    assert monitor.sparkline([float("nan"), 1, 2], 2) == "▁█" and monitor.sparkline([float("nan")] * 3, 8) == "   "
+    assert monitor.sparkline(range(100), 4, monitor.ASCII) == "_-*@"
+
+
+def test_the_monitor_on_a_recorded_status(settings, running):
+    """What a person sees over ssh: on 80 columns nothing is cut, every fault has its remedy."""
+    running.arm()
+    running.send(3, 8.0)
+    trails: dict[str, deque[float]] = {}
+    for _ in range(30):
+        running.tick(100)
+        monitor.remember(trails, status(running.shared))
+    running.backend.broken.add("coil_c")
+    running.tick(3)
+    recorded_status = json.loads(json.dumps(status(running.shared)))
+    answer = Commands(running.shared, settings, None, lambda *a, **k: None).answer(b'{"command": "latency"}', "")
+    console = Console(file=io.StringIO(), width=80, record=True, force_terminal=True)
+    console.print(monitor.screen(recorded_status, answer, trails, 80))
+    text = console.export_text(clear=False)
+    if PICTURES:
+        console.save_svg(str(Path(PICTURES) / "monitor.svg"), title="thermoctl monitor")
+    assert "FAULT" in text and "coil_error" in text and "-> look at `thermoctl status`" in text
+    for point in POINTS:
+        assert point.replace("_", " ") in text
+    assert f"{recorded_status['compensated_um']:.3f}" in text and "error without it" in text
+    assert "▁" in text and "█" in text and "lateness" in text and "readings: coil_c ERROR" in text
+    assert all(len(line.rstrip()) <= 80 for line in text.splitlines())
+    down, none = monitor.look(settings.socket.path + ".gone")
+    console.print(monitor.screen(down, none, trails, 80))
+    assert "the daemon is not running" in " ".join(console.export_text().split())
