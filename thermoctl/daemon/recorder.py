@@ -147,8 +147,9 @@ def read_recording(path: str) -> tuple[np.ndarray, str]:
     missing = [name for name in NAMES if name not in schema.names]
     if missing or b"law" not in metadata:
         raise InputError(f"{path}: not a full-rate recording of the daemon: '{(missing or ['law'])[0]}' is missing")
-    columns: list[np.ndarray] = [np.concatenate([b.column(name).to_numpy(zero_copy_only=False) for b in batches]) if batches else np.empty(0)
-               for name in NAMES]
+    if not batches:
+        return np.empty((0, len(NAMES))), metadata[b"law"].decode()
+    columns = [np.concatenate([b.column(name).to_numpy(zero_copy_only=False) for b in batches]) for name in NAMES]
     return np.ascontiguousarray(np.array(columns).T), metadata[b"law"].decode()
 
 
