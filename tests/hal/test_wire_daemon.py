@@ -1,0 +1,145 @@
+"""The whole chain at the wire: `thermoctl virtual-rig` and `thermoctl run`, two programs (issue 2, 'Must show' 2 and 5).
+
+Slow: `python -m pytest -m slow tests/hal/test_wire_daemon.py`. Limits are for a busy machine; what was measured is printed.
+"""
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from hal.virtual.rig import tell
+from tests.hal.conftest import CONFIG, free_port
+from thermoctl.daemon.socket import ask
+from thermoctl.recording.table import read_table
+from thermoctl.settings import load_settings
+from thermoctl.yamlfile import InputError
+
+pytestmark = pytest.mark.slow
+CLI = [sys.executable, "-m", "thermoctl.cli"]
+
+
+class Chain:
+    """Both programs on a private copy of config/wire.yaml."""
+
+    def __init__(self, tmp_path):
+        text = (CONFIG / "wire.yaml").read_text().replace("15020", str(free_port())).replace("../run/", "./run/")
+        text = text.replace("../recordings", str(tmp_path / "recordings"))
+        text = re.sub(r"(profile: |plant: |model: )(\w+/)", rf"\g<1>{CONFIG}/\g<2>", text)
+        self.config, self.run_dir = tmp_path / "wire.yaml", tmp_path / "run/wire"
+        self.config.write_text(text)
+        self.socket = load_settings(self.config).socket.path
+        self.rig = self.start_rig()
+        self.daemon = subprocess.Popen([*CLI, "run", "--config", str(self.config)], stderr=subprocess.DEVNULL)
+        self.until(lambda s: s.get("state") == "READY", 30)
+
+    def start_rig(self):
+        rig = subprocess.Popen([*CLI, "virtual-rig", "--config", str(self.config)], stdout=subprocess.PIPE, text=True)
+        for line in rig.stdout:
+            if "ready" in line:
+                return rig
+        raise AssertionError("the virtual rig did not start")
+
+    def ask(self, command, value=None):
+        try:
+            return ask(self.socket, {"command": command, "value": value})
+        except InputError as e:
+            return {"ok": False, "state": "OFF", "error": str(e)}
+
+    def status(self):
+        return self.ask("status")
+
+    def until(self, condition, limit_s):
+        begin = time.monotonic()
+        while not condition(s := self.status()):
+            assert time.monotonic() - begin < limit_s, (s.get("state"), s.get("faults"), s.get("slips"))
+            time.sleep(0.01)                                          # how often we ask, not a wait
+        return s
+
+    def tell(self, line):
+        assert tell(self.run_dir / "control.sock", line) == "ok"
+
+    def arm(self):
+        """Acknowledge what stands, and arm; the machine may still be settling, so within a limit."""
+        begin = time.monotonic()
+        while not self.ask("arm")["ok"]:
+            self.ask("disarm")
+            assert time.monotonic() - begin < 20, self.status()
+            time.sleep(0.05)
+        return self.until(lambda s: s.get("state") == "ARMED", 10)
+
+    def reference(self):
+        return read_table(self.run_dir / "reference.csv")
+
+    def stop(self):
+        for process in (self.daemon, self.rig):
+            process.terminate()
+        for process in (self.daemon, self.rig):
+            process.wait(20)
+
+
+@pytest.fixture
+def chain(tmp_path):
+    c = Chain(tmp_path)
+    yield c
+    c.stop()
+
+
+@pytest.mark.parametrize("pull,plug,fault", [
+    ("encoder unplug", "encoder plug", "position"), ("encoder mute on", "encoder mute off", "position"),
+    ("drive unplug", "drive plug", "amplifier"), ("drive heartbeat off", "drive heartbeat on", "amplifier"),
+    ("thermocouples unplug", "thermocouples plug", "coil"), ("meter unplug", "meter plug", "voltage")])
+def test_pulled_cable_ends_in_its_fault_and_rearms_without_a_jump(chain, pull, plug, fault):
+    chain.arm()
+    assert chain.ask("setpoint", 20.0)["ok"]
+    chain.until(lambda s: abs(s["position_um"] - 20) < 1, 30)
+    pulled = time.monotonic()
+    chain.tell(pull)
+    s = chain.until(lambda s: s["state"] in ("FAULT", "SAFE") or any(fault in str(f) for f in s["faults"]), 10)
+    assert any(fault in str(f) for f in s["faults"])
+    stopped = s["state"] == "FAULT"
+    if fault in ("position", "amplifier", "voltage"):
+        assert stopped
+    chain.tell(plug)
+    armed = chain.arm()
+    assert abs(armed["setpoint_um"] - armed["position_um"]) < 0.5
+    chain.until(lambda s: s["state"] == "ARMED", 5)
+    chain.stop()
+    r = chain.reference()
+    after = r.t > pulled
+    off = after & (r.columns["enabled"] == 0)
+    if stopped:
+        print(f"{pull}: amplifier off {(r.t[off][0] - pulled) * 1e3:.0f} ms after the command was typed")
+    again = after & (r.columns["enabled"] > 0) & (r.t > r.t[off][-1] if off.any() else True)
+    y = r.columns["position_um"][again]
+    assert np.abs(np.diff(y)).max() < 2.0                             # re-armed without a jump
+
+
+def test_killed_rig_is_a_fault_and_comes_back(chain):
+    chain.arm()
+    os.kill(chain.rig.pid, signal.SIGKILL)
+    chain.rig.wait()
+    s = chain.until(lambda s: s["state"] == "FAULT", 10)
+    assert any("position" in str(f) for f in s["faults"])
+    chain.rig = chain.start_rig()
+    chain.arm()
+
+
+def test_killed_daemon_leaves_the_amplifier_off(chain):
+    chain.arm()
+    for process in subprocess.run(["ps", "-o", "pid=", "--ppid", str(chain.daemon.pid)], capture_output=True,
+                                  text=True).stdout.split():
+        os.kill(int(process), signal.SIGKILL)                         # our own children: loop, pollers, recorder
+    chain.daemon.kill()
+    killed = time.monotonic()
+    while time.monotonic() < killed + 1.0:
+        assert "encoder" in tell(chain.run_dir / "control.sock", "help")     # the rig itself lives on
+    chain.rig.terminate()
+    chain.rig.wait(10)
+    r = chain.reference()
+    late = r.t > killed + 0.5                                         # watchdog 0.2 s
+    assert late.any() and not r.columns["enabled"][late].any() and not r.columns["drive"][late].any()
