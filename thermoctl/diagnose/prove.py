@@ -14,6 +14,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -218,7 +219,8 @@ def prove(
     number: int | None = None,
     progress: Callable[[int, int, dict], None] | None = None,
 ) -> dict[str, Any]:
-    """Run and score a set; writes OUT/proof.json and OUT/proof.html and returns the JSON's content."""
+    """Run and score a set; writes OUT/proof.json, OUT/summary.json (the same without the cases: to be kept with a commit)
+    and OUT/proof.html; returns the JSON's content."""
     out = Path(out_dir)
     jobs = find_jobs(cases, number)
     run_all(jobs, out, scheduler, workers, progress=progress)
@@ -243,18 +245,24 @@ def prove(
         "commit": _commit(),
         "machine": platform.machine(),
         "cpus": os.cpu_count(),
+        "set": {"answers_sha256": hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()},
         **scoring.summary(rows),
         "rows": scoring.plain(rows),
     }
     out.mkdir(parents=True, exist_ok=True)
     (out / "proof.json").write_text(json.dumps(content, indent=1) + "\n")
+    small = {k: v for k, v in content.items() if k != "rows"}
+    (out / "summary.json").write_text(json.dumps(small, indent=1) + "\n")
     (out / "proof.html").write_text(page(content, rows))
     return content
 
 
 def _commit() -> str | None:
+    """The source's commit, `-dirty` when changed since; None outside a checkout."""
+    if shutil.which("git") is None:
+        return None
     run = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True
+        ["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent, capture_output=True, text=True
     )
     return run.stdout.strip() or None
 
