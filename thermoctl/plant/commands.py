@@ -44,7 +44,7 @@ def simulate(args: argparse.Namespace) -> int:
             if len(error):
                 spread = np.ptp(drive.y[np.isfinite(drive.y[:, j]), j])
                 rms = float(np.sqrt(np.mean(error ** 2)))
-                grid.add_row(o.name, str(len(e)), f"{rms:.4g} {o.unit or ''}", f"{np.max(np.abs(error)):.4g}",
+                grid.add_row(o.name, str(len(error)), f"{rms:.4g} {o.unit or ''}", f"{np.max(np.abs(error)):.4g}",
                              f"{100 * rms / spread:.2f} %" if spread > 0 else "")
             else:
                 grid.add_row(o.name, "0", "not measured", "", "")

@@ -349,7 +349,7 @@ def _typed(library: ctypes.CDLL) -> ctypes.CDLL:
     library.observe.restype = None
     library.slopes.argtypes = [_I, _P, _P, _P, _P, _P, _P]
     library.slopes.restype = None
-    library.advance.argtypes = [_D, _D, _P, _P, _P, _D, _P, _P, _P, _P]
+    library.advance_period.argtypes = [_D, _D, _P, _P, _P, _D, _P, _P, _P, _P, _P]
     return library
 
 

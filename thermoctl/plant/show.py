@@ -33,7 +33,8 @@ def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, in
         edges.append((i, index[node], "flow", "") if way == "in" else (index[node], i, "flow", ""))
     for f in plant.flows.values():
         drawn = {q for q in (f.source, f.target) if q}
-        edges += [(index[n], index[end], "uses", "") for n in sorted(ex.names(f.rate) & set(plant.nodes) - drawn) for end in drawn]
+        others = sorted(ex.names(f.rate) & set(plant.nodes) - drawn)
+        edges += [(index[n], index[end], "uses", "") for n in others for end in sorted(drawn)]
     edges = list(dict.fromkeys(edges))
     readings: dict[tuple[str, ...], list[str]] = {}
     for o in plant.outputs.values():
@@ -108,7 +109,8 @@ def draw(plant: Plant, path: str | Path) -> None:
     figure.canvas.draw()            # gives the boxes their sizes, at which the arrows end
     for a, b, kind, label in edges:
         line = {"arrowstyle": "-" if kind == "read" else "-|>", "color": colours[kind],
-                "lw": 1.3 if kind == "flow" else 0.8, "ls": {"flow": "-", "read": ":", "uses": "--"}[kind], "shrinkA": 0, "shrinkB": 2,
+                "lw": 1.3 if kind == "flow" else 0.8, "ls": {"flow": "-", "read": ":", "uses": "--"}[kind],
+                "shrinkA": 0, "shrinkB": 0 if kind == "read" else 7,
                 "patchA": boxes[a].get_bbox_patch(), "patchB": boxes[b].get_bbox_patch()}
         axes.annotate("", xy=x[b], xytext=x[a], arrowprops=line, zorder=1)
         if label:

@@ -361,13 +361,16 @@ class Stepper:
         self._width = np.full(max(len(m.code.jumps), 1), 1e-6)
         self._scale = np.abs(self.x) * 1e-2 + 1e-3
         self._atol = self.rtol * self._scale
-        self._pointers = [_p(a) for a in (self._u, self._p, self._width)], [_p(a) for a in (self._atol, self.x, self._y, self._want)]
+        size = ctypes.c_int.in_dll(m.code.library, "memory_size").value
+        self._memory = np.zeros(size)       # the matrix of the exponential method, see integrator.h
+        tail = (self._atol, self.x, self._y, self._want, self._memory)
+        self._pointers = [_p(a) for a in (self._u, self._p, self._width)], [_p(a) for a in tail]
 
     def step(self, u: np.ndarray) -> np.ndarray:
         """Advance one period with inputs `u` (nu,) held; returns the outputs (ny,), a view that the next step changes."""
         self._u[:] = u
         head, tail = self._pointers
-        if self.model.code.library.advance(self.t, self.period_s, *head, self.rtol, *tail):
+        if self.model.code.library.advance_period(self.t, self.period_s, *head, self.rtol, *tail):
             raise SimulationError(f"the simulated rig cannot be integrated at t = {self.t:.6g} s")
         self.t += self.period_s
         return self._y
