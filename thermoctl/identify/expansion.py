@@ -142,8 +142,9 @@ class Bank:
     gives the present Expansion. 3 to 4 us a sample for 8 poles and 12 temperatures."""
 
     def __init__(self, inputs: int, period_s: float, poles: int = 8, tau_range_s: tuple[float, float] = (10.0, 3000.0),
-                 weight: float = 1.0, prior_sigma: float = 30.0):
+                 weight: float = 1.0, prior_sigma: float = 30.0, input_sigma_k: float | np.ndarray = 0.1):
         p = 2 * inputs + 2
+        self.sigma2 = np.broadcast_to(np.asarray(input_sigma_k, float)**2, (inputs,))
         self.period_s, self.weight, self.inputs = period_s, weight, inputs
         self.poles = np.exp(-period_s / np.geomspace(*tau_range_s, poles))
         self.r = np.zeros((poles, p, p + 1))
@@ -164,11 +165,21 @@ class Bank:
         self.samples += len(rises)
 
     def model(self) -> Expansion:
-        """The Expansion of the pole with the least error so far."""
-        k = int(np.argmin(self.cost))
-        p = self.r.shape[1]
-        theta = linalg.solve_triangular(self.r[k, :, :p], self.r[k, :, p])
-        f, m = float(self.poles[k]), self.inputs
+        """The Expansion of the pole with the least criterion so far: squared error and, as in `output_error`, the ridge that the
+        inputs' error asks for, laid under each triangle."""
+        m, p = self.inputs, self.r.shape[1]
+        count = self.samples if self.weight == 1 else (1 - self.weight**self.samples) / (1 - self.weight)
+        best = (np.inf, 0, np.zeros(p))
+        for k, f in enumerate(self.poles):
+            ridge = np.append(np.tile(self.sigma2, 2) * (1 - f) / (1 + f) * count, [0, 0])
+            rows = np.vstack([self.r[k], np.column_stack([np.diag(np.sqrt(ridge)), np.zeros(p)])])
+            left = linalg.qr(rows, mode="r", check_finite=False)[0]
+            theta = linalg.solve_triangular(left[:p, :p], left[:p, p])
+            criterion = self.cost[k] + left[p, p]**2
+            if criterion < best[0]:
+                best = (criterion, k, theta)
+        _, k, theta = best
+        f = float(self.poles[k])
         return Expansion(f, (1 - f) * theta[:m], (1 - f) * theta[m:2 * m], self.period_s, 0.0, float(theta[-1]),
                          {"method": "online bank", "start_um": float(theta[2 * m]), "samples": self.samples})
 
