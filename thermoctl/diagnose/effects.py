@@ -43,6 +43,11 @@ class EffectParameter:
     per_recording: bool
     typical: float | None
 
+    @property
+    def amplitude(self) -> bool:
+        """Does it scale with an amplitude of the screening?"""
+        return self.trial is not None and any(re.fullmatch(r"s\d?", n) for n in ex.names(self.trial))
+
 
 @dataclass(frozen=True)
 class Effect:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose import locate, observer
-from thermoctl.diagnose.effects import CATALOGUE, Candidate, Rig, candidates, catalogue
+from thermoctl.diagnose.effects import CATALOGUE, PLACES, Candidate, Rig, candidates, catalogue
 from thermoctl.diagnose.evidence import Colour, channels, white_sigma
 from thermoctl.diagnose.screen import Direction, Metric, screen
 from thermoctl.plant import expression as ex
@@ -40,6 +40,7 @@ CLEAN = 1.25                # residual rms over sensor noise up to which the sen
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 LARGE = 1.6                 # coloured residual beyond this is physics, not a sensor's colour
 TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
+BLOCKS = 8                  # of a single recording, every other one held out
 DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
 
 
@@ -107,7 +108,10 @@ class Case:
 
 
 def _surprise(c: Candidate) -> float:
-    """Prior odds as -2 log: a fault in an input's reading, or physics with a choice of signals, is a little less likely."""
+    """Prior odds as -2 log: a fault in an input's reading, or another form of an entry, is a little less likely. Where a
+    displacement lags, its members do (expansion_lag); an encoder does not."""
+    if c.effect.name == "sensor_lag" and c.place.output and any(p.output == c.place.output for p in PLACES["displacement"](c.rig)):
+        return 5.0
     return (6.0 if c.place.input and c.effect.where != "drive" else 0.0) + (1.0 if c.variant else 0.0)
 
 
@@ -133,6 +137,9 @@ def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, f
             continue
         if p.shape:
             out[p.name] = (max(p.low, value / 30), min(p.high, value * 30)) if kind != "delays" else (0.0, value * 8)
+            continue
+        if np.isfinite(p.low) and np.isfinite(p.high) and not p.per_recording:
+            out[p.name] = (p.low, p.high)
             continue
         reach = 30 * max(abs(value - p.null), 1e-3 * abs(p.null), 1e-12)
         low, high = max(p.low, p.null - reach), min(p.high, p.null + reach)
@@ -278,6 +285,12 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         if followed and followed[0].score < current.score - ACCEPT:
             current, reference, rivals = followed
     first = rounds[0]
+    if current.effects:
+        case.progress("trying the findings on data that took no part")
+        kept = prune(case, base, current, notes)
+        if kept is not current:
+            current, reference = kept, kept
+            rivals = [r for r in rivals if len(r.effects) == len(kept.effects)]
     suspects = locate.suspects(first.metric) if first.directions and first.p_any() < 1e-3 else []
     excess = case.excess(current)
     worst = max(excess.values(), default=0.0)
@@ -436,18 +449,8 @@ def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[
     for _ in range(2):
         changed = False
         for k in range(len(current.effects)):
-            others = [c for i, c in enumerate(current.effects) if i != k]
-            plant, own = base.plant, []
-            try:
-                for c in others:
-                    values = {p: current.plant.parameters[n].value for p, n in current.own[current.effects.index(c)].items()}
-                    ranges = {p: current.plant.parameters[n].range or (-np.inf, np.inf)
-                              for p, n in current.own[current.effects.index(c)].items()}
-                    again = dataclasses.replace(c, rig=_on(c.rig, plant))
-                    plant = again.extend({**values}, ranges)
-                    own.append(current.own[current.effects.index(c)])
-                without = case.explain(plant, others, own)
-            except (SimulationError, InputError, KeyError):
+            without = leave_out(case, base, current, k)
+            if without is None:
                 continue
             if without.score < current.score + ACCEPT / 2:
                 case.progress("one effect is not needed beside the others")
@@ -463,6 +466,43 @@ def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[
         if not changed:
             break
     return current, rivals
+
+
+def leave_out(case: Case, base: Explanation, current: Explanation, k: int) -> Explanation | None:
+    """The explanation without its effect k, refitted; None where that cannot be simulated."""
+    plant, effects, own = base.plant, [], []
+    try:
+        for i, (c, names) in enumerate(zip(current.effects, current.own, strict=True)):
+            if i == k:
+                continue
+            values = {p: current.plant.parameters[n].value for p, n in names.items()}
+            ranges = {p: current.plant.parameters[n].range or (-np.inf, np.inf) for p, n in names.items()}
+            plant = dataclasses.replace(c, rig=_on(c.rig, plant)).extend(values, ranges)
+            effects.append(c)
+            own.append(names)
+        return case.explain(plant, effects, own) if effects else base
+    except (SimulationError, InputError, KeyError):
+        return None
+
+
+def prune(case: Case, base: Explanation, current: Explanation, notes: list[str]) -> Explanation:
+    """Drop effects that do not lower the error on data that took no part: the interval of the gain must exclude zero."""
+    while current.effects:
+        weakest: tuple[float, Explanation, Candidate] | None = None
+        for k, c in enumerate(current.effects):
+            without = leave_out(case, base, current, k)
+            if without is None:
+                continue
+            before, after = (unseen_errors(case, e.plant) for e in (without, current))
+            high = pooled_gain(case, before, after)[2]
+            if not high < 1.0 and (weakest is None or high > weakest[0]):
+                weakest = (high, without, c)
+        if weakest is None:
+            return current
+        notes.append(f"{weakest[2].effect.name} at {weakest[2].place.where} fits better but does not predict held-out data "
+                     "better; it is not counted")
+        current = weakest[1]
+    return current
 
 
 def _on(rig: Rig, plant: Plant) -> Rig:
@@ -486,42 +526,68 @@ def _weigh(current: Explanation, rivals: Sequence[Explanation]) -> None:
 # ----------------------------------------------------------------------------------------------------------- held out
 
 def folds(case: Case) -> list[tuple[list[int], list[Table], list[Table]]]:
-    """(test recordings, training tables, test tables): each recording in turn, or the last two fifths of a single one."""
+    """(test recordings, training tables, test tables): each recording in turn; a single one is cut into blocks, of which
+    every other one is held out, and then the others."""
     if len(case.tables) > 1:
         return [([r], [t for q, t in enumerate(case.tables) if q != r], [case.tables[r]]) for r in range(len(case.tables))]
     (table,) = case.tables
-    cut = table.t[0] + 0.6 * (table.t[-1] - table.t[0])
+    span = (table.t - table.t[0]) / max(float(table.t[-1] - table.t[0]), 1e-300)
+    odd = (np.minimum(span * BLOCKS, BLOCKS - 1).astype(int) % 2).astype(bool)
     measured = {o.column for o in case.plant.outputs.values()}
 
     def masked(keep: np.ndarray) -> Table:
         columns = {k: np.where(keep, v, np.nan) if k in measured else v for k, v in table.columns.items()}
         return dataclasses.replace(table, columns=columns)
-    return [([0], [masked(table.t <= cut)], [masked(table.t > cut)])]
+    return [([0], [masked(~held)], [masked(held)]) for held in (odd, ~odd)]
+
+
+def unseen_errors(case: Case, plant: Plant, refit: bool = True) -> list[np.ndarray]:
+    """Free-run errors (N, outputs) on each fold's test data, the plant fitted to that fold's training data only."""
+    out: list[np.ndarray] = []
+    for _, train, test in folds(case):
+        model = plant.compile()
+        drives = [model.drive(t) for t in test]
+        try:
+            dx0 = None
+            if refit:
+                training = [model.drive(t) for t in train]
+                found = fit(model, training, case.noise, iterations=15, seconds=case.patience)
+                model = Model(updated(plant, found, training), model.code)
+                if train[0].path == test[0].path:       # one recording, split: its start took part
+                    dx0 = found.dx0[0]
+            out += [d.y - model.run(model.prepare(d), None, dx0).y for d in drives]
+        except SimulationError:
+            out += [np.full_like(d.y, np.nan) for d in drives]
+    return out
+
+
+def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray],
+                draws: int = 400) -> tuple[float, float, float]:
+    """Ratio of held-out rms after / before over all outputs in units of their noise, with its 95 % interval (paired block
+    bootstrap)."""
+    sigma = np.array([n.sigma for n in case.noise])
+    pairs = []
+    for a, b in zip(before, after, strict=True):
+        if not np.isfinite(b[np.isfinite(a)]).all():
+            return np.inf, np.inf, np.inf
+        x, y = np.nansum((a / sigma) ** 2, axis=1), np.nansum((b / sigma) ** 2, axis=1)
+        block = max(5, len(x) // 20)
+        n = len(x) // block
+        x, y = x[:n * block].reshape(n, block).sum(1), y[:n * block].reshape(n, block).sum(1)
+        pairs += [(p, q) for p, q in zip(x, y, strict=True) if p > 0]
+    values = np.array(pairs)
+    if len(values) < 4:
+        return 1.0, 0.0, np.inf
+    index = np.random.default_rng(3).integers(0, len(values), (draws, len(values)))
+    ratio = np.sqrt(values[index, 1].sum(1) / np.maximum(values[index, 0].sum(1), 1e-300))
+    return (float(np.sqrt(values[:, 1].sum() / values[:, 0].sum())), float(np.quantile(ratio, 0.025)),
+            float(np.quantile(ratio, 0.975)))
 
 
 def held_out(case: Case, base: Explanation, final: Explanation) -> dict[str, Any]:
     """Fit the plant's own parameters, and those of the explanation, without some of the data; errors on that data."""
-    out: dict[str, list[np.ndarray]] = {"before": [], "refit_only": [], "after": []}
-    for _, train, test in folds(case):
-        for label, plant, refit in (("before", case.plant, False), ("refit_only", base.plant, True), ("after", final.plant, True)):
-            if label == "after" and not final.effects:
-                out["after"].append(out["refit_only"][-1])
-                continue
-            model = plant.compile()
-            drives = [model.drive(t) for t in test]
-            try:
-                p = None
-                if refit:
-                    training = [model.drive(t) for t in train]
-                    found = fit(model, training, case.noise, iterations=15)
-                    p = updated(plant, found, training)
-                    model = Model(p, model.code)
-                parts = [d.y - model.run(model.prepare(d)).y for d in drives]
-                if case.plant.nodes and len(train) == 1 and train[0].path == test[0].path and refit:
-                    parts = [d.y - model.run(model.prepare(d), None, found.dx0[0]).y for d in drives]
-            except SimulationError:
-                parts = [np.full_like(d.y, np.nan) for d in drives]
-            out[label] += parts
+    out = {"before": unseen_errors(case, case.plant, refit=False), "refit_only": unseen_errors(case, base.plant)}
+    out["after"] = unseen_errors(case, final.plant) if final.effects else out["refit_only"]
     figures: dict[str, Any] = {f"held_out_{k}": _rms(case.model, v) for k, v in out.items()}
     figures["gain"] = _gain(case, out["refit_only"], out["after"]) if final.effects else {}
     return figures
@@ -639,7 +705,7 @@ def not_seen(d: Diagnosis) -> list[dict[str, Any]]:
     """Per effect and place the smallest size that would have been seen (five sigmas of its amplitude's estimate)."""
     out = []
     for direction in d.rounds[0].directions:
-        amplitude = next((p for p in direction.candidate.effect.parameters if p.trial is not None), None)
+        amplitude = next((p for p in direction.candidate.effect.parameters if p.amplitude), None)
         if amplitude is None or direction.gain <= 0:
             continue
         size = abs(direction.start[amplitude.name] - amplitude.null) / np.sqrt(direction.gain) * 5

@@ -270,7 +270,7 @@ def _columns(c: Candidate, metric: Metric, at: Sequence[Trajectory]) -> list[_Co
         grids["window"] = [{"start": float(v), "end": 10 * duration} for v in np.linspace(0, duration, 25)[:-1]]
     phases = [{"phase": 0.0}, {"phase": float(np.pi / 2)}] if "phases" in effect.shapes.values() else [{}]
     shapes = [{k: v for part in combination for k, v in part.items()} for combination in itertools.product(*grids.values())] or [{}]
-    amplitudes = [p for p in effect.parameters if p.trial is not None]
+    amplitudes = [p for p in effect.parameters if p.amplitude]
     dims = effect.dims if amplitudes else ((1.0,),)
     out = []
     for g, shape in enumerate(shapes):
@@ -319,7 +319,7 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metri
     shape, dim = entries[0][0].item[2]
     r = metric.residual
     g, m = rows.T @ r, rows.T @ rows
-    amplitudes = [p for p in c.effect.parameters if p.trial is not None]
+    amplitudes = [p for p in c.effect.parameters if p.amplitude]
     windowed = "windows" in c.effect.shapes.values()
     noise = None if draws is None else rows.T @ draws
     if windowed:
