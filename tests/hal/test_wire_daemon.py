@@ -99,11 +99,10 @@ def test_pulled_cable_ends_in_its_fault_and_rearms_without_a_jump(chain, pull, p
     chain.until(lambda s: abs(s["position_um"] - 20) < 1, 30)
     pulled = time.monotonic()
     chain.tell(pull)
-    s = chain.until(lambda s: s["state"] in ("FAULT", "SAFE") or any(fault in str(f) for f in s["faults"]), 10)
-    assert any(fault in str(f) for f in s["faults"])
-    stopped = s["state"] == "FAULT"
-    if fault in ("position", "amplifier", "voltage"):
-        assert stopped
+    chain.until(lambda s: any(fault in str(f) for f in s["faults"]), 10)
+    stopped = fault in ("position", "amplifier", "voltage")           # a lost thermocouple freezes the compensation
+    if stopped:
+        chain.until(lambda s: s["state"] == "FAULT", 5)
     chain.tell(plug)
     armed = chain.arm()
     assert abs(armed["setpoint_um"] - armed["position_um"]) < 0.5
@@ -114,9 +113,9 @@ def test_pulled_cable_ends_in_its_fault_and_rearms_without_a_jump(chain, pull, p
     off = after & (r.columns["enabled"] == 0)
     if stopped:
         print(f"{pull}: amplifier off {(r.t[off][0] - pulled) * 1e3:.0f} ms after the command was typed")
-    again = after & (r.columns["enabled"] > 0) & (r.t > r.t[off][-1] if off.any() else True)
-    y = r.columns["position_um"][again]
-    assert np.abs(np.diff(y)).max() < 2.0                             # re-armed without a jump
+    on = r.columns["enabled"] > 0
+    held = after[1:] & on[1:] & on[:-1]                               # both rows driven: what the controller did
+    assert held.any() and np.abs(np.diff(r.columns["position_um"]))[held].max() < 2.0      # re-armed without a jump
 
 
 def test_killed_rig_is_a_fault_and_comes_back(chain):
