@@ -57,7 +57,7 @@ class Node:
         return self.value
 
     def error(self, message: str) -> InputError:
-        return InputError(f"{self.place}: {message}")
+        return InputError(f"{self.place}: {message}".replace("\n", "\\n"))      # a name may hold anything
 
 
 def suggest(name: str, allowed: Iterable[str]) -> str:

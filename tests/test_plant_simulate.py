@@ -1,0 +1,152 @@
+"""Simulation and sensitivities against scipy's Radau at rtol 1e-10, interval by interval, on plants of every kind."""
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import loads
+from thermoctl.recording.table import Table
+
+HEAD = "format: thermoctl-plant/1\n"
+PLANTS = {
+    "linear_thermal": """
+inputs: {P: {unit: W}, air: {unit: degC, between_samples: linear}}
+parameters: {C1: {value: 40, range: [10, 90]}, C2: {value: 90, range: [10, 200]}, G: {value: 0.8, range: [0.1, 3]},
+             H: {value: 0.2, range: [0.01, 1]}}
+nodes: {a: {storage: C1, initial: air}, b: {storage: C2, initial: air}}
+flows: {heat: {into: a, rate: P}, ab: {from: a, into: b, rate: G * (a - b)}, out: {from: b, rate: H * (b - air)}}
+outputs: {ya: {value: a}, yb: {value: b + 0.1 * a}}""",
+    "stiff_coil_and_heat": """
+inputs: {P: {unit: V}, air: {unit: degC}}
+parameters: {L: {value: 0.003, range: [0.001, 0.01]}, R: {value: 5, range: [1, 9]}, C: {value: 40, range: [10, 90]},
+             G: {value: 0.3, range: [0.1, 1]}}
+nodes: {i: {storage: L, initial: 0}, T: {storage: C, initial: air}}
+flows: {u: {into: i, rate: P}, drop: {from: i, rate: R * (1 + 0.004 * (T - 20)) * i}, heat: {into: T, rate: R * i**2},
+        out: {from: T, rate: G * (T - air)}}
+outputs: {current: {value: i}, temperature: {value: T}}""",
+    "radiation_and_convection": """
+inputs: {P: {unit: W}, air: {unit: degC}}
+parameters: {C: {value: 40, range: [10, 90]}, E: {value: 2.0e-9, range: [1.0e-10, 1.0e-8]}, N: {value: 0.05, range: [0.01, 0.2]}}
+nodes: {T: {storage: C * (1 + 0.001 * T), initial: air}}
+flows: {heat: {into: T, rate: P}, rad: {from: T, rate: E * ((T + 273.15)**4 - (air + 273.15)**4)},
+        conv: {from: T, rate: N * (T - air) * abs(T - air)**0.25}}
+outputs: {y: {value: T}, z: {value: "table(T, [20, 30, 90], [0, 5, 8])"}}""",
+    "tanks": """
+inputs: {P: {unit: V}, air: {unit: V}}
+parameters: {k: {value: 0.05, range: [0.01, 0.2]}, k1: {value: 0.06, range: [0.01, 0.2]}, k2: {value: 0.08, range: [0.01, 0.2]}}
+nodes: {upper: {storage: 1, initial: 3}, lower: {storage: 1, initial: 2}}
+flows: {pump: {into: upper, rate: k * P}, down: {from: upper, into: lower, rate: "k1 * sqrt(max(upper, 0))"},
+        drain: {from: lower, rate: "k2 * sqrt(max(lower, 0)) + 0 * air"}}
+outputs: {y: {value: lower + 0 * air}, spill: {value: "max(upper - 4, 0) + air * 1e-9"}}""",
+    "friction": """
+inputs: {P: {unit: N}, air: {unit: m}}
+parameters: {m: {value: 2.0, range: [1, 5]}, F: {value: 0.7, range: [0.1, 2]}, B: {value: 1.5, range: [0.1, 5]}}
+nodes: {v: {storage: m, initial: 0}, x: {storage: 1, initial: 0}}
+flows: {push: {into: v, rate: P - 4}, dry: {from: v, rate: F * tanh(v / 0.02)}, wet: {from: v, rate: B * v},
+        spring: {from: v, rate: 3 * (x - air * 0.01)}, go: {into: x, rate: v}}
+outputs: {position: {value: x}}""",
+}
+
+
+def recording(uneven=True, n=120, seed=3):
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.uniform(0.5, 1.5, n)) if uneven else np.arange(n, dtype=float)
+    power = np.where((t // 17) % 2 > 0, 6.0, 1.0) + rng.normal(0, 0.2, n)
+    air = 22 + 2 * np.sin(t / 30)
+    power[::11], air[5::7] = np.nan, np.nan         # missing samples of a held and of a linear signal
+    return Table("r", "r.csv", t, {"P": power, "air": air})
+
+
+def filled(t, column, linear):
+    good = np.isfinite(column)
+    if linear:
+        return np.interp(t, t[good], column[good])
+    held, last = column.copy(), column[good][0]
+    for k in range(len(held)):
+        held[k] = last = held[k] if good[k] else last
+    return held
+
+
+def radau(plant, table, values):
+    """Outputs (N, ny) with scipy, straight from the expressions; inputs held or linear within each interval."""
+    t = table.t - table.t[0]
+    inputs = {i.name: filled(t, table.columns[i.column], i.linear) for i in plant.inputs.values()}
+    nodes = list(plant.nodes)
+
+    def point(s, x, k, seconds):
+        at = {n: q[k] + ((q[k + 1] - q[k]) * s / seconds if plant.inputs[n].linear and k + 1 < len(t) else 0.0)
+              for n, q in inputs.items()}
+        return values | at | dict(zip(nodes, x, strict=True)) | {"t": t[k] + s}
+
+    def slopes(s, x, k, seconds):
+        p = point(s, x, k, seconds)
+        rates = {f.name: ex.evaluate(f.rate, p) for f in plant.flows.values()}
+        return [(sum(r for f, r in rates.items() if plant.flows[f].target == n)
+                 - sum(r for f, r in rates.items() if plant.flows[f].source == n)) / ex.evaluate(plant.nodes[n].storage, p) for n in nodes]
+    start = values | {n: q[0] for n, q in inputs.items()}
+    x = np.array([float(ex.evaluate(plant.nodes[n].initial, start)) for n in nodes])
+    rows = [x]
+    for k in range(len(t) - 1):
+        seconds = t[k + 1] - t[k]
+        done = solve_ivp(slopes, (0, seconds), x, "Radau", rtol=1e-10, atol=1e-11, args=(k, seconds))
+        assert done.success
+        x = done.y[:, -1]
+        rows.append(x)
+    return np.array([[float(ex.evaluate(o.value, point(0.0, x, k, 1.0))) for o in plant.outputs.values()] for k, x in enumerate(rows)])
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+def test_free_run_agrees_with_radau_to_1e_6_of_the_range(kind):
+    plant, table = loads(HEAD + PLANTS[kind], kind), recording(n=60)
+    values = {p.name: p.value for p in plant.parameters.values()}
+    reference = radau(plant, table, values)
+    run = plant.compile().simulate(table, rtol=1e-9)
+    assert np.all(np.abs(run.y - reference) <= 1e-6 * np.ptp(reference, axis=0))
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+def test_default_tolerance_is_within_1e_5_of_the_range(kind):
+    plant, table = loads(HEAD + PLANTS[kind], kind), recording()
+    model = plant.compile()
+    fine, usual = model.simulate(table, rtol=1e-10), model.simulate(table)
+    assert np.all(np.abs(usual.y - fine.y) <= 1e-5 * np.ptp(fine.y, axis=0))
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+def test_sensitivities_are_the_slopes_of_the_fine_simulation(kind):
+    """Against central differences of runs at rtol 1e-12 (whose agreement with Radau the test above shows)."""
+    plant, table = loads(HEAD + PLANTS[kind], kind), recording(n=80)
+    model = plant.compile()
+    run = model.simulate(table, sensitivities=True, rtol=1e-9)
+    for c, name in enumerate(model.active):
+        p = plant.parameters[name].value
+        pair = [model.simulate(table, {name: p * (1 + s)}, rtol=1e-12).y for s in (-1e-4, 1e-4)]
+        slope = (pair[1] - pair[0]) / (2e-4 * p)
+        assert np.all(np.abs(run.dy[:, :, c] - slope) <= 2e-4 * np.abs(slope).max(axis=0) + 1e-9), name
+
+
+def test_delay_of_a_reading_and_of_an_input():
+    text = HEAD + """
+inputs: {P: {unit: W, between_samples: linear}, air: {unit: degC}}
+parameters: {C: {value: 10, range: [1, 90]}, TD: {value: 3.5, unit: s, range: [0, 9]}}
+nodes: {T: {storage: C, initial: air}}
+flows: {heat: {into: T, rate: "delay(P, TD)"}, out: {from: T, rate: 0.5 * (T - air)}}
+outputs: {y: {value: T}, late: {value: "delay(T, TD)"}}"""
+    model = loads(text).compile()
+    t = np.arange(0, 60, 0.25)
+    table = Table("d", "d.csv", t, {"P": np.sin(t / 5) ** 2 * 4, "air": np.full(len(t), 20.0)})
+    run = model.simulate(table, sensitivities=True)
+    assert np.allclose(run.y[14:, 1], np.interp(t[14:] - 3.5, t, run.y[:, 0]), atol=2e-3)
+    step = [model.simulate(table, {"TD": 3.5 + s}).y for s in (-1e-3, 1e-3)]
+    slope = (step[1] - step[0]) / 2e-3
+    c = model.active.index("TD")
+    # both are exact away from the samples' kinks, where a straight line's slope jumps
+    assert np.sqrt(np.mean((run.dy[:, :, c] - slope) ** 2)) < 0.1 * np.sqrt(np.mean(slope ** 2))
+    assert run.y[0, 1] == pytest.approx(20.0)
+
+
+def test_static_plant_has_no_states():
+    plant = loads(HEAD + "inputs: {P: {unit: V}}\nparameters: {a: {value: 2, range: [0, 9]}}\noutputs: {y: {value: a * P**2}}")
+    table = Table("s", "s.csv", np.arange(4.0), {"P": np.array([1.0, 2.0, np.nan, 3.0])})
+    run = plant.compile().simulate(table, sensitivities=True)
+    assert run.y[:, 0].tolist() == [2, 8, 8, 18] and run.dy[:, 0, 0].tolist() == [1, 4, 4, 9]
