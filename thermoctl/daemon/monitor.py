@@ -126,8 +126,8 @@ def _timing(latency: dict[str, Any], ramp: str) -> Text:
     counts = [sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)]
     shape = sparkline([math.log1p(c) if c else math.nan for c in counts], len(counts), ramp)
     return Text.assemble(("lateness      ", "dim"), (f"[{shape}]", "cyan"),
-                         f" 0..1000+ us   p50 {_number(late['p50_us'], 0)}  p99 {_number(late['p99_us'], 0)}  largest "
-                         f"{_number(late['largest_us'], 0)} us   busy p99 {_number(busy['p99_us'], 0)}"
+                         f" p50 {_number(late['p50_us'], 0)}, p99 {_number(late['p99_us'], 0)}, max "
+                         f"{_number(late['largest_us'], 0)}; busy p99 {_number(busy['p99_us'], 0)}"
                          f" of {latency['period_us']:.0f} us")
 
 
