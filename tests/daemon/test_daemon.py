@@ -305,4 +305,4 @@ def test_what_a_session_recorded_replays_to_the_bit(config, capsys):
         assert "bit for bit" in out
         ticks += int(out.split(": ")[1].split()[0])
     assert ticks > 3500
-    assert main(["replay", str(config)]) == 2 and "no recording" in capsys.readouterr().err
+    assert main(["replay", str(config)]) == 2 and "rig.yaml" in capsys.readouterr().err

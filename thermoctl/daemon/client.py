@@ -132,7 +132,7 @@ def _bars(bins: list[list[int]], width: int = 50) -> str:
     edges = [0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 1 << 30]
     counts = [sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)]
     top = max(counts, default=0) or 1
-    return "\n".join(f"{low:6d} .. {str(high) if high < 1 << 30 else '':5} {count:9d} {'#' * round(width * count / top)}"
+    return "\n".join(f"{low:6d} .. {high if high < 1 << 30 else '':<5} {count:9d} {'#' * round(width * count / top)}"
                      for low, high, count in zip(edges, edges[1:], counts, strict=False) if count)
 
 
@@ -216,9 +216,9 @@ def replay(recording: str) -> int:
     """Run a recording's inputs through the law; 1 when an output differs in one bit."""
     import numpy as np
 
-    from thermoctl.daemon.recorder import read_recording
     from thermoctl.daemon.replay import replay as run_replay
-    rows, metadata = read_recording(recording)
+    from thermoctl.recording.reader import read_rows
+    rows, metadata = read_rows(recording)
     begin = time.perf_counter()
     result = run_replay(rows, metadata, recording)
     seconds = time.perf_counter() - begin

@@ -17,8 +17,7 @@ import numpy as np
 
 from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared
-from thermoctl.signals import INDEX, NAMES
-from thermoctl.yamlfile import InputError
+from thermoctl.signals import INDEX
 
 INTERVAL_S = 0.1
 _TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
@@ -137,20 +136,6 @@ def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Re
         return RecordingWriter(settings.recording, metadata, settings.rig.name, lambda text: log("recorder", what=text))
 
     return Recorder(shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer)
-
-
-def read_recording(path: str) -> tuple[np.ndarray, str]:
-    """(rows (ticks, len(SIGNALS)), law metadata) of a full-rate recording. Raises InputError for any other file."""
-    from thermoctl.recording.stream import read_batches
-    schema, batches, _ = read_batches(path)
-    metadata = schema.metadata or {}
-    missing = [name for name in NAMES if name not in schema.names]
-    if missing or b"law" not in metadata:
-        raise InputError(f"{path}: not a full-rate recording of the daemon: '{(missing or ['law'])[0]}' is missing")
-    if not batches:
-        return np.empty((0, len(NAMES))), metadata[b"law"].decode()
-    columns = [np.concatenate([b.column(name).to_numpy(zero_copy_only=False) for b in batches]) for name in NAMES]
-    return np.ascontiguousarray(np.array(columns).T), metadata[b"law"].decode()
 
 
 def record(recorder: Recorder, stopping: Callable[[], bool]) -> None:
