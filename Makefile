@@ -58,3 +58,8 @@ clean:
 models: install
 	$(BIN)/thermoctl plant linearise config/plants/actuator_thermal.yaml --rig simulated --out config/models/simulated.yaml --replace
 	$(BIN)/thermoctl plant linearise config/plants/actuator_thermal.yaml --rig wire --out config/models/wire.yaml --replace
+
+.PHONY: bench
+bench: install
+	$(BIN)/python -m pip install --quiet '.[bench]'
+	$(BIN)/python tests/bench/plant.py
