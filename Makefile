@@ -63,3 +63,7 @@ models: install
 bench: install
 	$(BIN)/python -m pip install --quiet '.[bench]'
 	$(BIN)/python tests/bench/plant.py
+
+.PHONY: prove-refit
+prove-refit: install
+	$(BIN)/python tests/prove_refit.py
