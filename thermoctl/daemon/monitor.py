@@ -142,6 +142,11 @@ def _span(seconds: float | None) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min" if minutes else f"{seconds:.0f} s"
 
 
+def ramp_of(console: Console) -> str:
+    """The characters of sparklines that this terminal can show."""
+    return BLOCKS if console.encoding.lower().startswith("utf") else ASCII
+
+
 def look(path: str, with_latency: bool = True) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Status and latency from the daemon's socket; without a daemon a status that says so."""
     try:
@@ -156,7 +161,7 @@ def monitor(settings: Any, interval_s: float = 0.5, once: bool = False) -> int:
     if not 0.05 <= interval_s <= 60.0:
         raise InputError(f"--interval {interval_s:g}: 0.05 to 60 seconds were expected")
     console = Console()
-    ramp = BLOCKS if console.encoding.lower().startswith("utf") else ASCII
+    ramp = ramp_of(console)
     trails: dict[str, deque[float]] = {}
     if once or not console.is_terminal:
         status, latency = look(settings.socket.path)
