@@ -28,7 +28,6 @@ from thermoctl.yamlfile import InputError
 
 MAX_LINE = 65536            # bytes of one request
 MAX_CLIENTS = 32
-MAX_BACKLOG = 1 << 20       # unsent bytes of a client that does not read: then it is dropped
 ANSWER_S = 1.0              # how long a command may take to show in the loop
 
 
@@ -236,22 +235,24 @@ def _accept(listener: socket.socket, selector: selectors.BaseSelector) -> None:
 
 
 def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector, commands: Commands) -> None:
+    """One read, one request, one write at most: no client keeps another waiting. One that does not take its answer is
+    not read from."""
     try:
         if events & selectors.EVENT_READ:
             data = client.connection.recv(MAX_LINE)
             if not data:
                 raise OSError("closed")
             client.received += data
-            while b"\n" in client.received:
-                line, client.received = client.received.split(b"\n", 1)
-                client.unsent += json.dumps(commands.answer(line, client.peer)).encode() + b"\n"
-            if len(client.received) > MAX_LINE or len(client.unsent) > MAX_BACKLOG:
-                raise OSError("too much")
+        if not client.unsent and b"\n" in client.received:
+            line, client.received = client.received.split(b"\n", 1)
+            client.unsent = json.dumps(commands.answer(line, client.peer)).encode() + b"\n"
+        if not client.unsent and len(client.received) > MAX_LINE:
+            raise OSError("an endless line")
         if client.unsent:
             with contextlib.suppress(BlockingIOError):
                 client.unsent = client.unsent[client.connection.send(client.unsent):]
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.unsent else 0)
-        selector.modify(client.connection, wanted, client)
+        busy = client.unsent or b"\n" in client.received
+        selector.modify(client.connection, selectors.EVENT_WRITE if busy else selectors.EVENT_READ, client)
     except OSError:
         selector.unregister(client.connection)
         client.connection.close()
