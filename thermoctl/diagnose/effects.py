@@ -440,6 +440,7 @@ class _Builder:
             warm = self._unit_of_y() in TEMPERATURE and self.rig.air
             self.symbols["reference"] = name(self.rig.air or "") if warm and self.rig.air not in ex.names(y) else num(0.0)
         dts = [float(np.median(np.diff(d.t))) for d in self.rig.drives if len(d.t) > 1]
+        self.symbols["duration"] = num(max((float(d.t[-1]) for d in self.rig.drives), default=1.0))
         self.symbols["sample"] = num(float(f"{min(dts):.6g}") if dts else 1.0)
         for e in c.effect.parameters:
             own = c.own(e.name)

@@ -23,7 +23,7 @@ import numpy as np
 from thermoctl.diagnose import locate, observer
 from thermoctl.diagnose.effects import CATALOGUE, PLACES, Candidate, Rig, candidates, catalogue
 from thermoctl.diagnose.evidence import Colour, channels, white_sigma
-from thermoctl.diagnose.screen import Direction, Metric, screen
+from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
@@ -38,6 +38,7 @@ ACCEPT = 12.0               # an effect must lower the score by this much beyond
 NAME = 0.9                  # one explanation is named alone from this probability on
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
+REMAINS = -8.0              # log10 p of an unknown smooth input from which something is left over
 LARGE = 1.6                 # coloured residual beyond this is physics, not a sensor's colour
 TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
 BLOCKS = 8                  # of a single recording, every other one held out
@@ -52,6 +53,7 @@ class Explanation:
     fit: Fit
     score: float
     colours: list[Colour]
+    raw: float = 0.0                                            # the score without the price of parameters and priors
     own: list[dict[str, str]] = field(default_factory=list)     # per effect: its parameter to the plant's name
     direction: Direction | None = None
     probability: float = 0.0
@@ -94,7 +96,8 @@ class Case:
         colours = channels(found.residuals, [n.sigma for n in self.noise])
         added = sum(len(o) for o in own)
         price = added * np.log(max(found.samples, 2)) + sum(_surprise(c) for c in effects)
-        return Explanation(plant, list(effects), found, sum(c.score for c in colours) + float(price), colours, list(own))
+        raw = sum(c.score for c in colours)
+        return Explanation(plant, list(effects), found, raw + float(price), colours, raw, list(own))
 
     def excess(self, e: Explanation) -> dict[str, float]:
         """Residual rms over sensor noise, per output that was measured."""
@@ -301,7 +304,10 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     if current.effects:
         share = (worst ** 2 - 1) / max(before_worst ** 2 - 1, 1e-9)
         explained = worst < CLEAN or (share < 0.02 and worst < LARGE)
-        if explained:
+        if explained and remains(case, current):
+            verdict = "unexplained"
+            notes.append("beside what is named, something remains in the residual that no entry of the catalogue explains")
+        elif explained:
             verdict = "explained" if current.probability >= NAME else "ambiguous"
         else:
             verdict = "unexplained"
@@ -320,6 +326,16 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     return Diagnosis(verdict, base, current, rivals, rounds, suspects, missing, held, notes, None, start)
 
 
+def counts(seen: Round, e: Explanation) -> bool:
+    """Is an explanation better than what chance alone would make of the best of all candidates? The gain in score is held
+    against the smallest chance p that pure noise showed over the whole catalogue."""
+    assert e.direction is not None
+    gain = seen.base.raw - e.raw
+    if seen.chance is None:
+        return e.score < seen.base.score - ACCEPT
+    return gain > 0 and log_p(gain, e.direction.dims) < min(float(np.min(seen.chance)), -3.5) - 0.3
+
+
 def search(case: Case, base: Explanation, entries: Mapping[str, Any],
            most: int) -> tuple[Explanation, list[Explanation], list[Round]]:
     """Add effects while the evidence asks for them; then take each out again. Returns the best explanation, its rivals and
@@ -336,7 +352,7 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any],
             break
         case.progress(f"refitting {len(chosen)} explanations")
         seen.finalists = compete(case, seen, chosen)
-        if not seen.finalists or seen.finalists[0].score > current.score - ACCEPT:
+        if not seen.finalists or not counts(seen, seen.finalists[0]):
             break
         current, rivals = seen.finalists[0], seen.finalists[1:]
         if len(current.effects) >= most:
@@ -392,6 +408,18 @@ def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanatio
         if e.last.effect.name not in {o.last.effect.name for o in out}:
             out.append(e)
     return out[:count]
+
+
+def remains(case: Case, e: Explanation) -> bool:
+    """Does a smooth unknown input at some node still explain more of the residual than noise of the residual's own colour
+    would let it?"""
+    coloured = tuple(Noise(c.sigma, c.phi, c.theta) for c in e.colours)
+    drives = [e.fit.model.drive(t) for t in case.tables]
+    for r, d in enumerate(drives):
+        e.fit.model.prepare(d, e.fit.values[r])
+    metric = Metric(dataclasses.replace(e.fit, noise=coloured), drives)
+    found = locate.suspects(metric)
+    return bool(found) and found[0].log_p < REMAINS
 
 
 def _energy(case: Case, e: Explanation) -> float:
@@ -677,7 +705,10 @@ def _finding(d: Diagnosis, c: Candidate, own: Mapping[str, str], estimates: Mapp
                       "unit": plant.parameters[n].unit} for n in own.values()}
     figures = ", ".join(f"{p} = {v:.4g}" + (f" {plant.parameters[own[p]].unit}" if plant.parameters[own[p]].unit not in (None, "1") else "")
                         for p, v in values.items())
-    return {"effect": c.effect.name, "where": c.place.where, "when": when, "probability": round(d.final.probability, 4),
+    everyone = [d.final, *d.rivals]
+    held = sum(e.probability for e in everyone if c.key in {x.key for x in e.effects})
+    probability = min(held / max(sum(e.probability for e in everyone), 1e-9), 0.995) if d.rivals else d.final.probability
+    return {"effect": c.effect.name, "where": c.place.where, "when": when, "probability": round(probability, 4),
             "equation": equation, "parameters": parameters,
             "summary": f"{c.effect.title} at {c.place.where}: {equation} with {figures}."}
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.signal import lfilter
 
 from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulate import Drive, Model, SimulationError
@@ -27,9 +28,11 @@ BELIEF_WEIGHT = 0.02    # a whole range away from the belief costs as much as a 
 
 @dataclass(frozen=True)
 class Noise:
-    """One channel's noise: standard deviation and correlation over one median sampling interval."""
+    """One channel's noise: standard deviation, and its colour over one median sampling interval. With `theta` it is
+    ARMA(1,1), white noise beside a first-order coloured part, and `sigma` is that of the innovations."""
     sigma: float
     phi: float = 0.0
+    theta: float = 0.0
 
 
 @dataclass
@@ -179,6 +182,9 @@ class Problem:
         index, phi, scale = self.rows[r][j]
         part = e if len(index) == len(e) else e[index]
         shape = (-1, *([1] * (part.ndim - 1)))
+        noise = self.noise[j]
+        if noise.theta > 0 and len(index) > 1:
+            return lfilter([1.0, -noise.phi], [1.0, -noise.theta], part, axis=0) / noise.sigma
         if len(index) > 1 and phi.any():
             part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
         return part / scale.reshape(shape)
