@@ -129,7 +129,7 @@ def trapezoids(settings: Any, hours: float, compensate: bool, out: str | None = 
     """`hours` of rig time in trapezoids of 75 s (the paper's test 4B): how far the output stayed from the setpoint.
 
     Judged by the reference encoder, which the law never reads, wherever the reference has stood for SETTLE_S. Prints
-    mean and largest deviation; `out`: ten rows a second as Parquet. Returns 0 when every deviation is within 0.5 um, else 1.
+    mean and largest deviation; `out`: ten rows a second as Parquet. Returns 0 when all are within 0.5 um, else 1.
     """
     parameters = dataclasses.replace(law_parameters(settings), compensate=float(compensate))
     simulation = Simulation(settings, parameters=parameters)
