@@ -79,7 +79,7 @@ def casadi_functions(plant, table):
 
 
 def closed_loop(seconds):
-    """CPU seconds for `seconds` of the daemon's own tick (law, protection, record row) with the whole actuator."""
+    """CPU seconds for `seconds` of the daemon's own tick with the whole actuator as its rig."""
     from thermoctl.daemon.simulate import Simulation
     from thermoctl.settings import load_settings
     rig = Simulation(load_settings("config/simulated.yaml"))
@@ -88,14 +88,47 @@ def closed_loop(seconds):
     begin = time.process_time()
     rig.tick(round(seconds * 1000))
     spent = time.process_time() - begin
+    rig.close()
+    return spent
+
+
+def law_and_plant(seconds):
+    """The law (estimator, compensation, PID, protection) closed over the whole actuator, nothing between them: CPU seconds
+    of `seconds`, how long the plant alone takes, and the position where the setpoint was 50 um."""
+    from thermoctl.control import arming
+    from thermoctl.control.faults import CHANNELS
+    from thermoctl.control.law import Law
+    from thermoctl.daemon.assemble import compensator, law_parameters
+    from thermoctl.settings import load_settings
+    settings = load_settings("config/simulated.yaml")
     model = load("config/plants/actuator.yaml").compile(())
-    stepper, u = model.stepper(1e-3, np.array([0.0, 22.0])), np.array([0.3, 22.0])
+    stepper, u = model.stepper(1e-3, np.array([0.0, 22.0])), np.array([0.0, 22.0])
+    value, fresh, status = np.full(len(CHANNELS), 22.0), np.ones(len(CHANNELS), np.uint8), np.zeros(len(CHANNELS), np.uint8)
+    at = {name: CHANNELS.index(name) for name in model.outputs}
+    assert list(at.values()) == [k for k, c in enumerate(CHANNELS) if c in at]
+    readings = np.array(list(at.values()))
+    value[CHANNELS.index("supply_v")], value[CHANNELS.index("amplifier_fault")] = 24.0, 0.0
+    amplifier = CHANNELS.index("amplifier_state")
+    law = Law(compensator(settings), law_parameters(settings), 1e-3)
+    law.bind(value, fresh, status)
+    commands = {name: k for k, name in enumerate(arming.COMMANDS)}
+
+    def ticks(count, command=0, target=0.0):
+        for k in range(count):
+            value[readings] = stepper.step(u)
+            value[amplifier] = 1.0 + (law.enable > 0)
+            law.step(1e-3, command if k == 0 else 0, target)
+            u[0] = law.drive
+    ticks(3000)
+    ticks(1, commands["arm"])
+    ticks(5000, commands["setpoint"], 50.0)
+    begin = time.process_time()
+    ticks(round(seconds * 1000))
+    spent = time.process_time() - begin
     begin = time.process_time()
     for _ in range(round(seconds * 1000)):
         stepper.step(u)
-    alone = time.process_time() - begin
-    rig.close()
-    return spent, alone
+    return spent, time.process_time() - begin, law.compensated_um, arming.STATES[law.state]
 
 
 def main():
@@ -126,9 +159,10 @@ def main():
     print(f"{'':62}{'simulation':>12}{'ratio':>8}{'+ Jacobian':>12}{'ratio':>8}")
     for label, a, b in rows:
         print(f"{label:62}{a:10.4f} s{a / ours:8.0f}{b:10.3f} s{b / ours_j:8.0f}")
-    spent, alone = closed_loop(10.0)
-    print(f"closed loop, the daemon's tick and the whole actuator at 1 ms: {10 / spent:.0f} times real time "
-          f"(of {spent * 100:.1f} us a tick the plant takes {alone * 100:.1f})")
+    spent, alone, position, state = law_and_plant(20.0)
+    print(f"closed loop of law and whole actuator at 1 ms: {20 / spent:.0f} times real time (of {spent * 50:.1f} us a tick the plant "
+          f"takes {alone * 50:.1f}); state {state}, position {position:.3f} um of 50")
+    print(f"the same with the daemon's whole tick (sensors with noise, record row): {10 / closed_loop(10.0):.0f} times real time")
 
 
 if __name__ == "__main__":
