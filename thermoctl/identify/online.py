@@ -69,9 +69,9 @@ class Tuner:
 
 
 def clipped(new: Expansion, old: CompensatorModel, clip: float) -> Expansion:
-    """`new` with each static gain within +-clip of the largest calibrated gain round the calibrated one, pole within the bank's."""
-    g_old1, g_old2 = old.b1 / (1 - old.f1), old.b2 / (1 - old.f1)
-    width = clip * max(np.abs(g_old1 + g_old2).max(), 1e-12)
-    g1 = np.clip(new.b1 / (1 - new.f1), g_old1 - width, g_old1 + width)
-    g2 = np.clip(new.b2 / (1 - new.f1), g_old2 - width, g_old2 + width)
-    return replace(new, b1=(1 - new.f1) * g1, b2=(1 - new.f1) * g2)
+    """`new` with each static gain within +-clip of the largest calibrated gain round the calibrated one. The two lags' gains are not
+    told apart by slow temperatures (only their sum is), so the sum is clipped and given to T(n)."""
+    old_gain = (old.b1 + old.b2) / (1 - old.f1)
+    width = clip * max(np.abs(old_gain).max(), 1e-12)
+    gain = np.clip((new.b1 + new.b2) / (1 - new.f1), old_gain - width, old_gain + width)
+    return replace(new, b1=np.zeros_like(gain), b2=(1 - new.f1) * gain)

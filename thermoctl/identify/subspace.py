@@ -360,7 +360,7 @@ def refine_prediction_error(model: StateSpace, u: np.ndarray, y: np.ndarray, ite
     uy = _c(np.hstack([u, y]))
 
     def cost(mod: StateSpace, k: np.ndarray) -> float:
-        if not (0 < np.diag(mod.a)).all() or np.abs(np.linalg.eigvals(mod.a - k @ mod.c)).max() >= 1 or not mod.stable:
+        if not (np.diag(mod.a) > 0).all() or np.abs(np.linalg.eigvals(mod.a - k @ mod.c)).max() >= 1 or not mod.stable:
             return np.inf
         return float(((innovations(mod, u, y, k) @ root.T)**2).sum())
 

@@ -1,0 +1,284 @@
+"""Expansion models, filters, tuning and calibration files."""
+import numpy as np
+import pytest
+from scipy import linalg, signal
+
+from thermoctl.control.model import CompensatorModel, zero_model
+from thermoctl.identify import expansion, filter, kernels, modelfile, online, tuning
+from thermoctl.identify.statespace import StateSpace
+from thermoctl.yamlfile import InputError
+
+
+def motion(n=9000, seed=0):
+    """Two temperature rises and the position error of a first-order expansion with tau = 120 s."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n)
+    heat = ((t % 1500) < 700 + 300 * np.sin(t / 1900)).astype(float)
+    rises = np.column_stack([signal.lfilter([1 - p], [1, -p], 8 * heat) for p in np.exp(-1 / np.array([250.0, 1400.0]))])
+    f = np.exp(-1 / 120)
+    y = signal.lfilter([0, 1 - f], [1, -f], rises @ [1.2, -0.8])
+    return rises, y, rng
+
+
+def test_recursion_equals_block_least_squares():
+    rises, y, rng = motion(3000)
+    rises, y = rises + 0.05 * rng.standard_normal(rises.shape), y + 0.05 * rng.standard_normal(len(y))
+    a, b = expansion.block_ls(rises, y, 1.0), expansion.recursive(rises, y, 1.0, q0=1e9)
+    assert np.allclose(np.concatenate([a.b1, a.b2, [a.f1]]), np.concatenate([b.b1, b.b2, [b.f1]]), atol=1e-5)
+
+
+def test_equation_error_is_biased_and_output_error_is_not():
+    rises, y, rng = motion()
+    read = y + 0.1 * rng.standard_normal(len(y))
+    biased, true = expansion.recursive(rises, read, 1.0), expansion.output_error(rises, read, 1.0)
+    assert biased.time_constant_s < 30
+    assert abs(true.time_constant_s - 120) < 15
+    left = [np.std((y - m.predict(rises))[2000:]) for m in (biased, true)]
+    assert left[1] < 0.15 * left[0]
+
+
+def test_the_air_enters_with_the_sum_of_the_gains():
+    rises, _, rng = motion()
+    air = 22 + 0.5 * np.sin(np.arange(len(rises)) / 3000)
+    y = (rises + (air - air[0])[:, None]) @ [0.7, 0.5] + 0.3
+    m = expansion.output_error(rises, y + 0.01 * rng.standard_normal(len(y)), 1.0, air=air, lags=1, tau_range_s=(0.5, 60))
+    assert m.b_air == pytest.approx((m.b1 + m.b2).sum())
+    assert np.std((y - m.predict(rises, air, m.info["start_um"]))[100:]) < 0.02
+
+
+def test_noisy_inputs_shrink_the_gains():
+    rises, y, _ = motion(4000)
+    free, careful = expansion.output_error(rises, y, 1.0), expansion.output_error(rises, y, 1.0, input_sigma_k=5.0)
+    assert np.abs(careful.b1 + careful.b2).sum() / (1 - careful.f1) < np.abs(free.b1 + free.b2).sum() / (1 - free.f1)
+
+
+def test_bank_online_comes_near_the_block_fit_and_misses_samples():
+    rises, y, rng = motion()
+    read = y + 0.05 * rng.standard_normal(len(y))
+    read[::7] = np.nan
+    bank = expansion.Bank(2, 1.0)
+    for k in range(0, len(y), 500):
+        bank.update(rises[k:k + 500], read[k:k + 500])
+    m = bank.model()
+    assert 60 < m.time_constant_s < 240
+    assert np.std((y - m.predict(rises))[2000:]) < 0.1
+
+
+def test_square_root_rls_equals_least_squares():
+    rng = np.random.default_rng(0)
+    rows = rng.standard_normal((400, 6))
+    r = np.zeros((5, 6))
+    r[np.arange(5), np.arange(5)] = 1e-9
+    kernels.triangle_run(r, rows, 1.0)
+    theta = linalg.solve_triangular(r[:, :5], r[:, 5])
+    assert np.allclose(theta, np.linalg.lstsq(rows[:, :5], rows[:, 5], rcond=None)[0], atol=1e-10)
+
+
+def test_rls_step_equals_run_and_forgets():
+    rng = np.random.default_rng(0)
+    f, y = rng.standard_normal((300, 4)), rng.standard_normal(300)
+    a, qa, b, qb, w = np.zeros(4), 1e3 * np.eye(4), np.zeros(4), 1e3 * np.eye(4), np.zeros(4)
+    kernels.rls_run(a, qa, f, y, 0.98)
+    for k in range(300):
+        kernels.rls_step(b, qb, f[k], y[k], 0.98, w)
+    assert np.array_equal(a, b)
+    weight = 0.98**np.arange(299, -1, -1.0)
+    normal = (f * weight[:, None]).T @ f
+    assert np.allclose(a, np.linalg.solve(normal, (f * weight[:, None]).T @ y), atol=1e-3)
+
+
+def thermal():
+    p = np.exp(-1 / np.array([30.0, 300.0, 2000.0]))
+    return StateSpace(np.diag(p), (1 - p)[:, None], np.array([[1.0, 1.0, 0.6], [0.2, 1.2, 0.8], [0.1, 0.3, 1.0]]), 1.0, np.zeros(3))
+
+
+def test_mkf_is_the_printed_recursion():
+    """(34), (35) written out in numpy."""
+    m, rng = thermal(), np.random.default_rng(0)
+    u = (np.arange(600) % 200 < 90).astype(float)[:, None]
+    y = m.simulate(u) + 0.2 * rng.standard_normal((600, 3)).cumsum(0) / 10
+    f = filter.mkf(m, u, y, 0.01, 1.0)
+    e = y - m.simulate(u)
+    z = e - e.mean(0)
+    assert np.allclose(f.zeta, (z[:, :1] * z).mean(0) / (z[:, 0]**2).mean())
+    coil = y[:, 0].copy()
+    coil[5:9] = np.nan
+    got, gains = f.run(u[:, 0], coil)
+    x, p = np.zeros(3), f.r_w
+    for k in range(600):
+        if np.isfinite(coil[k]):
+            gain = p / (p + f.r_v)
+            p = p * (1 - gain)
+            x = x + gain * (coil[k] - x[0]) * f.zeta
+            assert gains[k] == pytest.approx(gain)
+        assert np.allclose(got[k], x)
+        x = f.alpha @ x + f.beta[:, 0] * u[k, 0]
+        p = f.alpha[0] @ f.alpha[0] * p + f.r_w
+
+
+def test_steady_filter_is_where_the_kalman_recursion_ends():
+    m = filter.disturbed(filter.with_air(thermal()))
+    v = np.array([1e-2, 1e-9, 1e-6, 1e-12])
+    k = filter.steady(m, v, 0.01)
+    q, c = filter.process_noise(m, v), m.c[:1]
+    p = np.eye(m.order)
+    for _ in range(60_000):
+        p = m.a @ p @ m.a.T + q
+        gain = p @ c.T / (c @ p @ c.T + 0.01)
+        p = p - gain @ c @ p
+    assert np.allclose(k.gain, gain, rtol=1e-4, atol=1e-7)
+
+
+def test_warming_air_lowers_every_rise_by_as_much():
+    m = filter.with_air(thermal())
+    quick = m.simulate(np.column_stack([np.zeros(3), [1.0, 0, 0]]))
+    assert np.allclose(quick[1], -1.0, atol=1e-9)
+
+
+def test_filter_follows_an_unmodelled_disturbance_better_than_the_model_alone():
+    rng = np.random.default_rng(3)
+    m = thermal()
+    u = ((np.arange(7200) % 1500) < 700).astype(float) * 4
+    wrong = m.simulate((u * 1.08)[:, None])
+    measured = np.round((wrong + 0.06 * rng.standard_normal(wrong.shape)) / 0.25) * 0.25
+    f, _ = filter.tune(filter.disturbed(filter.with_air(m)), [filter.Record(u, 0 * u, measured)], filter.sensor_variance(0.25, 0.06))
+    left = [np.sqrt(np.mean((e - wrong)**2)) for e in (m.simulate(u[:, None]), f.run(u, 0 * u, measured[:, 0]))]
+    assert left[1] < 0.5 * left[0]
+
+
+def test_more_sensors_never_cost_accuracy():
+    m = filter.disturbed(filter.with_air(thermal()))
+    choice = filter.choose_sensors(m, np.array([1e-2, 1e-9, 1e-5, 1e-12]), 0.01, np.array([0.5, 1.0, -0.7]), 3)
+    assert [len(s) for s, _ in choice] == [1, 2, 3]
+    errors = [e for _, e in choice]
+    assert errors[0] >= errors[1] >= errors[2] > 0
+
+
+# PID
+PLANT = tuning.SecondOrder(300.0, 0.012, 0.0012, 0.002)
+
+
+def test_zn_from_a_noisy_step_is_within_two_percent():
+    t = np.arange(-0.02, 0.2, 0.001)
+    clean = tuning.ziegler_nichols(PLANT)
+    for seed in range(5):
+        y = PLANT.step(t) * 0.3 + 0.15 * np.random.default_rng(seed).standard_normal(len(t))
+        assert tuning.ziegler_nichols(tuning.fit_step(t, y, 0.3)).kp == pytest.approx(clean.kp, rel=0.03)
+
+
+def test_table_one():
+    """tau_d 2 ms, tau_c 10.8 ms, K_0 308: the paper's 0.021, 0.004 s, 0.001 s."""
+    first = tuning.SecondOrder(308.0, 0.0108, 1e-7, 0.002)
+    g = tuning.ziegler_nichols(first)
+    assert (g.kp, g.ti_s, g.td_s) == pytest.approx((0.021, 0.004, 0.001), rel=0.02)
+
+
+def test_margins_predict_where_the_loop_becomes_unstable():
+    g = tuning.imc(PLANT)
+    m = tuning.margins(PLANT, g, 0.001)
+
+    def diverges(factor):
+        n = 4000
+        impulse = np.diff(PLANT.step(np.arange(400) * 0.001))
+        ts, kp, ti, td = 0.001, g.kp * factor, g.ti_s, g.td_s
+        e, v, y = np.zeros(n + 2), np.zeros(n), np.zeros(n)
+        for k in range(n):
+            past = v[max(0, k - 399):k][::-1]
+            y[k] = past @ impulse[:len(past)]
+            e[k] = 1 - y[k]
+            v[k] = (v[k - 1] if k else 0) + kp * ((1 + ts / ti + td / ts) * e[k] - (1 + 2 * td / ts) * (e[k - 1] if k else 0)
+                                                   + td / ts * (e[k - 2] if k > 1 else 0))
+            if abs(y[k]) > 1e6:
+                return True
+        return np.abs(y[-500:] - 1).max() > 0.5
+
+    assert m.stable and not diverges(0.93 * m.gain) and diverges(1.07 * m.gain)
+
+
+def test_robust_tuning_has_the_margins_and_the_relay_finds_the_limit():
+    g = tuning.robust(PLANT, 0.001, 4)
+    m = tuning.margins(PLANT, g, 0.001, 4)
+    assert m.phase_deg >= 45 and m.gain >= 2
+    t = np.arange(0, 1, 0.001)
+    w = 2 * np.pi / 0.02
+    r = tuning.relay(t, 5 * np.sin(w * t), 0.1)
+    assert r.ti_s == pytest.approx(0.01, rel=0.01) and r.kp == pytest.approx(0.6 * 4 * 0.1 / (np.pi * 5), rel=0.02)
+    with pytest.raises(InputError, match="oscillations"):
+        tuning.relay(t, t, 0.1)
+
+
+def test_no_response_is_said():
+    t = np.arange(-0.02, 0.2, 0.001)
+    with pytest.raises(InputError, match="larger step"):
+        tuning.fit_step(t, np.random.default_rng(0).standard_normal(len(t)), 0.3)
+
+
+def test_a_proposal_changes_only_the_three_lines(tmp_path):
+    path = tmp_path / "rig.yaml"
+    text = "rig: {name: a}\ncontrol:            # gains\n  kp: 0.01          # um\n  ti_s: 4 ms\n  td_s: 0.001\n  moving_average: 4\nloop:\n  kp: 7\n"
+    path.write_text(text)
+    tuning.write(path, tuning.Gains(0.02, 0.005, 0.002, "test"))
+    assert path.read_text() == text.replace("kp: 0.01 ", "kp: 0.02 ").replace("ti_s: 4 ms", "ti_s: 0.005").replace("td_s: 0.001", "td_s: 0.002")
+    path.write_text("control: {kp: 1}\n")
+    with pytest.raises(InputError):
+        tuning.write(path, tuning.Gains(0.02, 0.005, 0.002, "test"))
+
+
+# calibrations
+def test_calibration_round_trip_and_roll_back(tmp_path):
+    recording = tmp_path / "r.csv"
+    recording.write_text("t,x\n0,1\n")
+    one = modelfile.install(tmp_path / "m", zero_model(), "bench", [recording], {"rms_um": 0.1})
+    two = modelfile.install(tmp_path / "m", zero_model(0.002), "bench")
+    c = modelfile.load_calibration(one, "bench")
+    assert c.fingerprints == {"r.csv": modelfile.fingerprint(recording)} and c.figures == {"rms_um": 0.1}
+    assert all(np.array_equal(getattr(c.model, k), getattr(zero_model(), k)) for k in ("A_minus_I", "B", "C", "gain", "b1"))
+    assert modelfile.load_model(tmp_path / "m").period_s == 0.002 and modelfile.current(tmp_path / "m") == two
+    assert modelfile.roll_back(tmp_path / "m") == one and modelfile.load_model(tmp_path / "m").period_s == 0.001
+    with pytest.raises(InputError, match="oldest"):
+        modelfile.roll_back(tmp_path / "m")
+    with pytest.raises(InputError, match="never overwritten"):
+        modelfile.save_model(one, zero_model(), "bench")
+
+
+def test_a_calibration_that_does_not_fit_is_refused(tmp_path):
+    path = modelfile.save_model(tmp_path / "a.yaml", zero_model(), "bench")
+    with pytest.raises(InputError, match="rig 'bench', this one is 'other'"):
+        modelfile.load_model(path, "other")
+    text = path.read_text()
+    path.write_text(text.replace("R_v: 1.0", "R_v: 2.0"))
+    with pytest.raises(InputError, match="checksum"):
+        modelfile.load_model(path)
+    path.write_text("format: something\n")
+    with pytest.raises(InputError, match="not a calibration"):
+        modelfile.load_model(path)
+    with pytest.raises(InputError, match="no calibration is current"):
+        modelfile.load_model(tmp_path)
+
+
+# online
+def compensator(gain):
+    b = np.zeros(12)
+    b[:2] = gain
+    f = np.exp(-1 / 120)
+    return CompensatorModel("kalman", 0.001, -np.eye(2) * 1e-6, np.zeros((2, 2)), np.zeros((12, 2)), np.zeros(2), 0.0, 1.0, f, np.zeros(12),
+                            (1 - f) * b, 1.0)
+
+
+def test_online_tuning_waits_for_excitation_and_is_clipped():
+    rises, y, rng = motion(9000)
+    wide = np.zeros((len(rises), 12))
+    wide[:, :2] = rises
+    tuner = online.Tuner(compensator([1.0, -0.7]), buckets_k=(1.0, 3.0, 5.0), full=200)
+    for k in range(400):
+        tuner.update(wide[k], y[k])
+    new, why = tuner.proposal()
+    assert new is None and "excitation" in why and tuner.progress < 100
+    for k in range(400, len(y)):
+        tuner.update(wide[k], y[k] + 0.02 * rng.standard_normal())
+    assert tuner.progress == 100
+    new, why = tuner.proposal()
+    assert new is not None, why
+    old = compensator([1.0, -0.7])
+    move = (new.b1 + new.b2) / (1 - new.f1) - (old.b1 + old.b2) / (1 - old.f1)
+    assert np.abs(move).max() <= 0.3 + 1e-9
