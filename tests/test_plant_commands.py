@@ -1,0 +1,162 @@
+"""linearise, show and the plant commands, from outside."""
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from thermoctl.cli import main
+from thermoctl.identify.modelfile import load_model
+from thermoctl.plant import load
+from thermoctl.plant.linearise import discrete, gains, linearise, thermal
+from thermoctl.plant.show import layout
+from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.yamlfile import InputError
+
+THERMAL = "config/plants/actuator_thermal.yaml"
+
+
+@pytest.fixture(autouse=True)
+def in_repository(monkeypatch, request):
+    monkeypatch.chdir(request.config.rootpath)
+
+
+@pytest.fixture(scope="module")
+def plant(request):
+    return load(request.config.rootpath / THERMAL)
+
+
+def test_model_predicts_what_the_plant_does(plant):
+    """An hour of power steps and drifting air: temperatures and growth by the model, against the plant's own simulation."""
+    model, n, step = linearise(plant, period_s=1.0, expansion_period_s=1.0), 3600, 1.0
+    t = np.arange(n) * step
+    current, air = 0.8 * ((t // 300) % 2), 22 + t / 1800
+    run = plant.compile(()).simulate(Table("x", "x", t, {"voltage_v": 5 * current, "current_a": current, "air_c": air}))
+    x, rises = np.zeros(12), []
+    for k in range(n):
+        rises.append(model.C @ x)
+        x = x + model.A_minus_I @ x + model.B @ [5 * current[k] ** 2, 1 / 1800]
+    rises = np.array(rises)
+    assert np.abs(rises + air[:, None] - run.y[:, :12]).max() < 1e-4
+    growth = rises @ model.b2 + model.b_air * (air - air[0])
+    assert np.abs(growth - run.y[:, 12]).max() < 1e-3
+
+
+def test_delta_form_keeps_the_slow_poles_at_1_ms(plant):
+    heat = thermal(plant)
+    step, _, noise = discrete(heat, 1e-3)
+    poles = np.sort(np.log1p(np.linalg.eigvals(step).real) / 1e-3)
+    assert poles == pytest.approx(np.sort(np.linalg.eigvals(heat.A).real), rel=1e-8)
+    assert np.linalg.eigvalsh(noise).min() > 0
+
+
+def test_time_varying_gain_ends_in_the_steady_one(plant):
+    steady = linearise(plant).gain
+    sequence = gains(thermal(plant), 0.1, 20_000)
+    coil = list(plant.nodes).index("coil")
+    assert sequence[0, coil, 0] > 10 * steady[0, 0]
+    assert sequence[-1] == pytest.approx(steady, rel=0.02, abs=2e-5)
+
+
+def test_steady_gain_estimates_better_than_no_sensor(plant):
+    heat, rng = thermal(plant), np.random.default_rng(5)
+    step, _, noise = discrete(heat, 1.0)
+    model, A = linearise(plant, period_s=1.0, sensor_period_s=1.0), expm(heat.A)
+    root = np.linalg.cholesky(noise)
+    x, z, errors = rng.normal(0, 0.5, 12), np.zeros(12), []
+    blind = x.copy()
+    for _ in range(4000):
+        x, blind, z = A @ x + root @ rng.normal(size=12), A @ blind, A @ z
+        z = z + model.gain[:, 0] * (x[0] + np.sqrt(heat.variance[0]) * rng.normal() - z[0])
+        errors.append((x[0] - z[0], x[0]))
+    with_sensor, without = np.sqrt(np.mean(np.array(errors[500:]) ** 2, axis=0))
+    assert with_sensor < 0.7 * without
+
+
+def test_a_plant_that_is_not_thermal_is_refused():
+    with pytest.raises(InputError, match="no input reads the column"):
+        linearise(load("config/plants/actuator.yaml"))
+
+
+@pytest.mark.parametrize("rig", ["simulated", "wire"])
+def test_shipped_models_are_those_of_the_plant_file(plant, rig):
+    shipped, made = load_model(f"config/models/{rig}.yaml", rig), linearise(plant)
+    assert shipped.A_minus_I == pytest.approx(made.A_minus_I, rel=1e-9, abs=1e-15), "stale: make models"
+    assert shipped.gain == pytest.approx(made.gain, rel=1e-6) and shipped.b2 == pytest.approx(made.b2)
+
+
+def test_linearise_writes_a_model_and_its_gains(tmp_path):
+    out = tmp_path / "m.yaml"
+    arguments = ["plant", "linearise", THERMAL, "--out", str(out), "--kind", "mkf", "--gains", str(tmp_path / "g.csv"), "--samples", "50"]
+    assert main(arguments) == 0
+    assert load_model(out, "simulated").kind == "mkf" and len(read_table(tmp_path / "g.csv")) == 50
+    assert main(arguments) == 2                     # a calibration is never overwritten unasked
+
+
+@pytest.mark.parametrize("suffix", ["svg", "png"])
+def test_show_draws_every_node(tmp_path, suffix):
+    out = tmp_path / f"p.{suffix}"
+    assert main(["plant", "show", THERMAL, "--out", str(out)]) == 0
+    assert out.stat().st_size > 20_000
+    if suffix == "svg":
+        assert out.read_text().count("outer_stator") >= 1
+
+
+def test_show_prints_and_refuses_other_endings(capsys, tmp_path):
+    assert main(["plant", "show", THERMAL]) == 0
+    assert "G_coil_bobbin" in capsys.readouterr().out
+    assert main(["plant", "show", THERMAL, "--out", str(tmp_path / "p.doc")]) == 2
+
+
+def test_layout_keeps_the_lengths_of_a_chain():
+    x = layout(5, [(k, k + 1, 1.0) for k in range(4)])
+    assert np.linalg.norm(np.diff(x, axis=0), axis=1) == pytest.approx(np.ones(4), abs=0.05)
+
+
+BLOCK = """format: thermoctl-plant/1
+inputs: {P: {unit: W}, air: {unit: degC}}
+parameters: {C: {value: 30, unit: J/K, range: [10, 90]}, G: {value: 0.5, unit: W/K, range: [0.1, 1]}}
+nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}}
+flows: {heat: {into: T, rate: P, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}
+outputs: {y: {value: T, unit: degC, noise: 0.1}}
+"""
+
+
+@pytest.fixture
+def block(tmp_path):
+    (tmp_path / "p.yaml").write_text(BLOCK)
+    plant, rng = load(tmp_path / "p.yaml"), np.random.default_rng(1)
+    for name in ("a", "b"):
+        t = np.arange(600.0)
+        table = Table(name, name, t, {"P": 6.0 * rng.integers(0, 2, 12).repeat(50), "air": np.full(600, 21.0)})
+        table.columns["y"] = plant.compile().simulate(table, {"C": 46.0, "G": 0.31}).y[:, 0] + rng.normal(0, 0.1, 600)
+        write_table(tmp_path / f"{name}.csv", table)
+    return tmp_path
+
+
+def test_simulate_writes_plots_and_predicts_ahead(block, capsys):
+    both = [str(block / "a.csv"), str(block / "b.csv")]
+    assert main(["simulate", "--plant", str(block / "p.yaml"), *both, "--out", str(block / "o.csv"), "--plot", str(block / "o.png")]) == 0
+    free = read_table(block / "o_a.csv").columns
+    assert (block / "o_b.png").stat().st_size > 10_000
+    assert main(["simulate", "--plant", str(block / "p.yaml"), both[0], "--horizon", "10", "--out", str(block / "h.csv")]) == 0
+    ahead = read_table(block / "h.csv").columns
+    errors = [np.sqrt(np.mean((c["y"] - c["y_simulated"]) ** 2)) for c in (free, ahead)]
+    assert errors[1] < 0.3 * errors[0]              # the wrong belief has ten seconds only to go astray
+    assert "free run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("noise", ["white", "ar1"])
+def test_refit_finds_the_truth_and_judges_on_held_out_data(block, capsys, noise):
+    assert main(["refit", "--plant", str(block / "p.yaml"), str(block / "a.csv"), "--held-out", str(block / "b.csv"),
+                 "--out", str(block / "p2.yaml"), "--noise", noise]) == 0
+    found = load(block / "p2.yaml").parameters
+    assert found["C"].value == pytest.approx(46, rel=0.03) and found["G"].value == pytest.approx(0.31, rel=0.03)
+    held = next(line for line in capsys.readouterr().out.splitlines() if "│ b " in line and "no" in line)
+    before, after = (float(q) for q in held.replace("│", " ").split()[-2:])
+    assert after < 0.12 < before
+
+
+def test_check_names_what_is_wrong(block, capsys):
+    (block / "bad.yaml").write_text(BLOCK.replace("G * (T - air)", "G * (T - iar)"))
+    assert main(["plant", "check", str(block / "p.yaml")]) == 0
+    assert main(["plant", "check", str(block / "bad.yaml")]) == 2
+    assert "did you mean 'air'" in capsys.readouterr().err
