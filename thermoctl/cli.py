@@ -232,6 +232,16 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
          ("--interval", {"type": float, "default": 0.5, "metavar": "S", "help": "seconds between two looks (default 0.5)"}),
          ("--once", {"action": "store_true", "help": "one screen; exit 1 when no daemon runs or a fault stands"}))
 
+    def fleet(args: argparse.Namespace) -> int:
+        from thermoctl.diagnose.fleet import fleet
+        return fleet(args.folder, args.plant, args.parameters, args.workers, args.scheduler, args.json)
+    _add(sub, "fleet", "many rigs' recordings: health, drift of parameters, which model no longer fits; exit 1 when one needs "
+         "attention", fleet, ("folder", {"metavar": "FOLDER"}),
+         ("--plant", {"metavar": "FILE", "help": "the plant that the recordings are held against"}),
+         ("--parameters", {"default": "", "metavar": "A,B", "help": "its parameters to follow over time"}),
+         ("--workers", {"type": int, "default": 0, "metavar": "N", "help": "Dask processes here (default: this one)"}),
+         ("--scheduler", {"metavar": "ADDRESS", "help": "a Dask cluster"}), ("--json", {"action": "store_true"}))
+
     def completion(args: argparse.Namespace) -> None:
         import shtab
         print(shtab.complete(parser(), args.shell))

@@ -75,14 +75,6 @@ def reduce(bucket: np.ndarray, low: np.ndarray, mean: np.ndarray, high: np.ndarr
             np.fmax.reduceat(high, starts))
 
 
-def recorded_rigs(directory: str | Path) -> dict[str, list[Path]]:
-    """The full-rate recordings in a folder by the rig's name, oldest first."""
-    rigs: dict[str, list[Path]] = {}
-    for path in recording_files(Path(directory), FULL):
-        rigs.setdefault(_match(path)["rig"], []).append(path)
-    return rigs
-
-
 def _match(path: Path) -> re.Match[str]:
     found = NAME.match(path.name)
     assert found is not None                # recording_files gives only such names
