@@ -11,18 +11,19 @@ os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
 import contextlib  # noqa: E402
 import ctypes  # noqa: E402
 import io  # noqa: E402
-import resource  # noqa: E402
 import subprocess  # noqa: E402
 import sys  # noqa: E402
 import tempfile  # noqa: E402
 import time  # noqa: E402
 import warnings  # noqa: E402
+from functools import partial  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import numpy as np  # noqa: E402
 from scipy import linalg  # noqa: E402
 
 from thermoctl.identify import expansion, kernels, modal, subspace  # noqa: E402
+from thermoctl.identify.statespace import StateSpace  # noqa: E402
 
 warnings.filterwarnings("ignore")
 MISSED: list[str] = []
@@ -71,6 +72,11 @@ def cpu(work, repeat: int = 1):
     return best, out
 
 
+def memory(key: str) -> float:
+    """MB of this process: VmRSS now, VmHWM at most."""
+    return next(float(line.split()[1]) / 1024 for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(key))
+
+
 def goal(what: str, value: float, limit: float, detail: str = "") -> None:
     met = value <= limit
     if not met:
@@ -101,7 +107,7 @@ def sippy(u: np.ndarray, y: np.ndarray):
 def ipsid(u: np.ndarray, y: np.ndarray):
     import PSID
     with contextlib.redirect_stdout(io.StringIO()):
-        m = PSID.IPSID(y, None, u, nx=12, n1=0, i=20, fit_Cz_via_KF=False) if False else PSID.IPSID(y, U=u, nx=12, n1=0, i=20)
+        m = PSID.IPSID(y, U=u, nx=12, n1=0, i=20)
     return m.A, m.B, m.C
 
 
@@ -180,9 +186,10 @@ def scale() -> None:
                     yield z[:, :1], z[:, 1:]
 
         reading, _ = cpu(lambda: sum(len(u) for u, _ in chunks()))
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        Path("/proc/self/clear_refs").write_text("5")              # the peak counts from here
+        before = memory("VmRSS")
         t, m = cpu(lambda: modal.identify(modal.reduce(chunks(), 0.001), 8))
-        grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+        grown = memory("VmHWM") - before
         fine = error(m.resample(1.0), uv, yv)
         coarse = []
         for s in range(3):
@@ -194,7 +201,8 @@ def scale() -> None:
         z = np.load(path)
         try:
             theirs, p = cpu(lambda: slicot(z[:, :1], z[:, 1:], refine=False))
-            goal("18 M x 13: CPU after reading / ctrlsys", (t - reading) / theirs, 0.06, f"{t - reading:.2f} / {theirs:.1f} s, its radius {radius(p):.6f}")
+            goal("18 M x 13: CPU after reading / ctrlsys", (t - reading) / theirs, 0.06,
+                 f"{t - reading:.2f} / {theirs:.1f} s, its radius {radius(p):.6f}")
         except Exception as e:                                   # noqa: BLE001
             print(f"    ctrlsys does not run at 18 M: {type(e).__name__}: {str(e)[:90]}")
 
@@ -215,12 +223,12 @@ def output_error() -> None:
             y[k] = f * y[k - 1] + (1 - f) * rises[k - 1] @ gains
         measured = np.round((rises + 0.07 * rng.standard_normal(rises.shape)) / 0.25) * 0.25
         read = np.round((y + 0.05 * rng.standard_normal(n)) / 0.005) * 0.005
-        tr = slice(0, 7200)
+        rises_in, read_in = measured[:7200], read[:7200]
         sigma = np.sqrt(0.25**2 / 12 + 0.07**2)
-        spent["recursion (5)"], m5 = cpu(lambda measured=measured, read=read: expansion.recursive(measured[tr], read[tr], 1.0))
-        spent["output error"], mo = cpu(lambda measured=measured, read=read: expansion.output_error(measured[tr], read[tr], 1.0, sigma))
         bank = expansion.Bank(12, 1.0)
-        spent["bank"], _ = cpu(lambda measured=measured, read=read, bank=bank: bank.update(measured[tr], read[tr]))
+        spent["recursion (5)"], m5 = cpu(partial(expansion.recursive, rises_in, read_in, 1.0))
+        spent["output error"], mo = cpu(partial(expansion.output_error, rises_in, read_in, 1.0, sigma))
+        spent["bank"], _ = cpu(partial(bank.update, rises_in, read_in))
         for name, m in (("recursion (5)", m5), ("output error", mo), ("bank", bank.model())):
             e = (y - m.predict(measured))[7200:]
             held[name].append(float(np.sqrt(np.mean(e**2))))
@@ -283,10 +291,74 @@ def steps() -> None:
          f"{1e6 * ours / 2e5:.3f} / {1e6 * theirs / 2000:.0f} us; dense {1e6 * dense / 2e5:.3f} us")
 
 
+def measured_data() -> None:
+    """Held-out free-run error on measured recordings: the first part identifies, the rest judges, its start estimated from its first tenth.
+    Peers: ctrlsys N4SID + ib01cd of orders 1 to 5, the best of them on the held-out part itself (in the peer's favour)."""
+    from thermoctl.recording.table import read_table
+    folder = Path(os.environ.get("THERMOCTL_RECORDINGS", "../shared/recordings"))
+    if not folder.is_dir():
+        print(f"    measured data: no folder {folder}; set THERMOCTL_RECORDINGS")
+        return
+
+    def block(name: str, inputs: list[str], outputs: list[str], less: str | None, square: bool, period: float):
+        table = read_table(folder / name)
+        t = np.arange(table.t[0], table.t[-1], period)
+        u = np.column_stack([np.interp(t, table.t, table.columns[c]) for c in inputs])
+        y = np.column_stack([np.interp(t, table.t, table.columns[c]) for c in outputs])
+        if less:
+            y = y - np.interp(t, table.t, table.columns[less])[:, None]
+        return (u**2 if square else u), y
+
+    sets = {"tclab run 3": block("tclab/run_3.csv", ["Q1", "Q2"], ["T1", "T2"], "air", False, 1.0) + (1.0, 0.6),
+            "tclab run 1": block("tclab/run_1.csv", ["Q1", "Q2"], ["T1", "T2"], "air", False, 1.0) + (1.0, 0.6),
+            "tmotor run 3": block("tmotor_ak109/run_3.csv", ["current"], ["temperature"], "air", True, 1.0) + (1.0, 0.6),
+            "building": block("building_prbs/run_1.csv", ["outdoor", "solar", "heating"], ["indoor"], None, False, 300.0) + (300.0, 0.6)}
+    for name, (u, y, period, part) in sets.items():
+        cut = int(part * len(u))
+        level, base = (u[:cut].mean(0), y[:cut].mean(0)) if name == "building" else (0.0, 0.0)
+        u, y = u - level, y - base
+
+        def judge(m, u=u, y=y, start=cut, stop=len(u)) -> float:
+            first = start + max(20, (stop - start) // 10)
+            x0 = m.initial_state(u[start:first], y[start:first])
+            with np.errstate(over="ignore", invalid="ignore"):
+                e = float(np.sqrt(np.mean((m.simulate(u[start:stop], x0) - y[start:stop])**2)))
+            return e if np.isfinite(e) else np.inf
+
+        inner = int(0.7 * cut)
+
+        def fit(order: int, stop: int, u=u, y=y, period=period):
+            blocks = modal.reduce((u[:stop], y[:stop]), period, period)
+            return modal.identify(blocks, order, rest=False, tau_range_s=(period, stop * period))
+
+        # the order is the one that predicts the last 30 % of the identification part best
+        order = min((1, 2, 3), key=lambda k: judge(fit(k, inner), start=inner, stop=cut))
+        ours = judge(fit(order, cut))
+        peer = np.inf
+        for order in range(1, 6):
+            for i in (8, 15):
+                try:
+                    a, b, c = slicot_mimo(u[:cut], y[:cut], order, i)
+                    peer = min(peer, judge(StateSpace(a, b, c, period, np.zeros(order))))
+                except Exception:                                # noqa: BLE001, S112  an order the peer cannot do
+                    continue
+        goal(f"{name}: held-out error / ctrlsys at its best order", ours / peer, 1.0, f"{ours:.3f} / {peer:.3f} K")
+
+
+def slicot_mimo(u: np.ndarray, y: np.ndarray, n: int, i: int):
+    import ctrlsys
+    u, y, m = np.asfortranarray(u), np.asfortranarray(y), u.shape[1]
+    r = ctrlsys.ib01ad("N", "F", "N", "O", "N", "N", i, m, y.shape[1], u, y, 0.0, -1.0)[1]
+    a, c, b, d, *_ = ctrlsys.ib01bd("N", "A", "N", i, n, m, y.shape[1], len(u), r, 0.0)
+    b = ctrlsys.ib01cd("X", "C", "B", n, m, y.shape[1], *(np.asfortranarray(v) for v in (a, b, c, 0 * d)), u, y, 0.0)[1]
+    return np.array(a), np.array(b), np.array(c)
+
+
 if __name__ == "__main__":
     steps()
     output_error()
     models()
+    measured_data()
     if "--scale" in sys.argv:
         scale()
     if MISSED:

@@ -56,7 +56,8 @@ def test_designed_pulses_beat_equal_ones():
 
 
 @pytest.mark.parametrize("text, message", [
-    ("format: x", "missing|expected"), ("format: thermoctl-experiments/1\nrate_um_s: 1\nexperiments:\n  a: {title: t, parts: [{hold: [[1]]}]}", ":4:.*seconds"),
+    ("format: x", "missing|expected"),
+    ("format: thermoctl-experiments/1\nrate_um_s: 1\nexperiments:\n  a: {title: t, parts: [{hold: [[1]]}]}", ":4:.*seconds"),
     ("format: thermoctl-experiments/1\nrate_um_s: 1\nexperiments:\n  a: {title: t, parts: [{hald: [[1, 2]]}]}", ":4:.*one of")])
 def test_bad_experiments(tmp_path, text, message):
     path = tmp_path / "e.yaml"

@@ -99,7 +99,7 @@ def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = 8) -> 
 def identify_better(tests: list[Any], order: int | None) -> StateSpace:
     """Real-pole model from all calibration tests together, with the air's own movement taken out of the data: a change of the air
     shifts every rise by C b_air, known up to the model, so it is simulated with the model of the round before and subtracted."""
-    moved = [0.0] * len(tests)
+    moved: list[Any] = [0.0] * len(tests)
     for round_ in range(3):
         model = modal.identify([modal.reduce((t.power_w[:, None], rises(t) - m), 1.0) for t, m in zip(tests, moved, strict=True)], order)
         if round_ < 2:

@@ -168,7 +168,8 @@ def tune(config: str, method: str, write: bool) -> int:
     else:
         raise InputError("the relay test needs the amplifier in a loop of its own; use 'zn' or 'imc' on this rig")
     k0, tau_d, tau_c = tuning.tangent(plant)
-    print(f"open-loop step: K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms, residual {plant.residual:.2g} um")
+    print(f"open-loop step: K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms, "
+          f"residual {plant.residual:.2g} um")
     for g in (present, proposed):
         m = tuning.margins(plant, g, period, average)
         print(f"{g.how}: gain margin {m.gain:.2f}, phase margin {m.phase_deg:.0f} deg{'' if m.stable else ', UNSTABLE'}")

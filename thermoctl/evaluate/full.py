@@ -109,7 +109,8 @@ def run(config: str, plant_file: str, folder: Path, say: Any = print, part: floa
         for k, f in futures.items():
             rows[f"test_4b_{k}"] = f.result()[0]
         say("full run: compensated tests done")
-    np.savez_compressed(folder / "full_run.npz", columns=np.array(NAMES), **rows)
+    arrays: dict[str, Any] = {"columns": np.array(NAMES), **rows}
+    np.savez_compressed(folder / "full_run.npz", **arrays)
     figures: dict[str, Any] = {"agreement": agreement(Path(truth), r["test_2"], tests["test_2"])}
     for k in models:
         w = rows[f"test_4b_{k}"]

@@ -45,7 +45,7 @@ def one_seed(plant_file: str, tests_file: str, seed: int, disturbance: str | Non
         estimate["open loop"] = np.repeat(estimate["open loop"], 10, axis=0)
         estimate["open loop"] = np.vstack([estimate["open loop"], estimate["open loop"][-1:]])[:len(truth)]
         errors = {k: (float(np.abs(v - truth).max()), float(np.abs(v - truth).mean())) for k, v in estimate.items()}
-    out = {"seed": seed, "disturbance": disturbance, "position": figures, "temperature": errors, "stable": c.paper_model.stable}
+    out: dict[str, Any] = {"seed": seed, "disturbance": disturbance, "position": figures, "temperature": errors, "stable": c.paper_model.stable}
     if keep:
         out["kept"] = {"c": c, "r2": r2, "r3": r3, "r4": r4, "estimate": estimate, "truth": truth, "left": left,
                        "r1": rig.run(tests["test_1"], 0)}
@@ -126,7 +126,7 @@ def _median(results: list[dict], k: str) -> str:
 
 def _report(results: list[dict], disturbed: list[dict], kept: dict, rows: list, whole: dict | None, used: float) -> str:
     paper = {k: f"{m:+.1f} ± {s:.1f}" for k, (m, s) in tables.POSITION.items()}
-    three = [["uncompensated", paper["uncompensated"], _median(results, "uncompensated"), None],
+    three: list[list[Any]] = [["uncompensated", paper["uncompensated"], _median(results, "uncompensated"), None],
              ["coil alone (SISO)", paper["siso"], _median(results, "siso"), None],
              ["compensated, one sensor", paper["paper"], _median(results, "paper"), _median(results, "better")],
              ["same filter with 12 sensors", None, None, _median(results, "twelve")],
@@ -138,10 +138,10 @@ def _report(results: list[dict], disturbed: list[dict], kept: dict, rows: list, 
         sections.append(("The daemon's law at 1 ms on the full plant", table(["", "mean µm", "2 s µm"], [[k, *map(float, whole[k])] for k in names])
                          + table(["quasi-static against full run, test 2", ""], [[k, float(v)] for k, v in whole["agreement"].items()])))
     sections.append(("What was promised", table(["", "measured", "wanted", "met"], rows)))
-    each = [[r["seed"], *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in ("uncompensated", "siso", "paper", "better", "twelve",
+    each: list[list[Any]] = [[r["seed"], *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in ("uncompensated", "siso", "paper", "better", "twelve",
              "bayes")), "stable" if r["stable"] else "unstable"] for r in results]
     sections.append(("Every rig", table(["seed", "uncompensated", "SISO", "paper's", "better", "12 sensors", "Bayes", "paper's model"], each)))
-    dist = [[r["disturbance"].replace("_", " "), *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in
+    dist: list[list[Any]] = [[r["disturbance"].replace("_", " "), *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in
              ("uncompensated", "siso", "paper", "better", "twelve"))] for r in disturbed]
     sections.append(("Disturbed rigs", table(["", "uncompensated", "SISO", "paper's", "better", "12 sensors"], dist,
                                              "the disturbance comes after the calibration, or holds throughout (sensor faults)")))
@@ -185,8 +185,8 @@ def _figures(kept: dict) -> list[str]:
     b.loglog(f[1:3000], s[1:3000])
     b.axvline(CUTOFF_HZ, ls="--")
     b.set(xlabel="Hz", ylabel="W²/Hz", ylim=(s[1:3000].max() * 1e-7, None))
-    out.append(figure(fig, f"Fig. 11, test 2: input; {100 * experiments.share_below(r2.t, r2.power_w, CUTOFF_HZ):.0f} % of its alternating power lies "
-                      "below f_c"))
+    share = 100 * experiments.share_below(r2.t, r2.power_w, CUTOFF_HZ)
+    out.append(figure(fig, f"Fig. 11, test 2: input; {share:.0f} % of its alternating power lies below f_c"))
     fig, (a,) = axes()
     a.semilogy(np.arange(1, 31), np.array(c.paper_model.info["singular_values"][:30]), "o-")
     a.set(xlabel="order", ylabel="singular value")

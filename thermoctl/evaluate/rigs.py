@@ -149,8 +149,8 @@ class Rig:
         temperatures, error = y[:, :12], y[:, 12] - y[0, 12]
         measured = temperatures.copy()
         if self.disturbance == "sensor_lag":
-            for k in range(1, n):
-                measured[k] = measured[k - 1] + (temperatures[k] - measured[k - 1]) / 25.0
+            for row in range(1, n):
+                measured[row] = measured[row - 1] + (temperatures[row] - measured[row - 1]) / 25.0
         if noise:
             measured = measured + 0.06 * rng.standard_normal(measured.shape)
             step = 0.25

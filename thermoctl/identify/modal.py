@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -55,7 +56,9 @@ def reduce(chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray, n
     basis = gram_polynomials(q)
     if isinstance(chunks, tuple):
         chunks = [chunks]
-    u = y = count = None
+    u: Any = None
+    y: Any = None
+    count: Any = None
     start = 0
     for cu, cy in chunks:
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T

@@ -85,8 +85,9 @@ def load_calibration(path: str | Path, rig: str | None = None) -> Calibration:
     if rig is not None and content["rig"] != rig:
         raise root.value["rig"].error(f"the calibration is of rig '{content['rig']}', this one is '{rig}'; calibrate this rig")
     node: Node = root.value["model"]
+    numbers: dict[str, Any] = {k: tuple(v) if k == "sensors" else v for k, v in content["model"].items()}
     try:
-        model = CompensatorModel(**{k: tuple(v) if k == "sensors" else v for k, v in content["model"].items()})
+        model = CompensatorModel(**numbers)
     except (TypeError, ValueError) as e:
         raise node.error(str(e)) from None
     return Calibration(model, content["rig"], content["created"], content["fingerprints"], content["figures"])

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -53,9 +54,10 @@ def correlate(chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray
     if isinstance(chunks, tuple):
         chunks = [chunks]
     lags = 2 * i
-    sums = triangle = None
+    sums: Any = None
+    triangle: Any = None
+    head: Any = None
     tail = np.empty((0, 0))
-    head = None
     total = m = w = 0
     for cu, cy in chunks:
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -75,7 +76,7 @@ def fit_step(t_s: np.ndarray, y_um: np.ndarray, drive: float, at_s: float = 0.0)
         root = np.sqrt(complex(zeta**2 - 1))
         return SecondOrder(p[0] / drive, 1 / (wn * (zeta - root)), 1 / (wn * (zeta + root)), np.exp(p[3]))
 
-    best = None
+    best: Any = None
     for zeta in (0.3, 1.01, 2.0):
         for dead in (0.02, 0.2, 0.5):
             start = [final, np.log(2 * max(zeta, 0.5) / reach), np.log(zeta), np.log(dead * reach)]
