@@ -78,11 +78,11 @@ def test_a_left_over_segment_is_replaced_and_a_foreign_one_refused(name):
     try:
         assert second.counters[0] == 0.0 and second.ring.head == 0
         second.areas["header"][1] = 99
-        with pytest.raises(InputError, match="another version"):
+        with pytest.raises(InputError, match="of another version"):
             Shared.attach(name)
     finally:
         second.remove()
-    with pytest.raises(InputError, match="not running"):
+    with pytest.raises(InputError, match="no daemon runs"):
         Shared.attach(name)
 
 
