@@ -6,7 +6,9 @@ The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the d
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -77,6 +79,14 @@ def draw(plant: Plant, path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() not in (".svg", ".png", ".pdf"):
         raise InputError(f"{path}: a name that ends in .svg, .png or .pdf was expected")
+    try:
+        drawing(plant).savefig(path, dpi=130)
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+
+
+def drawing(plant: Plant, marked: Collection[str] = ()) -> Any:
+    """The network as a matplotlib Figure; nodes, flows and outputs named in `marked` stand out."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     vertices, edges = _graph(plant)
@@ -98,8 +108,10 @@ def draw(plant: Plant, path: str | Path) -> None:
              "read": ("#1d6b3a", "#e2f3e6", 8)}
     colours = {"flow": "#5a6b7b", "read": "#1d6b3a", "uses": "#9a86b8"}
     boxes = {}
-    for i, (kind, _, label) in enumerate(vertices):
+    for i, (kind, key, label) in enumerate(vertices):
         edge, face, size = style[kind]
+        if key in marked if kind == "node" else not set(label.split("\n")).isdisjoint(marked):
+            edge, face = "#b3261e", "#ffdad6"
         boxes[i] = axes.text(x[i, 0], x[i, 1], label, ha="center", va="center", fontsize=size, color=edge, zorder=3,
                              bbox={"boxstyle": "round,pad=0.35" if kind == "node" else "round,pad=0.2", "fc": face, "ec": edge,
                                    "lw": 1.2 if kind == "node" else 0.6})
@@ -123,10 +135,7 @@ def draw(plant: Plant, path: str | Path) -> None:
         at = 1.0 - 1.215 / figure.get_figwidth() * (4 - k)
         figure.text(at, 0.025 if figure.get_figwidth() < 11 else 0.965, word, fontsize=8, color=style[kind][0], va="center",
                     bbox={"boxstyle": "round,pad=0.25", "fc": style[kind][1], "ec": style[kind][0], "lw": 0.6})
-    try:
-        figure.savefig(path, dpi=130)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+    return figure
 
 
 def table(plant: Plant) -> list:
