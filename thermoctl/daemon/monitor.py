@@ -132,7 +132,7 @@ def _timing(latency: dict[str, Any], ramp: str) -> Text:
 
 
 def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+    return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"          # + 0.0: no -0.00
 
 
 def _span(seconds: float | None) -> str:

@@ -216,10 +216,14 @@ def _plain(value: Any) -> Any:
 
 
 def _show(rigs: Sequence[Rig], names: Sequence[str]) -> None:
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table as Grid
     console = Console()
-    grid = Grid("rig", "recordings", "hours", "armed", "slips", "innovation, K", "proof error, um", "misfit", *names)
+    grid = Grid(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    grid.add_column("rig", no_wrap=True)
+    for title in ("files", "hours", "armed", "slips", "innov. K", "proof um", "misfit", *names):
+        grid.add_column(title, justify="right", no_wrap=True)
     for r in rigs:
         good = [s for s in r.summaries if not s.error]
         newest = good[-1] if good else Summary("", r.name, math.nan, math.nan)
