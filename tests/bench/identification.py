@@ -292,7 +292,7 @@ def steps() -> None:
 
 
 def measured_data() -> None:
-    """Held-out free-run error on measured recordings: the first part identifies, the rest judges, its start estimated from its first tenth.
+    """Held-out free-run error on measured recordings: the first part identifies, the free run from its start is judged on the rest.
     Peers: ctrlsys N4SID + ib01cd of orders 1 to 5, the best of them on the held-out part itself (in the peer's favour)."""
     from thermoctl.recording.table import read_table
     folder = Path(os.environ.get("THERMOCTL_RECORDINGS", "../shared/recordings"))
@@ -318,11 +318,12 @@ def measured_data() -> None:
         level, base = (u[:cut].mean(0), y[:cut].mean(0)) if name == "building" else (0.0, 0.0)
         u, y = u - level, y - base
 
-        def judge(m, u=u, y=y, start=cut, stop=len(u)) -> float:
-            first = start + max(20, (stop - start) // 10)
-            x0 = m.initial_state(u[start:first], y[start:first])
+        end = len(u)
+
+        def judge(m, u=u, y=y, start=cut, stop=end) -> float:
+            x0 = m.initial_state(u[:start], y[:start])            # the free run goes on from the part that was identified on
             with np.errstate(over="ignore", invalid="ignore"):
-                e = float(np.sqrt(np.mean((m.simulate(u[start:stop], x0) - y[start:stop])**2)))
+                e = float(np.sqrt(np.mean((m.simulate(u[:stop], x0)[start:] - y[start:stop])**2)))
             return e if np.isfinite(e) else np.inf
 
         inner = int(0.7 * cut)
