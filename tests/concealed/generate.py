@@ -253,7 +253,7 @@ def _conceal(scene: Scene, kind: str, rng: np.random.Generator, number: int):
 
 
 def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
-    """Two effects at once: each large, or so that their signals largely cancel and each is still large alone."""
+    """Two effects at once: each large, or so that their signals partly cancel while each alone is large."""
     best = None
     for i, first in enumerate(bench.curve):
         for second in bench.curve[i + 1 :]:
@@ -273,7 +273,9 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
     effects = [(s.effect, s.where, s.make(z)) for s, z in zip((one, two), sizes, strict=True)]
     alone = [bench.left_of([e])[0] for e in effects]
     left, runs = bench.left_of(effects)
-    if snr(left) < 6 or min(snr(a) for a in alone) < 10:
+    if snr(left) < 6 or not 10 < min(map(snr, alone)) <= max(map(snr, alone)) < 240:
+        return None
+    if kind == "cancel" and snr(left) ** 2 > 0.75 * sum(snr(a) ** 2 for a in alone):
         return None
     onset = next((e[2][s.onset] for e, s in zip(effects, (one, two), strict=True) if s.onset), None)
     told |= {
