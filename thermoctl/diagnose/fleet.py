@@ -223,14 +223,14 @@ def _show(rigs: Sequence[Rig], names: Sequence[str]) -> None:
     grid = Grid(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     grid.add_column("rig", no_wrap=True)
     for title in ("files", "hours", "armed", "slips", "innov. K", "proof um", "misfit", *names):
-        grid.add_column(title, justify="right", no_wrap=True)
+        grid.add_column(title, justify="right", min_width=5, overflow="fold")
     for r in rigs:
         good = [s for s in r.summaries if not s.error]
         newest = good[-1] if good else Summary("", r.name, math.nan, math.nan)
         grid.add_row(r.name, str(len(r.summaries)), f"{sum(s.hours for s in good):.1f}", _number(100 * newest.armed, "{:.0f} %"),
                      _number(newest.slips, "{:.0f}"), _number(newest.innovation_c, "{:+.3f}"), _number(newest.proof_um, "{:.3f}"),
                      _number(newest.misfit, "{:.1f}"),
-                     *(_number(newest.estimates.get(p, (math.nan,))[0], "{:.4g}") for p in names))
+                     *(_number(newest.estimates.get(p, (math.nan,))[0], "{:.3g}") for p in names))
     console.print(grid)
     for r in rigs:
         for line in r.advice:
