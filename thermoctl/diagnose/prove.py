@@ -124,7 +124,7 @@ def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
                 n_workers=workers or os.cpu_count(),
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",
                 memory_limit=0,
                 silence_logs=50,
             ) as local,
