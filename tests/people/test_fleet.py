@@ -76,8 +76,10 @@ def test_files_that_are_bad_do_not_stop_the_others(folder, capsys, tmp_path):
     assert "stands twice" in out and "67 %" in out
     for words in ([str(tmp_path / "none")], [str(folder / "data"), "--parameters", "H"]):
         assert main(["fleet", *words]) == 2
-    missing = summarise(str(folder / "data/well/0.parquet"), str(folder / "plant.yaml"), ("G",))
-    assert "no parameter 'G'" in missing.error and judge([missing])[0].advice
+    assert main(["fleet", str(folder / "data"), "--plant", str(folder / "plant.yaml"), "--parameters", "G"]) == 2
+    assert "no parameter 'G' with a range" in capsys.readouterr().err
+    lost = summarise(str(tmp_path / "none.csv"), None, ())
+    assert lost.error and "none.csv" in judge([lost])[0].advice[0]
 
 
 def test_drift_needs_evidence():

@@ -25,7 +25,7 @@ from thermoctl.plant.refit import fit, report
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table, read_table
 from thermoctl.recording.writer import NAME, TIER
-from thermoctl.yamlfile import InputError
+from thermoctl.yamlfile import InputError, suggest
 
 DRIFT_SIGMA, DRIFT_SHARE, FIT_LIMIT = 4.0, 0.05, 3.0
 ROWS = 4000                     # a recording is thinned to about so many
@@ -100,10 +100,6 @@ def _thinned(table: Table) -> Table:
 
 def _model(summary: Summary, table: Table, plant_path: str, names: tuple[str, ...]) -> Summary:
     plant = load(plant_path)
-    for name in names:
-        if name not in plant.parameters or plant.parameters[name].range is None:
-            ranged = [n for n, p in plant.parameters.items() if p.range is not None]
-            raise InputError(f"{plant_path}: no parameter '{name}' with a range; expected some of {', '.join(ranged)}")
     asis = fit(plant.compile(()), [plant.compile(()).drive(table)])
     noise = dict(zip(asis.model.outputs, asis.noise, strict=True))
     ratios = {o: r / noise[o].sigma for o, r in asis.rms().items() if math.isfinite(r)}
@@ -192,6 +188,11 @@ def fleet(folder: str, plant: str | None = None, parameters: str = "", workers: 
     names = tuple(n.strip() for n in parameters.split(",") if n.strip())
     if names and plant is None:
         raise InputError("--parameters: a plant was expected with --plant FILE")
+    ranged = [n for n, p in load(plant).parameters.items() if p.range is not None] if plant else []
+    for name in names:
+        if name not in ranged:
+            raise InputError(f"{plant}: no parameter '{name}' with a range{suggest(name, ranged)}; expected some of "
+                             f"{', '.join(ranged)}")
     paths = [str(p) for p in find_recordings(folder)]
     if workers or scheduler:
         from thermoctl.diagnose.prove import cluster
