@@ -23,6 +23,11 @@ def _add(sub: argparse._SubParsersAction, name: str, help: str, run: Callable[[a
     return parser
 
 
+def _with(run: Callable[[argparse.Namespace, str], int | None], name: str) -> Callable[[argparse.Namespace], int | None]:
+    """A handler that is told its command's name."""
+    return lambda args: run(args, name)
+
+
 def _plant_commands(sub: argparse._SubParsersAction) -> None:
     """simulate, refit, plant show, plant linearise, plant check."""
     def to(name: str) -> Callable[[argparse.Namespace], int | None]:
@@ -85,14 +90,13 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
          ("--seconds", {"type": float, "metavar": "S", "help": "stop by itself after S seconds"}))
     for action, help in (("start", "start the daemon: by systemd where its unit is installed, else in the background"),
                          ("stop", "stop it; the amplifier is disabled first"), ("restart", "stop, then start")):
-        _add(sub, action, help, lambda a, action=action: room().service(a.config, action), config)
+        _add(sub, action, help, _with(lambda a, name: room().service(a.config, name), action), config)
     _add(sub, "status", "state, position, compensation, temperatures, faults with remedies; exit 1 when a fault stands",
          lambda a: room().status(a.config, a.json), config, as_json)
     for command, help in (("arm", "enable the amplifier, holding the measured position"),
                           ("disarm", "disable the amplifier; in FAULT: acknowledge"),
                           ("reload", "validate the configuration and apply it between two ticks")):
-        _add(sub, command, help, lambda a, command=command: room().request(a.config, command, None, a.json), config,
-             as_json)
+        _add(sub, command, help, _with(lambda a, name: room().request(a.config, name, None, a.json), command), config, as_json)
     _add(sub, "setpoint", "move the output to VALUE_UM at the limited rate",
          lambda a: room().request(a.config, "setpoint", a.value, a.json),
          ("value", {"type": float, "metavar": "VALUE_UM"}), config, as_json)

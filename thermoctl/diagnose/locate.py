@@ -134,7 +134,7 @@ def missing_flow(metric: Metric, node: str, signals: dict[str, list[np.ndarray]]
 
 def _intervals(t: np.ndarray, on: np.ndarray) -> list[list[float]]:
     out: list[list[float]] = []
-    for k in np.flatnonzero(on):
+    for k in map(int, np.flatnonzero(on)):
         lo, hi = float(t[max(k - 1, 0)]), float(t[min(k + 1, len(t) - 1)])
         if out and lo <= out[-1][1]:
             out[-1][1] = hi

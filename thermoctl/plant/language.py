@@ -20,7 +20,7 @@ import yaml
 from thermoctl import yamlfile
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
-from thermoctl.yamlfile import InputError, suggest
+from thermoctl.yamlfile import suggest
 
 if TYPE_CHECKING:
     from thermoctl.plant.simulate import Model
@@ -256,7 +256,8 @@ def _plant(root: yamlfile.Node) -> Plant:
     plant = Plant(title, inputs, parameters, nodes, flows, outputs, root.file)
     _check_names(plant, items)
     _check_use(plant, places)
-    from thermoctl.plant.units import check_units      # pint is slow to import
+    from thermoctl.plant.units import check_units  # it knows Plant, so it is read late
+
     check_units(plant)
     return plant
 

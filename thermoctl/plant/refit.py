@@ -249,7 +249,8 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
         tries: int = 0, seed: int = 0, seconds: float = 600.0, progress: Callable[[str], None] | None = None) -> Fit:
     """Fit the active parameters that have a range (and uncertain initial states) to the drives.
 
-    `seconds`: after which no further iteration is begun. `tries`: how many starts drawn over the ranges are looked at besides the given one; the best two are followed.
+    `seconds`: after which no further iteration is begun. `tries`: how many starts drawn over the ranges are looked at
+    besides the given one; the best two are followed.
     Raises SimulationError where no start can be simulated, InputError where there is nothing to compare."""
     for d in drives:
         if d.scale is None:
