@@ -3,7 +3,7 @@
 One substep h: half a step of position, a whole step of velocity with the smooth forces held at the midpoint (exact for
 the linear damper), the Coulomb force as a set-valued law (the velocity is held at zero when the dry friction can hold
 it, else the exact impulse is taken off, never through zero), half a step of position. Memory forces (Bouc-Wen, Maxwell)
-take exact or midpoint steps. Four substeps a sample; many variants (rows) go through together as columns of numbers.
+take exact or midpoint steps. Four substeps a sample or more; many variants (rows) go through together as columns of numbers.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from tests.concealed.rig import Scene, Suspect, clock, levels, room
 from tests.concealed.rigs_thermal import _draw, _fault, _parameter_block, sensor_suspects
 from tests.concealed.thermal import Variant
 
-SUBSTEPS = 4
+SUBSTEPS = 4  # a sample; a rig with a resonance asks for more by run["substeps"]
 
 # effect parameters as columns of numbers; the value is the neutral one
 _NEUTRAL = {
@@ -95,6 +95,7 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
     rest = x.copy()  # creep: position of the damper in series
     bouc = np.zeros(m)
     x2, v2 = x.copy(), np.zeros(m)
+    substeps = run.get("substeps", SUBSTEPS)
     stays = bool(run.get("held"))  # input holds between samples, else straight lines
     out = {k: np.empty((m, len(t))) for k in ("position", "velocity", "coil")}
     heated = "C_coil" in theta
@@ -103,15 +104,15 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
         out["position"][:, k], out["velocity"][:, k], out["coil"][:, k] = x, v, coil
         if k == len(t) - 1:
             break
-        h = (t[k + 1] - t[k]) / SUBSTEPS
+        h = (t[k + 1] - t[k]) / substeps
         decay_rate = damping + e["viscous_friction.B"]
-        for s in range(SUBSTEPS):
+        for s in range(substeps):
             x = x + v * (h / 2)
             now = t[k] + (s + 0.5) * h
             if delayed:
                 drive = _delayed(run, now - e["actuator_delay.TD"], stays)
             else:
-                drive = np.full(m, u[k] if stays else u[k] + (u[k + 1] - u[k]) * (s + 0.5) / SUBSTEPS)
+                drive = np.full(m, u[k] if stays else u[k] + (u[k + 1] - u[k]) * (s + 0.5) / substeps)
             sent = drive
             if on["actuator_saturation.U"]:
                 sent = np.clip(sent, -e["actuator_saturation.U"], e["actuator_saturation.U"])
@@ -164,7 +165,7 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
             x = x + v * (h / 2)
             if heated:
                 watts = ohm * drive**2 * (1 + 0.00393 * (coil - 20) * copper)
-                room_now = air[k] + (air[k + 1] - air[k]) * (s + 0.5) / SUBSTEPS
+                room_now = air[k] + (air[k + 1] - air[k]) * (s + 0.5) / substeps
                 settle = room_now + watts / heat_g
                 coil = settle + (coil - settle) * np.exp(-heat_g / heat_c * h)
     return out
@@ -354,6 +355,7 @@ class Flexure:
                     "t": t,
                     "drive": np.round(current, 6),
                     "held": False,
+                    "substeps": 12,  # 4 would leave 3 sigmas of their own
                     "air": room(t, rng, 0.3),
                     "start": rng.normal(0, 3e-6),
                     "start_coil": rng.normal(0, 0.1),

@@ -105,6 +105,20 @@ def test_nothing_missing_is_nothing(family, monkeypatch):
     assert snr(bench.judge.left_over(d))[0] < 1.0
 
 
+@pytest.mark.parametrize("family", ["flexure", "stage"])
+def test_the_step_of_a_motion_truth_is_fine_enough(family):
+    """Twice as many substeps change less than one sigma of what a refit leaves."""
+    rng = np.random.default_rng(3)
+    scene = generate.FAMILIES[family].scene(rng, "designed", True)
+    bench = generate.Bench(scene, rng)
+    bench.measure([], [])
+    for run in scene.runs:
+        run["substeps"] = 2 * run.get("substeps", rigs_motion.SUBSTEPS)
+    finer = [scene.outputs_of(k, [Variant()])[0] for k in range(2)]
+    d = bench.judge.whiten([(a - b)[None] for a, b in zip(bench.base, finer, strict=True)])
+    assert snr(bench.judge.left_over(d))[0] < 1.0
+
+
 def test_size_is_what_a_refit_leaves_in_sigmas():
     n, sd = 400, 0.5
     t = np.arange(n)
