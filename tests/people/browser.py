@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import time
 
-LIMIT_S = 30.0
+LIMIT_S = 120.0
 
 
 def find():

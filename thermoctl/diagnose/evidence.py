@@ -84,7 +84,7 @@ def channels(residuals: Sequence[np.ndarray], sigmas: Sequence[float]) -> list[C
     (N, outputs); sigmas: white noise per output."""
     out = []
     for j, sigma in enumerate(sigmas):
-        found = colour([r[:, j] for r in residuals], 0.95 * sigma)
+        found = colour([r[:, j] for r in residuals], 0.6 * sigma)
         price = sum(_price(r[:, j], sigma) for r in residuals)
         out.append(dataclasses.replace(found, score=found.score + price))
     return out

@@ -193,13 +193,13 @@ class Round:
         return float(min(1 / (len(self.chance) + 1), 0.1 * 10 ** (best - floor)))
 
 
-def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS) -> Round:
-    """Screen the catalogue from an explanation."""
+def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool = False) -> Round:
+    """Screen the catalogue from an explanation; `coloured`: in the metric of the residual's own colour."""
     model = base.fit.model
     drives = [model.drive(t) for t in case.tables]
     for d in drives:
         model.prepare(d, base.fit.values[drives.index(d)])
-    metric = Metric(base.fit, drives)
+    metric = Metric(dataclasses.replace(base.fit, noise=_colours(base)) if coloured else base.fit, drives)
     rig = Rig(base.plant, drives, [t.columns for t in case.tables])
     found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
     noise = np.random.default_rng(1).standard_normal((len(metric.residual), draws)) if draws else None
@@ -288,6 +288,17 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         if followed and followed[0].score < current.score - ACCEPT:
             current, reference, rivals = followed
     first = rounds[0]
+    left_over = False
+    if not current.effects and first.p_any() < 1e-3:
+        # In white noise's metric something stands out, but nothing counts: the residual's own colour decides.
+        case.progress("screening in the colour of the residual")
+        again = look(case, base, entries, coloured=True)
+        left_over = again.p_any() < 1e-3
+        if left_over:
+            again.finalists = compete(case, again, finalists(again.directions))
+            if again.finalists and counts(again, again.finalists[0]):
+                current = reference = again.finalists[0]
+                rivals = again.finalists[1:]
     if current.effects:
         case.progress("trying the findings on data that took no part")
         kept = prune(case, base, current, notes)
@@ -316,7 +327,7 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
                 held = held_out(case, base, current)
             notes.append(f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains")
     else:
-        verdict = "unexplained" if before_worst > LARGE else "consistent"
+        verdict = "unexplained" if before_worst > LARGE or left_over else "consistent"
     missing = None
     if verdict != "consistent":
         nodes = [s for s in suspects if s.kind == "node"]
@@ -410,14 +421,17 @@ def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanatio
     return out[:count]
 
 
+def _colours(e: Explanation) -> tuple[Noise, ...]:
+    return tuple(Noise(c.sigma, c.phi, c.theta) for c in e.colours)
+
+
 def remains(case: Case, e: Explanation) -> bool:
     """Does a smooth unknown input at some node still explain more of the residual than noise of the residual's own colour
     would let it?"""
-    coloured = tuple(Noise(c.sigma, c.phi, c.theta) for c in e.colours)
     drives = [e.fit.model.drive(t) for t in case.tables]
     for r, d in enumerate(drives):
         e.fit.model.prepare(d, e.fit.values[r])
-    metric = Metric(dataclasses.replace(e.fit, noise=coloured), drives)
+    metric = Metric(dataclasses.replace(e.fit, noise=_colours(e)), drives)
     found = locate.suspects(metric)
     return bool(found) and found[0].log_p < REMAINS
 
