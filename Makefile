@@ -67,3 +67,7 @@ bench: install
 .PHONY: prove-refit
 prove-refit: install
 	$(BIN)/python tests/prove_refit.py
+
+.PHONY: test-wire
+test-wire: install                 # pulled cables and killed programs, with the daemon and the virtual rig as two programs
+	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py
