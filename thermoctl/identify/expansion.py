@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import linalg, optimize, signal
 
-from thermoctl.identify import kernels      # type: ignore[attr-defined]
+from thermoctl.identify import kernels  # type: ignore[attr-defined]
 from thermoctl.yamlfile import InputError
 
 
