@@ -292,13 +292,13 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     if not current.effects and first.p_any() < 1e-3:
         # In white noise's metric something stands out, but nothing counts: the residual's own colour decides.
         case.progress("screening in the colour of the residual")
-        again = look(case, base, entries, coloured=True)
-        left_over = again.p_any() < 1e-3
+        tinted = look(case, base, entries, coloured=True)
+        left_over = tinted.p_any() < 1e-3
         if left_over:
-            again.finalists = compete(case, again, finalists(again.directions))
-            if again.finalists and counts(again, again.finalists[0]):
-                current = reference = again.finalists[0]
-                rivals = again.finalists[1:]
+            tinted.finalists = compete(case, tinted, finalists(tinted.directions))
+            if tinted.finalists and counts(tinted, tinted.finalists[0]):
+                current = reference = tinted.finalists[0]
+                rivals = tinted.finalists[1:]
     if current.effects:
         case.progress("trying the findings on data that took no part")
         kept = prune(case, base, current, notes)
