@@ -71,3 +71,7 @@ prove-refit: install
 .PHONY: test-wire
 test-wire: install                 # pulled cables and killed programs, with the daemon and the virtual rig as two programs
 	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py
+
+.PHONY: test-browser
+test-browser: install              # the dashboard in headless Chromium (Debian: apt-get install chromium)
+	$(BIN)/python -m pytest -m slow tests/people/test_dashboard.py

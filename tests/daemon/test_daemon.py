@@ -305,5 +305,5 @@ def test_what_a_session_recorded_replays_to_the_bit(config, capsys):
         out = capsys.readouterr().out
         assert "bit for bit" in out
         ticks += int(out.split(": ")[1].split()[0])
-    assert ticks > 3500
+    assert ticks > 2000         # the 3000 that were waited for, less the second that a kill may cost
     assert main(["replay", str(config)]) == 2 and "rig.yaml" in capsys.readouterr().err

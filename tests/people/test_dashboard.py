@@ -259,6 +259,7 @@ def choose(browser, select, value):
     browser.js(f"(s => {{ s.value = '{value}'; s.dispatchEvent(new Event('change')); }})(document.getElementById('{select}'))")
 
 
+@pytest.mark.slow       # its capture needs a machine that is not shared with the rest of the suite: make test-browser
 def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
     """From a look at the armed rig to a pulled sensor: numbers, drawing, fault with remedy, capture, history, themes."""
     folder = Path(settings.recording.directory)
