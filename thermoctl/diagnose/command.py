@@ -93,7 +93,7 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
     """Print a result for a person."""
     from rich.console import Console
     from rich.table import Table
-    console = Console(soft_wrap=True)
+    console = Console() if sys.stdout.isatty() else Console(width=160)
     console.print(f"[bold]{found['verdict']}[/]. {sentence(found)}")
     if found["findings"]:
         table = Table("effect", "where", "equation", "parameter", "value", "95 %", box=None, header_style="bold")
