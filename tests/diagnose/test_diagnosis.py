@@ -1,0 +1,150 @@
+"""Diagnoses of rigs whose truth this file simulates itself (scipy, no plant code), judged from outside by what is written."""
+import json
+import re
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from thermoctl.cli import main
+from thermoctl.diagnose.effects import catalogue
+from thermoctl.plant import load
+from thermoctl.recording.table import read_table
+from thermoctl.yamlfile import InputError
+
+HEATER = """
+format: thermoctl-plant/1
+title: Two heated blocks
+inputs:
+  heat: {unit: W}
+  air: {unit: degC, column: air_temperature, between_samples: linear}
+parameters:
+  C_1: {value: 6, unit: J/K, range: [2, 14]}
+  C_2: {value: 6, unit: J/K, range: [2, 14]}
+  G_1: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
+  G_2: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
+  G_12: {value: 0.02, unit: W/K, range: [0.004, 0.08]}
+nodes:
+  one: {unit: degC, storage: C_1, initial: air, initial_sigma: 0.5}
+  two: {unit: degC, storage: C_2, initial: air, initial_sigma: 0.5}
+flows:
+  power: {into: one, rate: heat, unit: W}
+  between: {from: one, into: two, rate: G_12 * (one - two), unit: W}
+  loss_1: {from: one, rate: G_1 * (one - air), unit: W}
+  loss_2: {from: two, rate: G_2 * (two - air), unit: W}
+outputs:
+  temperature_1: {value: one, unit: degC, noise: 0.1}
+  temperature_2: {value: two, unit: degC, noise: 0.1}
+"""
+LEVELS = (0.0, 2.5, 0.8, 0.0, 1.6, 3.0, 0.0, 2.0)
+
+
+def heater(folder, extra=lambda t, x, air: (0.0, 0.0), seeds=(1, 2), sensor=lambda t, y: y):
+    """Two recordings of a two-block heater that has `extra` watts into its blocks; returns the plant's and their paths."""
+    (folder / "plant.yaml").write_text(HEATER)
+    paths = [folder / "plant.yaml"]
+    c, g, g12 = (5.2, 7.1), (0.062, 0.043), 0.026
+    t = np.arange(0.0, 1600.0, 2.0)
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        heat = np.array(rng.permutation(LEVELS))[(t // 200).astype(int)]
+        air = 21.5 + 0.4 * np.sin(t / 700 + seed)
+        x = np.empty((len(t), 2))
+        x[0] = air[0]
+        for k in range(len(t) - 1):
+            def slope(s, q, k=k):
+                a = np.interp(s, t, air)
+                e = extra(s, q, a)
+                flow = g12 * (q[0] - q[1])
+                return [(heat[k] - flow - g[0] * (q[0] - a) + e[0]) / c[0], (flow - g[1] * (q[1] - a) + e[1]) / c[1]]
+            x[k + 1] = solve_ivp(slope, (t[k], t[k + 1]), x[k], rtol=1e-6, atol=1e-8).y[:, -1]
+        y = sensor(t, x) + rng.normal(0, 0.1, x.shape)
+        path = folder / f"run_{seed}.csv"
+        np.savetxt(path, np.column_stack([t, heat, air, y]), delimiter=",", comments="", fmt="%.7g",
+                   header="t,heat,air_temperature,temperature_1,temperature_2")
+        paths.append(path)
+    return paths
+
+
+def diagnosed(paths, out):
+    """The command's result."""
+    assert main(["diagnose", "--plant", str(paths[0]), *map(str, paths[1:]), "--out", str(out)]) == 0
+    return json.loads((out / "diagnosis.json").read_text())
+
+
+def test_nothing_missing_is_said_with_what_would_have_been_seen(tmp_path):
+    r = diagnosed(heater(tmp_path), tmp_path / "out")
+    assert r["verdict"] == "consistent" and r["findings"] == [] and r["mismatch"] == []
+    smallest = {(e["effect"], e["where"]): e["smallest"] for e in r["not_seen"]}
+    assert smallest and all(size > 0 for size in smallest.values())
+
+
+def test_natural_convection_is_named_placed_and_worth_it_on_unseen_data(tmp_path):
+    r = diagnosed(heater(tmp_path, lambda t, x, a: (-0.02 * (x[0] - a) * abs(x[0] - a) ** 0.25, 0.0)), tmp_path / "out")
+    named = {(f["effect"], f["where"]) for f in r["findings"]} | {(a["effect"], a["where"]) for a in r["alternatives"]}
+    assert ("natural_convection", "one") in named and r["verdict"] in ("explained", "ambiguous")
+    fit = r["fit"]
+    assert fit["held_out_after"]["temperature_1"] < 0.115 < fit["held_out_refit_only"]["temperature_1"]
+    assert set(r["fit"]) == {"before", "refit_only", "after", "held_out_before", "held_out_refit_only", "held_out_after"}
+    # The extended plant runs in the simulator and gives the error that was reported.
+    plant = load(tmp_path / "out" / "plant.yaml")
+    model = plant.compile()
+    errors = np.concatenate([read_table(tmp_path / f"run_{s}.csv").columns["temperature_1"]
+                             - model.simulate(read_table(tmp_path / f"run_{s}.csv")).y[:, 0] for s in (1, 2)])
+    assert np.sqrt(np.mean(errors ** 2)) == pytest.approx(fit["after"]["temperature_1"], rel=0.1)
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "natural" in page.lower() and not re.search(r"(src|href)=.?https?://", page)
+
+
+def test_heat_from_outside_is_found_with_its_interval(tmp_path):
+    r = diagnosed(heater(tmp_path, lambda t, x, a: (0.0, 0.3 * (500 <= t < 900))), tmp_path / "out")
+    (finding,) = r["findings"]
+    assert (finding["effect"], finding["where"], r["verdict"]) == ("external_heat_source", "two", "explained")
+    assert finding["when"][0] == pytest.approx([500, 900], abs=15)
+    value = next(p for n, p in finding["parameters"].items() if n.startswith("Q"))
+    assert abs(value["value"] - 0.3) < max(4 * value["sd"], 0.01)
+
+
+def test_physics_outside_the_catalogue_is_not_given_a_confident_name(tmp_path):
+    def boiling(t, x, a):
+        return (-1.2 * np.sin(t / 9.0) ** 2 * (x[0] > 45), 0.0)
+    r = diagnosed(heater(tmp_path, boiling), tmp_path / "out")
+    assert r["verdict"] == "unexplained" or max((f["probability"] for f in r["findings"]), default=0) < 0.9
+    assert r["mismatch"] and {"channel", "rms", "expected_rms", "node"} <= set(r["mismatch"][0])
+
+
+@pytest.mark.parametrize(("spoil", "words"), [
+    (lambda p: p[1].write_text(p[1].read_text().replace("heat,", "warmth,", 1)), "no column 'heat'"),
+    (lambda p: p[1].write_text("\n".join(p[1].read_text().splitlines()[:12])), "too little data"),
+    (lambda p: p[1].write_text(p[1].read_text().replace("\n2,", "\nx,", 1)), "run_1.csv"),
+    (lambda p: p[0].write_text(HEATER.replace("G_12 *", "G_13 *")), "G_13"),
+])
+def test_unusable_input_is_one_line_and_leaves_nothing(tmp_path, capsys, spoil, words):
+    paths = heater(tmp_path, seeds=(1,))
+    spoil(paths)
+    capsys.readouterr()
+    assert main(["diagnose", "--plant", str(paths[0]), str(paths[1]), "--out", str(tmp_path / "out")]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_entry_of_the_catalogue_reads_and_a_users_own_replaces_it(tmp_path):
+    entries = catalogue()
+    assert {"radiation", "coulomb_friction", "sensor_lag", "missing_member", "overflow"} <= set(entries) and len(entries) >= 48
+    (tmp_path / "mine.yaml").write_text("effect: mine\ntitle: T\nwhere: temperature_node\nsource: me\n"
+                                        "change: [{flow: {from: T, rate: 'K * (T - air)**3'}}]\nparameters: {K: {low: 0}}\n")
+    from thermoctl.diagnose.effects import CATALOGUE
+    assert "mine" in catalogue((CATALOGUE, tmp_path))
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("effect: mine\n", "needs 'title'"),
+    ("effect: m\ntitle: T\nwhere: temperature_nod\nsource: s\nchange: []\nparameters: {}\n", "did you mean 'temperature_node'"),
+    ("effect: m\ntitle: T\nwhere: sensor\nsource: s\nchange: [{vlaue: y}]\nparameters: {}\n", "a change must be one of"),
+    ("effect: m\ncolour: red\n", "unknown key 'colour'"),
+])
+def test_a_bad_effect_file_gives_its_one_error(tmp_path, text, words):
+    (tmp_path / "bad.yaml").write_text(text)
+    with pytest.raises(InputError, match="bad.yaml:") as e:
+        catalogue((tmp_path,))
+    assert words in str(e.value)
