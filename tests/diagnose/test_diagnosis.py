@@ -52,7 +52,7 @@ def heater(folder, extra=lambda t, x, air: (0.0, 0.0), seeds=(1, 2), sensor=lamb
         x = np.empty((len(t), 2))
         x[0] = air[0]
         for k in range(len(t) - 1):
-            def slope(s, q, k=k):
+            def slope(s, q, k=k, heat=heat, air=air):
                 a = np.interp(s, t, air)
                 e = extra(s, q, a)
                 flow = g12 * (q[0] - q[1])

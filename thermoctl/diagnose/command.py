@@ -11,7 +11,7 @@ from typing import Any
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.yamlfile import InputError, suggest
 
-# How far along a diagnosis is when a stage begins (share of its whole time, from timed runs): for the estimate of what is left.
+# How far along a diagnosis is when a stage begins (share of its whole time, a rough guess): for the estimate of what is left.
 _STAGES = (("refitting the plant", 0.0), ("screening the catalogue", 0.12), ("looking again", 0.35), ("refitting", 0.25),
            ("screening again", 0.6), ("one effect is not needed", 0.85))
 
