@@ -10,6 +10,7 @@ between samples (recorded inputs) keep their true jumps.
 """
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import os
@@ -17,6 +18,7 @@ import shutil
 import subprocess
 import tempfile
 import threading
+import time
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
@@ -334,10 +336,15 @@ def _build(work: Path, source: str) -> None:
         raise InputError(f"the C compiler failed on the plant: {done.stderr.strip()[:500]}")
 
 
-def _trim(folder: Path, keep: int = 2000) -> None:
-    files = sorted(folder.glob("*.so"), key=lambda f: f.stat().st_mtime)
-    for old in files[:-keep]:
-        old.unlink(missing_ok=True)
+def _trim(folder: Path, keep: int = 2000, age_s: float = 86_400.0) -> None:
+    """Forget the oldest beyond `keep`, but none made within a day: another process may be about to load it."""
+    made = []
+    for path in folder.glob("*.so"):
+        with contextlib.suppress(OSError):      # another process trims, too
+            made.append((path.stat().st_mtime, path))
+    for mtime, path in sorted(made)[:-keep]:
+        if time.time() - mtime > age_s:
+            path.unlink(missing_ok=True)
 
 
 _P, _I, _D = ctypes.c_void_p, ctypes.c_int, ctypes.c_double
