@@ -94,7 +94,7 @@ class Case:
     def scored(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], found: Fit) -> Explanation:
         """The score of a fit: coloured -2 log likelihood and the price of its parameters."""
         colours = channels(found.residuals, [n.sigma for n in self.noise])
-        added = sum(len(o) for o in own)
+        added = sum(len(self.tables) if plant.parameters[n].per_recording else 1 for o in own for n in o.values())
         price = added * np.log(max(found.samples, 2)) + sum(_surprise(c) for c in effects)
         raw = sum(c.score for c in colours)
         return Explanation(plant, list(effects), found, raw + float(price), colours, raw, list(own))
@@ -363,16 +363,20 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any],
             break
         case.progress(f"refitting {len(chosen)} explanations")
         seen.finalists = compete(case, seen, chosen)
-        if not seen.finalists or not counts(seen, seen.finalists[0]):
+        # The best score that also predicts: a rival that merely fits better gives way to the next.
+        before = unseen_errors(case, current.plant)
+        best = next((e for e in seen.finalists[:4] if counts(seen, e) and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0),
+                    None)
+        if best is None:
             break
-        current, rivals = seen.finalists[0], seen.finalists[1:]
+        current, rivals = best, [e for e in seen.finalists if e is not best and e.score > best.score - 2 * ACCEPT]
         if len(current.effects) >= most:
             break
         case.progress("screening again")
         rounds.append(look(case, current, entries))
         if len(current.effects) == 1 and max(case.excess(current).values()) > LARGE and time.monotonic() - case.begun < 40:
             # A first choice made beside other missing physics can be wrong: the runners-up get their second effect, too.
-            best: Explanation | None = None
+            best = None
             others: list[Explanation] = []
             for other in _runners_up(seen.finalists):
                 again = rounds[-1] if other is current else look(case, other, entries, draws=0)
