@@ -609,8 +609,8 @@ def unseen_errors(case: Case, plant: Plant, refit: bool = True) -> list[np.ndarr
 
 def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray],
                 draws: int = 400) -> tuple[float, float, float]:
-    """Ratio of held-out rms after / before over all outputs in units of their noise, with its 95 % interval (paired block
-    bootstrap)."""
+    """Ratio of held-out rms after / before over all outputs in units of their noise, with its 90 % interval (paired block
+    bootstrap), whose upper end is a one-sided 95 % bound."""
     sigma = np.array([n.sigma for n in case.noise])
     pairs = []
     for a, b in zip(before, after, strict=True):
@@ -626,8 +626,8 @@ def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.nda
         return 1.0, 0.0, np.inf
     index = np.random.default_rng(3).integers(0, len(values), (draws, len(values)))
     ratio = np.sqrt(values[index, 1].sum(1) / np.maximum(values[index, 0].sum(1), 1e-300))
-    return (float(np.sqrt(values[:, 1].sum() / values[:, 0].sum())), float(np.quantile(ratio, 0.025)),
-            float(np.quantile(ratio, 0.975)))
+    return (float(np.sqrt(values[:, 1].sum() / values[:, 0].sum())), float(np.quantile(ratio, 0.05)),
+            float(np.quantile(ratio, 0.95)))
 
 
 def held_out(case: Case, base: Explanation, final: Explanation) -> dict[str, Any]:
