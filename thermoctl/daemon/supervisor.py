@@ -21,11 +21,12 @@ import signal
 import socket as sockets
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import structlog
 
 from hal.backend import HardwareError, make_backend, slow_devices
 from thermoctl.control import arming, faults
@@ -50,8 +51,12 @@ Log = Callable[..., None]
 
 def console_log(event: str, **values: Any) -> None:
     """One line on stderr: event and key=value pairs; systemd's journal adds time and unit."""
-    print(" ".join([f"thermoctl: {event}", *(f"{k}={v}" for k, v in values.items() if v is not None)]),
-          file=sys.stderr, flush=True)
+    structlog.wrap_logger(structlog.PrintLogger(sys.stderr), processors=[_line]).msg(event, **values)
+
+
+def _line(_logger: Any, _method: str, values: MutableMapping[str, Any]) -> str:
+    event = values.pop("event")
+    return " ".join([f"thermoctl: {event}", *(f"{k}={v}" for k, v in values.items() if v is not None)])
 
 
 class _Stop:
