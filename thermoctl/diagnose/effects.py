@@ -431,6 +431,7 @@ class _Builder:
         self.c, self.rig, self.base = c, c.rig, c.rig.plant
         self.inputs, self.parameters = dict(self.base.inputs), dict(self.base.parameters)
         self.nodes, self.flows, self.outputs = dict(self.base.nodes), dict(self.base.flows), dict(self.base.outputs)
+        self.made: dict[str, str] = {}          # nodes that the effect brings: its own name to the plant's
         self.symbols: dict[str, Expr] = {**c.place.symbols, **c.symbols}
         if self.rig.air:
             self.symbols.setdefault("air", name(self.rig.air))
@@ -514,17 +515,11 @@ class _Builder:
         used = set().union(*(ex.names(e) for e in exprs))
         return {k: p for k, p in self.parameters.items() if k in used}
 
-    def _end(self, key: str | None) -> str | None:
-        return None if key is None else self.c.place.nodes.get(key) or self._made.get(key)
-
-    _made: dict[str, str]
-
     def _flow(self, what: Mapping[str, Any]) -> None:
         label = f"{self.c.effect.name}_{self.c.place.where}".replace("-", "_")
         while label in self.flows or label in self.nodes or label in self.outputs:
             label += "_2"
-        made = getattr(self, "_made", {})
-        ends = {k: (self.c.place.nodes.get(what[k]) or made.get(what[k])) if k in what else None for k in ("from", "into")}
+        ends = {k: self.c.place.nodes.get(what[k]) or self.made.get(what[k]) if k in what else None for k in ("from", "into")}
         self.flows[label] = Flow(label, self.expression(what["rate"]), ends["from"], ends["into"], None)
 
     def _rate(self, form: str) -> None:
@@ -544,9 +539,9 @@ class _Builder:
         def change(e: Expr) -> Expr | None:
             return new if e.op == "name" and e.value == p.input else None
         # The start stays as read: an expression of inputs at the first sample knows no node, no time and no delay.
-        self.flows = {k: dataclasses.replace(f, rate=_once(f.rate, change)) if k in self.base.flows else f
+        self.flows = {k: dataclasses.replace(f, rate=ex.substitute(f.rate, change)) if k in self.base.flows else f
                       for k, f in self.flows.items()}
-        self.outputs = {k: dataclasses.replace(o, value=_once(o.value, change)) for k, o in self.outputs.items()}
+        self.outputs = {k: dataclasses.replace(o, value=ex.substitute(o.value, change)) for k, o in self.outputs.items()}
 
     def _storage(self, form: str) -> None:
         n = self.base.nodes[self.c.place.nodes["T"]]
@@ -556,7 +551,7 @@ class _Builder:
     def _node(self, what: Mapping[str, Any]) -> None:
         label = what["name"] + self.suffix
         label = label[:78]
-        self._made = {**getattr(self, "_made", {}), what["name"]: label}
+        self.made[what["name"]] = label
         self.symbols[what["name"]] = name(label)
         special = {"start_of_T": "T", "start_of_y": "y", "start_of_x": "x"}
         text = str(what["initial"])
@@ -585,7 +580,7 @@ class _Builder:
     def _drive(self, form: str) -> None:
         new, u, f = self.expression(form), self.c.place.input, self.base.flows[self.c.place.flow or ""]
         self.flows[f.name] = dataclasses.replace(
-            f, rate=_once(f.rate, lambda e: new if e.op == "name" and e.value == u else None))
+            f, rate=ex.substitute(f.rate, lambda e: new if e.op == "name" and e.value == u else None))
 
     def _spill(self, what: Mapping[str, Any]) -> None:
         a, b = self.c.place.nodes["a"], self.c.place.nodes.get("b")
@@ -624,15 +619,11 @@ class _Builder:
         p = self.c.place
         if p.output:
             o = self.base.outputs[p.output]
-            self.outputs[p.output] = dataclasses.replace(o, value=_once(o.value, change))
+            self.outputs[p.output] = dataclasses.replace(o, value=ex.substitute(o.value, change))
         elif p.flow:
             f = self.base.flows[p.flow]
-            self.flows[p.flow] = dataclasses.replace(f, rate=_once(f.rate, change))
+            self.flows[p.flow] = dataclasses.replace(f, rate=ex.substitute(f.rate, change))
 
-
-def _once(e: Expr, change) -> Expr:
-    """substitute, where what was put in is not looked at again."""
-    return ex.substitute(e, change)
 
 
 # ---------------------------------------------------------------------------------------------------------- shapes

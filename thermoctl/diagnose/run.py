@@ -238,7 +238,6 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
         return e
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
         done = [e for e in pool.map(one, chosen) if e is not None]
-    # A shape found on a coarse grid may sit in the wrong valley: the leaders start again from elsewhere.
     done.sort(key=lambda e: e.score)
     return done
 
