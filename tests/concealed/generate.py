@@ -1,6 +1,7 @@
 """Write folders of cases with concealed physics; the answers apart, hashed.
 
     python -m tests.concealed.generate --out DIR --number N --seed S [--smoke] [--answers DIR] [--families a,b] [--kind none]
+    python -m tests.concealed.generate --out DIR --number N --seed S --list
 
 DIR/NNNN/{plant.yaml,run_1.csv,run_2.csv}; answers in --answers (default DIR/../<name>_answers) as NNNN.yaml with
 `manifest.sha256`; `--answers inside` puts answer.yaml into each case instead (a set to develop on). A case is a
@@ -12,6 +13,10 @@ from __future__ import annotations
 import argparse
 import hashlib
 import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -31,48 +36,60 @@ SCHEDULES = ("production-like", "designed", "warm-up", "designed")
 STRANGE = 8.0
 SIZES = 10.0 ** np.arange(-2.0, 1.51, 0.5)
 # one period of kinds: 600 cases hold 150 of nothing missing, 360 single effects, 45 unknown, 30 pairs, 15 that cancel
-KINDS = (
-    "one",
-    "none",
-    "one",
-    "one",
-    "none",
-    "one",
-    "one",
-    "unknown",
-    "one",
-    "none",
-    "one",
-    "pair",
-    "one",
-    "one",
-    "none",
-    "one",
-    "one",
-    "unknown",
-    "one",
-    "none",
-    "one",
-    "one",
-    "pair",
-    "one",
-    "none",
-    "one",
-    "one",
-    "one",
-    "none",
-    "one",
-    "unknown",
-    "one",
-    "one",
-    "none",
-    "one",
-    "cancel",
-    "one",
-    "none",
-    "one",
-    "one",
-)
+_PERIOD = "one none one one none one one unknown one none one pair one one none one one unknown one none "
+_PERIOD += "one one pair one none one one none one none one unknown one one none one cancel one none one"
+KINDS = tuple(_PERIOD.split())
+ATTEMPTS = 24
+CHUNK = 24  # rivals measured at a time: a large rig's signals are hundreds of megabytes
+FIXED = ("copper_resistance", "resistance_temperature")  # copper's coefficient: the drive's strength decides how visible
+
+
+@dataclass(frozen=True)
+class Slot:
+    """What case `number` of a set is to be; effect and band only of a single effect."""
+
+    number: int
+    kind: str
+    family: str
+    schedule: str
+    effect: str | None = None
+    band: str | None = None
+
+
+@cache
+def holders() -> dict[str, tuple[str, ...]]:
+    """Every effect and the families with a place for it, by looking at a few rigs of each."""
+    found: dict[str, set[str]] = {}
+    for name, family in FAMILIES.items():
+        for seed in range(6):
+            for s in family.scene(np.random.default_rng(seed), "designed", True).suspects:
+                found.setdefault(s.effect, set()).add(name)
+    return {e: tuple(f for f in FAMILIES if f in found[e]) for e in sorted(found)}
+
+
+def plan(seed: int, number: int, families: Sequence[str] = tuple(FAMILIES), kind: str | None = None) -> list[Slot]:
+    """The first `number` slots of a set. Each kind goes round the families and schedules by itself; single effects go
+    round all pairs of an effect and a size in an order that the seed shuffles, so that no pair is forgotten. `kind` asks
+    for one kind instead of the set's turn."""
+    effects = {e: [f for f in held if f in families] for e, held in holders().items()}
+    cells = [(e, b) for e, held in effects.items() if held for b in BANDS]
+    order = np.random.default_rng([seed, len(cells)]).permutation(len(cells))
+    count: dict[str, int] = {}
+    slots = []
+    for n in range(number):
+        what = kind or KINDS[n % len(KINDS)]
+        k = count[what] = count.get(what, -1) + 1
+        if what == "one":
+            turn, at = divmod(k, len(cells))
+            effect, band = cells[order[at]]
+            held = effects[effect]
+            # another family and schedule for each size of an effect, and in each turn
+            shift = turn + list(BANDS).index(band) + seed
+            slots.append(Slot(n, what, held[shift % len(held)], SCHEDULES[(k + turn) % len(SCHEDULES)], effect, band))
+        else:
+            family = families[(k + seed) % len(families)]
+            slots.append(Slot(n, what, family, SCHEDULES[(k // len(families) + k) % len(SCHEDULES)]))
+    return slots
 
 
 class Bench:
@@ -91,8 +108,8 @@ class Bench:
             )
         self.judge = Judge(spectra)
 
-    def measure(self, pool: list[Suspect], rivals: list[Suspect]) -> None:
-        """Signals left of `pool` at SIZES and of `rivals` at two sizes, all in one batch per run."""
+    def measure(self, pool: list[Suspect]) -> None:
+        """What a refit leaves of each of `pool` at SIZES (`curve`: suspect, sizes, rows), all in one batch per run."""
         scene = self.scene
         rows, steps = [Variant()], []
         for name, (low, high) in scene.ranges.items():
@@ -104,8 +121,6 @@ class Bench:
         sized = [(s, [z for z in SIZES if z <= s.top]) for s in pool]
         for s, sizes in sized:
             rows += [Variant(effects=[(s.effect, s.where, s.make(z))]) for z in sizes]
-        for s in rivals:
-            rows += [Variant(effects=[(s.effect, s.where, s.make(z))]) for z in (0.1 * min(1, s.top), min(1, s.top))]
         runs = [scene.outputs_of(k, rows) for k in range(len(scene.runs))]
         self.base = [y[0] for y in runs]
         d = [y - y[:1] for y in runs]
@@ -126,7 +141,20 @@ class Bench:
         for s, sizes in sized:
             self.curve.append((s, np.array(sizes), left[at : at + len(sizes)]))
             at += len(sizes)
-        self.rivals = [(s, left[at + 2 * i : at + 2 * i + 2]) for i, s in enumerate(rivals)]
+
+    def beyond_rivals(self, signals: list[np.ndarray]) -> list[list[tuple[Suspect, float]]]:
+        """For each left-over signal (M,): every suspect of the rig at a place, and what it would leave of the signal."""
+        found: list[list[tuple[Suspect, float]]] = [[] for _ in signals]
+        rivals = self.scene.suspects
+        for begin in range(0, len(rivals), CHUNK):
+            part = rivals[begin : begin + CHUNK]
+            rows = [Variant(effects=[(s.effect, s.where, s.make(z * min(1, s.top)))]) for s in part for z in (0.1, 1)]
+            d = [self.scene.outputs_of(k, rows) - self.base[k] for k in range(len(self.scene.runs))]
+            left = self.judge.left_over(self.judge.whiten(d))
+            for i, s in enumerate(part):
+                for row, signal in zip(found, signals, strict=True):
+                    row.append((s, beyond(signal, left[2 * i : 2 * i + 2])))
+        return found
 
     def left_of(self, effects: list[tuple[str, str, dict]]) -> tuple[np.ndarray, list[np.ndarray]]:
         """Left-over row (M,) and readings of the truth with these effects."""
@@ -134,17 +162,10 @@ class Bench:
         d = self.judge.whiten([(y - b)[None] for y, b in zip(runs, self.base, strict=True)])
         return self.judge.left_over(d)[0], runs
 
-    def strangest(self, left: np.ndarray) -> float:
-        """What is left of a signal after the single catalogue effect that comes nearest to it."""
-        return min(beyond(left, row) for _, row in self.rivals)
 
-    def like(self, left: np.ndarray, truth: Suspect) -> list[tuple[str, str]]:
-        """Rivals after which too little of the signal is left to tell them from the truth."""
-        return [
-            (s.effect, s.where)
-            for s, row in self.rivals
-            if (s.effect, s.where) != (truth.effect, truth.where) and beyond(left, row) < TELL_APART
-        ]
+def _alike(rivals: list[tuple[Suspect, float]], truth: Suspect) -> list[tuple[str, str]]:
+    """Rivals after which too little of the signal is left to tell them from the truth."""
+    return [(s.effect, s.where) for s, stays in rivals if (s.effect, s.where) != (truth.effect, truth.where) and stays < TELL_APART]
 
 
 def _size_for(curve: tuple, target: float) -> float | None:
@@ -161,22 +182,30 @@ def _size_for(curve: tuple, target: float) -> float | None:
 
 
 def make_case(
-    seed: int, number: int, families: list[str], short: bool, kind: str | None = None
+    seed: int, number: int, families: Sequence[str] = tuple(FAMILIES), short: bool = False, kind: str | None = None
 ) -> tuple[dict, list[list[tuple[str, np.ndarray]]], dict]:
-    """Case `number` of a set: (plant, columns of each run, answer). `kind` asks for one kind instead of the set's turn."""
-    turn = KINDS[(number // len(families) + 7 * (number % len(families))) % len(KINDS)]
-    kind = kind or turn
-    for attempt in range(20):
+    """Case `number` of a set: (plant, columns of each run, answer)."""
+    slot = plan(seed, number + 1, families, kind)[number]
+    held = [f for f in families if slot.effect is None or f in holders()[slot.effect]]
+    at = held.index(slot.family)
+    for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([seed, number, attempt])
-        family = families[number % len(families)]
-        schedule = SCHEDULES[(number // 3) % len(SCHEDULES)]
-        scene = FAMILIES[family].scene(rng, schedule, short)
-        case = _conceal(scene, kind, rng, number)
+        late = attempt // 6  # not visible on this rig: another one; where no such rig shows it, another family, schedule
+        family, schedule = held[(at + late) % len(held)], SCHEDULES[(SCHEDULES.index(slot.schedule) + late) % len(SCHEDULES)]
+        vigour = 1.0
+        for _ in range(4 if slot.effect in FIXED else 1):
+            scene = FAMILIES[family].scene(np.random.default_rng([seed, number, attempt, 1]), schedule, short, vigour)
+            case, seen = _conceal(scene, slot, np.random.default_rng([seed, number, attempt, 2]))
+            if case is not None or not seen:
+                break
+            # heat times the current itself: the signal goes with the current cubed
+            vigour = min(vigour * (np.sqrt(np.prod(BANDS[slot.band or "large"])) / seen) ** (1 / 3), 1.2)
         if case is not None:
             effects, runs, told, bench = case
             break
     else:
-        raise RuntimeError(f"case {number}: no visible effect in 20 draws")
+        raise RuntimeError(f"case {number}: {slot.effect or slot.kind} not visible as asked in {ATTEMPTS} draws")
+    kind = slot.kind
     answer = {
         "verdict": "consistent" if kind == "none" else "unexplained" if kind == "unknown" else "explained",
         "effects": [["?" if e.startswith("?") else e, w] for e, w, _ in effects],
@@ -190,7 +219,7 @@ def make_case(
         "snr": [round(float(s), 2) for s in told["snr"]],
         "onset": told["onset"],
         "also_right": [list(x) for x in told["aliases"]],
-        "parameters": [{k: float(v) for k, v in p.items()} for _, _, p in effects],
+        "parameters": [{k: float(v) for k, v in published(e, p).items()} for e, _, p in effects],
         "true_parameters": {k: float(f"{v:.6g}") for k, v in scene.theta.items()},
     }
     if kind == "unknown":
@@ -214,42 +243,59 @@ def make_case(
     return scene.plant, tables, answer
 
 
-def _conceal(scene: Scene, kind: str, rng: np.random.Generator, number: int):
-    """Choose effects and sizes: (effects, readings by run, what the answer tells, bench), or None when not visible."""
+def published(effect: str, p: dict) -> dict:
+    """An effect's parameters by the names that the catalogue publishes."""
+    if effect == "directional_friction":  # F either way, D and H|v| what differs; the mean damping goes to the damper
+        plus, minus = p["FP"], p["FM"]
+        return {"F": (plus + minus) / 2, "D": (plus - minus) / 2, "H": (p["BP"] - p["BM"]) / 2}
+    names = {"A": "ALPHA"} if effect in FIXED else {"X": "X0"} if effect == "backlash_hysteresis" else {}
+    return {names.get(k, k): v for k, v in p.items()}
+
+
+def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple | None, float | None]:
+    """Choose place and size: (effects, readings by run, what the answer tells, bench), or None when not visible as
+    asked; and the signal in sigmas that was seen instead, where a place for the effect was found."""
+    if slot.effect and slot.effect not in {s.effect for s in scene.suspects}:
+        return None, None
     bench = Bench(scene, rng)
+    kind = slot.kind
     told: dict = {"alike": [], "band": None, "snr": [], "onset": None, "aliases": []}
     if kind == "none":
         bench.base = [scene.outputs_of(k, [Variant()])[0] for k in range(len(scene.runs))]
-        return [], bench.base, told, bench
+        return ([], bench.base, told, bench), None
     pool = scene.unknowns if kind == "unknown" else scene.suspects
     names = sorted({s.effect for s in pool})  # every effect alike, whatever its number of places
-    picks = list(rng.permutation(names))[: 4 if kind in ("one", "unknown") else 8]
+    picks = [slot.effect] if slot.effect else list(rng.permutation(names))[: 4 if kind == "unknown" else 8]
     chosen = [options[rng.integers(len(options))] for options in ([s for s in pool if s.effect == e] for e in picks)]
-    bench.measure(chosen, scene.suspects)
-    if kind in ("one", "unknown"):
-        band = "large" if kind == "unknown" else ("large", "middle", "large", "small")[number // 2 % 4]
-        low, high = BANDS[band]
-        for curve in bench.curve:
-            size = _size_for(curve, float(np.exp(rng.uniform(np.log(low * 1.1), np.log(high * 0.9)))))
-            if size is None:
-                continue
-            s = curve[0]
-            effects = [(s.effect, s.where, s.make(size))]
-            left, runs = bench.left_of(effects)
-            if not low <= snr(left) < high * (4 if band == "large" else 1):
-                continue
-            if kind == "unknown" and bench.strangest(left) < STRANGE:
-                continue
-            told |= {
-                "band": band,
-                "snr": [snr(left)],
-                "alike": bench.like(left, s),
-                "onset": effects[0][2].get(s.onset) if s.onset else None,
-                "aliases": [(s.effect, w) for w in s.aliases],
-            }
-            return effects, runs, told, bench
-        return None
-    return _two(bench, kind, rng, told)
+    bench.measure(chosen)
+    if kind in ("pair", "cancel"):
+        return _two(bench, kind, rng, told), None
+    band = slot.band or "large"
+    low, high = BANDS[band]
+    seen = None
+    for curve in bench.curve:
+        size = _size_for(curve, float(np.exp(rng.uniform(np.log(low * 1.1), np.log(high * 0.9)))))
+        s = curve[0]
+        if size is None:
+            seen = float(np.max(snr(curve[2])))
+            continue
+        effects = [(s.effect, s.where, s.make(size))]
+        left, runs = bench.left_of(effects)
+        seen = float(snr(left))
+        if not low <= seen < high * (4 if band == "large" else 1):
+            continue
+        rivals = bench.beyond_rivals([left])[0]
+        if kind == "unknown" and min(stays for _, stays in rivals) < STRANGE:
+            continue
+        told |= {
+            "band": band,
+            "snr": [seen],
+            "alike": _alike(rivals, s),
+            "onset": effects[0][2].get(s.onset) if s.onset else None,
+            "aliases": [(s.effect, w) for w in s.aliases],
+        }
+        return (effects, runs, told, bench), seen
+    return None, seen
 
 
 def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
@@ -282,7 +328,7 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
         "band": "large",
         "snr": [snr(left), *(snr(a) for a in alone)],
         "onset": onset,
-        "alike": [x for s, a in zip((one, two), alone, strict=True) for x in bench.like(a, s)],
+        "alike": [x for s, rivals in zip((one, two), bench.beyond_rivals(alone), strict=True) for x in _alike(rivals, s)],
     }
     return effects, runs, told, bench
 
@@ -308,10 +354,42 @@ def _plain(x):
     return x
 
 
+def coverage(answers: Sequence[dict]) -> dict[str, Counter]:
+    """How many of these answers there are of each: `size` (effect, band), `place` (kind, family, schedule), `colour`, `dirt`."""
+    return {
+        "size": Counter((a["effects"][0][0], a["band"]) for a in answers if a["kind"] == "one"),
+        "place": Counter((a["kind"], a["family"], a["schedule"]) for a in answers),
+        "colour": Counter(a["colour"] for a in answers),
+        "dirt": Counter(a["dirt"] for a in answers),
+    }
+
+
+def listing(slots: Sequence[Slot], answers: Sequence[dict]) -> str:
+    """The coverage of a set as text: what is planned, and what has been made so far, as planned/made."""
+    made = coverage(answers)
+    size = Counter((s.effect, s.band) for s in slots if s.kind == "one")
+    place = Counter((s.kind, s.family, s.schedule) for s in slots)
+    kinds, families, schedules = (sorted({p[i] for p in place | made["place"]}) for i in range(3))
+    lines = [f"{len(slots)} cases planned, {len(answers)} made (planned/made)", "", f"{'effect':36s}" + "".join(f"{b:>9s}" for b in BANDS)]
+    for e, held in holders().items():
+        cells = "".join(f"{size[e, b]:>6d}/{made['size'][e, b]:<2d}" for b in BANDS)
+        lines.append(f"{e:36s}{cells}  {', '.join(held)}")
+    lines += ["", f"{'family, schedule':36s}" + "".join(f"{k:>9s}" for k in kinds)]
+    for f in families:
+        for s in schedules:
+            lines.append(f"{f + ', ' + s:36s}" + "".join(f"{place[k, f, s]:>6d}/{made['place'][k, f, s]:<2d}" for k in kinds))
+    total = [sum(x[k, f, s] for f in families for s in schedules) for k in kinds for x in (place, made["place"])]
+    lines.append(f"{'all':36s}" + "".join(f"{a:>6d}/{b:<2d}" for a, b in zip(total[::2], total[1::2], strict=True)))
+    for what in ("colour", "dirt"):
+        lines.append(f"{what} made: " + ", ".join(f"{k} {n}" for k, n in sorted(made[what].items())))
+    return "\n".join(lines)
+
+
 def main(argv: list[str] | None = None) -> int:
     """The command."""
     p = argparse.ArgumentParser(prog="tests.concealed.generate", description=__doc__)
     p.add_argument("--out", required=True, type=Path)
+    p.add_argument("--list", action="store_true", help="count what the set covers, planned and made so far; make nothing")
     p.add_argument("--number", type=int, default=600)
     p.add_argument("--first", type=int, default=0, help="number of the first case (to make a part of a set)")
     p.add_argument("--seed", type=int, default=1)
@@ -322,6 +400,11 @@ def main(argv: list[str] | None = None) -> int:
     a = p.parse_args(argv)
     inside = a.answers == "inside"
     answers = a.out.parent / f"{a.out.name}_answers" if a.answers is None else Path(a.answers)
+    if a.list:
+        files = sorted(a.out.glob("*/answer.yaml") if inside else answers.glob("[0-9]*.yaml"))
+        slots = plan(a.seed, a.first + a.number, a.families.split(","), a.kind)[a.first :]
+        print(listing(slots, [yaml.safe_load(f.read_text()) for f in files]))
+        return 0
     a.out.mkdir(parents=True, exist_ok=True)
     for number in range(a.first, a.first + a.number):
         name = f"{number + 1:04d}"

@@ -47,8 +47,8 @@ class Family(Protocol):
 
     name: str
 
-    def scene(self, rng: np.random.Generator, schedule: str, short: bool) -> Scene:
-        """Draw a rig, its parameters and its two runs."""
+    def scene(self, rng: np.random.Generator, schedule: str, short: bool, vigour: float = 1.0) -> Scene:
+        """Draw a rig, its parameters and its two runs; `vigour` scales an electric drive's current."""
         ...
 
 

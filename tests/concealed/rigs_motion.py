@@ -212,7 +212,7 @@ class FreeStage:
 
     name = "stage"
 
-    def scene(self, rng: np.random.Generator, schedule: str, short: bool) -> Scene:
+    def scene(self, rng: np.random.Generator, schedule: str, short: bool, vigour: float = 1.0) -> Scene:
         size = float(np.round(rng.uniform(0.3, 1.5), 2))
         damped = rng.random() < 0.8
         belief: dict[str, tuple] = {"gain": (32.0 * size, "N/V"), "mass": (90.0 * size, "kg", 40 * size, 160 * size)}
@@ -315,7 +315,7 @@ class Flexure:
 
     name = "flexure"
 
-    def scene(self, rng: np.random.Generator, schedule: str, short: bool) -> Scene:
+    def scene(self, rng: np.random.Generator, schedule: str, short: bool, vigour: float = 1.0) -> Scene:
         knows = {
             e: bool(rng.random() < 0.65)
             for e in ("back_emf", "inductance", "resistance_temperature", "copper_resistance")
@@ -347,7 +347,7 @@ class Flexure:
             tones = sum(
                 rng.uniform(0.2, 0.5) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in rng.uniform(0.3, 6.0, 5)
             )
-            current = np.convolve(
+            current = vigour * np.convolve(
                 hold * rng.choice([-1, 1]) + 0.5 * tones * (hold > 0), np.hanning(41) / np.hanning(41).sum(), "same"
             )
             runs.append(

@@ -15,7 +15,7 @@ class Tanks:
 
     name = "tanks"
 
-    def scene(self, rng: np.random.Generator, schedule: str, short: bool) -> Scene:
+    def scene(self, rng: np.random.Generator, schedule: str, short: bool, vigour: float = 1.0) -> Scene:
         names = ["upper", "lower"] if rng.random() < 0.6 else ["upper", "middle", "lower"]
         belief: dict[str, tuple] = {"k_pump": (0.05, "1/s", 0.01, 0.2)}
         belief |= {f"k_{n}": (0.06, "V**0.5/s", 0.015, 0.25) for n in names}

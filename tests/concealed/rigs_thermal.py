@@ -175,7 +175,7 @@ class Actuator:
 
     name = "actuator"
 
-    def scene(self, rng: np.random.Generator, schedule: str, short: bool) -> Scene:
+    def scene(self, rng: np.random.Generator, schedule: str, short: bool, vigour: float = 1.0) -> Scene:
         belief: dict[str, tuple] = {f"C_{n}": (c, "J/K", c * 0.5, c * 2.0) for n, c in _NODES.items()}
         belief |= {f"G_{a}_{b}": (g, "W/K", g * 0.4, g * 2.5) for (a, b), g in _LINKS.items()}
         belief |= {f"H_{n}": (h, "W/K", h * 0.2, h * 3.0) for n, h in _FILMS.items()}
@@ -357,7 +357,7 @@ class Heater:
 
     name = "heater"
 
-    def scene(self, rng: np.random.Generator, schedule: str, short: bool) -> Scene:
+    def scene(self, rng: np.random.Generator, schedule: str, short: bool, vigour: float = 1.0) -> Scene:
         three = rng.random() < 0.35
         count = 3 if three else 2
         scale = rng.uniform(0.7, 1.5)
@@ -455,7 +455,7 @@ class Drive:
 
     name = "drive"
 
-    def scene(self, rng: np.random.Generator, schedule: str, short: bool) -> Scene:
+    def scene(self, rng: np.random.Generator, schedule: str, short: bool, vigour: float = 1.0) -> Scene:
         known_resistance = 1.2
         knows = {e: rng.random() < 0.6 for e in ("copper_resistance", "resistance_temperature", "back_emf")}
         belief: dict[str, tuple] = {
@@ -483,7 +483,7 @@ class Drive:
         runs = []
         for _ in range(2):
             t = clock(2400 if short else 3600, 2.0, rng)
-            hold = levels(t, rng, schedule, 5.0, 500.0)
+            hold = vigour * levels(t, rng, schedule, 5.0, 500.0)
             wave = 1 + (0.25 * np.sin(2 * np.pi * t / rng.uniform(30, 90)) if schedule != "warm-up" else 0)
             current = np.round(hold * wave, 5)
             pace = np.interp(t, np.linspace(0, t[-1], 25), rng.choice([0.0, 20.0, 60.0, 100.0], 25)) * rng.choice(

@@ -96,7 +96,7 @@ def test_nothing_missing_is_nothing(family, monkeypatch):
     rng = np.random.default_rng(5)
     scene = generate.FAMILIES[family].scene(rng, "designed", True)
     bench = generate.Bench(scene, rng)
-    bench.measure([], [])
+    bench.measure([])
     lumped = thermal.simulate
     monkeypatch.setattr(rigs_thermal, "simulate", lambda net, *rest: lumped(dataclasses.replace(net, cells=1), *rest))
     one_cell = [scene.outputs_of(k, [Variant()])[0] for k in range(2)]
@@ -111,7 +111,7 @@ def test_the_step_of_a_motion_truth_is_fine_enough(family):
     rng = np.random.default_rng(3)
     scene = generate.FAMILIES[family].scene(rng, "designed", True)
     bench = generate.Bench(scene, rng)
-    bench.measure([], [])
+    bench.measure([])
     for run in scene.runs:
         run["substeps"] = 2 * run.get("substeps", rigs_motion.SUBSTEPS)
     finer = [scene.outputs_of(k, [Variant()])[0] for k in range(2)]

@@ -18,7 +18,7 @@ def find():
 class Browser:
     """One browser with one page. `messages` are what the page wrote to its console, errors included."""
 
-    def __init__(self, program, folder, width=1440, height=1900):
+    def __init__(self, program, folder, width=1440, height=1000):
         to_browser, our_write = os.pipe()
         our_read, from_browser = os.pipe()
         self.write_fd, self.read_fd, self.received, self.number, self.messages = our_write, our_read, b"", 0, []

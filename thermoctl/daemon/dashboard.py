@@ -1,7 +1,8 @@
 """The dashboard: one page in the browser, served by a process of its own, with Prometheus' metrics beside it.
 
     GET  /                  the page: complete in itself, no file from elsewhere
-    GET  /api/live          frames as server-sent events, 1 to 50 a second (watch.Watch); `latency` once a second
+    GET  /api/live          server-sent events: `past`, the last minute; then frames, 1 to 50 a second (watch.Watch), and
+                            `slow` once a second: latency and captures
     GET  /api/info          rig, limits, signals, whether commands are taken
     GET  /api/history       ?signal=NAME&begin=S&end=S&points=N   least, mean and largest per pixel, from the recording
     GET  /api/captures      faults with full-rate rows;  /api/capture?number=N&signal=NAME[&format=csv]
@@ -239,6 +240,7 @@ class Handler(BaseHTTPRequestHandler):
         try:
             self._head(HTTPStatus.OK, "text/event-stream", None)
             watch, seen, told = self.server.watch, -1, -math.inf
+            self.wfile.write(f"event: past\ndata: {_dump(list(watch.past))}\n\n".encode())
             while not watch.stopping:
                 seen, frame = watch.wait(seen, 1.0)
                 now, text = time.monotonic(), f"data: {_dump(frame)}\n\n"

@@ -1,7 +1,9 @@
 """What the dashboard shows: a thread that follows the ring and makes a frame a few times a second.
 
 It only reads shared memory: the loop never knows. A daemon that ends is seen (its segment is gone), one that starts
-again is found. Around each new fault the rows of every tick are kept: the capture.
+again is found. Around each new fault the rows of every tick are kept: the capture. It begins with what the ring still
+held when the follower came, so a fault soon after the dashboard's start has its seconds before as well. The last minute
+is kept in few numbers: a page that opens shows it at once.
 """
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.control import faults
+from thermoctl.control import arming, faults
 from thermoctl.daemon.assemble import compensator, shared_name
 from thermoctl.daemon.shared import Shared
 from thermoctl.daemon.socket import latency, status
@@ -26,6 +28,9 @@ from thermoctl.yamlfile import InputError
 BEFORE_S, AFTER_S = 2.0, 2.0        # of a capture
 CAPTURES = 16
 SILENT_S = 2.0                      # no tick for so long: the rows are shown as old
+PAST_S, PAST_STEP_S = 60.0, 0.1     # the last minute that a page gets when it opens
+PAST = ("wall_s", "reference_um", "compensated_um", "position_raw_um", "output_reference_um", "compensation_um", "innovation_c",
+        "power_w")
 RANGED = ("position_raw_um", "compensated_um", "output_reference_um", "lateness_us", "drive", "power_w", "innovation_c")
 """Signals of which a frame says the least and largest value since the frame before."""
 LATENESS_EDGES_US = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
@@ -43,18 +48,19 @@ class Capture:
     faults: list[str]
     rows: np.ndarray
     whole: bool = False
+    lost: int = 0                   # ticks that were overwritten before they could be read
 
     def summary(self) -> dict[str, Any]:
         """What a list of captures shows."""
         return {"number": self.number, "wall_s": self.wall_s, "t_s": self.t_s, "faults": self.faults,
-                "rows": len(self.rows), "whole": self.whole}
+                "rows": len(self.rows), "whole": self.whole, "lost": self.lost}
 
 
 class Watch:
     """Follows the ring of `settings`' daemon: `look()` once, or `run()` at `rate_hz` until `stop()`.
 
     frame: the newest one, a dict ready for JSON; `wait(seen)` gives (number, frame) as soon as its number is not `seen`.
-    captures: newest last.
+    captures: newest last. past: the last minute, {state, PAST signals} every tenth of a second, oldest first.
     """
 
     def __init__(self, settings: Any, rate_hz: float = 20.0):
@@ -62,12 +68,13 @@ class Watch:
         self.name = shared_name(settings)
         self.shared: Shared | None = None
         self.captures: deque[Capture] = deque(maxlen=CAPTURES)
+        self.past: deque[dict[str, Any]] = deque(maxlen=round(PAST_S / PAST_STEP_S))
         self.number, self.frame = 0, _down()
         self._changed = threading.Condition()
         self._stopping = threading.Event()
         self._recent: deque[np.ndarray] = deque()
         self._position = self._captured = self._inode = 0
-        self._bits = 0
+        self._bits: int | None = None               # fault bits of the row before; None before the first
         self._moved_s = time.monotonic()
         model = compensator(settings)
         self._noise_c2 = model.R_v if settings.compensation.model else math.nan
@@ -137,16 +144,19 @@ class Watch:
             except InputError:
                 return None
             self.shared, self._inode = shared, inode
-            self._position, self._bits = max(0, shared.ring.head - 1), 0
+            self._position, self._bits = 0, None        # from the oldest row that the ring still holds
             self._recent.clear()
+            self.past.clear()
         return self.shared
 
     def _follow(self, shared: Shared) -> dict[str, Any]:
-        rows, self._position, _ = shared.ring.read(self._position)
+        first = self._bits is None
+        rows, self._position, lost = shared.ring.read(self._position)
         now = time.monotonic()
         if len(rows):
             self._moved_s = now
-            self._keep(rows)
+            self._keep(rows, 0 if first else lost)
+            self._remember(rows)
         frame = {**status(shared), "ok": True, "silent_s": round(now - self._moved_s, 1)}
         frame["stale"] = frame["silent_s"] > SILENT_S
         newest = rows[-1] if len(rows) else shared.ring.newest()
@@ -164,15 +174,33 @@ class Watch:
         share = self._gain * row[INDEX["kalman_gain"]]
         return _finite(math.sqrt(self._noise_c2 / (1.0 - share))) if 0.0 <= share < 1.0 else None
 
-    def _keep(self, rows: np.ndarray) -> None:
-        """Rows into the captures under way; a capture begins where a fault that trips is new."""
+    def _remember(self, rows: np.ndarray) -> None:
+        """The last row of each PAST_STEP_S of the newest minute into `past`."""
+        rows = rows[rows[:, _WALL] > rows[-1, _WALL] - PAST_S]
+        step = np.floor(rows[:, _WALL] / PAST_STEP_S)
+        for row in rows[np.append(np.diff(step) != 0, True)]:
+            point = {"ok": True, "state": arming.STATES[int(row[INDEX["state"]])],
+                     **{n: _finite(row[INDEX[n]]) for n in PAST}}
+            if self.past and row[_WALL] < self.past[-1]["wall_s"]:
+                self.past.clear()                           # the clock was set back
+            if self.past and row[_WALL] // PAST_STEP_S == self.past[-1]["wall_s"] // PAST_STEP_S:
+                self.past[-1] = point
+            else:
+                self.past.append(point)
+
+    def _keep(self, rows: np.ndarray, lost: int) -> None:
+        """Rows into the captures under way; a capture begins where a fault that trips is new. lost: ticks missing before
+        `rows`, because this process was held up for longer than the ring is."""
+        if lost:
+            self._recent.clear()
         for capture in self.captures:
             if not capture.whole:
+                capture.lost += min(lost, round((capture.t_s + AFTER_S - capture.rows[-1, _T]) / self.settings.loop.period_s))
                 after = rows[rows[:, _T] <= capture.t_s + AFTER_S]
                 capture.rows = np.concatenate((capture.rows, after))
                 capture.whole = len(after) < len(rows)
         bits = rows[:, _BITS].astype(np.int64) & _TRIPS
-        before = np.concatenate(([self._bits], bits[:-1]))
+        before = np.concatenate((bits[:1] if self._bits is None else [self._bits], bits[:-1]))
         for k in np.flatnonzero(bits & ~before):
             names = [f.name for f in faults.decode(int(bits[k] & ~before[k]))]
             self._begin_capture(rows, int(k), names)

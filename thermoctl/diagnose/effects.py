@@ -23,7 +23,7 @@ from thermoctl.plant.simulate import Drive, Simulation
 from thermoctl.plant.units import dimension
 
 CATALOGUE = Path(__file__).parents[2] / "config" / "effects"
-_KEYS = ("effect", "title", "where", "needs", "change", "variants", "shapes", "parameters", "dims", "excited_by", "mimics", "source")
+_KEYS = ("effect", "title", "where", "needs", "change", "variants", "shapes", "parameters", "dims", "prior", "excited_by", "mimics", "source")
 _SHAPES = ("onsets", "windows", "times", "lags", "delays", "periods", "phases", "end_levels", "high_levels", "drive_levels",
            "small_levels", "speeds", "creep_speeds", "distances")
 TEMPERATURE = {"degC", "K", "kelvin", "celsius", "degree_Celsius", "delta_degC", "°C"}
@@ -42,6 +42,7 @@ class EffectParameter:
     shape: str | None
     per_recording: bool
     typical: float | None
+    origin: str | None          # 'first_air': low and high are counted from the ambient at the start
 
     @property
     def amplitude(self) -> bool:
@@ -63,6 +64,7 @@ class Effect:
     excited_by: str
     mimics: tuple[str, ...]
     source: str
+    prior: Expr | None = None       # -2 log of how likely its parameters' values are, beyond their bounds
 
 
 def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
@@ -108,7 +110,11 @@ def _read(root: yamlfile.Node) -> Effect:
             amplitudes = max([amplitudes, *(int(n[1:] or 1) for n in ex.names(trial) if re.fullmatch(r"s\d?", n))])
         parameters.append(EffectParameter(key, p.get("unit"), float(p.get("low", -np.inf)), float(p.get("high", np.inf)),
                                           float(p.get("null", 0.0)), trial, p.get("shape"), bool(p.get("per_recording")),
-                                          p.get("typical")))
+                                          p.get("typical"), p.get("origin")))
+    try:
+        prior = ex.parse(str(top["prior"].value)) if "prior" in top else None
+    except ex.ExpressionError as e:
+        raise top["prior"].error(str(e)) from None
     dims = tuple(map(tuple, top["dims"].plain())) if "dims" in top else tuple(
         tuple(1.0 if i == k else 0.0 for i in range(amplitudes)) for k in range(amplitudes)) or ((1.0,),)
     for node in [top["change"], *(top["variants"].value if "variants" in top else [])]:
@@ -118,7 +124,7 @@ def _read(root: yamlfile.Node) -> Effect:
     changes = (tuple(top["change"].plain()), *(tuple(v) for v in (top["variants"].plain() if "variants" in top else [])))
     return Effect(top["effect"].value, top["title"].value, top["where"].value, tuple(top["needs"].plain()) if "needs" in top else (),
                   changes, shapes, tuple(parameters), dims, top["excited_by"].value if "excited_by" in top else "",
-                  tuple(top["mimics"].plain()) if "mimics" in top else (), top["source"].value)
+                  tuple(top["mimics"].plain()) if "mimics" in top else (), top["source"].value, prior)
 
 
 # ---------------------------------------------------------------------------------------------------------- the rig
@@ -139,6 +145,10 @@ def _dimension(unit: str | None) -> str:
     return next((kind for kind, like in _KINDS.items() if dimension(like) == found), "")
 
 
+# Nodes that an effect brought to model a reading (lag, memory of the start): no body, so no physics can sit there.
+_READINGS = re.compile(r"(lagged|memory|grown)_(sensor_lag|cold_junction_drift|missing_member|expansion_lag)_")
+
+
 class Rig:
     """A plant and its recordings as the catalogue sees them: which node is a temperature, what moves, what is air."""
 
@@ -148,7 +158,7 @@ class Rig:
         p = dataclasses.replace(plant, inputs={k: v for k, v in plant.inputs.items() if not k.startswith("seen_")},
                                 flows={k: v for k, v in plant.flows.items() if not k.startswith("correct_")})
         self.physics = p
-        self.temperatures = [n.name for n in p.nodes.values() if _dimension(n.unit) == "temperature" and not n.name.endswith("_memory")]
+        self.temperatures = [n.name for n in p.nodes.values() if _dimension(n.unit) == "temperature" and not _READINGS.match(n.name)]
         self.velocities = [n.name for n in p.nodes.values() if _dimension(n.unit) in ("velocity", "rotation")
                            and any(f.target == n.name or f.source == n.name for f in p.flows.values())]
         self.position_of: dict[str, str] = {}
@@ -384,6 +394,24 @@ class Candidate:
     def key(self) -> tuple[str, str]:
         """(effect, where): what a result names."""
         return self.effect.name, self.place.where
+
+    def bounds(self, p: EffectParameter) -> tuple[float, float]:
+        """Where physics lets a parameter be."""
+        origin = self.rig.drives[0].first.get(self.rig.air or "", 0.0) if p.origin == "first_air" else 0.0
+        return origin + p.low, origin + p.high
+
+    def surprise(self, plant: Plant) -> float:
+        """-2 log of how likely the values are that `plant` holds for the effect, summed over recordings where it has a
+        value for each."""
+        if self.effect.prior is None:
+            return 0.0
+        total = 0.0
+        for d in self.rig.drives:
+            known = {p.name: plant.parameters[self.own(p.name)].values.get(d.name, plant.parameters[self.own(p.name)].value)
+                     for p in self.effect.parameters if self.own(p.name) in plant.parameters}
+            total += float(ex.evaluate(self.effect.prior, {**known, "duration": float(d.t[-1] - d.t[0]),
+                                                           "first_air": d.first.get(self.rig.air or "", 0.0)}))
+        return total if any(p.per_recording for p in self.effect.parameters) else total / max(len(self.rig.drives), 1)
 
     def own(self, parameter: str) -> str:
         """The plant's name of one of the effect's parameters."""

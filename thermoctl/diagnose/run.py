@@ -95,7 +95,7 @@ class Case:
         """The score of a fit: coloured -2 log likelihood and the price of its parameters."""
         colours = channels(found.residuals, [n.sigma for n in self.noise])
         added = sum(len(self.tables) if plant.parameters[n].per_recording else 1 for o in own for n in o.values())
-        price = added * np.log(max(found.samples, 2)) + sum(_surprise(c) for c in effects)
+        price = added * np.log(max(found.samples, 2)) + sum(_surprise(c) + c.surprise(plant) for c in effects)
         raw = sum(c.score for c in colours)
         return Explanation(plant, list(effects), found, raw + float(price), colours, raw, list(own))
 
@@ -115,7 +115,16 @@ def _surprise(c: Candidate) -> float:
     displacement lags, its members do (expansion_lag); an encoder does not."""
     if c.effect.name == "sensor_lag" and c.place.output and any(p.output == c.place.output for p in PLACES["displacement"](c.rig)):
         return 5.0
+    if c.effect.where == "bending_pair" and any(_free_member(c, side) for side in ("TA", "TB")):
+        return 12.0         # with one side's growth already free it is the other side's growth, said in a longer way
     return (6.0 if c.place.input and c.effect.where != "drive" else 0.0) + (1.0 if c.variant else 0.0)
+
+
+def _free_member(c: Candidate, side: str) -> bool:
+    """Does the displacement already hold this side's temperature with a coefficient that a refit moves?"""
+    plant = c.rig.plant
+    slope = ex.derivative(c.place.symbols["y"], str(c.place.symbols[side].value))
+    return any(n in plant.parameters and plant.parameters[n].range for n in ex.names(slope))
 
 
 def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, float]]:
@@ -141,8 +150,9 @@ def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, f
         if p.shape:
             out[p.name] = (max(p.low, value / 30), min(p.high, value * 30)) if kind != "delays" else (0.0, value * 8)
             continue
-        if np.isfinite(p.low) and np.isfinite(p.high) and not p.per_recording:
-            out[p.name] = (p.low, p.high)
+        floor, ceiling = direction.candidate.bounds(p)
+        if np.isfinite(floor) and np.isfinite(ceiling):
+            out[p.name] = (floor, ceiling)
             continue
         reach = 30 * max(abs(value - p.null), 1e-3 * abs(p.null), 1e-12)
         low, high = max(p.low, p.null - reach), min(p.high, p.null + reach)
