@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import re
 import subprocess
 import sys
+from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -192,10 +195,60 @@ def test_cases_are_in_the_public_formats_and_answers_are_sealed(tmp_path):
         assert hashlib.sha256((tmp_path / "cases_answers" / name).read_bytes()).hexdigest() == digest
 
 
-def test_what_is_concealed_is_as_large_as_its_band_says():
+def test_what_is_concealed_is_what_the_plan_says_and_as_large():
+    """The first single effects of a set: the effect that was asked for, on a rig that holds it, in its band of sigmas."""
     low_high = {"large": (15, 240), "middle": (6, 15), "small": (3, 6)}
-    for number in (0, 2, 6):
-        answer = generate.make_case(21, number, ["heater"], True)[2]
-        if answer["kind"] == "one":
-            low, high = low_high[answer["band"]]
-            assert low <= answer["snr"][0] <= high
+    families = ["heater", "tanks", "stage"]
+    for slot in generate.plan(21, 4, families, "one"):
+        answer = generate.make_case(21, slot.number, families, True, "one")[2]
+        low, high = low_high[slot.band]
+        assert low <= answer["snr"][0] <= high and answer["band"] == slot.band
+        assert answer["effects"][0][0] == slot.effect and answer["family"] in generate.holders()[slot.effect]
+
+
+def test_a_fixed_effect_gets_its_size_from_the_drive():
+    """Copper's coefficient is what it is: the current decides how much of it is seen."""
+    rigs = generate.FAMILIES["drive"]
+    rng = np.random.default_rng
+    full, weak = (rigs.scene(rng(4), "designed", True, v) for v in (1.0, 0.25))
+    assert weak.runs[0]["current"].max() == pytest.approx(0.25 * full.runs[0]["current"].max(), rel=1e-3)
+    slot = next(s for s in generate.plan(3, 144, ["drive"], "one") if s.effect == "resistance_temperature" and s.band == "middle")
+    answer = generate.make_case(3, slot.number, ["drive"], True, "one")[2]
+    assert answer["effects"] == [["resistance_temperature", "winding_voltage"]] and 6 <= answer["snr"][0] <= 15
+    assert answer["parameters"] == [{"ALPHA": 0.00393}]
+
+
+def test_a_set_of_600_holds_every_effect_in_every_size_and_150_of_nothing():
+    slots = generate.plan(7, 600)
+    count = Counter(s.kind for s in slots)
+    assert count == {"one": 360, "none": 150, "unknown": 45, "pair": 30, "cancel": 15}
+    sizes = Counter((s.effect, s.band) for s in slots if s.kind == "one")
+    catalogue = {f.stem for f in (Path(__file__).parents[2] / "config" / "effects").glob("*.yaml")}
+    assert {e for e, _ in sizes} == catalogue  # every effect that the catalogue publishes
+    assert all(sizes[e, b] >= 2 for e in catalogue for b in ("small", "middle", "large"))
+    for kind in ("one", "none"):
+        held = Counter((s.family, s.schedule) for s in slots if s.kind == kind)
+        assert len(held) == 18 and min(held.values()) >= 4  # 6 families x 3 schedules
+    assert generate.plan(7, 600) == slots and generate.plan(8, 600) != slots
+    assert generate.plan(7, 40) == slots[:40]  # a part of a set is the beginning of it
+
+
+def test_the_listing_counts_what_was_planned_and_made(tmp_path, capsys):
+    argv = ["--out", str(tmp_path / "c"), "--seed", "3", "--smoke", "--kind", "none", "--families", "tanks,heater"]
+    generate.main([*argv, "--number", "2"])
+    capsys.readouterr()
+    generate.main([*argv, "--number", "4", "--list"])
+    text = capsys.readouterr().out
+    assert text.startswith("4 cases planned, 2 made")
+    assert re.search(r"^all +4/2", text, re.M)
+    slots = generate.plan(3, 2, ["tanks", "heater"], "none")
+    for s in slots:
+        assert re.search(rf"^{s.family}, {s.schedule} +[12]/1", text, re.M)
+
+
+def test_parameters_are_told_by_the_names_that_the_catalogue_publishes():
+    """What a diagnosis reports can be compared with the truth: each name of an answer is one of the catalogue's."""
+    for family in generate.FAMILIES.values():
+        for s in family.scene(np.random.default_rng(1), "designed", True).suspects:
+            entry = yaml.safe_load((Path(__file__).parents[2] / f"config/effects/{s.effect}.yaml").read_text())
+            assert set(generate.published(s.effect, s.make(1.0))) <= set(entry["parameters"]), s.effect
