@@ -1,0 +1,318 @@
+#include "law.h"
+#include <math.h>
+#include <stdio.h>
+#include <string.h>
+
+enum { OK, STALE, ERROR, ABSENT };
+enum { POSITION = 0, VOLTAGE = 2, CURRENT = 3, AIR = 4, COIL = 5, AMPLIFIER_STATE = 18 };
+enum { K_ERROR, K_STALE, K_RANGE, K_RATE, K_FROZEN, KINDS };
+enum { B_FOLLOWING = 35, B_HOT, B_HOT_MODEL, B_HEATING, B_DISAGREES, B_POWER, B_STUCK, B_BOUND, B_SLEWING, B_SATURATED,
+       B_AMPLIFIER, B_NOT_FOLLOWING, B_LATE, B_WRITE, B_NOT_FINITE };
+enum { OFF, SAFE, READY, ARMED, FAULT };
+enum { NONE, ARM, DISARM, SETPOINT };
+#define BIT(b) ((uint64_t)1 << (b))
+
+static int finite_(double v) { return v - v == 0.0; }
+static double clip(double v, double low, double high) { return v < low ? low : v > high ? high : v; }
+static double least(double a, double b) { return b < a ? b : a; }
+
+static const double *take(const double *p, double *to, int count) {
+    memcpy(to, p, count * sizeof(double));
+    return p + count;
+}
+
+int law_load(law_t *l, const char *path) {
+    static double numbers[4096];
+    FILE *f = fopen(path, "rb");
+    if (!f) return -1;
+    size_t count = fread(numbers, sizeof(double), 4096, f);
+    fclose(f);
+    const double *p = numbers;
+    memset(l, 0, sizeof *l);
+    l->n = (int)*p++, l->sensors_used = (int)*p++, l->mkf = (int)*p++;
+    for (int k = 0; k < l->sensors_used; k++) l->sensors[k] = (int)*p++;
+    for (int c = 0; c < N; c++) l->group[c] = (int)*p++;
+    p = take(p, l->A, l->n * l->n), p = take(p, l->B, l->n * 2), p = take(p, l->C, M * l->n);
+    p = take(p, l->K, l->n * l->sensors_used), p = take(p, l->b1, M), p = take(p, l->b2, M);
+    double *scalars[] = {&l->b_air, &l->f1, &l->offset_um, &l->expansion_period_s, &l->R_w, &l->R_v, &l->air_filter_s,
+        &l->model_period_s, &l->period_s, &l->a1a1, &l->first_gain, &l->kp, &l->ti_s, &l->td_s, &l->output_limit,
+        &l->setpoint_rate_um_s, &l->setpoint_low_um, &l->setpoint_high_um};
+    for (unsigned k = 0; k < sizeof scalars / sizeof *scalars; k++) *scalars[k] = *p++;
+    l->average_length = (int)*p++, l->compensate_on = *p++ > 0.0;
+    l->bound_um = *p++, l->slew_um_s = *p++;
+    p = take(p, l->low, N), p = take(p, l->high, N), p = take(p, l->rate, N);
+    p = take(p, l->stale_s, N), p = take(p, l->frozen_s, N), p = take(p, l->required, N);
+    double *limits[] = {&l->following_um, &l->following_limit_s, &l->coil_limit_c, &l->coil_rate_limit, &l->coil_rate_time_s,
+        &l->innovation_limit_c, &l->innovation_time_s, &l->power_limit_w, &l->power_time_s, &l->idle_current_a,
+        &l->idle_power_w, &l->idle_limit_s, &l->saturation_limit_s, &l->amplifier_limit_s, &l->late_s};
+    for (unsigned k = 0; k < sizeof limits / sizeof *limits; k++) *limits[k] = *p++;
+    l->trip_others = (uint64_t)*p++, l->critical = (uint64_t)*p++;
+    l->P = 1e3 * l->R_v;
+    for (int c = 0; c < N; c++) l->value[c] = NAN, l->status[c] = ABSENT;
+    return (size_t)(p - numbers) == count ? 0 : -2;
+}
+
+static void judge_readings(law_t *l, double dt) {
+    l->faults = l->trips = 0;
+    l->hold = 0;
+    for (int c = 0; c < N; c++) {
+        l->age[c] += l->dt;
+        int status = l->status[c];
+        if (status == ABSENT && l->required[c] == 0.0) {
+            l->verdict[c] = 1.0 + K_ERROR;
+            continue;
+        }
+        if (status == ERROR || status == ABSENT) {
+            l->verdict[c] = 1.0 + K_ERROR;
+        } else if (status == STALE) {
+            l->verdict[c] = 1.0 + K_STALE;
+        } else if (l->fresh[c]) {
+            double value = l->value[c], elapsed = l->age[c] < l->period_s ? l->period_s : l->age[c];
+            if (!(l->low[c] <= value && value <= l->high[c]) || !finite_(value)) {
+                l->verdict[c] = 1.0 + K_RANGE;
+            } else if (l->seen[c] > 0.0 && fabs(value - l->last[c]) > l->rate[c] * elapsed) {
+                l->verdict[c] = 1.0 + K_RATE;
+                l->last[c] = value;
+            } else {
+                if (l->seen[c] > 0.0 && value == l->last[c]) l->same_s[c] += elapsed;
+                else l->same_s[c] = 0.0;
+                l->verdict[c] = l->same_s[c] > l->frozen_s[c] ? 1.0 + K_FROZEN : 0.0;
+                l->last[c] = value;
+                l->seen[c] = 1.0;
+            }
+            l->age[c] = 0.0;
+        } else if (l->age[c] > l->stale_s[c] || (l->seen[c] == 0.0 && l->verdict[c] == 0.0)) {
+            l->verdict[c] = 1.0 + K_STALE;
+        }
+        if (l->verdict[c] > 0.0) {
+            int kind = (int)l->verdict[c] - 1;
+            uint64_t bit = BIT(l->group[c] * KINDS + kind);
+            l->faults |= bit;
+            if (l->required[c] > 0.0) {
+                l->trips |= bit;
+                if (c == VOLTAGE || c == CURRENT || c == AIR || c == COIL) l->hold = 1;
+            }
+        }
+    }
+    if (dt > l->late_s) l->faults |= BIT(B_LATE);
+}
+
+static void power_and_air(law_t *l) {
+    if (l->verdict[VOLTAGE] == 0.0 && l->verdict[CURRENT] == 0.0) l->power_w = l->value[VOLTAGE] * l->value[CURRENT];
+    else if (l->enable == 0.0) l->power_w = 0.0;
+    l->power_mean_w += (l->power_w - l->power_mean_w) * least(1.0, l->dt / l->power_time_s);
+    l->air_rate_k_s = 0.0;
+    if (l->verdict[AIR] == 0.0) {
+        if (l->air_known == 0.0) {
+            l->air_c = l->air_start_c = l->value[AIR];
+            l->air_known = 1.0;
+        }
+        l->air_rate_k_s = (l->value[AIR] - l->air_c) / l->air_filter_s;
+        l->air_c += l->air_rate_k_s * l->dt;
+    }
+}
+
+static void correct(law_t *l) {
+    int coil_new = l->fresh[COIL] && l->verdict[COIL] == 0.0, n = l->n;
+    if (l->air_known == 0.0 && coil_new) {
+        l->air_c = l->air_start_c = l->value[COIL];
+        l->air_known = 1.0;
+    }
+    if (l->corrected == 0.0 && !coil_new) return;
+    for (int k = 0; k < l->sensors_used; k++) {
+        int c = COIL + l->sensors[k];
+        l->e[k] = 0.0;
+        if (l->fresh[c] && l->verdict[c] == 0.0) {
+            double s = l->value[c] - l->air_c;
+            for (int j = 0; j < n; j++) s -= l->C[l->sensors[k] * n + j] * l->x[j];
+            l->e[k] = s;
+        }
+    }
+    if (coil_new) {
+        double elapsed = l->corrected == 0.0 ? l->dt : l->coil_elapsed_s;
+        l->coil_elapsed_s = 0.0;
+        if (l->corrected == 0.0) {
+            for (int i = 0; i < n; i++) l->x[i] += l->first_gain * l->K[i * l->sensors_used] * l->e[0];
+            l->coil_slow_c = l->value[COIL];
+            l->corrected = 1.0;
+            l->primed = 0.0;
+            return;
+        }
+        l->innovation_c = l->e[0];
+        l->innovation_mean_c += (l->e[0] - l->innovation_mean_c) * least(1.0, elapsed / l->innovation_time_s);
+        l->coil_rate_k_s = (l->value[COIL] - l->coil_slow_c) / l->coil_rate_time_s;
+        l->coil_slow_c += l->coil_rate_k_s * least(elapsed, l->coil_rate_time_s);
+    }
+    double gain = 1.0;
+    if (l->mkf) {
+        if (!coil_new) return;
+        double prior = l->a1a1 * l->P + l->R_w;
+        gain = prior / (prior + l->R_v);
+        l->P = prior * (1.0 - gain);
+    }
+    l->kalman_gain = gain;
+    for (int k = 0; k < l->sensors_used; k++)
+        if (l->e[k] != 0.0)
+            for (int i = 0; i < n; i++) l->x[i] += gain * l->K[i * l->sensors_used + k] * l->e[k];
+}
+
+static void estimate(law_t *l, double dt) {
+    int n = l->n;
+    l->dt = finite_(dt) ? clip(dt, 0.0, 1.0) : 0.0;
+    l->tick += 1;
+    l->coil_elapsed_s += l->dt;
+    judge_readings(l, dt);
+    power_and_air(l);
+    double scale = l->dt / l->model_period_s;
+    for (int i = 0; i < n; i++) {
+        double s = l->B[2 * i] * l->power_w + l->B[2 * i + 1] * l->air_rate_k_s;
+        for (int j = 0; j < n; j++) s += l->A[i * n + j] * l->x[j];
+        l->dx[i] = s;
+    }
+    for (int i = 0; i < n; i++) l->x[i] += scale * l->dx[i];
+    if (!l->hold) correct(l);
+    for (int m = 0; m < M; m++) {
+        double s = 0.0;
+        for (int j = 0; j < n; j++) s += l->C[m * n + j] * l->x[j];
+        l->T[m] = s;
+    }
+}
+
+static void compensate(law_t *l) {
+    if (l->primed == 0.0) {
+        double s = l->b_air * (l->air_c - l->air_start_c);
+        for (int m = 0; m < M; m++) {
+            s += (l->b1[m] + l->b2[m]) * l->T[m];
+            l->T_before[m] = l->T[m];
+        }
+        l->expansion_before_um = l->expansion_after_um = s / (1.0 - l->f1);
+        l->phase_s = 0.0;
+        l->primed = l->corrected;
+    }
+    l->phase_s += l->dt;
+    if (l->phase_s >= l->expansion_period_s) {
+        l->phase_s -= l->expansion_period_s;
+        double s = l->f1 * l->expansion_after_um + l->b_air * (l->air_c - l->air_start_c);
+        for (int m = 0; m < M; m++) {
+            s += l->b1[m] * l->T_before[m] + l->b2[m] * l->T[m];
+            l->T_before[m] = l->T[m];
+        }
+        l->expansion_before_um = l->expansion_after_um;
+        l->expansion_after_um = s;
+    }
+    double part = least(1.0, l->phase_s / l->expansion_period_s);
+    l->expansion_um = (l->expansion_before_um + part * (l->expansion_after_um - l->expansion_before_um)) + l->offset_um;
+    double target = l->compensate_on ? l->expansion_um : 0.0;
+    if (!(fabs(target) <= l->bound_um)) {
+        l->faults |= BIT(B_BOUND);
+        target = finite_(target) ? clip(target, -l->bound_um, l->bound_um) : l->compensation_um;
+    }
+    if (l->hold) return;
+    if (l->state == ARMED) {
+        double step = l->slew_um_s * l->dt;
+        if (fabs(target - l->compensation_um) > 2.0 * step) l->faults |= BIT(B_SLEWING);
+        target = clip(target, l->compensation_um - step, l->compensation_um + step);
+    }
+    l->compensation_um = target;
+}
+
+static void control(law_t *l, int command, double command_value) {
+    if (l->fresh[POSITION] && l->verdict[POSITION] == 0.0) {
+        if (l->averaged == 0)
+            for (int k = 0; k < AVERAGE; k++) l->average[k] = l->value[POSITION];
+        l->averaged = l->average_length;
+        l->average[l->average_at] = l->value[POSITION];
+        l->average_at = l->average_at + 1 < l->average_length ? l->average_at + 1 : 0;
+        double s = 0.0;
+        for (int k = 0; k < l->average_length; k++) s += l->average[k];
+        l->position_um = s / l->average_length;
+    }
+    l->compensated_um = l->position_um + l->compensation_um;
+    if (l->state != ARMED) {
+        l->setpoint_um = l->reference_um = l->compensated_um;
+        l->v = l->eps1 = l->d1 = 0.0;
+        return;
+    }
+    if (command == SETPOINT && finite_(command_value)) l->setpoint_um = command_value;
+    l->setpoint_um = clip(l->setpoint_um, l->setpoint_low_um, l->setpoint_high_um);
+    double step = l->setpoint_rate_um_s * l->dt;
+    l->reference_um = clip(l->setpoint_um, l->reference_um - step, l->reference_um + step);
+    double eps = l->reference_um - l->compensated_um, change = eps - l->eps1;
+    double d = l->dt > 0.0 ? change / l->dt : 0.0;
+    l->v = clip(l->v + l->kp * (change + l->dt / l->ti_s * eps + l->td_s * (d - l->d1)), -l->output_limit, l->output_limit);
+    l->eps1 = eps;
+    l->d1 = d;
+}
+
+static int64_t next_state(int64_t state, int command, int started, int tripped, int critical) {
+    if (!started || state == OFF) return started ? SAFE : OFF;
+    if (critical) return FAULT;
+    if (state == ARMED) return tripped ? FAULT : command == DISARM ? SAFE : ARMED;
+    if (state == FAULT) return command == DISARM && !tripped ? SAFE : FAULT;
+    if (tripped) return SAFE;
+    return state == READY && command == ARM ? ARMED : READY;
+}
+
+static void protect(law_t *l, int command, uint64_t external) {
+    uint64_t found = external;
+    if (l->state == ARMED) {
+        l->following_s = fabs(l->eps1) > l->following_um ? l->following_s + l->dt : 0.0;
+        if (l->following_s > l->following_limit_s) found |= BIT(B_FOLLOWING);
+        l->saturation_s = fabs(l->v) >= l->output_limit ? l->saturation_s + l->dt : 0.0;
+        if (l->saturation_s > l->saturation_limit_s) found |= BIT(B_SATURATED);
+        int reports = l->status[AMPLIFIER_STATE] == OK && l->value[AMPLIFIER_STATE] != 2.0;
+        l->amplifier_s = reports ? l->amplifier_s + l->dt : 0.0;
+        if (l->amplifier_s > l->amplifier_limit_s) found |= BIT(B_NOT_FOLLOWING);
+        l->idle_s = 0.0;
+    } else {
+        l->following_s = l->saturation_s = l->amplifier_s = 0.0;
+        int driven = (l->verdict[CURRENT] == 0.0 && fabs(l->value[CURRENT]) > l->idle_current_a)
+                     || fabs(l->power_w) > l->idle_power_w;
+        l->idle_s = driven ? l->idle_s + l->dt : 0.0;
+        if (l->idle_s > l->idle_limit_s) found |= BIT(B_STUCK);
+    }
+    if (l->status[AMPLIFIER_STATE] == OK && l->value[AMPLIFIER_STATE] == 3.0) found |= BIT(B_AMPLIFIER);
+    if (l->verdict[COIL] == 0.0 && l->value[COIL] > l->coil_limit_c) found |= BIT(B_HOT);
+    if (l->T[0] + l->air_c > l->coil_limit_c) found |= BIT(B_HOT_MODEL);
+    if (l->coil_rate_k_s > l->coil_rate_limit) found |= BIT(B_HEATING);
+    if (fabs(l->innovation_mean_c) > l->innovation_limit_c) found |= BIT(B_DISAGREES);
+    if (l->power_mean_w > l->power_limit_w) found |= BIT(B_POWER);
+    if (!(finite_(l->v) && finite_(l->reference_um) && finite_(l->compensated_um) && finite_(l->T[0])
+          && finite_(l->expansion_um) && finite_(l->power_w))) found |= BIT(B_NOT_FINITE);
+    l->faults |= found;
+    l->trips |= l->faults & l->trip_others;
+    int64_t before = l->state;
+    l->state = next_state(before, command, l->tick > 100, l->trips != 0, (l->trips & l->critical) != 0);
+    l->latched = l->state == FAULT ? l->latched | l->trips : 0;
+    if (before == ARMED && l->state != ARMED) l->v = l->eps1 = l->d1 = 0.0;
+    l->control_v = l->v;
+    l->enable = l->state == ARMED && finite_(l->v) ? 1.0 : 0.0;
+    l->drive = l->enable > 0.0 ? clip(l->v, -l->output_limit, l->output_limit) : 0.0;
+    double *o = l->out;
+    o[0] = l->state, o[1] = l->faults | l->latched, o[2] = l->setpoint_um, o[3] = l->reference_um, o[4] = l->position_um;
+    o[5] = l->compensated_um, o[6] = l->compensation_um, o[7] = l->expansion_um, o[8] = l->control_v, o[9] = l->drive;
+    o[10] = l->enable, o[11] = l->power_w, o[12] = l->air_rate_k_s;
+    for (int m = 0; m < M; m++) o[13 + m] = l->T[m] + l->air_c;
+    o[25] = l->innovation_c, o[26] = l->kalman_gain, o[27] = l->age[POSITION], o[28] = l->age[COIL];
+}
+
+void law_step(law_t *l, double dt, int command, double command_value, uint64_t external) {
+    estimate(l, dt);
+    compensate(l);
+    control(l, command, command_value);
+    protect(l, command, external);
+}
+
+/* For the batch figure: `count` ticks with readings (count, N) as the loop would get them; outputs (count, OUTPUTS). */
+static law_t the_law;
+int batch_load(const char *path) { return law_load(&the_law, path); }
+void batch_run(long count, const double *values, const uint8_t *fresh, const uint8_t *status, const double *dt,
+               const int *commands, const double *command_values, double *outputs) {
+    for (long k = 0; k < count; k++) {
+        memcpy(the_law.value, values + k * N, sizeof the_law.value);
+        memcpy(the_law.fresh, fresh + k * N, N);
+        memcpy(the_law.status, status + k * N, N);
+        law_step(&the_law, dt[k], commands[k], command_values[k], 0);
+        memcpy(outputs + k * OUTPUTS, the_law.out, sizeof the_law.out);
+    }
+}
