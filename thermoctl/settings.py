@@ -27,6 +27,10 @@ CHANNELS = ("position_um", "output_reference_um", "voltage_v", "current_a", "air
             "supply_v", "amplifier_state", "amplifier_fault")
 """Channel roles that protection limits may name (the back end's roles)."""
 
+TEMPERATURES = "temperatures_c"
+"""In a mapping of limits: all twelve temperatures that are not named themselves."""
+_TWELVE = tuple(n for n in CHANNELS if n.endswith("_c") and n != "air_c")
+
 
 @dataclass(frozen=True)
 class Option:
@@ -90,7 +94,8 @@ class CompensationSettings:
 
 @dataclass(frozen=True)
 class ProtectionSettings:
-    """When the amplifier is disabled. Mappings are channel: limit; a channel that is not named has none."""
+    """When the amplifier is disabled. Mappings are channel: limit; a channel that is not named has none; temperatures_c
+    stands for all twelve temperatures that are not named themselves."""
     required: tuple[str, ...] = option("channels without which nothing is driven; others only warn",
                                        ("position_um", "voltage_v", "current_a", "coil_c"))
     low: dict[str, float] = option("smallest believable reading", factory=dict)
@@ -114,6 +119,22 @@ class ProtectionSettings:
     saturation_s: float = option("longest time at the drive's limit", 0.5, "s", 0.0, 3600.0)
     amplifier_s: float = option("longest time until an enabled amplifier reports that it drives", 1.0, "s", 0.0, 60.0)
     late_s: float = option("longest time between two ticks", 0.1, "s", 0.0, 60.0)
+    agree_time_s: float = option("time constant of the means in which readings are compared with each other", 0.5, "s", 1e-3, 60.0)
+    drift_limit_c: float = option("largest difference of the coil's reading from the model without corrections", 8.0, "K", 0.0, 1e3)
+    monitored_limit_c: float = option("largest mean difference of a watched temperature from its estimate", 8.0, "K", 0.0, 1e3)
+    resistance_ohm: float = option("the coil's resistance at 20 degC, against which voltage and current are compared; 0: not",
+                                   0.0, "ohm", 0.0, 1e6)
+    resistance_tolerance: float = option("how far voltage and resistance x current may be apart, as a share of the larger",
+                                         0.2, "1", 0.0, 1.0)
+    resistance_v: float = option("and this much more", 0.3, "V", 0.0, 1e3)
+    current_per_drive: float = option("what a current amplifier makes of a unit of drive, compared while armed; 0: not",
+                                      0.0, "A", -1e3, 1e3)
+    current_tolerance_a: float = option("largest mean difference of the coil's current from the one asked for", 0.1, "A", 0.0, 1e3)
+    flexure_um_per_a: float = option("how far the current moves a stage on flexures, compared with the position; 0: not",
+                                     0.0, "um/A", -1e6, 1e6)
+    position_tolerance_um: float = option("largest mean difference of position and current x flexure_um_per_a", 40.0, "um", 0.0, 1e6)
+    reference_tolerance_um: float = option("largest mean difference of the output reference from the estimated output", 10.0, "um",
+                                           0.0, 1e6)
 
 
 @dataclass(frozen=True)
@@ -313,9 +334,12 @@ def _mapping(key: str, kind: Any, row: Option, node: Node) -> dict[str, Any]:
         raise node.error(f"{key}: a mapping of names was expected, not {_shown(node)}")
     if kind is str:
         return {name: _value(f"{key}.{name}", str, row, item) for name, item in node.value.items()}
-    for name, item in node.value.items():
-        _channel(key, name, item)
-    return {name: _number(f"{key}.{name}", float, row, item) for name, item in node.value.items()}
+    numbers = {}
+    for name, item in sorted(node.value.items(), key=lambda pair: pair[0] != TEMPERATURES):       # single channels after all
+        for channel in _TWELVE if name == TEMPERATURES else (name,):
+            _channel(key, channel, item)
+            numbers[channel] = _number(f"{key}.{name}", float, row, item)
+    return numbers
 
 
 def _channel(key: str, name: Any, node: Node) -> None:

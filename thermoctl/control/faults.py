@@ -69,7 +69,7 @@ _OTHERS = [
      "let it cool; if the measured coil is cold, check the power reading and the model file"),
     ("coil_heating_rate", "critical", "the measured coil temperature rises faster than protection.coil_rate_k_s",
      "look for a stalled stage or a short in the coil; check the amplifier's current limit"),
-    ("coil_disagrees", "fault", "measured and estimated coil temperature stay apart: drifted, swapped or frozen sensor",
+    ("coil_disagrees", "fault", "measured coil temperature and the model stay apart: drifted, swapped or frozen sensor",
      "compare the coil sensor with a second one; check wiring order; identify the model again if the rig was changed"),
     ("power_limit", "critical", "the mean electrical power of the coil is above protection.power_limit_w",
      "reduce the motion's duty; check for a blocked stage"),
@@ -83,14 +83,24 @@ _OTHERS = [
      "see whether the stage is blocked, the amplifier unpowered or the setpoint out of reach"),
     ("amplifier_fault", "critical", "the amplifier reports a fault of its own",
      "read its code in `thermoctl status`, clear the cause, then `thermoctl disarm` to acknowledge"),
-    ("amplifier_not_following", "fault", "the amplifier does not report that it drives although it was enabled",
-     "check its supply, its enable input and its heartbeat; see `thermoctl status` for its state"),
+    ("amplifier_not_following", "fault", "the amplifier does not drive although it was enabled: it reports another "
+     "state, or the coil's current is not the one asked for",
+     "check its supply, its enable input, its heartbeat and the coil's leads; see `thermoctl status` for its state"),
     ("loop_late", "fault", "the loop did not run for longer than protection.late_s (starved, stopped or suspended)",
      "see `thermoctl latency` and the tuning page; stop what burns the processor beside the loop"),
     ("amplifier_write", "critical", "a command could not be handed to the amplifier",
      "check the amplifier's bus; the amplifier's own watchdog must have disabled it"),
     ("not_finite", "critical", "a number in the law was not finite: the last gate before the amplifier closed",
      "a defect of the model file or the program: keep the recording and report it"),
+    ("electrical_disagrees", "fault", "coil voltage and current do not fit its resistance: a sensor of the two drifted, "
+     "hangs, is open, shorted or swapped, or the coil's lead is broken",
+     "measure both with a second instrument; check their leads, the coil's, and protection.resistance_ohm"),
+    ("position_disagrees", "fault", "the position is not where the coil's current holds the stage: encoder drifted, "
+     "hangs, lost its zero or counts backwards, or the stage is blocked",
+     "move the stage by hand and watch the encoder; home it again; check protection.flexure_um_per_a"),
+    ("monitored_disagrees", "warning", "the output reference or a temperature that is only watched stays away from its "
+     "estimate: drifted or swapped sensor, or a model of another rig",
+     "compare the twelve readings with the rig at rest: all must show the air; check the order of the sensors"),
 ]
 
 FAULTS = tuple(Fault(bit, *row) for bit, row in enumerate(_READINGS + _OTHERS))

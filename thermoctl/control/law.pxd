@@ -4,11 +4,13 @@ from libc.stdint cimport uint8_t
 
 ctypedef unsigned long long bits_t
 
-cdef int _OK, _STALE, _ERROR, _ABSENT, _SETPOINT, _ARMED, _FAULT, _N, _M
-cdef int _POSITION, _VOLTAGE, _CURRENT, _AIR, _COIL, _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT
+cdef int _OK, _STALE, _ERROR, _ABSENT, _SETPOINT, _OFF, _ARMED, _FAULT, _N, _M
+cdef int _POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL, _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT
 cdef int _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS
 cdef int _B_FOLLOWING, _B_HOT, _B_HOT_MODEL, _B_HEATING, _B_DISAGREES, _B_POWER, _B_STUCK, _B_BOUND, _B_SLEWING
 cdef int _B_SATURATED, _B_AMPLIFIER, _B_NOT_FOLLOWING, _B_LATE, _B_NOT_FINITE
+cdef int _B_ELECTRICAL, _B_DISPLACED, _B_MONITORED
+cdef double _GAP_S, _RESUME_C, _COPPER
 cdef bits_t _TRIP_OTHERS, _CRITICAL
 
 cdef bint finite(double value) noexcept nogil
@@ -17,10 +19,11 @@ cdef double clip(double value, double low, double high) noexcept nogil
 cdef class Law:
     cdef readonly object model, parameters, outputs
     cdef int n, sensors_used, average_length
-    cdef bint mkf, compensate_on, hold
+    cdef bint mkf, compensate_on, hold, expands
     cdef double[:, ::1] A, B, C, K
+    cdef readonly double correction_step_s
     cdef double[::1] b1, b2, dx, e, low, high, rate, stale_s, frozen_s, required, out
-    cdef int[::1] sensors, group
+    cdef int[::1] sensors, group, predicts
     cdef double[::1] value
     cdef uint8_t[::1] fresh, status
     cdef double b_air, f1, offset_um, expansion_period_s, R_w, R_v, air_filter_s, model_period_s, a1a1, first_gain
@@ -28,7 +31,9 @@ cdef class Law:
     cdef double kp, ti_s, td_s, output_limit, setpoint_rate_um_s, setpoint_low_um, setpoint_high_um, bound_um, slew_um_s
     cdef double following_um, following_limit_s, coil_limit_c, coil_rate_limit, coil_rate_time_s, innovation_limit_c
     cdef double innovation_time_s, power_limit_w, power_time_s, idle_current_a, idle_power_w, idle_limit_s
-    cdef double saturation_limit_s, amplifier_limit_s, late_s
+    cdef double saturation_limit_s, amplifier_limit_s, late_s, agree_time_s, drift_limit_c, monitored_limit_c
+    cdef double resistance_ohm, resistance_tolerance, resistance_v, current_per_drive, current_tolerance_a
+    cdef double flexure_um_per_a, position_tolerance_um, reference_tolerance_um
     cdef bits_t faults, trips
     # the state: what snapshot() holds
     cdef public long long state, tick, average_at, averaged
@@ -38,7 +43,9 @@ cdef class Law:
     cdef public double corrected, primed, expansion_before_um, expansion_after_um, phase_s, coil_slow_c, coil_rate_k_s
     cdef public double coil_elapsed_s, power_mean_w, following_s, idle_s, saturation_s, amplifier_s, enable, drive
     cdef public double control_v
-    cdef public double[::1] x, T, T_before, average, age, last, same_s, seen, verdict
+    cdef public double air_started, resumed, model_error_c, ohm_v, ohm_scale_v, current_error_a, displaced_um
+    cdef public double position_zero_um, zeroed, reference_error_um, reference_zero_um, reference_zeroed
+    cdef public double[::1] x, T, T_before, average, age, last, same_s, seen, verdict, corrections, apart_c
 
     cpdef bind(self, double[::1] value, uint8_t[::1] fresh, uint8_t[::1] status)
     cpdef step(self, double dt, int command=*, double command_value=*, bits_t external=*)
@@ -53,6 +60,13 @@ cdef class Law:
     @cython.locals(one=bits_t, bit=bits_t, c=cython.int, kind=cython.int, status=cython.int, value=cython.double, elapsed=cython.double)
     cdef void _judge_readings(self, double dt) noexcept
     cdef void _power_and_air(self) noexcept
+    cdef void _start_air(self, double value) noexcept
+    @cython.locals(i=cython.int)
+    cdef void _forget(self) noexcept
+    @cython.locals(i=cython.int, j=cython.int, s=cython.double, left=cython.double, step=cython.double)
+    cdef void _predict_corrections(self, double elapsed) noexcept
+    @cython.locals(one=bits_t, m=cython.int, s=cython.double, part=cython.double, amperes=cython.double, current=cython.bint)
+    cdef void _agree(self) noexcept
     @cython.locals(coil_new=cython.bint, i=cython.int, j=cython.int, k=cython.int, c=cython.int, s=cython.double,
                    elapsed=cython.double, gain=cython.double, prior=cython.double)
     cdef void _correct(self) noexcept

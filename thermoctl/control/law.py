@@ -17,8 +17,19 @@ both give the same bits (IEEE doubles, no contraction, one order of operations).
                 v is clipped where it is stored, so nothing winds up; gains may change without a jump.
     protect     every reading's range, rate, age and liveness; following error, coil temperature and heating rate,
                 power, idle current, innovation, saturation, amplifier; arming; and last: every number finite.
+    agree       what two readings say of one thing must agree in the mean; a sensor that drifts, is swapped or hangs
+                between its limits is found so, and in no other way:
+                coil's voltage and R20 (1 + alpha (coil - 20 degC)) current;  current and the drive that was asked for;
+                position and the current that holds it against the flexures;  a watched temperature and its estimate;
+                the reference encoder and position + expansion (each encoder's own zero is taken while OFF);
+                the coil's reading and what the model says of it alone, x - c with the sum of all corrections
+                c(n+1) = c(n) + (dt/T) (A-I) c(n) + k zeta e: a drifting sensor takes the estimate along, not this.
 
-A reading that is not valid is never used. The encoder's reading is held for a tick without a new frame (1 to 3 % of the
+After a gap of more than MAX_GAP_S (suspend) the estimate starts again on the coil's next reading. `resume` starts from
+the estimates of an earlier run, advanced over the pause without power; when the coil's first reading is more than
+RESUME_LIMIT_C from them they are dropped, and the start is as without.
+
+A reading that is not valid is never used (`last` holds the newest valid one). The encoder's reading is held for a tick without a new frame (1 to 3 % of the
 ticks of a polled encoder): the differences then come one tick later and nothing is lost.
 """
 from __future__ import annotations
@@ -39,14 +50,18 @@ OUTPUTS = ("state", "fault_bits", "setpoint_um", "reference_um", "position_um", 
 
 MAX_AVERAGE = 64
 WARM_UP_TICKS = 100
+MAX_GAP_S = 10.0            # a longer time between two ticks makes the estimate worthless
+RESUME_LIMIT_C = 2.0        # estimates of an earlier run are kept when the coil's first reading is as close as this
+COPPER_1_K = 0.00393        # temperature coefficient of the coil's resistance, from 20 degC
+_GAP_S, _RESUME_C, _COPPER = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K
 COMPILED = not __file__.endswith(".py")
 """False when this module runs interpreted: right for coverage, a hundred times too slow for a rig."""
 
 # Constants that the compiler turns into C numbers (typed in law.pxd).
 _OK, _STALE, _ERROR, _ABSENT = 0, 1, 2, 3                  # status of a reading, as the back ends give it
-_SETPOINT, _ARMED, _FAULT = arming.SETPOINT, arming.ARMED, arming.FAULT
+_SETPOINT, _OFF, _ARMED, _FAULT = arming.SETPOINT, arming.OFF, arming.ARMED, arming.FAULT
 _N, _M = len(faults.CHANNELS), len(faults.TEMPERATURES)
-_POSITION, _VOLTAGE, _CURRENT, _AIR, _COIL = 0, 2, 3, 4, 5
+_POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL = 0, 1, 2, 3, 4, 5
 _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT = 18, 2, 3
 _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS = 0, 1, 2, 3, 4, 5
 _B_FOLLOWING = faults.BIT["following_error"]
@@ -57,6 +72,8 @@ _B_BOUND, _B_SLEWING = faults.BIT["compensation_bound"], faults.BIT["compensatio
 _B_SATURATED, _B_AMPLIFIER = faults.BIT["drive_saturated"], faults.BIT["amplifier_fault"]
 _B_NOT_FOLLOWING, _B_LATE = faults.BIT["amplifier_not_following"], faults.BIT["loop_late"]
 _B_NOT_FINITE = faults.BIT["not_finite"]
+_B_ELECTRICAL, _B_DISPLACED = faults.BIT["electrical_disagrees"], faults.BIT["position_disagrees"]
+_B_MONITORED = faults.BIT["monitored_disagrees"]
 _TRIP_OTHERS = faults.mask("fault", "critical") >> (len(faults.GROUPS) * _KINDS) << (len(faults.GROUPS) * _KINDS)
 _CRITICAL = faults.mask("critical")
 
@@ -65,9 +82,14 @@ _SCALARS = (
     "compensation_um", "expansion_um", "power_w", "air_c", "air_start_c", "air_known", "air_rate_k_s", "innovation_c",
     "innovation_mean_c", "kalman_gain", "P", "corrected", "primed", "expansion_before_um", "expansion_after_um",
     "phase_s", "coil_slow_c", "coil_rate_k_s", "coil_elapsed_s", "power_mean_w", "following_s", "idle_s",
-    "saturation_s", "amplifier_s", "average_at", "averaged", "enable", "drive")
+    "saturation_s", "amplifier_s", "average_at", "averaged", "enable", "drive", "air_started", "resumed",
+    "model_error_c", "ohm_v", "ohm_scale_v", "current_error_a", "displaced_um", "position_zero_um", "zeroed",
+    "reference_error_um", "reference_zero_um", "reference_zeroed")
 _WHOLE = ("state", "tick", "latched", "average_at", "averaged")
-_VECTORS = ("x", "T", "T_before", "average", "age", "last", "same_s", "seen", "verdict")
+_VECTORS = ("x", "T", "T_before", "average", "age", "last", "same_s", "seen", "verdict", "corrections", "apart_c")
+_KEPT = ("air_c", "air_start_c", "air_known", "air_started", "corrected", "primed", "P", "expansion_before_um",
+         "expansion_after_um", "phase_s", "compensation_um", "expansion_um", "position_zero_um", "zeroed",
+         "reference_zero_um", "reference_zeroed", "x", "T", "T_before", "corrections")
 
 
 def finite(value):
@@ -103,10 +125,16 @@ class Law:
         first[0] += 1.0
         self.a1a1 = float(first @ first)
         self.sensors = array("i", model.sensors)
+        # A model that says nothing of a temperature, or of the expansion, cannot disagree with it.
+        self.predicts = array("i", model.C.any(axis=1).astype(int))
+        self.expands = bool(model.b1.any() or model.b2.any() or model.b_air != 0.0)
         # The first correction puts the estimate on the coil's reading: along zeta, or along K.
         along = float(model.C[0] @ model.gain[:, 0])
         self.first_gain = 1.0 / along if abs(along) > 1e-9 else 0.0
+        # c is advanced once a reading, in steps that the fastest mode allows.
+        self.correction_step_s = 0.5 * model.period_s / max(float(np.abs(model.A_minus_I).sum(axis=1).max()), 1e-12)
         self.dx, self.e = np.zeros(self.n), np.zeros(_M)
+        self.corrections, self.apart_c = np.zeros(self.n), np.zeros(_M)
         self.group = array("i", faults.GROUP_OF_CHANNEL)
         self.x, self.T, self.T_before = np.zeros(self.n), np.zeros(_M), np.zeros(_M)
         self.average = np.zeros(MAX_AVERAGE)
@@ -121,6 +149,10 @@ class Law:
         self.P = 1e3 * model.R_v
         self.primed = self.phase_s = self.expansion_before_um = self.expansion_after_um = 0.0
         self.expansion_um = self.compensation_um = 0.0
+        self.air_started = self.resumed = self.model_error_c = 0.0
+        self.ohm_v = self.ohm_scale_v = self.current_error_a = 0.0
+        self.displaced_um = self.position_zero_um = self.zeroed = 0.0
+        self.reference_error_um = self.reference_zero_um = self.reference_zeroed = 0.0
         self.following_s = self.idle_s = self.saturation_s = self.amplifier_s = 0.0
         self.enable = self.drive = self.control_v = 0.0
         self.average_length = 1
@@ -156,6 +188,12 @@ class Law:
         self.power_limit_w, self.power_time_s = p.power_limit_w, p.power_time_s
         self.idle_current_a, self.idle_power_w, self.idle_limit_s = p.idle_current_a, p.idle_power_w, p.idle_s
         self.saturation_limit_s, self.amplifier_limit_s, self.late_s = p.saturation_s, p.amplifier_s, p.late_s
+        self.agree_time_s, self.drift_limit_c, self.monitored_limit_c = p.agree_time_s, p.drift_limit_c, p.monitored_limit_c
+        self.resistance_ohm, self.resistance_tolerance, self.resistance_v = (p.resistance_ohm, p.resistance_tolerance,
+                                                                             p.resistance_v)
+        self.current_per_drive, self.current_tolerance_a = p.current_per_drive, p.current_tolerance_a
+        self.flexure_um_per_a, self.position_tolerance_um = p.flexure_um_per_a, p.position_tolerance_um
+        self.reference_tolerance_um = p.reference_tolerance_um
 
     def snapshot(self) -> np.ndarray:
         """The whole state as one float64 vector, for replay and for a warm restart."""
@@ -175,6 +213,42 @@ class Law:
             setattr(self, name, np.array(vector[start:start + length], dtype=np.float64))
             start += length
 
+    def resume(self, vector: np.ndarray, gap_s: float):
+        """Start from the estimates in `vector`, the snapshot of an earlier run `gap_s` seconds ago without power since.
+
+        Arming, controller and fault timers start anew. Raises ValueError as `restore` does.
+        """
+        earlier = Law(self.model, self.parameters, self.period_s)
+        earlier.restore(vector)
+        for name in _KEPT:
+            kept = getattr(earlier, name)
+            setattr(self, name, kept if isinstance(kept, float) else np.array(kept))
+        self.resumed = self.corrected
+        step_s = min(self.expansion_period_s, float(self.correction_step_s))
+        A, x, c = np.asarray(self.A), np.asarray(self.x), np.asarray(self.corrections)
+        left, phase, before, after = gap_s, self.phase_s, self.expansion_before_um, self.expansion_after_um
+        T_before = np.asarray(self.T_before)
+        while left > 0.0:
+            h = min(left, step_s)
+            left, phase = left - h, phase + h
+            x, c = x + h / self.model_period_s * (A @ x), c + h / self.model_period_s * (A @ c)
+            if phase >= self.expansion_period_s:
+                phase -= self.expansion_period_s
+                T = np.asarray(self.C) @ x
+                before, after = after, (self.f1 * after + self.b_air * (self.air_c - self.air_start_c)
+                                        + float(np.asarray(self.b1) @ T_before + np.asarray(self.b2) @ T))
+                T_before = T
+        self.x, self.corrections, self.T, self.T_before = x, c, np.asarray(self.C) @ x, T_before
+        self.phase_s, self.expansion_before_um, self.expansion_after_um = phase, before, after
+
+    def _forget(self):
+        """The estimate starts again on the coil's next reading; the air at the start stays the expansion's origin."""
+        for i in range(self.n):
+            self.x[i] = 0.0
+            self.corrections[i] = 0.0
+        self.corrected = self.primed = self.air_known = self.resumed = self.model_error_c = self.innovation_mean_c = 0.0
+        self.P = 1e3 * self.R_v
+
     def step(self, dt, command=0, command_value=0.0, external=0):
         """One tick, four stages: dt measured, s; command one of arming's; external: fault bits from outside the law."""
         self.estimate(dt)
@@ -189,6 +263,8 @@ class Law:
         self.dt = clip(dt, 0.0, 1.0) if finite(dt) else 0.0
         self.tick += 1
         self.coil_elapsed_s += self.dt
+        if dt > _GAP_S:
+            self._forget()
         self._judge_readings(dt)
         self._power_and_air()
         n = self.n
@@ -259,24 +335,41 @@ class Law:
     def _power_and_air(self):
         """q(n): electrical power, rate of the low-passed air; the last good value while a reading is at fault."""
         if self.verdict[_VOLTAGE] == 0.0 and self.verdict[_CURRENT] == 0.0:
-            self.power_w = self.value[_VOLTAGE] * self.value[_CURRENT]
+            self.power_w = self.last[_VOLTAGE] * self.last[_CURRENT]
         elif self.enable == 0.0:
             self.power_w = 0.0
         self.power_mean_w += (self.power_w - self.power_mean_w) * min(1.0, self.dt / self.power_time_s)
         self.air_rate_k_s = 0.0
         if self.verdict[_AIR] == 0.0:
             if self.air_known == 0.0:
-                self.air_c = self.air_start_c = self.value[_AIR]
-                self.air_known = 1.0
-            self.air_rate_k_s = (self.value[_AIR] - self.air_c) / self.air_filter_s
+                self._start_air(self.last[_AIR])
+            self.air_rate_k_s = (self.last[_AIR] - self.air_c) / self.air_filter_s
             self.air_c += self.air_rate_k_s * self.dt
+
+    def _start_air(self, value):
+        """The air's low-pass starts at its first reading; the first one of all is where the expansion counts from."""
+        self.air_c = value
+        self.air_known = 1.0
+        if self.air_started == 0.0:
+            self.air_start_c = value
+            self.air_started = 1.0
 
     def _correct(self):
         """(35): every new valid reading of a correcting sensor moves the state; the coil's first one starts it."""
         coil_new = self.fresh[_COIL] and self.verdict[_COIL] == 0.0
+        if self.resumed > 0.0 and coil_new:                     # do the kept estimates still fit?
+            s = self.value[_COIL] - self.air_c
+            for j in range(self.n):
+                s -= self.C[0, j] * self.x[j]
+            self.resumed = 0.0
+            self.coil_slow_c = self.value[_COIL]
+            if not (abs(s) <= _RESUME_C):
+                self._forget()
+                self.air_started = 0.0
+                if self.verdict[_AIR] == 0.0:
+                    self._start_air(self.last[_AIR])
         if self.air_known == 0.0 and coil_new:                  # no air sensor: rises above the first coil reading
-            self.air_c = self.air_start_c = self.value[_COIL]
-            self.air_known = 1.0
+            self._start_air(self.value[_COIL])
         if self.corrected == 0.0 and not coil_new:
             return
         for k in range(self.sensors_used):
@@ -294,9 +387,11 @@ class Law:
                 for i in range(self.n):
                     self.x[i] += self.first_gain * self.K[i, 0] * self.e[0]
                 self.coil_slow_c = self.value[_COIL]
+                self.coil_rate_k_s = 0.0
                 self.corrected = 1.0
                 self.primed = 0.0
                 return
+            self._predict_corrections(elapsed)
             self.innovation_c = self.e[0]
             self.innovation_mean_c += (self.e[0] - self.innovation_mean_c) * min(1.0, elapsed / self.innovation_time_s)
             self.coil_rate_k_s = (self.value[_COIL] - self.coil_slow_c) / self.coil_rate_time_s
@@ -313,6 +408,25 @@ class Law:
             if self.e[k] != 0.0:
                 for i in range(self.n):
                     self.x[i] += gain * self.K[i, k] * self.e[k]
+                    self.corrections[i] += gain * self.K[i, k] * self.e[k]
+
+    def _predict_corrections(self, elapsed):
+        """c over the time since the coil's last reading; then reading - (model alone) = e + C c."""
+        left = min(elapsed, _GAP_S)
+        while left > 0.0:
+            step = min(left, self.correction_step_s)
+            left -= step
+            for i in range(self.n):
+                s = 0.0
+                for j in range(self.n):
+                    s += self.A[i, j] * self.corrections[j]
+                self.dx[i] = s
+            for i in range(self.n):
+                self.corrections[i] += step / self.model_period_s * self.dx[i]
+        s = self.e[0]
+        for j in range(self.n):
+            s += self.C[0, j] * self.corrections[j]
+        self.model_error_c = s
 
     # ---- compensate ---------------------------------------------------------------------------------------------
 
@@ -404,26 +518,28 @@ class Law:
             self.idle_s = 0.0
         else:
             self.following_s = self.saturation_s = self.amplifier_s = 0.0
-            driven = ((self.verdict[_CURRENT] == 0.0 and abs(self.value[_CURRENT]) > self.idle_current_a)
+            driven = ((self.verdict[_CURRENT] == 0.0 and abs(self.last[_CURRENT]) > self.idle_current_a)
                       or abs(self.power_w) > self.idle_power_w)
             self.idle_s = self.idle_s + self.dt if driven else 0.0
             if self.idle_s > self.idle_limit_s:
                 found |= one << _B_STUCK
         if self.status[_AMPLIFIER_STATE] == _OK and self.value[_AMPLIFIER_STATE] == _AMPLIFIER_FAULT:
             found |= one << _B_AMPLIFIER
-        if self.verdict[_COIL] == 0.0 and self.value[_COIL] > self.coil_limit_c:
+        if self.verdict[_COIL] == 0.0 and self.last[_COIL] > self.coil_limit_c:
             found |= one << _B_HOT
         if self.T[0] + self.air_c > self.coil_limit_c:
             found |= one << _B_HOT_MODEL
         if self.coil_rate_k_s > self.coil_rate_limit:
             found |= one << _B_HEATING
-        if abs(self.innovation_mean_c) > self.innovation_limit_c:
+        if self.predicts[0] and (abs(self.innovation_mean_c) > self.innovation_limit_c
+                                 or abs(self.model_error_c) > self.drift_limit_c):
             found |= one << _B_DISAGREES
         if self.power_mean_w > self.power_limit_w:
             found |= one << _B_POWER
         if not (finite(self.v) and finite(self.reference_um) and finite(self.compensated_um) and finite(self.T[0])
                 and finite(self.expansion_um) and finite(self.power_w)):
             found |= one << _B_NOT_FINITE
+        self._agree()
         self.faults |= found
         self.trips |= self.faults & _TRIP_OTHERS
         self._arm(command)
@@ -431,6 +547,52 @@ class Law:
         self.enable = 1.0 if self.state == _ARMED and finite(self.v) else 0.0
         self.drive = clip(self.v, -self.output_limit, self.output_limit) if self.enable > 0.0 else 0.0
         self._report()
+
+    def _agree(self):
+        """Readings against each other, low-passed; `drive` is still what was asked for one tick ago."""
+        one = 1
+        part = min(1.0, self.dt / self.agree_time_s)
+        current = self.verdict[_CURRENT] == 0.0
+        amperes = self.last[_CURRENT] if current else 0.0
+        if current and self.verdict[_VOLTAGE] == 0.0 and self.resistance_ohm > 0.0:
+            s = self.resistance_ohm * amperes
+            if self.air_known > 0.0:
+                s *= 1.0 + _COPPER * (self.T[0] + self.air_c - 20.0)
+            self.ohm_v += part * (self.last[_VOLTAGE] - s - self.ohm_v)
+            self.ohm_scale_v += part * (max(abs(self.last[_VOLTAGE]), abs(s)) - self.ohm_scale_v)
+            if abs(self.ohm_v) > self.resistance_tolerance * self.ohm_scale_v + self.resistance_v:
+                self.faults |= one << _B_ELECTRICAL
+        if self.state != _ARMED or not current or self.current_per_drive == 0.0:
+            self.current_error_a = 0.0
+        else:
+            self.current_error_a += part * (amperes - self.current_per_drive * self.drive - self.current_error_a)
+            if abs(self.current_error_a) > self.current_tolerance_a:
+                self.faults |= one << _B_NOT_FOLLOWING
+        if current and self.verdict[_POSITION] == 0.0 and self.flexure_um_per_a != 0.0:
+            s = self.last[_POSITION] - self.flexure_um_per_a * amperes
+            if self.zeroed == 0.0:
+                self.position_zero_um = s
+                self.zeroed = 1.0 if self.state != _OFF else 0.0
+            self.displaced_um += part * (s - self.position_zero_um - self.displaced_um)
+            if abs(self.displaced_um) > self.position_tolerance_um:
+                self.faults |= one << _B_DISPLACED
+        if self.corrected == 0.0:
+            return
+        part = min(1.0, self.dt / self.innovation_time_s)
+        for m in range(1, _M):
+            if self.verdict[_COIL + m] == 0.0 and self.predicts[m]:
+                self.apart_c[m] += part * (self.last[_COIL + m] - self.air_c - self.T[m] - self.apart_c[m])
+                if abs(self.apart_c[m]) > self.monitored_limit_c:
+                    self.faults |= one << _B_MONITORED
+        if self.expands and self.verdict[_REFERENCE] == 0.0 and self.verdict[_POSITION] == 0.0:
+            s = self.last[_REFERENCE] - self.last[_POSITION] - self.expansion_um
+            if self.reference_zeroed == 0.0:
+                self.reference_zero_um = s
+                self.reference_zeroed = 1.0 if self.state != _OFF else 0.0
+            part = min(1.0, self.dt / self.agree_time_s)
+            self.reference_error_um += part * (s - self.reference_zero_um - self.reference_error_um)
+            if abs(self.reference_error_um) > self.reference_tolerance_um:
+                self.faults |= one << _B_MONITORED
 
     def _arm(self, command):
         """The state machine; what tripped stays in `fault_bits` until FAULT is left."""

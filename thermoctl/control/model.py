@@ -130,6 +130,17 @@ class Parameters:
     saturation_s: float = np.inf
     amplifier_s: float = 1.0
     late_s: float = np.inf
+    agree_time_s: float = 0.5              # readings are compared in their means over this time
+    drift_limit_c: float = np.inf          # coil's reading against the model alone
+    monitored_limit_c: float = np.inf      # a watched temperature against its estimate
+    resistance_ohm: float = 0.0            # of the coil at 20 degC; 0: not compared
+    resistance_tolerance: float = 0.2
+    resistance_v: float = 0.3
+    current_per_drive: float = 0.0         # A per unit of drive of a current amplifier; 0: not compared
+    current_tolerance_a: float = np.inf
+    flexure_um_per_a: float = 0.0          # where a current holds the stage; 0: not compared
+    position_tolerance_um: float = np.inf
+    reference_tolerance_um: float = np.inf
 
     def pack(self) -> np.ndarray:
         """All numbers as one flat float64 vector (fields in order, arrays in place)."""
