@@ -236,6 +236,19 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
          ("--interval", {"type": float, "default": 0.5, "metavar": "S", "help": "seconds between two looks (default 0.5)"}),
          ("--once", {"action": "store_true", "help": "one screen; exit 1 when no daemon runs or a fault stands"}))
 
+    def calibrate(args: argparse.Namespace) -> int:
+        from thermoctl.daemon.client import find_config
+        from thermoctl.evaluate.calibrate import calibrate
+        return calibrate(find_config(args.config), args.out, args.models, args.order, args.gains, args.accept, args.again)
+    _add(sub, "calibrate", "doctor, step, PID, tests, model, proof, one after the other; goes on where it was ended; writes nothing "
+         "outside its folder before it is accepted", calibrate, config,
+         ("--out", {"metavar": "DIR", "help": "the calibration's folder (calibration/RIG)"}),
+         ("--models", {"metavar": "DIR", "default": "models", "help": "where an accepted model goes (models)"}),
+         ("--order", {"type": int, "default": 8, "help": "number of real poles (8; 0: by BIC)"}),
+         ("--gains", {"action": "store_true", "help": "an acceptance also writes the proposed PID gains"}),
+         ("--accept", {"action": "store_true", "help": "install the model when the proof is done"}),
+         ("--again", {"action": "store_true", "help": "forget an earlier run in the folder"}))
+
     def fleet(args: argparse.Namespace) -> int:
         from thermoctl.diagnose.fleet import fleet
         return fleet(args.folder, args.plant, args.parameters, args.workers, args.scheduler, args.json)

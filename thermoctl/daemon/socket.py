@@ -47,7 +47,7 @@ def status(shared: Shared) -> dict[str, Any]:
             "output_reference_um", "control_v", "drive", "enable", "voltage_v", "current_a", "power_w", "air_c",
             "innovation_c", "kalman_gain", "position_age_s", "coil_age_s", "supply_v", "amplifier_state",
             "amplifier_fault")},
-        "channels": _channels(int(row[INDEX["status_bits"]])),
+        "channels": channel_states(int(row[INDEX["status_bits"]])),
         "temperatures_c": {p: number[f"{p}_c"] for p in POINTS},
         "estimates_c": {p: number[f"{p}_est_c"] for p in POINTS},
         "lateness_us": number["lateness_us"], "busy_us": number["busy_us"], "busy_p50_us": _or_none(busy[0]),
@@ -57,7 +57,8 @@ def status(shared: Shared) -> dict[str, Any]:
     }
 
 
-def _channels(status_bits: int) -> dict[str, str]:
+def channel_states(status_bits: int) -> dict[str, str]:
+    """Each channel's reading: OK, STALE, ERROR or ABSENT, from the signal status_bits."""
     return {name: ("OK", "STALE", "ERROR", "ABSENT")[status_bits >> (2 * c) & 3]
             for c, name in enumerate(faults.CHANNELS)}
 

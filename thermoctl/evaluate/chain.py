@@ -85,15 +85,21 @@ def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = 8) -> 
     coil = filled(rises(test_4a)[:, :1])
     siso_um = expansion.recursive(coil, y4, 1.0)
     # the better way
-    model = identify_better([test_2, test_3, test_4a], order)
-    plant = filter.disturbed(filter.with_air(model))
-    records = [filter.Record(t.power_w, air_rate(t.air_c), rises(t)) for t in (test_2, test_3, test_4a)]
-    kalman, variances = filter.tune(plant, records, r_v)
     tests = [test_2, test_3, test_4a]
-    better_um = fit_expansion(kalman, tests)
+    model, kalman, variances, better_um = calibrate_better(tests, order)
+    plant = filter.disturbed(filter.with_air(model))
     twelve = filter.steady(plant, variances, r_v, tuple(range(12)))
     twelve_um = fit_expansion(twelve, tests)
     return Calibration(paper_model, mkf, paper_um, siso_um, model, kalman, better_um, twelve, twelve_um, variances)
+
+
+def calibrate_better(tests: list[Any], order: int | None = 8) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion]:
+    """The better estimator alone, from any tests: (model, filter, its variances, expansion)."""
+    model = identify_better(tests, order)
+    plant = filter.disturbed(filter.with_air(model))
+    records = [filter.Record(t.power_w, air_rate(t.air_c), rises(t)) for t in tests]
+    kalman, variances = filter.tune(plant, records, filter.sensor_variance(STEP_K, NOISE_K))
+    return model, kalman, variances, fit_expansion(kalman, tests)
 
 
 def identify_better(tests: list[Any], order: int | None) -> StateSpace:
@@ -154,10 +160,15 @@ def compensator(c: Calibration, kind: str, period_s: float = 0.001, sensor_s: fl
         return CompensatorModel("mkf", period_s, reduced.minus_identity(period_s), np.column_stack([fast.b[:, 0], np.zeros(12)]), np.eye(12),
                                 c.mkf.zeta, c.mkf.r_w * period_s / c.mkf.period_s, c.mkf.r_v, um.f1, um.b1, um.b2, um.period_s,
                                 air_filter_s=AIR_FILTER_S)
-    model, um = c.kalman.model, c.better_um
+    return better_compensator(c.kalman, c.better_um, period_s, sensor_s)
+
+
+def better_compensator(kalman: filter.Kalman, um: expansion.Expansion, period_s: float = 0.001, sensor_s: float = 0.1) -> CompensatorModel:
+    """The better estimator as the daemon runs it; see `compensator`."""
+    model = kalman.model
     scale = sensor_s / model.period_s
     at_sensor = _at_period(model, sensor_s)
-    q = c.kalman.noise * scale
+    q = kalman.noise * scale
     cs = at_sensor.c[:1]
     r = np.array([[filter.sensor_variance(STEP_K, NOISE_K) / scale]])
     p = linalg.solve_discrete_are(at_sensor.a.T, cs.T, q + 1e-16 * np.eye(len(q)), r)
