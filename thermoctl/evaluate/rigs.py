@@ -27,6 +27,7 @@ PAPER_SCALE = {"a_bobbin": 1.5, "a_bobbin_connector": 1.5, "a_shaft_1": 1.5, "a_
 """Expansion of the proving rigs over the plant file's: a longer shaft and a long arm under the encoder's head, so that what is
 left uncompensated (5.7 +- 7.3 um in the paper) and with the coil alone (+-2.3 um) is of the paper's size."""
 HEAT_W, HEAT_TAU_S = 0.012, 1800.0
+AIR_K = (0.25, 0.35, 0.12)             # the chamber: spread of the day's level, swing in 3 to 8 hours, wander in 40 minutes
 DISTURBANCES = ("outside_heat", "fan", "changed_air", "stuck_quantisation", "sensor_lag", "missing_samples", "faster_motion", "aged_joint")
 
 
@@ -115,8 +116,9 @@ class Rig:
             if k[:2] in ("N_", "H_"):
                 p[k] *= convection
         p["T_bench"] = 22.0 + 0.3 * rng.standard_normal()
-        air = 22 + 0.25 * rng.standard_normal() + 0.35 * np.sin(2 * np.pi * (t / rng.uniform(12000, 28000) + rng.uniform())) \
-            + 0.12 * _walk(rng, n, 2500.0)
+        level, swing, wander = AIR_K
+        air = 22 + level * rng.standard_normal() + swing * np.sin(2 * np.pi * (t / rng.uniform(12000, 28000) + rng.uniform())) \
+            + wander * _walk(rng, n, 2500.0)
         heat = {b: HEAT_W * noise * _walk(rng, n, HEAT_TAU_S) for b in HEATED}
         fine = np.arange(0, n * 10) / 10
         x = schedule.at(fine)
