@@ -5,8 +5,8 @@ import numpy
 from Cython.Build import cythonize
 from setuptools import Extension, setup
 
-root = Path("thermoctl")
-sources = sorted([*root.rglob("*.pyx"), *(p.with_suffix(".py") for p in root.rglob("*.pxd"))])
+sources = sorted(p if p.suffix == ".pyx" else p.with_suffix(".py")
+                 for root in ("thermoctl", "hal") for p in [*Path(root).rglob("*.pyx"), *Path(root).rglob("*.pxd")])
 
 # -ffp-contract=off: the law gives the same bits on every machine that a recording is replayed on.
 setup(ext_modules=cythonize(

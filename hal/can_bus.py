@@ -42,7 +42,8 @@ from canopen.objectdictionary import datatypes
 from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
 from hal.devices import Device
 from hal.profile import Binding, Cia402, Dbc, LineSettings
-from hal.serial_port import open_port, read_available
+from hal.serial_port import open_port
+from hal.wire import SlcanParser, encode_slcan
 from thermoctl.yamlfile import InputError
 
 SYNC_ID, NMT_ID = 0x080, 0x000
@@ -60,46 +61,6 @@ _FORMATS = {datatypes.INTEGER8: "b", datatypes.INTEGER16: "h", datatypes.INTEGER
 Frame = tuple[int, bytes]
 
 
-def encode_slcan(can_id: int, data: bytes) -> bytes:
-    """A data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR above 0x7FF."""
-    head = b"t%03X%d" % (can_id, len(data)) if can_id <= 0x7FF else b"T%08X%d" % (can_id, len(data))
-    return head + data.hex().upper().encode() + b"\r"
-
-
-class SlcanParser:
-    """Bytes from an adapter in, data frames out. Acknowledgements (z, Z, CR) pass silently; BEL, which refuses a
-    command, is counted in `refused`, what is no valid message in `bad`. Time stamps after the data are ignored."""
-
-    def __init__(self) -> None:
-        self._rest = b""
-        self.bad = self.refused = 0
-
-    def feed(self, data: bytes) -> list[Frame]:
-        """Frames that `data` completed, in order."""
-        *messages, rest = (self._rest + data).split(b"\r")
-        self._rest = rest if len(rest) <= 64 else b""       # the longest message has 30 bytes
-        self.bad += len(rest) > 64
-        frames = []
-        for message in messages:
-            if b"\a" in message:
-                self.refused += message.count(b"\a")
-                message = message.replace(b"\a", b"")
-            kind = message[:1]
-            if kind not in (b"t", b"T"):
-                self.bad += kind not in (b"", b"z", b"Z", b"r", b"R", b"F", b"V", b"N")
-                continue
-            digits = 3 if kind == b"t" else 8
-            try:
-                size = message[1 + digits] - 48
-                body = message[2 + digits:2 + digits + 2 * size]
-                if not 0 <= size <= 8 or len(body) != 2 * size:
-                    raise ValueError
-                frames.append((int(message[1:1 + digits], 16), bytes.fromhex(body.decode("ascii"))))
-            except (ValueError, IndexError):
-                self.bad += 1
-        return frames
-
-
 class SlcanPort:
     """A Lawicel adapter on a serial port; `open` sets bitrate and opens the channel."""
 
@@ -109,22 +70,22 @@ class SlcanPort:
         self._port = open_port(path, LineSettings(baud=3_000_000), f"slcan:{path}")
         self._fd = self._port.fileno()
         self._parser = SlcanParser()
-        self._out = bytearray()
+        self._out = b""
         os.write(self._fd, b"\r\rC\rS%d\rO\r" % _SLCAN_BITRATES[bitrate])
 
     def send(self, *frames: Frame) -> None:
         """Send without waiting, in one write. Raises OSError when the adapter is gone or takes nothing any more."""
-        self._out += b"".join([encode_slcan(*f) for f in frames])
+        out = b"".join([self._out, *[encode_slcan(can_id, data) for can_id, data in frames]])
         try:
-            del self._out[:os.write(self._fd, self._out)]
+            self._out = out[os.write(self._fd, out):]
         except BlockingIOError:
-            if len(self._out) > MAX_PENDING:
+            self._out = out
+            if len(out) > MAX_PENDING:
                 raise OSError(errno.ENOBUFS, "the adapter takes no data") from None
 
     def receive(self) -> list[Frame]:
         """What has arrived. Raises OSError when the adapter is gone."""
-        data = read_available(self._fd)
-        return self._parser.feed(data) if data else []
+        return self._parser.read(self._fd)
 
     @property
     def bad(self) -> int:

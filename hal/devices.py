@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, HardwareError, Sample
+from hal.backend import ABSENT, ERROR, ROLE, ROLES, STALE, HardwareError, Sample
 from hal.profile import Binding, bind, check_rig
+from hal.wire import Ages, Channels
 
 RECONNECT_S = 0.25          # between attempts to open a device that is gone
 SLOW_BUSES = ("modbus",)
@@ -31,7 +32,8 @@ class Device:
         self.slow = binding.profile.bus in SLOW_BUSES
         self.drives = binding.profile.drive is not None
         self.roles = [ROLE[b.role] for b in binding.bounds]
-        self._bounds = [(ROLE[b.role], b.scale, b.offset, b.low, b.high) for b in binding.bounds]
+        columns = zip(*((b.scale, b.offset, b.low, b.high) for b in binding.bounds), strict=True)
+        self._channels = Channels(np.array(self.roles, np.intc), *(np.array(c, float) for c in columns))
         self.problems: dict[int, str] = {}
         self.counts: dict[str, int] = {"frames": 0, "errors": 0, "reconnections": 0}
         self.up = False
@@ -57,26 +59,25 @@ class Device:
 
     def put(self, sample: Sample, bound: int, raw: float, time_s: float) -> None:
         """Store reading `raw` of the bound channel number `bound`, scaled; out of range or not finite is ERROR."""
-        role, scale, offset, low, high = self._bounds[bound]
-        value = raw * scale + offset
-        if low <= value <= high and -math.inf < value < math.inf:
-            sample.value[role] = value
-            sample.time_s[role] = time_s
-            sample.fresh[role] = True
-            sample.status[role] = OK
-        else:
-            self.fail(sample, bound, f"reading {value:g} is outside {low:g} .. {high:g}: check sensor and wiring")
+        if not self._channels.put(sample, bound, raw, time_s):
+            b = self.binding.bounds[bound]
+            self.fail(sample, bound, f"reading {raw * b.scale + b.offset:g} is outside {b.low:g} .. {b.high:g}: "
+                                     "check sensor and wiring")
 
     def fail(self, sample: Sample, bound: int, problem: str) -> None:
         """Mark the bound channel number `bound` as ERROR; the last valid value stays."""
-        role = self._bounds[bound][0]
+        role = self.roles[bound]
         sample.status[role] = ERROR
         self.problems[role] = f"{self.name} {self.binding.bounds[bound].channel.name}: {problem}"
 
     def fail_all(self, sample: Sample, problem: str) -> None:
         """Mark every channel as ERROR."""
-        for i in range(len(self._bounds)):
+        for i in range(len(self.roles)):
             self.fail(sample, i, problem)
+
+    def counters(self) -> dict[str, int]:
+        """What the driver has counted, by name."""
+        return self.counts
 
     def explain(self, sample: Sample, role: int) -> str:
         """One line: why this role is not OK."""
@@ -117,10 +118,10 @@ class DevicesBackend:
         self.sample = Sample()
         self._owner = {role: d for d in [*fast, *slow] for role in d.roles}
         self._seen = dict.fromkeys(slow, 0)
-        self._limit_s = np.full(len(ROLES), np.inf)             # age at which a reading is stale
+        limit_s = np.full(len(ROLES), np.inf)                   # age at which a reading is stale
         for b in (b for d in self._owner.values() for b in d.binding.bounds):
-            self._limit_s[ROLE[b.role]] = b.channel.stale_after_s
-        self._age_s, self._late = np.empty(len(ROLES)), np.empty(len(ROLES), dtype=bool)
+            limit_s[ROLE[b.role]] = b.channel.stale_after_s
+        self._ages = Ages(self.sample, limit_s)
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self._repairs: dict[Device, threading.Thread] = {}
@@ -155,7 +156,7 @@ class DevicesBackend:
         """One pass over all devices; see hal.backend."""
         sample = self.sample
         self._now_s = now_s
-        sample.fresh[:] = False
+        self._ages.begin()
         for device in self.fast:
             if device.up:
                 try:
@@ -164,10 +165,7 @@ class DevicesBackend:
                     self._lost(device, e)
         for device in self.slow:
             self._seen[device] = self.board.merge(sample, device.roles, self._seen[device])
-        np.subtract(now_s, sample.time_s, out=self._age_s)
-        np.greater(self._age_s, self._limit_s, out=self._late)
-        if self._late.any():
-            sample.status[self._late & (sample.status == OK)] = STALE       # an ERROR stays one
+        self._ages.judge(now_s)
         return sample
 
     def write(self, drive: float, enable: bool) -> None:
@@ -209,7 +207,7 @@ class DevicesBackend:
 
     def counters(self) -> dict[str, int]:
         """`<device>.<what>`: frames, errors, reconnections and what else a driver counts."""
-        return {f"{d.name}.{what}": n for d in [*self.fast, *self.slow] for what, n in d.counts.items()}
+        return {f"{d.name}.{what}": n for d in [*self.fast, *self.slow] for what, n in d.counters().items()}
 
     def _lost(self, device: Device, why: Exception) -> None:
         device.up = False

@@ -1,20 +1,14 @@
 """Serial devices: framed bytes with a CRC, and lines of text.
 
-A binary frame on the wire:   sync (1..8 bytes) | length (uint8, optional) | payload | CRC-16 over all that follows sync
-
 pyserial opens and configures the line (exclusive, so that a second program is refused); the tick then reads and writes
-the bare descriptor without waiting. Framing resynchronises after garbage: a frame whose length or CRC is wrong costs
-its first byte, and the search goes on from the next one, so a true frame behind a false sync is never lost.
+the bare descriptor without waiting. Frames are cut out of the bytes by hal.wire.Framer.
 """
 from __future__ import annotations
 
-import binascii
 import contextlib
 import errno
 import os
-import struct
 import termios
-from collections.abc import Callable
 from pathlib import Path
 
 import serial
@@ -22,101 +16,9 @@ import serial
 from hal.backend import HardwareError, Sample
 from hal.devices import Device
 from hal.profile import BinaryFrame, Binding, LineSettings
+from hal.wire import Framer, read_available
 
 MAX_LINE = 1024             # a text line longer than this is garbage
-MAX_READ = 4096
-MAX_BUFFER = 8192
-
-
-def _reflected_table(polynomial: int) -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        for _ in range(8):
-            byte = (byte >> 1) ^ polynomial if byte & 1 else byte >> 1
-        table.append(byte)
-    return tuple(table)
-
-
-_MODBUS = _reflected_table(0xA001)
-
-
-def crc16_modbus(data: bytes) -> int:
-    """CRC-16/MODBUS: polynomial 0x8005 reflected, start 0xFFFF. Check value of b'123456789': 0x4B37."""
-    crc = 0xFFFF
-    for byte in data:
-        crc = (crc >> 8) ^ _MODBUS[(crc ^ byte) & 0xFF]
-    return crc
-
-
-CRC16: dict[str, Callable[[bytes], int]] = {
-    "ccitt-false": lambda data: binascii.crc_hqx(data, 0xFFFF),      # polynomial 0x1021, check value 0x29B1
-    "xmodem": lambda data: binascii.crc_hqx(data, 0),                # check value 0x31C3
-    "modbus": crc16_modbus}
-
-
-class Framer:
-    """Bytes in, frames out. `newest` is the payload tuple of the last good frame; counters tell the rest."""
-
-    def __init__(self, spec: BinaryFrame) -> None:
-        self.spec, self._payload, self._crc = spec, spec.payload, CRC16[spec.crc]
-        self._crc_order = "little" if spec.crc_endian == "<" else "big"
-        self._head = len(spec.sync) + spec.has_length
-        self._size = self._head + self._payload.size + 2
-        self._buffer = bytearray()
-        names = [n for n, _ in spec.fields]
-        self._sequence = names.index(spec.sequence) if spec.sequence else -1
-        self.modulus = 256 ** struct.calcsize(self._payload.format[1 + self._sequence]) if spec.sequence else 0
-        self.newest: tuple = ()
-        self.frames = self.bad = self.skipped = self.lost = 0
-
-    def encode(self, *values: float) -> bytes:
-        """A frame with these field values."""
-        body = (bytes([self._payload.size]) if self.spec.has_length else b"") + self._payload.pack(*values)
-        return self.spec.sync + body + self._crc(body).to_bytes(2, self._crc_order)     # type: ignore[arg-type]
-
-    def feed(self, data: bytes) -> int:
-        """Take bytes; returns how many good frames they completed. `bad` counts wrong lengths and CRCs, `skipped` bytes
-        outside frames, `lost` gaps of the sequence counter."""
-        buffer, sync, size, good = self._buffer, self.spec.sync, self._size, 0
-        buffer += data
-        at = 0
-        while at < len(buffer):
-            start = buffer.find(sync, at)
-            if start < 0:
-                keep = max(at, len(buffer) - len(sync) + 1)       # the tail may be the beginning of a sync
-                self.skipped += keep - at
-                at = keep
-                break
-            self.skipped += start - at
-            at = start
-            if self.spec.has_length and len(buffer) > at + len(sync) and buffer[at + len(sync)] != self._payload.size:
-                self.bad += 1
-                self.skipped += 1
-                at += 1
-                continue
-            if len(buffer) - at < size:
-                break
-            end = at + size
-            if self._crc(bytes(buffer[at + len(sync):end - 2])) != int.from_bytes(
-                    buffer[end - 2:end], self._crc_order):                              # type: ignore[arg-type]
-                self.bad += 1
-                self.skipped += 1
-                at += 1
-                continue
-            values = self._payload.unpack_from(buffer, at + self._head)
-            if self._sequence >= 0 and self.newest:
-                self.lost += (values[self._sequence] - self.newest[self._sequence] - 1) % self.modulus
-            self.newest = values
-            good += 1
-            at = end
-        del buffer[:at]
-        self.frames += good
-        return good
-
-    def reset(self) -> None:
-        """Forget half a frame and the sequence (after a reconnection)."""
-        self._buffer.clear()
-        self.newest = ()
 
 
 class LineReader:
@@ -188,17 +90,6 @@ def latency_timer_ms(path: str, sys_root: str = "/sys") -> int | None:
         return None
 
 
-def read_available(fd: int) -> bytes:
-    """What has arrived, without waiting; b'' when nothing has. Raises OSError when the other end is gone."""
-    try:
-        data = os.read(fd, MAX_READ)
-    except BlockingIOError:
-        return b""
-    if not data:
-        raise OSError(errno.EIO, "the port was closed at the other end")
-    return data
-
-
 class SerialDevice(Device):
     """A device that streams (or answers requests with) binary frames or text lines."""
 
@@ -212,7 +103,7 @@ class SerialDevice(Device):
         self._due_s = 0.0
         if self._framer:
             names = [n for n, _ in spec.fields]
-            self._index = [names.index(b.channel.source) for b in binding.bounds]
+            self._index = [(i, names.index(b.channel.source)) for i, b in enumerate(binding.bounds)]
             self._invalid = (names.index(spec.invalid[0]), spec.invalid[1]) if spec.invalid else (-1, 0)
 
     def connect(self) -> None:
@@ -233,26 +124,23 @@ class SerialDevice(Device):
 
     def read(self, sample: Sample, now_s: float) -> None:
         """Newest frame or line into `sample`."""
-        data = read_available(self._fd)
-        if self._framer:
-            if data:
-                self._take_frames(sample, data, now_s)
-        else:
-            self._take_lines(sample, data, now_s)
-
-    def _take_frames(self, sample: Sample, data: bytes, now_s: float) -> None:
         framer = self._framer
-        assert framer is not None
-        if framer.feed(data):
-            values = framer.newest
+        if framer is None:
+            self._take_lines(sample, read_available(self._fd), now_s)
+        elif framer.read(self._fd):
             field, mask = self._invalid
-            if field >= 0 and values[field] & mask:
-                self.fail_all(sample, f"reports an error (status 0x{values[field] & mask:X}): check the sensor")
+            if field >= 0 and framer.whole(field) & mask:
+                self.fail_all(sample, f"reports an error (status 0x{framer.whole(field) & mask:X}): check the sensor")
             else:
-                for i, index in enumerate(self._index):
-                    self.put(sample, i, values[index], now_s)
-        counts = self.counts
-        counts["frames"], counts["errors"], counts["lost"] = framer.frames, framer.bad, framer.lost
+                for i, index in self._index:
+                    self.put(sample, i, framer.number(index), now_s)
+
+    def counters(self) -> dict[str, int]:
+        """Frames, wrong frames, gaps of the sequence, reconnections."""
+        if self._framer is not None:
+            framer = self._framer
+            self.counts.update(frames=framer.frames, errors=framer.bad, lost=framer.lost)
+        return self.counts
 
     def _take_lines(self, sample: Sample, data: bytes, now_s: float) -> None:
         spec = self.binding.profile.bus_spec

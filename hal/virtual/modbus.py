@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from hal.profile import FIELD_TYPES, Register
-from hal.serial_port import crc16_modbus
+from hal.wire import crc16
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
 
@@ -81,7 +81,7 @@ class ModbusUnit:
         """The same with RTU framing: requests of functions 3 and 4 have 8 bytes; garbage is skipped byte by byte."""
         out = bytearray()
         while len(buffer) >= 8:
-            if crc16_modbus(bytes(buffer[:6])) != int.from_bytes(buffer[6:8], "little"):
+            if crc16("modbus", bytes(buffer[:6])) != int.from_bytes(buffer[6:8], "little"):
                 del buffer[0]
                 continue
             unit, pdu = buffer[0], bytes(buffer[1:6])
@@ -89,7 +89,7 @@ class ModbusUnit:
             if self.silent or unit != self.unit_id:
                 continue
             body = bytes((unit,)) + self.answer(pdu)
-            crc = crc16_modbus(body) ^ (0x5A5A if self.corrupt else 0)
+            crc = crc16("modbus", body) ^ (0x5A5A if self.corrupt else 0)
             frame = body + crc.to_bytes(2, "little")
             out += frame[:len(frame) // 2] if self.half else frame
         return bytes(out)

@@ -25,12 +25,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hal.can_bus import encode_slcan
 from hal.profile import Binding, Bound, bind, check_rig
-from hal.serial_port import Framer, LineReader
+from hal.serial_port import LineReader
 from hal.simulated import PlantRig, make_rig
 from hal.virtual.drive import Cia402Drive, SlcanAdapter
 from hal.virtual.modbus import ModbusUnit
+from hal.wire import Framer, encode_slcan
 from thermoctl.yamlfile import InputError, suggest
 
 MAX_STEPS = 50              # periods caught up at once; a longer stop of this program shifts the plant's time

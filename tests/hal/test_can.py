@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
-from hal.can_bus import SlcanParser, drive_state, encode_slcan, next_control_word, open_can
+from hal.can_bus import drive_state, next_control_word, open_can
 from hal.virtual.drive import DISABLED, ENABLED, FAULT, HEARTBEAT_LOST, PRE_OPERATIONAL, Cia402Drive, SlcanAdapter
+from hal.wire import SlcanParser, encode_slcan
 
 
 def test_slcan_ascii():
@@ -42,7 +43,7 @@ def test_any_bytes_leave_parser_and_adapter_able(chunks):
     for chunk in chunks:
         parser.feed(chunk)
         adapter.feed(chunk)
-        assert len(parser._rest) <= 64 and len(adapter._rest) <= 64
+        assert parser.pending <= 64 and len(adapter._rest) <= 64
     parser.feed(b"\r")
     assert parser.feed(b"t1231FF\r") == [(0x123, b"\xff")]
     adapter.feed(b"\rC\rS8\rO\r")

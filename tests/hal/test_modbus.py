@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hal.modbus import decode, plan_blocks
 from hal.profile import Modbus, Register
-from hal.serial_port import crc16_modbus
+from hal.wire import crc16
 from hal.virtual.modbus import ModbusUnit, encode
 
 
@@ -16,7 +16,7 @@ def register(address, type="int16", kind="input", order="big"):
 
 
 def rtu(body):
-    return body + crc16_modbus(body).to_bytes(2, "little")
+    return body + crc16("modbus", body).to_bytes(2, "little")
 
 
 def test_read_input_registers_bytes():

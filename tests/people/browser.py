@@ -8,6 +8,7 @@ import subprocess
 import time
 
 LIMIT_S = 120.0
+PICTURES = os.environ.get("THERMOCTL_PICTURES")          # a folder that keeps the screenshots (make pictures: docs/images)
 
 
 def find():
@@ -41,6 +42,7 @@ class Browser:
         self.session = self.call("Target.attachToTarget", targetId=target["targetId"], flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
+        self.call("Emulation.setScrollbarsHidden", hidden=True)
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def call(self, method, **parameters):
@@ -115,6 +117,15 @@ class Browser:
                          clip={"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1})
         with open(path, "wb") as f:
             f.write(base64.b64decode(shot["data"]))
+
+    def keep(self, name):
+        """The picture as NAME.png, in 160 colours: small enough to live in the repository. Only where PICTURES is set."""
+        if PICTURES:
+            from PIL import Image
+            path = os.path.join(PICTURES, f"{name}.png")
+            os.makedirs(PICTURES, exist_ok=True)
+            self.picture(path)
+            Image.open(path).convert("RGB").quantize(160, dither=Image.Dither.NONE).save(path, optimize=True)
 
     def close(self):
         """End it."""

@@ -6,147 +6,29 @@ import json
 import os
 import re
 import socket
-import tempfile
 import threading
 import time
 from collections import deque
-from multiprocessing import resource_tracker
 from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import Browser, find
 from rich.console import Console
+from running import Running
 
-from hal.backend import ERROR, OK, ROLE, make_backend
 from thermoctl.daemon import dashboard, monitor
-from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
-from thermoctl.daemon.loop import Rig
 from thermoctl.daemon.metrics import metrics
-from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.socket import Commands, listen, serve, status
+from thermoctl.daemon.socket import Commands, status
 from thermoctl.daemon.watch import Watch
 from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter
-from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX, POINTS, SIGNALS
 from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
-PICTURES = os.environ.get("THERMOCTL_PICTURES")          # a folder that keeps the screenshots
 LIMIT_S = 20.0
 HEATING_S = 240.0                                         # of rig time before the page's test
 TOKEN = "a-token-of-tests-0123456789"
-
-
-class Spoilt:
-    """The back end, with channels that can be set to fail."""
-
-    def __init__(self, inner):
-        self.inner, self.broken = inner, set()
-
-    def read(self, now_s):
-        sample = self.inner.read(now_s)
-        for role in self.broken:
-            sample.status[ROLE[role]], sample.fresh[ROLE[role]] = ERROR, False
-        return sample
-
-    def write(self, drive, enable):
-        self.inner.write(drive, enable)
-
-    def mend(self, role):
-        self.broken.discard(role)
-        self.inner.read(0.0).status[ROLE[role]] = OK
-
-
-class Running:
-    """A daemon's ring, mailbox and command socket, ticked in simulated time by a thread that can be held."""
-
-    def __init__(self, settings):
-        self.settings = settings
-        self.shared = Shared.create(shared_name(settings))
-        backend = make_backend(settings)
-        backend.open()
-        self.backend = Spoilt(backend)
-        self.rig = Rig(self.backend, compensator(settings), law_parameters(settings), settings.loop.period_s,
-                       self._publish, self.shared.mailbox, self.shared.parameters, self.shared.state)
-        self.rig.wall_s = lambda: self.base_s + self.now_s
-        self.base_s, self.now_s, self.record = time.time(), 0.0, None
-        self.lateness = np.random.default_rng(1)
-        self.lock, self.stopping = threading.Lock(), threading.Event()
-        self.threads = [threading.Thread(target=serve, daemon=True, args=(
-            listen(Path(settings.socket.path), None), Commands(self.shared, settings, None, lambda *a, **k: None),
-            self.stopping.is_set))]
-
-    def _publish(self, row):
-        self.shared.ring.write(row)
-        self.shared.lateness.add(row[INDEX["lateness_us"]])
-        self.shared.busy.add(row[INDEX["busy_us"]])
-        if self.record is not None:
-            self.record(row)
-
-    def tick(self, count=1):
-        """So many ticks, at once."""
-        with self.lock:
-            for _ in range(count):
-                self.now_s += self.settings.loop.period_s
-                self.rig.tick(self.now_s, self.settings.loop.period_s, float(self.lateness.gamma(4.0, 15.0)))
-        return self.rig.row
-
-    def run(self, ticks=20, pause_s=0.02):
-        """From now on, tick beside the test."""
-        def pace():
-            while not self.stopping.wait(pause_s):
-                self.tick(ticks)
-        self.threads.append(threading.Thread(target=pace, daemon=True))
-        for thread in self.threads:
-            thread.start()
-
-    def send(self, kind, value=0.0):
-        assert self.shared.mailbox.push(float(kind), value)
-
-    def until(self, condition, what):
-        """Tick until condition(row)."""
-        for _ in range(60000):
-            if condition(self.tick()):
-                return
-        raise AssertionError(what)
-
-    def arm(self):
-        self.until(lambda row: row[INDEX["state"]] == 2, "READY")
-        self.send(1)
-        self.until(lambda row: row[INDEX["state"]] == 3, "ARMED")
-
-    def close(self):
-        self.stopping.set()
-        for thread in self.threads:
-            if thread.ident:
-                thread.join(5.0)
-        self.remove()
-
-    def remove(self):
-        """As at the daemon's end. Whoever attached in this process has told the resource tracker to forget it."""
-        resource_tracker.register("/" + shared_name(self.settings), "shared_memory")
-        self.shared.remove()
-
-
-@pytest.fixture
-def settings():
-    with tempfile.TemporaryDirectory(prefix="thermoctl") as folder:
-        text = (ROOT / "config/simulated.yaml").read_text()
-        for old, new in (("plants/", f"{ROOT}/config/plants/"), ("models/", f"{ROOT}/config/models/"), ("../run/", f"{folder}/"),
-                         ("../recordings", f"{folder}/rec")):
-            text = text.replace(old, new)
-        path = Path(folder) / "rig.yaml"
-        path.write_text(text)
-        yield load_settings(path)
-
-
-@pytest.fixture
-def running(settings):
-    r = Running(settings)
-    yield r
-    r.close()
 
 
 @contextlib.contextmanager
@@ -211,26 +93,6 @@ def frames(server, count, **headers):
 
 
 # ------------------------------------------------------------------------------------------------------ the browser
-@pytest.fixture
-def browser(tmp_path):
-    program = find()
-    if program is None:
-        pytest.skip("no Chromium on this machine: the page is not driven (apt-get install chromium)")
-    b = Browser(program, tmp_path)
-    yield b
-    b.close()
-
-
-def keep(browser, name):
-    """The picture, in 160 colours: small enough to live in the repository."""
-    if PICTURES:
-        from PIL import Image
-        Path(PICTURES).mkdir(parents=True, exist_ok=True)
-        path = Path(PICTURES) / f"{name}.png"
-        browser.picture(path)
-        Image.open(path).convert("RGB").quantize(160, dither=Image.Dither.NONE).save(path, optimize=True)
-
-
 def choose(browser, select, value):
     browser.js(f"(s => {{ s.value = '{value}'; s.dispatchEvent(new Event('change')); }})(document.getElementById('{select}'))")
 
@@ -286,7 +148,7 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         browser.js("document.getElementById('c-position').focus()")
         browser.key("End")
         browser.until("/reference 12\\.500/.test(document.getElementById('r-position').textContent)")
-        keep(browser, "dashboard-light")
+        browser.keep("dashboard-light")
         # Every tick of the last seconds, and other signals, from the same recording.
         choose(browser, "signal", "coil_c")
         browser.until("document.getElementById('n-history').textContent.startsWith('coil: measured')")
@@ -313,7 +175,7 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         assert browser.js("charts.capture.x[charts.capture.series[0].y.indexOf(4)]") == 0.0
         browser.dark(True)
         browser.until("colours.ink === '#e8edf2'")
-        keep(browser, "dashboard-dark-fault")
+        browser.keep("dashboard-dark-fault")
         assert browser.messages == []
 
         # The daemon goes away: said, and the page lives on.
@@ -594,8 +456,6 @@ def test_the_monitor_on_a_recorded_status(settings, running):
     console = Console(file=io.StringIO(), width=80, record=True, force_terminal=True)
     console.print(monitor.screen(recorded_status, answer, trails, 80))
     text = console.export_text(clear=False)
-    if PICTURES:
-        console.save_svg(str(Path(PICTURES) / "monitor.svg"), title="thermoctl monitor")
     assert "FAULT" in text and "coil_error" in text and "-> look at `thermoctl status`" in text
     for point in POINTS:
         assert point.replace("_", " ") in text

@@ -29,8 +29,9 @@ After a gap of more than MAX_GAP_S (suspend) the estimate starts again on the co
 the estimates of an earlier run, advanced over the pause without power; when the coil's first reading is more than
 RESUME_LIMIT_C from them they are dropped, and the start is as without.
 
-A reading that is not valid is never used (`last` holds the newest valid one). The encoder's reading is held for a tick without a new frame (1 to 3 % of the
-ticks of a polled encoder): the differences then come one tick later and nothing is lost.
+A reading that is not valid is never used (`last` holds the newest valid one). The encoder's reading is held for a
+tick without a new frame (1 to 3 % of the ticks of a polled encoder): the differences then come one tick later and
+nothing is lost.
 """
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit, Noise, default_noise, fit, report, updated
+from thermoctl.plant.refit import Fit, Noise, Scale, default_noise, fit, report, updated
 from thermoctl.plant.simulate import Drive, Model, SimulationError
 from thermoctl.recording.table import Table, read_table
 from thermoctl.yamlfile import InputError
@@ -42,6 +42,7 @@ REMAINS = -8.0              # log10 p of an unknown smooth input from which some
 LARGE = 1.6                 # coloured residual beyond this is physics, not a sensor's colour
 TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
 BLOCKS = 8                  # of a single recording, every other one held out
+SPREAD = 0.06, 0.2          # least and greatest spread of parameters round their beliefs, in shares of their ranges
 DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
 
 
@@ -54,6 +55,8 @@ class Explanation:
     score: float
     colours: list[Colour]
     raw: float = 0.0                                            # the score without the price of parameters and priors
+    away: np.ndarray = field(default_factory=lambda: np.zeros(0))       # the plant's own parameters, from their beliefs
+    spread: float = 0.0                                         # of such distances, that the score was taken with
     own: list[dict[str, str]] = field(default_factory=list)     # per effect: its parameter to the plant's name
     direction: Direction | None = None
     probability: float = 0.0
@@ -82,6 +85,7 @@ class Case:
         self.patience = 60.0        # seconds for one refit; set from the time that the plant's own refit took
         self.begun = time.monotonic()
         self.noise = tuple(noise or default_noise(plant, self.drives))
+        self.spread = SPREAD[1]     # how far the plant's parameters lie from what was believed, in shares of their ranges
 
     def explain(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], iterations: int = 25,
                 tries: int = 0) -> Explanation:
@@ -97,7 +101,32 @@ class Case:
         added = sum(len(self.tables) if plant.parameters[n].per_recording else 1 for o in own for n in o.values())
         price = added * np.log(max(found.samples, 2)) + sum(_surprise(c) + c.surprise(plant) for c in effects)
         raw = sum(c.score for c in colours)
-        return Explanation(plant, list(effects), found, raw + float(price), colours, raw, list(own))
+        away, spread = self._away(found)
+        self.spread = min(self.spread, spread)
+        return Explanation(plant, list(effects), found, raw + float(price) + implausible(away, self.spread), colours, raw, away,
+                           self.spread, list(own))
+
+    def _away(self, found: Fit) -> tuple[np.ndarray, float]:
+        """The plant's own parameters' distances from the beliefs, and their spread over those that the data determine."""
+        sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(found.hessian, hermitian=True)), 0.0))
+        away, known = [], []
+        for k, (q, r) in enumerate(found.unknowns):
+            p = self.plant.parameters.get(q)
+            if p is None or not p.range:
+                continue
+            belief = p.values.get(self.tables[r].name, p.value) if r is not None else p.value
+            z = Scale(p)
+            away.append(z.z(float(found.values[r or 0, found.model.parameters.index(q)])) - z.z(belief))
+            if sd[k] < 0.1:
+                known.append(abs(away[-1]))
+        spread = 1.4826 * float(np.median(known)) if len(known) >= 5 else SPREAD[1]
+        return np.array(away), float(np.clip(spread, *SPREAD))
+
+    def reprice(self, explanations: Sequence[Explanation]) -> None:
+        """Bring scores to the one spread of parameters that is known by now."""
+        for e in explanations:
+            e.score += implausible(e.away, self.spread) - implausible(e.away, e.spread)
+            e.spread = self.spread
 
     def excess(self, e: Explanation) -> dict[str, float]:
         """Residual rms over sensor noise, per output that was measured."""
@@ -108,6 +137,12 @@ class Case:
             if len(parts):
                 out[o] = float(np.sqrt(np.mean(np.minimum(np.abs(parts), 8 * max(n.sigma, np.median(np.abs(parts)))) ** 2)) / n.sigma)
         return out
+
+
+def implausible(away: np.ndarray, spread: float) -> float:
+    """-2 log density of parameters that lie `away` from the beliefs (Student's t with 3 degrees of freedom: a far one is
+    unlikely, not impossible). Of two explanations that fit alike it favours the one that leaves the plant as it was known."""
+    return float(4 * np.sum(np.log1p((away / spread) ** 2 / 3)))
 
 
 def _surprise(c: Candidate) -> float:
@@ -248,6 +283,7 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
         return e
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
         done = [e for e in pool.map(one, chosen) if e is not None]
+    case.reprice([seen.base, *done])
     done.sort(key=lambda e: e.score)
     return done
 
@@ -318,6 +354,7 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     excess = case.excess(current)
     worst = max(excess.values(), default=0.0)
     before_worst = max(case.excess(base).values(), default=0.0)
+    case.reprice([base, current, reference, *rivals])
     _weigh(reference, rivals)
     current.probability = reference.probability
     held = held_out(case, base, current)

@@ -228,7 +228,7 @@ class Wizard:
                  say: Callable[[str], None]):
         self.settings, self.rig, self.folder, self.tests, self.order, self.say = settings, rig, folder, tests, order, say
         self.state_path = folder / "state.json"
-        self.fingerprint = hashlib.sha256(Path(settings.path).read_bytes()).hexdigest()
+        self.fingerprint = self._fingerprint()
         self.done: dict[str, dict[str, Any]] = {}
         self.at_s: dict[str, float] = {}                      # how far an ended test came
         self._used_s, self._tested_s = 0.0, 0.0               # wall and rig seconds of tests in this run, for the ETA
@@ -242,8 +242,12 @@ class Wizard:
             except (ValueError, KeyError, TypeError):
                 raise InputError(f"{self.state_path}: not a calibration's state; give another --out") from None
             if known != self.fingerprint:
-                raise InputError(f"{folder}: was begun with another configuration than {settings.path} is now; "
-                                 "put it back, or begin anew with --again")
+                raise InputError(f"{folder}: was begun with another configuration or other experiments than {settings.path} has now; "
+                                 "put them back, or begin anew with --again")
+
+    def _fingerprint(self) -> str:
+        path = Path(self.settings.path)
+        return hashlib.sha256(path.read_bytes() + (path.parent / "experiments.yaml").read_bytes()).hexdigest()
 
     def _save(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -416,6 +420,8 @@ class Wizard:
         if gains and "proposed" in self.done["pid"]:
             g = self.done["pid"]["proposed"]
             tuning.write(Path(self.settings.path), tuning.Gains(g["kp"], g["ti_s"], g["td_s"], g["how"]))
+            self.fingerprint = self._fingerprint()
+            self._save()
         self.say(f"{path} is current; older ones stay (`thermoctl model rollback`).")
         if Path(self.settings.compensation.model or ".").resolve() not in (models.resolve(), path.resolve()):
             self.say(f"compensation.model is {self.settings.compensation.model or 'not set'}: set it to {models.resolve()} to use it, then "

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -312,9 +313,10 @@ def walk(expr: Expr) -> Iterable[Expr]:
             stack.extend((a, False) for a in reversed(node.args))
 
 
-def names(expr: Expr) -> set[str]:
+@lru_cache(maxsize=100_000)
+def names(expr: Expr) -> frozenset[str]:
     """The names an expression reads (those inside first() are not among them)."""
-    return {n.value for n in walk(expr) if n.op == "name"}
+    return frozenset(n.value for n in walk(expr) if n.op == "name")
 
 
 def substitute(expr: Expr, change: Callable[[Expr], Expr | None]) -> Expr:

@@ -276,6 +276,10 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
     for z in starts:
         try:
             problem.set_outlier_limits(problem.evaluate(z, False)[3])
+            if best is not None:        # another start is followed to its end only if a few steps bring it below
+                z = _descend(problem, z, 12, tolerance, deadline).z
+                if _sum_of_squares(problem, problem.evaluate(z, False)[3]) > 0.98 * _sum_of_squares(problem, best.residuals):
+                    continue
             for _ in range(4):
                 found = _descend(problem, z, iterations, tolerance, deadline)
                 z = found.z
@@ -291,6 +295,10 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
     if best is None:
         raise failure or SimulationError("the plant cannot be simulated")
     return best
+
+
+def _sum_of_squares(problem: Problem, residuals: Sequence[np.ndarray]) -> float:
+    return float(sum(np.sum(problem.whiten(r, j, e[:, j]) ** 2) for r, e in enumerate(residuals) for j in range(len(problem.noise))))
 
 
 def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float, deadline: float) -> Fit:
