@@ -189,22 +189,25 @@ def run(simulation: Any, schedule: Schedule, every: int = 100, start_s: float = 
     before = [c for c in schedule.commands() if c[0] < start_s]
     waiting = ([(start_s, *before[-1][1:])] if before else []) + waiting
     ticks = round((schedule.duration_s - start_s) / period)
-    block, began, nxt = [], time.monotonic(), 0
+    block, began, nxt, k = [], time.monotonic(), 0, 0
     state, bits = INDEX["state"], INDEX["fault_bits"]
     if simulation.row[state] != arming.ARMED:
         simulation.arm()
-    for k in range(ticks):
+    while k < ticks:
         while nxt < len(waiting) and round((waiting[nxt][0] - start_s) / period) <= k:
             simulation.command(waiting[nxt][1], waiting[nxt][2])
             nxt += 1
-        row = simulation.tick()
-        if (k + 1) % every == 0:
+        coming = round((waiting[nxt][0] - start_s) / period) if nxt < len(waiting) else ticks
+        count = min(every - k % every, coming - k, ticks - k)
+        row = simulation.tick(count)
+        k += count
+        if k % every == 0:
             block.append(row.copy())
-        if len(block) == 1000 or k == ticks - 1:
+        if len(block) == 1000 or k == ticks:
             if block:
                 yield np.array(block)
             block = []
-            done = start_s + (k + 1) * period
+            done = start_s + k * period
             if progress is not None:
                 progress(Progress(done, schedule.duration_s, time.monotonic() - began))
             if stop():
@@ -213,7 +216,7 @@ def run(simulation: Any, schedule: Schedule, every: int = 100, start_s: float = 
             if block:
                 yield np.array(block)
             standing = [f.name for f in FAULTS if int(row[bits]) >> f.bit & 1]
-            raise Aborted(f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", start_s + (k + 1) * period)
+            raise Aborted(f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", start_s + k * period)
 
 
 def _keys(node: Node, what: str, allowed: set[str]) -> dict[str, Node]:
