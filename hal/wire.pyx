@@ -1,0 +1,394 @@
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The bytes of a tick: frames with a CRC, Lawicel CAN in ASCII, checked readings; compiled, because a tick meets them cold.
+
+A binary frame on the wire:   sync (1..8 bytes) | length (uint8, optional) | payload | CRC-16 over all that follows sync
+
+Framing resynchronises after garbage: a frame whose length or CRC is wrong costs its first byte, and the search goes on
+from the next one, so a true frame behind a false sync is never lost. Nothing here waits, and what a sender can fill is
+bounded: a frame by its profile, a Lawicel message by 64 bytes.
+"""
+import errno
+import os
+import struct
+
+from libc.errno cimport EAGAIN, EINTR, errno as c_errno
+from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint8_t, uint16_t, uint32_t, uint64_t
+from libc.string cimport memcmp, memcpy, memmove
+from posix.unistd cimport read as c_read
+
+from hal.profile import CRCS, FIELD_TYPES
+
+cdef enum:
+    MAX_READ = 4096             # bytes a tick takes from a port
+    MAX_FRAME = 1024
+    MAX_FIELDS = 64
+    MAX_MESSAGE = 64            # the longest Lawicel message has 30 bytes
+
+cdef uint16_t[256] _CCITT, _MODBUS
+
+
+cdef void _fill_tables() noexcept:
+    cdef int byte, k
+    cdef uint16_t crc
+    for byte in range(256):
+        crc = <uint16_t>(byte << 8)
+        for k in range(8):
+            crc = <uint16_t>((crc << 1) ^ 0x1021) if crc & 0x8000 else <uint16_t>(crc << 1)
+        _CCITT[byte] = crc
+        crc = <uint16_t>byte
+        for k in range(8):
+            crc = (crc >> 1) ^ 0xA001 if crc & 1 else crc >> 1
+        _MODBUS[byte] = crc
+
+
+_fill_tables()
+
+
+cdef uint16_t _crc16(int kind, const uint8_t *data, int size) noexcept nogil:
+    cdef uint16_t crc = 0 if kind == 1 else 0xFFFF
+    cdef int i
+    if kind == 2:
+        for i in range(size):
+            crc = (crc >> 8) ^ _MODBUS[(crc ^ data[i]) & 0xFF]
+    else:
+        for i in range(size):
+            crc = <uint16_t>(crc << 8) ^ _CCITT[(crc >> 8) ^ data[i]]
+    return crc
+
+
+def crc16(str kind, const uint8_t[::1] data) -> int:
+    """CRC-16 of `data`. Check values of b'123456789': ccitt-false 0x29B1, xmodem 0x31C3, modbus 0x4B37."""
+    return _crc16(CRCS.index(kind), &data[0] if data.shape[0] else NULL, <int>data.shape[0])
+
+
+cdef int _read(int fd, uint8_t *to, int size) except -1:
+    """Bytes that have arrived, 0 when none has. Raises OSError when the other end is gone."""
+    cdef int got = <int>c_read(fd, to, size)
+    if got > 0:
+        return got
+    if got < 0 and (c_errno == EAGAIN or c_errno == EINTR):
+        return 0
+    if got == 0:
+        raise OSError(errno.EIO, "the port was closed at the other end")
+    raise OSError(c_errno, os.strerror(c_errno))
+
+
+def read_available(int fd) -> bytes:
+    """What has arrived, without waiting; b'' when nothing has. Raises OSError when the other end is gone."""
+    cdef uint8_t[MAX_READ] data
+    cdef int got = _read(fd, data, MAX_READ)
+    return data[:got]
+
+
+cdef class Framer:
+    """Bytes in, frames out. `newest` is the payload tuple of the last good frame (() before the first); `frames`, `bad`
+    (wrong lengths and CRCs), `skipped` (bytes outside frames) and `lost` (gaps of the sequence counter) count.
+
+    spec: hal.profile.BinaryFrame.
+    """
+    cdef readonly object spec
+    cdef readonly long frames, bad, skipped, lost
+    cdef readonly int size
+    cdef object _payload
+    cdef uint8_t[MAX_READ + MAX_FRAME] _buffer
+    cdef uint8_t[MAX_FRAME] _newest
+    cdef uint8_t[8] _sync
+    cdef int _length, _sync_size, _head, _payload_size, _has_length, _crc_kind, _crc_big, _big, _sequence, _known
+    cdef int[MAX_FIELDS] _offset
+    cdef char[MAX_FIELDS] _type
+    cdef uint64_t _modulus_mask
+
+    def __init__(self, spec):
+        self.spec, self._payload = spec, spec.payload
+        self._sync_size, self._has_length = len(spec.sync), spec.has_length
+        memcpy(self._sync, <const char *><bytes>spec.sync, self._sync_size)
+        self._head = self._sync_size + self._has_length
+        self._payload_size = self._payload.size
+        self.size = self._head + self._payload_size + 2
+        if self.size > MAX_FRAME or len(spec.fields) > MAX_FIELDS:
+            raise ValueError(f"a frame of {self.size} bytes and {len(spec.fields)} fields; at most {MAX_FRAME} and {MAX_FIELDS}")
+        self._crc_kind, self._crc_big = CRCS.index(spec.crc), spec.crc_endian == ">"
+        self._big = spec.endian == ">"
+        names = [n for n, _ in spec.fields]
+        at = 0
+        for i, (_, kind) in enumerate(spec.fields):
+            self._type[i], self._offset[i] = ord(FIELD_TYPES[kind]), at
+            at += struct.calcsize(FIELD_TYPES[kind])
+        self._sequence = names.index(spec.sequence) if spec.sequence else -1
+        bits = 8 * struct.calcsize(FIELD_TYPES[spec.fields[self._sequence][1]]) if spec.sequence else 64
+        self._modulus_mask = <uint64_t>((1 << bits) - 1)
+
+    @property
+    def modulus(self) -> int:
+        """Where the sequence counter starts again."""
+        return int(self._modulus_mask) + 1
+
+    @property
+    def newest(self) -> tuple:
+        return self._payload.unpack(bytes(self._newest[:self._payload_size])) if self._known else ()
+
+    @property
+    def pending(self) -> int:
+        """Bytes of a frame that is not complete."""
+        return self._length
+
+    def encode(self, *values) -> bytes:
+        """A frame with these field values."""
+        body = (bytes([self._payload_size]) if self._has_length else b"") + self._payload.pack(*values)
+        return self.spec.sync + body + crc16(self.spec.crc, body).to_bytes(2, "big" if self._crc_big else "little")
+
+    def feed(self, const uint8_t[::1] data) -> int:
+        """Take bytes; returns how many good frames they completed."""
+        cdef Py_ssize_t at = 0, part
+        cdef int good = 0
+        while at < data.shape[0]:
+            part = min(<Py_ssize_t>MAX_READ, data.shape[0] - at)
+            memcpy(self._buffer + self._length, &data[at], part)
+            self._length += <int>part
+            good += self._scan()
+            at += part
+        return good
+
+    cpdef int read(self, int fd) except -1:
+        """Take what has arrived at a descriptor; how many good frames it completed. Raises OSError when it is gone."""
+        cdef int got = _read(fd, self._buffer + self._length, MAX_READ)
+        if got == 0:
+            return 0
+        self._length += got
+        return self._scan()
+
+    cdef int _scan(self) noexcept:
+        cdef uint8_t *buffer = self._buffer
+        cdef int at = 0, start, end, n = self._length, good = 0, found
+        cdef uint16_t crc
+        cdef uint64_t before
+        while at < n:
+            start = at
+            while start + self._sync_size <= n and memcmp(buffer + start, self._sync, self._sync_size) != 0:
+                start += 1
+            if start + self._sync_size > n:                  # the tail may be the beginning of a sync
+                start = max(at, n - self._sync_size + 1)
+                self.skipped += start - at
+                at = start
+                break
+            self.skipped += start - at
+            at = start
+            found = not self._has_length or n <= at + self._sync_size or buffer[at + self._sync_size] == self._payload_size
+            if found:
+                if n - at < self.size:
+                    break
+                end = at + self.size
+                crc = (<uint16_t>(buffer[end - 2] << 8) | buffer[end - 1] if self._crc_big
+                       else <uint16_t>(buffer[end - 1] << 8) | buffer[end - 2])
+                found = _crc16(self._crc_kind, buffer + at + self._sync_size, self.size - self._sync_size - 2) == crc
+            if not found:
+                self.bad += 1
+                self.skipped += 1
+                at += 1
+                continue
+            if self._sequence >= 0:
+                before = self.whole(self._sequence)
+                memcpy(self._newest, buffer + at + self._head, self._payload_size)
+                if self._known:
+                    self.lost += <long>((self.whole(self._sequence) - before - 1) & self._modulus_mask)
+            else:
+                memcpy(self._newest, buffer + at + self._head, self._payload_size)
+            self._known = 1
+            good += 1
+            at = end
+        memmove(buffer, buffer + at, n - at)
+        self._length = n - at
+        self.frames += good
+        return good
+
+    cdef uint64_t _bits(self, int field, int size) noexcept:
+        cdef uint64_t value = 0
+        cdef const uint8_t *p = self._newest + self._offset[field]
+        cdef int i
+        for i in range(size):
+            value = value << 8 | p[i if self._big else size - 1 - i]
+        return value
+
+    cpdef uint64_t whole(self, int field) noexcept:
+        """A field of the newest frame as the bits of an unsigned number (sequence counters, status flags)."""
+        cdef char t = self._type[field]
+        return self._bits(field, 1 if t in (b'b', b'B') else 2 if t in (b'h', b'H') else 4 if t in (b'i', b'I', b'f') else 8)
+
+    cpdef double number(self, int field) noexcept:
+        """A field of the newest frame as a number."""
+        cdef uint64_t bits = self.whole(field)
+        cdef uint32_t half = <uint32_t>bits
+        cdef float single
+        cdef double double_
+        cdef char t = self._type[field]
+        if t == b'i':
+            return <int32_t>half
+        if t == b'h':
+            return <int16_t>half
+        if t == b'b':
+            return <int8_t>half
+        if t == b'q':
+            return <double><int64_t>bits
+        if t == b'f':
+            memcpy(&single, &half, 4)
+            return single
+        if t == b'd':
+            memcpy(&double_, &bits, 8)
+            return double_
+        return <double>bits
+
+    def reset(self) -> None:
+        """Forget half a frame and the sequence (after a reconnection)."""
+        self._length = self._known = 0
+
+
+cdef int _nibble(uint8_t c) noexcept nogil:
+    if 48 <= c <= 57:
+        return c - 48
+    c |= 32
+    return c - 87 if 97 <= c <= 102 else -1
+
+
+cdef char *_DIGITS = b"0123456789ABCDEF"
+
+
+cpdef bytes encode_slcan(uint32_t can_id, const uint8_t[::1] data):
+    """A data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR above 0x7FF."""
+    cdef char[32] out
+    cdef int digits = 3 if can_id <= 0x7FF else 8, at = 1, i
+    out[0] = b't' if digits == 3 else b'T'
+    if data.shape[0] > 8:
+        raise ValueError(f"a CAN frame has at most 8 bytes, not {data.shape[0]}")
+    for i in range(digits):
+        out[at] = _DIGITS[can_id >> (4 * (digits - 1 - i)) & 15]
+        at += 1
+    out[at] = <char>(48 + data.shape[0])
+    at += 1
+    for i in range(data.shape[0]):
+        out[at], out[at + 1] = _DIGITS[data[i] >> 4], _DIGITS[data[i] & 15]
+        at += 2
+    out[at] = b'\r'
+    return out[:at + 1]
+
+
+cdef class SlcanParser:
+    """Bytes from an adapter in, data frames out. Acknowledgements (z, Z, CR) pass silently; BEL, which refuses a
+    command, is counted in `refused`, what is no valid message in `bad`. Time stamps after the data are ignored."""
+    cdef public long bad, refused
+    cdef uint8_t[MAX_MESSAGE] _rest
+    cdef int _length
+
+    @property
+    def pending(self) -> int:
+        """Bytes of a message that is not complete."""
+        return self._length
+
+    cpdef list feed(self, const uint8_t[::1] data):
+        """Frames that `data` completed, in order: (id, data)."""
+        frames = []
+        if data.shape[0]:
+            self._feed(&data[0], <int>data.shape[0], frames)
+        return frames
+
+    cpdef list read(self, int fd):
+        """Frames that arrived at a descriptor. Raises OSError when it is gone."""
+        cdef uint8_t[MAX_READ] data
+        cdef int got = _read(fd, data, MAX_READ)
+        frames = []
+        if got:
+            self._feed(data, got, frames)
+        return frames
+
+    cdef int _feed(self, const uint8_t *data, int size, list frames) except -1:
+        cdef int i
+        for i in range(size):
+            if data[i] == b'\r':
+                if self._length > 0:
+                    self._take(frames)
+                self._length = 0
+            elif data[i] == b'\a':
+                self.refused += 1
+            elif self._length == MAX_MESSAGE:               # no message is so long: drop it up to its end
+                self._length = -1
+                self.bad += 1
+            elif self._length >= 0:
+                self._rest[self._length] = data[i]
+                self._length += 1
+        return 0
+
+    cdef int _take(self, list frames) except -1:
+        cdef uint8_t *m = self._rest
+        cdef uint8_t[8] body
+        cdef int digits, size, i, high, low
+        cdef uint32_t can_id = 0
+        if m[0] != b't' and m[0] != b'T':
+            self.bad += m[0] not in (b'z', b'Z', b'r', b'R', b'F', b'V', b'N')
+            return 0
+        digits = 3 if m[0] == b't' else 8
+        size = m[1 + digits] - 48 if self._length > 1 + digits else -1
+        if not 0 <= size <= 8 or self._length < 2 + digits + 2 * size:
+            self.bad += 1
+            return 0
+        for i in range(digits):
+            high = _nibble(m[1 + i])
+            if high < 0:
+                self.bad += 1
+                return 0
+            can_id = can_id << 4 | <uint32_t>high
+        for i in range(size):
+            high, low = _nibble(m[2 + digits + 2 * i]), _nibble(m[3 + digits + 2 * i])
+            if high < 0 or low < 0:
+                self.bad += 1
+                return 0
+            body[i] = <uint8_t>(high << 4 | low)
+        frames.append((can_id, (<char *>body)[:size]))
+        return 0
+
+
+cdef class Channels:
+    """The bound channels of one device: reading = raw * scale + offset, good inside low..high.
+
+    roles, scale, offset, low, high: one number a channel, in order.
+    """
+    cdef readonly int[::1] roles
+    cdef double[::1] scale, offset, low, high, value, time_s
+    cdef uint8_t[::1] fresh, status
+    cdef object _sample
+
+    def __init__(self, int[::1] roles, double[::1] scale, double[::1] offset, double[::1] low, double[::1] high):
+        self.roles, self.scale, self.offset, self.low, self.high = roles, scale, offset, low, high
+
+    cpdef bint put(self, object sample, int channel, double raw, double time_s) except -1:
+        """Store a raw reading of `channel` in a hal.backend.Sample; False, and nothing stored, when it is out of range."""
+        cdef double value = raw * self.scale[channel] + self.offset[channel]
+        cdef int role = self.roles[channel]
+        if sample is not self._sample:
+            self._sample, self.value, self.time_s = sample, sample.value, sample.time_s
+            self.fresh, self.status = sample.fresh.view("u1"), sample.status
+        if not (self.low[channel] <= value <= self.high[channel]) or value - value != 0.0:
+            return False
+        self.value[role], self.time_s[role], self.fresh[role], self.status[role] = value, time_s, 1, 0
+        return True
+
+
+cdef class Ages:
+    """Which readings of a sample are too old. limit_s: float64 over the roles."""
+    cdef double[::1] time_s, limit_s
+    cdef uint8_t[::1] fresh, status
+
+    def __init__(self, sample, double[::1] limit_s):
+        self.time_s, self.fresh, self.status = sample.time_s, sample.fresh.view("u1"), sample.status
+        self.limit_s = limit_s
+
+    cpdef void begin(self) noexcept:
+        """A new tick: nothing is fresh."""
+        cdef Py_ssize_t k
+        for k in range(self.fresh.shape[0]):
+            self.fresh[k] = 0
+
+    cpdef void judge(self, double now_s) noexcept:
+        """OK becomes STALE where the newest reading is older than its limit; an ERROR stays one."""
+        cdef Py_ssize_t k
+        for k in range(self.time_s.shape[0]):
+            if self.status[k] == 0 and now_s - self.time_s[k] > self.limit_s[k]:
+                self.status[k] = 1
