@@ -73,5 +73,19 @@ test-wire: install                 # pulled cables and killed programs, with the
 	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py
 
 .PHONY: test-browser
-test-browser: install              # the dashboard in headless Chromium (Debian: apt-get install chromium)
-	$(BIN)/python -m pytest -m slow tests/people/test_dashboard.py
+test-browser: install              # pages in headless Chromium (Debian: apt-get install chromium)
+	$(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py
+
+.PHONY: pictures
+pictures: install                  # the same, and its screenshots into docs/images
+	THERMOCTL_PICTURES=docs/images $(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py
+
+.PHONY: test-wizard
+test-wizard: install               # thermoctl calibrate from doctor to proof, with shortened tests
+	$(BIN)/python -m pytest -m slow tests/people/test_calibrate.py
+
+# The diagnosis beside its peers on the same cases; CASES= takes other folders of cases with answers.
+.PHONY: bench-diagnosis
+bench-diagnosis: install
+	$(BIN)/python -m pip install --quiet '.[bench]'
+	$(BIN)/python tests/bench/diagnosis.py $(CASES)

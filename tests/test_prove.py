@@ -304,3 +304,28 @@ def test_smoke_set_is_diagnosed_and_scored(tmp_path):
     assert content["figures"]["detected"] == 1
     assert json.loads((tmp_path / "out/proof.json").read_text())["rows"][0]["case"]
     assert prove.prove(tmp_path / "cases", tmp_path / "out", tmp_path / "answers")["rows"] == content["rows"]
+
+
+def test_bench_counts_a_peer_by_the_same_scoring(tmp_path, capsys):
+    """A peer on two cases with nothing missing: what it says is scored, kept, and not computed again."""
+    import importlib.util
+
+    path = Path(__file__).parent / "bench" / "diagnosis.py"
+    spec = importlib.util.spec_from_file_location("bench_diagnosis", path)
+    bench = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(bench)
+    from tests.concealed import generate
+
+    cases = str(tmp_path / "cases")
+    generate.main(["--out", cases, "--answers", "inside", "--number", "2", "--families", "tanks,heater", "--kind", "none", "--smoke"])
+    argv = [cases, "--methods", "latent", "--out", str(tmp_path)]
+    assert bench.main(argv) == 0
+    found = json.loads((tmp_path / "figures.json").read_text())["latent"]
+    assert found["cases"] == 2 and found["failed"] == 0
+    assert found["detected"] == [0, 0] and found["false_alarms"][1] == 2
+    kept = sorted((tmp_path / "latent").glob("*.json"))
+    told = json.loads(kept[0].read_text())
+    assert told["result"]["findings"] == [] and told["result"]["verdict"] in ("consistent", "unexplained")
+    kept[0].write_text(json.dumps(told | {"cpu_s": 123.0}))
+    assert bench.main(argv) == 0  # kept results are taken
+    assert json.loads((tmp_path / "figures.json").read_text())["latent"]["cpu_s_longest"] == 123.0

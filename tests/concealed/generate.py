@@ -71,7 +71,7 @@ def plan(seed: int, number: int, families: Sequence[str] = tuple(FAMILIES), kind
     """The first `number` slots of a set. Each kind goes round the families and schedules by itself; single effects go
     round all pairs of an effect and a size in an order that the seed shuffles, so that no pair is forgotten. `kind` asks
     for one kind instead of the set's turn."""
-    effects = {e: [f for f in held if f in families] for e, held in holders().items()}
+    effects = {e: [f for f in held if f in families] for e, held in holders().items()} if kind in (None, "one") else {}
     cells = [(e, b) for e, held in effects.items() if held for b in BANDS]
     order = np.random.default_rng([seed, len(cells)]).permutation(len(cells))
     count: dict[str, int] = {}
