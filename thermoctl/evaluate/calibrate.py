@@ -199,8 +199,8 @@ class DaemonRig:
         """`earlier` with what the daemon recorded since, or None when that has a hole longer than GAP_S."""
         from thermoctl.recording.writer import TIER, recording_files
         parts = [_rows(earlier)]
-        wall = INDEX["wall_s"]
-        for path in recording_files(Path(self.settings.recording.directory), TIER):
+        wall, folder = INDEX["wall_s"], Path(self.settings.recording.directory)
+        for path in recording_files(folder, TIER) if folder.is_dir() else ():
             with contextlib.suppress(InputError):
                 rows = _rows(read_table(path))
                 parts.append(rows[(rows[:, wall] > parts[-1][-1, wall]) & (rows[:, INDEX["t_s"]] > parts[-1][-1, INDEX["t_s"]])])
