@@ -211,7 +211,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
 
 
 def _people_commands(sub: argparse._SubParsersAction) -> None:
-    """dashboard, monitor, calibrate, fleet, completion."""
+    """dashboard, monitor, mqtt, calibrate, fleet, completion."""
     config = ("--config", {"metavar": "FILE", "help": "configuration, found as by `thermoctl status`"})
 
     def dashboard(args: argparse.Namespace) -> int:
@@ -235,6 +235,17 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     _add(sub, "monitor", "the rig in the terminal, as over ssh; commands nothing", monitor, config,
          ("--interval", {"type": float, "default": 0.5, "metavar": "S", "help": "seconds between two looks (default 0.5)"}),
          ("--once", {"action": "store_true", "help": "one screen; exit 1 when no daemon runs or a fault stands"}))
+
+    def mqtt(args: argparse.Namespace) -> int:
+        from thermoctl.daemon.client import settings_of
+        from thermoctl.daemon.mqtt import mqtt
+        return mqtt(settings_of(args.config), args.broker, args.topic, args.rate, args.user, args.password_file, args.tls)
+    _add(sub, "mqtt", "publish state, faults and availability to an MQTT broker; takes no commands", mqtt, config,
+         ("--broker", {"required": True, "metavar": "HOST[:PORT]"}),
+         ("--topic", {"default": "", "metavar": "TOPIC", "help": "below this (thermoctl/RIG)"}),
+         ("--rate", {"type": float, "default": 1.0, "metavar": "HZ", "help": "messages a second (1)"}),
+         ("--user", {"default": "", "metavar": "NAME"}), ("--password-file", {"metavar": "FILE"}),
+         ("--tls", {"action": "store_true", "help": "encrypted, with the system's certificates"}))
 
     def calibrate(args: argparse.Namespace) -> int:
         from thermoctl.daemon.client import find_config
