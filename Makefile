@@ -64,9 +64,12 @@ bench: install
 	$(BIN)/python -m pip install --quiet '.[bench]'
 	$(BIN)/python tests/bench/plant.py
 
-.PHONY: prove-refit
-prove-refit: install
-	$(BIN)/python tests/prove_refit.py
+.PHONY: prove-refit refit-recordings
+prove-refit: install               # do 95 % intervals hold the truth? 100 truths a kind of rig and noise
+	nice -n 15 $(BIN)/python tests/prove_refit.py
+
+refit-recordings: install          # every fit quoted for the naive plants of the real recordings, and ours
+	$(BIN)/python -m pytest -m slow -s tests/test_refit_recordings.py
 
 .PHONY: test-wire
 test-wire: install                 # pulled cables and killed programs, with the daemon and the virtual rig as two programs
@@ -79,6 +82,10 @@ test-browser: install              # pages in headless Chromium (Debian: apt-get
 .PHONY: pictures
 pictures: install                  # the same, and its screenshots into docs/images
 	THERMOCTL_PICTURES=docs/images $(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py
+
+.PHONY: test-fleet
+test-fleet: install                # many rigs' recordings, from a folder and an object store, also spread by Dask
+	$(BIN)/python -m pytest -m "slow or not slow" tests/people/test_fleet.py
 
 .PHONY: test-wizard
 test-wizard: install               # thermoctl calibrate from doctor to proof, with shortened tests
