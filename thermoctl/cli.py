@@ -264,7 +264,7 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
         from thermoctl.diagnose.fleet import fleet
         return fleet(args.folder, args.plant, args.parameters, args.workers, args.scheduler, args.json)
     _add(sub, "fleet", "many rigs' recordings: health, drift of parameters, which model no longer fits; exit 1 when one needs "
-         "attention", fleet, ("folder", {"metavar": "FOLDER"}),
+         "attention", fleet, ("folder", {"metavar": "FOLDER", "help": "a folder, or an object store's path as s3://BUCKET/RIGS"}),
          ("--plant", {"metavar": "FILE", "help": "the plant that the recordings are held against"}),
          ("--parameters", {"default": "", "metavar": "A,B", "help": "its parameters to follow over time"}),
          ("--workers", {"type": int, "default": 0, "metavar": "N", "help": "Dask processes here (default: this one)"}),

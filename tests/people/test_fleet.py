@@ -82,6 +82,33 @@ def test_files_that_are_bad_do_not_stop_the_others(folder, capsys, tmp_path):
     assert lost.error and "none.csv" in judge([lost])[0].advice[0]
 
 
+def test_an_object_store(folder, capsys):
+    """The same rigs from a store by its address; each recording is fetched, judged and forgotten."""
+    fsspec = pytest.importorskip("fsspec", reason="fsspec is not installed: pip install 'thermoctl[fleet]'")
+    store = fsspec.filesystem("memory")
+    store.put(str(folder / "data"), "/rigs", recursive=True)
+    plant = ["--plant", str(folder / "plant.yaml"), "--parameters", "H", "--json"]
+    assert main(["fleet", "memory://rigs", *plant]) == 1
+    there = {r["name"]: r for r in json.loads(capsys.readouterr().out)}
+    assert main(["fleet", str(folder / "data"), *plant]) == 1
+    here = {r["name"]: r for r in json.loads(capsys.readouterr().out)}
+    assert set(there) == {"well", "drifting", "changed"}
+    for name in there:
+        assert there[name]["drifts"] == here[name]["drifts"]
+        assert all(s["path"].startswith("memory://") and not s["error"] for s in there[name]["summaries"])
+    assert main(["fleet", "memory://nothing"]) == 2 and "no recordings" in capsys.readouterr().err
+    assert main(["fleet", "nonsense://x"]) == 2 and "nonsense" in capsys.readouterr().err
+
+
+@pytest.mark.slow       # Dask's processes take seconds to start: make test-fleet
+def test_dask_gives_the_same(folder, capsys):
+    plant = ["--plant", str(folder / "plant.yaml"), "--parameters", "C,H", "--json"]
+    assert main(["fleet", f"file://{folder}/data", *plant, "--workers", "2"]) == 1
+    spread = json.loads(capsys.readouterr().out)
+    assert main(["fleet", f"file://{folder}/data", *plant]) == 1
+    assert spread == json.loads(capsys.readouterr().out)
+
+
 def test_drift_needs_evidence():
     times = [k * MONTH_S for k in range(4)]
     assert drift(times, [(1.0, 0.01), (0.9, 0.01), (0.8, 0.01), (0.7, 0.01)]).drifts

@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,14 +54,50 @@ class Summary:
     error: str = ""
 
 
-def find_recordings(folder: str | Path) -> list[Path]:
-    """All recordings below a folder: our 10 Hz tiers, Parquet, CSV and Arrow files. Raises InputError without one."""
-    if not Path(folder).is_dir():
+def find_recordings(folder: str | Path) -> list[str]:
+    """All recordings below a folder, or below an object store's path (s3://BUCKET/RIGS; whatever fsspec knows): our 10 Hz
+    tiers, Parquet, CSV and Arrow files. Raises InputError without one."""
+    if "://" in str(folder):
+        fs, root = _store(str(folder))
+        try:
+            found = sorted(fs.unstrip_protocol(p) for p in fs.find(root) if p.endswith(SUFFIXES))
+        except Exception as e:          # each store raises what its own library raises
+            raise InputError(f"{folder}: cannot be listed: {e}") from None
+    elif not Path(folder).is_dir():
         raise InputError(f"{folder}: not a folder; one with the rigs' recordings was expected")
-    found = sorted(p for p in Path(folder).rglob("*") if p.is_file() and p.name.endswith(SUFFIXES))
+    else:
+        found = sorted(str(p) for p in Path(folder).rglob("*") if p.is_file() and p.name.endswith(SUFFIXES))
     if not found:
         raise InputError(f"{folder}: no recordings in it; files ending in {', '.join(SUFFIXES)} were expected")
     return found
+
+
+def _store(url: str) -> tuple[Any, str]:
+    """(file system, path in it) of an address; its credentials are those that its own library finds."""
+    try:
+        import fsspec
+    except ImportError:
+        raise InputError(f"{url}: needs the package 'fsspec': pip install 'thermoctl[fleet]'") from None
+    try:
+        return fsspec.core.url_to_fs(url)
+    except (ImportError, ValueError) as e:
+        raise InputError(f"{url}: {e}") from None
+
+
+@contextmanager
+def _local(path: str) -> Iterator[str]:
+    """A path that can be read here: itself, or a copy of what lies in an object store."""
+    if "://" not in path:
+        yield path
+        return
+    fs, inside = _store(path)
+    with tempfile.TemporaryDirectory(prefix="thermoctl-fleet") as folder:
+        copy = f"{folder}/{Path(inside).name}"
+        try:
+            fs.get_file(inside, copy)
+        except Exception as e:          # as above
+            raise InputError(f"{path}: cannot be fetched: {e}") from None
+        yield copy
 
 
 def summarise(path: str, plant_path: str | None, names: tuple[str, ...]) -> Summary:
@@ -67,7 +105,8 @@ def summarise(path: str, plant_path: str | None, names: tuple[str, ...]) -> Summ
     match = NAME.match(Path(path).name)
     rig = match["rig"] if match else Path(path).parent.name
     try:
-        table = read_table(path)
+        with _local(path) as here:
+            table = read_table(here)
         summary = _health(table, path, table.meta.get("rig", rig))
         return summary if plant_path is None else _model(summary, _thinned(table), plant_path, names)
     except (InputError, SimulationError) as e:
@@ -193,7 +232,7 @@ def fleet(folder: str, plant: str | None = None, parameters: str = "", workers: 
         if name not in ranged:
             raise InputError(f"{plant}: no parameter '{name}' with a range{suggest(name, ranged)}; expected some of "
                              f"{', '.join(ranged)}")
-    paths = [str(p) for p in find_recordings(folder)]
+    paths = find_recordings(folder)
     if workers or scheduler:
         from thermoctl.diagnose.prove import cluster
         with cluster(scheduler, workers) as client:
