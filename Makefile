@@ -96,3 +96,8 @@ test-wizard: install               # thermoctl calibrate from doctor to proof, w
 bench-diagnosis: install
 	$(BIN)/python -m pip install --quiet '.[bench]'
 	$(BIN)/python tests/bench/diagnosis.py $(CASES)
+
+# Six and more effects concealed in rigs of the judge's own making: diagnosed, modelled, compensated; one page.
+.PHONY: demo-concealed
+demo-concealed: install
+	$(BIN)/python tests/demo_concealed.py
