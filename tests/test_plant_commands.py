@@ -160,3 +160,22 @@ def test_check_names_what_is_wrong(block, capsys):
     assert main(["plant", "check", str(block / "p.yaml")]) == 0
     assert main(["plant", "check", str(block / "bad.yaml")]) == 2
     assert "did you mean 'air'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("file", [THERMAL, "config/plants/actuator.yaml"])
+def test_arrows_end_at_the_boxes_and_not_under_them(file):
+    """Every arrow's head lies on the edge of a box (a hidden head says nothing of the direction), at any resolution."""
+    from matplotlib.text import Annotation
+
+    from thermoctl.plant.show import drawing
+    figure = drawing(load(file))
+    axes = figure.axes[0]
+    for dpi in (100, 170):
+        figure.set_dpi(dpi)
+        figure.canvas.draw()
+        boxes = np.array([q.get_bbox_patch().get_window_extent().get_points() for q in axes.texts
+                          if not isinstance(q, Annotation) and q.get_zorder() == 3])
+        heads = np.array([axes.transData.transform(q.xy) for q in axes.texts if isinstance(q, Annotation)])
+        assert len(heads) > 20
+        depth = np.minimum(heads[:, None] - boxes[None, :, 0], boxes[None, :, 1] - heads[:, None]).min(axis=2)   # pixels inside
+        assert np.abs(depth).min(axis=1).max() < 3, dpi

@@ -45,7 +45,18 @@ def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, in
         i = len(vertices)
         vertices.append(("read", ",".join(nodes), "\n".join(names)))
         edges += [(index[n], i, "read", "") for n in nodes]
+        if not nodes:                               # a static reading: the inputs it is made of stand beside it
+            used = sorted(set().union(*(ex.names(plant.outputs[o].value) for o in names)) & set(plant.inputs))
+            edges += [(len(vertices) + k, i, "read", "") for k in range(len(used))]
+            vertices += [("in", n, n) for n in used]
     return vertices, edges
+
+
+def _edge(box: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """Where the line from `outside` (2,) to `inside` (2,) meets the box [[left, bottom], [right, top]] round the latter."""
+    way = outside - inside
+    room = np.where(way > 0, box[1] - inside, inside - box[0]) / np.maximum(np.abs(way), 1e-12)
+    return inside + way * min(float(room.min()), 1.0)
 
 
 def layout(count: int, edges: list[tuple[int, int, float]], rounds: int = 400) -> np.ndarray:
@@ -119,17 +130,18 @@ def drawing(plant: Plant, marked: Collection[str] = ()) -> Any:
     axes.set_xlim(x[:, 0].min() - margin, x[:, 0].max() + margin)
     axes.set_ylim(x[:, 1].min() - margin, x[:, 1].max() + margin)
     figure.canvas.draw()            # gives the boxes their sizes, at which the arrows end
+    sizes = {i: axes.transData.inverted().transform(q.get_bbox_patch().get_window_extent().get_points()) for i, q in boxes.items()}
     for a, b, kind, label in edges:
-        line = {"arrowstyle": "-" if kind == "read" else "-|>", "color": colours[kind],
-                "lw": 1.3 if kind == "flow" else 0.8, "ls": {"flow": "-", "read": ":", "uses": "--"}[kind],
-                "shrinkA": 0, "shrinkB": 0 if kind == "read" else 7,
-                "patchA": boxes[a].get_bbox_patch(), "patchB": boxes[b].get_bbox_patch()}
-        axes.annotate("", xy=x[b], xytext=x[a], arrowprops=line, zorder=1)
+        line = {"arrowstyle": "-" if kind == "read" else "-|>", "color": colours[kind], "mutation_scale": 13, "shrinkA": 0, "shrinkB": 0,
+                "lw": 1.3 if kind == "flow" else 0.8, "ls": {"flow": "-", "read": ":", "uses": "--"}[kind]}
+        axes.annotate("", xy=_edge(sizes[b], x[b], x[a]), xytext=_edge(sizes[a], x[a], x[b]), arrowprops=line, zorder=1)
         if label:
             middle = (x[a] + x[b]) / 2
-            axes.text(middle[0], middle[1], textwrap.fill(label, 22), fontsize=6.5, color="#5a6b7b", ha="center", va="center",
+            words = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
+            axes.text(middle[0], middle[1], words, fontsize=6.5, color="#5a6b7b", ha="center", va="center",
                       zorder=2, bbox={"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85})
-    figure.text(0.02, 0.965, plant.title, fontsize=12, weight="bold", va="center")
+    room = figure.get_figwidth() * 9.5 - (45 if figure.get_figwidth() >= 11 else 0)         # letters of the title in a line
+    figure.text(0.02, 0.995, textwrap.fill(plant.title, max(int(room), 20)), fontsize=12, weight="bold", va="top")
     words = {"node": "stored quantity", "in": "flow from outside", "out": "flow to outside", "read": "reading"}
     for k, (kind, word) in enumerate(words.items()):
         at = 1.0 - 1.215 / figure.get_figwidth() * (4 - k)
