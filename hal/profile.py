@@ -14,7 +14,7 @@ import math
 import re
 import struct
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -489,14 +489,22 @@ def resolve_port(port: str, folder: Path) -> str:
 
 
 def bind(node: Node, folder: Path) -> Binding:
-    """One item of `hal.devices`: {profile, port, roles: {channel: role}, name?, address?}; `profile` is relative to
-    `folder`. Raises InputError: unknown channel, unknown role, unit that does not fit the role."""
+    """One item of `hal.devices`: {profile, port, roles: {channel: role}, name?, address?, stale_after_s?, watchdog_s?};
+    `profile` is relative to `folder`. The last two replace the profile's on a machine that cannot keep them. Raises
+    InputError: unknown channel, unknown role, unit that does not fit the role."""
     s = Section(node, "device")
     profile_node = _must(s.get("profile"))
     path = folder / s.text("profile")
     if not path.is_file():
         raise profile_node.error(f"profile: {path} cannot be read: no such file")
     profile = load_profile(path)
+    if (stale := s.number("stale_after_s", 0.0, 1e-4, 3600.0)) > 0.0:
+        profile = replace(profile, channels={n: replace(c, stale_after_s=stale) for n, c in profile.channels.items()})
+    if (watchdog := s.get("watchdog_s", False)) is not None:
+        if profile.bus != "can-cia402":
+            raise watchdog.error(f"watchdog_s: a {profile.bus} device has none")
+        profile = replace(profile, bus_spec=replace(profile.bus_spec, watchdog_s=s.number(
+            "watchdog_s", 0.0, 2 * profile.bus_spec.heartbeat_s, 10.0)))
     bounds = []
     for name, role in Section(_must(s.get("roles")), "roles").node.value.items():
         if name not in profile.channels:

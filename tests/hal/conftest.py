@@ -20,10 +20,13 @@ WIRING = """
 - name: encoder
   profile: encoder-serial.yaml
   port: "{dir}/encoder"
+  stale_after_s: 0.1     # the rig and the reader are threads of one process: either may stall for tens of ms
   roles: {{position: position_um}}
 - name: drive
   profile: drive-cia402.yaml
   port: "slcan:{dir}/can"
+  stale_after_s: 0.1
+  watchdog_s: 0.2
   roles: {{state: amplifier_state, fault: amplifier_fault, supply: supply_v}}
 - name: thermocouples
   profile: thermocouples-modbus-12.yaml

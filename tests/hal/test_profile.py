@@ -1,5 +1,4 @@
 """Device profiles and bindings: what ships is good, and every mistake is one line with its place."""
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -40,7 +39,7 @@ CASES = [
     (ENCODER, "scale: 0.005", "scale: 0", "scale: 0 makes every reading the same"),
     (ENCODER, "scale: 0.005", "scale: fast", "scale: a number was expected, found 'fast'"),
     (ENCODER, "[-5000, 5000]", "[5000, -5000]", "is empty"),
-    (ENCODER, "stale_after_s: 0.1", "stale_after_s: 0.0005", "every reading would be stale"),
+    (ENCODER, "stale_after_s: 0.01", "stale_after_s: 0.0005", "every reading would be stale"),
     (ENCODER, "field: counts", "field: count", "did you mean 'counts'"),
     (ENCODER, "type: int32", "type: int33", "did you mean 'int32'"),
     (ENCODER, "[0xAA, 0x55]", "[0xAA, 0x155]", "is outside 0 .. 255"),
@@ -51,7 +50,7 @@ CASES = [
     (DRIVE, "[0x6041, 0x6078", "[0x6078, 0x6041", "the status word '0x6041' first"),
     (DRIVE, "limits: [-2.5, 2.5]", "limits: [1, 2.5]", "must contain 0"),
     (DRIVE, ", limits: [-2.5, 2.5]", "", "'limits' is missing"),
-    (DRIVE, "watchdog_s: 0.2", "watchdog_s: 0.03", "below two heartbeats"),
+    (DRIVE, "watchdog_s: 0.1", "watchdog_s: 0.03", "below two heartbeats"),
     (DRIVE, "object: 0x6078", "object: 0x6077", "is not sent by the drive"),
     (MODULE, "register: 0,", "register: 70000,", "is outside 0 .. 65535"),
     (MODULE, "modbus: {unit_id: 1", "modbus: {unit_id: 300", "is outside 0 .. 247"),
@@ -73,9 +72,9 @@ def test_each_mistake_has_its_place_and_a_word(tmp_path, good, old, new, message
 
 
 @given(st.integers(0, len(ENCODER) - 1), st.sampled_from(["", " ", ":", "{", "[", "x", "-", "\t", "0", "'"]))
-def test_a_damaged_profile_is_read_or_refused_never_a_traceback(at, put):
+def test_a_damaged_profile_is_read_or_refused_never_a_traceback(tmp_path_factory, at, put):
     from hal.profile import FORMAT
-    path = Path("/tmp") / "thermoctl-damaged-profile.yaml"
+    path = tmp_path_factory.getbasetemp() / "damaged-profile.yaml"
     path.write_text(ENCODER[:at] + put + ENCODER[at + 1:])
     try:
         assert load_profile(path).bus and FORMAT
@@ -93,6 +92,20 @@ def test_a_damaged_profile_is_read_or_refused_never_a_traceback(at, put):
 def test_mistakes_in_a_binding_are_named(text, message):
     with pytest.raises(InputError, match=message):
         bind(yamlfile.loads(text), CONFIG / "devices")
+
+
+def test_a_binding_may_loosen_the_limits_of_its_profile():
+    drive = "profile: drive-cia402.yaml, port: 'slcan:x', roles: {state: amplifier_state}"
+    tight, loose = (bind(yamlfile.loads(f"{{{drive}{more}}}"), CONFIG / "devices")
+                    for more in ("", ", stale_after_s: 0.1, watchdog_s: 0.2"))
+    assert tight.profile.bus_spec.watchdog_s == 0.1 and loose.profile.bus_spec.watchdog_s == 0.2
+    assert tight.bounds[0].channel.stale_after_s == 0.02 and loose.bounds[0].channel.stale_after_s == 0.1
+    for more, message in ((", watchdog_s: 0.03", "watchdog_s: 0.03 is outside 0.04"), (", stale_after_s: 0", "stale_after_s")):
+        with pytest.raises(InputError, match=message):
+            bind(yamlfile.loads(f"{{{drive}{more}}}"), CONFIG / "devices")
+    with pytest.raises(InputError, match="has none"):
+        bind(yamlfile.loads("{profile: encoder-serial.yaml, port: x, watchdog_s: 1, roles: {position: position_um}}"),
+             CONFIG / "devices")
 
 
 def test_two_devices_in_one_role_are_refused():

@@ -33,7 +33,7 @@ cdef class Law:
     cdef double innovation_time_s, power_limit_w, power_time_s, idle_current_a, idle_power_w, idle_limit_s
     cdef double saturation_limit_s, amplifier_limit_s, late_s, agree_time_s, drift_limit_c, monitored_limit_c
     cdef double resistance_ohm, resistance_tolerance, resistance_v, current_per_drive, current_tolerance_a
-    cdef double flexure_um_per_a, position_tolerance_um, reference_tolerance_um
+    cdef double flexure_um_per_a, position_tolerance_um, reference_tolerance_um, order_limit_c
     cdef bits_t faults, trips
     # the state: what snapshot() holds
     cdef public long long state, tick, average_at, averaged
@@ -44,7 +44,7 @@ cdef class Law:
     cdef public double coil_elapsed_s, power_mean_w, following_s, idle_s, saturation_s, amplifier_s, enable, drive
     cdef public double control_v
     cdef public double air_started, resumed, model_error_c, ohm_v, ohm_scale_v, current_error_a, displaced_um
-    cdef public double position_zero_um, zeroed, reference_error_um, reference_zero_um, reference_zeroed
+    cdef public double position_zero_um, zeroed, reference_error_um, reference_zero_um, reference_zeroed, exchanged
     cdef public double[::1] x, T, T_before, average, age, last, same_s, seen, verdict, corrections, apart_c
 
     cpdef bind(self, double[::1] value, uint8_t[::1] fresh, uint8_t[::1] status)
@@ -67,6 +67,8 @@ cdef class Law:
     cdef void _predict_corrections(self, double elapsed) noexcept
     @cython.locals(one=bits_t, m=cython.int, s=cython.double, part=cython.double, amperes=cython.double, current=cython.bint)
     cdef void _agree(self) noexcept
+    @cython.locals(m=cython.int, k=cython.int, s=cython.double)
+    cdef void _compare_order(self) noexcept
     @cython.locals(coil_new=cython.bint, i=cython.int, j=cython.int, k=cython.int, c=cython.int, s=cython.double,
                    elapsed=cython.double, gain=cython.double, prior=cython.double)
     cdef void _correct(self) noexcept

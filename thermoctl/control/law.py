@@ -22,6 +22,8 @@ both give the same bits (IEEE doubles, no contraction, one order of operations).
                 coil's voltage and R20 (1 + alpha (coil - 20 degC)) current;  current and the drive that was asked for;
                 position and the current that holds it against the flexures;  a watched temperature and its estimate;
                 the reference encoder and position + expansion (each encoder's own zero is taken while OFF);
+                two temperatures and their estimates, which must not stand the other way round: y_i > y_j while T_i < T_j
+                by so much that the readings would fit better exchanged, (y_i - y_j)(T_i - T_j) < -order_limit^2;
                 the coil's reading and what the model says of it alone, x - c with the sum of all corrections
                 c(n+1) = c(n) + (dt/T) (A-I) c(n) + k zeta e: a drifting sensor takes the estimate along, not this.
 
@@ -85,7 +87,7 @@ _SCALARS = (
     "phase_s", "coil_slow_c", "coil_rate_k_s", "coil_elapsed_s", "power_mean_w", "following_s", "idle_s",
     "saturation_s", "amplifier_s", "average_at", "averaged", "enable", "drive", "air_started", "resumed",
     "model_error_c", "ohm_v", "ohm_scale_v", "current_error_a", "displaced_um", "position_zero_um", "zeroed",
-    "reference_error_um", "reference_zero_um", "reference_zeroed")
+    "reference_error_um", "reference_zero_um", "reference_zeroed", "exchanged")
 _WHOLE = ("state", "tick", "latched", "average_at", "averaged")
 _VECTORS = ("x", "T", "T_before", "average", "age", "last", "same_s", "seen", "verdict", "corrections", "apart_c")
 _KEPT = ("air_c", "air_start_c", "air_known", "air_started", "corrected", "primed", "P", "expansion_before_um",
@@ -154,6 +156,7 @@ class Law:
         self.ohm_v = self.ohm_scale_v = self.current_error_a = 0.0
         self.displaced_um = self.position_zero_um = self.zeroed = 0.0
         self.reference_error_um = self.reference_zero_um = self.reference_zeroed = 0.0
+        self.exchanged = 0.0
         self.following_s = self.idle_s = self.saturation_s = self.amplifier_s = 0.0
         self.enable = self.drive = self.control_v = 0.0
         self.average_length = 1
@@ -194,7 +197,7 @@ class Law:
                                                                              p.resistance_v)
         self.current_per_drive, self.current_tolerance_a = p.current_per_drive, p.current_tolerance_a
         self.flexure_um_per_a, self.position_tolerance_um = p.flexure_um_per_a, p.position_tolerance_um
-        self.reference_tolerance_um = p.reference_tolerance_um
+        self.reference_tolerance_um, self.order_limit_c = p.reference_tolerance_um, p.order_limit_c
 
     def snapshot(self) -> np.ndarray:
         """The whole state as one float64 vector, for replay and for a warm restart."""
@@ -580,11 +583,15 @@ class Law:
         if self.corrected == 0.0:
             return
         part = min(1.0, self.dt / self.innovation_time_s)
-        for m in range(1, _M):
+        for m in range(_M):
             if self.verdict[_COIL + m] == 0.0 and self.predicts[m]:
                 self.apart_c[m] += part * (self.last[_COIL + m] - self.air_c - self.T[m] - self.apart_c[m])
-                if abs(self.apart_c[m]) > self.monitored_limit_c:
+                if m > 0 and abs(self.apart_c[m]) > self.monitored_limit_c:
                     self.faults |= one << _B_MONITORED
+        if self.fresh[_COIL]:
+            self._compare_order()
+        if self.exchanged > 0.0:
+            self.faults |= one << _B_MONITORED
         if self.expands and self.verdict[_REFERENCE] == 0.0 and self.verdict[_POSITION] == 0.0:
             s = self.last[_REFERENCE] - self.last[_POSITION] - self.expansion_um
             if self.reference_zeroed == 0.0:
@@ -594,6 +601,17 @@ class Law:
             self.reference_error_um += part * (s - self.reference_zero_um - self.reference_error_um)
             if abs(self.reference_error_um) > self.reference_tolerance_um:
                 self.faults |= one << _B_MONITORED
+
+    def _compare_order(self):
+        """exchanged: two mean readings would fit their estimates better the other way round."""
+        self.exchanged = 0.0
+        for m in range(1, _M):
+            for k in range(m):
+                if (self.predicts[m] and self.predicts[k] and self.verdict[_COIL + m] == 0.0
+                        and self.verdict[_COIL + k] == 0.0):
+                    s = self.T[m] - self.T[k]
+                    if (s + self.apart_c[m] - self.apart_c[k]) * s < -self.order_limit_c * self.order_limit_c:
+                        self.exchanged = 1.0
 
     def _arm(self, command):
         """The state machine; what tripped stays in `fault_bits` until FAULT is left."""

@@ -141,6 +141,7 @@ class Parameters:
     flexure_um_per_a: float = 0.0          # where a current holds the stage; 0: not compared
     position_tolerance_um: float = np.inf
     reference_tolerance_um: float = np.inf
+    order_limit_c: float = np.inf          # how far two temperatures may stand the wrong way round
 
     def pack(self) -> np.ndarray:
         """All numbers as one flat float64 vector (fields in order, arrays in place)."""
