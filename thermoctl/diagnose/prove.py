@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -345,35 +346,14 @@ def _lines(content: dict[str, Any]) -> Iterator[tuple[str, str, str, str, str, b
 
 
 def page(content: dict[str, Any], rows: Sequence[scoring.Row]) -> str:
-    """One self-contained HTML page: figures, reliability, confusion, what went wrong case by case."""
-    e = html.escape
-    figures = "".join(
-        f"<tr{' class=bad' if reached is False else ''}>" + "".join(f"<td>{e(c)}</td>" for c in cells) + "</tr>"
-        for *cells, reached in _lines(content)
-    )
-    called = sorted({c for row in content["confusion"].values() for c in row})
-    head = "".join(f"<th class=up><span>{e(c)}</span></th>" for c in called)
-    confusion = "".join(
-        f"<tr><th>{e(t)}</th>"
-        + "".join(
-            f"<td class='{'hit' if c.removeprefix('ambiguous: ') == t else 'miss'}'>{row[c]}</td>"
-            if c in row
-            else "<td></td>"
-            for c in called
-        )
-        + "</tr>"
-        for t, row in content["confusion"].items()
-    )
-    families = "".join(
-        f"<tr><td>{e(k)}</td>" + "".join(f"<td>{v}</td>" for v in b.values()) + "</tr>"
-        for part in ("by_family", "by_effect")
-        for k, b in content[part].items()
-    )
-    heads = "".join(f"<th>{e(k)}</th>" for k in next(iter(content["by_family"].values()), {}))
-    wrong = "".join(
-        f"<tr><td>{e(r.case)}</td><td>{e(r.family)}</td><td>{e(r.kind)} {e(r.band or '')}</td>"
-        f"<td>{e(_names(r.truth))}</td>"
-        f"<td>{e(r.verdict)}</td><td>{e(_names(r.findings))}</td><td>{e(r.error or '')}</td></tr>"
+    """One self-contained HTML page: figures, plots, confusion, by family and effect, what went wrong case by case."""
+    from thermoctl.report import page as sheet
+
+    def brief(part: str) -> str:
+        groups = content[part]
+        return sheet.table(["", *next(iter(groups.values()), {})], [[k, *b.values()] for k, b in groups.items()])
+    wrong = [
+        (r.case, r.family, f"{r.kind} {r.band or ''}", _names(r.truth), r.verdict, _names(r.findings), r.error or "")
         for r in rows
         if not (
             r.alike
@@ -383,57 +363,83 @@ def page(content: dict[str, Any], rows: Sequence[scoring.Row]) -> str:
             or r.kind == "unknown"
             and r.verdict == "unexplained"
         )
+    ]
+    kinds = ", ".join(f"{n} {k}" for k, n in sorted(Counter(r.kind for r in rows).items()))
+    sections = [
+        ("Figures", _figures(content)),
+        ("Plots", sheet.figure(_plots(content, rows), "Bars are 95 % intervals (Wilson).")),
+        ("Called (columns) against true (rows)", _confusion(content["confusion"])),
+        ("By rig family", brief("by_family")),
+        ("By effect", brief("by_effect")),
+        ("Not right", sheet.table(("case", "rig", "kind", "true", "verdict", "found", "error"), wrong)),
+    ]
+    note = (
+        f"{content['figures']['cases']} cases ({kinds}); thermoctl {content['version']} {content['commit'] or ''}. Answers were opened "
+        "after the last diagnosis. Red: a goal that is missed."
     )
-    return _PAGE.format(
-        cases=content["figures"]["cases"],
-        version=e(f"{content['version']} {content['commit'] or ''}"),
-        figures=figures,
-        plots=_plots(content, rows),
-        head=head,
-        confusion=confusion,
-        heads=heads,
-        families=families,
-        wrong=wrong,
+    return sheet.page("Proof on concealed cases", sections, note)
+
+
+def _figures(content: dict[str, Any]) -> str:
+    e = html.escape
+    body = "".join(
+        f"<tr{' class=bad' if reached is False else ''}>" + "".join(f"<td>{e(c)}</td>" for c in cells) + "</tr>"
+        for *cells, reached in _lines(content)
     )
+    return f"<table><tr><th>figure<th>is<th>95 % interval<th>of<th>goal</tr>{body}</table>"
+
+
+def _confusion(confusion: dict[str, dict[str, int]]) -> str:
+    e = html.escape
+    called = sorted({c for row in confusion.values() for c in row})
+    head = "".join(f"<th style='writing-mode:vertical-rl;text-align:left'>{e(c)}</th>" for c in called)
+    body = "".join(
+        f"<tr><th style='text-align:left'>{e(t)}</th>"
+        + "".join(
+            f"<td class={'good' if c.removeprefix('ambiguous: ') == t else 'bad'}><b>{row[c]}</b></td>" if c in row else "<td></td>"
+            for c in called
+        )
+        + "</tr>"
+        for t, row in confusion.items()
+    )
+    return f"<div style='overflow-x:auto'><table><tr><th></th>{head}</tr>{body}</table></div>"
 
 
 def _names(effects: Sequence[tuple[str, str]]) -> str:
     return ", ".join(f"{a} at {b}" for a, b in effects) or "nothing"
 
 
-_PAGE = """<!doctype html><html lang=en><meta charset=utf-8><title>Proof on concealed cases</title><style>
-body{{font:15px/1.4 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#222}}
-table{{border-collapse:collapse;margin:1rem 0}}td,th{{border:1px solid #ddd;padding:.2rem .5rem;text-align:left}}
-.bad td{{color:#b00020}}.hit{{background:#cfe8cf}}.miss{{background:#f6d5d5}}.up{{height:11rem;vertical-align:bottom}}
-.up span{{writing-mode:vertical-rl}}.wide{{overflow-x:auto}}svg{{max-width:100%;height:auto}}</style>
-<h1>Proof on {cases} concealed cases</h1><p>thermoctl {version}. Answers were opened after the last diagnosis.</p>
-<table><tr><th>figure<th>is<th>95 % interval<th>of<th>goal</tr>{figures}</table>{plots}
-<h2>Called (columns) against true (rows)</h2><div class=wide><table><tr><th></th>{head}</tr>{confusion}</table></div>
-<h2>By rig family and effect</h2><table><tr><th></th>{heads}</tr>{families}</table>
-<h2>Not right</h2><table><tr><th>case<th>rig<th>kind<th>true<th>verdict<th>found<th>error</tr>{wrong}</table></html>
-"""
-
-
-def _plots(content: dict[str, Any], rows: Sequence[scoring.Row]) -> str:
-    """Reliability diagram, held-out gain and time as one SVG."""
-    import io
-
+def _plots(content: dict[str, Any], rows: Sequence[scoring.Row]) -> Any:
+    """Detection and name by size, reliability, held-out gain, effect parameters, onset and time as one matplotlib figure."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12, 3.4), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
-    left.plot([0, 1], [0, 1], color="0.8")
-    bins = content["reliability"]
-    left.scatter([b["probability"] for b in bins], [b["right"] for b in bins], s=[10 + 2 * b["n"] for b in bins])
-    left.set(xlabel="probability given", ylabel="share right", title="Reliability")
+    figure = Figure(figsize=(12, 6.6), layout="constrained")
+    (size, reliable, gain), (wide, onset, clock) = figure.subplots(2, 3)
+    for shift, what, label in ((-0.08, "detected", "detected"), (0.08, "exact_name", "exact name")):
+        told = [(k, s) for k, b in enumerate(reversed(scoring.BANDS)) if (s := content["shares"][f"{what}_{b}"])["n"]]
+        y = [s["share"] for _, s in told]
+        spread = [[max(s["share"] - s["low"], 0) for _, s in told], [max(s["high"] - s["share"], 0) for _, s in told]]
+        size.errorbar([k + shift for k, _ in told], y, yerr=spread, fmt="o", capsize=3, label=label)
+    size.set(xticks=range(3), xticklabels=["small\n3–6 σ", "middle\n6–15 σ", "large\n> 15 σ"], ylim=(0, 1.05), title="By size", ylabel="share")
+    size.legend(loc="lower right")
+    reliable.plot([0, 1], [0, 1], color="0.8")
+    for b in content["reliability"]:
+        s = scoring.Share(round(b["right"] * b["n"]), int(b["n"]))
+        low, high = s.interval()
+        reliable.plot([b["probability"]] * 2, [low, high], color="C0", lw=1)
+        reliable.scatter([b["probability"]], [b["right"]], s=12 + 2 * b["n"], color="C0")
+    reliable.set(xlabel="probability given", ylabel="share right", title="Reliability", xlim=(0, 1.02), ylim=(0, 1.05))
     gains = [r.gain for r in rows if r.gain is not None and r.detected]
-    middle.hist([max(min(g, 1.2), -0.2) for g in gains], bins=28, range=(-0.2, 1.2))
-    middle.set(xlabel="share of the oracle's held-out gain", ylabel="cases", title="Held-out gain")
-    right.hist([r.seconds for r in rows if r.seconds is not None], bins=30)
-    right.set(xlabel="seconds", ylabel="cases", title="Time per case")
-    text = io.StringIO()
-    figure.savefig(text, format="svg")
-    return re.sub(r"^.*?(?=<svg)", "", text.getvalue(), flags=re.S)
+    gain.hist([max(min(g, 1.2), -0.2) for g in gains], bins=28, range=(-0.2, 1.2))
+    gain.set(xlabel="share of the oracle's held-out gain", ylabel="cases", title="Held-out gain")
+    errors = [p["error"] for r in rows for p in r.parameters]
+    wide.hist([min(x, 1.0) for x in errors], bins=20, range=(0, 1))
+    wide.set(xlabel="relative error (1: that or more)", ylabel="parameters", title="Effect parameters of right names")
+    onset.hist([min(r.onset_error, 0.2) for r in rows if r.onset_error is not None], bins=20, range=(0, 0.2))
+    onset.set(xlabel="share of the recording", ylabel="cases", title="Onset error")
+    clock.hist([r.seconds for r in rows if r.seconds is not None], bins=30)
+    clock.set(xlabel="seconds", ylabel="cases", title="Time per case")
+    return figure
 
 
 def real(
