@@ -2,34 +2,68 @@
 
 Each output channel's residual is white noise plus, where the data ask for it, a first-order coloured part: ARMA(1,1)
     e_k = phi e_(k-1) + w_k - theta w_(k-1),    phi = 0 .. 0.9995
-fitted anew under every explanation. A white likelihood on coloured residuals would call every long drift a discovery.
+or flicker noise (1/f^a, as a sum of first-order parts a factor of eight apart), fitted anew under every explanation. A white likelihood on coloured residuals would call every long drift a discovery.
 
     score = sum over channels of N log(s^2) + sum over channels and recordings of h(excess)     (smaller is better)
 
 The second sum is the prior that a sensor's colour is about as large as its white noise: excess = (rms / sigma)^2 - 1 costs
 half of itself, and beyond 30 only its logarithm more, since then every explanation is far off. Without it a slow noise
-process would swallow any slow physics of a short record.
+process would swallow any slow physics of a short record. Where the residual is larger than a sensor's colour can be (rms above
+LARGE sigmas), something is still missing, its part of the residual is no stationary noise, and its energy counts, too:
+WEIGHT * N * log(rms^2 / (LARGE sigma)^2). Innovations alone would let what is fast decide over what is large.
 """
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.signal import lfilter
+
+LARGE = 1.6         # coloured residual beyond this many sigmas of white noise is physics, not a sensor's colour
+WEIGHT = 0.1        # of the residual's energy beside its innovations, where it is larger than that
 
 _PHI = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 0.9995)
 _SHARE = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99)       # theta / phi
+_FLICKER = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)               # variance of the fastest first-order part over the white one's
+_SLOPES = (0.5, 0.75, 1.0, 1.3)                             # 1/f^slope
+_TIMES = 2.0 * 8.0 ** np.arange(5)                          # their time constants in samples
 
 
 @dataclass(frozen=True)
 class Colour:
-    """The noise of one channel under an explanation: innovation's sigma, phi and theta, and its -2 log likelihood."""
+    """The noise of one channel under an explanation: innovation's sigma, the filter ar(z)/ma(z) that turns it into white
+    noise, and its -2 log likelihood."""
     sigma: float
-    phi: float
-    theta: float
+    ar: tuple[float, ...]
+    ma: tuple[float, ...]
     score: float
+
+
+@cache
+def _filters() -> tuple[tuple[tuple[float, ...], tuple[float, ...], int], ...]:
+    """(ar, ma, parameters) of every colour that is tried."""
+    arma = [((1.0, -phi), (1.0, -phi * share), 2) for phi in _PHI for share in (_SHARE if phi else (0.0,))]
+    return ((1.0,), (1.0,), 0), *arma[1:], *((*flicker(v, slope), 2) for v in _FLICKER for slope in _SLOPES)
+
+
+def flicker(variance: float, slope: float = 1.0) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """(ar, ma) of white noise of variance 1 beside first-order parts, the fastest of `variance`: the spectrum
+    1 + sum q / |1 - phi e^(-iw)|^2 in factors. With y = cos(w) - 1 its zeros are real and lie between its poles."""
+    phi = np.exp(-1 / _TIMES[::-1])                     # the slowest part's pole comes first in y
+    q = variance * (_TIMES[::-1] / _TIMES[0]) ** (slope - 1) * (1 - phi ** 2)
+    edge = (1 - phi) ** 2 / (2 * phi)
+
+    def spectrum(y: float) -> float:
+        return 1 + float(np.sum(q / ((1 - phi) ** 2 - 2 * phi * y)))
+    zeros = []
+    for low, high in zip(edge, [*edge[1:], 1e6], strict=True):
+        y = brentq(spectrum, low * (1 + 1e-12), high * (1 - 1e-12), xtol=1e-18, rtol=1e-14)
+        zeros.append(1 + y - np.sqrt(y * (y + 2)))
+    return tuple(map(float, np.poly(phi))), tuple(map(float, np.poly(zeros)))
 
 
 def colour(parts: Sequence[np.ndarray], floor: float) -> Colour:
@@ -38,24 +72,18 @@ def colour(parts: Sequence[np.ndarray], floor: float) -> Colour:
     parts = [p[np.isfinite(p)] for p in parts]
     parts = [p for p in parts if len(p) > 8]
     n = sum(map(len, parts))
-    if not n:
-        return Colour(floor, 0.0, 0.0, 0.0)
-    best = None
-    for phi in _PHI:
-        for share in (_SHARE if phi else (0.0,)):
-            theta = phi * share
-            variance = _variance(parts, phi, theta)
-            variance = max(variance, floor ** 2)
-            score = n * np.log(variance) + (0.0 if phi == 0 else 2 * np.log(n))
-            if best is None or score < best.score - 1e-9:
-                best = Colour(float(np.sqrt(variance)), phi, theta, float(score))
-    assert best is not None
+    best = Colour(floor, (1.0,), (1.0,), np.inf if n else 0.0)
+    for ar, ma, parameters in _filters() if n else ():
+        variance = max(_variance(parts, ar, ma), floor ** 2)
+        score = n * np.log(variance) + parameters * np.log(n)
+        if score < best.score - 1e-9:
+            best = Colour(float(np.sqrt(variance)), ar, ma, float(score))
     return best
 
 
-def _variance(parts: Sequence[np.ndarray], phi: float, theta: float) -> float:
+def _variance(parts: Sequence[np.ndarray], ar: tuple[float, ...], ma: tuple[float, ...]) -> float:
     """Variance of the innovations, outliers beyond 5 sigmas counted as 5."""
-    w = np.concatenate([_innovations(p, phi, theta) for p in parts])
+    w = np.concatenate([_innovations(p, ar, ma) for p in parts])
     spread = 1.4826 * float(np.median(np.abs(w))) or float(np.std(w))
     raw = float(np.mean(w ** 2))
     if spread <= 0:
@@ -64,11 +92,12 @@ def _variance(parts: Sequence[np.ndarray], phi: float, theta: float) -> float:
     return float(np.mean(np.minimum(np.abs(w), limit) ** 2))
 
 
-def _innovations(e: np.ndarray, phi: float, theta: float) -> np.ndarray:
-    if phi == 0:
+def _innovations(e: np.ndarray, ar: tuple[float, ...], ma: tuple[float, ...]) -> np.ndarray:
+    if len(ar) == 1:
         return e
-    w = lfilter([1.0, -phi], [1.0, -theta], e)
-    w[0] *= np.sqrt(1 - phi ** 2)      # the first sample comes from the stationary distribution
+    w = lfilter(ar, ma, e)
+    if len(ar) == 2:
+        w[0] *= np.sqrt(1 - ar[1] ** 2)      # the first sample comes from the stationary distribution
     return w
 
 
@@ -95,5 +124,7 @@ def _price(e: np.ndarray, sigma: float) -> float:
     if not len(e):
         return 0.0
     limit = 8 * max(sigma, 1.5 * float(np.median(e)))
-    excess = max(float(np.mean(np.minimum(e, limit) ** 2)) / sigma ** 2 - 1.0, 0.0)
-    return 0.5 * (excess if excess <= 30 else 30 * (1 + float(np.log(excess / 30))))
+    power = float(np.mean(np.minimum(e, limit) ** 2)) / sigma ** 2
+    excess = max(power - 1.0, 0.0)
+    return 0.5 * (excess if excess <= 30 else 30 * (1 + float(np.log(excess / 30)))) \
+        + WEIGHT * len(e) * max(float(np.log(max(power, 1e-9) / LARGE ** 2)), 0.0)

@@ -22,7 +22,7 @@ import numpy as np
 
 from thermoctl.diagnose import locate, observer
 from thermoctl.diagnose.effects import CATALOGUE, PLACES, Candidate, Rig, candidates, catalogue
-from thermoctl.diagnose.evidence import Colour, channels, white_sigma
+from thermoctl.diagnose.evidence import LARGE, Colour, channels, white_sigma
 from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, save
@@ -39,7 +39,6 @@ NAME = 0.9                  # one explanation is named alone from this probabili
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 REMAINS = -8.0              # log10 p of an unknown smooth input from which something is left over
-LARGE = 1.6                 # coloured residual beyond this is physics, not a sensor's colour
 TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
 BLOCKS = 8                  # of a single recording, every other one held out
 SPREAD = 0.06, 0.2          # least and greatest spread of parameters round their beliefs, in shares of their ranges
@@ -224,6 +223,7 @@ class Round:
     rig: Rig
     directions: list[Direction]
     chance: np.ndarray | None
+    coloured: bool = False
     finalists: list[Explanation] = field(default_factory=list)
 
     def p_any(self) -> float:
@@ -238,8 +238,11 @@ class Round:
         return float(min(1 / (len(self.chance) + 1), 0.1 * 10 ** (best - floor)))
 
 
-def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool = False) -> Round:
-    """Screen the catalogue from an explanation; `coloured`: in the metric of the residual's own colour."""
+def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool | None = None) -> Round:
+    """Screen the catalogue from an explanation; `coloured`: in the metric of the residual's own colour (unless said: where
+    the residual is no larger than a sensor's colour can be)."""
+    if coloured is None:
+        coloured = max(case.excess(base).values(), default=0.0) < CLEAN and any(len(c.ar) > 1 for c in base.colours)
     model = base.fit.model
     drives = [model.drive(t) for t in case.tables]
     for d in drives:
@@ -249,7 +252,7 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
     found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
     noise = np.random.default_rng(1).standard_normal((len(metric.residual), draws)) if draws else None
     ranked, chance = screen(metric, rig, found, noise)
-    return Round(base, metric, rig, ranked, chance)
+    return Round(base, metric, rig, ranked, chance, coloured)
 
 
 def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direction]:
@@ -324,22 +327,25 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     followed = None
     if max(case.excess(base).values(), default=0.0) > FAR and Rig(base.plant, case.drives, [t.columns for t in case.tables]).velocities:
         followed = _following(case, base, entries, most)
-    if followed and max(case.excess(followed[0]).values()) < CLEAN:
+    if followed:
         current, reference, rivals = followed
         rounds = [look(case, base, entries)]
+        if max(case.excess(current).values()) >= CLEAN and len(current.effects) < most:
+            more, others, looks = search(case, base, entries, most, current)
+            if len(more.effects) > len(current.effects):
+                current = reference = more
+                rivals, rounds = others, [*rounds, *looks]
     else:
         current, rivals, rounds = search(case, base, entries, most)
         reference = current
-        if followed and followed[0].score < current.score - ACCEPT:
-            current, reference, rivals = followed
     first = rounds[0]
     left_over = False
     if not current.effects and first.p_any() < 1e-3:
         # In white noise's metric something stands out, but nothing counts: the residual's own colour decides.
         case.progress("screening in the colour of the residual")
-        tinted = look(case, base, entries, coloured=True)
+        tinted = first if first.coloured else look(case, base, entries, coloured=True)
         left_over = tinted.p_any() < 1e-3
-        if left_over:
+        if left_over and tinted is not first:
             tinted.finalists = compete(case, tinted, finalists(tinted.directions))
             if tinted.finalists and counts(tinted, tinted.finalists[0]):
                 current = reference = tinted.finalists[0]
@@ -393,12 +399,13 @@ def counts(seen: Round, e: Explanation) -> bool:
     return gain > 0 and log_p(gain, e.direction.dims) < min(float(np.min(seen.chance)), -3.5) - 0.3
 
 
-def search(case: Case, base: Explanation, entries: Mapping[str, Any],
-           most: int) -> tuple[Explanation, list[Explanation], list[Round]]:
-    """Add effects while the evidence asks for them; then take each out again. Returns the best explanation, its rivals and
-    the looks that were taken."""
+def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
+           start: Explanation | None = None) -> tuple[Explanation, list[Explanation], list[Round]]:
+    """Add effects (to `start`, if given) while the evidence asks for them; then take each out again. Returns the best
+    explanation, its rivals and the looks that were taken."""
     case.progress("screening the catalogue")
-    rounds, current = [look(case, base, entries)], base
+    current = start or base
+    rounds = [look(case, current, entries)]
     rivals: list[Explanation] = []
     while len(current.effects) < most:
         seen = rounds[-1]
@@ -472,7 +479,7 @@ def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanatio
 
 
 def _colours(e: Explanation) -> tuple[Noise, ...]:
-    return tuple(Noise(c.sigma, c.phi, c.theta) for c in e.colours)
+    return tuple(Noise(c.sigma, 0.0, c.ar, c.ma) for c in e.colours)
 
 
 def remains(case: Case, e: Explanation) -> bool:

@@ -28,11 +28,12 @@ BELIEF_WEIGHT = 0.02    # a whole range away from the belief costs as much as a 
 
 @dataclass(frozen=True)
 class Noise:
-    """One channel's noise: standard deviation, and its colour over one median sampling interval. With `theta` it is
-    ARMA(1,1), white noise beside a first-order coloured part, and `sigma` is that of the innovations."""
+    """One channel's noise: standard deviation, and its colour over one median sampling interval. With a filter ar(z)/ma(z)
+    that turns it into white noise, `sigma` is that of the innovations."""
     sigma: float
     phi: float = 0.0
-    theta: float = 0.0
+    ar: tuple[float, ...] = (1.0,)
+    ma: tuple[float, ...] = (1.0,)
 
 
 @dataclass
@@ -183,23 +184,44 @@ class Problem:
         part = e if len(index) == len(e) else e[index]
         shape = (-1, *([1] * (part.ndim - 1)))
         noise = self.noise[j]
-        if noise.theta > 0 and len(index) > 1:
-            return lfilter([1.0, -noise.phi], [1.0, -noise.theta], part, axis=0) / noise.sigma
+        if len(noise.ar) > 1 and len(index) > 1:
+            return lfilter(noise.ar, noise.ma, part, axis=0) / noise.sigma
         if len(index) > 1 and phi.any():
             part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
         return part / scale.reshape(shape)
 
     def set_outlier_limits(self, residuals: Sequence[np.ndarray]) -> bool:
         """Huber's limit of each output from the spread of its residuals: what a plant that lacks physics misses is no
-        outlier. True where a limit changed by more than a half."""
+        outlier, nor is what happens in more than one sample of fifty. True where a limit changed by more than a half."""
         new = np.full(len(self.noise), HUBER)
         for j in range(len(self.noise)):
             w = np.concatenate([self.whiten(r, j, e[:, j]) for r, e in enumerate(residuals)])
             if len(w):
-                new[j] = HUBER * max(1.0, 1.4826 * float(np.median(np.abs(w))))
+                middle, high = np.quantile(np.abs(w), [0.5, 0.98])
+                new[j] = max(HUBER * max(1.0, 1.4826 * float(middle)), float(high))
         changed = bool(np.any((new > 1.5 * self.huber) | (new < self.huber / 1.5)))
         self.huber = new
         return changed
+
+    def _slopes(self, r: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The columns of recording r's sensitivities that are unknowns, which unknowns, and their slopes d q / d z."""
+        used = np.flatnonzero(self.columns[r] >= 0)
+        active = self.model.active
+        return used, self.columns[r, used], np.array(
+            [self.scales[active[c]].slope(values[self.model.parameters.index(active[c])]) if c < len(active)
+             else self.sigma0[self.columns[r, c] - self.n_parameters] for c in used])
+
+    def prior(self) -> np.ndarray:
+        """What each unknown's belief weighs (its entry in the Gauss-Newton matrix)."""
+        return np.concatenate([np.full(self.n_parameters, BELIEF_WEIGHT ** 2), np.ones(len(self.unknowns) - self.n_parameters)])
+
+    def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray]:
+        """Which unknowns recording r feels (k,), and the outputs' slopes by them (N, ny, k)."""
+        values, dx0 = self.unpack(z)
+        run = self.model.run(self.drives[r], values[r], dx0[r], sensitivities=True)
+        used, k, slope = self._slopes(r, values[r])
+        assert run.dy is not None
+        return k, run.dy[:, :, used] * slope
 
     def evaluate(self, z: np.ndarray, jacobian: bool) -> tuple[float, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Cost, gradient/2 and Gauss-Newton matrix by the unknowns, raw residuals. Raises SimulationError."""
@@ -214,10 +236,7 @@ class Problem:
             if not np.all(np.isfinite(run.y)):
                 raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
             residuals.append(e)
-            used = np.flatnonzero(self.columns[r] >= 0)
-            k = self.columns[r, used]
-            slope = np.array([self.scales[self.model.active[c]].slope(values[r, self.model.parameters.index(self.model.active[c])])
-                              if c < len(self.model.active) else self.sigma0[self.columns[r, c] - self.n_parameters] for c in used])
+            used, k, slope = self._slopes(r, values[r])
             part_gradient, part_matrix = np.zeros(len(k)), np.zeros((len(k), len(k)))
             for j in range(len(self.noise)):
                 if not len(self.rows[r][j][0]):
@@ -238,7 +257,7 @@ class Problem:
             if jacobian:
                 np.add.at(gradient, k, part_gradient * slope)
                 matrix[np.ix_(k, k)] += part_matrix * np.outer(slope, slope)
-        prior = np.concatenate([np.full(self.n_parameters, BELIEF_WEIGHT ** 2), np.ones(n - self.n_parameters)])
+        prior = self.prior()
         away = z - self.belief
         cost += float(np.sum(prior * away ** 2))
         return cost, gradient - prior * away, matrix + np.diag(prior), residuals
