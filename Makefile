@@ -101,3 +101,7 @@ bench-diagnosis: install
 .PHONY: demo-concealed
 demo-concealed: install
 	$(BIN)/python tests/demo_concealed.py
+
+.PHONY: hazards
+hazards: install                   # every hazard with its limit; the table of what was measured goes to docs/proof/hazards.md
+	THERMOCTL_HAZARDS=docs/proof/hazards.md $(BIN)/python -m pytest -m "slow or not slow" tests/hazards

@@ -135,7 +135,7 @@ class ProtectionSettings:
     position_tolerance_um: float = option("largest mean difference of position and current x flexure_um_per_a", 40.0, "um", 0.0, 1e6)
     reference_tolerance_um: float = option("largest mean difference of the output reference from the estimated output", 10.0, "um",
                                            0.0, 1e6)
-    order_limit_c: float = option("how far two temperatures may stand the other way round than their estimates", 1.5, "K", 0.0, 1e3)
+    order_limit_c: float = option("how far two temperatures may stand the other way round than their estimates", 1.2, "K", 0.0, 1e3)
 
 
 @dataclass(frozen=True)
