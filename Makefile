@@ -105,3 +105,7 @@ demo-concealed: install
 .PHONY: hazards
 hazards: install                   # every hazard with its limit; the table of what was measured goes to docs/proof/hazards.md
 	THERMOCTL_HAZARDS=docs/proof/hazards.md $(BIN)/python -m pytest -m "slow or not slow" tests/hazards
+
+.PHONY: walkthrough
+walkthrough:                       # a new user's walk: a clean clone, every command of README, a diagnosed recording
+	$(PYTHON) tests/walkthrough/walk.py

@@ -12,6 +12,13 @@ from collections.abc import Callable, Sequence
 from thermoctl import __version__
 from thermoctl.yamlfile import InputError
 
+DESCRIPTION = """\
+Holds the output of a precision linear actuator where it belongs while its coil heats up, and says what physics a
+simulation left out when it disagrees with a recording.
+
+Exit status: 0 done; 1 the answer is no (a check failed, the daemon is not running, a fault stands); 2 unusable input (one
+line on stderr says what, where, what was expected); 3 the hardware or the system refused; 130 interrupted."""
+
 
 def _add(sub: argparse._SubParsersAction, name: str, help: str, run: Callable[[argparse.Namespace], int | None],
          *arguments: tuple) -> argparse.ArgumentParser:
@@ -211,7 +218,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
 
 
 def _people_commands(sub: argparse._SubParsersAction) -> None:
-    """dashboard, monitor, mqtt, calibrate, fleet, completion."""
+    """dashboard, monitor, mqtt, calibrate, fleet, completion, manual."""
     config = ("--config", {"metavar": "FILE", "help": "configuration, found as by `thermoctl status`"})
 
     def dashboard(args: argparse.Namespace) -> int:
@@ -276,10 +283,17 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     _add(sub, "completion", "print the shell completion; source it", completion,
          ("shell", {"choices": ["bash", "zsh", "tcsh"]}))
 
+    def manual(args: argparse.Namespace) -> int:
+        from thermoctl.manual import manual
+        return manual(parser(), args.action, args.root)
+    _add(sub, "manual", "the manual page, written from these very commands: show it, or install it with the shells' completions",
+         manual, ("action", {"nargs": "?", "choices": ["show", "install", "uninstall"], "default": "show"}),
+         ("--root", {"default": "/", "metavar": "DIR", "help": "install below this directory"}))
+
 
 def parser() -> argparse.ArgumentParser:
     """The whole command line (also read by the completion and by the reference page)."""
-    top = argparse.ArgumentParser(prog="thermoctl", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    top = argparse.ArgumentParser(prog="thermoctl", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter)
     top.add_argument("--version", action="version", version=f"thermoctl {__version__}")
     sub = top.add_subparsers(metavar="COMMAND", required=True)
     for declare in (_daemon_commands, _recording_commands, _plant_commands, _identify_commands, _diagnose_commands,
