@@ -362,6 +362,7 @@ class Wizard:
         compensator = chain.better_compensator(kalman, um, self.settings.loop.period_s)
         last = tests[-1]
         left = last.error_um - _estimate(kalman, um, last)
+        thin = max(1, len(left) // 2000)
         path = self.folder / "model.yaml"
         path.unlink(missing_ok=True)
         figures = {"method": "better", "time_constants_s": np.asarray(model.info["time_constants_s"]).tolist(),
@@ -369,7 +370,7 @@ class Wizard:
         modelfile.save_model(path, compensator, self.settings.rig.name, [self._recording(n) for n in ("test_2", "test_3", "test_4a")], figures)
         return {"said": f"order {model.order}, temperatures to {figures['residual_rms_k']:.3f} K rms, expansion to "
                         f"{figures['expansion_rms_um']:.3f} um rms of {_rms(last.error_um):.2f}", **figures, "grown_rms_um": _rms(last.error_um),
-                "t": last.t[::5].tolist(), "measured_um": _plain(last.error_um[::5]), "left_um": _plain(left[::5])}
+                "t": last.t[::thin].tolist(), "measured_um": _plain(last.error_um[::thin]), "left_um": _plain(left[::thin])}
 
     def _proof(self) -> dict[str, Any]:
         t = read_table(self._recording("test_4b"))
@@ -448,6 +449,10 @@ def _plain(x: np.ndarray) -> list[float | None]:
     return [float(f"{v:.6g}") if math.isfinite(v) else None for v in x.tolist()]
 
 
+def _for_people(said: str) -> str:
+    return said.replace("+-", "±").replace(" um", " µm").replace(" deg", "°")
+
+
 def _span(s: float) -> str:
     return f"{s:.0f} s" if s < 120 else f"{s / 60:.0f} min" if s < 7200 else f"{int(s // 3600)} h {s % 3600 / 60:.0f} min"
 
@@ -480,7 +485,7 @@ def _report(settings: Any, where: str, done: dict[str, dict[str, Any]]) -> str:
     def curve(x: list, key: list) -> tuple[np.ndarray, np.ndarray]:
         return np.array(x), np.array([np.nan if v is None else v for v in key])
 
-    sections = [("", f'<p style="font-size:1.15rem"><b>{"Better" if proof["better"] else "No better"}:</b> position error '
+    sections = [("", f'<p class="lead"><b>{"Better" if proof["better"] else "No better"}:</b> position error '
                      f'{proof["before"][0]:+.2f} ± {proof["before"][1]:.2f} µm without compensation, {proof["after"][0]:+.3f} ± '
                      f'{proof["after"][1]:.3f} µm with the new model (ISO 230-2: mean ± 2 s, at rest).</p>')]
     fig, (a, b) = axes(2)
@@ -489,7 +494,7 @@ def _report(settings: Any, where: str, done: dict[str, dict[str, Any]]) -> str:
     b.plot(np.array(proof["t"]) / 60, curve(proof["t"], proof["with_um"])[1], color="#0b6bcb", lw=0.8)
     a.set(ylabel="error (µm)")
     b.set(ylabel="with, enlarged (µm)", xlabel="time (min)")
-    a.legend(frameon=False, fontsize=8)
+    fig.legend(*a.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False, fontsize=8)
     sections.append(("Proof: before and after", figure(fig, f"Test 4B. How it was made: {proof['how']}.")))
     fig, (a, b) = axes(2)
     t = np.array(model["t"]) / 60
@@ -498,7 +503,7 @@ def _report(settings: Any, where: str, done: dict[str, dict[str, Any]]) -> str:
     b.plot(t, curve(t.tolist(), model["left_um"])[1], color="#0b6bcb", lw=0.8)
     a.set(ylabel="expansion (µm)")
     b.set(ylabel="left (µm)", xlabel="time (min)")
-    a.legend(frameon=False, fontsize=8)
+    fig.legend(*a.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False, fontsize=8)
     sections.append(("Model", table(("figure", "value"), [
         ("time constants, s", ", ".join(f"{v:.4g}" for v in model["time_constants_s"])), ("temperatures, K rms", model["residual_rms_k"]),
         ("expansion left over test 4A, µm rms", model["expansion_rms_um"]), ("expansion itself, µm rms", model["grown_rms_um"])])
@@ -511,11 +516,11 @@ def _report(settings: Any, where: str, done: dict[str, dict[str, Any]]) -> str:
         a.plot(1e3 * ts, y - y[ts < 0].mean(), ".", ms=2, color="#1b1f24", label="measured")
         a.plot(1e3 * ts, np.where(ts > 0, fitted.step(ts) * STEP_DRIVE, 0.0), color="#0b6bcb", lw=1, label="second order with dead time")
         a.set(xlabel="time (ms)", ylabel="position (µm)")
-        a.legend(frameon=False, fontsize=8)
+        fig.legend(*a.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False, fontsize=8)
         rows = [(k, g["kp"], g["ti_s"], g["td_s"], g["gain"], g["phase_deg"], g["how"]) for k, g in pid.items() if isinstance(g, dict)]
-        sections.append(("Step and PID", figure(fig, f"Open-loop step of {STEP_DRIVE:g} of the drive. {step['said']}.") + table(
+        sections.append(("Step and PID", figure(fig, f"Open-loop step of {STEP_DRIVE:g} of the drive. {_for_people(step['said'])}.") + table(
             ("gains", "kp", "ti, s", "td, s", "gain margin", "phase margin, °", "how"), rows)))
-    sections.append(("Steps", table(("step", "result"), [(k, v["said"]) for k, v in done.items()])))
+    sections.append(("Steps", table(("step", "result"), [(k.replace("_", " "), _for_people(v["said"])) for k, v in done.items()])))
     return page("Calibration", sections, f"rig '{settings.rig.name}' · {where}")
 
 

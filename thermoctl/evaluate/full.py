@@ -64,66 +64,89 @@ def scaled_truth(plant_file: str | Path, path: Path) -> Path:
     return path
 
 
-def agreement(plant_file: Path, test: rigs.Recorded, schedule: experiments.Schedule) -> dict[str, float]:
-    """The quasi-static plant on the same schedule and recorded air against the full run: power, temperature and position error rms, and
-    the largest difference of position, once the thermometers' steps are averaged over a minute."""
+def still(plant_file: Path, test: rigs.Recorded, schedule: experiments.Schedule, seed: int) -> rigs.Recorded:
+    """The quasi-static plant on the same schedule and the same recorded air as a full run, read by the same instruments."""
     p = plant.load(plant_file)
-    still = rigs.quasi_static(p)
     n = len(test.t)
     value = {k: v.value for k, v in p.parameters.items()}
-    fine = np.arange(n * 10) / 10
-    x = schedule.at(fine) * 1e-6
+    x = schedule.at(np.arange(n * 10) / 10) * 1e-6
     v = np.gradient(x, 0.1)
     i = (value["k_flexure"] * x + value["b_eddy"] * v) / value["k_T"]
-    air = chain.smooth_air(test.air_c)
-    columns = {"current": np.sqrt((i**2).reshape(n, 10).mean(1)), "eddy_w": (value["b_eddy"] * v**2).reshape(n, 10).mean(1), "air": air,
-               **{f"heat_{b}": np.zeros(n) for b in rigs.HEATED}}
-    model = still.compile()
+    columns = {"current": np.sqrt((i**2).reshape(n, 10).mean(1)), "eddy_w": (value["b_eddy"] * v**2).reshape(n, 10).mean(1),
+               "air": chain.smooth_air(test.air_c), **{f"heat_{b}": np.zeros(n) for b in rigs.HEATED}}
+    model = rigs.quasi_static(p).compile()
     sim = model.simulate(Table("still", "still", np.arange(n, dtype=float), columns))
     names = list(model.outputs)
-    order = [names.index(f"{q}_c") for q in POINTS]
-    minute = n // 60 * 60
+    true_c = sim.y[:, [names.index(f"{q}_c") for q in POINTS]]
+    true_um = sim.y[:, names.index("error_um")] - sim.y[0, names.index("error_um")]
+    rng = np.random.default_rng([seed, n])
+
+    def read(y: np.ndarray, name: str) -> np.ndarray:
+        o = p.outputs[name]
+        return np.round((y + (o.noise or 0.0) * rng.standard_normal(y.shape)) / (o.resolution or 1e-9)) * (o.resolution or 1e-9)
+
+    measured = np.column_stack([read(true_c[:, j], f"{q}_c") for j, q in enumerate(POINTS)])
+    error = read(true_um, "output_reference_um") - read(np.zeros(n), "position_um")
+    return rigs.Recorded(test.t, sim.y[:, names.index("power_w")], test.air_c, measured, error - error[:5].mean(), true_c, true_um,
+                         schedule.at(test.t))
+
+
+def agreement(full: rigs.Recorded, quasi: rigs.Recorded) -> dict[str, float]:
+    """How far the quasi-static run of a test is from the full one, minute by minute (instruments' steps averaged out): temperature and
+    position error, rms and largest; and the ratio of the energies."""
+    minute = len(full.t) // 60 * 60
+
     def mean(a: np.ndarray) -> np.ndarray:
         return a[:minute].reshape(minute // 60, 60, -1).mean(1)
-    dt = mean(sim.y[:, order]) - mean(test.temperatures)
-    error = sim.y[:, names.index("error_um")]
-    de = mean((error - error[0])[:, None]) - mean(test.error_um[:, None])
+    dt = mean(quasi.true_c) - mean(full.temperatures)
+    de = mean(quasi.true_um[:, None]) - mean(full.error_um[:, None])
     return {"temperature_rms_k": float(np.sqrt(np.mean(dt**2))), "temperature_max_k": float(np.abs(dt).max()),
             "position_rms_um": float(np.sqrt(np.mean(de**2))), "position_max_um": float(np.abs(de).max()),
-            "energy_ratio": float(sim.y[:, names.index("power_w")].sum() / test.power_w.sum())}
+            "position_range_um": float(np.ptp(mean(full.error_um[:, None]))),
+            "energy_ratio": float(quasi.power_w.sum() / full.power_w.sum())}
 
 
 def run(config: str, plant_file: str, folder: Path, say: Any = print, part: float = 1.0) -> dict[str, Any]:
     """Everything; returns figures and the recordings {name: rows}. `part` < 1 is for tests: only that part of each test."""
-    truth = str(scaled_truth(plant_file, folder / "truth.yaml"))
+    truth = scaled_truth(plant_file, folder / "truth.yaml")
     tests = experiments.load_experiments(Path(config).parent / "experiments.yaml")
     with ProcessPoolExecutor(2) as pool:
-        a = pool.submit(run_test, config, truth, ["test_2"], None, 1000, part)
-        b = pool.submit(run_test, config, truth, ["test_3", "test_4a"], None, 1000, part)
-        rows = {"test_2": a.result()[0], **dict(zip(("test_3", "test_4a"), b.result(), strict=True))}
+        waiting = {k: pool.submit(run_test, config, str(truth), [k], None, 1000, part) for k in ("test_2", "test_3", "test_4a")}
+        rows = {k: f.result()[0] for k, f in waiting.items()}
         say("full run: calibration tests done")
         r = {k: recorded(v) for k, v in rows.items()}
         calibration = chain.calibrate(r["test_2"], r["test_3"], r["test_4a"])
         models = {k: chain.compensator(calibration, k) for k in ("paper", "better")}
-        futures = {k: pool.submit(run_test, config, truth, ["test_4b"], m, 1000, part) for k, m in models.items()}
+        futures = {k: pool.submit(run_test, config, str(truth), ["test_4b"], m, 1000, part) for k, m in models.items()}
         for k, f in futures.items():
             rows[f"test_4b_{k}"] = f.result()[0]
         say("full run: compensated tests done")
     arrays: dict[str, Any] = {"columns": np.array(NAMES), **rows}
     np.savez_compressed(folder / "full_run.npz", **arrays)
-    figures: dict[str, Any] = {"agreement": agreement(Path(truth), r["test_2"], tests["test_2"])}
-    for k in models:
+    return {"figures": judge(truth, rows, calibration, tests), "rows": rows, "calibration": calibration}
+
+
+def judge(truth: Path, rows: dict[str, np.ndarray], calibration: chain.Calibration, tests: dict[str, experiments.Schedule]) -> dict[str, Any]:
+    """(mean, 2 s) of test 4B wherever the reference stands at its target: the output's error under each compensator (`paper`, `better`),
+    what each estimator and the coil alone leave of the growth in the better one's run, and the same from the quasi-static plant
+    (`still_...`); and the agreement of the two plants over tests 2 and 4A."""
+    figures: dict[str, Any] = {}
+    r = {k: recorded(v) for k, v in rows.items()}
+    for k in ("paper", "better"):
         w = rows[f"test_4b_{k}"]
         col = {n: w[:, i] for n, i in INDEX.items()}
-        growth = col["output_reference_um"] - col["position_raw_um"]
-        growth = growth - growth[:5].mean()
         at_rest = np.abs(col["reference_um"] - col["setpoint_um"]) < 1e-9
         left = col["output_reference_um"] - col["reference_um"]
-        left = left - left[:5].mean()
-        figures[k] = mean_and_two_s(left[at_rest])
-        figures["uncompensated"] = mean_and_two_s(growth[at_rest])
-        figures[f"{k}_estimator"] = mean_and_two_s((growth - col["expansion_um"])[at_rest])
-        if k == "better":
-            coil = chain.filled(chain.rises(recorded(w))[:, :1])
-            figures["siso"] = mean_and_two_s((growth - calibration.siso_um.predict(coil))[at_rest])
-    return {"figures": figures, "rows": rows, "calibration": calibration}
+        figures[k] = mean_and_two_s((left - left[:5].mean())[at_rest])
+    growth = r["test_4b_better"].error_um
+    figures["uncompensated"] = mean_and_two_s(growth[at_rest])
+    quasi = {k: still(truth, r[k], tests[k.removesuffix("_better")], 1) for k in ("test_2", "test_3", "test_4a", "test_4b_better")}
+    again = chain.calibrate(quasi["test_2"], quasi["test_3"], quasi["test_4a"])
+    for label, c, recording in (("", calibration, r["test_4b_better"]), ("still_", again, quasi["test_4b_better"])):
+        estimate = chain.estimates(c, recording, starts_anew=True)
+        for k in ("siso", "paper", "better", "twelve"):
+            error = recording.error_um - estimate[k]
+            figures[f"{label}{k}_estimator"] = mean_and_two_s((error - error[:60].mean())[at_rest[:len(error)]])
+    figures["still_uncompensated"] = mean_and_two_s(quasi["test_4b_better"].error_um[at_rest])
+    figures["agreement"] = {k: agreement(r[k], quasi[k]) for k in ("test_2", "test_4a")}
+    return figures

@@ -19,12 +19,18 @@ from thermoctl.signals import POINTS
 
 CUTOFF_HZ = 4.3e-4
 CALIBRATION_S = 7200
+SEEN, FRESH = range(12), range(1000, 1012)
+"""Seeds. Methods and rigs (rigs.PAPER_SCALE, rigs.HEAT_W, chain.PAPER_CHOICES) were chosen while the first were looked at; what is
+promised is judged on the others, which nothing was chosen by."""
+DISTURBED_SEEDS = 4
+CALMER = 0.4                        # of the chamber's drift, where the report asks why
 
 
-def one_seed(plant_file: str, tests_file: str, seed: int, disturbance: str | None = None, keep: bool = False) -> dict[str, Any]:
-    """All estimators on one rig: {estimator: (mean, 2 s)} over test 4B, temperature errors in test 3, and (`keep`) what the figures need."""
+def one_seed(plant_file: str, tests_file: str, seed: int, disturbance: str | None = None, keep: bool = False, **ease: float) -> dict[str, Any]:
+    """All estimators on one rig: {estimator: (mean, 2 s)} over test 4B, temperature errors in test 3, and (`keep`) what the figures need.
+    `ease`: as rigs.Rig takes it."""
     tests = experiments.load_experiments(tests_file)
-    rig = rigs.Rig(plant.load(plant_file), seed, disturbance, rigs.PAPER_SCALE)
+    rig = rigs.Rig(plant.load(plant_file), seed, disturbance, rigs.PAPER_SCALE, **ease)
     run4 = rigs.joined(tests["test_4a"], tests["test_4b"], "test_4")
     r2, r3, r4 = rig.run(tests["test_2"], 1), rig.run(tests["test_3"], 2), rig.run(run4, 4)
     r4a = rigs.Recorded(*(getattr(r4, f.name)[:CALIBRATION_S] for f in dataclasses.fields(r4)))
@@ -40,12 +46,12 @@ def one_seed(plant_file: str, tests_file: str, seed: int, disturbance: str | Non
             figures[k] = (mean, two_s)
         air = chain.smooth_air(r3.air_c)
         truth = r3.true_c - air[:, None]
-        estimate = {"open loop": c.paper_model.simulate(chain.block_mean(r3.power_w[:, None], 10)),
+        q = round(c.paper_model.period_s)
+        estimate = {"open loop": chain.held(c.paper_model.simulate(chain.block_mean(r3.power_w[:, None], q)), q, len(truth)),
                     "paper": chain.estimate_mkf(c.mkf, r3), "better": chain.run_kalman(c.kalman, r3)}
-        estimate["open loop"] = np.repeat(estimate["open loop"], 10, axis=0)
-        estimate["open loop"] = np.vstack([estimate["open loop"], estimate["open loop"][-1:]])[:len(truth)]
         errors = {k: (float(np.abs(v - truth).max()), float(np.abs(v - truth).mean())) for k, v in estimate.items()}
-    out: dict[str, Any] = {"seed": seed, "disturbance": disturbance, "position": figures, "temperature": errors, "stable": c.paper_model.stable}
+    out: dict[str, Any] = {"seed": seed, "disturbance": disturbance, "position": figures, "temperature": errors, "stable": c.paper_model.stable,
+                           "choice": [c.paper_model.info["period_s"], c.paper_model.info["i"]]}
     if keep:
         out["kept"] = {"c": c, "r2": r2, "r3": r3, "r4": r4, "estimate": estimate, "truth": truth, "left": left,
                        "r1": rig.run(tests["test_1"], 0)}
@@ -69,52 +75,76 @@ def goals(seeds: list[dict[str, Any]], disturbed: list[dict[str, Any]]) -> list[
 
     goal("uncompensated mean, median seed, um", np.median(mean("uncompensated")), 5, 10, "5 to 10")
     goal("uncompensated 2 s, median seed, um", np.median(u), 5, 15, "5 to 15")
-    goal("paper's method 2 s / SISO 2 s, median", np.median(p / s), 0, 0.45, "about 1/3")
-    goal("largest filtered temperature error, paper's method, median seed, % of range",
-         100 * np.median([x["temperature"]["paper"][0] for x in seeds]) / tables.RANGE_K, 0, 1.8, "<= 1.8")
-    goal("largest filtered temperature error, better method, median seed, % of range",
-         100 * np.median([x["temperature"]["better"][0] for x in seeds]) / tables.RANGE_K, 0, 1.8, "<= 1.8")
+    goal("paper's method 2 s / SISO 2 s, median", np.median(p / s), 0, 1 / 3, "<= 1/3")
+    for k, name in (("paper", "paper's"), ("better", "better")):
+        goal(f"largest filtered temperature error, {name} method, median seed, % of range",
+             100 * np.median([x["temperature"][k][0] for x in seeds]) / tables.RANGE_K, 0, 1.8, "<= 1.8")
     goal("better 2 s / paper's, median seed", np.median(b / p), 0, 0.45, "<= 0.45")
     goal("better 2 s / paper's, worst seed", np.max(b / p), 0, 0.6, "<= 0.6")
     goal("better 2 s / SISO 2 s, median", np.median(b / s), 0, 0.2, "<= 0.2")
     goal("better |mean| / paper's |mean|, medians", np.median(mean("better")) / np.median(mean("paper")), 0, 0.4, "<= 0.4")
     goal("better 2 s / that of 12 sensors, median", np.median(b / t), 0, 1.5, "<= 1.5")
     goal("better 2 s / Bayes bound, median", np.median(b / y), 0, np.inf, "printed")
-    for d in disturbed:
-        q = d["position"]
-        goal(f"{d['disturbance'].replace('_', ' ')}: better 2 s / paper's", q["better"][1] / q["paper"][1] if np.isfinite(q["paper"][1]) else 0.0,
-             0, 1.0, "<= 1")
+    for name in rigs.DISTURBANCES:
+        q = [d["position"] for d in disturbed if d["disturbance"] == name]
+        if q:
+            goal(f"{name.replace('_', ' ')}: better 2 s / paper's, worst of {len(q)} rigs",
+                 max(v["better"][1] / v["paper"][1] if np.isfinite(v["paper"][1]) else 0.0 for v in q), 0, 1.0, "<= 1")
     return rows
 
 
+def why(families: dict[str, list[dict[str, Any]]]) -> list[list[Any]]:
+    """[rigs, paper's / SISO, paper's 2 s, largest temperature error K, better / paper's], medians: what limits the paper's method."""
+    out: list[list[Any]] = []
+    for name, results in families.items():
+        p, s, b = (np.array([r["position"][k][1] for r in results]) for k in ("paper", "siso", "better"))
+        out.append([name, float(np.median(p / s)), float(np.median(p)), float(np.median([r["temperature"]["paper"][0] for r in results])),
+                    float(np.median(b / p))])
+    return out
+
+
 def reproduce(plant_file: str, config: str, out: Path, seeds: int = 12, full: bool = True, say: Any = print) -> bool:
-    """Run everything, write report.html and figures.json into `out`; returns whether every goal is met."""
+    """Run everything, write report.html, figures.json and figures.txt into `out`; returns whether every goal is met."""
     began = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     tests_file = str(Path(config).parent / "experiments.yaml")
+
+    def submit(pool: ProcessPoolExecutor, seed: int, *given: Any, **ease: Any) -> Any:
+        return pool.submit(one_seed, plant_file, tests_file, seed, *given, **ease)
+
     with ProcessPoolExecutor(2) as pool:
-        first = pool.submit(one_seed, plant_file, tests_file, 0, None, True)
-        others = [pool.submit(one_seed, plant_file, tests_file, k) for k in range(1, seeds)]
-        bad = [pool.submit(one_seed, plant_file, tests_file, k % seeds, d) for k, d in enumerate(rigs.DISTURBANCES)]
-        results = [first.result(), *(f.result() for f in others)]
-        say(f"{seeds} seeds: {time.monotonic() - began:.0f} s")
+        fresh = [submit(pool, k, None, k == FRESH[0]) for k in FRESH[:seeds]]
+        seen = [submit(pool, k) for k in SEEN[:seeds]]
+        bad = [submit(pool, k, d) for d in rigs.DISTURBANCES for k in FRESH[:min(DISTURBED_SEEDS, seeds)]]
+        eased = {f"a chamber that drifts {CALMER:g} times as much": [submit(pool, k, air=CALMER) for k in FRESH[:seeds]],
+                 "no drift of chamber or bench, no unmeasured heat": [submit(pool, k, air=0.0, bench=0.0, heat=0.0) for k in FRESH[:seeds]]}
+        results, first = [f.result() for f in fresh], [f.result() for f in seen]
+        say(f"2 x {len(results)} seeds: {time.monotonic() - began:.0f} s")
         disturbed = [f.result() for f in bad]
-        say(f"{len(disturbed)} disturbed rigs: {time.monotonic() - began:.0f} s")
+        reasons = why({"as judged": results, **{k: [f.result() for f in v] for k, v in eased.items()}})
+        say(f"{len(disturbed)} disturbed rigs, {2 * len(results)} eased ones: {time.monotonic() - began:.0f} s")
     kept = results[0].pop("kept")
     whole = None
     if full:
         from thermoctl.evaluate import full as full_run
         whole = full_run.run(config, plant_file, out, say)["figures"]
-    rows = goals(results, disturbed)
+    rows, before = goals(results, disturbed), goals(first, [])
     used = time.monotonic() - began
-    (out / "figures.json").write_text(json.dumps({"goals": rows, "seeds": results, "disturbed": disturbed, "full": whole, "seconds": used}, indent=1,
-                                                 default=float), encoding="utf-8")
-    (out / "report.html").write_text(_report(results, disturbed, kept, rows, whole, used), encoding="utf-8")
-    for what, value, wanted, met in rows:
-        say(f"{met:3s}  {value:9.3g}  {wanted:10s} {what}")
+    (out / "figures.json").write_text(json.dumps({
+        "goals": rows, "goals_on_seeds_looked_at": before, "why": reasons, "seeds": results, "seeds_looked_at": first, "disturbed": disturbed,
+        "full": whole, "seconds": used}, indent=1, default=float), encoding="utf-8")
+    (out / "report.html").write_text(_report(results, disturbed, kept, rows, before, reasons, whole, used), encoding="utf-8")
+    text = [f"{met:3s}  {value:9.3g}  {wanted:10s} {what}" for what, value, wanted, met in rows]
+    text += [f"     {r[0]}: paper's / SISO {r[1]:.2f}, paper's 2 s {r[2]:.2f} um, largest filtered temperature error {r[3]:.2f} K, "
+             f"better / paper's {r[4]:.2f}" for r in reasons]
     if whole:
-        say("full run at 1 ms, mean and 2 s in um: " + ", ".join(f"{k} {v[0]:+.2f} +- {v[1]:.2f}" for k, v in whole.items() if isinstance(v, tuple)))
-    say(f"{out / 'report.html'} ({used:.0f} s)")
+        text += [f"     full run at 1 ms, {k}: {v[0]:+.2f} +- {v[1]:.2f} um" for k, v in whole.items() if isinstance(v, tuple)]
+        text += [f"     quasi-static against full, {k}: " + ", ".join(f"{a} {b:.3g}" for a, b in v.items()) for k, v in whole["agreement"].items()]
+    text.append(f"     {used:.0f} s")
+    (out / "figures.txt").write_text("\n".join(text) + "\n", encoding="utf-8")
+    for line in text:
+        say(line)
+    say(f"{out / 'report.html'}")
     return all(r[3] == "yes" for r in rows)
 
 
@@ -124,7 +154,12 @@ def _median(results: list[dict], k: str) -> str:
     return f"{m:+.2f} ± {s:.2f}"
 
 
-def _report(results: list[dict], disturbed: list[dict], kept: dict, rows: list, whole: dict | None, used: float) -> str:
+def _plus_minus(v: Any) -> str:
+    return f"{v[0]:+.2f} ± {v[1]:.2f}"
+
+
+def _report(results: list[dict], disturbed: list[dict], kept: dict, rows: list, before: list, reasons: list, whole: dict | None,
+            used: float) -> str:
     paper = {k: f"{m:+.1f} ± {s:.1f}" for k, (m, s) in tables.POSITION.items()}
     three: list[list[Any]] = [["uncompensated", paper["uncompensated"], _median(results, "uncompensated"), None],
              ["coil alone (SISO)", paper["siso"], _median(results, "siso"), None],
@@ -132,19 +167,44 @@ def _report(results: list[dict], disturbed: list[dict], kept: dict, rows: list, 
              ["same filter with 12 sensors", None, None, _median(results, "twelve")],
              ["Bayes bound, one sensor and the true plant", None, None, _median(results, "bayes")]]
     sections = [("Position error over test 4B, µm (ISO 230-2: mean ± 2 s)",
-                 table(["", "paper", "ours, paper's method", "ours, better method"], three, f"medians of {len(results)} rigs"))]
+                 table(["", "paper", "ours, paper's method", "ours, better method"], three,
+                       f"medians of {len(results)} rigs, seeds {results[0]['seed']} to {results[-1]['seed']}"))]
+    sections.append(("How to read this", f"""<p>The rigs are simulated: config/plants/actuator_truth.yaml with the fast electromechanics
+replaced by its quasi-static equivalent, other heat capacities, conductances and expansions for every seed, another chamber, bench and unmeasured
+heat every day, two bodies no thermometer sees. Two sets of numbers in them were set after results had been looked at, on seeds
+{SEEN[0]} to {SEEN[-1]}: the expansions were scaled ({", ".join(f"{k} × {v:g}" for k, v in rigs.PAPER_SCALE.items())}) so that what is left
+uncompensated and by the coil alone is of the paper's size, and the unmeasured heat was lowered to {rigs.HEAT_W:g} W. The sampling and block
+rows that the paper leaves open are chosen for each rig by the filter's error in test 4A. Everything promised is therefore judged on seeds
+{FRESH[0]} to {FRESH[-1]}, which nothing was chosen by; the seeds looked at stand beside them.</p>"""))
+    old = {r[0]: r[1] for r in before}
+    sections.append(("What was promised", table(["", "measured", "wanted", "met", "on the seeds looked at"],
+                                                [[*r[:3], r[3], old.get(r[0])] for r in rows])))
+    sections.append(("What limits the paper's method here", """<p>A model of rises above the air cannot see the output move when the chamber
+warms everything: net expansion (the sum of all gains) times drift is left, whatever the filter does. Neither can it see a bench of its own
+temperature, which bends the filtered temperatures of the brackets. The same rigs with less of either:</p>"""
+                     + table(["rigs", "paper's / SISO", "paper's 2 s, µm", "largest filtered error, K", "better / paper's"], reasons, "medians")))
     if whole:
-        names = [k for k in whole if k not in ("agreement",)]
-        sections.append(("The daemon's law at 1 ms on the full plant", table(["", "mean µm", "2 s µm"], [[k, *map(float, whole[k])] for k in names])
-                         + table(["quasi-static against full run, test 2", ""], [[k, float(v)] for k, v in whole["agreement"].items()])))
-    sections.append(("What was promised", table(["", "measured", "wanted", "met"], rows)))
+        names = [("uncompensated", "uncompensated", "still_uncompensated"), ("coil alone (SISO), estimate", "siso_estimator", "still_siso_estimator"),
+                 ("paper's method, estimate", "paper_estimator", "still_paper_estimator"),
+                 ("better method, estimate", "better_estimator", "still_better_estimator"),
+                 ("12 sensors, estimate", "twelve_estimator", "still_twelve_estimator")]
+        body = table(["test 4B, mean ± 2 s, µm", "full run at 1 ms", "quasi-static"],
+                     [[label, _plus_minus(whole[a]), _plus_minus(whole[b])] for label, a, b in names],
+                     "what each estimate leaves of the growth, each plant calibrated on its own tests 2, 3, 4A")
+        body += table(["output against reference, compensated by the daemon's law", "mean ± 2 s, µm"],
+                      [[k, _plus_minus(whole[k])] for k in ("paper", "better")])
+        each = whole["agreement"]
+        body += table(["quasi-static against full run", *each],
+                      [[k.replace("_", " "), *(float(v[k]) for v in each.values())] for k in each["test_2"]],
+                      "minute by minute; position is the difference of the two encoders")
+        sections.append(("One rig with the daemon's law and the full plant at 1 ms", body))
     shown = ("uncompensated", "siso", "paper", "better", "twelve", "bayes")
-    each: list[list[Any]] = [[r["seed"], *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in shown),
-                              "stable" if r["stable"] else "unstable"] for r in results]
-    sections.append(("Every rig", table(["seed", "uncompensated", "SISO", "paper's", "better", "12 sensors", "Bayes", "paper's model"], each)))
-    dist: list[list[Any]] = [[r["disturbance"].replace("_", " "), *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in
+    every: list[list[Any]] = [[r["seed"], *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in shown),
+                              f"{r['choice'][0]} s, i {r['choice'][1]}"] for r in results]
+    sections.append(("Every rig", table(["seed", "uncompensated", "SISO", "paper's", "better", "12 sensors", "Bayes", "paper's model"], every)))
+    dist: list[list[Any]] = [[r["disturbance"].replace("_", " "), r["seed"], *(f"{r['position'][k][0]:+.2f} ± {r['position'][k][1]:.2f}" for k in
              ("uncompensated", "siso", "paper", "better", "twelve"))] for r in disturbed]
-    sections.append(("Disturbed rigs", table(["", "uncompensated", "SISO", "paper's", "better", "12 sensors"], dist,
+    sections.append(("Disturbed rigs", table(["", "seed", "uncompensated", "SISO", "paper's", "better", "12 sensors"], dist,
                                              "the disturbance comes after the calibration, or holds throughout (sensor faults)")))
     five, six = tables.temperature_rows(kept["estimate"], kept["truth"])
     head = ["point", "paper open", "paper MKF", "ours open", "ours MKF", "ours better"]

@@ -90,11 +90,13 @@ def hidden_masses(plant: Plant) -> Plant:
 
 
 class Rig:
-    """One seed's rig. `run(schedule, day)` simulates a test on a day; the same arguments give the same recording."""
+    """One seed's rig. `run(schedule, day)` simulates a test on a day; the same arguments give the same recording. `air`, `bench` and
+    `heat` multiply the chamber's drift, the bench's and the unmeasured heat: 0 takes them away."""
 
     def __init__(self, plant: Plant, seed: int, disturbance: str | None = None,
-                 scale: dict[str, float] | None = None):
+                 scale: dict[str, float] | None = None, air: float = 1.0, bench: float = 1.0, heat: float = 1.0):
         self.seed, self.disturbance = seed, disturbance
+        self.air_k, self.bench, self.heat_w = tuple(air * v for v in AIR_K), bench, heat * HEAT_W
         p = {k: v.value for k, v in plant.parameters.items()}
         self.electrical = {k: p[k] for k in ("k_flexure", "k_T", "b_eddy")}
         self.model = hidden_masses(quasi_static(plant)).compile()
@@ -115,11 +117,12 @@ class Rig:
         for k in p:
             if k[:2] in ("N_", "H_"):
                 p[k] *= convection
-        p["T_bench"] = 22.0 + 0.3 * rng.standard_normal()
-        level, swing, wander = AIR_K
+        p["T_bench"] = 22.0 + self.bench * 0.3 * rng.standard_normal()
+        p["bench_swing"] *= self.bench
+        level, swing, wander = self.air_k
         air = 22 + level * rng.standard_normal() + swing * np.sin(2 * np.pi * (t / rng.uniform(12000, 28000) + rng.uniform())) \
             + wander * _walk(rng, n, 2500.0)
-        heat = {b: HEAT_W * noise * _walk(rng, n, HEAT_TAU_S) for b in HEATED}
+        heat = {b: self.heat_w * noise * _walk(rng, n, HEAT_TAU_S) for b in HEATED}
         fine = np.arange(0, n * 10) / 10
         x = schedule.at(fine)
         v = np.gradient(x, 0.1)
@@ -201,7 +204,7 @@ class Rig:
         m = len(heat)
         big = np.block([[a, b], [np.zeros((m, n)), f * np.eye(m)]])
         q = np.zeros((n + m, n + m))
-        q[n:, n:] = HEAT_W**2 * (1 - f * f) * np.eye(m)
+        q[n:, n:] = max(self.heat_w, 1e-6)**2 * (1 - f * f) * np.eye(m)
         q[:n, :n] = 1e-12 * np.eye(n)
         coil, error = np.append(c[names.index("coil_c")], np.zeros(m)), np.append(c[names.index("error_um")], np.zeros(m))
         r = 0.25**2 / 12 + 0.06**2

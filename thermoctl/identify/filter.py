@@ -137,8 +137,6 @@ def tune(model: StateSpace, records: list[Record], r_v: float, sensors: tuple[in
     base = np.array([np.log(1e-2), np.log(1e-10), np.log(1e-6), np.log(1e-13)])
     used = 4 if not model.c[:, -1].any() else 3
     w = np.ones(len(model.c)) if weights is None else weights / np.sqrt(np.mean(weights**2))
-    kernel = np.ones(smooth) / smooth
-
     def cost(x: np.ndarray) -> float:
         try:
             f = steady(model, np.exp(np.append(x, base[len(x):])), r_v, sensors)
@@ -147,7 +145,7 @@ def tune(model: StateSpace, records: list[Record], r_v: float, sensors: tuple[in
         total, count = 0.0, 0
         for rec in records:
             e = (f.run(rec.power_w, rec.air_rate, rec.rises[:, list(sensors)]) - rec.rises) * w
-            e = np.apply_along_axis(np.convolve, 0, np.nan_to_num(e[:len(e) // smooth * smooth]), kernel, "valid")[::smooth]
+            e = np.nan_to_num(e[:len(e) // smooth * smooth]).reshape(-1, smooth, e.shape[1]).mean(1)
             total, count = total + float((e**2).sum()), count + e.size
         value = total / count
         return (value if np.isfinite(value) else 1e9) * (1 + 1e-4 * float(((x - base[:len(x)])**2).sum()))
