@@ -11,7 +11,7 @@ import numpy as np
 from thermoctl.diagnose.command import sentence
 from thermoctl.diagnose.effects import Candidate
 from thermoctl.plant.show import drawing
-from thermoctl.report.page import figure, page, table
+from thermoctl.report.page import figure, page, table, unit
 
 if TYPE_CHECKING:
     from thermoctl.diagnose.run import Case, Diagnosis, Explanation
@@ -24,7 +24,7 @@ _COLOURS = {"measured": "#1b1f24", "refit": "#c7621b", "with": "#0b6bcb"}
 def write_report(case: Case, found: Diagnosis, path: str | Path) -> None:
     """Write report.html for a diagnosis whose `result` is set."""
     r = found.result
-    sections = [("", f'<p style="font-size:1.15rem"><b>{r["verdict"].capitalize()}.</b> {html.escape(sentence(r))}</p>'
+    sections = [("", f'<p class="lead"><b>{r["verdict"].capitalize()}.</b> {html.escape(sentence(r))}</p>'
                      + _items(r["notes"])),
                 ("Where", _place(case, found)),
                 ("What is missing", _missing(found)),
@@ -46,6 +46,10 @@ def _p(text: str) -> str:
 
 def _items(lines: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
+
+
+def _named(name: str, its_unit: str | None) -> str:
+    return f"{name} ({unit(its_unit)})" if unit(its_unit) else name
 
 
 def _label(c: Candidate) -> str:
@@ -89,16 +93,16 @@ def _missing(found: Diagnosis) -> str:
                       else first.rig.columns[k].get(followed))
             if column is not None:
                 axes[1].plot(np.interp(t, drive.t, column), q, ".", ms=5, label=drive.name)
-    unit = next((x.get("missing_flow_unit") for x in found.result["mismatch"]), None) or "storage x node's unit / s"
-    axes[0].set(xlabel="time (s)", ylabel=f"into {m.node} ({unit})")
+    per = unit(next((x.get("missing_flow_unit") for x in found.result["mismatch"]), None)) or "storage x node's unit / s"
+    axes[0].set(xlabel="time (s)", ylabel=f"into {m.node} ({per})")
     axes[0].axhline(0, color="0.7", lw=0.8)
     if followed:
         axes[1].set(xlabel=followed)
         axes[1].axhline(0, color="0.7", lw=0.8)
-    axes[0].legend(fontsize=8, frameon=False)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=len(m.flow), fontsize=8, frameon=False)
     told = f" It follows {', '.join(m.follows)}." if m.follows else " It follows none of the recorded signals."
     when = "; ".join(f"{a:.4g} to {b:.4g} s" for a, b in m.when[:6])
-    return figure(fig, f"The flow into {m.node} that the recordings ask for beyond the refitted plant, {m.rms:.3g} {unit} rms."
+    return figure(fig, f"The flow into {m.node} that the recordings ask for beyond the refitted plant, {m.rms:.3g} {per} rms."
                   + told + (f" Largest: {when}." if when else "")
                   + " Made by: smooth unknown input, ridge by cross-validation, after what the plant's own parameters can absorb.")
 
@@ -107,7 +111,7 @@ def _equations(found: Diagnosis) -> str:
     body = ""
     for f, c in zip(found.result["findings"], found.final.effects, strict=False):
         body += f"<p><b>{html.escape(_label(c))}</b> (probability {f['probability']:.2f})</p><pre>{html.escape(f['equation'])}</pre>"
-        rows = [(n, p["value"], p["unit"] or "1", f"{p['value'] - 1.96 * (p['sd'] or 0):.4g} .. {p['value'] + 1.96 * (p['sd'] or 0):.4g}")
+        rows = [(n, p["value"], unit(p["unit"]), f"{p['value'] - 1.96 * (p['sd'] or 0):.4g} .. {p['value'] + 1.96 * (p['sd'] or 0):.4g}")
                 for n, p in f["parameters"].items()]
         body += table(("parameter", "value", "unit", "95 % interval"), rows)
         if f["when"]:
@@ -123,7 +127,7 @@ def _worth(case: Case, found: Diagnosis) -> str:
         if o not in fit["refit_only"]:
             continue
         g = gain.get(o)
-        rows.append((f"{o} ({out.unit or '1'})", n.sigma, *(fit.get(k, {}).get(o) for k in
+        rows.append((_named(o, out.unit), n.sigma, *(fit.get(k, {}).get(o) for k in
                      ("before", "refit_only", "after", "held_out_before", "held_out_refit_only", "held_out_after")),
                      f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else None))
     how = ("each recording in turn, fitted without it" if len(case.tables) > 1
@@ -153,8 +157,7 @@ def _curves(case: Case, found: Diagnosis) -> str:
     body = ""
     for o in worst:
         j = case.model.outputs.index(o)
-        unit = case.plant.outputs[o].unit or "1"
-        fig = Figure(figsize=(9, 3.6), layout="constrained")
+        fig = Figure(figsize=(9, 3.8), layout="constrained")
         axes = fig.subplots(2, len(case.drives), sharex="col", sharey="row", squeeze=False, height_ratios=(3, 2))
         for k, d in enumerate(case.drives):
             t, y, e0, e1 = _thin(d.t, d.y[:, j], refit[k][:, j], after[k][:, j])
@@ -168,9 +171,9 @@ def _curves(case: Case, found: Diagnosis) -> str:
             low.axhline(0, color="0.6", lw=0.8)
             top.set_title(d.name, fontsize=9)
             low.set_xlabel("time (s)")
-        axes[0, 0].set_ylabel(f"{o} ({unit})", fontsize=8)
-        axes[1, 0].set_ylabel(f"error ({unit})", fontsize=8)
-        axes[0, 0].legend(fontsize=8, frameon=False)
+        axes[0, 0].set_ylabel(_named(o, case.plant.outputs[o].unit), fontsize=8)
+        axes[1, 0].set_ylabel(_named("error", case.plant.outputs[o].unit), fontsize=8)
+        fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=8, frameon=False)
         body += figure(fig, f"{o}: free run of the simulator on the recorded inputs, and what it misses below.")
     if len(excess) > len(worst):
         body += _p(f"The {len(worst)} outputs with the largest misfit of {len(excess)} are drawn; the table has all.")
@@ -205,7 +208,7 @@ def _parameters(case: Case, found: Diagnosis) -> str:
         words = [e.state] if e.state != "ok" else []
         if e.trades_with:
             words.append("trades with " + ", ".join(e.trades_with[:3]))
-        rows.append((f"{e.name} ({e.unit or '1'})", first, refit.value, e.value, f"± {1.96 * e.sd:.2g}", "; ".join(words) or "ok"))
+        rows.append((_named(e.name, e.unit), first, refit.value, e.value, f"± {1.96 * e.sd:.2g}", "; ".join(words) or "ok"))
         moved = abs(refit.value - e.value) > max(4 * np.hypot(e.sd, refit.sd), 0.25 * abs(e.value))
         if found.final.effects and moved and refit.value and e.value:
             said.append(f"{e.name}: without the missing physics the refit put it at {refit.value:.4g}, {refit.value / e.value:.2g} times "
@@ -216,7 +219,7 @@ def _parameters(case: Case, found: Diagnosis) -> str:
 
 
 def _unseen(found: Diagnosis) -> str:
-    rows = [(n["effect"], n["where"], n["smallest"], f"{n['parameter']} ({n['unit'] or '1'})")
+    rows = [(n["effect"], n["where"], n["smallest"], _named(n["parameter"], n["unit"]))
             for n in found.result["not_seen"] if n["smallest"] is not None]
     if not rows:
         return ""
@@ -241,14 +244,20 @@ def _next(told: dict[str, Any] | None) -> str:
     return body
 
 
+def _chance(found: Diagnosis, chance: float) -> str:
+    """Draws of noise say nothing finer than one in their number."""
+    drawn = len(c) if found.rounds and (c := found.rounds[0].chance) is not None else 0
+    return f"less than 1/{drawn} (none of {drawn} draws came near)" if drawn and chance < 1 / drawn else f"{chance:.2g}"
+
+
 def _made(case: Case, found: Diagnosis) -> str:
     chance = found.result["chance"]
     lines = [f"{len(case.tables)} recordings, {sum(len(t.t) for t in case.tables)} samples. "
-             + "; ".join(t.path for t in case.tables),
+             + ", ".join(Path(t.path).name for t in case.tables) + ".",
              "Refit: bounded weighted least squares on the free-run error with exact sensitivities; noise with colour, "
              "ARMA(1,1) a channel, fitted anew under every explanation.",
-             f"Chance that noise alone makes some entry of the catalogue look this good: {chance:.2g}. "
-             f"{len(found.rounds[0].directions) if found.rounds else 0} (effect, place, shape) directions screened.",
+             f"Chance that noise alone makes some entry of the catalogue look this good: {_chance(found, chance)}; "
+             f"{len(found.rounds[0].directions) if found.rounds else 0} directions (effect, place, shape) were screened.",
              "Intervals: 1.96 standard errors of the joint refit. Probabilities: weights of the refitted explanations' scores.",
              f"Settled in {len(found.rounds)} looks at the catalogue."]
     return _items(lines)

@@ -3,22 +3,31 @@ from __future__ import annotations
 
 import html
 import io
+import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 _STYLE = """
 :root{color-scheme:light dark;--fg:#1b1f24;--bg:#fff;--soft:#5b6570;--line:#d5dae0;--mark:#0b6bcb;--tint:#f3f6f9;--bad:#b3261e;--good:#1a7f37}
-@media(prefers-color-scheme:dark){:root{--fg:#e3e7eb;--bg:#14171a;--soft:#9aa4ae;--line:#343b42;--mark:#6cb2ff;--tint:#1d2226;--bad:#ff8a80;--good:#6fdd8b}
-figure svg{background:#fff;border-radius:4px}}
+@media screen and (prefers-color-scheme:dark){:root{--fg:#e3e7eb;--bg:#14171a;--soft:#9aa4ae;
+--line:#343b42;--mark:#6cb2ff;--tint:#1d2226;--bad:#ff8a80;--good:#6fdd8b}
+figure svg{filter:invert(.92) hue-rotate(180deg)}}
 body{font:15px/1.5 system-ui,sans-serif;color:var(--fg);background:var(--bg);max-width:62rem;margin:0 auto;padding:1.5rem}
 h1{font-size:1.6rem;margin:.2rem 0 1rem}h2{font-size:1.2rem;margin:2rem 0 .5rem;border-bottom:1px solid var(--line)}
 table{border-collapse:collapse;margin:.6rem 0;font-variant-numeric:tabular-nums}
 th,td{padding:.25rem .7rem;border-bottom:1px solid var(--line);text-align:right}
-th:first-child,td:first-child{text-align:left}th{color:var(--soft);font-weight:600}caption{text-align:left;color:var(--soft);padding:.2rem 0}
-figure{margin:1rem 0}figure svg{max-width:100%;height:auto}figcaption,.note{color:var(--soft);font-size:.92rem}
+th:first-child,td:first-child,.text{text-align:left}td.text{max-width:26rem;overflow-wrap:break-word}td:first-child{white-space:nowrap}
+th{color:var(--soft);font-weight:600}caption{text-align:left;color:var(--soft);padding:.2rem 0}
+figure{margin:1rem 0}figure svg{width:100%;height:auto;max-height:40rem}
+.wide{overflow-x:auto}.lead{font-size:1.15rem}figcaption,.note{color:var(--soft);font-size:.92rem}
 pre{background:var(--tint);padding:.7rem;overflow-x:auto}.good{color:var(--good)}.bad{color:var(--bad)}
-@media print{body{max-width:none;padding:0}h2{break-after:avoid}figure,table{break-inside:avoid}}
+@media print{:root{color-scheme:light}body{max-width:none;padding:0;font-size:10.5pt}h2{break-after:avoid}
+figure,tr,pre{break-inside:avoid}thead{display:table-header-group}
+.wide{overflow:visible}pre{white-space:pre-wrap}}
 """
+_NUMERIC = re.compile(r"^[-+−±<>≤ \d.,:/()%…eE·]*$")
+_UNIT = re.compile(r"\b(degC|um|us|ohm)\b")
 
 
 def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str:
@@ -30,17 +39,40 @@ def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = "") -> str:
-    """An HTML table; numbers with four significant digits, None as a dash."""
-    def cell(v: Any) -> str:
-        return "–" if v is None else f"{v:.4g}" if isinstance(v, float) else html.escape(str(v))
-    body = "".join("<tr>" + "".join(f"<td>{cell(v)}</td>" for v in row) + "</tr>\n" for row in rows)
+    """An HTML table; numbers with four significant digits and to the right, words to the left, None as a dash."""
+    rows = [list(row) for row in rows]
+    words = [any(isinstance(row[k], str) and not _NUMERIC.match(row[k]) for row in rows if k < len(row)) for k in range(len(head))]
+
+    def line(cells: Sequence[Any], tag: str) -> str:
+        return "<tr>" + "".join(f'<{tag}{" class=text" if k < len(words) and words[k] else ""}>{cell(v)}</{tag}>'
+                                for k, v in enumerate(cells)) + "</tr>\n"
     top = f"<caption>{html.escape(caption)}</caption>" if caption else ""
-    return f"<table>{top}<thead><tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in head) + f"</tr></thead><tbody>\n{body}</tbody></table>"
+    return (f'<div class="wide"><table>{top}<thead>{line(head, "th")}</thead><tbody>\n' + "".join(line(row, "td") for row in rows)
+            + "</tbody></table></div>")
+
+
+def cell(v: Any) -> str:
+    """A number or a word as HTML: 4 significant digits, thousands apart, powers of ten as such."""
+    if v is None or (isinstance(v, float) and math.isnan(v)):
+        return "–"
+    if not isinstance(v, float):
+        return html.escape(str(v))
+    text = f"{v:,.0f}".replace(",", "\u202f") if 1e4 <= abs(v) < 1e7 else f"{v:.4g}"
+    mantissa, e, power = text.partition("e")
+    return (f"{mantissa}·10<sup>{int(power)}</sup>" if e else mantissa).replace("-", "−")
+
+
+def unit(name: str | None) -> str:
+    """A unit as people write it: degC is °C, um is µm, no unit is nothing."""
+    text = _UNIT.sub(lambda m: {"degC": "°C", "um": "µm", "us": "µs", "ohm": "Ω"}[m[0]], name or "")
+    return "" if text == "1" else text.replace("**2", "²").replace("**3", "³").replace("*", "·")
 
 
 def figure(fig: Any, caption: str = "") -> str:
     """A matplotlib figure as inline SVG with its caption; the figure is closed."""
     import matplotlib.pyplot as plt
+    for axis in fig.axes:
+        axis.spines[["top", "right"]].set_visible(False)
     out = io.StringIO()
     with plt.rc_context({"svg.fonttype": "none", "svg.hashsalt": "thermoctl"}):
         fig.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
