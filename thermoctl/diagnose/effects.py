@@ -194,7 +194,7 @@ class Rig:
         if kind == "v":
             if near in self.velocities:
                 return [near]       # type: ignore[list-item]
-            found = [*self.velocities, *(i for i in p.inputs if _dimension(p.inputs[i].unit) == "velocity")]
+            found = [*self.velocities, *(i for i in p.inputs if _dimension(p.inputs[i].unit) in ("velocity", "rotation"))]
             return (found or [c for c in self.spare if re.search(r"veloc|speed|^v$", c, re.I)])[:3]
         if kind == "x":
             if near in self.position_of:
@@ -218,7 +218,7 @@ class Rig:
     def drives_of(self, f: Flow) -> list[str]:
         """The inputs that drive a flow (temperatures, positions and references aside)."""
         return [i for i in self.physics.inputs if i in ex.names(f.rate) and i in self.moving_inputs
-                and _dimension(self.physics.inputs[i].unit) not in ("temperature", "length", "velocity")]
+                and _dimension(self.physics.inputs[i].unit) not in ("temperature", "length", "velocity", "rotation")]
 
 
 # ---------------------------------------------------------------------------------------------------------- places

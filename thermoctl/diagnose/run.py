@@ -42,6 +42,8 @@ REMAINS = -8.0              # log10 p of an unknown smooth input from which some
 TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
 BLOCKS = 8                  # of a single recording, every other one held out
 SPREAD = 0.06, 0.2          # least and greatest spread of parameters round their beliefs, in shares of their ranges
+CHI2_MEDIAN = 0.455         # of one degree of freedom
+MARGINAL = 200.0            # a gain in score below this is looked at twice
 DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
 
 
@@ -223,7 +225,7 @@ class Round:
     rig: Rig
     directions: list[Direction]
     chance: np.ndarray | None
-    coloured: bool = False
+    inflation: float | None = None
     finalists: list[Explanation] = field(default_factory=list)
 
     def p_any(self) -> float:
@@ -238,11 +240,8 @@ class Round:
         return float(min(1 / (len(self.chance) + 1), 0.1 * 10 ** (best - floor)))
 
 
-def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool | None = None) -> Round:
-    """Screen the catalogue from an explanation; `coloured`: in the metric of the residual's own colour (unless said: where
-    the residual is no larger than a sensor's colour can be)."""
-    if coloured is None:
-        coloured = max(case.excess(base).values(), default=0.0) < CLEAN and any(len(c.ar) > 1 for c in base.colours)
+def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool = False) -> Round:
+    """Screen the catalogue from an explanation; `coloured`: in the metric of the residual's own colour."""
     model = base.fit.model
     drives = [model.drive(t) for t in case.tables]
     for d in drives:
@@ -252,7 +251,7 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
     found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
     noise = np.random.default_rng(1).standard_normal((len(metric.residual), draws)) if draws else None
     ranked, chance = screen(metric, rig, found, noise)
-    return Round(base, metric, rig, ranked, chance, coloured)
+    return Round(base, metric, rig, ranked, chance)
 
 
 def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direction]:
@@ -343,11 +342,13 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     if not current.effects and first.p_any() < 1e-3:
         # In white noise's metric something stands out, but nothing counts: the residual's own colour decides.
         case.progress("screening in the colour of the residual")
-        tinted = first if first.coloured else look(case, base, entries, coloured=True)
-        left_over = tinted.p_any() < 1e-3
-        if left_over and tinted is not first:
+        tinted = look(case, base, entries, coloured=True)
+        if tinted.directions:
+            best = tinted.directions[0]
+            left_over = tinted.p_any() < 1e-3 and log_p(best.gain / inflation(tinted.directions), best.dims) < _threshold(tinted)
+        if left_over:
             tinted.finalists = compete(case, tinted, finalists(tinted.directions))
-            if tinted.finalists and counts(tinted, tinted.finalists[0]):
+            if tinted.finalists and counts(case, tinted, tinted.finalists[0], entries):
                 current = reference = tinted.finalists[0]
                 rivals = tinted.finalists[1:]
     if current.effects:
@@ -389,14 +390,32 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     return Diagnosis(verdict, base, current, rivals, rounds, suspects, missing, held, notes, None, start)
 
 
-def counts(seen: Round, e: Explanation) -> bool:
+def inflation(ranked: Sequence[Direction]) -> float:
+    """How much larger than by chance the catalogue's gains are: noise whose colour the model of noise does not quite hold
+    makes all of them larger. The median over entries without a shape, drawn towards 1 where they are few (Devlin & Roeder
+    1999, genomic control)."""
+    plain = [d.gain for d in ranked if d.dims == 1 and not d.candidate.effect.shapes]
+    if not plain:
+        return 1.0
+    return max(1.0, (len(plain) * float(np.median(plain)) / CHI2_MEDIAN + 10) / (len(plain) + 10))
+
+
+def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) -> bool:
     """Is an explanation better than what chance alone would make of the best of all candidates? The gain in score is held
     against the smallest chance p that pure noise showed over the whole catalogue."""
     assert e.direction is not None
     gain = seen.base.raw - e.raw
+    if 0 < gain < MARGINAL:
+        if seen.inflation is None:      # beside what was found: an effect that is found inflates no longer
+            seen.inflation = inflation(look(case, e, entries, draws=0, coloured=True).directions)
+        gain /= seen.inflation
     if seen.chance is None:
         return e.score < seen.base.score - ACCEPT
-    return gain > 0 and log_p(gain, e.direction.dims) < min(float(np.min(seen.chance)), -3.5) - 0.3
+    return gain > 0 and log_p(gain, e.direction.dims) < _threshold(seen)
+
+
+def _threshold(seen: Round) -> float:
+    return (min(float(np.min(seen.chance)), -3.5) if seen.chance is not None else -5.0) - 0.3
 
 
 def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
@@ -418,7 +437,7 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
         seen.finalists = compete(case, seen, chosen)
         # The best score that also predicts: a rival that merely fits better gives way to the next.
         before = unseen_errors(case, current.plant)
-        best = next((e for e in seen.finalists[:4] if counts(seen, e) and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0),
+        best = next((e for e in seen.finalists[:4] if counts(case, seen, e, entries) and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0),
                     None)
         if best is None:
             break
