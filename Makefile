@@ -81,7 +81,7 @@ test-browser: install              # pages in headless Chromium (Debian: apt-get
 
 .PHONY: pictures
 pictures: install                  # the same, and its screenshots into docs/images
-	THERMOCTL_PICTURES=docs/images $(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py
+	THERMOCTL_PICTURES=docs/images $(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py tests/people/test_calibrate.py
 
 .PHONY: test-fleet
 test-fleet: install                # many rigs' recordings, from a folder and an object store, also spread by Dask

@@ -43,7 +43,7 @@ class Browser:
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
         self.call("Emulation.setScrollbarsHidden", hidden=True)
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.size(width, height)
 
     def call(self, method, **parameters):
         """One command of the protocol and its result."""
@@ -110,21 +110,25 @@ class Browser:
         self.call("Emulation.setEmulatedMedia", features=[
             {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}])
 
-    def picture(self, path):
-        """The whole page as PNG."""
+    def size(self, width, height):
+        """The window's size in pixels."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def picture(self, path, height=None):
+        """The whole page, or its upper `height` pixels, as PNG."""
         size = self.call("Page.getLayoutMetrics")["cssContentSize"]
         shot = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True,
-                         clip={"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1})
+                         clip={"x": 0, "y": 0, "width": size["width"], "height": height or size["height"], "scale": 1})
         with open(path, "wb") as f:
             f.write(base64.b64decode(shot["data"]))
 
-    def keep(self, name):
+    def keep(self, name, height=None):
         """The picture as NAME.png, in 160 colours: small enough to live in the repository. Only where PICTURES is set."""
         if PICTURES:
             from PIL import Image
             path = os.path.join(PICTURES, f"{name}.png")
             os.makedirs(PICTURES, exist_ok=True)
-            self.picture(path)
+            self.picture(path, height)
             Image.open(path).convert("RGB").quantize(160, dither=Image.Dither.NONE).save(path, optimize=True)
 
     def close(self):

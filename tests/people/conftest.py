@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 from browser import Browser, find
-from running import Running
 
 from thermoctl.settings import load_settings
 
@@ -25,6 +24,7 @@ def settings():
 
 @pytest.fixture
 def running(settings):
+    from running import Running  # the daemon's rooms are loaded where they are used
     r = Running(settings)
     yield r
     r.close()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import PICTURES, Browser, find
 
 from thermoctl import cli
 from thermoctl.daemon.socket import status
@@ -65,6 +66,12 @@ def test_from_doctor_to_proof_with_an_end_in_between(settings, capsys, monkeypat
     assert not (folder / "models").exists() and config.read_bytes() == before
     assert len(read_table(out / "test_2.parquet")) == pytest.approx(2400, abs=2) and not (out / "test_2.part.parquet").exists()
     report = (out / "report.html").read_text()
+    if PICTURES and find():
+        browser = Browser(find(), folder / "browser", 1100, 900)
+        browser.open(f"file://{out}/report.html")
+        browser.until("document.readyState === 'complete'")
+        browser.keep("report-calibration", height=1250)
+        browser.close()
     assert "Proof: before and after" in report and report.count("<svg") >= 3 and "without compensation" in report
 
     # Only now: accepted.

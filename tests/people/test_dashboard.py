@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.terminal_theme import DIMMED_MONOKAI
 from running import Running
 
 from thermoctl.daemon import dashboard, monitor
@@ -93,6 +94,30 @@ def frames(server, count, **headers):
 
 
 # ------------------------------------------------------------------------------------------------------ the browser
+def seen_in_the_terminal(browser, running, settings):
+    """A picture of the monitor as it is now."""
+    trails, console = {}, Console(file=io.StringIO(), width=80, record=True, force_terminal=True)
+    for _ in range(40):
+        running.tick(100)
+        monitor.remember(trails, status(running.shared))
+    latency = Commands(running.shared, settings, None, lambda *a, **k: None).answer(b'{"command": "latency"}', "")
+    console.print(monitor.screen(status(running.shared), latency, trails, 80))
+    page = Path(settings.path).with_name("monitor.html")
+    page.write_text(console.export_html(theme=DIMMED_MONOKAI, code_format=(
+        '<!doctype html><meta charset="utf-8"><style>{stylesheet} body {{ margin: 0; padding: 14px; color: #d9d9d9; background: #191919; '
+        'font: 15px/1.25 "DejaVu Sans Mono", monospace }} pre {{ margin: 0; font: inherit }}</style><pre>{code}</pre>')))
+    browser.size(760, 300)
+    browser.open(f"file://{page}")
+    browser.until("document.readyState === 'complete' && document.body.textContent.includes('lateness')")
+    browser.keep("monitor")
+    browser.size(1440, 1000)
+
+
+def choose_when_there(browser, select, value):
+    browser.until("document.getElementById('signal')?.options.length > 5")
+    choose(browser, select, value)
+
+
 def choose(browser, select, value):
     browser.js(f"(s => {{ s.value = '{value}'; s.dispatchEvent(new Event('change')); }})(document.getElementById('{select}'))")
 
@@ -149,6 +174,9 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         browser.key("End")
         browser.until("/reference 12\\.500/.test(document.getElementById('r-position').textContent)")
         browser.keep("dashboard-light")
+        seen_in_the_terminal(browser, running, settings)
+        browser.open(dashboard.url(server))
+        choose_when_there(browser, "span", "600")
         # Every tick of the last seconds, and other signals, from the same recording.
         choose(browser, "signal", "coil_c")
         browser.until("document.getElementById('n-history').textContent.startsWith('coil: measured')")

@@ -29,7 +29,7 @@ def write_report(case: Case, found: Diagnosis, path: str | Path) -> None:
                 ("Where", _place(case, found)),
                 ("What is missing", _missing(found)),
                 ("The equation", _equations(found)),
-                ("What adding it is worth", _worth(case, found)),
+                ("What adding it is worth" if found.final.effects else "How well it fits", _worth(case, found)),
                 ("Before and after", _curves(case, found)),
                 ("What it could be confused with", _confused(found)),
                 ("Parameters before and after", _parameters(case, found)),
@@ -259,5 +259,5 @@ def _made(case: Case, found: Diagnosis) -> str:
              f"Chance that noise alone makes some entry of the catalogue look this good: {_chance(found, chance)}; "
              f"{len(found.rounds[0].directions) if found.rounds else 0} directions (effect, place, shape) were screened.",
              "Intervals: 1.96 standard errors of the joint refit. Probabilities: weights of the refitted explanations' scores.",
-             f"Settled in {len(found.rounds)} looks at the catalogue."]
+             f"Settled in {len(found.rounds)} look{'' if len(found.rounds) == 1 else 's'} at the catalogue."]
     return _items(lines)

@@ -65,7 +65,8 @@ def cell(v: Any) -> str:
 def unit(name: str | None) -> str:
     """A unit as people write it: degC is °C, um is µm, no unit is nothing."""
     text = _UNIT.sub(lambda m: {"degC": "°C", "um": "µm", "us": "µs", "ohm": "Ω"}[m[0]], name or "")
-    return "" if text == "1" else text.replace("**2", "²").replace("**3", "³").replace("*", "·")
+    text = re.sub(r"\*\*(2|3|4)(?![.\d])", lambda m: {"2": "²", "3": "³", "4": "⁴"}[m[1]], text).replace("**", "^").replace("*", "·")
+    return "" if text == "1" else text.replace("(unit_of_y)", "reading").replace("unit_of_y", "reading")
 
 
 def figure(fig: Any, caption: str = "") -> str:
