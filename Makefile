@@ -109,3 +109,7 @@ hazards: install                   # every hazard with its limit; the table of w
 .PHONY: walkthrough
 walkthrough:                       # a new user's walk: a clean clone, every command of README, a diagnosed recording
 	$(PYTHON) tests/walkthrough/walk.py
+
+.PHONY: test-scale
+test-scale: install                # a Dask scheduler and workers started by hand, one killed; diagnose over a folder of rigs
+	$(BIN)/python -m pytest -m slow tests/test_prove.py

@@ -7,6 +7,10 @@ import io
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -208,20 +212,99 @@ def fake(job, out: str) -> dict:
 
 
 def test_a_killed_worker_loses_nothing_and_done_cases_are_not_run_again(tmp_path):
-    import sys
-
     import cloudpickle
 
     cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the workers need not find this file
     jobs = prove.find_jobs(a_set(tmp_path / "cases"))
     seen = []
-    assert prove.run_all(jobs, tmp_path / "out", workers=2, task=fake, progress=lambda *x: seen.append(x[:2])) == 4
+    assert prove.run_all(jobs, tmp_path / "out/cases", workers=2, task=fake, progress=lambda *x: seen.append(x[:2])) == 4
     assert (tmp_path / "out/cases/died").exists()
     assert sorted(set((tmp_path / "out/cases/log").read_text().split())) == ["a", "b", "c", "d"]
     assert [count for count, _ in seen] == [1, 2, 3, 4]
-    assert prove.run_all(jobs, tmp_path / "out", workers=1, task=fake) == 0
+    assert prove.run_all(jobs, tmp_path / "out/cases", workers=1, task=fake) == 0
     Path(jobs[2].recordings[0]).write_text("t,y\n0,2\n")  # other data: only this one again
-    assert prove.run_all(jobs, tmp_path / "out", workers=1, task=fake) == 1
+    assert prove.run_all(jobs, tmp_path / "out/cases", workers=1, task=fake) == 1
+
+
+def dies_once(job, out: str) -> dict:
+    """The real diagnosis, in a worker that is killed in the middle of its first case."""
+    marker = Path(out).parent / "died"
+    if not marker.exists():
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.write_text(str(os.getpid()))
+        os.kill(os.getpid(), signal.SIGKILL)
+    return prove.run_one(job, out)
+
+
+@contextmanager
+def a_dask_by_hand(folder: Path):
+    """A scheduler and two workers as one starts them on three machines: (address, worker processes)."""
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL,
+             "env": {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}}  # the task of this file must be found there
+    file = folder / "scheduler.json"
+    command = [sys.executable, "-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
+    started = [subprocess.Popen(command, **quiet)]
+    try:
+        limit = time.monotonic() + 120
+        while not file.exists() or not file.read_text():
+            assert time.monotonic() < limit and started[0].poll() is None, "no scheduler"
+            time.sleep(0.05)
+        address = json.loads(file.read_text())["address"]
+        worker = [sys.executable, "-m", "dask", "worker", address, "--no-nanny", "--nthreads", "1", "--no-dashboard"]
+        started += [subprocess.Popen([*worker, "--local-directory", str(folder)], **quiet) for _ in range(2)]
+        yield address, started[1:]
+    finally:
+        for process in started:
+            process.kill()
+        for process in started:
+            process.wait(30)
+
+
+@pytest.mark.slow
+def test_a_remote_scheduler_loses_nothing_when_one_of_two_workers_is_killed(tmp_path):
+    """tcp:// scheduler, two workers started by hand, one killed during a case: every case is diagnosed, by the other worker."""
+    from distributed import Client
+
+    from tests.concealed import generate
+
+    generate.main(["--out", str(tmp_path / "cases"), "--number", "3", "--families", "tanks", "--kind", "none", "--smoke"])
+    jobs = prove.find_jobs(tmp_path / "cases")
+    with a_dask_by_hand(tmp_path) as (address, workers):
+        with Client(address) as client:
+            client.wait_for_workers(2, timeout=120)
+        told = []
+        assert prove.run_all(jobs, tmp_path / "out/cases", scheduler=address, task=dies_once, progress=lambda *x: told.append(x[2])) == 3
+        assert [x["error"] for x in told] == [None] * 3
+        assert sorted(w.poll() for w in workers if w.poll() is not None) == [-signal.SIGKILL]  # one is dead, one lives
+    assert (tmp_path / "out/cases/died").exists()
+    content = prove.prove(tmp_path / "cases", tmp_path / "out", tmp_path / "cases_answers", workers=1)  # nothing is run again
+    assert content["figures"]["cases"] == 3 and content["figures"]["failed"] == 0
+
+
+@pytest.mark.slow
+def test_diagnose_over_a_folder_of_rigs(tmp_path, capsys):
+    """Two rigs of one plant, one file that cannot be read: each rig by itself, through Dask, the bad one told."""
+    from tests.concealed import generate
+    from thermoctl.cli import main
+
+    generate.main(["--out", str(tmp_path / "c"), "--number", "1", "--families", "tanks", "--kind", "none", "--smoke", "--seed", "4"])
+    case = tmp_path / "c" / "0001"
+    for rig in ("north", "south"):
+        (tmp_path / "fleet" / rig).mkdir(parents=True)
+        for run in ("run_1.csv", "run_2.csv"):
+            (tmp_path / "fleet" / rig / run).write_bytes((case / run).read_bytes())
+    (tmp_path / "fleet" / "east").mkdir()
+    (tmp_path / "fleet" / "east" / "bad.csv").write_text("t,pump\n0,1\n0,2\n")
+    words = ["diagnose", str(tmp_path / "fleet"), "--plant", str(case / "plant.yaml"), "--out", str(tmp_path / "out"), "--workers", "2"]
+    assert main([*words, "--json"]) == 0
+    told = {x["rig"]: x for x in json.loads(capsys.readouterr().out)}
+    assert set(told) == {"north", "south", "east"}
+    assert told["east"]["verdict"] is None and "bad.csv" in told["east"]["error"]
+    assert told["north"]["verdict"] == told["south"]["verdict"] == json.loads((tmp_path / "out/north/diagnosis.json").read_text())["verdict"]
+    assert len(told["north"]["recordings"]) == 2 and (tmp_path / "out/south/report.html").exists()
+    before = (tmp_path / "out/north/run.json").stat().st_mtime_ns
+    assert main([*words, "--quiet"]) == 0
+    assert (tmp_path / "out/north/run.json").stat().st_mtime_ns == before  # done rigs are not run again
 
 
 def test_answers_apart_must_be_the_sealed_ones(tmp_path):

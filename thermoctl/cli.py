@@ -195,9 +195,13 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
         return command.effects(args)
     folder = ("--effects", {"action": "append", "metavar": "DIR", "help": "a further folder of effect files (repeatable)"})
     _add(sub, "diagnose", "where simulation and recordings differ, which physics was left out, what adding it is worth", diagnose,
-         ("recordings", {"nargs": "+", "metavar": "REC", "help": "recordings: .csv, .parquet or .arrow"}),
+         ("recordings", {"nargs": "+", "metavar": "REC", "help": "recordings: .csv, .parquet or .arrow; or folders of many rigs' "
+                                                                 "recordings: each rig by itself"}),
          ("--plant", {"required": True, "metavar": "FILE"}),
-         ("--out", {"required": True, "metavar": "DIR", "help": "for diagnosis.json, plant.yaml and report.html"}),
+         ("--out", {"required": True, "metavar": "DIR", "help": "for diagnosis.json, plant.yaml and report.html (of folders: DIR/RIG)"}),
+         ("--last", {"type": int, "default": 2, "metavar": "N", "help": "of folders: each rig's newest N recordings (default 2)"}),
+         ("--workers", {"type": int, "metavar": "N", "help": "of folders: local processes (default: one a core)"}),
+         ("--scheduler", {"metavar": "ADDRESS", "help": "of folders: a Dask scheduler (tcp://...) that sees the same files"}),
          folder, ("--json", {"action": "store_true", "help": "print the result as JSON"}),
          ("--quiet", {"action": "store_true", "help": "no progress, no summary"}))
     _add(sub, "effects", "list the catalogue of effects, or `effects show NAME`", effects,

@@ -31,6 +31,8 @@ class Progress:
 
 def diagnose(args: argparse.Namespace) -> int:
     """`thermoctl diagnose`: runs the diagnosis and prints its summary. Raises InputError for unusable inputs."""
+    if any(Path(r).is_dir() for r in args.recordings):
+        return fleet(args)
     from thermoctl.diagnose import run
     found = run.diagnose(args.plant, args.recordings, args.out, [Path(e) for e in args.effects or ()],
                          None if args.quiet else Progress())
@@ -38,6 +40,42 @@ def diagnose(args: argparse.Namespace) -> int:
         print(json.dumps(found, indent=1, allow_nan=False))
     elif not args.quiet:
         summary(found, args.out)
+    return 0
+
+
+def fleet(args: argparse.Namespace) -> int:
+    """`thermoctl diagnose` over folders: every rig's newest recordings by themselves, spread over processes or a Dask cluster,
+    into OUT/RIG each. A rig is what the program's recordings are named by, else the folder that holds them. A rig that cannot be
+    diagnosed is told and does not stop the others; done rigs are not run again."""
+    from thermoctl.diagnose import prove
+    from thermoctl.diagnose.fleet import find_recordings, rig_of
+    rigs: dict[str, list[str]] = {}
+    for path in (p for r in args.recordings for p in (find_recordings(r) if Path(r).is_dir() else [r])):
+        rigs.setdefault(rig_of(path), []).append(path)
+    jobs = [prove.Job(rig, args.plant, tuple(sorted(paths, key=lambda p: Path(p).name)[-args.last:]), tuple(args.effects or ()))
+            for rig, paths in sorted(rigs.items())]
+    if not Path(args.plant).is_file():
+        raise InputError(f"{args.plant}: no such file; the plant of the fleet's rigs was expected")
+    out = Path(args.out)
+    prove.run_all(jobs, out, args.scheduler, args.workers, progress=None if args.quiet else prove.Reporter())
+    told = []
+    for job in jobs:
+        run = json.loads((out / job.name / "run.json").read_text())
+        found = {} if run["error"] else json.loads((out / job.name / "diagnosis.json").read_text())
+        told.append({"rig": job.name, "recordings": list(job.recordings), "error": run["error"], "seconds": run["seconds"],
+                     "verdict": found.get("verdict"), "findings": [{k: f[k] for k in ("effect", "where", "probability")}
+                                                                   for f in found.get("findings", [])]})
+    if args.json:
+        print(json.dumps(told, indent=1))
+    elif not args.quiet:
+        from rich.console import Console
+        from rich.table import Table
+        table = Table("rig", "recordings", "verdict", "effect at place (probability)", "s", box=None, header_style="bold")
+        for x in told:
+            what = x["error"] or "\n".join(f"{f['effect']} at {f['where']} ({f['probability']:.2f})" for f in x["findings"])
+            table.add_row(x["rig"], str(len(x["recordings"])), x["verdict"] or "not diagnosed", what, f"{x['seconds'] or 0:.0f}")
+        Console(soft_wrap=True).print(table)
+        print(f"reports: {out}/RIG/report.html")
     return 0
 
 

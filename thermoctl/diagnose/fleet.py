@@ -100,10 +100,15 @@ def _local(path: str) -> Iterator[str]:
         yield copy
 
 
+def rig_of(path: str) -> str:
+    """The rig that a recording is of: by the name that the program gives its recordings, else by its folder."""
+    match = NAME.match(Path(path).name)
+    return match["rig"] if match else Path(path).parent.name
+
+
 def summarise(path: str, plant_path: str | None, names: tuple[str, ...]) -> Summary:
     """One recording. A file that cannot be read or simulated gives a Summary with `error`: the others go on."""
-    match = NAME.match(Path(path).name)
-    rig = match["rig"] if match else Path(path).parent.name
+    rig = rig_of(path)
     try:
         with _local(path) as here:
             table = read_table(here)

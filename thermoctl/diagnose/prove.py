@@ -2,8 +2,8 @@
 
 A case is a folder with plant.yaml and recordings. Answers lie apart (DIR/NAME.yaml, checked against manifest.sha256) or
 as answer.yaml inside the case; they are read after the last diagnosis has ended. Diagnoses run through Dask in separate
-processes; a case that is done (OUT/cases/NAME/run.json of the same inputs) is not run again, and the case of a worker
-that dies is given to another.
+processes; a case that is done (OUT/cases/NAME/run.json of the same inputs and the same code) is not run again, and the case
+of a worker that dies is given to another.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from typing import Any
 
 from thermoctl import __version__
 from thermoctl.diagnose import score as scoring
+from thermoctl.diagnose.effects import CATALOGUE
 from thermoctl.yamlfile import InputError, load
 
 RECORDINGS = (".csv", ".parquet", ".arrow")
@@ -35,16 +36,20 @@ RETRIES = 3  # how many workers may die over one case
 
 @dataclass(frozen=True)
 class Job:
-    """One diagnosis to run: `inputs` are the plant and the recordings."""
+    """One diagnosis to run: plant file, recordings, and folders of effects beside the catalogue's."""
 
     name: str
     plant: str
     recordings: tuple[str, ...]
+    effects: tuple[str, ...] = ()
 
     def fingerprint(self) -> str:
-        """Of the contents of all inputs."""
+        """Of the contents of all inputs and of the program that diagnoses: a result of other code is not this job's."""
+        package = Path(__file__).parents[1]
+        code = [f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.py"))]
+        entries = [f for folder in (CATALOGUE, *self.effects) for f in sorted(Path(folder).glob("*.yaml"))]
         digest = hashlib.sha256()
-        for path in (self.plant, *self.recordings):
+        for path in (self.plant, *self.recordings, *entries, *code):
             digest.update(hashlib.sha256(Path(path).read_bytes()).digest())
         return digest.hexdigest()
 
@@ -79,7 +84,7 @@ def run_one(job: Job, out: str) -> dict[str, Any]:
     begun, cpu = time.monotonic(), time.process_time()
     told: dict[str, Any] = {"name": job.name, "fingerprint": job.fingerprint(), "version": __version__, "error": None}
     try:
-        diagnose(job.plant, list(job.recordings), out)
+        diagnose(job.plant, list(job.recordings), out, [Path(e) for e in job.effects])
     except InputError as e:
         told["error"] = str(e)
     except Exception as e:  # a crash is a result of the proof, not the end of it
@@ -93,7 +98,7 @@ def run_one(job: Job, out: str) -> dict[str, Any]:
 
 
 def done(job: Job, out: Path) -> bool:
-    """Whether this case, with these inputs, has been run into `out`."""
+    """Whether this job has been run into `out`, by this code."""
     try:
         told = json.loads((out / "run.json").read_text())
     except (OSError, ValueError):
@@ -142,15 +147,15 @@ def run_all(
     task: Callable[[Job, str], dict[str, Any]] = run_one,
     progress: Callable[[int, int, dict], None] | None = None,
 ) -> int:
-    """Run every case that is not done yet; returns how many were run. `task` is called in a worker."""
-    waiting = [j for j in jobs if not done(j, out / "cases" / j.name)]
+    """Run every job that is not done yet into OUT/NAME; returns how many were run. `task` is called in a worker."""
+    waiting = [j for j in jobs if not done(j, out / j.name)]
     if not waiting:
         return 0
     from distributed import as_completed
 
     with cluster(scheduler, workers) as client:
         futures = {
-            client.submit(task, j, str(out / "cases" / j.name), pure=False, key=f"case-{j.name}"): j for j in waiting
+            client.submit(task, j, str(out / j.name), pure=False, key=f"case-{j.name}"): j for j in waiting
         }
         for count, future in enumerate(as_completed(list(futures)), 1):
             job = futures[future]
@@ -162,7 +167,7 @@ def run_all(
                     "seconds": None,
                     "error": f"{type(future.exception()).__name__}: {future.exception()}",
                 }
-                folder = out / "cases" / job.name
+                folder = out / job.name
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "run.json").write_text(json.dumps(told) + "\n")
             else:
@@ -224,7 +229,7 @@ def prove(
     and OUT/proof.html; returns the JSON's content."""
     out = Path(out_dir)
     jobs = find_jobs(cases, number)
-    run_all(jobs, out, scheduler, workers, progress=progress)
+    run_all(jobs, out / "cases", scheduler, workers, progress=progress)
     told = read_answers(jobs, Path(answers) if answers is not None else None)
     rows = []
     for job in jobs:
@@ -454,7 +459,7 @@ def real(
     README's lines on published figures. Writes OUT/real.json."""
     out = Path(out_dir)
     jobs = find_jobs(folder, apart=apart)
-    run_all(jobs, out, scheduler, workers, progress=progress)
+    run_all(jobs, out / "cases", scheduler, workers, progress=progress)
     entries = []
     for job in jobs:
         result, run = _outcome(job, out)
