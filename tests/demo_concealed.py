@@ -90,13 +90,20 @@ def conceal(story: Story, seed: int, folder: Path) -> tuple[Scene, tuple[str, st
         tables.append(columns)
     plant = scene.plant
     if story.family == "actuator":
-        names = {"voltage": "voltage_v", "current": "current_a", "air_temperature": "air_c", "position_error": "position_error_um"}
-        names |= {o: o.replace("_temperature", "_c") for o in scene.outputs if o.endswith("_temperature")}
-        tables = [[(names.get(n, n), x) for n, x in columns] for columns in tables]
-        plant = {**plant, **{part: {n: {**x, "column": names.get(x.get("column", n), x.get("column", n))} for n, x in plant[part].items()}
-                             for part in ("inputs", "outputs")}}
+        tables = [in_signals(plant, columns)[1] for columns in tables]
+        plant, _ = in_signals(plant, tables[0])
     generate.write_case(folder, plant, tables)
     return scene, effect, true, float(np.linalg.norm(left))
+
+
+def in_signals(plant: dict, columns: list) -> tuple[dict, list]:
+    """An actuator's plant file and columns by the program's names of signals, which its compensator knows."""
+    names = {"voltage": "voltage_v", "current": "current_a", "air_temperature": "air_c", "position_error": "position_error_um"}
+    names |= {o: o.replace("_temperature", "_c") for o in plant["outputs"] if o.endswith("_temperature")}
+
+    def named(part: str) -> dict:
+        return {n: {**x, "column": names.get(x.get("column", n), x.get("column", n))} for n, x in plant[part].items()}
+    return {**plant, "inputs": named("inputs"), "outputs": named("outputs")}, [(names.get(n, n), x) for n, x in columns]
 
 
 def compensated(plant_file: Path, recording: Path, true_um: np.ndarray, t_now_s: float) -> np.ndarray:
