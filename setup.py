@@ -5,8 +5,8 @@ import numpy
 from Cython.Build import cythonize
 from setuptools import Extension, setup
 
-sources = sorted(p if p.suffix == ".pyx" else p.with_suffix(".py")
-                 for root in ("thermoctl", "hal") for p in [*Path(root).rglob("*.pyx"), *Path(root).rglob("*.pxd")])
+typed = [p for root in ("thermoctl", "hal") for p in Path(root).rglob("*.p[xy][xd]")]
+sources = sorted({p.with_suffix(".pyx") if p.with_suffix(".pyx").exists() else p.with_suffix(".py") for p in typed})
 
 # -ffp-contract=off: the law gives the same bits on every machine that a recording is replayed on.
 setup(ext_modules=cythonize(

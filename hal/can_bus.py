@@ -1,3 +1,4 @@
+# cython: annotation_typing=False, cdivision=True
 """CAN: ports that the tick can use without waiting, CiA-402 drives, and devices that a DBC file describes.
 
 Ports ("interface:channel@bitrate", bitrate 1000000 where left out)
@@ -43,7 +44,7 @@ from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, Hardw
 from hal.devices import Device
 from hal.profile import Binding, Cia402, Dbc, LineSettings
 from hal.serial_port import open_port
-from hal.wire import SlcanParser, encode_slcan
+from hal.wire import SlcanParser, join_slcan, write_bytes
 from thermoctl.yamlfile import InputError
 
 SYNC_ID, NMT_ID = 0x080, 0x000
@@ -75,13 +76,10 @@ class SlcanPort:
 
     def send(self, *frames: Frame) -> None:
         """Send without waiting, in one write. Raises OSError when the adapter is gone or takes nothing any more."""
-        out = b"".join([self._out, *[encode_slcan(can_id, data) for can_id, data in frames]])
-        try:
-            self._out = out[os.write(self._fd, out):]
-        except BlockingIOError:
-            self._out = out
-            if len(out) > MAX_PENDING:
-                raise OSError(errno.ENOBUFS, "the adapter takes no data") from None
+        out = join_slcan(self._out, frames)
+        self._out = out[write_bytes(self._fd, out):]
+        if len(self._out) > MAX_PENDING:
+            raise OSError(errno.ENOBUFS, "the adapter takes no data")
 
     def receive(self) -> list[Frame]:
         """What has arrived. Raises OSError when the adapter is gone."""

@@ -1,3 +1,4 @@
+# cython: annotation_typing=False, cdivision=True
 """Real devices as one back end: what every driver shares, and the keeping up of links.
 
 A driver knows one protocol. Its `connect` may block (opening, configuring); `read` and `write`, called in the tick, may

@@ -1,3 +1,4 @@
+# cython: annotation_typing=False, cdivision=True
 """Serial devices: framed bytes with a CRC, and lines of text.
 
 pyserial opens and configures the line (exclusive, so that a second program is refused); the tick then reads and writes

@@ -12,17 +12,11 @@ import os
 import struct
 
 from libc.errno cimport EAGAIN, EINTR, errno as c_errno
-from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint8_t, uint16_t, uint32_t, uint64_t
+from libc.stdint cimport int8_t, int16_t, int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memmove
-from posix.unistd cimport read as c_read
+from posix.unistd cimport read as c_read, write as c_write
 
 from hal.profile import CRCS, FIELD_TYPES
-
-cdef enum:
-    MAX_READ = 4096             # bytes a tick takes from a port
-    MAX_FRAME = 1024
-    MAX_FIELDS = 64
-    MAX_MESSAGE = 64            # the longest Lawicel message has 30 bytes
 
 cdef uint16_t[256] _CCITT, _MODBUS
 
@@ -86,17 +80,6 @@ cdef class Framer:
 
     spec: hal.profile.BinaryFrame.
     """
-    cdef readonly object spec
-    cdef readonly long frames, bad, skipped, lost
-    cdef readonly int size
-    cdef object _payload
-    cdef uint8_t[MAX_READ + MAX_FRAME] _buffer
-    cdef uint8_t[MAX_FRAME] _newest
-    cdef uint8_t[8] _sync
-    cdef int _length, _sync_size, _head, _payload_size, _has_length, _crc_kind, _crc_big, _big, _sequence, _known
-    cdef int[MAX_FIELDS] _offset
-    cdef char[MAX_FIELDS] _type
-    cdef uint64_t _modulus_mask
 
     def __init__(self, spec):
         self.spec, self._payload = spec, spec.payload
@@ -252,31 +235,55 @@ cdef int _nibble(uint8_t c) noexcept nogil:
 cdef char *_DIGITS = b"0123456789ABCDEF"
 
 
-cpdef bytes encode_slcan(uint32_t can_id, const uint8_t[::1] data):
-    """A data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR above 0x7FF."""
-    cdef char[32] out
+cdef int _encode(char *out, uint32_t can_id, const uint8_t *data, int size) noexcept nogil:
     cdef int digits = 3 if can_id <= 0x7FF else 8, at = 1, i
     out[0] = b't' if digits == 3 else b'T'
-    if data.shape[0] > 8:
-        raise ValueError(f"a CAN frame has at most 8 bytes, not {data.shape[0]}")
     for i in range(digits):
         out[at] = _DIGITS[can_id >> (4 * (digits - 1 - i)) & 15]
         at += 1
-    out[at] = <char>(48 + data.shape[0])
+    out[at] = <char>(48 + size)
     at += 1
-    for i in range(data.shape[0]):
+    for i in range(size):
         out[at], out[at + 1] = _DIGITS[data[i] >> 4], _DIGITS[data[i] & 15]
         at += 2
     out[at] = b'\r'
-    return out[:at + 1]
+    return at + 1
+
+
+cpdef bytes encode_slcan(uint32_t can_id, bytes data):
+    """A data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR above 0x7FF."""
+    return join_slcan(b"", ((can_id, data),))
+
+
+cpdef bytes join_slcan(bytes before, tuple frames):
+    """`before` and the frames (id, data) after it in Lawicel ASCII, as one write takes them."""
+    cdef char[1024] out
+    cdef int at = 0
+    cdef tuple frame
+    cdef bytes data
+    if len(frames) > 32:
+        raise ValueError(f"{len(frames)} frames at once; at most 32")
+    for frame in frames:
+        data = frame[1]
+        if len(data) > 8:
+            raise ValueError(f"a CAN frame has at most 8 bytes, not {len(data)}")
+        at += _encode(out + at, frame[0], <const uint8_t *><const char *>data, <int>len(data))
+    return before + out[:at] if before else out[:at]
+
+
+cpdef Py_ssize_t write_bytes(int fd, bytes data) except -1:
+    """Bytes of `data` that a descriptor took without waiting, 0 when it takes none now. Raises OSError when it is gone."""
+    cdef Py_ssize_t done = c_write(fd, <const char *>data, len(data))
+    if done >= 0:
+        return done
+    if c_errno == EAGAIN or c_errno == EINTR:
+        return 0
+    raise OSError(c_errno, os.strerror(c_errno))
 
 
 cdef class SlcanParser:
     """Bytes from an adapter in, data frames out. Acknowledgements (z, Z, CR) pass silently; BEL, which refuses a
     command, is counted in `refused`, what is no valid message in `bad`. Time stamps after the data are ignored."""
-    cdef public long bad, refused
-    cdef uint8_t[MAX_MESSAGE] _rest
-    cdef int _length
 
     @property
     def pending(self) -> int:
@@ -350,10 +357,6 @@ cdef class Channels:
 
     roles, scale, offset, low, high: one number a channel, in order.
     """
-    cdef readonly int[::1] roles
-    cdef double[::1] scale, offset, low, high, value, time_s
-    cdef uint8_t[::1] fresh, status
-    cdef object _sample
 
     def __init__(self, int[::1] roles, double[::1] scale, double[::1] offset, double[::1] low, double[::1] high):
         self.roles, self.scale, self.offset, self.low, self.high = roles, scale, offset, low, high
@@ -373,8 +376,6 @@ cdef class Channels:
 
 cdef class Ages:
     """Which readings of a sample are too old. limit_s: float64 over the roles."""
-    cdef double[::1] time_s, limit_s
-    cdef uint8_t[::1] fresh, status
 
     def __init__(self, sample, double[::1] limit_s):
         self.time_s, self.fresh, self.status = sample.time_s, sample.fresh.view("u1"), sample.status

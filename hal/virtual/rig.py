@@ -438,7 +438,7 @@ class VirtualRig:
         try:
             for device in self.devices.values():
                 device.plug()
-            with open(self.run_dir / "reference.csv", "w", buffering=1 << 14) as reference:
+            with open(self.run_dir / "reference.csv", "w", buffering=1) as reference:
                 reference.write("# the virtual rig's own truth; t is CLOCK_MONOTONIC\n"
                                 f"t,{','.join(_REFERENCE)},drive,enabled\n")
                 for device in self.devices.values():

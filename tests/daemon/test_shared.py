@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from thermoctl.daemon.clock import now_ns, sleep_until
-from thermoctl.daemon.ring import Box, Histogram, Mailbox, Ring, pack_readings, unpack_readings
+from thermoctl.daemon.ring import Box, Histogram, Mailbox, Record, Ring, unpack_readings
 
 from thermoctl.daemon.shared import Shared, percentiles
 from thermoctl.yamlfile import InputError
@@ -120,7 +120,12 @@ def test_histogram_and_percentiles():
 def test_readings_pack_into_two_exact_numbers(channels):
     fresh = np.array([f for f, _ in channels], dtype=np.uint8)
     status = np.array([s for _, s in channels], dtype=np.uint8)
-    packed = pack_readings(fresh, status)
+    row, values, outputs = np.zeros(3 + 20 + 2 + 4), np.arange(20.0), np.arange(4.0)
+    record = Record(row, 3)
+    record.bind(values, fresh, status, outputs)
+    record.fill((7, 8.5, 9))
+    np.testing.assert_array_equal(np.delete(row, [23, 24]), [7, 8.5, 9, *values, *outputs])
+    packed = row[23], row[24]
     again = np.zeros(20, np.uint8), np.zeros(20, np.uint8)
     unpack_readings(*packed, *again)
     np.testing.assert_array_equal(again[0], fresh)

@@ -22,14 +22,14 @@ from thermoctl.control import arming, faults
 from thermoctl.control.law import Law
 from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.clock import now_ns, sleep_until
-from thermoctl.daemon.ring import pack_readings
+from thermoctl.daemon.ring import Record
 from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
 from thermoctl.signals import INDEX, SIGNALS
 
 RELOAD = float(len(arming.COMMANDS))
 """The mailbox command that applies the parameter block; the others are arming's."""
 STATE_EVERY = 1000                     # ticks between two snapshots of the law's state
-_CHANNELS, _OUTPUTS = INDEX["position_raw_um"], INDEX["state"]
+_HEAD = INDEX["position_raw_um"]            # numbers of a row before the channels
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
 
 
@@ -48,6 +48,7 @@ class Rig:
         self.law = Law(model, parameters, period_s)
         self.reading: Any = None
         self.row = np.zeros(len(SIGNALS))
+        self.record = Record(self.row, _HEAD)
         self.slips = self.generation = self.external = self.write_failed = 0
         self.command, self.value = arming.NONE, 0.0
         self.wall_s: Callable[[], float] = time.time
@@ -69,7 +70,9 @@ class Rig:
         reading = self.backend.read(now_s)
         if reading is not self.reading:                       # the same object every time, by contract
             self.reading = reading
-            self.law.bind(reading.value, reading.fresh.view(np.uint8), reading.status)
+            fresh = reading.fresh.view(np.uint8)
+            self.law.bind(reading.value, fresh, reading.status)
+            self.record.bind(reading.value, fresh, reading.status, self.law.outputs)
         self.command, self.value, self.external = arming.NONE, 0.0, self.write_failed
         if self.mailbox is not None:
             message = self.mailbox.take()
@@ -96,14 +99,10 @@ class Rig:
 
     def publish(self, now_s: float, dt_s: float, lateness_us: float, busy_us: float) -> None:
         """The finished row, and now and then the law's state (where a replay may start)."""
-        row, reading, law = self.row, self.reading, self.law
-        fresh_bits, status_bits = pack_readings(reading.fresh.view(np.uint8), reading.status)
-        row[:_CHANNELS] = (now_s - self.start_s, self.wall_s(), law.tick, lateness_us, busy_us, self.slips,
-                           self.generation, dt_s, self.command, self.value, self.external)
-        row[_CHANNELS:_OUTPUTS - 2] = reading.value
-        row[_OUTPUTS - 2], row[_OUTPUTS - 1] = fresh_bits, status_bits
-        row[_OUTPUTS:] = law.outputs
-        self.publish_row(row)
+        law = self.law
+        self.record.fill((now_s - self.start_s, self.wall_s(), law.tick, lateness_us, busy_us, self.slips, self.generation,
+                          dt_s, self.command, self.value, self.external))
+        self.publish_row(self.row)
         if law.tick % STATE_EVERY == 1:
             self._keep_state()
 

@@ -163,18 +163,41 @@ cdef class Histogram:
             self.largest[0] = microseconds
 
 
-def pack_readings(unsigned char[::1] fresh, unsigned char[::1] status):
-    """(fresh_bits, status_bits): one bit, and two bits, a channel, as whole float64 numbers for the record."""
-    cdef uint64_t f = 0, s = 0
-    cdef int c
-    for c in range(fresh.shape[0]):
-        f |= <uint64_t>(fresh[c] != 0) << c
-        s |= <uint64_t>(status[c] & 3) << (2 * c)
-    return <double>f, <double>s
+cdef class Record:
+    """The record row of a tick, filled in place. `bind` gives it what it copies from; head: number of its first scalars.
+
+    Layout (signals.SIGNALS): head scalars | values of the channels | fresh bits (one a channel) | status bits (two) | outputs
+    of the law; the bits as whole float64 numbers.
+    """
+    cdef double[::1] row, value, outputs
+    cdef unsigned char[::1] fresh, status
+    cdef int head
+
+    def __init__(self, double[::1] row, int head):
+        self.row, self.head = row, head
+
+    def bind(self, double[::1] value, unsigned char[::1] fresh, unsigned char[::1] status, double[::1] outputs):
+        """The arrays of the back end's sample and of the law. Raises ValueError where they do not make up a row."""
+        if self.head + value.shape[0] + 2 + outputs.shape[0] != self.row.shape[0] or value.shape[0] > 26:
+            raise ValueError(f"{self.head} + {value.shape[0]} + 2 + {outputs.shape[0]} numbers are not a row of {self.row.shape[0]}")
+        self.value, self.fresh, self.status, self.outputs = value, fresh, status, outputs
+
+    def fill(self, tuple scalars) -> None:
+        """This tick's row: `head` scalars, and what the bound arrays hold now."""
+        cdef int k, n = <int>self.value.shape[0]
+        cdef uint64_t f = 0, s = 0
+        for k in range(self.head):
+            self.row[k] = scalars[k]
+        memcpy(&self.row[self.head], &self.value[0], n * sizeof(double))
+        for k in range(n):
+            f |= <uint64_t>(self.fresh[k] != 0) << k
+            s |= <uint64_t>(self.status[k] & 3) << (2 * k)
+        self.row[self.head + n], self.row[self.head + n + 1] = <double>f, <double>s
+        memcpy(&self.row[self.head + n + 2], &self.outputs[0], self.outputs.shape[0] * sizeof(double))
 
 
 def unpack_readings(double fresh_bits, double status_bits, unsigned char[::1] fresh, unsigned char[::1] status):
-    """The reverse of `pack_readings`, into the given arrays."""
+    """The reverse of what `Record.fill` packs, into the given arrays."""
     cdef uint64_t f = <uint64_t>fresh_bits, s = <uint64_t>status_bits
     cdef int c
     for c in range(fresh.shape[0]):

@@ -109,12 +109,18 @@ def restart(settings: Any) -> int:
     return stop(settings) or start(settings)
 
 
+def _program() -> Path:
+    """This installation's program: the one that was called, else the one beside the interpreter."""
+    called = Path(sys.argv[0]).absolute()
+    return called if called.name == "thermoctl" and called.is_file() else Path(sys.executable).with_name("thermoctl")
+
+
 def install(config: Path, root: Path = Path("/"), prefix: Path | None = None) -> int:
     """Install unit, user, run directory and device rules under `root`, with this installation's program in the unit.
 
     Tells systemd about it when `root` is the running system. Raises InputError where a file cannot be written.
     """
-    program = prefix or Path(sys.executable).with_name("thermoctl")
+    program = prefix or _program()
     try:
         for name, target in FILES.items():
             text = (SOURCE / name).read_text()

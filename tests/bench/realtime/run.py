@@ -38,7 +38,7 @@ HERE = Path(__file__).resolve().parent
 PERIOD_NS = 1_000_000
 PRIORITY, PEER_PRIORITY = 80, 85
 CONFIG = """
-rig: {{name: bench}}
+rig: {{name: wire}}
 loop: {{period_s: 1 ms, cpu: {cpu}, priority: {priority}}}
 control: {{kp: 0.004, ti_s: 0.0108, td_s: 0, output_limit: 1.5, moving_average: 2}}
 compensation: {{enable: true, model: {root}/config/models/wire.yaml, bound_um: 40, slew_um_s: 1}}
