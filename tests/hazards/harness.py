@@ -52,7 +52,7 @@ def quick_settings(folder: Path):
         (folder / f"{name}.yaml").write_text(text)
     model = linearise(load(folder / "actuator_thermal.yaml"), 0.001, 0.1, expansion_period_s=0.02)
     model = dataclasses.replace(model, air_filter_s=model.air_filter_s / QUICK)
-    save_model(folder / "model.yaml", model, "quick", [folder / "actuator_thermal.yaml"])
+    save_model(folder / "model.yaml", model, "simulated", [folder / "actuator_thermal.yaml"])
     text = (ROOT / "config/simulated.yaml").read_text()
     for old, new in (("plants/", ""), ("models/simulated.yaml", "model.yaml"), ("slew_um_s: 1", "slew_um_s: 50"),
                      ("temperatures_c: 900", "temperatures_c: 18"), ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25\n  innovation_time_s: 0.6"),

@@ -41,11 +41,11 @@ def _by_channel(given: Any, default: float, where: str) -> np.ndarray:
 
 
 def compensator(settings: Any) -> CompensatorModel:
-    """The model that `compensation.model` names; without one, the model that estimates nothing."""
+    """The model that `compensation.model` names; without one, the model that estimates nothing. Raises InputError for a model of another rig."""
     if not settings.compensation.model:
         return zero_model(settings.loop.period_s)
     from thermoctl.identify.modelfile import load_model
-    return load_model(settings.compensation.model)
+    return load_model(settings.compensation.model, settings.rig.name)
 
 
 def shared_name(settings: Any) -> str:

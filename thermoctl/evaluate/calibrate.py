@@ -211,6 +211,19 @@ class DaemonRig:
         return _table(rows, earlier.path)
 
 
+def rig_of(settings: Any) -> SimulatedRig | DaemonRig:
+    """The rig that tests run on: the daemon's where one answers, else the simulated one. Raises InputError where there is neither."""
+    from thermoctl.daemon.socket import ask
+    try:
+        ask(settings.socket.path, {"command": "status"})
+        return DaemonRig(settings)
+    except InputError:
+        if settings.hal.backend != "simulated":
+            raise InputError(f"{settings.path}: hal.backend is '{settings.hal.backend}' and no daemon answers on {settings.socket.path}; "
+                             "start it first (thermoctl start)") from None
+    return SimulatedRig(settings)
+
+
 def _rows(t: Table) -> np.ndarray:
     return np.column_stack([t.t if n == "t_s" else t.columns.get(n, np.full(len(t), np.nan)) for n in NAMES])
 
@@ -528,16 +541,8 @@ def calibrate(config: str, out: str | None, models: str, order: int, gains: bool
     """The command: 0 when every step is done (and accepted, when asked), 1 when it was ended early or not accepted.
 
     Raises InputError for a rig that cannot be calibrated."""
-    from thermoctl.daemon.socket import ask
     settings = load_settings(config)
-    try:
-        ask(settings.socket.path, {"command": "status"})
-        rig: SimulatedRig | DaemonRig = DaemonRig(settings)
-    except InputError:
-        if settings.hal.backend != "simulated":
-            raise InputError(f"{config}: hal.backend is '{settings.hal.backend}' and no daemon answers on {settings.socket.path}; "
-                             "start it (thermoctl start), then calibrate") from None
-        rig = SimulatedRig(settings)
+    rig = rig_of(settings)
     folder = Path(out or Path("calibration") / settings.rig.name)
     if again and (folder / "state.json").exists():
         for path in [folder / "state.json", *folder.glob("test_*.part.parquet")]:

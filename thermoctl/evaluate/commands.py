@@ -1,8 +1,9 @@
 """What the commands experiment, identify, model, tune, evaluate and reproduce do; returns are exit statuses."""
 from __future__ import annotations
 
-import dataclasses
 import sys
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,11 @@ from thermoctl.evaluate import chain, iso230, rigs
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.recording.table import Table, read_table, write_table
 from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX, NAMES, POINTS
+from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError, suggest
+
+CUTOFF_HZ = 4.3e-4                     # 1 / (2 pi 370 s), the paper's
+RELAY_DRIVE, RELAY_UM = 0.1, 0.5
 
 
 def _schedule(name: str, config: str) -> experiments.Schedule:
@@ -24,53 +28,73 @@ def _schedule(name: str, config: str) -> experiments.Schedule:
     return tests[name]
 
 
+def spectrum_lines(t: np.ndarray, power: np.ndarray, cutoff_hz: float) -> list[str]:
+    """The alternating power's share in octaves round `cutoff_hz`, as lines for a terminal."""
+    edges = [0.0, *(cutoff_hz * 2.0**k for k in range(-3, 4)), 0.5 / (t[1] - t[0])]
+    f, s = experiments.spectrum(t, power)
+    out = []
+    for low, high in pairwise(edges):
+        share = 100 * s[(f > low) & (f <= high)].sum() / s.sum()
+        mark = "  <- f_c" if high == cutoff_hz else ""
+        out.append(f"  {1e3 * low:8.3f} to {1e3 * high:8.3f} mHz {share:5.1f} % {'#' * round(share / 2)}{mark}")
+    return out
+
+
 def experiment(name: str, config: str, out: str | None, dry_run: bool, resume: bool) -> int:
-    """Run a test on the simulated back end, faster than real time; what was recorded is kept when it is aborted."""
-    from thermoctl.daemon.simulate import Simulation
+    """Run a test on the daemon that answers (its own back end, in real time, under its protections), else on the simulated back end,
+    faster than real time. What was recorded is kept when it ends early, and gone on with."""
+    from thermoctl.evaluate import calibrate
     schedule = _schedule(name, config)
     settings = load_settings(config)
     t = np.arange(0, schedule.duration_s)
     power = (schedule.at(t) / 250.0)**2 * 3.3
     print(f"{schedule.title}: {schedule.duration_s / 60:.0f} min, {len(schedule.commands())} moves, "
           f"{schedule.setpoint_um.min():g} to {schedule.setpoint_um.max():g} um")
-    print(f"about {power.mean():.2f} W on the mean, {power.max():.2f} W at most; "
-          f"{100 * experiments.share_below(t, power, 4.3e-4):.0f} % of the alternating power below 4.3e-4 Hz")
+    print(f"about {power.mean():.2f} W on the mean, {power.max():.2f} W at most")
+    if np.ptp(power) > 0:
+        print(f"{100 * experiments.share_below(t, power, CUTOFF_HZ):.0f} % of the alternating power below f_c = {CUTOFF_HZ:g} Hz:")
+        print("\n".join(spectrum_lines(t, power, CUTOFF_HZ)))
+    low, high = settings.control.setpoint_low_um, settings.control.setpoint_high_um
+    if schedule.setpoint_um.min() < low or schedule.setpoint_um.max() > high:
+        raise InputError(f"{config}: the experiment's setpoints leave control.setpoint_low_um..setpoint_high_um ({low:g}..{high:g})")
     if dry_run:
         return 0
-    if settings.hal.backend != "simulated":
-        raise InputError(f"{config}: hal.backend is '{settings.hal.backend}'; experiments run on the simulated back end here")
     path = Path(out or f"{name}.parquet")
-    blocks, start = [], 0.0
-    if resume and path.exists():
-        old = read_table(path)
-        blocks.append(np.column_stack([old.t if n == "t_s" else old.columns.get(n, np.full(len(old), np.nan)) for n in NAMES]))
-        start = float(old.t[-1] - old.t[0])
-    if not settings.compensation.model:
-        settings = dataclasses.replace(settings, compensation=dataclasses.replace(settings.compensation, enable=False),
-                                       protection=dataclasses.replace(settings.protection, innovation_limit_c=1e3))
-    simulation = Simulation(settings)
+    progress_path = path.with_name(path.name + ".progress")             # how far the schedule came, beside what was recorded
+    rig = calibrate.rig_of(settings)
+    print(f"on {rig.where}")
+    earlier, at_s = None, 0.0
+    if resume and path.exists() and progress_path.exists() and isinstance(rig, calibrate.DaemonRig):
+        earlier = rig.meanwhile(read_table(path))
+        at_s = float(progress_path.read_text()) if earlier is not None else 0.0
+        print(f"goes on at {at_s:.0f} s" if earlier is not None else
+              "begins anew: the daemon did not record without a gap since it was ended, and heat does not wait")
+    control = calibrate.Control(sys.stdin.isatty() and sys.stderr.isatty())
+    blocks: list[np.ndarray] = []
+    done_s = [at_s]
 
     def show(p: experiments.Progress) -> None:
-        print(f"\r{p.percent:5.1f} %  {p.eta_s:6.0f} s left", end="", file=sys.stderr, flush=True)
+        done_s[0] = p.done_s
+        if sys.stderr.isatty():
+            print(f"\r{p.percent:5.1f} %  {p.eta_s:6.0f} s left", end="", file=sys.stderr, flush=True)
 
-    status = 0
+    ended = ""
     try:
-        for block in experiments.run(simulation, schedule, 100, start, show):
-            blocks.append(block)
-    except (experiments.Aborted, KeyboardInterrupt) as e:
-        print(f"\nended early: {e or 'interrupted'}; resume with --resume --out {path}", file=sys.stderr)
-        status = 130 if isinstance(e, KeyboardInterrupt) else 1
-    finally:
-        simulation.close()
-    print(file=sys.stderr)
+        with control.listening():
+            for block in rig.run(schedule, earlier, at_s, show, control):
+                blocks.append(block)
+    except experiments.Aborted as e:
+        ended = e.reason
     if blocks:
         rows = np.vstack(blocks)
-        if start:                                             # a resumed simulation counts from its own start again
-            k = len(blocks[0])
-            rows[k:, INDEX["t_s"]] += rows[k - 1, INDEX["t_s"]] + 0.1 - rows[k, INDEX["t_s"]]
         write_table(path, Table(path.stem, str(path), rows[:, INDEX["t_s"]], {n: rows[:, i] for n, i in INDEX.items() if n != "t_s"}))
-        print(path)
-    return status
+        print(f"{path}: {len(rows)} rows")
+    if not ended:
+        progress_path.unlink(missing_ok=True)
+        return 0
+    progress_path.write_text(f"{done_s[0]:.3f}\n")
+    print(f"ended after {done_s[0]:.0f} of {schedule.duration_s:.0f} s: {ended}; go on with --resume --out {path}", file=sys.stderr)
+    return 1
 
 
 def _recorded(path: str) -> rigs.Recorded:
@@ -123,34 +147,60 @@ def model(action: str, models: str, name: str | None) -> int:
     return 0
 
 
-def open_loop_step(config: str, drive: float = 0.3, before_s: float = 0.05, after_s: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
-    """Step of the drive on the opened back end, without the position loop: (t from the step s, position um). The drive is bounded by
-    control.output_limit and the test ends when the position leaves protection's range."""
+def _open_loop(config: str, seconds: float, drive_at: Callable[[float, float], float], what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Drive the opened back end without the position loop: `drive_at`(s since the amplifier's second of power-up, position um) -> drive,
+    within control.output_limit. Returns (t s, position um). Real hardware is paced by the clock. The amplifier is off on every way out.
+    Raises InputError when the position leaves protection's range."""
     from hal.backend import ROLE, make_backend
+    from thermoctl.daemon.clock import now_ns, sleep_until
     settings = load_settings(config)
     backend = make_backend(settings)
-    backend.open()
-    period = settings.loop.period_s
-    drive = float(np.clip(drive, -settings.control.output_limit, settings.control.output_limit))
-    high = float(settings.protection.high.get("position_um", np.inf))
+    period, paced = settings.loop.period_s, settings.hal.backend == "devices"
+    limit, high = settings.control.output_limit, float(settings.protection.high.get("position_um", np.inf))
     t, y = [], []
+    backend.open()
     try:
-        ready = round(1.0 / period)                            # the amplifier powers up
-        for k in range(ready + round((before_s + after_s) / period)):
+        begin = now_ns()
+        for k in range(round((1.0 + seconds) / period)):
             now = (k + 1) * period
-            sample = backend.read(now)
-            since = now - (ready * period + before_s)
-            position = float(sample.value[ROLE["position_um"]])
-            if k >= ready:
+            if paced:
+                now = sleep_until(begin + round(now * 1e9)) * 1e-9
+                since = now - begin * 1e-9 - 1.0
+            else:
+                since = now - 1.0
+            position = float(backend.read(now).value[ROLE["position_um"]])
+            if abs(position) > high:
+                raise InputError(f"{what} drove the position to {position:.0f} um, beyond {high:g} um; give a smaller drive")
+            if since >= 0:
                 t.append(since)
                 y.append(position)
-            if abs(position) > high:
-                raise InputError(f"the step of {drive:g} drove the position to {position:.0f} um, beyond {high:g} um; give a smaller step")
-            backend.write(drive if since >= 0 else 0.0, True)
+            backend.write(float(np.clip(drive_at(since, position), -limit, limit)) if since >= 0 else 0.0, True)
     finally:
         backend.write(0.0, False)
         backend.close()
     return np.array(t), np.array(y)
+
+
+def open_loop_step(config: str, drive: float = 0.3, before_s: float = 0.05, after_s: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
+    """Step of the drive without the position loop: (t from the step s, position um); see `_open_loop`."""
+    t, y = _open_loop(config, before_s + after_s, lambda since, position: drive if since >= before_s else 0.0, f"the step of {drive:g}")
+    return t - before_s, y
+
+
+def relay_test(config: str, drive: float = 0.1, hysteresis_um: float = 0.5, seconds: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
+    """Relay feedback (Astrom and Hagglund) about the first position: the drive is +-`drive` against the position, switched beyond
+    +-`hysteresis_um`: (t s, position um); see `_open_loop`."""
+    centre: list[float] = []
+    now = [drive]
+
+    def switch(since: float, position: float) -> float:
+        if not centre:
+            centre.append(position)
+        if abs(position - centre[0]) > hysteresis_um:
+            now[0] = -float(np.copysign(drive, position - centre[0]))
+        return now[0]
+
+    return _open_loop(config, seconds, switch, f"the relay of {drive:g}")
 
 
 def tune(config: str, method: str, write: bool) -> int:
@@ -166,7 +216,9 @@ def tune(config: str, method: str, write: bool) -> int:
     elif method == "imc":
         proposed = tuning.robust(plant, period, average)
     else:
-        raise InputError("the relay test needs the amplifier in a loop of its own; use 'zn' or 'imc' on this rig")
+        proposed = tuning.relay(*relay_test(config, RELAY_DRIVE, RELAY_UM), RELAY_DRIVE, RELAY_UM)
+    if "Ku" in proposed.figures:
+        print(f"relay of {RELAY_DRIVE:g}: ultimate gain {proposed.figures['Ku']:.4g} per um, period {1e3 * proposed.figures['Tu_s']:.3g} ms")
     k0, tau_d, tau_c = tuning.tangent(plant)
     print(f"open-loop step: K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms, "
           f"residual {plant.residual:.2g} um")
