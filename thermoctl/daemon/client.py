@@ -150,8 +150,11 @@ def check(config: str) -> int:
 
 
 def doctor(config: str, seconds: float = 2.0) -> int:
-    """Connect, read every channel for `seconds`, show value, unit and rate; drives nothing. 1 when one is bad."""
+    """Connect, read every channel for `seconds`, show value, unit and rate; drives nothing. 1 when one is bad.
+
+    Then what of the machine decides how late a tick may come, with remedies (docs/how-to/real-time.md); that is advice."""
     from hal.backend import OK, ROLES, STATUS_NAMES, HardwareError, make_backend
+    from thermoctl.daemon.doctor import real_time_checks
     from thermoctl.daemon.loop import become_real_time
     from thermoctl.signals import SIGNALS
     settings = load_settings(config)
@@ -188,6 +191,9 @@ def doctor(config: str, seconds: float = 2.0) -> int:
     become_real_time(settings, refused.append)
     for line in refused or ["priority, locked memory, processor and latency request are all granted"]:
         print(f"  {line}")
+    for check in real_time_checks(settings):
+        print(f"  {check.name:24}{'good' if check.good else 'tune'}  {check.found}"
+              + ("" if check.good else f"\n{'':30}-> {check.remedy}"))
     return 1 if bad else 0
 
 
