@@ -73,17 +73,23 @@ class Sample:
 class Backend(Protocol):
     """What the loop needs of hardware; the contract stands in the module's text."""
 
-    def open(self) -> None: ...
+    def open(self) -> None:
+        """Connect to everything; all failures are reported together. Raises HardwareError."""
 
-    def read(self, now_s: float) -> Sample: ...
+    def read(self, now_s: float) -> Sample:
+        """The newest reading of every channel at now_s (monotonic seconds); never blocks."""
 
-    def write(self, drive: float, enable: bool) -> None: ...
+    def write(self, drive: float, enable: bool) -> None:
+        """Send the drive (in the unit of its profile) and whether the amplifier shall be enabled."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Disable the amplifier and let go of everything; may be called twice."""
 
-    def problem(self, role: str) -> str: ...
+    def problem(self, role: str) -> str:
+        """What the device of a role says is wrong, in its own words; '' when nothing is."""
 
-    def counters(self) -> dict[str, int]: ...
+    def counters(self) -> dict[str, int]:
+        """Counts since the start by name: frames lost, checksums that failed, reconnections."""
 
 
 def make_backend(settings: Any, board: Any = None) -> Backend:

@@ -87,9 +87,11 @@ class SlcanPort:
 
     @property
     def bad(self) -> int:
+        """Lines that were no frame, and frames that the adapter refused."""
         return self._parser.bad + self._parser.refused
 
     def close(self) -> None:
+        """Close the channel and the line."""
         with contextlib.suppress(OSError):
             os.write(self._fd, b"C\r")
         with contextlib.suppress(OSError):
@@ -160,6 +162,7 @@ class LibraryPort:
                 frames.append((raw_id & 0x1FFF_FFFF, data[:size]))
 
     def close(self) -> None:
+        """Leave the bus."""
         with contextlib.suppress(can.CanError, OSError):
             self._bus.shutdown()
 

@@ -53,6 +53,7 @@ class Section:
         return found
 
     def text(self, key: str, default: str | None = None, choices: Iterable[str] = ()) -> str:
+        """The text of `key`, one of `choices` where there are any. Raises InputError with its place."""
         node = self.get(key, default is None)
         if node is None:
             return default or ""
@@ -63,6 +64,7 @@ class Section:
         return node.value
 
     def number(self, key: str, default: float | None = None, low: float = -math.inf, high: float = math.inf) -> float:
+        """The number of `key` within low..high. Raises InputError with its place."""
         node = self.get(key, default is None)
         return float(default or 0.0) if node is None else _number(node, key, low, high)
 
@@ -72,6 +74,7 @@ class Section:
         return int(default or 0) if node is None else _integer(node, key, low, high)
 
     def flag(self, key: str, default: bool) -> bool:
+        """True or false of `key`. Raises InputError with its place."""
         node = self.get(key, False)
         if node is None:
             return default
@@ -80,6 +83,7 @@ class Section:
         return node.value
 
     def interval(self, key: str, default: tuple[float, float] = (-math.inf, math.inf)) -> tuple[float, float]:
+        """The pair [low, high] of `key`. Raises InputError with its place."""
         node = self.get(key, False)
         if node is None:
             return default
@@ -91,6 +95,7 @@ class Section:
         return low, high
 
     def list(self, key: str, required: bool = True) -> list[Node]:
+        """The list of `key`, empty where it is not required and not there. Raises InputError with its place."""
         node = self.get(key, required)
         if node is None:
             return []
@@ -99,6 +104,7 @@ class Section:
         return node.value
 
     def section(self, key: str, required: bool = True) -> Section | None:
+        """The mapping below `key`; None where it is not required and not there."""
         node = self.get(key, required)
         return None if node is None else Section(node, key)
 
@@ -197,6 +203,7 @@ class BinaryFrame:
 
     @property
     def payload(self) -> struct.Struct:
+        """How the fields lie in the bytes."""
         return struct.Struct(self.endian + "".join(FIELD_TYPES[t] for _, t in self.fields))
 
 
@@ -256,6 +263,7 @@ class Register:
 
     @property
     def words(self) -> int:
+        """Registers of 16 bits that the value takes."""
         return struct.calcsize(FIELD_TYPES[self.type]) // 2
 
 

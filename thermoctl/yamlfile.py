@@ -46,6 +46,7 @@ class Node:
 
     @property
     def place(self) -> str:
+        """'file:line:column' for messages."""
         return f"{self.file}:{self.line}:{self.column}"
 
     def plain(self) -> Any:
@@ -57,6 +58,7 @@ class Node:
         return self.value
 
     def error(self, message: str) -> InputError:
+        """An InputError that begins with the place; to be raised by the caller."""
         return InputError(f"{self.place}: {message}".replace("\n", "\\n"))      # a name may hold anything
 
 

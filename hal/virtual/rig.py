@@ -91,9 +91,11 @@ class VirtualDevice:
         self.verbs: dict[str, Callable[[str], None]] = {}
 
     def plug(self) -> None:
+        """Put the device (back) on its wire."""
         raise NotImplementedError
 
     def unplug(self) -> None:
+        """Pull its cable."""
         raise NotImplementedError
 
     def descriptors(self) -> list[int]:
@@ -139,18 +141,23 @@ class EncoderStream(VirtualDevice):
         self._held: dict[str, float] = {}
 
     def plug(self) -> None:
+        """Put the device (back) on its wire."""
         self.pty.plug()
 
     def unplug(self) -> None:
+        """Pull its cable."""
         self.pty.unplug()
 
     def descriptors(self) -> list[int]:
+        """What to wait on for input."""
         return [self.pty.master] if self.pty.master >= 0 else []
 
     def ready(self, descriptor: int, now_s: float) -> None:
+        """Answer what has come in on `descriptor`."""
         self.pty.receive()
 
     def tick(self, now_s: float, tick: int) -> None:
+        """Send what is due at now_s."""
         if self.mute:
             return
         fields: dict[str, float] = dict.fromkeys(self._names, 0)
@@ -183,15 +190,19 @@ class TextMeter(VirtualDevice):
         self.verbs = {v: self.flag(self, v) for v in ("mute", "half")}
 
     def plug(self) -> None:
+        """Put the device (back) on its wire."""
         self.pty.plug()
 
     def unplug(self) -> None:
+        """Pull its cable."""
         self.pty.unplug()
 
     def descriptors(self) -> list[int]:
+        """What to wait on for input."""
         return [self.pty.master] if self.pty.master >= 0 else []
 
     def ready(self, descriptor: int, now_s: float) -> None:
+        """Answer what has come in on `descriptor`."""
         for _ in self._lines.feed(self.pty.receive()):
             if not self.mute:
                 line = self._line()
@@ -213,14 +224,17 @@ class SlcanDevice(VirtualDevice):
         self.adapter = SlcanAdapter()
 
     def plug(self) -> None:
+        """Put the device (back) on its wire."""
         if self.pty.master < 0:
             self.adapter = SlcanAdapter()
         self.pty.plug()
 
     def unplug(self) -> None:
+        """Pull its cable."""
         self.pty.unplug()
 
     def descriptors(self) -> list[int]:
+        """What to wait on for input."""
         return [self.pty.master] if self.pty.master >= 0 else []
 
 
@@ -252,12 +266,14 @@ class DriveOnSlcan(SlcanDevice):
         return self.drive.command * profile.scale if self.drive.alive else 0.0
 
     def ready(self, descriptor: int, now_s: float) -> None:
+        """Answer what has come in on `descriptor`."""
         answer, frames = self.adapter.feed(self.pty.receive())
         for frame in frames:
             self.drive.take(frame, now_s)
         self._send(answer, now_s)
 
     def tick(self, now_s: float, tick: int) -> None:
+        """Send what is due at now_s."""
         for b in self.binding.bounds:
             if b.channel.source not in (0x6041, 0x603F) and (raw := self.reading(b)) is not None:
                 self.drive.od[b.channel.source, 0].value = round(raw)
@@ -278,10 +294,12 @@ class DbcSender(SlcanDevice):
         self.verbs = {"mute": self.flag(self, "mute")}
 
     def ready(self, descriptor: int, now_s: float) -> None:
+        """Answer what has come in on `descriptor`."""
         answer, _ = self.adapter.feed(self.pty.receive())
         self.pty.send(answer)
 
     def tick(self, now_s: float, tick: int) -> None:
+        """Send what is due at now_s."""
         period = max(1, round(1.0 / (self.binding.bounds[0].channel.rate_hz * self.rig.stepper.period_s)))
         if self.mute or tick % period or not self.adapter.open:
             return
@@ -334,6 +352,7 @@ class ModbusOnWire(VirtualDevice):
         self._refresh()
 
     def plug(self) -> None:
+        """Put the device (back) on its wire."""
         if self._address is None:
             self.pty.plug()
         elif self._server is None:
@@ -342,6 +361,7 @@ class ModbusOnWire(VirtualDevice):
             self._server.setblocking(False)
 
     def unplug(self) -> None:
+        """Pull its cable."""
         self.pty.unplug()
         for client, _ in self._clients.values():
             client.close()
@@ -351,11 +371,13 @@ class ModbusOnWire(VirtualDevice):
             self._server = None
 
     def descriptors(self) -> list[int]:
+        """What to wait on for input."""
         if self._server is not None:
             return [self._server.fileno(), *self._clients]
         return [self.pty.master] if self.pty.master >= 0 else []
 
     def ready(self, descriptor: int, now_s: float) -> None:
+        """Answer what has come in on `descriptor`."""
         if descriptor == self.pty.master:
             self._buffer += self.pty.receive()
             del self._buffer[:-1024]
@@ -383,6 +405,7 @@ class ModbusOnWire(VirtualDevice):
                 del self._clients[descriptor]
 
     def tick(self, now_s: float, tick: int) -> None:
+        """Send what is due at now_s."""
         for i, b in enumerate(self.binding.bounds):
             if b.role in ("voltage_v", "current_a"):
                 self._sums[i] += self.rig.true(b.role)

@@ -94,6 +94,7 @@ class Simulation:
         self.tick()
 
     def close(self) -> None:
+        """Disable the amplifier and close the back end."""
         self.backend.write(0.0, False)
         self.backend.close()
 

@@ -93,6 +93,7 @@ class Watch:
 
     @property
     def stopping(self) -> bool:
+        """Whether `stop` was called."""
         return self._stopping.is_set()
 
     def wait(self, seen: int, timeout_s: float) -> tuple[int, dict[str, Any]]:

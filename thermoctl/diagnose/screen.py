@@ -117,6 +117,7 @@ class Trajectory:
         self.first = d.first
 
     def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
+        """The value of an expression along the trajectory."""
         return np.broadcast_to(np.asarray(ex.evaluate(e, {**self.values, **extra}), float), self.drive.t.shape)
 
 

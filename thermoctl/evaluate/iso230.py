@@ -31,10 +31,12 @@ class Direction:
 
     @property
     def accuracy(self) -> float:
+        """A: from the lowest mean - 2 s to the highest mean + 2 s, um."""
         return float((self.mean + 2 * self.s).max() - (self.mean - 2 * self.s).min())
 
     @property
     def systematic(self) -> float:
+        """E: range of the means, um."""
         return float(self.mean.max() - self.mean.min())
 
 

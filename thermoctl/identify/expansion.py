@@ -48,6 +48,7 @@ class Expansion:
 
     @property
     def time_constant_s(self) -> float:
+        """-T / ln f1, s."""
         return -self.period_s / np.log(self.f1) if 0 < self.f1 < 1 else 0.0
 
 

@@ -1,4 +1,8 @@
-"""Experiments: what the setpoint does over time, as data from a file; run on the daemon's own tick.
+"""Experiments: what the setpoint, or any rig's inputs, do over time, as data from a file.
+
+An experiment is made of `parts` (what the setpoint does) or lists `inputs`: a recording's column with its corners each. One
+whose only input is setpoint_um is a schedule like any other and runs on the daemon's own tick; another rig's is run by a person
+from the CSV beside it, or on a plant file in its place.
 
 A schedule is a list of (seconds, um) corners, joined by straight lines; the law's own rate limiter makes the ramps. Running it
 gives a recording. It runs under all protections: a fault ends it, nothing recorded is lost, and it can be resumed where it stood.
@@ -6,7 +10,7 @@ gives a recording. It runs under all protections: a fault ends it, nothing recor
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from itertools import cycle, product
 from pathlib import Path
@@ -17,6 +21,7 @@ import numpy as np
 from thermoctl.yamlfile import InputError, Node, load, suggest
 
 FORMAT = "thermoctl-experiments/1"
+SETPOINT = "setpoint_um"
 
 
 @dataclass(frozen=True)
@@ -43,15 +48,85 @@ class Schedule:
         return out
 
 
-def load_experiments(path: str | Path) -> dict[str, Schedule]:
-    """All experiments of a file. Raises InputError with the line of a wrong entry."""
-    root = load(path)
-    top = _keys(root, "the file", {"format", "rate_um_s", "experiments"})
+@dataclass(frozen=True)
+class Inputs:
+    """What a rig's inputs do: {column: corners (K, 2) of seconds and value} on straight lines, ends at duration_s, read every
+    sample_s; `assumed`: columns that nobody drives, at the values they were taken to have."""
+    name: str
+    title: str
+    corners: dict[str, np.ndarray]
+    assumed: dict[str, float]
+    sample_s: float
+    duration_s: float
+
+    def schedule(self) -> Schedule:
+        """The same for the daemon. Raises InputError where it drives more than the setpoint."""
+        if set(self.corners) != {SETPOINT}:
+            raise InputError(f"experiment '{self.name}' drives {', '.join(self.corners)}; the daemon commands {SETPOINT} only. Run it "
+                             "by hand from the CSV beside it, or give a plant file in the rig's place (--plant)")
+        t, v = self.corners[SETPOINT].T
+        return Schedule(self.name, self.title, t, v, self.duration_s)
+
+    def columns(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Times (N,) every sample_s, and each column over them."""
+        t = np.arange(int(np.floor(self.duration_s / self.sample_s + 1e-9)) + 1) * self.sample_s
+        return t, {**{n: np.full(len(t), v) for n, v in self.assumed.items()},
+                   **{n: np.interp(t, c[:, 0], c[:, 1]) for n, c in self.corners.items()}}
+
+
+def load_inputs(path: str | Path) -> dict[str, Inputs]:
+    """The experiments of a file that list inputs. Raises InputError with the line of a wrong entry."""
+    return {n: _inputs(n, node) for n, node in _head(load(path)).items() if isinstance(node.value, dict) and "inputs" in node.value}
+
+
+def _head(root: Node) -> dict[str, Node]:
+    """The file's experiments, its keys and format checked."""
+    top = _keys(root, "the file", {"format", "experiments"}, {"rate_um_s"})
     if top["format"].value != FORMAT:
         raise top["format"].error(f"'{FORMAT}' was expected")
-    rate = _number(top["rate_um_s"], 0.01, 1e5)
+    if not isinstance(top["experiments"].value, dict) or not top["experiments"].value:
+        raise top["experiments"].error("a mapping of experiments by name was expected")
+    return top["experiments"].value
+
+
+def _inputs(name: str, node: Node) -> Inputs:
+    e = _keys(node, f"experiment '{name}'", {"title", "inputs", "sample_s"}, {"assumed"})
+    if not isinstance(e["inputs"].value, dict) or not e["inputs"].value:
+        raise e["inputs"].error("a mapping of columns with `corners` each was expected")
+    corners = {}
+    for column, entry in e["inputs"].value.items():
+        points = _keys(entry, f"input '{column}'", {"corners"}, {"unit"})["corners"]
+        pairs = points.value if isinstance(points.value, list) else []
+        if len(pairs) < 2 or any(not isinstance(q.value, list) or len(q.value) != 2 for q in pairs):
+            raise points.error(f"input '{column}': two or more corners [seconds, value] were expected")
+        made = np.array([[_number(q.value[0], 0, 1e9), _number(q.value[1], -1e12, 1e12)] for q in pairs])
+        late = int(np.argmax(np.diff(made[:, 0]) <= 0)) + 1
+        if made[0, 0] != 0 or np.any(np.diff(made[:, 0]) <= 0):
+            raise pairs[late if made[0, 0] == 0 else 0].error(f"input '{column}': times must begin at 0 and increase")
+        corners[column] = made
+    ends = {c: float(made[-1, 0]) for c, made in corners.items()}
+    if max(ends.values()) - min(ends.values()) > 1e-9 * max(ends.values()):
+        raise e["inputs"].error("all inputs must end at the same time; they end at " + ", ".join(f"{c} {t:g} s" for c, t in ends.items()))
+    assumed = e["assumed"].value if "assumed" in e else {}
+    if not isinstance(assumed, dict):
+        raise e["assumed"].error("a mapping of columns to numbers was expected")
+    duration = max(ends.values())
+    return Inputs(name, str(e["title"].value), corners, {c: _number(v, -1e12, 1e12) for c, v in assumed.items()},
+                  _number(e["sample_s"], duration * 1e-7, duration), duration)
+
+
+def load_experiments(path: str | Path) -> dict[str, Schedule]:
+    """What the setpoint does in each experiment of a file. Raises InputError with the line of a wrong entry."""
+    root = load(path)
+    entries = _head(root)
     out = {}
-    for name, node in top["experiments"].value.items():
+    for name, node in entries.items():
+        if isinstance(node.value, dict) and "inputs" in node.value:
+            out[name] = _inputs(name, node).schedule()
+            continue
+        if "rate_um_s" not in root.value:
+            raise root.error("the file: 'rate_um_s' is missing, the rate at which parts are joined")
+        rate = _number(root.value["rate_um_s"], 0.01, 1e5)
         e = _keys(node, f"experiment '{name}'", {"title", "parts"})
         corners = [(0.0, 0.0)]
         _parts(e["parts"], rate, corners)
@@ -160,10 +235,12 @@ class Progress:
 
     @property
     def percent(self) -> float:
+        """Share of the duration that is done, %."""
         return 100 * self.done_s / self.duration_s
 
     @property
     def eta_s(self) -> float:
+        """Wall seconds left at the pace so far."""
         return self.used_s * (self.duration_s - self.done_s) / max(self.done_s, 1e-9)
 
 
@@ -219,13 +296,14 @@ def run(simulation: Any, schedule: Schedule, every: int = 100, start_s: float = 
             raise Aborted(f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", start_s + k * period)
 
 
-def _keys(node: Node, what: str, allowed: set[str]) -> dict[str, Node]:
+def _keys(node: Node, what: str, needed: set[str], optional: Collection[str] = ()) -> dict[str, Node]:
+    allowed = needed | set(optional)
     if not isinstance(node.value, dict):
         raise node.error(f"{what}: a mapping with {', '.join(sorted(allowed))} was expected")
     for key, value in node.value.items():
         if key not in allowed:
             raise value.error(f"{what}: '{key}' is not known{suggest(key, allowed)}; {', '.join(sorted(allowed))} are")
-    for key in allowed:
+    for key in sorted(needed):
         if key not in node.value:
             raise node.error(f"{what}: '{key}' is missing")
     return node.value

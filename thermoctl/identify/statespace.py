@@ -29,6 +29,7 @@ class StateSpace:
 
     @property
     def order(self) -> int:
+        """Number of states."""
         return len(self.a)
 
     @property
@@ -39,6 +40,7 @@ class StateSpace:
 
     @property
     def stable(self) -> bool:
+        """Whether every eigenvalue of A lies inside the unit circle."""
         return bool(np.abs(self.poles).max() < 1)
 
     @property

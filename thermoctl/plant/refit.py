@@ -74,9 +74,11 @@ class Scale:
         self.span = np.log(self.high / self.low) if self.log else self.high - self.low
 
     def z(self, value: float) -> float:
+        """The fitted coordinate of a value."""
         return float(np.log(value / self.low) / self.span if self.log else (value - self.low) / self.span)
 
     def value(self, z: float) -> float:
+        """The value of a fitted coordinate."""
         inside = min(max(z, 0.0), 1.0)
         raw = self.low * np.exp(inside * self.span) if self.log else self.low + inside * self.span
         return float(min(max(raw, self.low), self.high))
