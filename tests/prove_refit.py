@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from thermoctl.plant.commands import coloured
 from thermoctl.plant.language import load, loads
+from thermoctl.plant.noise import coloured
 from thermoctl.plant.refit import Scale, fit, report
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
@@ -83,7 +83,7 @@ def one(plant, model, rng, colour, **size):
     drive.scale = None
     found = fit(model, [drive])
     if colour:
-        found = fit(model, [drive], coloured(found), start=found.z)
+        found = fit(model, [drive], coloured(found, [drive]), start=found.z)
     counted = [e for e in report(found) if e.state == "ok"]
     return sum(abs(e.value - truth[e.name]) <= 1.96 * e.sd for e in counted), len(counted)
 
@@ -94,7 +94,7 @@ def main():
     parser.add_argument("--kind", default="", help="only rigs whose name holds this word")
     args = parser.parse_args()
     kinds = {kind: (loads(text, kind), {}) for kind, text in RIGS.items()}
-    kinds["12-node actuator"] = (load(ACTUATOR), {"n": 1800, "step_s": 4.0})
+    kinds["12-node actuator"] = (load(ACTUATOR), {"step_s": 8.0})
     good = True
     for kind, (plant, size) in kinds.items():
         if args.kind not in kind:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from thermoctl import __version__
 from thermoctl.yamlfile import InputError
@@ -43,7 +44,7 @@ def _plant_commands(sub: argparse._SubParsersAction) -> None:
             return getattr(commands, name)(args)
         return run
     plant = ("--plant", {"required": True, "metavar": "PLANT", "help": "the plant file"})
-    recordings = ("recordings", {"nargs": "+", "metavar": "REC", "help": "recordings (.csv, .parquet, .arrow)"})
+    recordings = ("recordings", {"nargs": "+", "metavar": "REC", "help": "recordings (.csv, .parquet, .arrow, .mf4, .tdms)"})
     _add(sub, "simulate", "run a plant on recorded inputs and compare", to("simulate"), plant, recordings,
          ("--horizon", {"type": float, "metavar": "S", "help": "predict at most S seconds ahead, re-initialised from the data"}),
          ("--out", {"metavar": "FILE", "help": "write time series (.csv, .parquet, .arrow)"}),
@@ -156,8 +157,10 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
         from thermoctl.evaluate import commands
         return commands
 
-    _add(sub, "experiment", "run one of the tests of experiments.yaml on the simulated rig and record it",
-         lambda a: room().experiment(a.name, a.config, a.out, a.dry_run, a.resume), ("name", {"metavar": "NAME"}), config,
+    _add(sub, "experiment", "run a test of experiments.yaml, or an experiment file such as a diagnosis proposes, and record it",
+         lambda a: room().experiment(a.name, a.config, a.out, a.dry_run, a.resume, a.plant),
+         ("name", {"metavar": "NAME|FILE", "help": "a test of experiments.yaml, or a file of experiments with one in it"}), config,
+         ("--plant", {"metavar": "PLANT", "help": "a plant file in the rig's place, for inputs that the daemon does not command"}),
          ("--out", {"metavar": "FILE", "help": "recording (.parquet, .csv, .arrow); default NAME.parquet"}),
          ("--dry-run", {"action": "store_true", "help": "show schedule, power and spectrum figures; drive nothing"}),
          ("--resume", {"action": "store_true", "help": "go on where an aborted recording ends"}))
@@ -188,6 +191,11 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
     """diagnose, prove, demo-concealed, effects."""
     def diagnose(args: argparse.Namespace) -> int:
         from thermoctl.diagnose import command
+
+        def record(experiment: Path, recording: Path) -> None:      # the rig is another room's business
+            from thermoctl.evaluate import commands
+            commands.record(experiment, recording, args.config, args.rig)
+        args.record = record
         return command.diagnose(args)
 
     def effects(args: argparse.Namespace) -> int:
@@ -202,7 +210,14 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
          ("--last", {"type": int, "default": 2, "metavar": "N", "help": "of folders: each rig's newest N recordings (default 2)"}),
          ("--workers", {"type": int, "metavar": "N", "help": "of folders: local processes (default: one a core)"}),
          ("--scheduler", {"metavar": "ADDRESS", "help": "of folders: a Dask scheduler (tcp://...) that sees the same files"}),
-         folder, ("--json", {"action": "store_true", "help": "print the result as JSON"}),
+         folder, ("--drive", {"action": "append", "metavar": "INPUT", "help": "an input that the next experiment may drive (repeatable; "
+                                                                              "default: what moved and is not the surroundings)"}),
+         ("--resolve", {"action": "store_true", "help": "run the next experiment on the rig, add its data and decide again"}),
+         ("--rounds", {"type": int, "default": 3, "metavar": "N", "help": "with --resolve: at most N experiments (3)"}),
+         ("--rig", {"metavar": "PLANT", "help": "with --resolve: a plant file in the rig's place"}),
+         ("--config", {"metavar": "FILE", "default": "config/simulated.yaml",
+                       "help": "with --resolve: the rig, with all protections (config/simulated.yaml)"}),
+         ("--json", {"action": "store_true", "help": "print the result as JSON"}),
          ("--quiet", {"action": "store_true", "help": "no progress, no summary"}))
     _add(sub, "effects", "list the catalogue of effects, or `effects show NAME`", effects,
          ("action", {"nargs": "?", "metavar": "show"}), ("name", {"nargs": "?", "metavar": "NAME"}), folder)

@@ -5,6 +5,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,16 @@ def diagnose(args: argparse.Namespace) -> int:
     if any(Path(r).is_dir() for r in args.recordings):
         return fleet(args)
     from thermoctl.diagnose import run
-    found = run.diagnose(args.plant, args.recordings, args.out, [Path(e) for e in args.effects or ()],
-                         None if args.quiet else Progress())
+    from thermoctl.diagnose.experiment import resolve
+
+    def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
+        return run.diagnose(args.plant, recordings, args.out, [Path(e) for e in args.effects or ()],
+                            None if args.quiet else Progress(), args.drive or ())
+    if args.resolve:
+        found = resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds,
+                        lambda text: print(text, file=sys.stderr, flush=True))
+    else:
+        found = diagnosed(args.recordings)
     if args.json:
         print(json.dumps(found, indent=1, allow_nan=False))
     elif not args.quiet:
@@ -165,7 +174,12 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
     for note in found["notes"]:
         console.print(f"note: {note}", markup=False)
     if found["next_experiment"]:
-        console.print(f"next experiment: {found['next_experiment']['profile']}. {found['next_experiment']['why']}", markup=False)
+        told = found["next_experiment"]
+        console.print(f"next experiment: {told['profile']}. {told['why']} {told['also_helpful'] or ''}", markup=False)
+        console.print(f"run it: thermoctl experiment {Path(out) / told['file']}  (or by hand: next_experiment.csv), "
+                      "or let `thermoctl diagnose --resolve` do it", markup=False)
+    for k, r in enumerate(found.get("resolved", ()), 1):
+        console.print(f"round {k}: was {r['verdict']}; ran {r['experiment']} -> {r['recording']}", markup=False)
     console.print(f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json", markup=False)
 
 

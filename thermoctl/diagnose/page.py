@@ -237,7 +237,7 @@ def _next(told: dict[str, Any] | None) -> str:
     if moving:
         fig = Figure(figsize=(9, 1.2 + 1.1 * len(moving)), layout="constrained")
         for axis, (name, corners) in zip(fig.subplots(len(moving), 1, sharex=True, squeeze=False)[:, 0], moving.items(), strict=True):
-            axis.step(corners[:, 0], corners[:, 1], where="post", lw=1.2)
+            axis.plot(corners[:, 0], corners[:, 1], lw=1.2)
             axis.set_ylabel(name, fontsize=8)
         axis.set_xlabel("time (s)")
         body += figure(fig, "The inputs of the proposed experiment, inside the range of the recorded ones.")

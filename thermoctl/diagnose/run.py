@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose import locate, observer
+from thermoctl.diagnose import experiment, locate, observer
 from thermoctl.diagnose.effects import CATALOGUE, PLACES, Candidate, Rig, candidates, catalogue
 from thermoctl.diagnose.evidence import LARGE, Colour, channels, white_sigma
 from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
@@ -42,6 +42,7 @@ REMAINS = -8.0              # log10 p of an unknown smooth input from which some
 TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
 BLOCKS = 16                 # of a single recording, every other one held out
 SPREAD = 0.06, 0.2          # least and greatest spread of parameters round their beliefs, in shares of their ranges
+MOST_IN_PAIRS = 250         # directions that are looked at two by two
 CHI2_MEDIAN = 0.455         # of one degree of freedom
 MARGINAL = 200.0            # a gain in score below this is looked at twice
 DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
@@ -290,6 +291,47 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
     return done
 
 
+def pairs(seen: Round, count: int = 6) -> list[tuple[Direction, Direction]]:
+    """Pairs of directions that explain much more together than the better one alone: effects that nearly cancel. From the
+    same first-order rows, without a refit: with a, b the two scores and c the cosine, gain = (a^2 + b^2 - 2abc) / (1 - c^2)."""
+    alone = [d for d in seen.directions if d.vector is not None and d.dims == 1][:MOST_IN_PAIRS]
+    if len(alone) < 2:
+        return []
+    vectors = np.stack([d.vector for d in alone], axis=1).astype(float)     # type: ignore[misc]
+    score = vectors.T @ seen.metric.residual
+    cosine = vectors.T @ vectors
+    a, b = score[:, None], score[None, :]
+    joint = (a ** 2 + b ** 2 - 2 * a * b * cosine) / np.maximum(1 - cosine ** 2, 1e-3)
+    joint[np.tril_indices(len(alone))] = 0.0
+    out: list[tuple[Direction, Direction]] = []
+    for flat in np.argsort(-joint, axis=None)[:200]:
+        i, j = np.unravel_index(flat, joint.shape)
+        first, second = alone[int(i)], alone[int(j)]
+        if joint[i, j] < max(first.gain, second.gain) + 2 * ACCEPT or len(out) >= count:
+            break
+        keys = {first.candidate.key, second.candidate.key}
+        if len(keys) == 2 and all({x.candidate.key, y.candidate.key} != keys for x, y in out):
+            out.append((first, second))
+    return out
+
+
+def compete_pairs(case: Case, seen: Round, chosen: Sequence[tuple[Direction, Direction]]) -> list[Explanation]:
+    """Refit each pair in full; best score first."""
+    done = []
+    for first, second in chosen:
+        try:
+            plant, own = extend(seen.base.plant, first, seen.metric.drives)
+            moved = dataclasses.replace(second, candidate=dataclasses.replace(second.candidate, rig=_on(second.candidate.rig, plant)))
+            plant, other = extend(plant, moved, seen.metric.drives)
+            e = case.explain(plant, [*seen.base.effects, first.candidate, moved.candidate], [*seen.base.own, own, other])
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            continue
+        e.direction = dataclasses.replace(moved, dims=first.dims + second.dims)
+        done.append(e)
+    case.reprice([seen.base, *done])
+    return sorted(done, key=lambda e: e.score)
+
+
 # ------------------------------------------------------------------------------------------------------------ the whole
 
 @dataclass
@@ -380,7 +422,7 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
                 held = held_out(case, base, current)
             notes.append(f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains")
     else:
-        verdict = "unexplained" if before_worst > LARGE or left_over else "consistent"
+        verdict = "unexplained" if before_worst > LARGE or left_over or remains(case, current) else "consistent"
     missing = None
     if verdict != "consistent":
         nodes = [s for s in suspects if s.kind == "node"]
@@ -439,6 +481,11 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
         before = unseen_errors(case, current.plant)
         best = next((e for e in seen.finalists[:4] if counts(case, seen, e, entries) and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0),
                     None)
+        if best is None and not current.effects and seen.p_any() < 1e-3:
+            case.progress("looking for two effects that hide each other")
+            together = compete_pairs(case, seen, pairs(seen))
+            best = next((e for e in together if counts(case, seen, e, entries)), None)
+            seen.finalists = together + seen.finalists if best else seen.finalists
         if best is None:
             break
         current, rivals = best, [e for e in seen.finalists if e is not best and e.score > best.score - 2 * ACCEPT]
@@ -849,9 +896,11 @@ def _clean(value: Any) -> Any:
 
 
 def diagnose(plant_path: str | Path, recording_paths: Sequence[str | Path], out_dir: str | Path,
-             effects: Sequence[Path] = (), progress: Callable[[str], None] | None = None) -> dict[str, Any]:
-    """Diagnose recordings against a plant file and write diagnosis.json, plant.yaml and report.html into `out_dir`,
-    all or nothing. Returns the JSON's content. Raises InputError for unusable inputs."""
+             effects: Sequence[Path] = (), progress: Callable[[str], None] | None = None,
+             drivable: Sequence[str] = ()) -> dict[str, Any]:
+    """Diagnose recordings against a plant file and write diagnosis.json, plant.yaml and report.html into `out_dir`, and where
+    nothing is decided next_experiment.yaml and .csv, all or nothing. `drivable`: inputs that an experiment may drive (default:
+    those that moved and are not the surroundings). Returns the JSON's content. Raises InputError for unusable inputs."""
     begun = time.monotonic()
     plant = load(plant_path)
     if not recording_paths:
@@ -866,6 +915,8 @@ def diagnose(plant_path: str | Path, recording_paths: Sequence[str | Path], out_
         found = examine(case, entries)
     except SimulationError as e:
         raise InputError(f"{plant_path}: the plant cannot follow these recordings at all: {e}") from None
+    proposed = experiment.propose(case, found, drivable)
+    found.next_experiment = proposed[0] if proposed else None
     found.result = result(case, found)
     found.result["seconds"] = round(time.monotonic() - begun, 1)
     out = Path(out_dir)
@@ -878,7 +929,10 @@ def diagnose(plant_path: str | Path, recording_paths: Sequence[str | Path], out_
         from thermoctl.diagnose.page import write_report
         write_report(case, found, part / "report.html")
         (part / "diagnosis.json").write_text(json.dumps(found.result, indent=1, allow_nan=False) + "\n")
+        written = experiment.write(part, case, *proposed) if proposed else []
         out.mkdir(parents=True, exist_ok=True)
-        for name in ("plant.yaml", "report.html", "diagnosis.json"):
+        for stale in experiment.FILES:
+            (out / stale).unlink(missing_ok=True)
+        for name in ("plant.yaml", "report.html", "diagnosis.json", *written):
             shutil.move(str(part / name), str(out / name))
     return found.result

@@ -40,11 +40,20 @@ def spectrum_lines(t: np.ndarray, power: np.ndarray, cutoff_hz: float) -> list[s
     return out
 
 
-def experiment(name: str, config: str, out: str | None, dry_run: bool, resume: bool) -> int:
-    """Run a test on the daemon that answers (its own back end, in real time, under its protections), else on the simulated back end,
-    faster than real time. What was recorded is kept when it ends early, and gone on with."""
+def experiment(name: str, config: str, out: str | None, dry_run: bool, resume: bool, plant: str | None = None) -> int:
+    """Run a test of experiments.yaml, or the one experiment of the file `name`, on the daemon that answers (its own back end, in real
+    time, under its protections), else on the simulated back end, faster than real time; an experiment of inputs also on a plant file in
+    the rig's place. What was recorded is kept when it ends early, and gone on with."""
     from thermoctl.evaluate import calibrate
-    schedule = _schedule(name, config)
+    if Path(name).suffix in (".yaml", ".yml"):
+        inputs = _of_inputs(name)
+        if dry_run or plant:
+            return _on_plant(inputs, None if dry_run else plant, Path(out or f"{inputs.name}.csv"))
+        schedule, name = inputs.schedule(), inputs.name
+    elif plant:
+        raise InputError(f"'{name}' is a test of the actuator's setpoint; --plant takes the file of an experiment that lists inputs")
+    else:
+        schedule = _schedule(name, config)
     settings = load_settings(config)
     t = np.arange(0, schedule.duration_s)
     power = (schedule.at(t) / 250.0)**2 * 3.3
@@ -95,6 +104,41 @@ def experiment(name: str, config: str, out: str | None, dry_run: bool, resume: b
     progress_path.write_text(f"{done_s[0]:.3f}\n")
     print(f"ended after {done_s[0]:.0f} of {schedule.duration_s:.0f} s: {ended}; go on with --resume --out {path}", file=sys.stderr)
     return 1
+
+
+def _of_inputs(path: str) -> experiments.Inputs:
+    """The one experiment of a file that lists inputs."""
+    found = list(experiments.load_inputs(path).values())
+    if len(found) != 1:
+        raise InputError(f"{path}: {len(found)} experiments that list inputs; one was expected")
+    return found[0]
+
+
+def _on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) -> int:
+    """An experiment told, and run on a plant file in the rig's place where one is given."""
+    from thermoctl.plant import load
+    from thermoctl.plant.simulate import SimulationError
+    print(f"{inputs.title}: {inputs.duration_s / 60:.4g} min, every {inputs.sample_s:g} s; drives "
+          + ", ".join(f"{n} {c[:, 1].min():.4g} to {c[:, 1].max():.4g}" for n, c in inputs.corners.items()))
+    if plant_file is None:
+        return 0
+    plant = load(plant_file)
+    t, columns = inputs.columns()
+    unsaid = {i.column for i in plant.inputs.values()} - set(columns)
+    if unsaid:
+        raise InputError(f"experiment '{inputs.name}' says nothing of {', '.join(sorted(unsaid))}, which {plant_file} reads")
+    try:
+        write_table(path, plant.compile(()).measure(Table(path.stem, str(path), t, columns), seed=len(t)))
+    except SimulationError as e:
+        raise InputError(f"{plant_file}: {e}") from None
+    print(f"{path}: {len(t)} rows")
+    return 0
+
+
+def record(experiment_file: Path, recording: Path, config: str, plant: str | None) -> None:
+    """Run an experiment file for `thermoctl diagnose --resolve`. Raises InputError where it does not come to its end."""
+    if experiment(str(experiment_file), config, str(recording), False, False, plant):
+        raise InputError(f"{experiment_file}: the experiment ended early; what was recorded is in {recording}")
 
 
 def _recorded(path: str) -> rigs.Recorded:

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table as Grid
 
 from thermoctl.plant import Plant, load, save
-from thermoctl.plant.refit import Estimate, Fit, Noise, fit, report, updated
+from thermoctl.plant.noise import coloured
+from thermoctl.plant.refit import Estimate, fit, report, updated
 from thermoctl.plant.simulate import Drive, Model, SimulationError
 from thermoctl.recording.table import Table, read_table, write_table
 from thermoctl.yamlfile import InputError
@@ -146,7 +147,7 @@ def refit(args: argparse.Namespace) -> int:
     try:
         found = fit(model, drives, tries=args.tries)
         if args.noise == "ar1":
-            found = fit(model, drives, coloured(found), start=found.z)
+            found = fit(model, drives, coloured(found, drives), start=found.z)
         for d in drives:
             d.scale = None
         fitted = updated(plant, found, drives)
@@ -165,22 +166,6 @@ def refit(args: argparse.Namespace) -> int:
     except SimulationError as e:
         raise InputError(f"{plant.file}: {e}") from None
     return 0
-
-
-def coloured(found: Fit) -> list[Noise]:
-    """Each output's noise as AR(1), measured on a fit's residuals: neighbours' correlation and standard deviation."""
-    out = []
-    for j, n in enumerate(found.noise):
-        pairs = [(r[:-1, j], r[1:, j]) for r in found.residuals if len(r) > 2]
-        a, b = (np.concatenate([p[k] for p in pairs]) for k in (0, 1)) if pairs else (np.zeros(0), np.zeros(0))
-        both = np.isfinite(a) & np.isfinite(b)
-        if both.sum() < 20:
-            out.append(n)
-            continue
-        a, b = a[both], b[both]
-        phi = float(np.clip(np.sum(a * b) / max(np.sqrt(np.sum(a * a) * np.sum(b * b)), 1e-300), 0.0, 0.995))
-        out.append(Noise(max(float(np.sqrt(np.mean(a * a))), 1e-3 * n.sigma), phi))
-    return out
 
 
 def _estimates(plant: Plant, rows: list[Estimate]) -> Grid:

@@ -52,6 +52,11 @@ def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, in
     return vertices, edges
 
 
+def _outline(text: Any) -> np.ndarray:
+    """[[left, bottom], [right, top]] of a drawn text's box, in pixels."""
+    return text.get_bbox_patch().get_window_extent().get_points()
+
+
 def _edge(box: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
     """Where the line from `outside` (2,) to `inside` (2,) meets the box [[left, bottom], [right, top]] round the latter."""
     way = outside - inside
@@ -130,15 +135,15 @@ def drawing(plant: Plant, marked: Collection[str] = ()) -> Any:
     axes.set_xlim(x[:, 0].min() - margin, x[:, 0].max() + margin)
     axes.set_ylim(x[:, 1].min() - margin, x[:, 1].max() + margin)
     figure.canvas.draw()            # gives the boxes their sizes, at which the arrows end
-    sizes = {i: axes.transData.inverted().transform(q.get_bbox_patch().get_window_extent().get_points()) for i, q in boxes.items()}
+    sizes = {i: axes.transData.inverted().transform(_outline(q)) for i, q in boxes.items()}
     for a, b, kind, label in edges:
         line = {"arrowstyle": "-" if kind == "read" else "-|>", "color": colours[kind], "mutation_scale": 13, "shrinkA": 0, "shrinkB": 0,
                 "lw": 1.3 if kind == "flow" else 0.8, "ls": {"flow": "-", "read": ":", "uses": "--"}[kind]}
-        axes.annotate("", xy=_edge(sizes[b], x[b], x[a]), xytext=_edge(sizes[a], x[a], x[b]), arrowprops=line, zorder=1)
+        axes.annotate("", xy=(*_edge(sizes[b], x[b], x[a]),), xytext=(*_edge(sizes[a], x[a], x[b]),), arrowprops=line, zorder=1)
         if label:
             middle = (x[a] + x[b]) / 2
-            words = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
-            axes.text(middle[0], middle[1], words, fontsize=6.5, color="#5a6b7b", ha="center", va="center",
+            broken = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
+            axes.text(middle[0], middle[1], broken, fontsize=6.5, color="#5a6b7b", ha="center", va="center",
                       zorder=2, bbox={"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85})
     room = figure.get_figwidth() * 9.5 - (45 if figure.get_figwidth() >= 11 else 0)         # letters of the title in a line
     figure.text(0.02, 0.995, textwrap.fill(plant.title, max(int(room), 20)), fontsize=12, weight="bold", va="top")

@@ -226,6 +226,18 @@ class Model:
         """Free run on a recording's inputs. Raises InputError, SimulationError."""
         return self.run(self.drive(table), parameters, None, sensitivities, rtol)
 
+    def measure(self, table: Table, seed: int = 0) -> Table:
+        """The plant in the rig's place: a recording of the inputs in `table` and what the sensors make of the outputs, with their
+        noise and their steps. Uncertain starts are drawn. Raises InputError, SimulationError."""
+        rng, drive = np.random.default_rng(seed), self.drive(table)
+        dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(size=len(self.uncertain))
+        y = self.run(drive, None, dx0).y
+        columns = {i.column: table.columns[i.column] for i in self.plant.inputs.values()}
+        for j, o in enumerate(self.plant.outputs.values()):
+            read = y[:, j] + (o.noise or 0.0) * rng.normal(size=len(y))
+            columns[o.column] = np.round(read / o.resolution) * o.resolution if o.resolution else read
+        return dataclasses.replace(table, columns=columns)
+
     def _run(self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None, sensitivities: bool, rtol: float,
              buffers: dict[str, np.ndarray] | None = None) -> Simulation:
         lib, n, nx, nq = self.code.library, len(drive.t), len(self.states), len(self.unknowns)
