@@ -65,7 +65,7 @@ def _place(case: Case, found: Diagnosis) -> str:
     if not found.final.effects and found.verdict != "consistent" and found.suspects:
         marked.add(found.suspects[0].name)
     words = "Red: where it sits." if marked else "Nothing is marked: nothing is missing."
-    body = figure(drawing(case.plant, marked), f"The network of the plant file. {words}")
+    body = figure(drawing(case.plant, marked, 11.0), f"The network of the plant file. {words}")
     if found.suspects and found.verdict != "consistent":
         body += table(("unknown input at", "kind", "explains (chi-square)", "degrees of freedom"),
                       [(s.name, "heat, force or flow into the node" if s.kind == "node" else "error of the sensor", s.gain, s.dims)

@@ -101,8 +101,9 @@ def draw(plant: Plant, path: str | Path) -> None:
         raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
 
 
-def drawing(plant: Plant, marked: Collection[str] = ()) -> Any:
-    """The network as a matplotlib Figure; nodes, flows and outputs named in `marked` stand out."""
+def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Any:
+    """The network as a matplotlib Figure of at most `widest` inches; nodes, flows and outputs named in `marked` stand out. Where it
+    would be wider it is drawn closer, without the words on its lines."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     vertices, edges = _graph(plant)
@@ -116,7 +117,12 @@ def drawing(plant: Plant, marked: Collection[str] = ()) -> Any:
     lengths = [(a, b, 2.2) if several.get(b, 0) > 1 else (a, b, q) for a, b, q in lengths]
     x = layout(len(vertices), lengths)
     span = np.maximum(np.ptp(x, axis=0), 0.5) if len(x) else np.ones(2)
-    figure = Figure(figsize=(float(np.clip(2.0 + 1.75 * span[0], 6, 40)), float(np.clip(1.6 + 1.3 * span[1], 3.5, 32))))
+    closer = min(1.0, widest / (2.0 + 1.75 * span[0]))
+    if closer < 0.9:                # the words keep their size: what hangs on a node needs more room beside it
+        x = layout(len(vertices), [(a, b, q * 1.45 if q < 1.0 else q) for a, b, q in lengths])
+        span = np.ptp(x, axis=0)
+    figure = Figure(figsize=(float(np.clip(2.0 + 1.75 * span[0], 6, min(40, widest))),
+                             float(np.clip(1.6 + 1.3 * span[1] * closer ** 0.5, 3.5, 32))))
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.92))
     axes.set_axis_off()
@@ -140,7 +146,7 @@ def drawing(plant: Plant, marked: Collection[str] = ()) -> Any:
         line = {"arrowstyle": "-" if kind == "read" else "-|>", "color": colours[kind], "mutation_scale": 13, "shrinkA": 0, "shrinkB": 0,
                 "lw": 1.3 if kind == "flow" else 0.8, "ls": {"flow": "-", "read": ":", "uses": "--"}[kind]}
         axes.annotate("", xy=(*_edge(sizes[b], x[b], x[a]),), xytext=(*_edge(sizes[a], x[a], x[b]),), arrowprops=line, zorder=1)
-        if label:
+        if label and closer > 0.9:
             middle = (x[a] + x[b]) / 2
             broken = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
             axes.text(middle[0], middle[1], broken, fontsize=6.5, color="#5a6b7b", ha="center", va="center",

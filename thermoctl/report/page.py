@@ -16,12 +16,13 @@ figure svg{filter:invert(.92) hue-rotate(180deg)}}
 body{font:15px/1.5 system-ui,sans-serif;color:var(--fg);background:var(--bg);max-width:62rem;margin:0 auto;padding:1.5rem}
 h1{font-size:1.6rem;margin:.2rem 0 1rem}h2{font-size:1.2rem;margin:2rem 0 .5rem;border-bottom:1px solid var(--line)}
 table{border-collapse:collapse;margin:.6rem 0;font-variant-numeric:tabular-nums}
-th,td{padding:.25rem .7rem;border-bottom:1px solid var(--line);text-align:right}
-th:first-child,td:first-child,.text{text-align:left}td.text{max-width:26rem;overflow-wrap:break-word}td:first-child{white-space:nowrap}
+th,td{white-space:nowrap;font-size:.94em;padding:.25rem .7rem;border-bottom:1px solid var(--line);text-align:right}
+th:first-child,td:first-child,.text{text-align:left}td.text{white-space:normal;max-width:30rem}
+th{white-space:normal;vertical-align:bottom}td:first-child{white-space:nowrap}
 th{color:var(--soft);font-weight:600}caption{text-align:left;color:var(--soft);padding:.2rem 0}
-figure{margin:1rem 0}figure svg{width:100%;height:auto;max-height:40rem}
+figure{margin:1rem 0}figure svg{width:100%;height:auto;max-height:46rem}
 .wide{overflow-x:auto}.lead{font-size:1.15rem}figcaption,.note{color:var(--soft);font-size:.92rem}
-pre{background:var(--tint);padding:.7rem;overflow-x:auto}.good{color:var(--good)}.bad{color:var(--bad)}
+pre{background:var(--tint);padding:.7rem;white-space:pre-wrap;overflow-wrap:anywhere}.good{color:var(--good)}.bad{color:var(--bad)}
 @media print{:root{color-scheme:light}body{max-width:none;padding:0;font-size:10.5pt}h2{break-after:avoid}
 figure,tr,pre{break-inside:avoid}thead{display:table-header-group}
 .wide{overflow:visible}pre{white-space:pre-wrap}}
