@@ -6,13 +6,15 @@ own python3 from /opt/thermoctl, as an installation would.
 """
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+from thermoctl.daemon.socket import ask
+from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOTFS = ROOT / "build/systemd/rootfs"
@@ -37,6 +39,12 @@ def missing() -> str:
     if sys.version_info[:2] != (3, 11):
         return "needs Python 3.11, as the rootfs (Debian 12) has it: the compiled parts are shared"
     return ""
+
+
+def may_raise_limits() -> bool:
+    """Whether LimitRTPRIO= and LimitMEMLOCK= can work here: systemd needs CAP_SYS_RESOURCE for them (bit 24)."""
+    status = Path("/proc/self/status").read_text()
+    return bool(int(status.split("CapBnd:")[1].split()[0], 16) >> 24 & 1)
 
 
 def make_rootfs() -> Path:
@@ -98,12 +106,19 @@ class Container:
     def thermoctl(self, *arguments: str, check: bool = True) -> str:
         return self.run("/opt/thermoctl/bin/thermoctl", *arguments, check=check)
 
-    def status(self) -> dict:
-        """`thermoctl status --json`; {} when nobody answers."""
+    def file(self, path: str) -> Path:
+        """A file as the container sees it (also in its tmpfs), from outside."""
+        return Path(f"/proc/{self.pid}/root{path}")
+
+    def ask(self, command: str, value: float | None = None) -> dict:
+        """A request on the daemon's command socket; {} when nobody answers."""
         try:
-            return json.loads(self.thermoctl("status", "--config", "/etc/thermoctl/rig.yaml", "--json", check=False))
-        except json.JSONDecodeError:
+            return ask(str(self.file("/run/thermoctl/rig.sock")), {"command": command, "value": value})
+        except InputError:
             return {}
+
+    def status(self) -> dict:
+        return self.ask("status")
 
     def unit(self, *properties: str, unit: str = "thermoctl.service") -> list[str]:
         """Properties of a unit as systemctl shows them."""

@@ -4,10 +4,11 @@
 #include <string.h>
 
 enum { OK, STALE, ERROR, ABSENT };
-enum { POSITION = 0, VOLTAGE = 2, CURRENT = 3, AIR = 4, COIL = 5, AMPLIFIER_STATE = 18 };
+enum { POSITION = 0, REFERENCE = 1, VOLTAGE = 2, CURRENT = 3, AIR = 4, COIL = 5, AMPLIFIER_STATE = 18 };
 enum { K_ERROR, K_STALE, K_RANGE, K_RATE, K_FROZEN, KINDS };
 enum { B_FOLLOWING = 35, B_HOT, B_HOT_MODEL, B_HEATING, B_DISAGREES, B_POWER, B_STUCK, B_BOUND, B_SLEWING, B_SATURATED,
-       B_AMPLIFIER, B_NOT_FOLLOWING, B_LATE, B_WRITE, B_NOT_FINITE };
+       B_AMPLIFIER, B_NOT_FOLLOWING, B_LATE, B_WRITE, B_NOT_FINITE, B_ELECTRICAL, B_DISPLACED,
+       B_MONITORED };
 enum { OFF, SAFE, READY, ARMED, FAULT };
 enum { NONE, ARM, DISARM, SETPOINT };
 #define BIT(b) ((uint64_t)1 << (b))
@@ -32,10 +33,13 @@ int law_load(law_t *l, const char *path) {
     l->n = (int)*p++, l->sensors_used = (int)*p++, l->mkf = (int)*p++;
     for (int k = 0; k < l->sensors_used; k++) l->sensors[k] = (int)*p++;
     for (int c = 0; c < N; c++) l->group[c] = (int)*p++;
+    for (int m = 0; m < M; m++) l->predicts[m] = *p++ > 0.0;
+    l->expands = *p++ > 0.0;
     p = take(p, l->A, l->n * l->n), p = take(p, l->B, l->n * 2), p = take(p, l->C, M * l->n);
     p = take(p, l->K, l->n * l->sensors_used), p = take(p, l->b1, M), p = take(p, l->b2, M);
     double *scalars[] = {&l->b_air, &l->f1, &l->offset_um, &l->expansion_period_s, &l->R_w, &l->R_v, &l->air_filter_s,
-        &l->model_period_s, &l->period_s, &l->a1a1, &l->first_gain, &l->kp, &l->ti_s, &l->td_s, &l->output_limit,
+        &l->model_period_s, &l->period_s, &l->a1a1, &l->first_gain, &l->correction_step_s,
+        &l->kp, &l->ti_s, &l->td_s, &l->output_limit,
         &l->setpoint_rate_um_s, &l->setpoint_low_um, &l->setpoint_high_um};
     for (unsigned k = 0; k < sizeof scalars / sizeof *scalars; k++) *scalars[k] = *p++;
     l->average_length = (int)*p++, l->compensate_on = *p++ > 0.0;
@@ -44,7 +48,10 @@ int law_load(law_t *l, const char *path) {
     p = take(p, l->stale_s, N), p = take(p, l->frozen_s, N), p = take(p, l->required, N);
     double *limits[] = {&l->following_um, &l->following_limit_s, &l->coil_limit_c, &l->coil_rate_limit, &l->coil_rate_time_s,
         &l->innovation_limit_c, &l->innovation_time_s, &l->power_limit_w, &l->power_time_s, &l->idle_current_a,
-        &l->idle_power_w, &l->idle_limit_s, &l->saturation_limit_s, &l->amplifier_limit_s, &l->late_s};
+        &l->idle_power_w, &l->idle_limit_s, &l->saturation_limit_s, &l->amplifier_limit_s, &l->late_s, &l->agree_time_s,
+        &l->drift_limit_c, &l->monitored_limit_c, &l->resistance_ohm, &l->resistance_tolerance, &l->resistance_v,
+        &l->current_per_drive, &l->current_tolerance_a, &l->flexure_um_per_a, &l->position_tolerance_um,
+        &l->reference_tolerance_um, &l->order_limit_c};
     for (unsigned k = 0; k < sizeof limits / sizeof *limits; k++) *limits[k] = *p++;
     l->trip_others = (uint64_t)*p++, l->critical = (uint64_t)*p++;
     l->P = 1e3 * l->R_v;
@@ -97,27 +104,62 @@ static void judge_readings(law_t *l, double dt) {
     if (dt > l->late_s) l->faults |= BIT(B_LATE);
 }
 
+static void forget(law_t *l) {
+    for (int i = 0; i < l->n; i++) l->x[i] = l->corrections[i] = 0.0;
+    l->corrected = l->primed = l->air_known = l->resumed = l->model_error_c = l->innovation_mean_c = 0.0;
+    l->P = 1e3 * l->R_v;
+}
+
+static void start_air(law_t *l, double value) {
+    l->air_c = value;
+    l->air_known = 1.0;
+    if (l->air_started == 0.0) l->air_start_c = value, l->air_started = 1.0;
+}
+
 static void power_and_air(law_t *l) {
-    if (l->verdict[VOLTAGE] == 0.0 && l->verdict[CURRENT] == 0.0) l->power_w = l->value[VOLTAGE] * l->value[CURRENT];
+    if (l->verdict[VOLTAGE] == 0.0 && l->verdict[CURRENT] == 0.0) l->power_w = l->last[VOLTAGE] * l->last[CURRENT];
     else if (l->enable == 0.0) l->power_w = 0.0;
     l->power_mean_w += (l->power_w - l->power_mean_w) * least(1.0, l->dt / l->power_time_s);
     l->air_rate_k_s = 0.0;
     if (l->verdict[AIR] == 0.0) {
-        if (l->air_known == 0.0) {
-            l->air_c = l->air_start_c = l->value[AIR];
-            l->air_known = 1.0;
-        }
-        l->air_rate_k_s = (l->value[AIR] - l->air_c) / l->air_filter_s;
+        if (l->air_known == 0.0) start_air(l, l->last[AIR]);
+        l->air_rate_k_s = (l->last[AIR] - l->air_c) / l->air_filter_s;
         l->air_c += l->air_rate_k_s * l->dt;
     }
 }
 
+static void predict_corrections(law_t *l, double elapsed) {
+    double left = least(elapsed, 10.0);
+    int n = l->n;
+    while (left > 0.0) {
+        double step = least(left, l->correction_step_s);
+        left -= step;
+        for (int i = 0; i < n; i++) {
+            double s = 0.0;
+            for (int j = 0; j < n; j++) s += l->A[i * n + j] * l->corrections[j];
+            l->dx[i] = s;
+        }
+        for (int i = 0; i < n; i++) l->corrections[i] += step / l->model_period_s * l->dx[i];
+    }
+    double s = l->e[0];
+    for (int j = 0; j < n; j++) s += l->C[j] * l->corrections[j];
+    l->model_error_c = s;
+}
+
 static void correct(law_t *l) {
     int coil_new = l->fresh[COIL] && l->verdict[COIL] == 0.0, n = l->n;
-    if (l->air_known == 0.0 && coil_new) {
-        l->air_c = l->air_start_c = l->value[COIL];
-        l->air_known = 1.0;
+    if (l->resumed > 0.0 && coil_new) {
+        double s = l->value[COIL] - l->air_c;
+        for (int j = 0; j < n; j++) s -= l->C[j] * l->x[j];
+        l->resumed = 0.0;
+        l->coil_slow_c = l->value[COIL];
+        if (!(fabs(s) <= 2.0)) {
+            forget(l);
+            l->air_started = 0.0;
+            if (l->verdict[AIR] == 0.0) start_air(l, l->last[AIR]);
+        }
     }
+    if (l->air_known == 0.0 && coil_new) start_air(l, l->value[COIL]);
     if (l->corrected == 0.0 && !coil_new) return;
     for (int k = 0; k < l->sensors_used; k++) {
         int c = COIL + l->sensors[k];
@@ -134,10 +176,12 @@ static void correct(law_t *l) {
         if (l->corrected == 0.0) {
             for (int i = 0; i < n; i++) l->x[i] += l->first_gain * l->K[i * l->sensors_used] * l->e[0];
             l->coil_slow_c = l->value[COIL];
+            l->coil_rate_k_s = 0.0;
             l->corrected = 1.0;
             l->primed = 0.0;
             return;
         }
+        predict_corrections(l, elapsed);
         l->innovation_c = l->e[0];
         l->innovation_mean_c += (l->e[0] - l->innovation_mean_c) * least(1.0, elapsed / l->innovation_time_s);
         l->coil_rate_k_s = (l->value[COIL] - l->coil_slow_c) / l->coil_rate_time_s;
@@ -153,7 +197,10 @@ static void correct(law_t *l) {
     l->kalman_gain = gain;
     for (int k = 0; k < l->sensors_used; k++)
         if (l->e[k] != 0.0)
-            for (int i = 0; i < n; i++) l->x[i] += gain * l->K[i * l->sensors_used + k] * l->e[k];
+            for (int i = 0; i < n; i++) {
+                l->x[i] += gain * l->K[i * l->sensors_used + k] * l->e[k];
+                l->corrections[i] += gain * l->K[i * l->sensors_used + k] * l->e[k];
+            }
 }
 
 static void estimate(law_t *l, double dt) {
@@ -161,6 +208,7 @@ static void estimate(law_t *l, double dt) {
     l->dt = finite_(dt) ? clip(dt, 0.0, 1.0) : 0.0;
     l->tick += 1;
     l->coil_elapsed_s += l->dt;
+    if (dt > 10.0) forget(l);
     judge_readings(l, dt);
     power_and_air(l);
     double scale = l->dt / l->model_period_s;
@@ -253,6 +301,58 @@ static int64_t next_state(int64_t state, int command, int started, int tripped, 
     return state == READY && command == ARM ? ARMED : READY;
 }
 
+static void compare_order(law_t *l) {
+    l->exchanged = 0.0;
+    for (int m = 1; m < M; m++)
+        for (int k = 0; k < m; k++)
+            if (l->predicts[m] && l->predicts[k] && l->verdict[COIL + m] == 0.0 && l->verdict[COIL + k] == 0.0) {
+                double s = l->T[m] - l->T[k];
+                if ((s + l->apart_c[m] - l->apart_c[k]) * s < -l->order_limit_c * l->order_limit_c) l->exchanged = 1.0;
+            }
+}
+
+static void agree(law_t *l) {
+    double part = least(1.0, l->dt / l->agree_time_s), s;
+    int current = l->verdict[CURRENT] == 0.0;
+    double amperes = current ? l->last[CURRENT] : 0.0;
+    if (current && l->verdict[VOLTAGE] == 0.0 && l->resistance_ohm > 0.0) {
+        s = l->resistance_ohm * amperes;
+        if (l->air_known > 0.0) s *= 1.0 + 0.00393 * (l->T[0] + l->air_c - 20.0);
+        l->ohm_v += part * (l->last[VOLTAGE] - s - l->ohm_v);
+        double a = fabs(l->last[VOLTAGE]), b = fabs(s);
+        l->ohm_scale_v += part * ((b > a ? b : a) - l->ohm_scale_v);
+        if (fabs(l->ohm_v) > l->resistance_tolerance * l->ohm_scale_v + l->resistance_v) l->faults |= BIT(B_ELECTRICAL);
+    }
+    if (l->state != ARMED || !current || l->current_per_drive == 0.0) {
+        l->current_error_a = 0.0;
+    } else {
+        l->current_error_a += part * (amperes - l->current_per_drive * l->drive - l->current_error_a);
+        if (fabs(l->current_error_a) > l->current_tolerance_a) l->faults |= BIT(B_NOT_FOLLOWING);
+    }
+    if (current && l->verdict[POSITION] == 0.0 && l->flexure_um_per_a != 0.0) {
+        s = l->last[POSITION] - l->flexure_um_per_a * amperes;
+        if (l->zeroed == 0.0) l->position_zero_um = s, l->zeroed = l->state != OFF ? 1.0 : 0.0;
+        l->displaced_um += part * (s - l->position_zero_um - l->displaced_um);
+        if (fabs(l->displaced_um) > l->position_tolerance_um) l->faults |= BIT(B_DISPLACED);
+    }
+    if (l->corrected == 0.0) return;
+    part = least(1.0, l->dt / l->innovation_time_s);
+    for (int m = 0; m < M; m++)
+        if (l->verdict[COIL + m] == 0.0 && l->predicts[m]) {
+            l->apart_c[m] += part * (l->last[COIL + m] - l->air_c - l->T[m] - l->apart_c[m]);
+            if (m > 0 && fabs(l->apart_c[m]) > l->monitored_limit_c) l->faults |= BIT(B_MONITORED);
+        }
+    if (l->fresh[COIL]) compare_order(l);
+    if (l->exchanged > 0.0) l->faults |= BIT(B_MONITORED);
+    if (l->expands && l->verdict[REFERENCE] == 0.0 && l->verdict[POSITION] == 0.0) {
+        s = l->last[REFERENCE] - l->last[POSITION] - l->expansion_um;
+        if (l->reference_zeroed == 0.0) l->reference_zero_um = s, l->reference_zeroed = l->state != OFF ? 1.0 : 0.0;
+        part = least(1.0, l->dt / l->agree_time_s);
+        l->reference_error_um += part * (s - l->reference_zero_um - l->reference_error_um);
+        if (fabs(l->reference_error_um) > l->reference_tolerance_um) l->faults |= BIT(B_MONITORED);
+    }
+}
+
 static void protect(law_t *l, int command, uint64_t external) {
     uint64_t found = external;
     if (l->state == ARMED) {
@@ -266,19 +366,21 @@ static void protect(law_t *l, int command, uint64_t external) {
         l->idle_s = 0.0;
     } else {
         l->following_s = l->saturation_s = l->amplifier_s = 0.0;
-        int driven = (l->verdict[CURRENT] == 0.0 && fabs(l->value[CURRENT]) > l->idle_current_a)
+        int driven = (l->verdict[CURRENT] == 0.0 && fabs(l->last[CURRENT]) > l->idle_current_a)
                      || fabs(l->power_w) > l->idle_power_w;
         l->idle_s = driven ? l->idle_s + l->dt : 0.0;
         if (l->idle_s > l->idle_limit_s) found |= BIT(B_STUCK);
     }
     if (l->status[AMPLIFIER_STATE] == OK && l->value[AMPLIFIER_STATE] == 3.0) found |= BIT(B_AMPLIFIER);
-    if (l->verdict[COIL] == 0.0 && l->value[COIL] > l->coil_limit_c) found |= BIT(B_HOT);
+    if (l->verdict[COIL] == 0.0 && l->last[COIL] > l->coil_limit_c) found |= BIT(B_HOT);
     if (l->T[0] + l->air_c > l->coil_limit_c) found |= BIT(B_HOT_MODEL);
     if (l->coil_rate_k_s > l->coil_rate_limit) found |= BIT(B_HEATING);
-    if (fabs(l->innovation_mean_c) > l->innovation_limit_c) found |= BIT(B_DISAGREES);
+    if (l->predicts[0] && (fabs(l->innovation_mean_c) > l->innovation_limit_c || fabs(l->model_error_c) > l->drift_limit_c))
+        found |= BIT(B_DISAGREES);
     if (l->power_mean_w > l->power_limit_w) found |= BIT(B_POWER);
     if (!(finite_(l->v) && finite_(l->reference_um) && finite_(l->compensated_um) && finite_(l->T[0])
           && finite_(l->expansion_um) && finite_(l->power_w))) found |= BIT(B_NOT_FINITE);
+    agree(l);
     l->faults |= found;
     l->trips |= l->faults & l->trip_others;
     int64_t before = l->state;

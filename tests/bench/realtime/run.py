@@ -3,9 +3,9 @@
 Each round runs, one after the other on the same processor with the same priority, locked memory and latency request:
 
     cyclictest   rt-tests' wake-up latency
-    daemon       the whole daemon (loop, recorder, command socket) on two ptys: encoder frames, CiA-402 over Lawicel CAN;
-                 a C reference loop one priority higher with the same deadlines wakes beside it (paired, per tick)
-    twin         the same loop in C, with the same reference beside it
+    daemon       the whole daemon (loop, recorder, command socket) on two ptys: encoder frames, CiA-402 over Lawicel CAN; and
+                 as long again with a C reference loop one priority higher and with the same deadlines (paired, per tick)
+    twin         the same loop in C, in the same two halves
     plain        pyserial + python-can + numpy, for comparison (without stress)
 
 idle and under stress: stress-ng on all processors and a disk, and a client that asks the daemon's status 100 times a second.
@@ -132,11 +132,11 @@ def run_cyclictest(bench: Bench, seconds: float) -> np.ndarray:
 def run_twin(bench: Bench, seconds: float) -> dict[str, Any]:
     out = bench.work / "twin.bin"
     twin = subprocess.Popen([bench.work / "twin", str(bench.cpu), str(PRIORITY), str(PERIOD_NS),
-                             str(round(seconds * 1e9 / PERIOD_NS)), bench.work / "law.bin", bench.work / "encoder",
+                             str(round(2 * seconds * 1e9 / PERIOD_NS)), bench.work / "law.bin", bench.work / "encoder",
                              bench.work / "can", out], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert twin.stdout
-    reference, reference_out = bench.reference(int(twin.stdout.readline()), seconds - 0.5)
-    _, errors = twin.communicate(timeout=seconds + 20)
+    reference, reference_out = bench.reference(int(twin.stdout.readline()) + round(seconds * 1e9), seconds - 0.5)
+    _, errors = twin.communicate(timeout=2 * seconds + 30)
     reference.wait(20)
     if twin.returncode:
         raise SystemExit(f"the C twin failed: {errors}")
@@ -145,10 +145,12 @@ def run_twin(bench: Bench, seconds: float) -> dict[str, Any]:
 
 
 def figures(rows: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
-    """wake (lateness, us), tick (wake-up to end of all work, us), paired, ticks, slips: of rows deadline, wake, end."""
+    """Of rows deadline, wake, end: wake (lateness, us) and tick (wake-up to end of all work, us) until the reference came
+    beside it, paired from then on; ticks and slips of both."""
     span = round((rows[-1, 0] - rows[0, 0]) / PERIOD_NS) + 1
-    return {"wake": (rows[:, 1] - rows[:, 0]) * 1e-3, "tick": (rows[:, 2] - rows[:, 1]) * 1e-3,
-            "paired": paired(rows, reference), "ticks": len(rows), "slips": span - len(rows)}
+    alone = rows[rows[:, 0] < reference[0, 0]] if len(reference) else rows
+    return {"wake": (alone[:, 1] - alone[:, 0]) * 1e-3, "tick": (alone[:, 2] - alone[:, 1]) * 1e-3,
+            "paired": paired(rows, reference) if len(reference) else np.array([]), "ticks": len(rows), "slips": span - len(rows)}
 
 
 def run_plain(bench: Bench, seconds: float) -> dict[str, Any]:
@@ -157,7 +159,7 @@ def run_plain(bench: Bench, seconds: float) -> dict[str, Any]:
                     str(round(seconds * 1e9 / PERIOD_NS / 2)), bench.work / "encoder", bench.work / "can", out], check=True,
                    stderr=subprocess.DEVNULL)
     rows = rows_of(out, 3)[100:]
-    return figures(rows, rows[:, :2])
+    return figures(rows, rows[:0, :2])
 
 
 def run_daemon(bench: Bench, seconds: float, ask_hz: float) -> dict[str, Any]:
@@ -172,7 +174,7 @@ def run_daemon(bench: Bench, seconds: float, ask_hz: float) -> dict[str, Any]:
     stamps_path = bench.work / "stamps.bin"
     log = open(bench.work / "daemon.log", "w")
     daemon = subprocess.Popen([sys.executable, HERE / "daemon.py", bench.config, stamps_path,
-                               str(round((seconds + 60) * 1e9 / PERIOD_NS))], stderr=log)
+                               str(round((2 * seconds + 60) * 1e9 / PERIOD_NS))], stderr=log)
     try:
         deadline = time.monotonic() + 30
         while True:
@@ -187,7 +189,7 @@ def run_daemon(bench: Bench, seconds: float, ask_hz: float) -> dict[str, Any]:
         newest = shared.ring.newest()
         start_s = float(shared.counters[START_S])
         first = (start_s + newest[INDEX["t_s"]]) * 1e9 - newest[INDEX["lateness_us"]] * 1e3
-        reference, reference_out = bench.reference(round(first) + 50 * PERIOD_NS, seconds)
+        reference, reference_out = bench.reference(round(first) + round(seconds * 1e9), seconds)
         before, ended, asked = processes(daemon.pid), threading.Event(), [0]
 
         def client() -> None:
@@ -197,7 +199,7 @@ def run_daemon(bench: Bench, seconds: float, ask_hz: float) -> dict[str, Any]:
         thread = threading.Thread(target=client)
         if ask_hz:
             thread.start()
-        end, lost = time.monotonic() + seconds, 0
+        end, lost = time.monotonic() + 2 * seconds, 0
         while time.monotonic() < end:
             time.sleep(0.2)
             rows, head, missed = shared.ring.read(head)
@@ -249,14 +251,18 @@ def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
     along = float(model.C[0] @ model.gain[:, 0])
     p = parameters
     parts = [model.A_minus_I.shape[0], len(model.sensors), model.kind == "mkf", model.sensors, faults.GROUP_OF_CHANNEL,
+             model.C.any(axis=1), model.b1.any() or model.b2.any() or model.b_air != 0.0,
              model.A_minus_I, model.B, model.C, model.gain, model.b1, model.b2,
              model.b_air, model.f1, model.offset_um, model.expansion_period_s, model.R_w, model.R_v, model.air_filter_s,
              model.period_s, period_s, float(first @ first), 1.0 / along if abs(along) > 1e-9 else 0.0,
+             0.5 * model.period_s / max(float(np.abs(model.A_minus_I).sum(axis=1).max()), 1e-12),
              p.kp, p.ti_s, p.td_s, p.output_limit, p.setpoint_rate_um_s, p.setpoint_low_um, p.setpoint_high_um,
              int(min(max(p.moving_average, 1), MAX_AVERAGE)), p.compensate, p.bound_um, p.slew_um_s,
              p.low, p.high, p.rate, p.stale_s, p.frozen_s, p.required, p.following_um, p.following_s, p.coil_limit_c,
              p.coil_rate_k_s, p.coil_rate_time_s, p.innovation_limit_c, p.innovation_time_s, p.power_limit_w, p.power_time_s,
-             p.idle_current_a, p.idle_power_w, p.idle_s, p.saturation_s, p.amplifier_s, p.late_s, trip_others,
+             p.idle_current_a, p.idle_power_w, p.idle_s, p.saturation_s, p.amplifier_s, p.late_s, p.agree_time_s,
+             p.drift_limit_c, p.monitored_limit_c, p.resistance_ohm, p.resistance_tolerance, p.resistance_v, p.current_per_drive,
+             p.current_tolerance_a, p.flexure_um_per_a, p.position_tolerance_um, p.reference_tolerance_um, p.order_limit_c, trip_others,
              faults.mask("critical")]
     return np.concatenate([np.atleast_1d(np.asarray(x, dtype=float)).ravel() for x in parts])
 
