@@ -124,10 +124,10 @@ def load_experiments(path: str | Path) -> dict[str, Schedule]:
         if isinstance(node.value, dict) and "inputs" in node.value:
             out[name] = _inputs(name, node).schedule()
             continue
+        e = _keys(node, f"experiment '{name}'", {"title", "parts"})
         if "rate_um_s" not in root.value:
             raise root.error("the file: 'rate_um_s' is missing, the rate at which parts are joined")
         rate = _number(root.value["rate_um_s"], 0.01, 1e5)
-        e = _keys(node, f"experiment '{name}'", {"title", "parts"})
         corners = [(0.0, 0.0)]
         _parts(e["parts"], rate, corners)
         t, v = np.array(corners).T
