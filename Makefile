@@ -7,7 +7,7 @@ SOURCES := pyproject.toml setup.py $(shell find thermoctl -name '*.pyx' -o -name
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run rig-hour bench-law test lint install clean reproduce bench-identification prove
+.PHONY: run rig-hour bench-law test lint install clean reproduce bench-identification test-identification prove
 run: install
 	$(BIN)/thermoctl demo --config config/simulated.yaml
 
@@ -45,8 +45,12 @@ $(VENV)/.installed: $(SOURCES)
 reproduce: install                 # the paper's tests, and the better method beside them
 	$(BIN)/thermoctl reproduce
 
-bench-identification: install
-	$(BIN)/python tests/bench/identification.py
+bench-identification: install      # all bars in one run; 18 million samples take 4 GB for the peer and some minutes
+	$(BIN)/python -m pip install --quiet '.[bench]'
+	$(BIN)/python tests/bench/identification.py --scale
+
+test-identification: install       # experiments, identification, model in the daemon and back, on a rig in simulated time
+	$(BIN)/python -m pytest tests/evaluate/test_experiment.py
 
 clean:
 	rm -rf $(VENV) build *.egg-info

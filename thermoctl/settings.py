@@ -64,6 +64,8 @@ class LoopSettings:
     priority: int = option("SCHED_FIFO priority; 0: no real-time scheduling", 80, "1", 0, 99, restart=True)
     spin_s: float = option("how long before a deadline the loop waits burning the processor", 0.0, "s", 0.0, 5e-4,
                            restart=True)
+    pace: str = option("what starts a tick: the clock, or the position encoder's frame (the clock, when none came for two "
+                       "periods)", "clock", restart=True, choices=("clock", "device"))
     overrun: str = option("what happens after a tick that took too long: skip the ticks it covered and keep the phase",
                           "skip", restart=True, choices=("skip",))
     reference: bool = option("run an idle loop of the same clock beside it, for `thermoctl latency`", False, restart=True)
@@ -88,6 +90,8 @@ class CompensationSettings:
     """The thermal error and its compensation."""
     model: str = option("model file made by identification, relative to this file; empty: no compensation", "", restart=True)
     enable: bool = option("act on the estimated thermal error", True)
+    tune: bool = option("learn the expansion model while the reference encoder is there; better ones become calibrations in the folder `model`",
+                        False, restart=True)
     bound_um: float = option("largest believable thermal error", 50.0, "um", 0.0, 1e4)
     slew_um_s: float = option("fastest change of the compensation while armed", 1.0, "um/s", 1e-4, 1e4)
 
@@ -369,6 +373,8 @@ def _together(settings: Settings, root: Node) -> None:
     needed = {"simulated": "plant", "devices": "devices", "replay": "recording"}[hal.backend]
     if not getattr(hal, needed):
         raise place("hal", "backend").error(f"hal.{needed} is missing: the back end '{hal.backend}' needs it")
+    if settings.loop.pace == "device" and hal.backend != "devices":
+        raise place("loop", "pace").error(f"loop.pace: device needs hal.backend: devices, found '{hal.backend}'; set pace: clock")
 
 
 __all__ = ["CHANNELS", "InputError", "Option", "Settings", "changed", "load_settings", "options"]

@@ -90,6 +90,8 @@ def status(config: str | None, as_json: bool = False) -> int:
     bad = {role: state for role, state in answer["channels"].items() if state not in ("OK", "ABSENT")}
     if bad:
         print("readings: " + ", ".join(f"{role} {state}" for role, state in bad.items()))
+    if answer.get("tuning_percent") is not None:
+        print(f"tuning of the expansion model: {answer['tuning_percent']:.0f} % of the excitation seen")
     if answer["recorder"]["lost"]:
         print(f"recorder: {answer['recorder']['lost']} ticks lost")
     for fault in answer["faults"]:

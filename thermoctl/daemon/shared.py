@@ -37,8 +37,8 @@ _AREAS = (
     ("lateness", "u8", (BINS + 1,)), ("busy", "u8", (BINS + 1,)), ("reference", "u8", (BINS + 1,)),
     ("largest", "f8", (3,)), ("counters", "f8", (16,)),
 )
-START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS = range(5)
-"""Places in `counters`."""
+START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING = range(6)
+"""Places in `counters`; TUNING is 1 + percent, 0 where nothing is tuned."""
 _LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES]).encode())
 
 

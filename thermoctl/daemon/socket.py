@@ -22,7 +22,7 @@ from typing import Any
 
 from thermoctl.control import arming, faults
 from thermoctl.daemon.loop import RELOAD
-from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared, percentiles
+from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
 from thermoctl.signals import INDEX, POINTS, SIGNALS
 from thermoctl.yamlfile import InputError
 
@@ -51,6 +51,7 @@ def status(shared: Shared) -> dict[str, Any]:
         "temperatures_c": {p: number[f"{p}_c"] for p in POINTS},
         "estimates_c": {p: number[f"{p}_est_c"] for p in POINTS},
         "lateness_us": number["lateness_us"], "busy_us": number["busy_us"], "busy_p50_us": _or_none(busy[0]),
+        "tuning_percent": float(shared.counters[TUNING]) - 1.0 if shared.counters[TUNING] else None,
         "recorder": {"rows": int(shared.counters[RECORDER_ROWS]), "lost": int(shared.counters[RECORDER_LOST])},
         "faults": [{"name": f.name, "severity": f.severity, "meaning": f.meaning, "remedy": f.remedy}
                    for f in faults.decode(row[INDEX["fault_bits"]])],

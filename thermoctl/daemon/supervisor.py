@@ -137,6 +137,16 @@ def _command_process(settings: Any, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
+def _tuner_process(settings: Any, shared: Shared, board: Any) -> int:
+    from thermoctl.daemon import tuner
+    stop = _Stop()
+    loops.die_with_parent()
+    tuning = tuner.Tuning(compensator(settings), settings.rig.name, Path(settings.compensation.model),
+                          lambda text: console_log("tuned", what=text))
+    tuner.run(shared, tuning, stop)
+    return EXIT_OK
+
+
 def _reference_process(settings: Any, shared: Shared, board: Any) -> int:
     stop = _Stop()
     loops.die_with_parent()
@@ -242,6 +252,9 @@ def run(settings: Any, log: Log = console_log) -> int:
     lock = _only_one(settings)
     compensator(settings)
     law_parameters(settings)
+    if settings.compensation.tune:                            # loaded only then: it brings scipy with it
+        from thermoctl.daemon import tuner
+        tuner.check(settings)
     shared = Shared.create(shared_name(settings))
     board, pollers = None, []
     if settings.hal.backend == "devices":
@@ -255,6 +268,8 @@ def run(settings: Any, log: Log = console_log) -> int:
               _Child("commands", _command_process, settings, shared, board)]
     if not settings.recording.enable:
         others = [c for c in others if c.name != "recorder"]
+    if settings.compensation.tune:
+        others.append(_Child("tuner", _tuner_process, settings, shared, board))
     if settings.loop.reference:
         others.append(_Child("reference", _reference_process, settings, shared, board))
     try:

@@ -163,11 +163,20 @@ def identify(test_2: str, test_3: str, test_4a: str, config: str, models: str, m
     """Calibrate from recordings and install the compensator in the folder `models`."""
     settings = load_settings(config)
     r2, r3, r4 = (_recorded(p) for p in (test_2, test_3, test_4a))
-    c = chain.calibrate(r2, r3, r4, order or None)
-    model = chain.compensator(c, method, settings.loop.period_s)
-    left = r4.error_um - chain.estimates(c, r4)[method]
-    figures: dict[str, Any] = {"method": method, "time_constants_s": c.model.info["time_constants_s"], "residual_rms_k": c.model.info["residual_rms"],
-                               "expansion_rms_um": float(np.sqrt(np.nanmean(left**2))), "zeta": c.mkf.zeta}
+    figures: dict[str, Any] = {"method": method}
+    if method == "paper":
+        c = chain.calibrate(r2, r3, r4, order or None)
+        model = chain.compensator(c, method, settings.loop.period_s)
+        left = r4.error_um - chain.estimates(c, r4)[method]
+        figures |= {"time_constants_s": c.paper_model.time_constants_s, "zeta": c.mkf.zeta}
+    else:
+        thermal, kalman, variances, um, refined = chain.calibrate_refined([r2, r3, r4], order or None)
+        model = chain.better_compensator(kalman, um, settings.loop.period_s)
+        left = r4.error_um - um.predict(chain.run_kalman(kalman, r4), chain.smooth_air(r4.air_c), um.info.get("start_um", 0.0))
+        figures |= {"time_constants_s": thermal.info["time_constants_s"], "residual_rms_k": thermal.info["residual_rms"], "variances": variances,
+                    "refinement": refined}
+        print(f"prediction-error refinement: {refined}")
+    figures["expansion_rms_um"] = float(np.sqrt(np.nanmean(left**2)))
     path = modelfile.install(models, model, settings.rig.name, [test_2, test_3, test_4a], figures)
     print(f"{path}: expansion left {figures['expansion_rms_um']:.3g} um rms over test 4A; set compensation.model to it, or to {models}")
     return 0

@@ -1,0 +1,165 @@
+"""From experiment to compensation: tests run and recorded, identified, installed, loaded by the daemon, refused elsewhere, rolled back."""
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermoctl import cli
+from thermoctl.daemon import tuner
+from thermoctl.daemon.assemble import compensator
+from thermoctl.daemon.simulate import Simulation
+from thermoctl.evaluate import commands
+from thermoctl.identify import modelfile, tuning
+from thermoctl.identify.online import Tuner
+from thermoctl.recording.table import read_table
+from thermoctl.settings import load_settings
+from thermoctl.signals import INDEX
+from thermoctl.yamlfile import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+QUICK = 50              # heat capacities are divided by it: an hour passes in 72 s
+SHORT = """\
+format: thermoctl-experiments/1
+rate_um_s: 16.6667
+experiments:
+  test_2: {title: Pulses, parts: [{hold: [[70, 250], [50, 0], [40, 250], [60, 0]]}]}
+  test_3: {title: Trapezoids, parts: [{trapezoid: {low_um: 0, high_um: 250, hold_s: [10, 25], duration_s: 160}}, {hold: [[60, 0]]}]}
+  test_4a: {title: Trapezoids, parts: [{trapezoid: {low_um: 0, high_um: 250, hold_s: [20, 15], duration_s: 160}}, {hold: [[60, 0]]}]}
+"""
+
+
+@pytest.fixture
+def quick(tmp_path, monkeypatch):
+    """A folder with a rig whose heat is QUICK times faster, its experiments, no model."""
+    text = (ROOT / "config/plants/actuator.yaml").read_text()
+    (tmp_path / "plant.yaml").write_text(re.sub(r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
+                                                lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}", text))
+    text = (ROOT / "config/simulated.yaml").read_text()
+    for old, new in (("plants/actuator.yaml", "plant.yaml"), ("model: models/simulated.yaml", 'model: ""'), ("slew_um_s: 1", "slew_um_s: 50"),
+                     ("temperatures_c: 900", "temperatures_c: 18"), ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25"),
+                     ("period_s: 7200", "period_s: 144"), ("../run/", f"{tmp_path}/"), ("../recordings", f"{tmp_path}/recordings")):
+        assert old in text, old
+        text = text.replace(old, new)
+    (tmp_path / "rig.yaml").write_text(text)
+    (tmp_path / "experiments.yaml").write_text(SHORT)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.slow       # 12 minutes of rig time: make test-identification
+def test_from_experiment_to_a_model_in_the_daemon_and_back(quick, capsys):
+    (quick / "plant.yaml").write_text((ROOT / "config/plants/actuator.yaml").read_text())          # heat at its own pace
+    for name in ("test_2", "test_3", "test_4a"):
+        assert cli.main(["experiment", name, "--config", "rig.yaml"]) == 0
+    said = capsys.readouterr().out
+    assert "faster than real time" in said and "mHz" in said and "<- f_c" in said
+    table = read_table("test_2.parquet")
+    assert len(table) == pytest.approx(2200, abs=2) and np.ptp(table.columns["output_reference_um"] - table.columns["position_raw_um"]) > 0.5
+
+    identify = ["identify", "test_2.parquet", "test_3.parquet", "test_4a.parquet", "--config", "rig.yaml", "--order", "2"]
+    assert cli.main(identify) == 0
+    one = modelfile.current("models")
+    found = modelfile.load_calibration(one)
+    assert found.rig == "simulated" and set(found.fingerprints) == {"test_2.parquet", "test_3.parquet", "test_4a.parquet"}
+    assert found.figures["expansion_rms_um"] < 0.5
+
+    # The daemon's own loader takes it by the folder, and refuses it for a rig of another name.
+    (quick / "rig.yaml").write_text((quick / "rig.yaml").read_text().replace('model: ""', "model: models"))
+    settings = load_settings("rig.yaml")
+    assert np.array_equal(compensator(settings).A_minus_I, found.model.A_minus_I) and found.figures["refinement"]
+    other = dataclasses.replace(settings, rig=dataclasses.replace(settings.rig, name="another"))
+    with pytest.raises(InputError, match="of rig 'simulated', this one is 'another'"):
+        compensator(other)
+    with pytest.raises(InputError, match="of rig 'simulated'"):
+        Simulation(other)
+
+    # It compensates: test 4A again, with the model.
+    simulation = Simulation(dataclasses.replace(settings, protection=dataclasses.replace(settings.protection, innovation_limit_c=1e3)))
+    simulation.arm()
+    first = simulation.tick()[INDEX["output_reference_um"]]
+    left, grown = [], []
+    for k in range(90):
+        simulation.command("setpoint", 250.0 if k % 20 < 10 else 0.0)
+        row = simulation.tick(1000)
+        if row[INDEX["reference_um"]] == row[INDEX["setpoint_um"]]:
+            left.append(row[INDEX["output_reference_um"]] - row[INDEX["reference_um"]] - first)
+        grown.append(row[INDEX["expansion_um"]])
+    simulation.close()
+    assert max(grown) > 0.3 and (not left or np.abs(left).max() < 0.5 * max(grown))
+
+    # A second calibration becomes current; the first one comes back.
+    assert cli.main(identify) == 0 and modelfile.current("models") != one
+    assert cli.main(["model", "rollback"]) == 0 and modelfile.current("models") == one
+
+
+def test_experiment_refuses_what_the_rig_may_not_do(quick, capsys):
+    (quick / "experiments.yaml").write_text(SHORT.replace("[70, 250]", "[70, 300]"))
+    assert cli.main(["experiment", "test_2", "--config", "rig.yaml"]) == 2
+    assert "setpoint_high_um" in capsys.readouterr().err and not (quick / "test_2.parquet").exists()
+    assert cli.main(["experiment", "test_3", "--config", "rig.yaml", "--dry-run"]) == 0 and not (quick / "test_3.parquet").exists()
+
+
+def test_relay_oscillates_at_the_loops_own_limit(quick):
+    t, y = commands.relay_test("rig.yaml", 0.1, 0.5)
+    g = tuning.relay(t, y, 0.1, 0.5)
+    step = tuning.fit_step(*commands.open_loop_step("rig.yaml"), 0.3)
+    w = 2 * np.pi / g.figures["Tu_s"]
+    # the describing function's point lies on the plant's own frequency response (its dead time and the hold of a period included)
+    assert g.figures["Ku"] * abs(step.frequency(np.array([w]))[0]) == pytest.approx(1, rel=0.35)
+    with pytest.raises(InputError, match="smaller drive"):
+        commands.relay_test("rig.yaml", 1.5, 395)
+
+
+def test_a_wrong_expansion_is_tuned_while_the_reference_is_there(quick):
+    """In simulated time: the tuner takes the daemon's rows, waits for excitation, and installs a better calibration, which can be undone."""
+    from thermoctl.plant import load
+    from thermoctl.plant.linearise import linearise
+    right = linearise(load(_thermal(quick)), 0.001, 0.1, expansion_period_s=0.05)
+    wrong = dataclasses.replace(right, b1=0.75 * right.b1, b2=0.75 * right.b2, b_air=0.75 * right.b_air, air_filter_s=right.air_filter_s / QUICK)
+    settings = load_settings("rig.yaml")
+    folder = quick / "models"
+    first = modelfile.install(folder, wrong, "simulated")
+    said: list[str] = []
+    learning = tuner.Tuning(wrong, "simulated", folder, said.append, Tuner(wrong, (0.5, 2.0, 4.0), 100, 0.4, hold_s=60.0))
+    rows: list[np.ndarray] = []
+    simulation = Simulation(dataclasses.replace(settings, protection=dataclasses.replace(settings.protection, innovation_limit_c=1e3)), wrong)
+    simulation.arm()
+    progress = []
+    for k in range(260):
+        simulation.command("setpoint", 250.0 if k % 100 < 60 else 0.0)
+        for _ in range(100):
+            rows.append(simulation.tick(10).copy())
+        learning.take(np.array(rows))
+        rows.clear()
+        progress.append(learning.tuner.progress)
+        if said:
+            break
+    simulation.close()
+    assert progress[0] < 50 and said and "in use from the next start on" in said[0]
+    second = modelfile.current(folder)
+    assert second != first
+    tuned = modelfile.load_calibration(second)
+    g = [((m.b1 + m.b2) / (1 - m.f1)).sum() for m in (right, wrong, tuned.model)]
+    assert tuned.model.meta["tuned_online"] and "um against" in tuned.figures["tuned_online"]
+    gains = (wrong.b1 + wrong.b2) / (1 - wrong.f1)
+    change = (tuned.model.b1 + tuned.model.b2) / (1 - tuned.model.f1) - gains
+    assert np.abs(change).max() <= 0.4 * np.abs(gains).max() + 1e-9
+    assert abs(g[2] - g[0]) < abs(g[1] - g[0]) or np.abs(change).max() > 0
+    assert modelfile.roll_back(folder) == first
+
+
+def _thermal(folder: Path) -> Path:
+    text = (ROOT / "config/plants/actuator_thermal.yaml").read_text()
+    path = folder / "thermal.yaml"
+    path.write_text(re.sub(r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
+                           lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}", text))
+    return path
+
+
+def test_tuning_needs_a_folder_of_calibrations(quick):
+    settings = load_settings("rig.yaml")
+    settings = dataclasses.replace(settings, compensation=dataclasses.replace(settings.compensation, tune=True))
+    with pytest.raises(InputError, match="folder of calibrations"):
+        tuner.check(settings)
