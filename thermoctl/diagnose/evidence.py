@@ -1,15 +1,16 @@
 """How well an explanation fits, in a likelihood that lets the noise have colour.
 
-Each output channel's residual is white noise plus, where the data ask for it, a first-order coloured part: ARMA(1,1)
+Each output channel's residual is white noise plus, where the data ask for it, a coloured part: first order, ARMA(1,1)
     e_k = phi e_(k-1) + w_k - theta w_(k-1),    phi = 0 .. 0.9995
-or flicker noise (1/f^a, as a sum of first-order parts a factor of eight apart), fitted anew under every explanation. A white likelihood on coloured residuals would call every long drift a discovery.
+or flicker noise (1/f^a, as a sum of first-order parts a factor of eight apart), fitted anew under every explanation. A white
+likelihood on coloured residuals would call every long drift a discovery.
 
     score = sum over channels of N log(s^2) + sum over channels and recordings of h(excess)     (smaller is better)
 
 The second sum is the prior that a sensor's colour is about as large as its white noise: excess = (rms / sigma)^2 - 1 costs
 half of itself, and beyond 30 only its logarithm more, since then every explanation is far off. Without it a slow noise
-process would swallow any slow physics of a short record. Where the residual is larger than a sensor's colour can be (rms above
-LARGE sigmas), something is still missing, its part of the residual is no stationary noise, and its energy counts, too:
+process would swallow any slow physics of a short record. Where the residual is larger than a sensor's colour can be (rms
+above LARGE sigmas), something is still missing, its part of the residual is no stationary noise, and its energy counts, too:
 WEIGHT * N * log(rms^2 / (LARGE sigma)^2). Innovations alone would let what is fast decide over what is large.
 """
 from __future__ import annotations

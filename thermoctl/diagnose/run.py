@@ -291,7 +291,7 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
     return done
 
 
-def pairs(seen: Round, count: int = 6) -> list[tuple[Direction, Direction]]:
+def pairs(seen: Round, count: int = 4) -> list[tuple[Direction, Direction]]:
     """Pairs of directions that explain much more together than the better one alone: effects that nearly cancel. From the
     same first-order rows, without a refit: with a, b the two scores and c the cosine, gain = (a^2 + b^2 - 2abc) / (1 - c^2)."""
     alone = [d for d in seen.directions if d.vector is not None and d.dims == 1][:MOST_IN_PAIRS]
@@ -317,17 +317,19 @@ def pairs(seen: Round, count: int = 6) -> list[tuple[Direction, Direction]]:
 
 def compete_pairs(case: Case, seen: Round, chosen: Sequence[tuple[Direction, Direction]]) -> list[Explanation]:
     """Refit each pair in full; best score first."""
-    done = []
-    for first, second in chosen:
+    def both(item: tuple[Direction, Direction]) -> Explanation | None:
+        first, second = item
         try:
             plant, own = extend(seen.base.plant, first, seen.metric.drives)
-            moved = dataclasses.replace(second, candidate=dataclasses.replace(second.candidate, rig=_on(second.candidate.rig, plant)))
+            moved = dataclasses.replace(second, candidate=_on(second.candidate, plant))
             plant, other = extend(plant, moved, seen.metric.drives)
             e = case.explain(plant, [*seen.base.effects, first.candidate, moved.candidate], [*seen.base.own, own, other])
-        except (SimulationError, InputError, np.linalg.LinAlgError):
-            continue
+        except (SimulationError, InputError, LookupError, np.linalg.LinAlgError):
+            return None
         e.direction = dataclasses.replace(moved, dims=first.dims + second.dims)
-        done.append(e)
+        return e
+    with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
+        done = [e for e in pool.map(both, chosen) if e is not None]
     case.reprice([seen.base, *done])
     return sorted(done, key=lambda e: e.score)
 
@@ -479,9 +481,9 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
         seen.finalists = compete(case, seen, chosen)
         # The best score that also predicts: a rival that merely fits better gives way to the next.
         before = unseen_errors(case, current.plant)
-        best = next((e for e in seen.finalists[:4] if counts(case, seen, e, entries) and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0),
-                    None)
-        if best is None and not current.effects and seen.p_any() < 1e-3:
+        best = next((e for e in seen.finalists[:4] if counts(case, seen, e, entries)
+                     and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0), None)
+        if best is None and not current.effects and seen.p_any() < 1e-3 and time.monotonic() - case.begun < 45:
             case.progress("looking for two effects that hide each other")
             together = compete_pairs(case, seen, pairs(seen))
             best = next((e for e in together if counts(case, seen, e, entries)), None)
@@ -642,11 +644,12 @@ def leave_out(case: Case, base: Explanation, current: Explanation, k: int) -> Ex
                 continue
             values = {p: current.plant.parameters[n].value for p, n in names.items()}
             ranges = {p: current.plant.parameters[n].range or (-np.inf, np.inf) for p, n in names.items()}
-            plant = dataclasses.replace(c, rig=_on(c.rig, plant)).extend(values, ranges)
+            c = _on(c, plant)
+            plant = c.extend(values, ranges)
             effects.append(c)
             own.append(names)
         return case.explain(plant, effects, own) if effects else base
-    except (SimulationError, InputError, KeyError):
+    except (SimulationError, InputError, LookupError):
         return None
 
 
@@ -670,8 +673,13 @@ def prune(case: Case, base: Explanation, current: Explanation, notes: list[str])
     return current
 
 
-def _on(rig: Rig, plant: Plant) -> Rig:
-    return Rig(plant, rig.drives, rig.columns)
+def _on(c: Candidate, plant: Plant) -> Candidate:
+    """The same effect at the same place of another plant. Raises LookupError where that has no such place."""
+    rig = Rig(plant, c.rig.drives, c.rig.columns)
+    same = [x for x in candidates(rig, {c.effect.name: c.effect}) if (x.key, x.variant, x.label) == (c.key, c.variant, c.label)]
+    if not same:
+        raise LookupError(f"{c.effect.name} has no place {c.place.where} any more")
+    return same[0]
 
 
 def _weigh(current: Explanation, rivals: Sequence[Explanation]) -> None:
