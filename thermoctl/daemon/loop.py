@@ -1,3 +1,4 @@
+# cython: annotation_typing=False
 """The loop: one tick a period, alone in its process.
 
     sample -> estimate -> compensate -> control -> protect -> actuate -> publish
@@ -21,13 +22,15 @@ import numpy as np
 from thermoctl.control import arming, faults
 from thermoctl.control.law import Law
 from thermoctl.control.model import CompensatorModel, Parameters
-from thermoctl.daemon.clock import now_ns, sleep_until
+from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns
 from thermoctl.daemon.ring import Record
 from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
 from thermoctl.signals import INDEX, SIGNALS
 
 RELOAD = float(len(arming.COMMANDS))
 """The mailbox command that applies the parameter block; the others are arming's."""
+SUSPEND_NS = 1_000_000                 # the two clocks are not read at once; less than this is no suspend
+SUSPEND_EVERY = 16                     # ticks between two looks for one
 STATE_EVERY = 1000                     # ticks between two snapshots of the law's state
 _HEAD = INDEX["position_raw_um"]            # numbers of a row before the channels
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
@@ -114,21 +117,35 @@ class Rig:
 def run_loop(settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], bool], warm_up_ticks: int = 100) -> None:
     """Tick until `stopping()`; the caller has opened the back end and disables the amplifier afterwards."""
     period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
+    paced = settings.loop.pace == "device"
+    if paced:
+        rig.backend.check_pacing()
     shared.counters[START_S], shared.counters[LOOP_PID] = rig.start_s, os.getpid()
     add_lateness, add_busy, busy = shared.lateness.add, shared.busy.add, INDEX["busy_us"]
-    before = now_ns()
+    before, slept_before = now_ns(), suspended_ns()
     deadline = before + period_ns
     while not stopping():
-        now = sleep_until(deadline, spin_ns)
-        if now < deadline:                                     # a signal woke us: its handler has run
-            continue
+        if paced:                                              # a frame is late: so is the tick, but not by two periods
+            sleep_until(before + period_ns // 2)
+            rig.backend.wait_frame(deadline, deadline + period_ns)
+            now = now_ns()
+            deadline = min(deadline, now)
+        else:
+            now = sleep_until(deadline, spin_ns)
+            if now < deadline:                                 # a signal woke us: its handler has run
+                continue
         lateness_us = (now - deadline) * 1e-3
-        rig.tick(now * 1e-9, (now - before) * 1e-9, lateness_us)
+        gap_ns = 0
+        if rig.law.tick % SUSPEND_EVERY == 0:                  # CLOCK_MONOTONIC stands while the machine sleeps
+            slept = suspended_ns()
+            gap_ns = slept - slept_before if slept - slept_before > SUSPEND_NS else 0
+            slept_before = slept
+        rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)
         if rig.law.tick > warm_up_ticks:
             add_lateness(lateness_us)
             add_busy(rig.row[busy])
         before = now
-        deadline += period_ns
+        deadline = now + period_ns if paced else deadline + period_ns
         late_ns = now_ns() - deadline
         if late_ns > 0:                                        # skip, and keep the phase
             skipped = late_ns // period_ns + (1 if late_ns % period_ns else 0)

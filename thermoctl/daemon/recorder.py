@@ -125,14 +125,14 @@ class Recorder:
 
 
 def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Recorder:
-    """The recorder of a daemon: files hold the configuration's text and the law's metadata."""
-    from pathlib import Path
-
+    """The recorder of a daemon: files hold the configuration in force, every option, and the law's metadata."""
     from thermoctl.daemon.assemble import compensator, law_parameters
     from thermoctl.recording.writer import RecordingWriter
+    from thermoctl.settings import effective
+    config = effective(settings)
 
     def open_writer(law: str) -> RecordingWriter:
-        metadata = {"rig": settings.rig.name, "config": Path(settings.path).read_text(), "law": law}
+        metadata = {"rig": settings.rig.name, "config": config, "law": law}
         return RecordingWriter(settings.recording, metadata, settings.rig.name, lambda text: log("recorder", what=text))
 
     return Recorder(shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer)
