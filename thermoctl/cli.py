@@ -86,6 +86,10 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
         from thermoctl.daemon import client
         return client
 
+    def service(args: argparse.Namespace) -> int:
+        from thermoctl import manual
+        return room().service_files(args.action, args.config, args.root) or manual.manual(parser(), args.action, args.root)
+
     run = _add(sub, "run", "the daemon in the foreground (what systemd starts), or its tick in simulated time",
                lambda a: room().run(a.config) if a.hours is None else
                room().run_simulated_time(a.config, a.hours, a.no_compensation, a.out), config)
@@ -121,8 +125,8 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
          lambda a: _virtual_rig(a.config, a.tell), ("--config", {"metavar": "FILE", "default": "config/wire.yaml"}),
          ("--tell", {"metavar": "LINE", "default": "", "help": "tell a running one to break or mend something, as "
                                                               "'encoder unplug' ('help' lists all)"}))
-    _add(sub, "service", "install or remove the systemd unit, its user and its device rules",
-         lambda a: room().service_files(a.action, a.config, a.root), ("action", {"choices": ["install", "uninstall"]}),
+    _add(sub, "service", "install or remove the systemd unit, its user, its device rules, the manual page and the shells' completions",
+         service, ("action", {"choices": ["install", "uninstall"]}),
          config, ("--root", {"default": "/", "metavar": "DIR", "help": "install below this directory"}))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from thermoctl.cli import main
+from thermoctl.manual import PLACES
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def test_install_and_uninstall_leave_nothing(installed, config):
     assert "@PROGRAM@" not in unit and f"run --config {config}" in unit
     for line in ("Type=notify", "WatchdogSec=2", "MemoryDenyWriteExecute=yes", "LimitMEMLOCK=infinity"):
         assert line in unit
-    assert len([p for p in installed.rglob("*") if p.is_file()]) == 4
+    assert len([p for p in installed.rglob("*") if p.is_file()]) == 4 + len(PLACES)
     assert main(["service", "uninstall", "--root", str(installed)]) == 0
     assert not [p for p in installed.rglob("*") if p.is_file()]
 
