@@ -3,7 +3,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := pyproject.toml setup.py $(shell find thermoctl -name '*.pyx' -o -name '*.pxd') thermoctl/control/law.py
+TYPED := $(shell find thermoctl hal -name '*.pxd')
+SOURCES := pyproject.toml setup.py $(shell find thermoctl hal -name '*.pyx') $(TYPED) $(wildcard $(TYPED:.pxd=.py))
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
@@ -55,7 +56,7 @@ test-identification: install       # experiments, identification, model in the d
 clean:
 	rm -rf $(VENV) build *.egg-info
 	find thermoctl hal -name '*.so' -delete
-	find thermoctl -name '*.pyx' -o -name '*.pxd' | sed 's/p.x*d*$$/c/' | xargs rm -f
+	find thermoctl hal -name '*.pyx' -o -name '*.pxd' | sed 's/p.x*d*$$/c/' | xargs rm -f
 
 # The compensator's models that are shipped, computed from the plant file.
 .PHONY: models
@@ -122,3 +123,17 @@ test-scale: install                # a Dask scheduler and workers started by han
 mutants: install                   # protection and arming: every branch reached, every mutant of the source broken or explained
 	$(BIN)/python -m pytest -m slow tests/control/test_protection.py
 	$(BIN)/python -m tests.control.mutants --page docs/proof/mutants.md
+
+# The loop beside cyclictest, a paired C reference, a C twin and a plain pyserial + python-can loop: idle and under stress.
+# Needs root and Debian's rt-tests and stress-ng; about 10 minutes.
+.PHONY: bench-realtime
+bench-realtime: install
+	$(BIN)/python tests/bench/realtime/run.py
+
+.PHONY: systemd-test
+systemd-test: install              # the unit in a really booted systemd (root; Debian: systemd-container, mmdebstrap)
+	$(BIN)/python -m pytest -q -s -m slow tests/systemd
+
+.PHONY: qemu-test
+qemu-test: install                 # SocketCAN for real in a qemu guest (root; Debian: qemu-system-x86, mmdebstrap)
+	$(BIN)/python -m pytest -q -s -m slow tests/qemu

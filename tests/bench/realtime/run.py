@@ -176,7 +176,7 @@ def run_daemon(bench: Bench, seconds: float, ask_hz: float) -> dict[str, Any]:
     daemon = subprocess.Popen([sys.executable, HERE / "daemon.py", bench.config, stamps_path,
                                str(round((2 * seconds + 60) * 1e9 / PERIOD_NS))], stderr=log)
     try:
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 120
         while True:
             with contextlib.suppress(InputError):
                 if ask(settings.socket.path, {"command": "status"}).get("ticks", 0) > 500:
@@ -212,7 +212,7 @@ def run_daemon(bench: Bench, seconds: float, ask_hz: float) -> dict[str, Any]:
         after = processes(daemon.pid)
     finally:
         daemon.send_signal(signal.SIGTERM)
-        daemon.wait(20)
+        daemon.wait(60)
         log.close()
     rows = np.concatenate(parts)
     wake = np.round((start_s + rows[:, INDEX["t_s"]]) * 1e9).astype(np.int64)
