@@ -709,7 +709,7 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
         return [{"level": float(v)} for v in np.unique(np.quantile(np.abs(z), [0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98]))]
     if kind == "small_levels":
         top = float(np.max(np.abs(z))) or 1.0
-        return [{"level": float(v)} for v in np.geomspace(0.01 * top, 0.6 * top, 10)]
+        return [{"level": float(v)} for v in np.geomspace(0.001 * top, 0.6 * top, 14)]
     quantiles = [0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.94, 0.97, 0.99]
     if kind == "end_levels" and candidate.variant == 1:
         quantiles = [1 - q for q in quantiles]

@@ -199,6 +199,15 @@ def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, f
     return out
 
 
+def weaker(direction: Direction, share: float = 0.1) -> Direction:
+    """The direction with a start at a tenth of its size."""
+    effect, start = direction.candidate.effect, dict(direction.start)
+    for p in effect.parameters:
+        if p.amplitude or effect.shapes.get(p.shape or "") in ("small_levels", "lags", "delays"):
+            start[p.name] = p.null + share * (start[p.name] - p.null)
+    return dataclasses.replace(direction, start=start)
+
+
 def extend(base: Plant, direction: Direction, drives: Sequence[Drive]) -> tuple[Plant, dict[str, str]]:
     """The plant with a screened effect at its starting values, and the plant's names of the effect's parameters."""
     duration = max(float(d.t[-1]) for d in drives)
@@ -276,13 +285,20 @@ def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direc
 
 def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explanation]:
     """Refit each direction in full; best score first."""
-    def one(direction: Direction) -> Explanation | None:
+    def tried(direction: Direction) -> Explanation | None:
         try:
             plant, own = extend(seen.base.plant, direction, seen.metric.drives)
             e = case.explain(plant, [*seen.base.effects, direction.candidate], [*seen.base.own, own])
         except (SimulationError, InputError, np.linalg.LinAlgError):
             return None
         e.direction = direction
+        return e
+
+    def one(direction: Direction) -> Explanation | None:
+        e = tried(direction)
+        if e is None or e.raw > seen.base.raw:      # led astray by a start too far out: once more from nearer to nothing
+            again = tried(weaker(direction))
+            e = again if e is None or (again is not None and again.score < e.score) else e
         return e
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
         done = [e for e in pool.map(one, chosen) if e is not None]
