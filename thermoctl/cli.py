@@ -216,6 +216,8 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
          ("--scheduler", {"metavar": "ADDRESS", "help": "of folders: a Dask scheduler (tcp://...) that sees the same files"}),
          folder, ("--drive", {"action": "append", "metavar": "INPUT", "help": "an input that the next experiment may drive (repeatable; "
                                                                               "default: what moved and is not the surroundings)"}),
+         ("--limit", {"action": "append", "metavar": "NAME=LOW:HIGH", "help": "what an input or output of the rig may reach in the next "
+                                                                             "experiment (repeatable; default: about what was recorded)"}),
          ("--resolve", {"action": "store_true", "help": "run the next experiment on the rig, add its data and decide again"}),
          ("--rounds", {"type": int, "default": 3, "metavar": "N", "help": "with --resolve: at most N experiments (3)"}),
          ("--rig", {"metavar": "PLANT", "help": "with --resolve: a plant file in the rig's place"}),

@@ -39,7 +39,7 @@ def diagnose(args: argparse.Namespace) -> int:
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
         return run.diagnose(args.plant, recordings, args.out, [Path(e) for e in args.effects or ()],
-                            None if args.quiet else Progress(), args.drive or ())
+                            None if args.quiet else Progress(), args.drive or (), _limits(args.limit or ()))
     if args.resolve:
         found = resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds,
                         lambda text: print(text, file=sys.stderr, flush=True))
@@ -50,6 +50,21 @@ def diagnose(args: argparse.Namespace) -> int:
     elif not args.quiet:
         summary(found, args.out)
     return 0
+
+
+def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """NAME=LOW:HIGH of each. Raises InputError."""
+    out = {}
+    for text in told:
+        name, _, span = text.partition("=")
+        low, _, high = span.partition(":")
+        try:
+            out[name] = (float(low), float(high))
+        except ValueError:
+            raise InputError(f"--limit {text}: NAME=LOW:HIGH was expected, such as block_temperature=15:90") from None
+        if not out[name][0] < out[name][1]:
+            raise InputError(f"--limit {text}: the first number must be the smaller one")
+    return out
 
 
 def fleet(args: argparse.Namespace) -> int:

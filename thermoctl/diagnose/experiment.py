@@ -11,7 +11,8 @@ What the experiment tells about which explanation is true, in bits (lower bound 
 
 Chosen is the most I per hour among those that reach ENOUGH of the best I. The family: levels, steps both ways, warm-up and
 cool-down, trapezoids slow and fast, triangles small and large, pseudo-random sequences of two bands; every input by itself and
-all together, in several lengths and from several starts. Inputs stay inside the range, and below the speed, that was recorded.
+all together, in several lengths and from several starts. Inputs stay inside the range, and below the speed, that was recorded,
+and readings within REACH of their recorded range of it, unless the rig's own limits are told.
 """
 from __future__ import annotations
 
@@ -45,8 +46,13 @@ LIKELY = 0.02               # an explanation below this share of the likeliest o
 POINTS = 700                # of a simulated experiment; a reading more often than that counts as less noise
 ENOUGH = 0.8                # of the best experiment's bits that a shorter one must reach
 TOGETHER = 0.98             # correlation from which two inputs are taken to be one lever (voltage and current)
+REACH = 0.5                 # how far beyond its recorded range, as a share of it, a reading may go
 TOLD_APART = 20.0           # D that decides: odds of e^(D/2) for one of two on the mean
 SURROUNDINGS = ("K", "W/m^2", "Pa")        # dimensions of what the surroundings do and no one commands
+
+
+Limits = Mapping[str, tuple[float, float]]
+NONE: Limits = {}
 
 
 @dataclass(frozen=True)
@@ -79,9 +85,10 @@ class Excitation:
 
 # -------------------------------------------------------------------------------------------------- what can be driven
 
-def levers(plant: Plant, tables: Sequence[Table], only: Sequence[str] = ()) -> list[Lever]:
+def levers(plant: Plant, tables: Sequence[Table], only: Sequence[str] = (), limits: Limits = NONE) -> list[Lever]:
     """The inputs that moved in the recordings and are no part of the surroundings (temperatures, sunshine, pressure), those that
-    moved alike as one. `only`: names that count, whatever their unit. Raises InputError for an unknown name."""
+    moved alike as one. `only`: names that count, whatever their unit; `limits`: by input, instead of what was recorded. Raises
+    InputError for an unknown name."""
     for n in only:
         if n not in plant.inputs:
             raise InputError(f"'{n}' is not an input of {plant.file}; there are {', '.join(plant.inputs)}")
@@ -102,7 +109,7 @@ def levers(plant: Plant, tables: Sequence[Table], only: Sequence[str] = ()) -> l
                 found[k] = dataclasses.replace(found[k], moves={**found[k].moves, i.name: (float(factor), float(offset))})
                 break
         else:
-            low, high = float(good.min()), float(good.max())
+            low, high = limits.get(i.name, (float(good.min()), float(good.max())))
             first = float(np.median([p[np.isfinite(p)][0] for p in parts if np.isfinite(p).any()]))
             rate = max((float(np.nanmax(np.abs(np.diff(t.columns[i.column]) / np.diff(t.t)))) for t in tables
                         if i.column in t.columns and len(t.t) > 1), default=np.inf)
@@ -293,14 +300,20 @@ def survivors(found: Diagnosis) -> list[Explanation]:
     return [e for e in out.values() if e.probability >= LIKELY * best and e.probability > 0][:MOST]
 
 
-def propose(case: Case, found: Diagnosis, drivable: Sequence[str] = ()) -> tuple[dict[str, Any], Excitation] | None:
+def propose(case: Case, found: Diagnosis, drivable: Sequence[str] = (),
+            limits: Limits = NONE) -> tuple[dict[str, Any], Excitation] | None:
     """The next experiment for an undecided diagnosis: the contract's entry and its excitation; None where one explanation
-    stands alone or nothing can be driven."""
+    stands alone or nothing can be driven. `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that
+    is neither."""
+    for n in limits:
+        if n not in case.plant.inputs and n not in case.plant.outputs:
+            raise InputError(f"a limit of '{n}': no such input or output of {case.plant.file}; there are "
+                             + ", ".join((*case.plant.inputs, *case.plant.outputs)))
     from thermoctl.diagnose import observer
     standing = survivors(found)
     if found.verdict not in ("ambiguous", "unexplained") or len(standing) < 2:
         return None
-    drive = levers(case.plant, case.tables, drivable)
+    drive = levers(case.plant, case.tables, drivable, limits)
     if not drive:
         return None
     case.progress("looking for the experiment that tells them apart")
@@ -319,7 +332,7 @@ def propose(case: Case, found: Diagnosis, drivable: Sequence[str] = ()) -> tuple
         grid = max(step, x.duration_s / POINTS)
         table = x.table(case.plant, grid)
         told = [_predict(b, table) for b in believers]
-        if any(p is None for p in told) or _leaves(case, outputs, told):
+        if any(p is None for p in told) or _leaves(case, outputs, told, limits):
             return None
         s = sigma[seen] * np.sqrt(step / grid)
         D = np.zeros((len(believers), len(believers)))
@@ -351,15 +364,15 @@ def propose(case: Case, found: Diagnosis, drivable: Sequence[str] = ()) -> tuple
     return entry, chosen
 
 
-def _leaves(case: Case, outputs: Sequence[str], told: Sequence[Any], reach: float = 0.5) -> bool:
-    """Would any reading leave the range that it was recorded in by more than `reach` of it? The rig was never seen there."""
-    for j, _ in enumerate(outputs):
+def _leaves(case: Case, outputs: Sequence[str], told: Sequence[Any], limits: Limits) -> bool:
+    """Would any reading leave its limits? Where none are told, they are what was recorded and REACH of it beyond."""
+    for j, o in enumerate(outputs):
         y = np.concatenate([d.y[np.isfinite(d.y[:, j]), j] for d in case.drives])
         if len(y):
-            room = reach * np.ptp(y)
-            for p in told:
-                if p[0][:, j].min() < y.min() - room or p[0][:, j].max() > y.max() + room:
-                    return True
+            room = REACH * np.ptp(y)
+            low, high = limits.get(o, (y.min() - room, y.max() + room))
+            if any(p[0][:, j].min() < low or p[0][:, j].max() > high for p in told):
+                return True
     return False
 
 

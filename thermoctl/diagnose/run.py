@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose import experiment, locate, observer
+from thermoctl.diagnose import doubt, experiment, locate, observer
 from thermoctl.diagnose.effects import CATALOGUE, PLACES, Candidate, Rig, candidates, catalogue
 from thermoctl.diagnose.evidence import LARGE, Colour, channels, white_sigma
 from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
@@ -383,6 +383,9 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     case.patience = max(4.0, 6 * (time.monotonic() - begun))
     _check_noise(case, base, notes)
     base = case.scored(base.plant, [], [], base.fit)
+    if quiet := _quiet(case, base):
+        return Diagnosis("consistent", base, base, [], [look(case, base, entries)], [], None, held_out(case, base, base), [*notes, quiet], None,
+                         start)
     followed = None
     if max(case.excess(base).values(), default=0.0) > FAR and Rig(base.plant, case.drives, [t.columns for t in case.tables]).velocities:
         followed = _following(case, base, entries, most)
@@ -411,6 +414,10 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
             if tinted.finalists and counts(case, tinted, tinted.finalists[0], entries):
                 current = reference = tinted.finalists[0]
                 rivals = tinted.finalists[1:]
+    clock = _clock(case, base, current, first)
+    if clock:
+        current = reference = base
+        rivals = []
     if current.effects:
         case.progress("trying the findings on data that took no part")
         kept = prune(case, base, current, notes)
@@ -441,6 +448,14 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
             notes.append(f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains")
     else:
         verdict = "unexplained" if before_worst > LARGE or left_over or remains(case, current) else "consistent"
+    if clock:
+        verdict, left_over = "unexplained", True
+        notes.insert(0, clock)
+    elif refused := doubt.other_rig(current.fit, [d.y for d in case.drives], excess, LARGE, list(case.plant.parameters)):
+        verdict, current, rivals = "unexplained", base, []
+        held = held_out(case, base, base)
+        notes.insert(0, refused)
+    notes += [c.effect.caution for c in current.effects if c.effect.caution]
     missing = None
     if verdict != "consistent":
         nodes = [s for s in suspects if s.kind == "node"]
@@ -448,6 +463,50 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
             at = rounds[0]
             missing = locate.missing_flow(at.metric, nodes[0].name, _signals(case, at))
     return Diagnosis(verdict, base, current, rivals, rounds, suspects, missing, held, notes, None, start)
+
+
+def _quiet(case: Case, base: Explanation) -> str | None:
+    moving = any(np.ptp(d.u[:, j]) > 0 for d in case.drives for j in range(d.u.shape[1]))
+    flat = dataclasses.replace(base.fit, residuals=[d.y for d in case.drives])
+    return doubt.still(flat, case.noise, moving)
+
+
+def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> str | None:
+    """Does one channel run ahead of the others, rather than physics being missing? The channel is shifted back, the plant
+    refitted, and the score held against that of the best explanation."""
+    if first.p_any() > 1e-3:
+        return None
+    guess = doubt.early(first.metric)
+    if guess is None or guess.gain < 0.3 * first.directions[0].gain:
+        return None
+    case.progress(f"trying whether {guess.output} runs ahead of the others")
+    column = case.plant.outputs[guess.output].column
+    step = max(float(np.median(np.diff(t.t))) for t in case.tables)
+    best, seconds = base, 0.0
+    ahead = guess.seconds
+    for _ in range(5):
+        total = round((seconds + ahead) / step) * step
+        if total <= 0 or total == seconds:
+            break
+        shifted = Case(case.plant, [doubt.later(t, column, total) for t in case.tables], case.noise)
+        shifted.patience = case.patience
+        try:
+            e = shifted.explain(base.plant, [], [])
+        except SimulationError:
+            break
+        if e.raw / max(e.fit.samples, 1) >= best.raw / max(best.fit.samples, 1):
+            break
+        best, seconds = e, total
+        again = doubt.early(Metric(e.fit, shifted.drives))
+        if again is None or again.output != guess.output:
+            break
+        ahead = again.seconds
+    per_sample = base.fit.samples / max(best.fit.samples, 1)        # the shift takes a few samples away
+    if seconds > 0 and best.raw * per_sample < found.raw - ACCEPT:
+        return (f"{guess.output}: its clock runs about {seconds:.3g} s ahead of the other channels' (shifted back, the residual falls from "
+                f"{base.fit.rms()[guess.output]:.3g} to {best.fit.rms()[guess.output]:.3g}); no sensor reads ahead of time. "
+                "Put the channels on one clock and diagnose again")
+    return None
 
 
 def inflation(ranked: Sequence[Direction]) -> float:
@@ -921,10 +980,10 @@ def _clean(value: Any) -> Any:
 
 def diagnose(plant_path: str | Path, recording_paths: Sequence[str | Path], out_dir: str | Path,
              effects: Sequence[Path] = (), progress: Callable[[str], None] | None = None,
-             drivable: Sequence[str] = ()) -> dict[str, Any]:
+             drivable: Sequence[str] = (), limits: experiment.Limits = experiment.NONE) -> dict[str, Any]:
     """Diagnose recordings against a plant file and write diagnosis.json, plant.yaml and report.html into `out_dir`, and where
     nothing is decided next_experiment.yaml and .csv, all or nothing. `drivable`: inputs that an experiment may drive (default:
-    those that moved and are not the surroundings). Returns the JSON's content. Raises InputError for unusable inputs."""
+    those that moved and are not the surroundings), `limits` of inputs and outputs that it keeps. Returns the JSON's content. Raises InputError for unusable inputs."""
     begun = time.monotonic()
     plant = load(plant_path)
     if not recording_paths:
@@ -939,7 +998,7 @@ def diagnose(plant_path: str | Path, recording_paths: Sequence[str | Path], out_
         found = examine(case, entries)
     except SimulationError as e:
         raise InputError(f"{plant_path}: the plant cannot follow these recordings at all: {e}") from None
-    proposed = experiment.propose(case, found, drivable)
+    proposed = experiment.propose(case, found, drivable, limits)
     found.next_experiment = proposed[0] if proposed else None
     found.result = result(case, found)
     found.result["seconds"] = round(time.monotonic() - begun, 1)
