@@ -20,10 +20,14 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("reader")
     for name in ("config", "examples"):
         shutil.copytree(ROOT / name, place / name)
+    config = place / "config/simulated.yaml"           # a machine that runs tests stalls for longer than a rig's may: here it is forgiven
+    text = config.read_text()
+    for strict, patient in ((r"stale_s: \{.*", "stale_s: {position_um: 5}"), (r"frozen_s: \{.*", "frozen_s: {coil_c: 900}\n  late_s: 30")):
+        text, replaced = re.subn(strict, patient, text)
+        assert replaced == 1
+    config.write_text(text)
     yield place
-    for config in place.glob("config/*.yaml"):
-        if "socket:" in config.read_text():
-            subprocess.run([BIN / "thermoctl", "stop", "--config", config], cwd=place, capture_output=True)
+    subprocess.run([BIN / "thermoctl", "stop", "--config", config], cwd=place, capture_output=True)
 
 
 def test_every_block_of_commands_says_whether_it_is_run():
