@@ -61,39 +61,34 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
         yield "gone", ast.Pass()
 
 
-class _Replace(ast.NodeTransformer):
-    """Put `new` in the place of the node numbered `at` in the order of ast.walk."""
-
-    def __init__(self, old: ast.AST, new: ast.AST):
-        self.old, self.new = old, new
-
-    def visit(self, node: ast.AST) -> ast.AST:
-        if node is self.old:
-            return ast.copy_location(self.new, node)
-        return super().generic_visit(node)
-
-
 def mutants(path: Path, functions: tuple[str, ...] | None) -> Iterator[tuple[str, ast.Module]]:
-    """(name, tree) of every mutant of a file; of some functions only, or of the whole module but its texts."""
+    """(name, tree) of every mutant of a file; of some functions only, or of the whole module but its texts. The tree is
+    the same object every time, changed in one place until the next one is asked for."""
     source = path.read_text()
-    lines = source.splitlines()
-    count = len(list(ast.walk(ast.parse(source))))
-    for at in range(count):
-        tree = ast.parse(source)
-        node = list(ast.walk(tree))[at]
+    lines, tree = source.splitlines(), ast.parse(source)
+    owners = [(f.lineno, f.end_lineno or 0, f.name) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef)]
+    places = [(parent, field, k, node) for parent in ast.walk(tree) for field, value in ast.iter_fields(parent)
+              for k, node in enumerate(value if isinstance(value, list) else [value]) if isinstance(node, ast.AST)]
+    for parent, field, k, node in places:
         line = getattr(node, "lineno", 0)
-        if not line:
+        owner = next((name for first, last, name in owners if first <= line <= last), "module")
+        if not line or functions is not None and owner not in functions:
             continue
-        owner = next((f.name for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) and f.lineno <= line <= (f.end_lineno or 0)),
-                     "module")
-        if functions is not None and owner not in functions:
-            continue
+        segment = " ".join((ast.get_source_segment(source, node) or "").split())
+        context = " ".join(lines[line - 1].split())
         for what, new in changes(node):
-            old = ast.get_source_segment(source, node) or lines[line - 1]
-            name = f"{path.name}:{owner}: `{' '.join(old.split())[:90]}` {what}"
-            other = ast.parse(source)
-            target = list(ast.walk(other))[at]
-            yield name, ast.fix_missing_locations(_Replace(target, new).visit(other))
+            replaced = ast.fix_missing_locations(ast.copy_location(new, node))
+            _put(parent, field, k, replaced)
+            yield f"{path.name}:{owner}: `{segment[:60]}` {what} in `{context[:90]}`", tree
+            _put(parent, field, k, node)
+
+
+def _put(parent: ast.AST, field: str, k: int, node: ast.AST) -> None:
+    value = getattr(parent, field)
+    if isinstance(value, list):
+        value[k] = node
+    else:
+        setattr(parent, field, node)
 
 
 def build(trees: dict[str, ast.Module]) -> types.ModuleType:

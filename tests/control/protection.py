@@ -35,7 +35,7 @@ def channels(default, **given):
     return array
 
 
-def model(gain=0.0, slow=1e-12):
+def model(gain=0.0, slow=0.0):
     """Two bodies that keep their heat, coil and bobbin; no expansion; corrections by `gain`."""
     C = np.zeros((12, 2))
     C[0, 0] = C[1, 1] = 1.0
@@ -121,7 +121,7 @@ def each_channel_has_its_bits(module):
 @scenario
 def absent(module):
     """A channel that no device has is no fault, unless it is required: then it is an error."""
-    Bench(module).armed().well()
+    Bench(module, monitored_limit_c=4.0, innovation_time_s=P).armed().well()
     bench = Bench(module, required=channels(0, shaft_1_c=1)).warm()
     assert bench.state == arming.SAFE and bench.shown == {"monitored_error"}
     bench = Bench(module).armed().say(3, "coil_c").tick()
@@ -222,6 +222,10 @@ def the_compensation_waits_for_what_it_needs(module):
         bench.say(2, name).tick(3)
         held = name in ("voltage_v", "current_a", "air_c", "coil_c")
         assert (bench.law.compensation_um == 1.0) == held, name
+    bench = Bench(module, replace(warm, gain=np.array([1.0, 0.0]))).set(coil_c=AIR + 1).warm()
+    bench.law.x[1] = 3.0
+    bench.say(2, "air_c").tick(3).set(air_c=AIR).tick(3)
+    assert bench.law.compensation_um != 1.0                                           # and goes on when it is back
     bench = Bench(module, replace(warm, gain=np.array([1.0, 0.0])), required=channels(0)).set(coil_c=AIR + 1).warm()
     bench.law.x[1] = 3.0
     bench.say(2, "air_c").tick(3)
@@ -293,12 +297,53 @@ def idle_to_the_tick(module):
         bench = Bench(module, idle_current_a=0.5, idle_power_w=2.0, idle_s=4 * P).armed().set(**readings).tick(20).well()
         bench.tick(command=arming.DISARM).tick(3)
         assert bench.shown == set()                                                   # the time counts from disarming
+        bench = Bench(module, idle_current_a=0.5, idle_power_w=2.0, idle_s=4 * P).warm().set(**readings).tick(2)
+        bench.tick(command=arming.ARM).tick().tick(command=arming.DISARM).tick(3)
+        assert bench.shown == set()
     bench = Bench(module, idle_current_a=0.5, idle_s=4 * P).warm().set(current_a=0.75).tick(3).set(current_a=0.5).tick()
     bench.set(current_a=0.75).tick(4)
     assert bench.shown == set()
     bench = Bench(module, required=channels(0), idle_current_a=0.5, idle_s=4 * P, high=channels(math.inf, current_a=9.0)).warm()
     bench.set(current_a=10.0).tick(9)
     assert bench.shown == {"current_range"}                                           # a reading at fault proves nothing
+
+
+@scenario
+def times_count_from_arming(module):
+    """What lasted for a while before DISARM does not count after the next ARM."""
+    def again(bench):
+        return bench.tick(3).well().tick(command=arming.DISARM).tick(2).tick(command=arming.ARM)
+    again(Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=1.0)).tick(4).well().tick().safe("amplifier_not_following")
+    bench = again(Bench(module, following_um=2.0, following_s=4 * P).armed().set(position_um=11.0))
+    bench.set(position_um=14.0).tick(4).well().tick().safe("following_error")
+    bench = Bench(module, saturation_s=4 * P).armed()
+    bench.law.v = 4.0
+    again(bench)
+    bench.law.v = 4.0
+    bench.tick(4).well().tick().safe("drive_saturated")
+
+
+@scenario
+def all_at_once(module):
+    """Faults add up: none hides another."""
+    bench = Bench(module, following_um=1.0, following_s=0.0, saturation_s=0.0, amplifier_s=0.0, coil_limit_c=30.0,
+                  coil_rate_k_s=0.5, coil_rate_time_s=1.0, innovation_limit_c=2.0, innovation_time_s=P, power_limit_w=1.0,
+                  power_time_s=P, late_s=P / 2, bound_um=1.0, resistance_ohm=4.0, agree_time_s=P, current_per_drive=1.0,
+                  current_tolerance_a=0.5, flexure_um_per_a=1.0, position_tolerance_um=1.0, monitored_limit_c=2.0)
+    bench.set(bobbin_c=AIR)
+    bench.law.configure(replace(bench.parameters, late_s=1.0))
+    bench.armed()
+    bench.law.configure(bench.parameters)
+    bench.law.v, bench.law.x[0] = 4.0, 99.0
+    bench.set(position_um=20.0, voltage_v=9.0, current_a=1.0, coil_c=40.0, bobbin_c=60.0, amplifier_state=3.0).say(2, "shaft_1_c")
+    bench.tick(external=1 << faults.BIT["amplifier_write"])
+    bench.safe("amplifier_write", "following_error", "drive_saturated", "amplifier_not_following", "amplifier_fault",
+               "coil_overtemperature", "coil_overtemperature_model", "coil_heating_rate", "coil_disagrees", "power_limit",
+               "loop_late", "electrical_disagrees", "position_disagrees", "monitored_disagrees", "monitored_error")
+    bench = Bench(module, idle_current_a=0.5, idle_s=0.0, power_limit_w=1.0, power_time_s=P).warm()
+    bench.law.x[0] = math.nan
+    bench.set(voltage_v=9.0, current_a=1.0).tick(external=1 << faults.BIT["amplifier_write"])
+    bench.safe("amplifier_write", "coil_stuck_on", "power_limit", "not_finite")
 
 
 @scenario
@@ -318,6 +363,9 @@ def coil_to_the_bit(module):
 def heating_rate(module):
     """A ramp of r K/s reads as r (1 - exp(-t/tau)): far below its temperature limit it trips."""
     bench = Bench(module, coil_rate_k_s=1.0, coil_rate_time_s=64 * P).armed()
+    exact = Bench(module, coil_rate_k_s=1.0, coil_rate_time_s=0.25).armed().set(coil_c=AIR + 0.25).tick().well()
+    assert exact.law.coil_rate_k_s == 1.0
+    Bench(module, coil_rate_k_s=1.0, coil_rate_time_s=0.25).armed().set(coil_c=AIR + 0.28125).tick().safe("coil_heating_rate")
     for k in range(1, 800):
         bench.set(coil_c=AIR + k * P).tick()
     bench.well()
@@ -422,6 +470,7 @@ def voltage_and_current(module):
         b.say(2, name).set(**{"voltage_v" if name == "current_a" else "current_a": 20.0}).tick(3)
         assert "electrical_disagrees" not in b.shown
     b = Bench(module, required=channels(0), resistance_ohm=4.0, agree_time_s=P, resistance_tolerance=0.0, resistance_v=0.5)
+    b.law.configure(replace(b.parameters, resistance_v=0.25))
     b.say(2, "air_c", "coil_c").set(current_a=1.0, voltage_v=4.0).tick(5)
     assert b.shown == {"air_error", "coil_error"}                                     # no temperature: R at 20 degC
 
@@ -624,13 +673,16 @@ def leaving_armed_empties_the_controller(module):
 
 @scenario
 def outputs_say_what_is(module):
-    bench = Bench(module, kp=0.125).set(bobbin_c=AIR).armed()
-    bench.set(position_um=7.0, voltage_v=3.0, current_a=0.5).tick(2, command=arming.SETPOINT, value=20.0)
+    growing = replace(model(0.5), b2=np.ones(12), expansion_period_s=P)
+    bench = Bench(module, growing, kp=0.125, slew_um_s=1.0).set(bobbin_c=AIR).armed()
+    bench.set(position_um=7.0, voltage_v=3.0, current_a=0.5, coil_c=AIR + 2, air_c=AIR + 1).tick(2, command=arming.SETPOINT, value=20.0)
+    bench.silent("position_um", "coil_c").tick(2)
     law, out = bench.law, dict(zip(module.OUTPUTS, bench.law.outputs, strict=True))
     for name in ("setpoint_um", "reference_um", "position_um", "compensated_um", "compensation_um", "expansion_um",
                  "control_v", "drive", "enable", "power_w", "air_rate_k_s", "innovation_c", "kalman_gain"):
         assert out[name] == getattr(law, name), name
-    assert out["state"] == arming.ARMED and out["fault_bits"] == 0 and out["power_w"] == 1.5
+    assert all(out[n] != 0.0 for n in ("compensation_um", "expansion_um", "air_rate_k_s", "innovation_c", "position_age_s", "coil_age_s"))
+    assert out["state"] == arming.ARMED and out["fault_bits"] == 1 << faults.BIT["compensation_slewing"] and out["power_w"] == 1.5
     assert out["position_age_s"] == law.age[0] and out["coil_age_s"] == law.age[AT["coil_c"]]
     assert [out[n[:-2] + "_est_c"] for n in faults.TEMPERATURES] == [law.T[m] + law.air_c for m in range(12)]
     law.v = 9.0
