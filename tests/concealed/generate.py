@@ -40,6 +40,7 @@ _PERIOD = "one none one one none one one unknown one none one pair one one none 
 _PERIOD += "one one pair one none one one none one none one unknown one one none one cancel one none one"
 KINDS = tuple(_PERIOD.split())
 ATTEMPTS = 24
+STEP = 2e-4  # of a parameter's range, for the derivatives by which a refit is judged
 CHUNK = 24  # rivals measured at a time: a large rig's signals are hundreds of megabytes
 FIXED = ("copper_resistance", "resistance_temperature")  # copper's coefficient: the drive's strength decides how visible
 
@@ -113,7 +114,7 @@ class Bench:
         scene = self.scene
         rows, steps = [Variant()], []
         for name, (low, high) in scene.ranges.items():
-            steps.append(2e-3 * (high - low))
+            steps.append(STEP * (high - low))
             rows.append(Variant(theta={name: scene.theta[name] + steps[-1]}))
         n_theta = len(rows)
         rows += [Variant(start={n: 0.1 * s}) for n, s in scene.starts.items()]
@@ -255,7 +256,7 @@ def published(effect: str, p: dict) -> dict:
 def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple | None, float | None]:
     """Choose place and size: (effects, readings by run, what the answer tells, bench), or None when not visible as
     asked; and the signal in sigmas that was seen instead, where a place for the effect was found."""
-    if slot.effect and slot.effect not in {s.effect for s in scene.suspects}:
+    if slot.effect and slot.effect not in {s.effect for s in scene.suspects} or scene.must not in (None, slot.effect):
         return None, None
     bench = Bench(scene, rng)
     kind = slot.kind

@@ -475,4 +475,5 @@ class Flexure:
             outputs_of,
             suspects,
             unknowns,
+            None if damped else "viscous_friction",
         )

@@ -122,6 +122,22 @@ def test_the_step_of_a_motion_truth_is_fine_enough(family):
     assert snr(bench.judge.left_over(d))[0] < 1.0
 
 
+@pytest.mark.parametrize("family", ["flexure", "stage"])
+def test_what_a_refit_leaves_does_not_hang_on_the_step_of_its_derivatives(family, monkeypatch):
+    """Half the step, the same sigmas: the derivatives are those of a straight piece. (A resonance without any damper fails
+    this by far; such a rig is made only to lack its damper.)"""
+    rng = np.random.default_rng
+    seed = next(k for k in range(50) if generate.FAMILIES[family].scene(rng(k), "designed", True).must is None)
+    found = []
+    for step in (generate.STEP, generate.STEP / 2):
+        monkeypatch.setattr(generate, "STEP", step)
+        scene = generate.FAMILIES[family].scene(rng(seed), "designed", True)
+        bench = generate.Bench(scene, rng(1))
+        bench.measure([next(s for s in scene.suspects if s.effect == "sensor_drift")])
+        found.append(snr(bench.curve[0][2]))
+    assert np.allclose(*found, rtol=0.05)
+
+
 def test_size_is_what_a_refit_leaves_in_sigmas():
     n, sd = 400, 0.5
     t = np.arange(n)
@@ -198,8 +214,8 @@ def test_cases_are_in_the_public_formats_and_answers_are_sealed(tmp_path):
 def test_what_is_concealed_is_what_the_plan_says_and_as_large():
     """The first single effects of a set: the effect that was asked for, on a rig that holds it, in its band of sigmas."""
     low_high = {"large": (15, 240), "middle": (6, 15), "small": (3, 6)}
-    families = ["heater", "tanks", "stage"]
-    for slot in generate.plan(21, 4, families, "one"):
+    families = ["heater", "tanks"]
+    for slot in generate.plan(21, 2, families, "one"):
         answer = generate.make_case(21, slot.number, families, True, "one")[2]
         low, high = low_high[slot.band]
         assert low <= answer["snr"][0] <= high and answer["band"] == slot.band
