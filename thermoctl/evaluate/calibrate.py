@@ -92,10 +92,12 @@ class SimulatedRig:
         from thermoctl.daemon.socket import channel_states
         simulation = Simulation(self.settings)
         try:
-            simulation.arm()
-            return channel_states(int(simulation.row[INDEX["status_bits"]]))
-        except RuntimeError as e:
-            raise InputError(f"{self.settings.path}: {e}") from None
+            ready = simulation.until(lambda row: row[INDEX["state"]] == arming.READY, 20.0)
+            row = simulation.row
+            if not ready:
+                names = ", ".join(f.name for f in faults.decode(row[INDEX["fault_bits"]])) or "none"
+                raise InputError(f"{self.settings.path}: not READY within 20 s; faults: {names}")
+            return channel_states(int(row[INDEX["status_bits"]]))
         finally:
             simulation.close()
 
