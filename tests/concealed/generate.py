@@ -256,7 +256,7 @@ def published(effect: str, p: dict) -> dict:
 def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple | None, float | None]:
     """Choose place and size: (effects, readings by run, what the answer tells, bench), or None when not visible as
     asked; and the signal in sigmas that was seen instead, where a place for the effect was found."""
-    if slot.effect and slot.effect not in {s.effect for s in scene.suspects} or scene.must not in (None, slot.effect):
+    if slot.effect and slot.effect not in {s.effect for s in scene.suspects}:
         return None, None
     bench = Bench(scene, rng)
     kind = slot.kind

@@ -40,7 +40,6 @@ class Scene:
     outputs_of: Callable[[int, list[Variant]], np.ndarray]  # (run, rows) -> (m, N, ny) readings without noise
     suspects: list[Suspect] = field(default_factory=list)
     unknowns: list[Suspect] = field(default_factory=list)
-    must: str | None = None  # the effect without which this truth would be no rig (a resonance that nothing damps)
 
 
 class Family(Protocol):

@@ -320,7 +320,6 @@ class Flexure:
             e: bool(rng.random() < 0.65)
             for e in ("back_emf", "inductance", "resistance_temperature", "copper_resistance")
         }
-        damped = rng.random() < 0.8
         belief: dict[str, tuple] = {
             "gain": (9.0, "N/A"),
             "mass": (0.6, "kg", 0.3, 1.2),
@@ -328,17 +327,15 @@ class Flexure:
             "R": (4.0, "ohm", 2.5, 6.5),
             "C_coil": (9.0, "J/K", 4, 20),
             "G_coil": (0.35, "W/K", 0.12, 1.0),
+            # always: a resonance that nothing damps is no rig, and what a refit leaves of a signal in it has no linear measure
+            "damping": (7.0, "N*s/m", 1.5, 30),
         }
-        if damped:
-            belief["damping"] = (7.0, "N*s/m", 1.5, 30)
         if knows["back_emf"]:
             belief["K_e"] = (9.0, "V*s/m", 4, 18)
         if knows["inductance"]:
             belief["L"] = (4e-3, "H", 1e-3, 1.2e-2)
         theta, ranges = _draw(belief, rng)
         theta["knows_copper"] = float(knows["copper_resistance"])
-        if not damped:
-            theta["damping"] = 0.0
         n, period = (4000 if short else 9000), 0.005
         runs = []
         for _ in range(2):
@@ -366,9 +363,8 @@ class Flexure:
             "motor": {"into": "velocity", "rate": "gain * current", "unit": "N"},
             "spring": {"from": "velocity", "rate": "stiffness * position", "unit": "N"},
         }
-        if damped:
-            flows["damper"] = {"from": "velocity", "rate": "damping * velocity", "unit": "N"}
         flows |= {
+            "damper": {"from": "velocity", "rate": "damping * velocity", "unit": "N"},
             "travel": {"into": "position", "rate": "velocity", "unit": "m/s"},
             "joule": {
                 "into": "coil",
@@ -448,9 +444,6 @@ class Flexure:
         }.items():
             if not knows[effect]:
                 suspects.append(suspect)
-        if not damped:
-            suspects = [s for s in suspects if s.effect not in ("directional_friction", "stribeck_friction")]
-            suspects.append(Suspect("viscous_friction", "velocity", lambda s: {"B": 3.0 * s}))
         for output, swing, air in zip(outputs, (8.0, 5.0, 15.0), (False, False, True), strict=True):
             suspects += [
                 s for s in sensor_suspects(output, period, span, swing, air, rng) if s.effect != "sensor_gain" or air
@@ -475,5 +468,4 @@ class Flexure:
             outputs_of,
             suspects,
             unknowns,
-            None if damped else "viscous_friction",
         )
