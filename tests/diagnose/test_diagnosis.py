@@ -148,3 +148,54 @@ def test_a_bad_effect_file_gives_its_one_error(tmp_path, text, words):
     with pytest.raises(InputError, match="bad.yaml:") as e:
         catalogue((tmp_path,))
     assert words in str(e.value)
+
+
+def _rewritten(path, change):
+    """A recording with its columns changed: change(names, rows) -> rows."""
+    names = path.read_text().splitlines()[0].split(",")
+    rows = change(names, np.genfromtxt(path, delimiter=",", skip_header=1))
+    np.savetxt(path, rows, delimiter=",", comments="", fmt="%.7g", header=",".join(names))
+
+
+def test_a_channel_whose_clock_runs_ahead_is_said_so_and_nothing_is_named(tmp_path):
+    paths = heater(tmp_path, seeds=(1,))
+
+    def ahead(names, rows):
+        k = names.index("temperature_2")
+        rows[:-20, k] = rows[20:, k]        # 20 samples of 2 s
+        return rows[:-20]
+    for p in paths[1:]:
+        _rewritten(p, ahead)
+    r = diagnosed(paths, tmp_path / "out")
+    assert r["verdict"] == "unexplained" and r["findings"] == []
+    said = next(n for n in r["notes"] if "clock" in n)
+    assert said.startswith("temperature_2") and float(re.search(r"about ([\d.]+) s ahead", said).group(1)) == pytest.approx(40, abs=6)
+
+
+def test_a_recording_of_another_rig_gets_no_name(tmp_path):
+    paths = heater(tmp_path, seeds=(1,))
+
+    def other(names, rows):
+        rng = np.random.default_rng(5)
+        for name in ("temperature_1", "temperature_2"):        # a machine that works to its own timetable
+            rows[:, names.index(name)] = 40 + 15 * np.sin(rows[:, 0] / 90 + rng.uniform(0, 6)) + rng.normal(0, 0.1, len(rows))
+        return rows
+    for p in paths[1:]:
+        _rewritten(p, other)
+    r = diagnosed(paths, tmp_path / "out")
+    assert r["verdict"] == "unexplained" and r["findings"] == []
+    assert any("of this rig" in n for n in r["notes"])
+
+
+def test_a_recording_in_which_nothing_moves_shows_nothing(tmp_path):
+    paths = heater(tmp_path, seeds=(1,))
+
+    def rest(names, rows):
+        rng = np.random.default_rng(6)
+        for name, value, noise in (("heat", 0, 0), ("air_temperature", 21.5, 0), ("temperature_1", 21.5, 0.1), ("temperature_2", 21.5, 0.1)):
+            rows[:, names.index(name)] = value + noise * rng.normal(size=len(rows))
+        return rows
+    _rewritten(paths[1], rest)
+    r = diagnosed(paths, tmp_path / "out")
+    assert r["verdict"] == "consistent" and r["findings"] == []
+    assert any("excited" in n for n in r["notes"])

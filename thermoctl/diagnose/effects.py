@@ -23,7 +23,8 @@ from thermoctl.plant.simulate import Drive, Simulation
 from thermoctl.plant.units import dimension
 
 CATALOGUE = Path(__file__).parents[2] / "config" / "effects"
-_KEYS = ("effect", "title", "where", "needs", "change", "variants", "shapes", "parameters", "dims", "prior", "excited_by", "mimics", "source")
+_KEYS = ("effect", "title", "where", "needs", "change", "variants", "shapes", "parameters", "dims", "prior",
+         "caution", "excited_by", "mimics", "source")
 _SHAPES = ("onsets", "windows", "times", "lags", "delays", "periods", "phases", "end_levels", "high_levels", "drive_levels",
            "small_levels", "speeds", "creep_speeds", "distances")
 TEMPERATURE = {"degC", "K", "kelvin", "celsius", "degree_Celsius", "delta_degC", "°C"}
@@ -64,6 +65,7 @@ class Effect:
     excited_by: str
     mimics: tuple[str, ...]
     source: str
+    caution: str | None = None      # what a finding of it cannot tell, in words
     prior: Expr | None = None       # -2 log of how likely its parameters' values are, beyond their bounds
 
 
@@ -124,7 +126,8 @@ def _read(root: yamlfile.Node) -> Effect:
     changes = (tuple(top["change"].plain()), *(tuple(v) for v in (top["variants"].plain() if "variants" in top else [])))
     return Effect(top["effect"].value, top["title"].value, top["where"].value, tuple(top["needs"].plain()) if "needs" in top else (),
                   changes, shapes, tuple(parameters), dims, top["excited_by"].value if "excited_by" in top else "",
-                  tuple(top["mimics"].plain()) if "mimics" in top else (), top["source"].value, prior)
+                  tuple(top["mimics"].plain()) if "mimics" in top else (), top["source"].value,
+                  top["caution"].value if "caution" in top else None, prior)
 
 
 # ---------------------------------------------------------------------------------------------------------- the rig

@@ -39,7 +39,7 @@ NAME = 0.9                  # one explanation is named alone from this probabili
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 REMAINS = -8.0              # log10 p of an unknown smooth input from which something is left over
-TEMPERING = 2.0             # how much less the score decides than a perfect likelihood would (calibrated by `make prove`)
+TEMPERING = 1.25, 2.0       # how much less the score decides than a perfect likelihood would, in white and in coloured noise
 BLOCKS = 16                 # of a single recording, every other one held out
 SPREAD = 0.06, 0.2          # least and greatest spread of parameters round their beliefs, in shares of their ranges
 MOST_IN_PAIRS = 250         # directions that are looked at two by two
@@ -386,23 +386,26 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     if quiet := _quiet(case, base):
         return Diagnosis("consistent", base, base, [], [look(case, base, entries)], [], None, held_out(case, base, base), [*notes, quiet], None,
                          start)
+    first = look(case, base, entries)
+    clock = _clock(case, base, base, first, CLEAN)
     followed = None
-    if max(case.excess(base).values(), default=0.0) > FAR and Rig(base.plant, case.drives, [t.columns for t in case.tables]).velocities:
+    if clock:
+        most = 0        # a shifted clock that leaves nothing to explain
+    elif max(case.excess(base).values(), default=0.0) > FAR and Rig(base.plant, case.drives, [t.columns for t in case.tables]).velocities:
         followed = _following(case, base, entries, most)
     if followed:
         current, reference, rivals = followed
-        rounds = [look(case, base, entries)]
+        rounds = [first]
         if max(case.excess(current).values()) >= CLEAN and len(current.effects) < most:
             more, others, looks = search(case, base, entries, most, current)
             if len(more.effects) > len(current.effects):
                 current = reference = more
                 rivals, rounds = others, [*rounds, *looks]
     else:
-        current, rivals, rounds = search(case, base, entries, most)
+        current, rivals, rounds = search(case, base, entries, most, first=first)
         reference = current
-    first = rounds[0]
     left_over = False
-    if not current.effects and first.p_any() < 1e-3:
+    if not clock and not current.effects and first.p_any() < 1e-3:
         # In white noise's metric something stands out, but nothing counts: the residual's own colour decides.
         case.progress("screening in the colour of the residual")
         tinted = look(case, base, entries, coloured=True)
@@ -414,7 +417,7 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
             if tinted.finalists and counts(case, tinted, tinted.finalists[0], entries):
                 current = reference = tinted.finalists[0]
                 rivals = tinted.finalists[1:]
-    clock = _clock(case, base, current, first)
+    clock = clock or _clock(case, base, current, first)
     if clock:
         current = reference = base
         rivals = []
@@ -471,9 +474,9 @@ def _quiet(case: Case, base: Explanation) -> str | None:
     return doubt.still(flat, case.noise, moving)
 
 
-def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> str | None:
+def _clock(case: Case, base: Explanation, found: Explanation, first: Round, within: float = np.inf) -> str | None:
     """Does one channel run ahead of the others, rather than physics being missing? The channel is shifted back, the plant
-    refitted, and the score held against that of the best explanation."""
+    refitted, and the score held against that of the best explanation; its residual must then be `within` so many sigmas."""
     if first.p_any() > 1e-3:
         return None
     guess = doubt.early(first.metric)
@@ -502,7 +505,7 @@ def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> s
             break
         ahead = again.seconds
     per_sample = base.fit.samples / max(best.fit.samples, 1)        # the shift takes a few samples away
-    if seconds > 0 and best.raw * per_sample < found.raw - ACCEPT:
+    if seconds > 0 and best.raw * per_sample < found.raw - ACCEPT and max(case.excess(best).values()) < within:
         return (f"{guess.output}: its clock runs about {seconds:.3g} s ahead of the other channels' (shifted back, the residual falls from "
                 f"{base.fit.rms()[guess.output]:.3g} to {best.fit.rms()[guess.output]:.3g}); no sensor reads ahead of time. "
                 "Put the channels on one clock and diagnose again")
@@ -538,12 +541,12 @@ def _threshold(seen: Round) -> float:
 
 
 def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
-           start: Explanation | None = None) -> tuple[Explanation, list[Explanation], list[Round]]:
-    """Add effects (to `start`, if given) while the evidence asks for them; then take each out again. Returns the best
-    explanation, its rivals and the looks that were taken."""
+           start: Explanation | None = None, first: Round | None = None) -> tuple[Explanation, list[Explanation], list[Round]]:
+    """Add effects (to `start`, if given) while the evidence asks for them; then take each out again. `first`: the look from
+    there, where it was taken. Returns the best explanation, its rivals and the looks that were taken."""
     case.progress("screening the catalogue")
     current = start or base
-    rounds = [look(case, current, entries)]
+    rounds = [first or look(case, current, entries)]
     rivals: list[Explanation] = []
     while len(current.effects) < most:
         seen = rounds[-1]
@@ -765,7 +768,8 @@ def _weigh(current: Explanation, rivals: Sequence[Explanation]) -> None:
         if key not in best or e.score < best[key].score:
             best[key] = e
     scores = np.array([e.score for e in best.values()])
-    weights = np.exp(-0.5 * (scores - scores.min()) / TEMPERING)
+    white = all(len(c.ar) == 1 for c in min(best.values(), key=lambda e: e.score).colours)
+    weights = np.exp(-0.5 * (scores - scores.min()) / TEMPERING[0 if white else 1])
     weights /= weights.sum()
     for e, w in zip(best.values(), weights, strict=True):
         e.probability = float(min(w, 0.995))
@@ -983,7 +987,8 @@ def diagnose(plant_path: str | Path, recording_paths: Sequence[str | Path], out_
              drivable: Sequence[str] = (), limits: experiment.Limits = experiment.NONE) -> dict[str, Any]:
     """Diagnose recordings against a plant file and write diagnosis.json, plant.yaml and report.html into `out_dir`, and where
     nothing is decided next_experiment.yaml and .csv, all or nothing. `drivable`: inputs that an experiment may drive (default:
-    those that moved and are not the surroundings), `limits` of inputs and outputs that it keeps. Returns the JSON's content. Raises InputError for unusable inputs."""
+    those that moved and are not the surroundings), `limits` of inputs and outputs that it keeps. Returns the JSON's content.
+    Raises InputError for unusable inputs."""
     begun = time.monotonic()
     plant = load(plant_path)
     if not recording_paths:
