@@ -177,8 +177,8 @@ uncompensated and by the coil alone is of the paper's size, and the unmeasured h
 rows that the paper leaves open are chosen for each rig by the filter's error in test 4A. Everything promised is therefore judged on seeds
 {FRESH[0]} to {FRESH[-1]}, which nothing was chosen by; the seeds looked at stand beside them.</p>"""))
     old = {r[0]: r[1] for r in before}
-    sections.append(("What was promised", table(["", "measured", "wanted", "met", "on the seeds looked at"],
-                                                [[*r[:3], r[3], old.get(r[0])] for r in rows])))
+    sections.append(("What was promised", table(["", "measured", "wanted", "met", "seeds looked at"],
+                                                [[r[0], r[1], r[2].replace(" ", "\u00a0").replace("<=", "≤"), r[3], old.get(r[0])] for r in rows])))
     sections.append(("What limits the paper's method here", """<p>A model of rises above the air cannot see the output move when the chamber
 warms everything: net expansion (the sum of all gains) times drift is left, whatever the filter does. Neither can it see a bench of its own
 temperature, which bends the filtered temperatures of the brackets. The same rigs with less of either:</p>"""
@@ -215,8 +215,9 @@ temperature, which bends the filtered temperatures of the brackets. The same rig
     gains = c.better_um.b1 + c.better_um.b2
     gains = gains / (1 - c.better_um.f1)
     choice = filter.choose_sensors(c.kalman.model, c.variances, filter.sensor_variance(chain.STEP_K, chain.NOISE_K), gains, 12)
-    sections.append(("What more sensors would buy", table(["sensors", "which", "standard error of position, µm"], [
-        [len(s), ", ".join(POINTS[j].replace("_", " ") for j in s), e] for s, e in choice])))
+    sections.append(("What more sensors would buy", table(["which", "sensors", "standard error of position, µm"], [
+        [", ".join(POINTS[j].replace("_", " ") for j in s), len(s), e] for s, e in choice],
+        "by the filter's own covariance with the calibrated noise: what it believes, unmeasured heat at its usual size")))
     return page("The paper, reproduced and beaten", sections, f"simulated rigs; {used:.0f} s")
 
 
@@ -235,7 +236,7 @@ def _figures(kept: dict) -> list[str]:
     for j in (0, 10):
         a.plot(r1.t / 60, r1.temperatures[:, j] - r1.air_c, lw=0.7, label=POINTS[j])
     a.set(xlabel="min", ylabel="rise, K")
-    a.legend()
+    a.legend(frameon=False)
     coil = r1.true_c[:, 0] - r1.air_c
     tau = float(np.argmax(coil >= 0.632 * coil[-300:].mean()))
     out.append(figure(fig, f"Fig. 10, test 1: step of power; the coil reaches 63.2 % after {tau:.0f} s, f_c = {1 / (2 * np.pi * tau):.2g} Hz"))
@@ -252,19 +253,37 @@ def _figures(kept: dict) -> list[str]:
     a.semilogy(np.arange(1, 31), np.array(c.paper_model.info["singular_values"][:30]), "o-")
     a.set(xlabel="order", ylabel="singular value")
     out.append(figure(fig, "Singular values of the oblique projection (19); 12 are used, 6 to 8 stand above the noise"))
-    for r, name in ((r2, "Fig. 12, test 2"), (r3, "Fig. 14 and 15, test 3")):
-        fig, (a, b, d) = axes(3)
+    def minutes(v: np.ndarray) -> np.ndarray:
+        return chain.block_mean(v, 60)
+
+    shown = (0, 2, 5, 8, 10)
+
+    def errors(r: Any, estimates: dict[str, np.ndarray], caption: str) -> None:
         truth = r.true_c - chain.smooth_air(r.air_c)[:, None]
-        paper, better = chain.estimate_mkf(c.mkf, r), chain.run_kalman(c.kalman, r)
-        for j in (0, 2, 5, 8, 10):
-            a.plot(r.t / 3600, truth[:, j], label=POINTS[j])
-            b.plot(r.t / 3600, paper[:, j] - truth[:, j])
-            d.plot(r.t / 3600, better[:, j] - truth[:, j])
-        a.set(ylabel="rise, K")
-        b.set(ylabel="error, MKF, K")
-        d.set(ylabel="error, better, K", xlabel="h")
-        a.legend(ncols=5, fontsize=7)
-        out.append(figure(fig, f"{name}: temperatures; error of the paper's filter; error of the better one"))
+        fig, (top, *rest) = axes(1 + len(estimates), 2.2)
+        for j in shown:
+            top.plot(r.t / 3600, truth[:, j], lw=1, label=POINTS[j].replace("_", " "))
+        top.set(ylabel="rise, K")
+        for ax, (name, estimate) in zip(rest, estimates.items(), strict=True):
+            left = minutes(estimate - truth)
+            ax.plot((np.arange(len(left)) + 0.5) / 60, left[:, list(shown)], lw=1)
+            ax.axhline(0, color="0.6", lw=0.6)
+            ax.set(ylabel=f"{name}, K")
+        rest[-1].set(xlabel="h")
+        fig.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=len(shown), frameon=False, fontsize=8)
+        out.append(figure(fig, caption))
+
+    errors(r2, {"paper's MKF": chain.estimate_mkf(c.mkf, r2), "better": chain.run_kalman(c.kalman, r2)},
+           "Fig. 12, test 2: true rises, and what the estimates leave of them, means of a minute")
+    fig, (a, b) = axes(2, 2.0)
+    a.plot(r3.t / 3600, r3.setpoint_um, lw=0.7)
+    first = r3.t < 900
+    b.plot(r3.t[first] / 60, r3.setpoint_um[first], lw=1)
+    a.set(ylabel="setpoint, µm", xlabel="h")
+    b.set(ylabel="setpoint, µm", xlabel="min")
+    out.append(figure(fig, "Fig. 13, test 3: motion, and its first quarter of an hour"))
+    errors(r3, {"before filtering": kept["estimate"]["open loop"], "paper's MKF": kept["estimate"]["paper"], "better": kept["estimate"]["better"]},
+           "Fig. 14 and 15, test 3: true rises, and what the paper's model alone, its MKF and the better filter leave of them, means of a minute")
     fig, (a, b) = axes(2)
     q = round(c.mkf.period_s)
     coil = chain.block_mean(chain.filled(chain.rises(r3)[:, :1]), q)[:, 0]
@@ -280,8 +299,8 @@ def _figures(kept: dict) -> list[str]:
     for name in ("siso", "paper", "better"):
         d.plot(r4.t / 3600, kept["left"][name], label=name, lw=0.8)
     a.set(ylabel="setpoint, µm")
-    b.set(ylabel="error, µm")
+    b.set(ylabel="uncompensated, µm")
     d.set(ylabel="left, µm", xlabel="h")
-    d.legend(ncols=3)
+    d.legend(ncols=3, frameon=False)
     out.append(figure(fig, "Fig. 17 and 18, test 4: motion, position error, and what each estimator leaves; the first two hours are the calibration"))
     return out
