@@ -76,6 +76,10 @@ prove-refit: install               # do 95 % intervals hold the truth? 100 truth
 refit-recordings: install          # every fit quoted for the naive plants of the real recordings, and ours
 	$(BIN)/python -m pytest -m slow -s tests/test_refit_recordings.py
 
+.PHONY: test-resolve
+test-resolve: install              # two explanations that look alike, decided by the experiment that was proposed
+	$(BIN)/python -m pytest -m slow tests/diagnose/test_experiment.py
+
 .PHONY: test-wire
 test-wire: install                 # pulled cables and killed programs, with the daemon and the virtual rig as two programs
 	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py
@@ -137,3 +141,7 @@ systemd-test: install              # the unit in a really booted systemd (root; 
 .PHONY: qemu-test
 qemu-test: install                 # SocketCAN for real in a qemu guest (root; Debian: qemu-system-x86, mmdebstrap)
 	$(BIN)/python -m pytest -q -s -m slow tests/qemu
+
+.PHONY: diagnose-recordings
+diagnose-recordings: install       # real rigs from their naive plants: what is named, where, and its worth on unseen data
+	$(BIN)/python -m pytest -m slow -s --no-header tests/diagnose/test_recordings.py

@@ -123,7 +123,9 @@ def _ramps(lever: Lever, plateaus: Sequence[tuple[float, float]], step_s: float)
     corners = [(0.0, lever.rest)]
     for seconds, value in plateaus:
         t, now = corners[-1]
-        ramp = min(max(abs(value - now) / max(lever.rate, 1e-300), 1e-3 * step_s), seconds)
+        ramp = max(abs(value - now) / max(lever.rate, 1e-300), 1e-3 * step_s)
+        if ramp > seconds:                              # too slow to get there in time
+            ramp, value = seconds, now + (value - now) * seconds / ramp
         corners += [(t + ramp, value), (t + seconds, value)]
     return np.array([c for k, c in enumerate(corners) if k == 0 or c[0] > corners[k - 1][0]])
 
@@ -161,7 +163,8 @@ def courses(lever: Lever, duration_s: float, step_s: float, seed: int = 0) -> di
     out = {k: _ramps(lever, p, step_s) for k, p in plans.items()}
     for word, part in (("large", 1.0), ("small", 0.2)):
         at = np.linspace(0, T, 9)
-        wave = np.where(np.arange(9) % 2, 0.5 * part, -0.5 * part) * span + middle
+        swing = 0.5 * min(part * span, lever.rate * T / 8)
+        wave = np.where(np.arange(9) % 2, swing, -swing) + middle
         out[f"in {word} triangles"] = np.column_stack([at, wave])
     return out
 
