@@ -198,40 +198,41 @@ def worst(ratios: dict[str, float]) -> float:
     return max(ratios.values(), default=float("nan"))
 
 
-def lines(all_told: Sequence[dict[str, Any]]) -> list[list[Any]]:
-    """One row an effect: what was concealed, what was found, figures before and after."""
+def fits(all_told: Sequence[dict[str, Any]]) -> list[list[Any]]:
+    """One row an effect: what was concealed, what was found, the unseen recording's worst output before and after."""
     rows = []
     for x in all_told:
         found = ", ".join(f"{e} at {w} ({p:.2f})" for e, w, p in x["findings"]) or "nothing"
-        p = x["position_um"]
-
-        def figure(name: str, p: dict[str, Any] = p) -> str:
-            v = p.get(name)
-            return "" if v is None else f"{v[0]:+.2f} ± {v[1]:.2f}" if not isinstance(v, str) else "no linear model"
-        rows.append([f"{x['effect']} at {x['where']} ({x['family']})", f"{x['verdict']}: {found}", "yes" if right(x) else "no",
-                     *(worst(x["fit"][n]) for n in ("as it came", "refitted", "extended")),
-                     *(figure(n) for n in ("no compensation", "refitted", "extended"))])
+        rows.append([f"{x['effect']} at {x['where']}", x["family"], f"{x['verdict']}: {found}", "yes" if right(x) else "no",
+                     *(worst(x["fit"][n]) for n in FILES)])
     return rows
 
 
-HEAD = ("concealed", "diagnosis", "right", "as it came", "refitted", "extended", "no compensation", "refitted", "extended")
+def positions(all_told: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """One row an actuator: position error, mean and 2 s in um, without and with the compensator made from each plant."""
+    def figure(v: Any) -> str:
+        return v if isinstance(v, str) else f"{v[0]:+.3f} ± {v[1]:.3f}"
+    return [[x["effect"], *(figure(x["position_um"][n]) for n in (FREE, *FILES))] for x in all_told if x["position_um"]]
+
+
+FREE, FILES = "no compensation", ("as it came", "refitted", "extended")
+HEAD = ("concealed", "rig", "diagnosis", "right", *FILES)
+FIT_NOTE = "Worst output's free-run error on a recording that took no part, in units of its noise, by plant file."
+POSITION_NOTE = "Position error of that recording in um (mean ± 2 s, ISO 230-2), corrected by the compensator made from each plant file."
 
 
 def write(all_told: Sequence[dict[str, Any]], out: Path) -> None:
-    """The page and the terminal's table."""
+    """The page and the terminal's tables."""
     from rich.console import Console
     from rich.table import Table
 
-    rows = lines(all_told)
-    note = ("Error on a recording that took no part: worst output's free-run rms over its noise; and, for the actuator, the position error in um "
-            "(mean ± 2 s) with the compensator made from each plant.")
-    t = Table(title="Concealed physics, found, modelled, compensated", caption=note)
-    for h in HEAD:
-        t.add_column(h)
-    for row in rows:
-        t.add_row(*(f"{c:.2f}" if isinstance(c, float) else str(c) for c in row))
-    Console(width=190).print(t)
-    sections = [("Before and after", page.table(HEAD, rows, note))]
+    parts = [(HEAD, fits(all_told), FIT_NOTE), (("concealed", FREE, *FILES), positions(all_told), POSITION_NOTE)]
+    for head, rows, note in parts:
+        t = Table(*head, caption=note)
+        for row in rows:
+            t.add_row(*(f"{c:.2f}" if isinstance(c, float) else str(c) for c in row))
+        Console(width=150).print(t)
+    sections = [("Before and after", "".join(f"<p>{note}</p>{page.table(head, rows)}" for head, rows, note in parts if rows))]
     for x in all_told:
         body = f"<p>Concealed: {x['meaning']} ({x['effect']} at {x['where']}, {x['sigmas']:.0f} sigmas after a refit). " \
                f"Diagnosis took {x['seconds']:.0f} s: {x['verdict']}.</p>"
