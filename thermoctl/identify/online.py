@@ -28,7 +28,8 @@ class Tuner:
         self.model, self.full, self.clip = model, full, clip
         self.edges = np.array(buckets_k)
         self.counts = np.zeros((2, len(buckets_k) - 1))
-        self.bank = Bank(len(model.b1), model.expansion_period_s)
+        period_s = model.expansion_period_s
+        self.bank = Bank(len(model.b1), period_s, tau_range_s=(2 * period_s, 2000 * period_s))
         self.recent: deque[tuple[np.ndarray, float]] = deque()
         self.hold = max(60, round(hold_s / model.expansion_period_s))
         self.last_coil: float | None = None
