@@ -445,7 +445,7 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
             verdict = "explained" if current.probability >= NAME else "ambiguous"
         else:
             verdict = "unexplained"
-            if _energy(case, current) > 0.3 * _energy(case, base):
+            if _energy(case, current) > 0.55 * _energy(case, base):
                 current, rivals, worst = base, [], before_worst     # what was found explains too little to be named
                 held = held_out(case, base, current)
             notes.append(f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains")
