@@ -145,3 +145,9 @@ qemu-test: install                 # SocketCAN for real in a qemu guest (root; D
 .PHONY: diagnose-recordings
 diagnose-recordings: install       # real rigs from their naive plants: what is named, where, and its worth on unseen data
 	$(BIN)/python -m pytest -m slow -s --no-header tests/diagnose/test_recordings.py
+
+.PHONY: fuzz
+FUZZ_S ?= 20
+TARGETS := plant config expression serial slcan modbus csv parquet arrow arrows commands metadata
+fuzz: install                      # FUZZ_S seconds for each that reads bytes from outside; a find ends it, its input stays in build/fuzz
+	for target in $(TARGETS); do $(BIN)/python -m tests.fuzz.targets $$target --seconds $(FUZZ_S) || exit 1; done

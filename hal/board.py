@@ -98,6 +98,10 @@ class Board:
                 sample.value[role], sample.time_s[role], sample.fresh[role] = row["value"], row["time_s"], True
         return int(before)
 
+    def beat(self, roles: list[int]) -> int:
+        """Grows with every post of the device with these roles: a poller that hangs is seen by it."""
+        return int(self._sequence[roles[0]])
+
     def problem(self, role: int) -> str:
         """The text a poller left on this role."""
         return bytes(self.rows[role]["text"]).decode("utf-8", "replace")

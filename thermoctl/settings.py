@@ -107,7 +107,7 @@ class ProtectionSettings:
     rate: dict[str, float] = option("largest believable change per second", factory=dict, low=0.0)
     stale_s: dict[str, float] = option("longest time without a new reading", factory=dict, unit="s", low=0.0)
     frozen_s: dict[str, float] = option("longest time with exactly the same reading", factory=dict, unit="s", low=0.0)
-    following_um: float = option("largest distance from the reference", 20.0, "um", 0.0, 1e6)
+    following_um: float = option("largest distance from the reference; twice as much trips at once", 20.0, "um", 0.0, 1e6)
     following_s: float = option("for how long it may be larger", 0.05, "s", 0.0, 60.0)
     coil_limit_c: float = option("hottest coil, measured or estimated", 80.0, "degC", 0.0, 250.0)
     coil_rate_k_s: float = option("fastest heating of the coil", 0.5, "K/s", 0.0, 100.0)

@@ -251,6 +251,8 @@ def following_to_the_tick(module):
     for sign in (1.0, -1.0):
         away(sign * 2.0).tick(20).well()
         away(sign * 2.25).tick(4).well().tick().safe("following_error")
+        away(sign * 4.0).tick(4).well()
+        away(sign * 4.25).tick().safe("following_error")                              # twice the limit: at once
     bench = away(2.25).tick(4).set(position_um=8.0).tick().set(position_um=10.25).tick(3).well()
     bench.tick(command=arming.DISARM)
     assert bench.state == arming.SAFE
@@ -314,7 +316,7 @@ def times_count_from_arming(module):
     def again(bench):
         return bench.tick(3).well().tick(command=arming.DISARM).tick(2).tick(command=arming.ARM)
     again(Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=1.0)).tick(4).well().tick().safe("amplifier_not_following")
-    bench = again(Bench(module, following_um=2.0, following_s=4 * P).armed().set(position_um=11.0))
+    bench = again(Bench(module, following_um=2.5, following_s=4 * P).armed().set(position_um=11.0))
     bench.set(position_um=14.0).tick(4).well().tick().safe("following_error")
     bench = Bench(module, saturation_s=4 * P).armed()
     bench.law.v = 4.0

@@ -24,7 +24,7 @@ def rig(quick):
 
 def pytest_sessionfinish(session, exitstatus):
     path = os.environ.get("THERMOCTL_HAZARDS")
-    if path and exitstatus == 0 and harness.ROWS:
+    if path and harness.ROWS:                   # a row is there only where its scenario was kept
         model = next((line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
                       if line.startswith("model name")), platform.machine())
         machine = f"{os.cpu_count()} x {model}, Linux {platform.release()}, Python {platform.python_version()}"

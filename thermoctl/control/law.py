@@ -205,10 +205,13 @@ class Law:
                                *(np.asarray(getattr(self, name)) for name in _VECTORS)])
 
     def restore(self, vector: np.ndarray):
-        """Take a state that `snapshot` gave for a model of the same order. Raises ValueError for another length."""
+        """Take a state that `snapshot` gave for a model of the same order. Raises ValueError for another length, and where
+        a number that counts is not finite."""
         size = len(self.snapshot())
         if len(vector) != size:
             raise ValueError(f"law: a state of {len(vector)} numbers, expected {size} (another model or version)")
+        if not np.isfinite(vector[[_SCALARS.index(name) for name in _WHOLE]]).all():
+            raise ValueError("law: a state whose counters are not finite")
         for name, number in zip(_SCALARS, vector, strict=False):
             setattr(self, name, float(number) if name not in _WHOLE else int(number))
         start = len(_SCALARS)
@@ -510,7 +513,7 @@ class Law:
         found = external
         if self.state == _ARMED:
             self.following_s = self.following_s + self.dt if abs(self.eps1) > self.following_um else 0.0
-            if self.following_s > self.following_limit_s:
+            if self.following_s > self.following_limit_s or abs(self.eps1) > 2.0 * self.following_um:
                 found |= one << _B_FOLLOWING
             self.saturation_s = self.saturation_s + self.dt if abs(self.v) >= self.output_limit else 0.0
             if self.saturation_s > self.saturation_limit_s:

@@ -88,7 +88,7 @@ class Rig:
             if numbers is not None:
                 self.law.configure(Parameters.unpack(numbers))
                 self.generation += 1
-                self._keep_state()
+                self.keep_state()
         elif kind < RELOAD:
             self.command, self.value = int(kind), value
 
@@ -107,9 +107,10 @@ class Rig:
                           dt_s, self.command, self.value, self.external))
         self.publish_row(self.row)
         if law.tick % STATE_EVERY == 1:
-            self._keep_state()
+            self.keep_state()
 
-    def _keep_state(self) -> None:
+    def keep_state(self) -> None:
+        """The law's state, its tick and generation into the box: where a replay, or the next run, may begin."""
         if self.state_box is not None:
             self.state_box.put(np.concatenate(((self.law.tick, self.generation), self.law.snapshot())))
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.control.model import CompensatorModel, Parameters
-from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared
+from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, Shared
 from thermoctl.signals import INDEX
 
 INTERVAL_S = 0.1
@@ -112,7 +112,7 @@ class Recorder:
             self.parameters = Parameters.unpack(numbers)
         kept = self.shared.state.get()
         tick, state = 0, None
-        if first[_TICK] > 1 and kept is not None:
+        if kept is not None and (first[_TICK] > 1 or self.shared.counters[RESUMED]):
             tick, state = int(kept[0]), kept[2:]
         self.writer = self.open_writer(
             law_metadata(self.model, self.parameters, self.period_s, self.generation, tick, state))

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import zlib
 from multiprocessing import resource_tracker, shared_memory
+from pathlib import Path
 
 import numpy as np
 
@@ -37,8 +38,11 @@ _AREAS = (
     ("lateness", "u8", (BINS + 1,)), ("busy", "u8", (BINS + 1,)), ("reference", "u8", (BINS + 1,)),
     ("largest", "f8", (3,)), ("counters", "f8", (16,)),
 )
-START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING = range(6)
-"""Places in `counters`; TUNING is 1 + percent, 0 where nothing is tuned."""
+START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED = range(7)
+"""Places in `counters`; TUNING is 1 + percent, 0 where nothing is tuned; RESUMED is 1 where the law began with the
+estimates of an earlier run."""
+BEATS = 8
+"""From here on in `counters`: each helper process counts its rounds, so that one that hangs is seen."""
 _LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES]).encode())
 
 
@@ -71,6 +75,11 @@ class Shared:
             old = shared_memory.SharedMemory(name)
         except FileNotFoundError:
             pass
+        except PermissionError:
+            raise InputError(f"shared memory '{name}': left by another user; remove /dev/shm/{name}, or take another "
+                             "socket.path") from None
+        except (ValueError, OSError):                          # empty: killed between making and sizing it
+            Path("/dev/shm", name).unlink(missing_ok=True)
         else:
             old.close()
             old.unlink()
@@ -83,15 +92,21 @@ class Shared:
         """The segment of a running daemon. Raises InputError when there is none or it has another layout."""
         try:
             memory = shared_memory.SharedMemory(name)
-        except FileNotFoundError:
+        except (FileNotFoundError, ValueError):
             raise InputError(f"shared memory '{name}': not there: no daemon runs (thermoctl start)") from None
         # An attaching process must not remove the segment when it ends (CPython issue 82300).
         resource_tracker.unregister(memory._name, "shared_memory")      # type: ignore[attr-defined]
+        if memory.size < 32:
+            raise InputError(f"shared memory '{name}': of another version; restart the daemon")
         header = np.ndarray((4,), "u8", memory.buf)
         found = tuple(int(h) for h in header)
         if found[:3] != (MAGIC, VERSION, _LAYOUT):
             raise InputError(f"shared memory '{name}': of another version; restart the daemon")
         return cls(memory)
+
+    def beats(self, place: int) -> float:
+        """Rounds that the helper at this place has done."""
+        return float(self.counters[BEATS + place])
 
     def remove(self) -> None:
         """Take the segment away (by its creator)."""

@@ -7,7 +7,8 @@
               └── reference   an idle loop beside it, when loop.reference is on
 
 The loop ends: the amplifier is disabled through a back end of the supervisor's own and the daemon ends with it
-(systemd starts it again, into SAFE). Any other process ends: it is started again, the loop runs on. The supervisor
+(systemd starts it again, into SAFE, with the estimates that were kept). Any other process ends or hangs: it is started
+again, the loop runs on. The supervisor
 ends: the kernel tells every child (PDEATHSIG) and the loop disables the amplifier. The loop stands still: it is killed,
 as if it had ended.
 """
@@ -22,6 +23,7 @@ import socket as sockets
 import sys
 import time
 from collections.abc import Callable, MutableMapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +33,14 @@ import structlog
 from hal.backend import HardwareError, make_backend, slow_devices
 from thermoctl.control import arming, faults
 from thermoctl.control.law import COMPILED
+from thermoctl.daemon import keep
 from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
-from thermoctl.daemon.shared import LOOP_PID, WARNINGS, Shared
+from thermoctl.daemon.shared import BEATS, LOOP_PID, RESUMED, WARNINGS, Shared
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
+HANG_S = 15.0               # a helper that did no round for so long is killed and started again
 READY_S = 60.0              # the first tick comes within this: devices connect before it
 STALL_S = 1.0               # a loop that made no tick for so long is ended
 STOP_S = 3.0                # a child that was asked to stop is killed after this
@@ -44,6 +48,9 @@ RESTART_S = 0.5             # pause before a child is started again, doubled up 
 RESTART_LONGEST_S = 30.0
 TELL_AGAIN_S = 10.0         # a fault that comes and goes is logged once in this time
 EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_HARDWARE = 0, 1, 2, 3
+
+RECORDER, COMMANDS, REFERENCE = range(3)
+"""The helpers' places among shared.BEATS."""
 
 _fork = multiprocessing.get_context("fork")
 Log = Callable[..., None]
@@ -60,10 +67,10 @@ def _line(_logger: Any, _method: str, values: MutableMapping[str, Any]) -> str:
 
 
 class _Stop:
-    """Set by SIGTERM; `SIGINT` is left to the supervisor, which gets it from the terminal as the children do."""
+    """Set by SIGTERM, and a helper's heartbeat; `SIGINT` is left to the supervisor, which gets it from the terminal as the children do."""
 
-    def __init__(self) -> None:
-        self.asked = False
+    def __init__(self, shared: Shared | None = None, beat: int = 0) -> None:
+        self.asked, self.shared, self.beat = False, shared, beat
         signal.signal(signal.SIGTERM, self._ask)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -72,6 +79,8 @@ class _Stop:
         self.asked = True
 
     def __call__(self) -> bool:
+        if self.shared is not None:
+            self.shared.counters[BEATS + self.beat] += 1       # asked once a round: a round done
         return self.asked
 
 
@@ -98,6 +107,7 @@ def _loop_process(settings: Any, shared: Shared, board: Any) -> int:
     try:
         rig = loops.Rig(backend, compensator(settings), law_parameters(settings), settings.loop.period_s,
                         shared.ring.write, shared.mailbox, shared.parameters, shared.state, time.monotonic())
+        _resume(settings, shared, rig)
 
         def warn(text: str) -> None:
             shared.counters[WARNINGS] += 1
@@ -113,9 +123,22 @@ def _loop_process(settings: Any, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
+def _resume(settings: Any, shared: Shared, rig: loops.Rig) -> None:
+    """Take up the estimates of the run before, where they are recent and of this model."""
+    state, age_s, why = keep.load(keep.kept_path(settings), rig.law.model)
+    if state is not None:
+        try:
+            rig.law.resume(state, age_s)
+            shared.counters[RESUMED] = 1.0
+            rig.keep_state()                                   # where a replay of this run begins
+        except ValueError as e:
+            state, why = None, str(e)
+    console_log("estimates", kept=state is not None, age_s=round(age_s, 1) if state is not None else None, why=why or None)
+
+
 def _recorder_process(settings: Any, shared: Shared, board: Any) -> int:
     from thermoctl.daemon.recorder import make_recorder, record
-    stop = _Stop()
+    stop = _Stop(shared, RECORDER)
     loops.die_with_parent()
     record(make_recorder(settings, shared, console_log), stop)
     return EXIT_OK
@@ -124,7 +147,7 @@ def _recorder_process(settings: Any, shared: Shared, board: Any) -> int:
 def _command_process(settings: Any, shared: Shared, board: Any) -> int:
     from thermoctl.daemon.reload import reload_settings
     from thermoctl.daemon.socket import Commands, listen, serve
-    stop = _Stop()
+    stop = _Stop(shared, COMMANDS)
     loops.die_with_parent()
     path = Path(settings.socket.path)
     listener = listen(path, settings.socket.group)
@@ -148,7 +171,7 @@ def _tuner_process(settings: Any, shared: Shared, board: Any) -> int:
 
 
 def _reference_process(settings: Any, shared: Shared, board: Any) -> int:
-    stop = _Stop()
+    stop = _Stop(shared, REFERENCE)
     loops.die_with_parent()
     loops.become_real_time(settings, lambda text: None)
     loops.run_reference(settings, shared, stop)
@@ -163,17 +186,26 @@ def _poller_process(settings: Any, shared: Shared, board: Any, device: str) -> i
 
 
 class _Child:
-    """One process: how it is started, and when it may be started again."""
+    """One process: how it is started, and when it may be started again. beats: gives its rounds done, None: unwatched."""
 
-    def __init__(self, name: str, main: Callable[..., int], *arguments: Any):
-        self.name, self.main, self.arguments = name, main, arguments
+    def __init__(self, name: str, main: Callable[..., int], *arguments: Any, beats: Callable[[], float] | None = None):
+        self.name, self.main, self.arguments, self.beats = name, main, arguments, beats
+        self.heard, self.heard_at = -1.0, 0.0
         self.process: Any = None
         self.again_at, self.pause_s = 0.0, RESTART_S
 
     def start(self) -> None:
         self.process = _fork.Process(target=_run_child, args=(self.name, self.main, self.arguments), name=self.name)
         self.process.start()
-        self.started = time.monotonic()
+        self.started = self.heard_at = time.monotonic()
+
+    def hangs(self, now: float) -> bool:
+        """True when it lives and has not done a round for HANG_S."""
+        if self.beats is None or not self.alive:
+            return False
+        if (beats := self.beats()) != self.heard:
+            self.heard, self.heard_at = beats, now
+        return now - self.heard_at > HANG_S
 
     @property
     def alive(self) -> bool:
@@ -262,16 +294,17 @@ def run(settings: Any, log: Log = console_log) -> int:
         slow = slow_devices(settings)
         if slow:
             board = Board.create(shared_name(settings) + "-board")
-            pollers = [_Child(f"poller {d.name}", _poller_process, settings, shared, board, d.name) for d in slow]
+            pollers = [_Child(f"poller {d.name}", _poller_process, settings, shared, board, d.name,
+                              beats=partial(board.beat, d.roles)) for d in slow]
     loop = _Child("loop", _loop_process, settings, shared, board)
-    others = [*pollers, _Child("recorder", _recorder_process, settings, shared, board),
-              _Child("commands", _command_process, settings, shared, board)]
+    others = [*pollers, _Child("recorder", _recorder_process, settings, shared, board, beats=partial(shared.beats, RECORDER)),
+              _Child("commands", _command_process, settings, shared, board, beats=partial(shared.beats, COMMANDS))]
     if not settings.recording.enable:
         others = [c for c in others if c.name != "recorder"]
     if settings.compensation.tune:
         others.append(_Child("tuner", _tuner_process, settings, shared, board))
     if settings.loop.reference:
-        others.append(_Child("reference", _reference_process, settings, shared, board))
+        others.append(_Child("reference", _reference_process, settings, shared, board, beats=partial(shared.beats, REFERENCE)))
     try:
         return _supervise(settings, shared, loop, others, log)
     finally:
@@ -302,7 +335,8 @@ def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child]
     signal.signal(signal.SIGHUP, lambda *_: reload_asked.append(1))
     notify, watcher = _Notify(), _Watcher(shared, log)
     code, ready, ticks, ticked = EXIT_OK, False, 0, time.monotonic()
-    started = time.monotonic()
+    started = kept_at = time.monotonic()
+    model = compensator(settings)
     try:
         for child in (loop, *others):
             child.start()
@@ -330,6 +364,9 @@ def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child]
                 code = EXIT_FAILED
                 break
             _restart(others, now, log)
+            if now - kept_at > keep.EVERY_S:
+                kept_at = now
+                _keep(settings, shared, model)
             if reload_asked:
                 reload_asked.clear()
                 _reload(settings, log)
@@ -340,14 +377,25 @@ def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child]
         if not ended_by_itself or loop.process.exitcode != 0:
             safe_amplifier(settings, log)
         watcher.look()
+        _keep(settings, shared, model)
         for child in others:
             child.end()
     log("stopped", ticks=shared.ring.head)
     return code
 
 
+def _keep(settings: Any, shared: Shared, model: Any) -> None:
+    state = shared.state.get()
+    if state is not None:
+        keep.save(keep.kept_path(settings), model, state[2:])
+
+
 def _restart(children: list[_Child], now: float, log: Log) -> None:
     for child in children:
+        if child.hangs(now):
+            log(f"{child.name} hangs: killed", seconds=round(now - child.heard_at, 1))
+            child.process.kill()
+            child.heard_at = now                               # one kill; it is gone at the next look
         if child.alive:
             continue
         if child.again_at == 0.0:

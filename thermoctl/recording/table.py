@@ -278,7 +278,7 @@ def _from_arrow(path: Path, arrow: pa.Table, want: list[str] | None) -> _Raw:
             raise InputError(f"{path}: row {row + 1}: column '{name}': {str(value)[:40]!r} ({kind}) stands where a "
                              "number belongs" + (" (seconds)" if name == "t" else ""))
         columns[name] = _numpy(column.cast(pa.float64(), safe=False))
-    meta = {k.decode(): v.decode(errors="replace") for k, v in (arrow.schema.metadata or {}).items()
+    meta = {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (arrow.schema.metadata or {}).items()
             if k not in (b"pandas", b"ARROW:schema")}
     return _Raw(columns, meta, lambda row: f"{path}: row {row + 1}")
 

@@ -1,0 +1,81 @@
+"""The law's estimates across a restart: kept on disk by the supervisor, taken up by the next loop.
+
+Kept are temperatures, expansion, compensation and the encoders' zeros, never arming, setpoint or controller: a daemon
+that was started again is as safe as a new one. They are taken up when they are of this boot of the machine and of this
+model, not older than KEEP_S, and (law.resume) when the coil's first reading is within RESUME_LIMIT_C of them; else
+the estimate starts anew on the coil's first reading. The time between is advanced without power.
+"""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoctl.control.model import CompensatorModel
+from thermoctl.daemon.recorder import decode, encode
+
+KEEP_S = 600.0              # older estimates say little about the rig's slow parts
+EVERY_S = 5.0               # between two times that the supervisor keeps them
+MAX_BYTES = 65536
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+
+
+def kept_path(settings: Any) -> Path:
+    """Where a daemon keeps its estimates: beside its socket."""
+    return Path(settings.socket.path).with_suffix(".state")
+
+
+def _now_s() -> float:
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def _fingerprint(model: CompensatorModel) -> int:
+    arrays = (model.A_minus_I, model.B, model.C, model.gain, model.b1, model.b2)
+    return zlib.crc32(b"".join(a.tobytes() for a in arrays) + f"{model.kind} {model.period_s} {model.f1}".encode())
+
+
+def save(path: Path, model: CompensatorModel, state: np.ndarray) -> bool:
+    """Keep a law's snapshot; False where the disk refuses (the next start is then a cold one)."""
+    text = json.dumps({"version": 1, "boot": _boot(), "at_s": _now_s(), "model": _fingerprint(model), "state": encode(state)})
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            path.with_suffix(".new").unlink()
+        fd = os.open(path.with_suffix(".new"), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(fd, "w") as file:
+            file.write(text)
+        path.with_suffix(".new").replace(path)
+        return True
+    except OSError:
+        return False
+
+
+def load(path: Path, model: CompensatorModel) -> tuple[np.ndarray | None, float, str]:
+    """(snapshot or None, its age in s, why there is none)."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        found = json.loads(data) if len(data) <= MAX_BYTES else {}
+        age_s = _now_s() - float(found["at_s"])
+        if found["version"] != 1 or found["boot"] != _boot() or not 0.0 <= age_s <= KEEP_S:
+            return None, 0.0, f"older than {KEEP_S:g} s or of another boot"
+        if found["model"] != _fingerprint(model):
+            return None, 0.0, "of another model"
+        state = decode(found["state"])
+        return (state, age_s, "") if np.isfinite(state).all() else (None, 0.0, "not finite")
+    except FileNotFoundError:
+        return None, 0.0, "none were kept"
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as e:
+        return None, 0.0, f"{path} cannot be read ({type(e).__name__})"
+
+
+def _boot() -> str:
+    try:
+        return _BOOT.read_text().strip()
+    except OSError:
+        return ""
