@@ -51,7 +51,8 @@ CASES = [
     Real("tmotor_ak109, each run from the others", "tmotor_ak109", [1, 2, 3], [{"hidden_thermal_mass"}], {"temperature": (0.70, 0.21)}),
     Real("building_prbs, last 40 %", "building_prbs", [1], [{"hidden_thermal_mass"}], {"indoor": (1.28, 0.67)}, share=0.6),
     *(Real(f"zprobe_drift, probe {k}", "zprobe_drift", [k], LAG, {}) for k in (1, 2)),
-    *(Real(f"zprobe_drift, probe {k}", "zprobe_drift", [k], LAG, {}, short="a probe that compensates itself: the lag does not predict its held-out blocks")
+    *(Real(f"zprobe_drift, probe {k}", "zprobe_drift", [k], LAG, {},
+           short="a probe that compensates itself: the lag does not predict its held-out blocks")
       for k in (3, 4)),
 ]
 
