@@ -80,3 +80,28 @@ def test_refits_are_no_worse_than_any_quoted_fit_of_the_same_structure():
     for r in (heads, *rows):
         print("  ".join(str(q).ljust(w) for q, w in zip(r, widths, strict=True)).rstrip())
     assert [r for r in rows if r[6] != "met"] == []
+
+
+CASES = Path(os.environ.get("THERMOCTL_CASES", FOLDER.parent / "cases"))
+PLANTS = sorted([*FOLDER.glob("*/plant*.yaml"), *CASES.glob("*/plant.yaml")])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PLANTS, reason=f"{FOLDER}, {CASES}: no such folders; set THERMOCTL_RECORDINGS and THERMOCTL_CASES")
+@pytest.mark.parametrize("path", PLANTS, ids=lambda p: f"{p.parent.name}/{p.name}")
+def test_every_plant_loads_simulates_and_refits(path):
+    """On all its recordings at once; a refit never fits worse than the belief, and stays inside the ranges."""
+    model = load(path).compile()
+    drives = [model.drive(read_table(p)) for p in sorted(path.parent.glob("run_*.csv"))]
+    runs = [model.run(d) for d in drives]
+    assert all(np.isfinite(run.y).all() and run.y.shape == d.y.shape for run, d in zip(runs, drives, strict=True))
+    found = fit(model, drives, iterations=15, seconds=120.0)
+    sigma = np.array([n.sigma for n in found.noise])
+    before, after = (np.nansum([np.nansum(np.minimum(np.abs(e / sigma), 1e3)) for e in q])
+                     for q in ([d.y - run.y for run, d in zip(runs, drives, strict=True)], found.residuals))
+    print(f"{path.parent.name}: {len(drives)} recordings, mean error in sigmas {before:.4g} -> {after:.4g} (sums), {found.iterations} iterations")
+    assert after <= before * 1.001
+    for q in model.active:
+        low, high = model.plant.parameters[q].range
+        column = found.values[:, model.parameters.index(q)]
+        assert np.all((column >= low) & (column <= high)), q

@@ -1,0 +1,105 @@
+"""What a refit reports, and the noise that it measures, against truths that are known."""
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from thermoctl.cli import main
+from thermoctl.plant.language import loads
+from thermoctl.plant.noise import coloured, innovations
+from thermoctl.plant.refit import fit, report
+from thermoctl.recording.table import Table, write_table
+
+BLOCK = """format: thermoctl-plant/1
+inputs: {P: {unit: W}, air: {unit: degC}}
+parameters: {C: {value: 30, unit: J/K, range: [10, 90]}, G: {value: 0.5, unit: W/K, range: [0.1, 1]}EXTRA}
+nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}}
+flows: {heat: {into: T, rate: P, unit: W}, loss: {from: T, rate: "LOSS", unit: W}}
+outputs: {y: {value: T, unit: degC, noise: 0.1}}
+"""
+
+
+def plant(extra="", loss="G * (T - air)", noise="noise: 0.1"):
+    return loads(BLOCK.replace("EXTRA", extra).replace("LOSS", loss).replace("noise: 0.1", noise))
+
+
+def recorded(truth, n=900, name="a", seed=1, noise=0.1, phi=0.0, step=None):
+    """A run of `truth` with AR(1) noise of standard deviation `noise`, rounded to `step`."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(float(n))
+    table = Table(name, name, t, {"P": 6.0 * rng.integers(0, 2, n // 50).repeat(50), "air": np.full(n, 21.0)})
+    white = rng.normal(0, noise * np.sqrt(1 - phi ** 2), n)
+    white[0] /= np.sqrt(1 - phi ** 2)
+    y = truth.compile(()).simulate(table).y[:, 0] + lfilter([1.0], [1.0, -phi], white)
+    table.columns["y"] = np.round(y / step) * step if step else y
+    return table
+
+
+def judged(believed, table):
+    model = believed.compile()
+    return {e.name: e for e in report(fit(model, [model.drive(table)]))}
+
+
+TRUTH = plant().extended(lambda d: (d["parameters"]["C"].update(value=46.0), d["parameters"]["G"].update(value=0.31)))
+
+
+def test_good_parameters_are_ok_with_errors_that_hold_the_truth():
+    found = judged(plant(), recorded(TRUTH))
+    assert {e.state for e in found.values()} == {"ok"}
+    assert all(abs(found[q].value - v) < 4 * found[q].sd and found[q].sd < 0.02 * v for q, v in (("C", 46.0), ("G", 0.31)))
+
+
+def test_a_parameter_that_the_data_do_not_feel_is_dead():
+    found = judged(plant(", K: {value: 1, unit: W/K, range: [0.1, 5]}", "G * (T - air) + K * max(T - 500, 0)"), recorded(TRUTH))
+    assert found["K"].state == "dead" and found["C"].state == "ok"
+
+
+def test_a_parameter_pressed_against_its_range_is_at_bound():
+    narrow = plant().extended(lambda d: d["parameters"]["G"].update(range=[0.4, 1.0]))
+    found = judged(narrow, recorded(TRUTH))
+    assert found["G"].state == "at bound" and found["G"].value == pytest.approx(0.4)
+
+
+def test_two_of_which_only_the_sum_is_felt_are_flat_and_trade():
+    found = judged(plant(", H: {value: 0.3, unit: W/K, range: [0.02, 1]}", "(G + H) * (T - air)"), recorded(TRUTH))
+    assert found["G"].state == found["H"].state == "flat"
+    assert found["G"].trades_with == ("H",) and found["H"].trades_with == ("G",) and found["C"].trades_with == ()
+
+
+def test_the_command_says_all_of_it(tmp_path, capsys):
+    (tmp_path / "p.yaml").write_text(BLOCK.replace("EXTRA", ", H: {value: 0.3, unit: W/K, range: [0.02, 1]}, "
+                                                  "K: {value: 1, unit: W/K, range: [0.1, 5]}")
+                                     .replace("LOSS", "(G + H) * (T - air) + K * max(T - 500, 0)"))
+    for name, seed in (("a", 1), ("b", 2)):
+        write_table(tmp_path / f"{name}.csv", recorded(TRUTH, name=name, seed=seed))
+    assert main(["refit", "--plant", str(tmp_path / "p.yaml"), str(tmp_path / "a.csv"), "--held-out", str(tmp_path / "b.csv")]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    for words in ("standard error", "dead", "flat", "trades with", "before", "after"):
+        assert words in told, words
+
+
+def test_outliers_hardly_move_a_fit():
+    clean, hit = recorded(TRUTH), recorded(TRUTH)
+    hit.columns["y"][::90] += 15.0                  # one reading of ninety
+    a, b = (judged(plant(), t) for t in (clean, hit))
+    assert all(abs(a[q].value - b[q].value) < 3 * a[q].sd for q in ("C", "G"))
+
+
+@pytest.mark.parametrize(("phi", "step"), [(0.0, None), (0.8, None), (0.8, 0.1), (0.95, 0.1)])
+def test_noise_is_measured_with_its_colour_beside_the_sensors_steps(phi, step):
+    """Correlation of neighbours of the coloured part alone, on the mean of six recordings; AR(1) comes with its own sampling error."""
+    believed = plant(noise=f"noise: 0.1{f', resolution: {step}' if step else ''}")
+    model = believed.compile()
+    measured = []
+    for seed in range(6):
+        drive = model.drive(recorded(TRUTH, seed=seed, phi=phi, step=step))
+        (noise,) = coloured(fit(model, [drive]), [drive])
+        measured.append(noise.phi if len(noise.ar) == 1 else -noise.ar[1])
+    assert np.mean(measured) == pytest.approx(phi, abs=0.06 if phi < 0.9 else 0.03)
+
+
+def test_innovations_form_has_the_variance_and_the_correlation_of_its_parts():
+    """AR(1) of variance 0.9 beside white noise of 0.1, from the impulse response of ma/ar."""
+    noise = innovations(0.7, 0.1, 1.0)
+    response = noise.sigma * lfilter(noise.ma, noise.ar, np.r_[1.0, np.zeros(400)])
+    assert response @ response == pytest.approx(1.0)
+    assert response[1:] @ response[:-1] == pytest.approx(0.7 * 0.9) and response[2:] @ response[:-2] == pytest.approx(0.49 * 0.9)
