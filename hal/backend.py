@@ -25,6 +25,9 @@ The sample: arrays over ROLES (index by `ROLE[name]`), all of length len(ROLES)
 - `status`  uint8: OK; STALE (newest reading older than the profile's `stale_after_s`, the value is held);
             ERROR (device gone, reported invalid, sentinel such as an open thermocouple, outside the profile's range);
             ABSENT (no device is bound to this role: not a fault).
+`wait_frame(due_ns, until_ns)` (real devices only; loop.pace: device) waits until the position's device has sent a whole
+frame, at most until `until_ns`, and only until `due_ns` while that device is gone; `check_pacing()` raises InputError
+where no device of the rig can give the time.
 `problem(role)` says in one line why a role is not OK. `counters()` counts frames, errors and reconnections by device.
 
 Slow buses. `slow_devices(settings)` lists devices whose `poll()` blocks (any profile with `bus: modbus`): the daemon

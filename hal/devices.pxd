@@ -14,7 +14,7 @@ cdef class Device:
 
 cdef class DevicesBackend:
     cdef public list fast, slow
-    cdef public object board, sample
+    cdef public object board, sample, _pacing
     cdef public object _stop
     cdef public dict _owner, _seen, _repairs
     cdef public list _threads

@@ -17,7 +17,8 @@ import numpy as np
 
 from hal.backend import ABSENT, ERROR, ROLE, ROLES, STALE, HardwareError, Sample
 from hal.profile import Binding, bind, check_rig
-from hal.wire import Ages, Channels
+from hal.wire import Ages, Channels, wait_readable
+from thermoctl.yamlfile import InputError
 
 RECONNECT_S = 0.25          # between attempts to open a device that is gone
 SLOW_BUSES = ("modbus",)
@@ -118,6 +119,7 @@ class DevicesBackend:
         self.fast, self.slow, self.board = fast, slow, board
         self.sample = Sample()
         self._owner = {role: d for d in [*fast, *slow] for role in d.roles}
+        self._pacing = self._owner.get(ROLE["position_um"])     # loop.pace: device
         self._seen = dict.fromkeys(slow, 0)
         limit_s = np.full(len(ROLES), np.inf)                   # age at which a reading is stale
         for b in (b for d in self._owner.values() for b in d.binding.bounds):
@@ -168,6 +170,26 @@ class DevicesBackend:
             self._seen[device] = self.board.merge(sample, device.roles, self._seen[device])
         self._ages.judge(now_s)
         return sample
+
+    def check_pacing(self) -> None:
+        """Raises InputError where the position's device cannot give the time (loop.pace: device)."""
+        device = self._pacing
+        if device is None or device.binding.profile.bus != "serial-binary":
+            what = "no device" if device is None else f"{device.name} ({device.binding.profile.bus})"
+            raise InputError(f"loop.pace: device: the position comes from {what}; an encoder that streams frames "
+                             "(bus: serial-binary) was expected: set loop.pace: clock")
+
+    def wait_frame(self, due_ns: int, until_ns: int) -> None:
+        """Wait until the position's device has sent a whole frame, at most until `until_ns`; only until `due_ns` while it is
+        gone (pace: device). Returns early when a signal came."""
+        device = self._pacing
+        try:
+            if device is not None and device.up:
+                device.wait_frame(until_ns)
+                return
+        except (OSError, HardwareError) as e:
+            self._lost(device, e)
+        wait_readable(-1, due_ns)
 
     def write(self, drive: float, enable: bool) -> None:
         """Command to the device that drives; see hal.backend."""

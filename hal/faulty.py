@@ -137,6 +137,14 @@ class FaultInjector:
                     drive, enable = 0.0, False
         self.inner.write(drive, enable)
 
+    def check_pacing(self) -> None:
+        """The inner back end's."""
+        self.inner.check_pacing()
+
+    def wait_frame(self, due_ns: int, until_ns: int) -> None:
+        """The inner back end's: a fault spoils the reading, not the time."""
+        self.inner.wait_frame(due_ns, until_ns)
+
     def close(self) -> None:
         """The inner back end's."""
         self.inner.close()

@@ -17,7 +17,7 @@ import serial
 from hal.backend import HardwareError, Sample
 from hal.devices import Device
 from hal.profile import BinaryFrame, Binding, LineSettings
-from hal.wire import Framer, read_available
+from hal.wire import Framer, read_available, wait_readable
 
 MAX_LINE = 1024             # a text line longer than this is garbage
 
@@ -101,7 +101,7 @@ class SerialDevice(Device):
         spec = binding.profile.bus_spec
         self._framer = Framer(spec) if isinstance(spec, BinaryFrame) else None
         self._lines = LineReader()
-        self._due_s = 0.0
+        self._due_s, self._waited = 0.0, False
         if self._framer:
             names = [n for n, _ in spec.fields]
             self._index = [(i, names.index(b.channel.source)) for i, b in enumerate(binding.bounds)]
@@ -113,6 +113,7 @@ class SerialDevice(Device):
         self._fd = self._port.fileno()
         termios.tcflush(self._fd, termios.TCIOFLUSH)
         self._lines.reset()
+        self._waited = False
         if self._framer:
             self._framer.reset()
 
@@ -123,12 +124,23 @@ class SerialDevice(Device):
             with contextlib.suppress(OSError):
                 port.close()
 
+    def wait_frame(self, until_ns: int) -> bool:
+        """Wait for a whole frame, at most until `until_ns` (monotonic clock); whether one came. `read` then stores it."""
+        framer = self._framer
+        while not self._waited:
+            if framer.read(self._fd):
+                self._waited = True
+            elif not wait_readable(self._fd, until_ns):
+                return False
+        return True
+
     def read(self, sample: Sample, now_s: float) -> None:
         """Newest frame or line into `sample`."""
         framer = self._framer
         if framer is None:
             self._take_lines(sample, read_available(self._fd), now_s)
-        elif framer.read(self._fd):
+        elif framer.read(self._fd) or self._waited:
+            self._waited = False
             field, mask = self._invalid
             if field >= 0 and framer.whole(field) & mask:
                 self.fail_all(sample, f"reports an error (status 0x{framer.whole(field) & mask:X}): check the sensor")

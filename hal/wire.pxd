@@ -1,5 +1,5 @@
 # The classes of wire.pyx as other compiled modules call them, without Python in between.
-from libc.stdint cimport uint8_t, uint16_t, uint32_t, uint64_t
+from libc.stdint cimport int64_t, uint8_t, uint16_t, uint32_t, uint64_t
 
 cdef enum:
     MAX_READ = 4096             # bytes a tick takes from a port
@@ -25,6 +25,8 @@ cdef class Framer:
     cdef uint64_t _bits(self, int field, int size) noexcept
     cpdef uint64_t whole(self, int field) noexcept
     cpdef double number(self, int field) noexcept
+
+cpdef bint wait_readable(int fd, int64_t until_ns) except -1
 
 cpdef bytes encode_slcan(uint32_t can_id, bytes data)
 cpdef bytes join_slcan(bytes before, tuple frames)

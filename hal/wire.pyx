@@ -12,11 +12,19 @@ import os
 import struct
 
 from libc.errno cimport EAGAIN, EINTR, errno as c_errno
-from libc.stdint cimport int8_t, int16_t, int32_t, int64_t
+from libc.stdint cimport int8_t, int16_t, int32_t
 from libc.string cimport memcmp, memcpy, memmove
+from posix.time cimport CLOCK_MONOTONIC, clock_gettime, timespec
 from posix.unistd cimport read as c_read, write as c_write
 
 from hal.profile import CRCS, FIELD_TYPES
+
+cdef extern from "<poll.h>" nogil:
+    cdef struct pollfd:
+        int fd
+        short events, revents
+    int POLLIN
+    int ppoll(pollfd *what, unsigned long count, const timespec *timeout, const void *mask)
 
 cdef uint16_t[256] _CCITT, _MODBUS
 
@@ -53,6 +61,22 @@ cdef uint16_t _crc16(int kind, const uint8_t *data, int size) noexcept nogil:
 def crc16(str kind, const uint8_t[::1] data) -> int:
     """CRC-16 of `data`. Check values of b'123456789': ccitt-false 0x29B1, xmodem 0x31C3, modbus 0x4B37."""
     return _crc16(CRCS.index(kind), &data[0] if data.shape[0] else NULL, <int>data.shape[0])
+
+
+cpdef bint wait_readable(int fd, int64_t until_ns) except -1:
+    """Wait until a descriptor has something to read or CLOCK_MONOTONIC reaches `until_ns`; whether it has. False also after
+    a signal, so that Python's handlers run."""
+    cdef timespec now, left
+    cdef pollfd what
+    cdef int64_t ns
+    cdef int found
+    what.fd, what.events, what.revents = fd, POLLIN, 0
+    clock_gettime(CLOCK_MONOTONIC, &now)
+    ns = max(<int64_t>0, until_ns - (<int64_t>now.tv_sec * 1000000000 + now.tv_nsec))
+    left.tv_sec, left.tv_nsec = ns // 1000000000, ns % 1000000000
+    with nogil:
+        found = ppoll(&what, 1, &left, NULL)
+    return found > 0
 
 
 cdef int _read(int fd, uint8_t *to, int size) except -1:

@@ -2,13 +2,13 @@
 import struct
 
 import pytest
+from hal.wire import SlcanParser, encode_slcan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
 from hal.can_bus import drive_state, next_control_word, open_can
 from hal.virtual.drive import DISABLED, ENABLED, FAULT, HEARTBEAT_LOST, PRE_OPERATIONAL, Cia402Drive, SlcanAdapter
-from hal.wire import SlcanParser, encode_slcan
 
 
 def test_slcan_ascii():

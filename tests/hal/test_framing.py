@@ -2,12 +2,12 @@
 import re
 
 import pytest
+from hal.wire import Framer, crc16
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.profile import BinaryFrame
 from hal.serial_port import MAX_LINE, LineReader, latency_timer_ms, set_latency_timer
-from hal.wire import Framer, crc16
 
 SPEC = BinaryFrame(b"\xaa\x55", (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8")), sequence="sequence")
 

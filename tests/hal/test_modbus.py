@@ -2,12 +2,12 @@
 import struct
 
 import pytest
+from hal.wire import crc16
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.modbus import decode, plan_blocks
 from hal.profile import Modbus, Register
-from hal.wire import crc16
 from hal.virtual.modbus import ModbusUnit, encode
 
 

@@ -79,7 +79,7 @@ class Container:
     def boot(self, limit_s: float = 90.0) -> float:
         """Boot it; returns the seconds until systemd says that it runs."""
         begin = time.monotonic()
-        log = open(self.work / "boot.log", "ab")
+        log = open(self.work / "boot.log", "ab")      # noqa: SIM115 - nspawn writes to it as long as it lives
         self.process = subprocess.Popen(
             ["systemd-nspawn", "-q", "-D", str(self.root), "-b", "--register=no", "--keep-unit", "--private-network",
              "--capability=CAP_IPC_LOCK,CAP_SYS_NICE", f"--bind-ro={ROOT}:{CHECKOUT}", "--console=pipe"],

@@ -7,9 +7,9 @@ Nothing else differs from `thermoctl run`; the probe costs the loop about 0.2 us
 import sys
 
 import numpy as np
+from thermoctl.daemon.clock import now_ns
 
 from thermoctl.daemon import loop, supervisor
-from thermoctl.daemon.clock import now_ns
 from thermoctl.settings import load_settings
 
 
