@@ -52,7 +52,7 @@ class Browser:
         if self.session:
             message["sessionId"] = self.session
         os.write(self.write_fd, json.dumps(message).encode() + b"\0")
-        deadline = time.monotonic() + LIMIT_S
+        deadline = time.monotonic() + LIMIT_S + 30.0         # `until` gives up first, and says what it waited for
         while True:
             answer = self._next(deadline)
             if answer.get("id") == self.number:

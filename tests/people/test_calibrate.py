@@ -122,6 +122,18 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
     assert len(rows) > len(whole) and status(running.shared)["state"] != "ARMED"
 
 
+def test_a_rig_is_at_rest_when_its_points_are_alike_or_none_moves():
+    alike, warm, offsets = np.full(12, 22.0), np.linspace(22, 27, 12), np.linspace(21, 23, 12)
+    assert calibrate.at_rest([(0.0, alike + np.linspace(0, 0.25, 12))]) and not calibrate.at_rest([(0.0, warm)])
+    cooling = [(60.0 * k, alike + 5.0 * np.exp(-k / 15) * np.linspace(0, 1, 12)) for k in range(40)]
+    rested = [calibrate.at_rest(cooling[:k + 1]) for k in range(40)]
+    assert not any(rested[:30]) and rested[-1], "5 K with a time constant of a quarter of an hour"
+    steady = [(60.0 * k, offsets) for k in range(12)]
+    assert not calibrate.at_rest(steady[:9]) and calibrate.at_rest(steady), "thermocouples that differ, all still"
+    missing = np.where(np.arange(12) == 3, np.nan, alike)
+    assert calibrate.at_rest([(0.0, missing)])
+
+
 def test_a_rig_that_cannot_be_calibrated_is_told_so(settings, capsys):
     config = Path(settings.path)
     (config.parent / "experiments.yaml").write_text(SHORT)

@@ -125,11 +125,12 @@ def choose(browser, select, value):
 @pytest.mark.slow       # its capture needs a machine that is not shared with the rest of the suite: make test-browser
 def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
     """From a look at the armed rig to a pulled sensor: numbers, drawing, fault with remedy, capture, history, themes."""
-    Path(settings.recording.directory).mkdir()
+    Path(settings.recording.directory).mkdir(exist_ok=True)
     writer = RecordingWriter(settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: running.base_s)
     waiting = []
     running.record = lambda row: waiting.append(row.copy())
     running.base_s -= HEATING_S + 60.0
+    recorded(settings, 23.5, running.base_s)           # and a day before
     running.arm()
     running.send(3, 240.0)
     while running.now_s < HEATING_S:                  # 2.9 W: the coil goes to 28 degC, the shaft grows by 10 um
@@ -160,10 +161,22 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         assert browser.js("document.getElementById('commands').hidden")
         browser.until("document.getElementById('n-late').textContent.includes('p99.9')")
         choose(browser, "span", "600")
-        browser.until("/ [1-9]\\d* points from 1 file of 10 Hz/.test(document.getElementById('n-history').textContent)")
+        browser.until("/ [1-9]\\d* points from [12] files? of 10 Hz/.test(document.getElementById('n-history').textContent)")
         # Frames come as often as they are made, and the page keeps up.
         browser.until("points.length > 30")
         assert browser.js("points[points.length - 1].t - points[0].t") > 30.0, "the last minute is there at once"
+        # Smooth at 50 Hz while a day of history is drawn, again and again: the page takes nearly every frame that is made.
+        watch.rate_hz = 50.0
+        browser.js("window.taken = 0; { const was = take; take = f => { window.taken++; was(f); }; }")
+        made = watch.number
+        for signal in ("air_c", "compensation_um", "air_c", "compensation_um"):
+            choose(browser, "signal", signal)
+            choose(browser, "span", "86400")
+            browser.until("/ [1-9]\\d{2,} points from 2 files of 10 Hz/.test(document.getElementById('n-history').textContent)")
+        browser.until("taken > 100")
+        assert browser.js("taken") > 0.8 * (watch.number - made)
+        watch.rate_hz = 20.0
+        choose(browser, "span", "600")
         # Keyboard: every control and chart is reached by Tab, a chart read by arrows.
         reached = set()
         for _ in range(30):

@@ -42,6 +42,7 @@ STEPS = ("doctor", "step", "pid", *TESTS, "model", "test_4b", "proof")
 NEEDED = ("position_raw_um", "output_reference_um", "voltage_v", "current_a", "air_c", *(f"{p}_c" for p in POINTS))
 EVERY_S = 0.1                  # between the rows that are kept
 STEP_DRIVE = 0.3               # of the open-loop step, in units of the drive
+REST_K, REST_S = 0.5, 600.0     # at rest: no two points further apart, or none moved by more than that in so long
 GAP_S = 2.0                    # a hole in the daemon's own recording that a test does not survive
 
 
@@ -166,6 +167,8 @@ class DaemonRig:
         stride = round(EVERY_S / self.settings.loop.period_s)
         if earlier is not None:
             yield _rows(earlier)
+        else:
+            self._rest(control)
         if self._ask("status")["state"] != "ARMED":
             self._ask("arm")
         position, done = shared.ring.head, at_s
@@ -197,6 +200,23 @@ class DaemonRig:
                 self._ask("setpoint", 0.0)
                 self._ask("disarm")
 
+    def _rest(self, control: Control) -> None:
+        """Wait until the rig is at rest: the models are fitted from there. Raises Aborted when the person ends it."""
+        seen: list[tuple[float, np.ndarray]] = []
+        told = -math.inf
+        while True:
+            now, status = time.monotonic(), self._ask("status")
+            seen.append((now, np.array([math.nan if v is None else v for v in status["temperatures_c"].values()])))
+            if at_rest(seen):
+                return
+            if control.ended:
+                raise Aborted("ended on request", 0.0)
+            if now - told >= 60.0:
+                told, warm = now, seen[-1][1]
+                print(f"   the rig is still warm ({np.nanmin(warm):.1f} to {np.nanmax(warm):.1f} degC): waiting until it is at rest",
+                      file=sys.stderr, flush=True)
+            time.sleep(1.0)
+
     def meanwhile(self, earlier: Table) -> Table | None:
         """`earlier` with what the daemon recorded since, or None when that has a hole longer than GAP_S."""
         from thermoctl.recording.writer import TIER, recording_files
@@ -224,6 +244,16 @@ def rig_of(settings: Any) -> SimulatedRig | DaemonRig:
             raise InputError(f"{settings.path}: hal.backend is '{settings.hal.backend}' and no daemon answers on {settings.socket.path}; "
                              "start it first (thermoctl start)") from None
     return SimulatedRig(settings)
+
+
+def at_rest(seen: list[tuple[float, np.ndarray]]) -> bool:
+    """Whether a rig of these temperatures, (s, degC (12,)) oldest first, is at rest: all alike within REST_K, or, because thermocouples
+    differ by a degree, none moved by more than REST_K in the last REST_S."""
+    now, newest = seen[-1]
+    if np.nanmax(newest) - np.nanmin(newest) <= REST_K:
+        return True
+    window = [t for at, t in seen if at >= now - REST_S]
+    return now - seen[0][0] >= REST_S and bool(np.nanmax(np.nanmax(window, axis=0) - np.nanmin(window, axis=0)) <= REST_K)
 
 
 def _rows(t: Table) -> np.ndarray:
