@@ -455,6 +455,7 @@ def voltage_and_current(module):
         bench().set(current_a=sign, voltage_v=sign * 6.25).tick().safe("electrical_disagrees")
         bench().set(current_a=sign, voltage_v=sign * 2.5).tick(2).well()               # 1.5 = 0.25 x 4 + 0.5
         bench().set(current_a=sign, voltage_v=sign * 2.25).tick().safe("electrical_disagrees")
+    bench().set(current_a=1.0, voltage_v=6.0).tick(dt=2 * P).well()                    # a longer tick: the reading itself
     bench(agree_time_s=4 * P).set(current_a=1.0, voltage_v=20.0).tick().safe("electrical_disagrees")
     bench(agree_time_s=4 * P, resistance_tolerance=1.0, resistance_v=3.0).set(current_a=0.0, voltage_v=16.0).tick(9).well()
     b = bench(agree_time_s=4 * P, resistance_tolerance=0.0, resistance_v=6.0).set(voltage_v=8.0).tick(4).well()    # 2, 3.5, 4.6, 5.5
@@ -539,6 +540,7 @@ def watched_temperatures(module):
         return Bench(module, **{"monitored_limit_c": 4.0, "innovation_time_s": P, **changes}).set(bobbin_c=AIR, shaft_1_c=AIR).armed()
     for sign in (1.0, -1.0):
         bench().set(bobbin_c=AIR + sign * 4.0).tick(2).well()
+        bench().set(bobbin_c=AIR + sign * 4.0).tick(dt=2 * P).well()
         bench().set(bobbin_c=AIR + sign * 4.25).tick().well("monitored_disagrees")
     bench().set(shaft_1_c=AIR + 50).tick(3).well()                                    # of which the model says nothing
     bench(innovation_time_s=4 * P).set(bobbin_c=AIR + 8).tick(2).well().tick().well("monitored_disagrees")     # 2, 3.5, 4.6 K
@@ -587,6 +589,7 @@ def reference_and_estimate(module):
     for sign in (1.0, -1.0):
         bench().set(position_um=8.0 + sign * 50, output_reference_um=108.0 + sign * 50).tick(2).well()
         bench().set(output_reference_um=108.0 + sign * 4.0).tick(2).well()
+        bench().set(output_reference_um=108.0 + sign * 4.0).tick(dt=2 * P).well()
         bench().set(output_reference_um=108.0 + sign * 4.25).tick().well("monitored_disagrees")
         b = bench()
         b.law.x[0] = sign * 9.0
@@ -739,5 +742,5 @@ def the_fault_table(module):
     assert table.mask("critical", "warning") == table.mask("critical") + table.mask("warning") and table.mask() == 0
     assert [f.name for f in table.decode(5.0)] == ["position_error", "position_range"] and table.decode(0) == ()
     assert table.decode(float(2 ** 52))[0].bit == 52 and table.BY_NAME["not_finite"].bit == table.BIT["not_finite"]
-    assert table.GROUP_OF_CHANNEL == (0, 1, 2, 3, 4, 5, *(1,) * 11, 6, 6, 6) and len(table.CHANNELS) == 20
+    assert list(table.GROUP_OF_CHANNEL) == [0, 1, 2, 3, 4, 5, *[1] * 11, 6, 6, 6] and len(table.CHANNELS) == 20
     assert table.CHANNELS[5:17] == table.TEMPERATURES and table.TEMPERATURES[0] == "coil_c"

@@ -45,8 +45,9 @@ def plant() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """A plant file: read, checked, its units counted."""
     from thermoctl.plant import load
     seeds = [p.read_bytes() for p in sorted((ROOT / "config/plants").glob("*.yaml"))]
-    seeds.append(b"format: thermoctl-plant/1\ntitle: a\ninputs: {u: {unit: W}}\nparameters: {C: {value: 1, unit: J/K}}\nnodes: {T: "
-                 b"{unit: degC, storage: C, initial: 20}}\nflows: {q: {into: T, rate: u * (1 - T / 3), unit: W}}\noutputs: {y: {value: T, unit: degC}}\n")
+    seeds.append(b"format: thermoctl-plant/1\ntitle: a\ninputs: {u: {unit: W}}\nparameters: {C: {value: 1, unit: J/K}}\n"
+                 b"nodes: {T: {unit: degC, storage: C, initial: 20}}\nflows: {q: {into: T, rate: u * (1 - T / 3), unit: W}}\n"
+                 b"outputs: {y: {value: T, unit: degC}}\n")
     return (lambda data: load(_file(data, ".yaml"))), seeds
 
 
@@ -100,9 +101,10 @@ def _cut(data: bytes) -> list[bytes]:
 
 def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """Encoder frames and text lines in any pieces; what the framer keeps stays small."""
+    from hal.wire import Framer
+
     from hal.profile import BinaryFrame
     from hal.serial_port import LineReader
-    from hal.wire import Framer
     fields = (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8"))
     specs = [BinaryFrame(b"\xaa\x55", fields, sequence="sequence"), BinaryFrame(b"\xaa", fields, has_length=False, crc="modbus"),
              BinaryFrame(b"\0\0\0\0\0\0\0\0", (("a", "float64"), ("b", "int64")), endian=">", crc="xmodem", crc_endian=">")]
@@ -122,8 +124,9 @@ def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
 
 def slcan() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """An adapter's answers, and a drive's frames behind them."""
-    from hal.can_bus import drive_state, next_control_word
     from hal.wire import SlcanParser, encode_slcan
+
+    from hal.can_bus import drive_state, next_control_word
 
     def one(data: bytes) -> None:
         parser = SlcanParser()
@@ -171,7 +174,8 @@ def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
             device.disconnect()
         assert ((sample.value != sample.value) | (abs(sample.value) < 1e4)).all()
     good = b"\xf0\x0d\0\0\0\x07\x01\x04\x04\x08\xb1\x08\xa0"
-    return one, [good, b"\xf0\x0d\0\0\0\x03\x01\x84\x02", good[:9], b"\xf0\x0d\0\0\xff\xff\x01\x04\xff", b"\xf0\x0d\0\0\0\x07\x01\x04\x04\x7f\xff\x80\x00"]
+    return one, [good, b"\xf0\x0d\0\0\0\x03\x01\x84\x02", good[:9],
+                 b"\xf0\x0d\0\0\xff\xff\x01\x04\xff", b"\xf0\x0d\0\0\0\x07\x01\x04\x04\x7f\xff\x80\x00"]
 
 
 def _recording(suffix: str) -> tuple[Callable[[bytes], Any], list[bytes]]:
@@ -227,7 +231,8 @@ def commands() -> tuple[Callable[[bytes], Any], list[bytes]]:
             found = obey.answer(line, "uid 0 pid 0")
             assert isinstance(found["ok"], bool) and len(json.dumps(found)) < 1_000_000
     return one, [b'{"command": "status"}\n{"command": "setpoint", "value": 1e3}\n{"command": "arm"}\n{"command": "latency"}',
-                 b'{"command": "setpoint", "value": NaN}\n{"command": ["x"]}\n[[[[1]]]]\n{"command": "reload"}\n{"command": "disarm", "value": "\\ud800"}']
+                 b'{"command": "setpoint", "value": NaN}\n{"command": ["x"]}\n[[[[1]]]]\n{"command": "reload"}\n'
+                 b'{"command": "disarm", "value": "\\ud800"}']
 
 
 def metadata() -> tuple[Callable[[bytes], Any], list[bytes]]:

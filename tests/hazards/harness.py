@@ -55,7 +55,8 @@ def quick_settings(folder: Path):
     save_model(folder / "model.yaml", model, "simulated", [folder / "actuator_thermal.yaml"])
     text = (ROOT / "config/simulated.yaml").read_text()
     for old, new in (("plants/", ""), ("models/simulated.yaml", "model.yaml"), ("slew_um_s: 1", "slew_um_s: 50"),
-                     ("temperatures_c: 900", "temperatures_c: 18"), ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25\n  innovation_time_s: 0.6"),
+                     ("temperatures_c: 900", "temperatures_c: 18"),
+                     ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25\n  innovation_time_s: 0.6"),
                      ("period_s: 7200", "period_s: 144"), ("../run/", f"{folder}/"), ("../recordings", f"{folder}/recordings")):
         assert old in text, old
         text = text.replace(old, new)

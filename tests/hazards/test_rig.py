@@ -52,8 +52,9 @@ def test_encoder_counts_backwards(rig):
     rig.backend.read = backwards
     rig.arm()
     rig.command("setpoint", 5.0)
-    way, limit = 0.0, 1500
-    for ticks in range(1, limit + 1):
+    way, limit, ticks = 0.0, 1500, 0
+    while ticks < limit:
+        ticks += 1
         rig.tick()
         way = max(way, abs(rig.output_um))
         if rig.state == "FAULT":

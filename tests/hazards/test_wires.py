@@ -10,12 +10,12 @@ import threading
 
 import numpy as np
 import pytest
+from hal.wire import Framer
 
 from hal.backend import ROLE, Sample
 from hal.devices import DevicesBackend, make_devices
 from hal.virtual import drive as drives
 from hal.virtual.rig import Pty
-from hal.wire import Framer
 from tests.hazards.harness import ROOT, HazardRig, say
 from thermoctl import yamlfile
 
@@ -163,8 +163,11 @@ def flip(frame):
     return frame[:5] + bytes([frame[5] ^ 0x10]) + frame[6:]
 
 
-def garbage(frame, random=np.random.default_rng(5)):
-    return random.integers(0, 256, len(frame), dtype=np.uint8).tobytes()
+RANDOM = np.random.default_rng(5)
+
+
+def garbage(frame):
+    return RANDOM.integers(0, 256, len(frame), dtype=np.uint8).tobytes()
 
 
 def set_(name, value):
