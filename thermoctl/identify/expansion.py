@@ -169,11 +169,9 @@ class Bank:
         """The Expansion of the pole with the least criterion so far: squared error and, as in `output_error`, the ridge that the
         inputs' error asks for, laid under each triangle."""
         m, p = self.inputs, self.r.shape[1]
-        count = self.samples if self.weight == 1 else (1 - self.weight**self.samples) / (1 - self.weight)
         best = (np.inf, 0, np.zeros(p))
-        for k, f in enumerate(self.poles):
-            ridge = np.append(np.tile(self.sigma2, 2) * (1 - f) / (1 + f) * count, [0, 0])
-            rows = np.vstack([self.r[k], np.column_stack([np.diag(np.sqrt(ridge)), np.zeros(p)])])
+        for k in range(len(self.poles)):
+            rows = self._rows(k)
             left = linalg.qr(rows, mode="r", check_finite=False)[0]
             theta = linalg.solve_triangular(left[:p, :p], left[:p, p])
             criterion = self.cost[k] + left[p, p]**2
@@ -183,6 +181,30 @@ class Bank:
         f = float(self.poles[k])
         return Expansion(f, (1 - f) * theta[:m], (1 - f) * theta[m:2 * m], self.period_s, 0.0, float(theta[-1]),
                          {"method": "online bank", "start_um": float(theta[2 * m]), "samples": self.samples})
+
+    def bounded(self, low: np.ndarray, high: np.ndarray) -> Expansion:
+        """The best Expansion of one lag whose static gains (M,) um/K lie within low..high: collinear gains that the data do not tell apart
+        are settled inside the bounds, not cut off at them."""
+        m = self.inputs
+        free = np.full(2, np.inf)
+        best = (np.inf, 0, np.zeros(m + 2))
+        for k in range(len(self.poles)):
+            rows = self._rows(k)
+            found = optimize.lsq_linear(rows[:, m:-1], rows[:, -1], (np.append(low, -free), np.append(high, free)))
+            criterion = self.cost[k] + 2 * found.cost
+            if criterion < best[0]:
+                best = (criterion, k, found.x)
+        _, k, theta = best
+        f = float(self.poles[k])
+        return Expansion(f, np.zeros(m), (1 - f) * theta[:m], self.period_s, 0.0, float(theta[-1]),
+                         {"method": "online bank, bounded", "start_um": float(theta[m]), "samples": self.samples})
+
+    def _rows(self, k: int) -> np.ndarray:
+        """The triangle of pole k over the ridge that the inputs' error asks for; the last column is the right-hand side."""
+        count = self.samples if self.weight == 1 else (1 - self.weight**self.samples) / (1 - self.weight)
+        f, p = self.poles[k], self.r.shape[1]
+        ridge = np.append(np.tile(self.sigma2, 2) * (1 - f) / (1 + f) * count, [0, 0])
+        return np.vstack([self.r[k], np.column_stack([np.diag(np.sqrt(ridge)), np.zeros(p)])])
 
 
 def _from_theta(theta: np.ndarray, period_s: float, info: dict) -> Expansion:

@@ -3,7 +3,7 @@
 Nothing is learnt before the rig has moved through what it shall be good for: samples are counted in buckets of coil temperature and of its
 trend (warming, cooling); progress is the part of the buckets that are full. The newest samples (`hold_s`) are kept back from the bank of
 output-error estimators, which is fed the older ones; its proposal is taken only where it explains what was kept back better. Static gains
-are clipped round the calibrated ones, also after many tunings: a tuned model carries the gains of the calibration it came from. Every
+stay within bounds round the calibrated ones, also after many tunings: a tuned model carries the gains of the calibration it came from. Every
 change is a calibration of its own (`modelfile.install`), so it can be rolled back.
 """
 from __future__ import annotations
@@ -61,7 +61,9 @@ class Tuner:
             return None, f"excitation {self.progress:.0f} %: warm up and cool down through {self.edges[0]:g} to {self.edges[-1]:g} K"
         if self.bank.samples < self.hold:
             return None, f"{self.bank.samples} samples before those kept back to judge by; {self.hold} are needed"
-        new = clipped(self.bank.model(), self.model, self.clip)
+        gains = calibrated_gains(self.model)
+        width = self.clip * max(np.abs(gains).max(), 1e-12)
+        new = self.bank.bounded(gains - width, gains + width)
         now = Expansion(self.model.f1, self.model.b1, self.model.b2, self.model.expansion_period_s)
         before, after = self._error(now), self._error(new)
         if not after <= 0.95 * before:
@@ -87,12 +89,3 @@ def calibrated_gains(model: CompensatorModel) -> np.ndarray:
     """Static gains (12,) um/K of the calibration a model came from, tuned since or not."""
     known = model.meta.get("calibrated_gains_um_k")
     return np.array(known, dtype=float) if known is not None else (model.b1 + model.b2) / (1 - model.f1)
-
-
-def clipped(new: Expansion, old: CompensatorModel, clip: float) -> Expansion:
-    """`new` with each static gain within +-clip of the largest calibrated gain round the calibrated one. The two lags' gains are not
-    told apart by slow temperatures (only their sum is), so the sum is clipped and given to T(n)."""
-    old_gain = calibrated_gains(old)
-    width = clip * max(np.abs(old_gain).max(), 1e-12)
-    gain = np.clip((new.b1 + new.b2) / (1 - new.f1), old_gain - width, old_gain + width)
-    return replace(new, b1=np.zeros_like(gain), b2=(1 - new.f1) * gain)
