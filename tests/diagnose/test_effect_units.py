@@ -1,0 +1,31 @@
+"""Effects of a speed fit whatever unit the speed has: the extended plant passes the unit check when it is read again."""
+import numpy as np
+import pytest
+
+from thermoctl.diagnose.effects import Rig, candidates, catalogue
+from thermoctl.plant import load, save
+from thermoctl.recording.table import Table
+
+PLANT = """format: thermoctl-plant/1
+title: A motor's housing
+inputs: {{heat: {{unit: W}}, speed: {{unit: {unit}}}, air: {{unit: degC, between_samples: linear}}}}
+parameters: {{C: {{value: 300, unit: J/K, range: [100, 900]}}, H: {{value: 1, unit: W/K, range: [0.2, 4]}}}}
+nodes: {{housing: {{unit: degC, storage: C, initial: air}}}}
+flows: {{joule: {{into: housing, rate: heat, unit: W}}, loss: {{from: housing, rate: H * (housing - air), unit: W}}}}
+outputs: {{housing_c: {{value: housing, unit: degC, noise: 0.1}}}}
+"""
+
+
+@pytest.mark.parametrize("unit", ["rad/s", "m/s", "rpm"])
+def test_heat_of_a_speed_is_offered_and_keeps_its_units(unit, tmp_path):
+    (tmp_path / "plant.yaml").write_text(PLANT.format(unit=unit))
+    plant = load(tmp_path / "plant.yaml")
+    t = np.arange(100.0)
+    table = Table("run", "run", t, {"heat": 1 + np.sin(t), "speed": np.cos(t), "air": np.full(100, 20.0), "housing_c": 20 + 0 * t})
+    rig = Rig(plant, [plant.compile().drive(table)], [table.columns])
+    names = {"eddy_heating", "hysteresis_heating", "forced_convection"}
+    found = [c for c in candidates(rig, catalogue()) if c.effect.name in names]
+    assert {c.effect.name for c in found} == names
+    for c in found:
+        save(c.extend({p.name: 0.1 for p in c.effect.parameters}), tmp_path / "extended.yaml")
+        assert c.own(c.effect.parameters[0].name) in load(tmp_path / "extended.yaml").parameters
