@@ -165,3 +165,33 @@ def test_tuning_needs_a_folder_of_calibrations(quick):
     settings = dataclasses.replace(settings, compensation=dataclasses.replace(settings.compensation, tune=True))
     with pytest.raises(InputError, match="folder of calibrations"):
         tuner.check(settings)
+
+
+@pytest.mark.slow       # two programs and wires in real time: make test-identification
+def test_an_experiment_at_the_wire_is_ended_and_goes_on(tmp_path):
+    """`thermoctl experiment` on the daemon that holds the virtual rig over serial, CAN and Modbus: nothing is lost when it is ended."""
+    import signal
+    import subprocess
+
+    from tests.hal.test_wire_daemon import CLI, Chain
+    (tmp_path / "experiments.yaml").write_text("format: thermoctl-experiments/1\nrate_um_s: 16.6667\nexperiments:\n"
+                                               "  short: {title: Up and down, parts: [{hold: [[1, 0], [6, 20], [3, 0]]}]}\n")
+    chain = Chain(tmp_path)
+    try:
+        out = tmp_path / "short.parquet"
+        command = [*CLI, "experiment", "short", "--config", str(chain.config), "--out", str(out), "--resume"]
+        first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        chain.until(lambda s: s.get("state") == "ARMED" and (s.get("position_um") or 0) > 10, 60)
+        first.send_signal(signal.SIGINT)
+        said, err = first.communicate(timeout=60)
+        assert first.returncode == 1 and "ended after" in err and "daemon at" in said, (said, err)
+        kept = read_table(out)
+        assert len(kept) > 5 and chain.status()["state"] != "ARMED"
+        second = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        assert second.returncode == 0, (second.stdout, second.stderr)
+        assert re.search(r"goes on at \d+ s|begins anew", second.stdout)
+        whole = read_table(out)
+        assert np.nanmax(whole.columns["position_um"]) == pytest.approx(20, abs=1) and (np.diff(whole.t) > 0).all()
+        assert not out.with_name("short.parquet.progress").exists() and chain.status()["state"] != "ARMED"
+    finally:
+        chain.stop()
