@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from thermoctl.cli import main
+from thermoctl.evaluate.commands import record
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.recording.table import read_table
 from thermoctl.yamlfile import InputError
@@ -80,3 +81,16 @@ def test_a_wrong_file_gives_one_error_with_its_line(folder, capsys, change, word
     with pytest.raises(InputError, match=words) as e:
         load_experiments(folder / "bad.yaml")
     assert "bad.yaml:" in str(e.value)
+
+
+def test_on_the_simulated_back_end_it_runs_under_the_daemons_protections(folder, capsys, monkeypatch, request):
+    monkeypatch.chdir(request.config.rootpath)
+    text = GOOD.replace("[[0, 0], [10, 8], [300, 8], [310, 0], [600, 0]]", "[[0, 0], [2, 20], [6, 20]]").replace("heat: {unit: W, ", "setpoint_um: {")
+    (folder / "s.yaml").write_text(text.replace("sample_s: 5", "sample_s: 0.1"))
+    record(folder / "s.yaml", folder / "r.csv", "config/simulated.yaml", None)
+    made = read_table(folder / "r.csv")
+    assert made.columns["setpoint_um"][-1] == 20 and made.columns["position_um"][-1] == pytest.approx(20, abs=5)
+    assert np.all(made.columns["fault_bits"] == 0) and made.columns["state"][-1] == 3
+    (folder / "far.yaml").write_text(text.replace("sample_s: 5", "sample_s: 0.1").replace("20]", "90000]"))
+    with pytest.raises(InputError, match="setpoints leave"):
+        record(folder / "far.yaml", folder / "r.csv", "config/simulated.yaml", None)
