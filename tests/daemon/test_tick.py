@@ -1,16 +1,16 @@
 """The tick in simulated time: determinism, replay to the bit, faults, arming and reload as a whole."""
 import dataclasses
-import inspect
+from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import make_model
 
+import thermoctl
 from hal.backend import ERROR, OK, ROLE, ROLES, STALE
 from thermoctl.control import arming, faults
 from thermoctl.control.law import OUTPUTS
 from thermoctl.daemon.assemble import law_parameters
-from thermoctl.daemon.loop import Rig
 from thermoctl.daemon.recorder import law_metadata, read_law_metadata
 from thermoctl.daemon.replay import replay
 from thermoctl.daemon.simulate import Simulation, run_simulated
@@ -32,7 +32,8 @@ def test_one_list_of_names():
 
 
 def test_the_tick_is_the_block_diagram():
-    lines = [line.strip() for line in inspect.getsource(Rig.tick).splitlines()]
+    source = (Path(thermoctl.__file__).parent / "daemon/loop.py").read_text()         # the module that runs is compiled
+    lines = [line.strip() for line in source[source.index("    def tick("):source.index("    def sample(")].splitlines()]
     stages = [stage for line in lines for stage in ("sample", "estimate", "compensate", "control", "protect", "actuate",
                                                     "publish") if f".{stage}(" in line]
     assert stages == ["sample", "estimate", "compensate", "control", "protect", "actuate", "publish"]

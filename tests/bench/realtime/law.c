@@ -357,7 +357,7 @@ static void protect(law_t *l, int command, uint64_t external) {
     uint64_t found = external;
     if (l->state == ARMED) {
         l->following_s = fabs(l->eps1) > l->following_um ? l->following_s + l->dt : 0.0;
-        if (l->following_s > l->following_limit_s) found |= BIT(B_FOLLOWING);
+        if (l->following_s > l->following_limit_s || fabs(l->eps1) > 2.0 * l->following_um) found |= BIT(B_FOLLOWING);
         l->saturation_s = fabs(l->v) >= l->output_limit ? l->saturation_s + l->dt : 0.0;
         if (l->saturation_s > l->saturation_limit_s) found |= BIT(B_SATURATED);
         int reports = l->status[AMPLIFIER_STATE] == OK && l->value[AMPLIFIER_STATE] != 2.0;
