@@ -340,7 +340,7 @@ def main() -> int:
         corpus.mkdir()
         for k, seed in enumerate(seeds):
             (corpus / str(k)).write_bytes(seed[:MAX_INPUT])
-        atheris.Setup([sys.argv[0], f"-max_total_time={args.seconds:.0f}", f"-timeout={LIMIT_S}", f"-rss_limit_mb={LIMIT_MB}", f"-seed={args.seed}",
+        atheris.Setup([sys.argv[0], f"-max_total_time={args.seconds:.0f}", "-timeout=30", f"-rss_limit_mb={LIMIT_MB}", f"-seed={args.seed}",
                        f"-max_len={MAX_INPUT}", f"-artifact_prefix={KEPT}/{args.name}-", "-print_final_stats=1", str(corpus)], run)
         atheris.Fuzz()                                     # ends the process
     signal.signal(signal.SIGPROF, _alarm)                  # processor time: a busy machine is no find
