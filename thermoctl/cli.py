@@ -207,7 +207,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
         return command.effects(args)
     folder = ("--effects", {"action": "append", "metavar": "DIR", "help": "a further folder of effect files (repeatable)"})
     _add(sub, "diagnose", "where simulation and recordings differ, which physics was left out, what adding it is worth", diagnose,
-         ("recordings", {"nargs": "+", "metavar": "REC", "help": "recordings: .csv, .parquet or .arrow; or folders of many rigs' "
+         ("recordings", {"nargs": "*", "metavar": "REC", "help": "recordings: .csv, .parquet or .arrow; or folders of many rigs' "
                                                                  "recordings: each rig by itself"}),
          ("--plant", {"required": True, "metavar": "FILE"}),
          ("--out", {"required": True, "metavar": "DIR", "help": "for diagnosis.json, plant.yaml and report.html (of folders: DIR/RIG)"}),
@@ -218,11 +218,13 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
                                                                               "default: what moved and is not the surroundings)"}),
          ("--limit", {"action": "append", "metavar": "NAME=LOW:HIGH", "help": "what an input or output of the rig may reach in the next "
                                                                              "experiment (repeatable; default: about what was recorded)"}),
+         ("--live", {"action": "store_true", "help": "the daemon's own recordings (--config), where its model no longer fits"}),
+         ("--hours", {"type": float, "default": 4.0, "metavar": "H", "help": "with --live: how far back (4)"}),
          ("--resolve", {"action": "store_true", "help": "run the next experiment on the rig, add its data and decide again"}),
          ("--rounds", {"type": int, "default": 3, "metavar": "N", "help": "with --resolve: at most N experiments (3)"}),
          ("--rig", {"metavar": "PLANT", "help": "with --resolve: a plant file in the rig's place"}),
          ("--config", {"metavar": "FILE", "default": "config/simulated.yaml",
-                       "help": "with --resolve: the rig, with all protections (config/simulated.yaml)"}),
+                       "help": "with --resolve and --live: the rig, with all protections (config/simulated.yaml)"}),
          ("--json", {"action": "store_true", "help": "print the result as JSON"}),
          ("--quiet", {"action": "store_true", "help": "no progress, no summary"}))
     _add(sub, "effects", "list the catalogue of effects, or `effects show NAME`", effects,

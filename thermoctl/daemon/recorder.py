@@ -4,6 +4,7 @@ It is never waited for. When it falls behind by more than the ring holds, the lo
 them.
 A recording holds the effective configuration, the model, the law's parameters and a state of the law to start a replay
 from; a reload starts a new file, so that one file has one set of parameters.
+What passes is also watched: innovations that the filter does not expect raise "the model no longer fits" in the log.
 """
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.control.model import CompensatorModel, Parameters
+from thermoctl.daemon.misfit import Misfit
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, Shared
 from thermoctl.signals import INDEX
 
@@ -65,7 +67,8 @@ class Recorder:
     """
 
     def __init__(self, shared: Shared, model: CompensatorModel, parameters: Parameters, period_s: float,
-                 open_writer: Callable[[str], Any]):
+                 open_writer: Callable[[str], Any], log: Callable[..., None] = lambda *a, **k: None):
+        self.log, self.misfit = log, Misfit(model)
         self.shared, self.model, self.parameters, self.period_s = shared, model, parameters, period_s
         self.open_writer = open_writer
         kept = shared.state.get()
@@ -79,6 +82,8 @@ class Recorder:
         rows, self.position, lost = self.shared.ring.read(self.position)
         self.shared.counters[RECORDER_LOST] += lost
         written = len(rows)
+        if written:
+            self._watch(rows)
         while len(rows):
             if self.writer is None or rows[0, _GENERATION] != self.generation:
                 self._new_file(rows[0])
@@ -92,6 +97,13 @@ class Recorder:
             self._write(part)
         self.shared.counters[RECORDER_ROWS] += written
         return written
+
+    def _watch(self, rows: np.ndarray) -> None:
+        alarm = self.misfit.add(rows[:, INDEX["t_s"]], rows[:, INDEX["innovation_c"]], rows[:, INDEX["kalman_gain"]])
+        if alarm is not None:
+            self.log("the model no longer fits", begins_s=round(alarm.begin_s, 1), ends_s=round(alarm.end_s, 1),
+                     mean_innovation_c=round(alarm.mean_c, 3),
+                     remedy="`thermoctl diagnose --live --out DIR` says which physics changed")
 
     def _write(self, rows: np.ndarray) -> None:
         self.shared.counters[RECORDER_LOST] += self.writer.write(rows)
@@ -135,7 +147,7 @@ def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Re
         metadata = {"rig": settings.rig.name, "config": config, "law": law}
         return RecordingWriter(settings.recording, metadata, settings.rig.name, lambda text: log("recorder", what=text))
 
-    return Recorder(shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer)
+    return Recorder(shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer, log)
 
 
 def record(recorder: Recorder, stopping: Callable[[], bool]) -> None:

@@ -32,6 +32,14 @@ class Progress:
 
 def diagnose(args: argparse.Namespace) -> int:
     """`thermoctl diagnose`: runs the diagnosis and prints its summary. Raises InputError for unusable inputs."""
+    if args.live:
+        if args.recordings:
+            raise InputError("diagnose --live reads the daemon's own recordings; no recording was expected beside it")
+        args.recordings = _live(args)
+        if not args.recordings:
+            return 0
+    if not args.recordings:
+        raise InputError("no recording was given; one or more were expected, or --live")
     if any(Path(r).is_dir() for r in args.recordings):
         return fleet(args)
     from thermoctl.diagnose import run
@@ -50,6 +58,26 @@ def diagnose(args: argparse.Namespace) -> int:
     elif not args.quiet:
         summary(found, args.out)
     return 0
+
+
+def _live(args: argparse.Namespace) -> list[str]:
+    """The stretch of the daemon's recordings that its model does not fit, as a file in OUT; none where it fits."""
+    from thermoctl.diagnose import live
+    from thermoctl.plant import load
+    from thermoctl.settings import load_settings
+    settings = load_settings(args.config)
+    table = live.newest(settings.recording.directory, settings.rig.name, args.hours)
+    alarms = live.where(settings, table)
+    span = f"{table.t[0]:.0f} s to {table.t[-1]:.0f} s of the newest session"
+    if not alarms:
+        print(f"The model fits: from {span} its innovations are what the filter expects. Nothing to diagnose.")
+        return []
+    a = alarms[-1]
+    print(f"The model no longer fits from {a.begin_s:.0f} s on (mean innovation {a.mean_c:+.3f} K; {span}); that is diagnosed.", file=sys.stderr)
+    Path(args.out).mkdir(parents=True, exist_ok=True)
+    path = Path(args.out) / "live.csv"
+    live.extract(load(args.plant), table, a, path)
+    return [str(path)]
 
 
 def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:

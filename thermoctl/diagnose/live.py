@@ -1,0 +1,82 @@
+"""`thermoctl diagnose --live`: the daemon's own recordings, searched for where its model no longer fits, as a recording to
+diagnose.
+
+The 10 Hz tier of the newest session is read back for some hours, averaged to a second, and its innovations go through the
+same sum as in the daemon (daemon/misfit.py). The stretch from well before the onset to now is written as a CSV whose columns
+are those of the thermal plant.
+"""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoctl.daemon.assemble import compensator
+from thermoctl.daemon.misfit import Alarm, Misfit
+from thermoctl.plant.language import Plant
+from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.recording.writer import TIER, recording_files
+from thermoctl.yamlfile import InputError
+
+BEFORE_S = 1800.0           # of a time when the model still fitted, taken along
+_STEP_S = 1.0
+
+
+def newest(directory: str | Path, rig: str, hours: float) -> Table:
+    """The newest session of a rig, at most so many hours back, one row a second. Raises InputError where there is none."""
+    folder = Path(directory)
+    files = [p for p in recording_files(folder, TIER) if p.name.startswith(rig + "-")] if folder.is_dir() else []
+    parts: list[Table] = []
+    for path in reversed(files):
+        part = read_table(path)
+        if parts and (part.t[-1] > parts[-1].t[0] or parts[0].t[-1] - part.t[0] > hours * 3600):
+            break               # an earlier session, whose clock ran on, or far enough back
+        parts.append(part)
+    if not parts:
+        raise InputError(f"{directory}: no recording of the rig '{rig}'; the daemon writes them while `recording: enable` is on")
+    parts.reverse()
+    t = np.concatenate([p.t for p in parts])
+    bins = np.floor((t - t[0]) / _STEP_S).astype(int)
+    count = np.bincount(bins)
+    there = count > 0
+    columns = {}
+    for name in set.intersection(*(set(p.columns) for p in parts)):
+        values = np.concatenate([p.columns[name] for p in parts])
+        good = np.isfinite(values)
+        total, n = np.bincount(bins[good], values[good], len(count)), np.bincount(bins[good], minlength=len(count))
+        columns[name] = np.where(n > 0, total / np.maximum(n, 1), np.nan)[there]
+    begins = t[0] + np.arange(len(count))[there] * _STEP_S
+    return Table(rig, str(files[-1]), begins, columns)
+
+
+def where(settings: Any, table: Table) -> list[Alarm]:
+    """Every time that the model stopped fitting in a table of `newest`."""
+    watch = Misfit(compensator(settings))
+    out = []
+    for k in range(0, len(table.t), 60):
+        rows = slice(k, k + 60)
+        # Means of a second hold ten samples of the sensor each: their scatter is smaller, a lasting shift is the same.
+        found = watch.add(table.t[rows], table.columns["innovation_c"][rows], table.columns["kalman_gain"][rows])
+        if found is not None:
+            out.append(found)
+    return out
+
+
+def extract(plant: Plant, table: Table, alarm: Alarm | None, out: str | Path) -> None:
+    """Write what the plant reads of the table, from BEFORE_S before the alarm on (None: all of it). Raises InputError."""
+    known = dict(table.columns)
+    if {"output_reference_um", "position_raw_um"} <= set(known):
+        known.setdefault("position_error_um", known["output_reference_um"] - known["position_raw_um"])
+    wanted = [i.column for i in plant.inputs.values()] + [o.column for o in plant.outputs.values()]
+    missing = [i.column for i in plant.inputs.values() if i.column not in known]
+    if missing:
+        raise InputError(f"{table.path}: the daemon records no column '{missing[0]}', which the plant reads as an input")
+    keep = table.t >= (alarm.begin_s - BEFORE_S if alarm is not None else -np.inf)
+    columns = {c: known[c][keep] for c in wanted if c in known and np.isfinite(known[c][keep]).any()}
+    whole = np.all([np.isfinite(columns[i.column]) for i in plant.inputs.values()], axis=0)
+    if not whole.any():
+        raise InputError(f"{table.path}: an input of the plant is missing throughout")
+    first = int(np.argmax(whole))
+    write_table(out, Table(Path(out).stem, str(out), table.t[keep][first:] - table.t[keep][first],
+                           {k: v[first:] for k, v in columns.items()}))
