@@ -9,10 +9,10 @@ from thermoctl.recording.table import Table
 PLANT = """format: thermoctl-plant/1
 title: A motor's housing
 inputs: {{heat: {{unit: W}}, speed: {{unit: {unit}}}, air: {{unit: degC, between_samples: linear}}}}
-parameters: {{C: {{value: 300, unit: J/K, range: [100, 900]}}, H: {{value: 1, unit: W/K, range: [0.2, 4]}}}}
+parameters: {{K_e: {{value: 0.1, unit: V/({unit})}}, C: {{value: 300, unit: J/K, range: [100, 900]}}, H: {{value: 1, unit: W/K, range: [0.2, 4]}}}}
 nodes: {{housing: {{unit: degC, storage: C, initial: air}}}}
 flows: {{joule: {{into: housing, rate: heat, unit: W}}, loss: {{from: housing, rate: H * (housing - air), unit: W}}}}
-outputs: {{housing_c: {{value: housing, unit: degC, noise: 0.1}}}}
+outputs: {{housing_c: {{value: housing, unit: degC, noise: 0.1}}, tacho: {{value: K_e * speed, unit: V, noise: 0.1}}}}
 """
 
 
