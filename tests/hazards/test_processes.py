@@ -71,6 +71,7 @@ class Daemon:
         return sorted(children, key=lambda p: (p.create_time(), p.pid))[{"loop": 0, "recorder": 1, "commands": 2}[name]].pid
 
     def armed(self):
+        wait(lambda: self.ask("status")["recorder"]["rows"] > 0, "the recorder")
         wait(lambda: self.ask("arm")["ok"] or self.ask("disarm") and False, "armed")
 
     def stop(self):
@@ -152,6 +153,7 @@ def test_the_loop_stopped_for_a_while(daemon):
 
 
 def test_the_recorder_stopped_for_a_while_loses_nothing(daemon):
+    daemon.armed()
     pid = daemon.child("recorder")
     os.kill(pid, signal.SIGSTOP)
     before = daemon.ask("status")["ticks"]

@@ -43,7 +43,7 @@ from thermoctl.yamlfile import InputError
 HANG_S = 15.0               # a helper that did no round for so long is killed and started again
 READY_S = 60.0              # the first tick comes within this: devices connect before it
 STALL_S = 1.0               # a loop that made no tick for so long is ended
-STOP_S = 3.0                # a child that was asked to stop is killed after this
+LOOP_STOP_S, STOP_S = 3.0, 10.0      # the loop, or a helper, that was asked to stop is killed after this
 RESTART_S = 0.5             # pause before a child is started again, doubled up to
 RESTART_LONGEST_S = 30.0
 TELL_AGAIN_S = 10.0         # a fault that comes and goes is logged once in this time
@@ -373,7 +373,7 @@ def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child]
     finally:
         notify("STOPPING=1")
         ended_by_itself = loop.alive
-        loop.end()
+        loop.end(LOOP_STOP_S)
         if not ended_by_itself or loop.process.exitcode != 0:
             safe_amplifier(settings, log)
         watcher.look()
