@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -43,7 +44,8 @@ SETPOINT = "setpoint_um"    # what the daemon commands; the current of a flexure
 ROUNDS = 3
 MOST = 5                    # explanations that are compared
 LIKELY = 0.02               # an explanation below this share of the likeliest one is not worth rig time
-POINTS = 700                # of a simulated experiment; a reading more often than that counts as less noise
+POINTS, READINGS = 700, 4000   # of a simulated experiment, at most; a reading more often than that counts as less noise
+SECONDS = 30.0              # after which no further candidate is looked at
 ENOUGH = 0.8                # of the best experiment's bits that a shorter one must reach
 TOGETHER = 0.98             # correlation from which two inputs are taken to be one lever (voltage and current)
 REACH = 0.5                 # how far beyond its recorded range, as a share of it, a reading may go
@@ -174,7 +176,7 @@ def family(plant: Plant, tables: Sequence[Table], found: Sequence[Lever], step_s
     usual = float(np.median([t.t[-1] - t.t[0] for t in tables]))
     still, several = _still(plant, tables, {n for lever in found for n in lever.moves})
     out = []
-    for share in (0.5, 1.0, 2.0):
+    for share in (1.0, 0.5, 2.0):
         T = usual * share
         rest = {lever.name: np.array([[0.0, lever.rest], [T, lever.rest]]) for lever in found}
         plans: list[tuple[str, dict[str, np.ndarray]]] = []
@@ -256,7 +258,7 @@ def _predict(b: _Believer, table: Table) -> tuple[np.ndarray, np.ndarray] | None
     """Readings and states of an experiment (N, ny + nx) and what they are uncertain by (N, ny + nx, z); None where it fails."""
     try:
         run = b.model.run(b.model.drive(table), sensitivities=True, rtol=1e-5)
-    except SimulationError:
+    except (SimulationError, InputError):
         return None
     assert run.dy is not None and run.dx is not None
     slopes = np.concatenate([run.dy, run.dx], axis=1) * b.slopes @ b.root
@@ -283,7 +285,8 @@ def noise_of(case: Case, e: Explanation) -> np.ndarray:
     """What one reading is uncertain by, per output (ny,): residual rms of the likeliest explanation, or the sensor's noise where
     larger, widened for the correlation of neighbours (whose mean tells less than that of independent ones)."""
     out = []
-    for j, n in enumerate(case.noise):
+    for o, n in zip(case.model.outputs, case.noise, strict=True):
+        j = e.fit.model.outputs.index(o)
         r = [q[np.isfinite(q[:, j]), j] for q in e.fit.residuals]
         r = [q for q in r if len(q) > 8]
         square = np.concatenate([q ** 2 for q in r]).mean() if r else n.sigma ** 2
@@ -331,8 +334,12 @@ def propose(case: Case, found: Diagnosis, drivable: Sequence[str] = (),
     outputs = list(case.model.outputs)
     seen = [j for j, o in enumerate(outputs) if any(np.isfinite(d.y[:, j]).any() for d in case.drives)]
 
+    points, deadline = min(POINTS, max(READINGS // len(outputs), 150)), time.monotonic() + SECONDS
+
     def judged(x: Excitation) -> tuple[float, np.ndarray, list] | None:
-        grid = max(step, x.duration_s / POINTS)
+        if time.monotonic() > deadline:
+            return None
+        grid = max(step, x.duration_s / points)
         table = x.table(case.plant, grid)
         told = [_predict(b, table) for b in believers]
         if any(p is None for p in told) or _leaves(case, outputs, told, limits):
@@ -359,7 +366,7 @@ def propose(case: Case, found: Diagnosis, drivable: Sequence[str] = (),
     hardest = believers[1 + int(np.argmin(sigmas))].label
     why = (f"It would set {believers[0].label} apart from {hardest} by {sigmas.min():.1f} standard errors, after what "
            f"their parameters are still uncertain by ({told_bits:.2f} bits in {hours:.3g} h; best per hour of {len(good)} candidates).")
-    also = None if clear else _sensor(case, believers, told, weights, sigma, seen, outputs, np.sqrt(step / max(step, chosen.duration_s / POINTS)), D)
+    also = None if clear else _sensor(case, believers, told, weights, sigma, seen, outputs, np.sqrt(step / max(step, chosen.duration_s / points)), D)
     inputs = {n: c.tolist() for n, c in chosen.corners.items()} | {n: [[0.0, v]] for n, v in chosen.starts.items() if n in case.plant.inputs}
     entry = {"profile": chosen.title, "why": why, "also_helpful": also, "duration_s": chosen.duration_s, "sample_s": step, "hours": hours,
              "bits": told_bits, "bits_per_hour": told_bits / hours, "candidates": len(good), "separates": apart, "inputs": inputs,
