@@ -123,13 +123,13 @@ class Browser:
             f.write(base64.b64decode(shot["data"]))
 
     def keep(self, name, height=None):
-        """The picture as NAME.png, in 160 colours: small enough to live in the repository. Only where PICTURES is set."""
+        """The picture as NAME.png, in 250 colours: small enough to live in the repository. Only where PICTURES is set."""
         if PICTURES:
             from PIL import Image
             path = os.path.join(PICTURES, f"{name}.png")
             os.makedirs(PICTURES, exist_ok=True)
             self.picture(path, height)
-            Image.open(path).convert("RGB").quantize(160, dither=Image.Dither.NONE).save(path, optimize=True)
+            Image.open(path).convert("RGB").quantize(250, dither=Image.Dither.NONE).save(path, optimize=True)
 
     def close(self):
         """End it."""
