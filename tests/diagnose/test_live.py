@@ -16,14 +16,17 @@ from thermoctl.signals import INDEX
 ROOT = Path(__file__).parents[2]
 
 
-def rig(folder, fault=None):
-    """Settings of the simulated rig that records into `folder`, its coil's thermometer faulty if asked."""
+def rig(folder, heat=None):
+    """Settings of the simulated rig that records into `folder`; `heat`: watts into its coil that no model knows of."""
     text = (ROOT / "config" / "simulated.yaml").read_text()
     for name in ("plants", "models", "devices"):
         text = text.replace(f"{name}/", f"{ROOT / 'config' / name}/")
     directory = folder / "recordings"
     text = text.replace("../recordings", str(directory))
-    text = text.replace("hal:\n", f"hal:\n  faults: [{fault}]\n", 1) if fault else text
+    if heat:
+        plant = (ROOT / "config" / "plants" / "actuator.yaml").read_text()
+        (folder / "changed.yaml").write_text(plant.replace("\nflows:\n", f"\nflows:\n  outside: {{into: coil, rate: {heat}, unit: W}}\n", 1))
+        text = text.replace(str(ROOT / "config" / "plants" / "actuator.yaml"), str(folder / "changed.yaml"))
     path = folder / "rig.yaml"
     path.write_text(text)
     settings = load_settings(path)
@@ -73,10 +76,11 @@ def test_live_without_recordings_is_one_line(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_live_diagnoses_the_stretch_that_the_model_does_not_fit(tmp_path):
-    path, settings = rig(tmp_path, "{kind: step, role: coil_c, at_s: 1500, by: 0.8}")
+    path, settings = rig(tmp_path, "1.2 * step(t - 1500)")
     rows = recorded(settings, 45)
     plant = ROOT / "config" / "plants" / "actuator_thermal.yaml"
     assert main(["diagnose", "--live", "--config", str(path), "--plant", str(plant), "--out", str(tmp_path / "out")]) == 0
     found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
-    assert any((f["effect"], f["where"]) == ("sensor_offset_step", "coil_c") for f in found["findings"]), found["findings"]
-    assert np.nanmax(np.abs(rows[:, INDEX["innovation_c"]])) > 0.3
+    (finding,) = [f for f in found["findings"] if f["where"] == "coil"]
+    assert finding["effect"] == "external_heat_source" and finding["when"][0][0] == pytest.approx(1500, abs=60)
+    assert np.isfinite(rows[:, INDEX["innovation_c"]]).any()

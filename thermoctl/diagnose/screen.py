@@ -344,6 +344,10 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metri
         if gains < 0:
             return chance
         a, b, amplitude = at
+        if a == 0 and b < len(edges) and m[b, b] > 1e-12 * max(full) ** 2 and g[b] ** 2 / m[b, b] > 0.8 * gains:
+            # Heat that ends and a lack of it that begins look alike where parameters absorb a constant: what begins is likelier.
+            a, b, amplitude = b, len(edges), g[b] / m[b, b]
+            gains = g[a] ** 2 / m[a, a]
         shape = {"start": edges[a], "end": edges[b] if b < len(edges) else max(ends)}
         vector = rows[:, a] - (rows[:, b] if b < len(edges) else 0)
         start = parameter_values(c, shape, [amplitude])
