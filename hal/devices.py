@@ -119,7 +119,7 @@ class DevicesBackend:
         self.fast, self.slow, self.board = fast, slow, board
         self.sample = Sample()
         self._owner = {role: d for d in [*fast, *slow] for role in d.roles}
-        self._pacing = self._owner.get(ROLE["position_um"])     # loop.pace: device
+        self._pacing: Any = self._owner.get(ROLE["position_um"])     # loop.pace: device
         self._seen = dict.fromkeys(slow, 0)
         limit_s = np.full(len(ROLES), np.inf)                   # age at which a reading is stale
         for b in (b for d in self._owner.values() for b in d.binding.bounds):

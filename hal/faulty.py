@@ -22,6 +22,7 @@ import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -84,7 +85,8 @@ class FaultInjector:
     """`hal.backend.Backend` that spoils another one's readings and commands on schedule; seeded, deterministic."""
 
     def __init__(self, inner: Backend, faults: Iterable[Fault], seed: int = 0) -> None:
-        self.inner, self.faults = inner, list(faults)
+        self.inner: Any = inner
+        self.faults = list(faults)
         self.sample = Sample()
         self._random = np.random.default_rng(seed)
         self._start_s = math.nan

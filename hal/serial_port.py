@@ -11,6 +11,7 @@ import errno
 import os
 import termios
 from pathlib import Path
+from typing import Any
 
 import serial
 
@@ -126,7 +127,7 @@ class SerialDevice(Device):
 
     def wait_frame(self, until_ns: int) -> bool:
         """Wait for a whole frame, at most until `until_ns` (monotonic clock); whether one came. `read` then stores it."""
-        framer = self._framer
+        framer: Any = self._framer
         while not self._waited:
             if framer.read(self._fd):
                 self._waited = True
