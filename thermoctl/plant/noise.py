@@ -47,7 +47,7 @@ def coloured(found: Fit, drives: Sequence[Drive]) -> list[Noise]:
 
     def parts(j: int, candidate: Noise) -> tuple[np.ndarray, np.ndarray, float, float]:
         """J' V^-1 J, J' V^-1 e, e' V^-1 e and log |V| of channel j under a noise."""
-        own = Problem(found.model, drives, [candidate if k == j else n for k, n in enumerate(noise)])
+        own = problem.heard(j, candidate)
         gram, gradient, square, size = np.zeros_like(prior), np.zeros(len(prior)), 0.0, 0.0
         for r, (columns, dy) in enumerate(slopes):
             e = found.residuals[r][:, j]

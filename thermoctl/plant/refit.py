@@ -10,6 +10,7 @@ that meets its bound is held there until the gradient leads back inside. Sensiti
 """
 from __future__ import annotations
 
+import copy
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -103,6 +104,18 @@ def default_noise(plant: Plant, drives: Sequence[Drive] = ()) -> tuple[Noise, ..
     return tuple(out)
 
 
+def _rows(d: Drive, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Output j's measured samples, their correlation with the one before, and what each innovation is uncertain by."""
+    dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
+    index = np.flatnonzero(np.isfinite(d.y[:, j]))
+    gaps = np.diff(d.t[index]) / dt if len(index) > 1 else np.zeros(0)
+    phi = n.phi ** np.clip(gaps, 0.0, 1e4) if n.phi > 0 else np.zeros(len(gaps))
+    scale = np.full(len(index), n.sigma)
+    if len(index):
+        scale[1:] = n.sigma * np.sqrt(np.maximum(1 - phi ** 2, 1e-9))
+    return index, phi, scale
+
+
 class Problem:
     """Residuals and Jacobian of a model on several recordings, in the metric of the noise."""
 
@@ -135,19 +148,7 @@ class Problem:
         self.belief = self.start({})
         self.buffers: dict[str, np.ndarray] = {}
         self.huber = np.full(len(self.noise), HUBER)
-        self.rows = []
-        for d in drives:
-            dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
-            entry = []
-            for j, n in enumerate(self.noise):
-                index = np.flatnonzero(np.isfinite(d.y[:, j]))
-                gaps = np.diff(d.t[index]) / dt if len(index) > 1 else np.zeros(0)
-                phi = n.phi ** np.clip(gaps, 0.0, 1e4) if n.phi > 0 else np.zeros(len(gaps))
-                scale = np.full(len(index), n.sigma)
-                if len(index):
-                    scale[1:] = n.sigma * np.sqrt(np.maximum(1 - phi ** 2, 1e-9))
-                entry.append((index, phi, scale))
-            self.rows.append(entry)
+        self.rows = [[_rows(d, j, n) for j, n in enumerate(self.noise)] for d in drives]
         self.samples = sum(len(e[0]) for entry in self.rows for e in entry)
         if self.samples == 0:
             raise InputError("no recording has a column that an output of the plant reads; nothing to fit")
@@ -163,6 +164,13 @@ class Problem:
             else:
                 out.append(0.0)
         return np.array(out)
+
+    def heard(self, j: int, n: Noise) -> Problem:
+        """The same with another noise of output j."""
+        other = copy.copy(self)
+        other.noise = (*self.noise[:j], n, *self.noise[j + 1:])
+        other.rows = [[_rows(d, j, n) if k == j else q for k, q in enumerate(rows)] for d, rows in zip(self.drives, self.rows, strict=True)]
+        return other
 
     def unpack(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values (recordings, parameters) and shifts of initial states (recordings, uncertain states)."""
