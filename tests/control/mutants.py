@@ -39,6 +39,7 @@ WHY: dict[str, str] = {
     "`self.drive = clip(self.v, -self.output_limit, self.output_limit) if self.enable > 0.0 else`": _NO_DRIVE,
     "law.py:_agree: `self.last[_CURRENT] if current else 0.0` condition True in "
     "`amperes = self.last[_CURRENT] if current else 0.0`": "amperes is looked at only where `current` holds",
+    "law.py:_judge_readings: `1.0 + _K_ERROR` Add -> Sub in `self.verdict[c] = 1.0 + _K_ERROR`": "_K_ERROR is 0",
     "law.py:_agree: `0.0` + 1 in `amperes = self.last[_CURRENT] if current else 0.0`":
         "amperes is looked at only where `current` holds",
 }

@@ -557,7 +557,7 @@ def exchanged_sensors(module):
         b.law.x[0], b.law.x[1] = estimates
         return b.set(coil_c=AIR + coil, bobbin_c=AIR + bobbin).tick(2)
     bench(4.0, 0.0).well()
-    bench(0.0, 4.0).well("monitored_disagrees")
+    bench(0.0, 4.0).well("monitored_disagrees").say(2, "shaft_1_c").tick().well("monitored_disagrees", "monitored_error")
     bench(0.0, 1.0).well()                                                            # 4 x -1 = -4: at the limit
     bench(0.0, 1.25).well("monitored_disagrees")
     bench(4.0, 0.0, (0.0, 4.0)).well("monitored_disagrees")
@@ -591,6 +591,7 @@ def reference_and_estimate(module):
         bench().set(output_reference_um=108.0 + sign * 4.0).tick(2).well()
         bench().set(output_reference_um=108.0 + sign * 4.0).tick(dt=2 * P).well()
         bench().set(output_reference_um=108.0 + sign * 4.25).tick().well("monitored_disagrees")
+        bench().set(output_reference_um=108.0 + sign * 4.25).say(2, "shaft_1_c").tick().well("monitored_disagrees", "monitored_error")
         b = bench()
         b.law.x[0] = sign * 9.0
         b.tick(3).well("monitored_disagrees")                                         # the expansion that was estimated is not there
