@@ -807,10 +807,26 @@ def unseen_errors(case: Case, plant: Plant, refit: bool = True) -> list[np.ndarr
                 model = Model(updated(plant, found, training), model.code)
                 if train[0].path == test[0].path:       # one recording, split: its start took part
                     dx0 = found.dx0[0]
-            out += [d.y - model.run(model.prepare(d), None, dx0).y for d in drives]
+            out += [_but_for_start(case, model, d) if dx0 is None and model.uncertain
+                    else d.y - model.run(model.prepare(d), None, dx0).y for d in drives]
         except SimulationError:
             out += [np.full_like(d.y, np.nan) for d in drives]
     return out
+
+
+def _but_for_start(case: Case, model: Model, d: Drive) -> np.ndarray:
+    """Free-run error on a recording that took no part, less what its uncertain start explains at first order: where it began
+    is no physics, and a free axis carries an error of its start to the end."""
+    run = model.run(model.prepare(d), None, None, sensitivities=True)
+    assert run.dy is not None
+    error = d.y - run.y
+    good = np.isfinite(error)
+    scale = np.array([n.sigma for n in case.noise])
+    by_start = run.dy[:, :, len(model.active):]
+    prior = np.array([model.plant.nodes[n].initial_sigma or 1.0 for n in model.uncertain])
+    rows, left = (by_start / scale[None, :, None])[good] * prior, (error / scale)[good]
+    shift = np.linalg.solve(rows.T @ rows + np.eye(len(prior)), rows.T @ left) * prior
+    return error - by_start @ shift
 
 
 def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray],
