@@ -97,9 +97,9 @@ def test_every_plant_loads_simulates_and_refits(path):
     assert all(np.isfinite(run.y).all() and run.y.shape == d.y.shape for run, d in zip(runs, drives, strict=True))
     found = fit(model, drives, iterations=15, seconds=120.0)
     sigma = np.array([n.sigma for n in found.noise])
-    before, after = (np.nansum([np.nansum(np.minimum(np.abs(e / sigma), 1e3)) for e in q])
+    before, after = (np.sqrt(np.nanmean(np.concatenate([(e / sigma).ravel() for e in q]) ** 2))
                      for q in ([d.y - run.y for run, d in zip(runs, drives, strict=True)], found.residuals))
-    print(f"{path.parent.name}: {len(drives)} recordings, mean error in sigmas {before:.4g} -> {after:.4g} (sums), {found.iterations} iterations")
+    print(f"{path.parent.name}: {len(drives)} recordings, error {before:.4g} -> {after:.4g} sigmas rms")
     assert after <= before * 1.001
     for q in model.active:
         low, high = model.plant.parameters[q].range
