@@ -27,7 +27,11 @@ def main():
             begun = time.monotonic()
             if seconds:                              # the time is that of the program; what has to be installed first is installed first
                 subprocess.run(["make", "install"], cwd=clone, check=True, capture_output=True)
-            said = run(block, clone, clone / ".venv/bin", float(seconds[1]) if seconds else None)
+            try:
+                said = run(block, clone, clone / ".venv/bin", float(seconds[1]) if seconds else None)
+            except AssertionError:                   # nothing of the walk goes on running
+                subprocess.run([clone / ".venv/bin/thermoctl", "stop", "--config", "config/simulated.yaml"], cwd=clone, check=False)
+                raise
             print("".join(f"    {line}\n" for line in said.splitlines()[-12:]) + f"    ({time.monotonic() - begun:.0f} s)", flush=True)
             if seconds:
                 assert "ARMED" in said, "the loop ran"
