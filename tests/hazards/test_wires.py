@@ -170,6 +170,10 @@ def garbage(frame):
     return RANDOM.integers(0, 256, len(frame), dtype=np.uint8).tobytes()
 
 
+def no_supply(wires):
+    wires.drive.alive, wires.drive.state = False, drives.DISABLED
+
+
 def set_(name, value):
     return lambda wires: setattr(wires, name, value)
 
@@ -183,7 +187,7 @@ def set_(name, value):
     ("encoder: cable out", {"position_error"}, 2, lambda w: w.encoder.unplug(), "lost on"),
     ("drive: its heartbeat is missing", {"amplifier_error"}, 103, lambda w: setattr(w.drive, "heartbeat", False),
      "no heartbeat"),
-    ("drive: supply off", {"amplifier_stale", "amplifier_error"}, 25, lambda w: setattr(w.drive, "alive", False), ""),
+    ("drive: supply off", {"amplifier_stale", "amplifier_error"}, 25, no_supply, ""),
     ("drive: restarts by itself", {"amplifier_error", "amplifier_not_following"}, 5, lambda w: w.drive.power_up(), ""),
     ("drive: over-current (0x2310)", {"amplifier_fault"}, 2, lambda w: w.drive.fault(0x2310), ""),
     ("drive: over-temperature (0x4210)", {"amplifier_fault"}, 2, lambda w: w.drive.fault(0x4210), ""),
