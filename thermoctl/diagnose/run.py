@@ -39,6 +39,7 @@ NAME = 0.9                  # one explanation is named alone from this probabili
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 REMAINS = -8.0              # log10 p of an unknown smooth input from which something is left over
+NO_COLOUR, SOME_COLOUR = -45.0, -25.0   # the same in white noise's metric: colour of sensors gives no less than the second
 TEMPERING = 1.25, 2.0       # how much less the score decides than a perfect likelihood would, in white and in coloured noise
 BLOCKS = 16                 # of a single recording, every other one held out
 SPREAD = 0.06, 0.2          # least and greatest spread of parameters round their beliefs, in shares of their ranges
@@ -533,6 +534,8 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
         gain /= seen.inflation
     if seen.chance is None:
         return e.score < seen.base.score - ACCEPT
+    if log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) < NO_COLOUR and smooth(case, e) > SOME_COLOUR:
+        return True         # with it the residual is white; without it a sensor would need a colour such as none has
     return gain > 0 and log_p(gain, e.direction.dims) < _threshold(seen)
 
 
@@ -628,15 +631,20 @@ def _colours(e: Explanation) -> tuple[Noise, ...]:
     return tuple(Noise(c.sigma, 0.0, c.ar, c.ma) for c in e.colours)
 
 
-def remains(case: Case, e: Explanation) -> bool:
-    """Does a smooth unknown input at some node still explain more of the residual than noise of the residual's own colour
-    would let it?"""
+def smooth(case: Case, e: Explanation, coloured: bool = False) -> float:
+    """log10 p of the best smooth unknown input at one node or on one sensor; 0 where there is none."""
     drives = [e.fit.model.drive(t) for t in case.tables]
     for r, d in enumerate(drives):
         e.fit.model.prepare(d, e.fit.values[r])
-    metric = Metric(dataclasses.replace(e.fit, noise=_colours(e)), drives)
+    metric = Metric(dataclasses.replace(e.fit, noise=_colours(e)) if coloured else e.fit, drives)
     found = locate.suspects(metric)
-    return bool(found) and found[0].log_p < REMAINS
+    return found[0].log_p if found else 0.0
+
+
+def remains(case: Case, e: Explanation) -> bool:
+    """Does a smooth unknown input still explain more of the residual than noise of the residual's own colour would let it, or
+    more than the colour of any sensor would?"""
+    return smooth(case, e, coloured=True) < REMAINS or (not e.effects and smooth(case, e) < NO_COLOUR)
 
 
 def _energy(case: Case, e: Explanation) -> float:
