@@ -29,6 +29,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -479,8 +480,8 @@ def percentiles(values: np.ndarray) -> list[float]:
     return [float(np.percentile(values, q)) for q in (50, 99, 99.9)] + [float(values.max())]
 
 
-def measure(bench: Bench, rounds: int, seconds: float, stressed: bool) -> dict[str, list]:
-    """`rounds` of cyclictest, daemon, twin (their order turns), and plain where idle."""
+def measure(bench: Bench, rounds: int, seconds: float, stressed: bool) -> Iterator[dict[str, list]]:
+    """`rounds` of cyclictest, daemon, twin (their order turns), and plain where idle; what was found so far after each."""
     found: dict[str, list] = {"cyclictest": [], "daemon": [], "twin": [], "plain": []}
     runs = {"cyclictest": lambda: run_cyclictest(bench, seconds),
             "daemon": lambda: run_daemon(bench, seconds, 100.0 if stressed else 0.0),
@@ -492,7 +493,7 @@ def measure(bench: Bench, rounds: int, seconds: float, stressed: bool) -> dict[s
         if not stressed:
             found["plain"].append(run_plain(bench, seconds / 2))
         print(f"  round {k + 1} of {rounds}{' under stress' if stressed else ''} done", file=sys.stderr)
-    return found
+        yield found
 
 
 def report(law: dict, conditions: dict[str, dict], hours: list, wire: list) -> tuple[list[str], int]:
@@ -583,12 +584,16 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="thermoctl-rt-") as folder:
         bench = Bench(Path(folder), args.cpu)
         law = bench_law(bench)
+        conditions: dict[str, dict] = {}
         print(f"  law: batch {law['ratio']:.2f} x C, call {law['call_p50_us']:.2f} us", file=sys.stderr)
         try:
             bench.start_peer()
-            conditions = {"idle": measure(bench, args.rounds, args.seconds, False)}
-            with stress(bench.work):
-                conditions["stress"] = measure(bench, args.rounds, args.seconds, True)
+            for condition, load in (("idle", contextlib.nullcontext()), ("stress", stress(bench.work))):
+                with load:
+                    for found in measure(bench, args.rounds, args.seconds, condition == "stress"):
+                        conditions[condition] = found
+                        if args.out:                                  # so that a run that is cut short leaves its rounds
+                            args.out.write_text("\n".join([*head, *report(law, conditions, [], [])[0], ""]))
             wire = in_child(hours_wire, bench, args.wire_ticks) if args.wire_ticks else []
         finally:
             bench.stop_peer()
