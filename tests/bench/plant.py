@@ -237,7 +237,7 @@ def law_and_plant(seconds):
     assert list(at.values()) == [k for k, c in enumerate(CHANNELS) if c in at]
     readings = np.array(list(at.values()))
     value[CHANNELS.index("supply_v")], value[CHANNELS.index("amplifier_fault")] = 24.0, 0.0
-    amplifier = CHANNELS.index("amplifier_state")
+    amplifier, air = CHANNELS.index("amplifier_state"), CHANNELS.index("air_c")
     law = Law(compensator(settings), law_parameters(settings), 1e-3)
     law.bind(value, fresh, status)
     noise = 1e-4 * np.random.default_rng(1).normal(size=(1024, len(readings)))      # a reading that never moves is a fault
@@ -246,7 +246,7 @@ def law_and_plant(seconds):
     def ticks(count, command=0, target=0.0):
         for k in range(count):
             value[readings] = stepper.step(u) + noise[k & 1023]
-            value[amplifier] = 1.0 + (law.enable > 0)
+            value[amplifier], value[air] = 1.0 + (law.enable > 0), 22.0 + noise[k & 1023, 0]
             law.step(1e-3, command if k == 0 else 0, target)
             u[0] = law.drive
     ticks(3000)
