@@ -78,7 +78,7 @@ refit-recordings: install          # every fit quoted for the naive plants of th
 
 .PHONY: test-resolve
 test-resolve: install              # two explanations that look alike, decided by the experiment that was proposed
-	$(BIN)/python -m pytest -m slow tests/diagnose/test_experiment.py
+	$(BIN)/python -m pytest -m slow tests/diagnose/test_next_experiment.py
 
 .PHONY: test-wire
 test-wire: install                 # pulled cables and killed programs, with the daemon and the virtual rig as two programs
