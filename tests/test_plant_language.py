@@ -103,8 +103,8 @@ EXPRESSIONS = st.recursive(st.one_of(NAMES, st.floats(0.1, 9).map(lambda q: f"{q
 @given(EXPRESSIONS)
 def test_an_expression_means_what_python_means_by_it(text):
     values = {"T": 1.7, "air": -0.4, "P": 2.3, "C": 0.9, "G": 3.1, "t": 0.6}
-    functions = {"abs": abs, "sign": lambda q: float(np.sign(float(q))), "tanh": lambda q: np.tanh(float(q)),
-                 "sin": lambda q: np.sin(float(q)), "cos": lambda q: np.cos(float(q)), "max": max, "min": min,
+    functions = {"abs": abs, "sign": lambda q: float(np.sign(float(q))), "tanh": lambda q: float(np.tanh(float(q))),
+                 "sin": lambda q: float(np.sin(float(q))), "cos": lambda q: float(np.cos(float(q))), "max": max, "min": min,
                  "step": lambda q: float(q >= 0), "pi": np.pi}
     try:
         expected = float(eval(text, {"__builtins__": {}}, functions | values))

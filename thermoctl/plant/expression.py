@@ -368,7 +368,8 @@ def _text(e: Expr, outer: int) -> str:
         text = f"{_text(e.args[0], p + 1)}**{_text(e.args[1], p)}"
     else:
         right = p if e.op in ("+", "*") else p + 1
-        text = f"{_text(e.args[0], p)} {e.op} {_text(e.args[1], right)}"
+        left = p + 1 if e.op in COMPARISONS else p          # a comparison of a comparison needs its brackets
+        text = f"{_text(e.args[0], left)} {e.op} {_text(e.args[1], right)}"
     return f"({text})" if p < outer else text
 
 
