@@ -112,6 +112,7 @@ def ticks(directory):
 def test_kill_9_of_a_helper(daemon, name):
     """The loop runs on armed; the helper is back; the recorder loses at most a second."""
     daemon.armed()
+    wait(lambda: daemon.ask("status")["ticks"] > 2500, "a second and more on disk")
     pid, before = daemon.child(name), daemon.ask("status")["ticks"]
     os.kill(pid, signal.SIGKILL)
     _, seconds = wait(lambda: f"{name} ended, started again" in daemon.log, "its end is noticed", 20)
