@@ -18,7 +18,7 @@ rig-hour: install
 	-$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1 --no-compensation
 
 bench-law: install                 # what a call of the law costs, by compiler
-	$(BIN)/python -m pip install --quiet '.[bench]'
+	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python tests/bench/law_call.py
 
 test: install lint
@@ -47,7 +47,7 @@ reproduce: install                 # the paper's tests, and the better method be
 	$(BIN)/thermoctl reproduce
 
 bench-identification: install      # all bars in one run; 18 million samples take 4 GB for the peer and some minutes
-	$(BIN)/python -m pip install --quiet '.[bench]'
+	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python tests/bench/identification.py --scale
 
 test-identification: install       # experiments, identification, model in the daemon and back, on a rig in simulated time
@@ -66,7 +66,7 @@ models: install
 
 .PHONY: bench
 bench: install
-	$(BIN)/python -m pip install --quiet '.[bench]'
+	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python tests/bench/plant.py
 
 .PHONY: prove-refit refit-recordings
@@ -103,7 +103,7 @@ test-wizard: install               # thermoctl calibrate from doctor to proof, w
 # The diagnosis beside its peers on the same cases; CASES= takes other folders of cases with answers.
 .PHONY: bench-diagnosis
 bench-diagnosis: install
-	$(BIN)/python -m pip install --quiet '.[bench]'
+	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python tests/bench/diagnosis.py $(CASES)
 
 # Six and more effects concealed in rigs of the judge's own making: diagnosed, modelled, compensated; one page.
@@ -151,6 +151,6 @@ FUZZ_S ?= 20
 TARGETS := plant config expression serial slcan modbus csv parquet arrow arrows commands metadata
 fuzz: install                      # FUZZ_S seconds for each that reads bytes from outside; a find ends it, its input stays in build/fuzz
 	for target in $(TARGETS); do $(BIN)/python -m tests.fuzz.targets $$target --seconds $(FUZZ_S) || exit 1; done
-	-$(BIN)/python -m pip install --quiet '.[fuzz]'
+	-$(BIN)/python -m pip install --quiet --editable '.[fuzz]'
 	if $(BIN)/python -c "import atheris" 2>/dev/null; then for target in $(TARGETS); do \
 		$(BIN)/python -m tests.fuzz.targets $$target --atheris --seconds $(FUZZ_S) || exit 1; done; fi
