@@ -6,68 +6,16 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
 import pytest
 from conftest import ROOT
 
+from tests.daemon.process import LIMIT_S, Daemon, wait
 from thermoctl.cli import main
 from thermoctl.daemon.socket import ask
 from thermoctl.settings import load_settings
-from thermoctl.yamlfile import InputError
-
-LIMIT_S = 90.0
-
-
-def wait(condition, what, limit_s=LIMIT_S):
-    """The first true value of condition(), within the limit."""
-    deadline = time.monotonic() + limit_s
-    while time.monotonic() < deadline:
-        with contextlib.suppress(InputError):
-            found = condition()
-            if found:
-                return found
-        time.sleep(0.02)
-    raise AssertionError(f"{what}: not within {limit_s} s")
-
-
-class Daemon:
-    """`thermoctl run` on a configuration, with its log."""
-
-    def __init__(self, config):
-        self.config, self.settings = config, load_settings(config)
-        self.log_path = Path(config).with_suffix(".log")
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-        with self.log_path.open("w") as log:
-            self.process = subprocess.Popen([sys.executable, "-m", "thermoctl.cli", "run", "--config", str(config)],
-                                            stdout=log, stderr=log, env=environment)
-        try:
-            wait(lambda: self.process.poll() is not None or self.ask("status")["state"] == "READY", "READY")
-        except AssertionError:
-            self.kill()
-            raise
-        self.family = psutil.Process(self.process.pid).children(recursive=True) if self.process.poll() is None else []
-
-    def ask(self, command, **more):
-        return ask(self.settings.socket.path, {"command": command, **more})
-
-    @property
-    def log(self):
-        return self.log_path.read_text()
-
-    def child(self, name):
-        """The pid of a child, from the order that the supervisor starts them in."""
-        children = [p for p in psutil.Process(self.process.pid).children()
-                    if "resource_tracker" not in " ".join(p.cmdline())]
-        return sorted(children, key=lambda p: (p.create_time(), p.pid))[{"loop": 0, "commands": 1, "reference": 2}[name]].pid
-
-    def kill(self):
-        for process in [*getattr(self, "family", []), self.process]:
-            with contextlib.suppress(psutil.Error, OSError):
-                process.kill()
-        self.process.wait()
 
 
 @pytest.fixture
@@ -150,7 +98,7 @@ def test_bad_clients_cost_nothing(daemon):
             for _ in range(20000):
                 deaf.send(b'{"command": "latency"}\n')
         assert daemon.ask("status")["ok"]
-    status = wait(lambda: (s := daemon.ask("status"))["ticks"] > ticks + 100 and s, "the loop ticking on")
+    status, _ = wait(lambda: (s := daemon.ask("status"))["ticks"] > ticks + 100 and s, "the loop ticking on")
     assert status["state"] == "READY"
 
 
@@ -170,7 +118,7 @@ def test_a_helper_that_is_killed_comes_back_and_the_loop_runs_on(daemon, name):
     pid, ticks = daemon.child(name), daemon.ask("status")["ticks"]
     os.kill(pid, signal.SIGKILL)
     wait(lambda: not psutil.pid_exists(pid) and f"{name} ended, started again" in daemon.log, "its end is noticed")
-    now = wait(lambda: daemon.ask("status"), "an answer")
+    now, _ = wait(lambda: daemon.ask("status"), "an answer")
     assert now["state"] == "ARMED" and now["ticks"] > ticks and daemon.process.poll() is None
 
 
@@ -180,8 +128,7 @@ def test_a_loop_that_dies_or_stands_still_ends_the_daemon_with_a_safe_amplifier(
     os.kill(daemon.child("loop"), how)
     assert daemon.process.wait(LIMIT_S) == 1
     assert "the loop" in daemon.log and "could not be disabled" not in daemon.log
-    assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in daemon.family
-                   if "resource_tracker" not in _command(p))
+    assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in daemon.family)
 
 
 def test_a_supervisor_that_is_killed_takes_all_with_it(daemon):
@@ -196,13 +143,6 @@ def test_a_supervisor_that_is_killed_takes_all_with_it(daemon):
         again.kill()
 
 
-def _command(process):
-    try:
-        return " ".join(process.cmdline())
-    except psutil.Error:
-        return ""
-
-
 def test_the_first_fault_is_logged_with_its_remedy(unrecorded):
     text = unrecorded.read_text().replace("air_c: 45", "air_c: 10")
     unrecorded.write_text(text.replace("air_c: 5,", "air_c: 4,"))
@@ -212,7 +152,7 @@ def test_the_first_fault_is_logged_with_its_remedy(unrecorded):
         line = next(line for line in process.stderr if "air_range" in line)
         assert "remedy=" in line and "protection.low..high" in line
         path = load_settings(unrecorded).socket.path
-        answer = wait(lambda: ask(path, {"command": "arm"}), "an answer")
+        answer, _ = wait(lambda: ask(path, {"command": "arm"}), "an answer")
         assert not answer["ok"] and "air_range" in answer["error"] and answer["state"] == "SAFE"
         process.terminate()
         process.communicate()
@@ -285,9 +225,7 @@ def test_what_a_session_recorded_replays_to_the_bit(config, capsys):
         assert daemon.ask("reload")["applied"] == ["control.kp"]
         before = daemon.ask("status")["recorder"]["rows"]
         wait(lambda: daemon.ask("status")["recorder"]["rows"] > before + 1500, "some rows after it")
-        children = sorted((p for p in psutil.Process(daemon.process.pid).children()
-                           if "resource_tracker" not in _command(p)), key=lambda p: (p.create_time(), p.pid))
-        children[1].kill()
+        os.kill(daemon.child("recorder"), signal.SIGKILL)
         wait(lambda: "recorder ended, started again" in daemon.log, "its end is noticed")
         before = daemon.ask("status")["recorder"]["rows"]
         wait(lambda: daemon.ask("status")["recorder"]["rows"] > before + 1500, "it records again")

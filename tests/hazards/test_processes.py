@@ -12,82 +12,30 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.daemon.process import LIMIT_S, Daemon, wait
 from tests.hazards.harness import ROOT, ROWS, Row
 from thermoctl.daemon.assemble import shared_name
-from thermoctl.daemon.socket import ask
 from thermoctl.recording.table import read_table
-from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
 
 pytestmark = pytest.mark.slow
-LIMIT_S = 120.0
 
 
-def wait(condition, what, limit_s=LIMIT_S):
-    """(the first true value of condition(), seconds until it came)."""
-    begin = time.monotonic()
-    while time.monotonic() - begin < limit_s:
-        with contextlib.suppress(InputError, psutil.Error):
-            if found := condition():
-                return found, time.monotonic() - begin
-        time.sleep(0.01)                                   # how often we look, not a wait
-    raise AssertionError(f"{what}: not within {limit_s} s")
-
-
-class Daemon:
-    """`thermoctl run` on a copy of the simulated rig, recording into `directory`."""
-
-    def __init__(self, folder: Path, directory: Path, keep_config: bool = False):
-        self.config, self.directory = folder / "rig.yaml", directory
-        if not keep_config:
-            text = (ROOT / "config/simulated.yaml").read_text()
-            for old, new in (("plants/", f"{ROOT}/config/plants/"), ("models/", f"{ROOT}/config/models/"), ("../run/", f"{folder}/"),
-                             ("../recordings", str(directory)), ("reference: true", "reference: false")):
-                text = text.replace(old, new)
-            self.config.write_text(text)
-        self.settings = load_settings(self.config)
-        self.log_path = folder / "log"
-        with self.log_path.open("a") as log:
-            self.process = subprocess.Popen([sys.executable, "-m", "thermoctl.cli", "run", "--config", str(self.config)], stdout=log,
-                                            stderr=log, env={**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"})
-        try:
-            wait(lambda: self.process.poll() is not None or self.ask("status")["state"] == "READY", "READY")
-            assert self.process.poll() is None, self.log
-        except AssertionError:
-            self.kill()
-            raise
-        self.family = psutil.Process(self.process.pid).children(recursive=True)
-
-    def ask(self, command, **more):
-        return ask(self.settings.socket.path, {"command": command, **more}, 10.0)
-
-    @property
-    def log(self):
-        return self.log_path.read_text()
-
-    def child(self, name):
-        """The pid of a child, from the order that the supervisor starts them in; restarted ones are the newest."""
-        children = [p for p in psutil.Process(self.process.pid).children() if "resource_tracker" not in " ".join(p.cmdline())]
-        return sorted(children, key=lambda p: (p.create_time(), p.pid))[{"loop": 0, "recorder": 1, "commands": 2}[name]].pid
-
-    def armed(self):
-        wait(lambda: self.ask("status")["recorder"]["rows"] > 0, "the recorder")
-        wait(lambda: self.ask("arm")["ok"] or self.ask("disarm") and False, "armed")
-
-    def stop(self):
-        self.process.terminate()
-        return self.process.wait(LIMIT_S)
-
-    def kill(self):
-        for process in [*getattr(self, "family", []), self.process]:
-            with contextlib.suppress(psutil.Error, OSError):
-                process.kill()
-        self.process.wait()
+def start(folder, directory):
+    """The simulated rig's daemon, recording into `directory`, its files in `folder`."""
+    text = (ROOT / "config/simulated.yaml").read_text()
+    for old, new in (("plants/", f"{ROOT}/config/plants/"), ("models/", f"{ROOT}/config/models/"), ("../run/", f"{folder}/"),
+                     ("../recordings", str(directory)), ("reference: true", "reference: false")):
+        text = text.replace(old, new)
+    (folder / "rig.yaml").write_text(text)
+    found = Daemon(folder / "rig.yaml")
+    assert found.process.poll() is None, found.log
+    return found
 
 
 @pytest.fixture
 def daemon(tmp_path):
-    d = Daemon(tmp_path, tmp_path / "recordings")
+    d = start(tmp_path, tmp_path / "recordings")
     yield d
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.Error, OSError):
@@ -120,7 +68,7 @@ def test_kill_9_of_a_helper(daemon, name):
     assert now["state"] == "ARMED" and now["ticks"] > before
     wait(lambda: daemon.ask("status")["ticks"] > now["ticks"] + 1500, "ticks")
     assert daemon.stop() == 0
-    count, missing = ticks(daemon.directory)
+    count, missing = ticks(Path(daemon.settings.recording.directory))
     assert count > 1000 and missing <= 1500
     say(f"kill -9: {name}", "1.5 s of record", f"noticed in {seconds:.1f} s; {missing} ticks not recorded", "drives on",
         f"`{name} ended, started again`")
@@ -163,7 +111,7 @@ def test_the_recorder_stopped_for_a_while_loses_nothing(daemon):
     wait(lambda: daemon.ask("status")["recorder"]["rows"] > before + 3000, "the rows are written")
     assert daemon.ask("status")["recorder"]["lost"] == 0
     assert daemon.stop() == 0
-    count, missing = ticks(daemon.directory)
+    count, missing = ticks(Path(daemon.settings.recording.directory))
     assert missing == 0 and count > 3000
     say("SIGSTOP, SIGCONT after 3 s: recorder", "nothing lost", f"{missing} of {count} ticks", "drives on", "")
 
@@ -194,10 +142,12 @@ def test_the_supervisor_stopped_and_killed(daemon, tmp_path):
     daemon.process.kill()
     daemon.process.wait()
     _, seconds = wait(lambda: not any(p.is_running() for p in daemon.family), "all children gone", 20)
-    assert Path("/dev/shm", shared_name(daemon.settings)).exists()           # left over
-    again = Daemon(tmp_path, daemon.directory, keep_config=True)
+    left = Path("/dev/shm", shared_name(daemon.settings)).stat().st_ino      # nobody is left who could remove it
+    again = Daemon(daemon.config)
     try:
         assert again.ask("status")["state"] == "READY" and "kept=True" in again.log
+        assert Path("/dev/shm", shared_name(daemon.settings)).stat().st_ino != left
+        assert again.stop() == 0 and not Path("/dev/shm", shared_name(daemon.settings)).exists()
     finally:
         again.kill()
     say("kill -9: supervisor", "20 s", f"children gone in {seconds:.1f} s", "amplifier off by the loop; the next daemon starts into SAFE",
@@ -233,7 +183,7 @@ def small_disk(tmp_path):
 
 def test_disk_full_and_read_only(tmp_path, small_disk):
     """The disk fills up, then becomes read-only, then is well again: told once each, ticks counted as lost, the loop never waits."""
-    daemon = Daemon(tmp_path, small_disk / "recordings")
+    daemon = start(tmp_path, small_disk / "recordings")
     try:
         daemon.armed()
         filler = small_disk / "filler"

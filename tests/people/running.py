@@ -1,7 +1,6 @@
 """A simulated rig that ticks into a daemon's shared memory, in this process, with the daemon's command socket."""
 import threading
 import time
-from multiprocessing import resource_tracker
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +99,5 @@ class Running:
         self.remove()
 
     def remove(self):
-        """As at the daemon's end. Whoever attached in this process has told the resource tracker to forget it."""
-        resource_tracker.register("/" + shared_name(self.settings), "shared_memory")
+        """As at the daemon's end."""
         self.shared.remove()

@@ -31,49 +31,65 @@ class Alarm:
 
 
 class Misfit:
-    """Feed it rows in order: `add(t_s, innovation_c, kalman_gain)` returns an alarm when one is new."""
+    """Feed it rows in order: `add(t_s, innovation_c, kalman_gain)` returns an alarm when one is new. How the rows are cut
+    into calls does not matter. A model that says nothing of the coil has no innovations to watch: no alarm ever."""
 
     def __init__(self, model: CompensatorModel):
         self._gain, self._noise = float(model.C[0] @ model.gain[:, 0]), math.sqrt(model.R_v)
+        self._watches = bool(model.C[0].any())
         self.restart()
 
     def restart(self) -> None:
         """Forget what was seen: another model, or a clock that began again."""
-        self._t: list[float] = []
-        self._values: list[float] = []
+        self._rows = np.empty((3, 0))           # of the block that is not complete: t, innovation, gain
+        self._last_t, self._last_c = -math.inf, math.nan
         self.sums = [0.0, 0.0]
-        self._since = [0.0, 0.0]
-        self._seen: list[list[float]] = [[], []]
+        self._since, self._total, self._blocks = [0.0, 0.0], [0.0, 0.0], [0, 0]      # of a sum since it was zero
         self.alarmed = False
 
     def add(self, t_s: np.ndarray, innovation_c: np.ndarray, kalman_gain: np.ndarray) -> Alarm | None:
-        """Rows (n,) of each; NaN innovations (no sample yet) are left out."""
+        """Rows (n,) of each; the newest alarm that they raise. NaN innovations (no sample yet) are left out."""
+        rows = np.array([t_s, innovation_c, kalman_gain])[:, np.isfinite(t_s) & np.isfinite(innovation_c)]
         found = None
-        for t, e, k in zip(t_s.tolist(), innovation_c.tolist(), kalman_gain.tolist(), strict=True):
-            if self._t and t < self._t[-1]:
+        if not self._watches or not rows.shape[1]:
+            return found
+        begins = np.flatnonzero(np.diff(rows[0], prepend=self._last_t) < 0.0)        # the clock began again
+        for k, part in enumerate(np.split(rows, begins, axis=1)):
+            if k > 0:
                 self.restart()
-            if not math.isfinite(e) or (self._values and e == self._values[-1]):
-                continue            # the signal holds between samples of the sensor
-            self._t.append(t)
-            self._values.append(e)
-            if t - self._t[0] >= BLOCK_S:
-                share = self._gain * k
-                found = self._block(self._noise / math.sqrt(1.0 - share) if 0.0 <= share < 1.0 else self._noise) or found
+            found = self._add(part) or found
         return found
 
-    def _block(self, sigma: float) -> Alarm | None:
-        mean, n = float(np.mean(self._values)), max(1.0, len(self._values) / CORRELATED)
-        begin, end = self._t[0], self._t[-1]
-        self._t, self._values = [], []
+    def _add(self, rows: np.ndarray) -> Alarm | None:
+        found = None
+        if not rows.shape[1]:
+            return found
+        changed = np.diff(rows[1], prepend=self._last_c) != 0.0     # the signal holds between samples of the sensor
+        self._last_t, self._last_c = rows[0, -1], rows[1, -1]
+        if not changed.any():
+            return found
+        rows = np.hstack((self._rows, rows[:, changed]))
+        while rows.shape[1] and rows[0, -1] >= rows[0, 0] + BLOCK_S:
+            size = int(np.searchsorted(rows[0], rows[0, 0] + BLOCK_S)) + 1
+            found = self._block(rows[:, :size]) or found
+            rows = rows[:, size:]
+        self._rows = rows
+        return found
+
+    def _block(self, rows: np.ndarray) -> Alarm | None:
+        share = self._gain * rows[2, -1]
+        sigma = self._noise / math.sqrt(1.0 - share) if 0.0 <= share < 1.0 else self._noise
+        mean, n = float(rows[1].mean()), max(1.0, rows.shape[1] / CORRELATED)
         z = max(-CLIP, min(CLIP, mean / (sigma / math.sqrt(n))))
         found = None
         for side, sign in enumerate((1.0, -1.0)):
             if self.sums[side] == 0.0:
-                self._since[side], self._seen[side] = begin, []
+                self._since[side], self._total[side], self._blocks[side] = float(rows[0, 0]), 0.0, 0
             self.sums[side] = max(0.0, self.sums[side] + sign * z - DRIFT)
-            self._seen[side].append(mean)
+            self._total[side] += mean
+            self._blocks[side] += 1
             if self.sums[side] > LIMIT:
-                found = Alarm(self._since[side], end, float(np.mean(self._seen[side])))
+                found = Alarm(self._since[side], float(rows[0, -1]), self._total[side] / self._blocks[side])
                 self.sums[side] = LIMIT         # so that it falls back soon after the model fits again
         new = found is not None and not self.alarmed
         if found is not None:

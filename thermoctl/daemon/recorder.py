@@ -68,7 +68,8 @@ class Recorder:
 
     def __init__(self, shared: Shared, model: CompensatorModel, parameters: Parameters, period_s: float,
                  open_writer: Callable[[str], Any], log: Callable[..., None] = lambda *a, **k: None):
-        self.log, self.misfit = log, Misfit(model)
+        self.log = log
+        self.misfit: Misfit | None = Misfit(model)
         self.shared, self.model, self.parameters, self.period_s = shared, model, parameters, period_s
         self.open_writer = open_writer
         kept = shared.state.get()
@@ -81,9 +82,7 @@ class Recorder:
         """Write what the ring has; returns the rows written."""
         rows, self.position, lost = self.shared.ring.read(self.position)
         self.shared.counters[RECORDER_LOST] += lost
-        written = len(rows)
-        if written:
-            self._watch(rows)
+        written, all_rows = len(rows), rows
         while len(rows):
             if self.writer is None or rows[0, _GENERATION] != self.generation:
                 self._new_file(rows[0])
@@ -96,10 +95,18 @@ class Recorder:
                 part = part[split:]
             self._write(part)
         self.shared.counters[RECORDER_ROWS] += written
+        self._watch(all_rows)
         return written
 
     def _watch(self, rows: np.ndarray) -> None:
-        alarm = self.misfit.add(rows[:, INDEX["t_s"]], rows[:, INDEX["innovation_c"]], rows[:, INDEX["kalman_gain"]])
+        if self.misfit is None:
+            return
+        try:
+            alarm = self.misfit.add(rows[:, INDEX["t_s"]], rows[:, INDEX["innovation_c"]], rows[:, INDEX["kalman_gain"]])
+        except Exception as e:                                 # to record is what we are for: never for the watch's sake not
+            self.misfit = None
+            self.log("the watch of the model failed, the recorder goes on without it", error=repr(e))
+            return
         if alarm is not None:
             self.log("the model no longer fits", begins_s=round(alarm.begin_s, 1), ends_s=round(alarm.end_s, 1),
                      mean_innovation_c=round(alarm.mean_c, 3),

@@ -1,7 +1,8 @@
 """The shared memory of one daemon: what the loop publishes and what it is told.
 
 One segment, named after the rig, with a header that says which version and layout it has. The supervisor creates it and
-removes it; a segment left over by a killed daemon is replaced. The object must be kept while its arrays are in use.
+removes it; a segment left over by a killed daemon is replaced. It is a plain file in SHARED_MEMORY, mapped: multiprocessing's
+own class starts one more process beside the daemon, which removes what a killed daemon left at a time of its own.
 
     ring        the record of every tick (rows in the order of signals.SIGNALS)
     mailbox     commands to the loop;  parameters: the block that a RELOAD command applies
@@ -12,8 +13,9 @@ removes it; a segment left over by a killed daemon is replaced. The object must 
 from __future__ import annotations
 
 import json
+import mmap
+import os
 import zlib
-from multiprocessing import resource_tracker, shared_memory
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +30,7 @@ MAGIC = 0x7468726D6F63746C         # 'thrmoctl'
 ROWS = 8192                        # ticks a reader may lag behind
 BINS = 4096                        # us
 STATE_NUMBERS = 1024
+SHARED_MEMORY = Path("/dev/shm")
 
 _AREAS = (
     ("header", "u8", (4,)),
@@ -49,12 +52,12 @@ _LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES]).enco
 class Shared:
     """The segment with its areas; `create` in the supervisor, `attach` elsewhere."""
 
-    def __init__(self, memory: shared_memory.SharedMemory):
-        self._memory = memory
+    def __init__(self, memory: mmap.mmap, path: Path):
+        self._memory, self._path = memory, path
         at = 0
         self.areas: dict[str, np.ndarray] = {}
         for name, kind, shape in _AREAS:
-            array: np.ndarray = np.ndarray(shape, kind, memory.buf, at)
+            array: np.ndarray = np.ndarray(shape, kind, memory, at)
             self.areas[name] = array
             at += array.nbytes
         a = self.areas
@@ -71,49 +74,49 @@ class Shared:
     def create(cls, name: str) -> Shared:
         """A fresh segment; one that a killed daemon left is removed first."""
         size = sum(int(np.prod(shape)) * 8 for _, _, shape in _AREAS)
+        path = SHARED_MEMORY / name
         try:
-            old = shared_memory.SharedMemory(name)
-        except FileNotFoundError:
-            pass
+            path.unlink(missing_ok=True)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         except PermissionError:
-            raise InputError(f"shared memory '{name}': left by another user; remove /dev/shm/{name}, or take another "
+            raise InputError(f"shared memory '{name}': left by another user; remove {path}, or take another "
                              "socket.path") from None
-        except (ValueError, OSError):                          # empty: killed between making and sizing it
-            Path("/dev/shm", name).unlink(missing_ok=True)
-        else:
-            old.close()
-            old.unlink()
-        shared = cls(shared_memory.SharedMemory(name, create=True, size=size))
+        try:
+            os.ftruncate(file, size)
+            shared = cls(mmap.mmap(file, size), path)
+        finally:
+            os.close(file)
         shared.areas["header"][:] = MAGIC, VERSION, _LAYOUT, size
         return shared
 
     @classmethod
     def attach(cls, name: str) -> Shared:
-        """The segment of a running daemon. Raises InputError when there is none or it has another layout."""
+        """The segment of a running daemon. Raises InputError when there is none, it is another user's or has another layout."""
+        path = SHARED_MEMORY / name
         try:
-            memory = shared_memory.SharedMemory(name)
-        except (FileNotFoundError, ValueError):
+            file = os.open(path, os.O_RDWR)
+        except FileNotFoundError:
             raise InputError(f"shared memory '{name}': not there: no daemon runs (thermoctl start)") from None
-        # An attaching process must not remove the segment when it ends (CPython issue 82300).
-        resource_tracker.unregister(memory._name, "shared_memory")      # type: ignore[attr-defined]
-        if memory.size < 32:
+        except PermissionError:
+            raise InputError(f"shared memory '{name}': belongs to another user: run this as the daemon's user") from None
+        try:
+            memory = mmap.mmap(file, 0)
+            header = tuple(int(h) for h in np.ndarray((4,), "u8", memory))
+        except (ValueError, TypeError):                        # empty, or shorter than a header
+            header = ()
+        finally:
+            os.close(file)
+        if header[:3] != (MAGIC, VERSION, _LAYOUT) or len(memory) < header[3]:
             raise InputError(f"shared memory '{name}': of another version; restart the daemon")
-        header = np.ndarray((4,), "u8", memory.buf)
-        found = tuple(int(h) for h in header)
-        if found[:3] != (MAGIC, VERSION, _LAYOUT):
-            raise InputError(f"shared memory '{name}': of another version; restart the daemon")
-        return cls(memory)
+        return cls(memory, path)
 
     def beats(self, place: int) -> float:
         """Rounds that the helper at this place has done."""
         return float(self.counters[BEATS + place])
 
     def remove(self) -> None:
-        """Take the segment away (by its creator)."""
-        try:
-            self._memory.unlink()
-        except FileNotFoundError:
-            resource_tracker.unregister(self._memory._name, "shared_memory")      # type: ignore[attr-defined]
+        """Take the segment's name away (by its creator); the memory goes with its last user."""
+        self._path.unlink(missing_ok=True)
 
 
 def percentiles(counts: np.ndarray, fractions: tuple[float, ...] = (0.5, 0.99, 0.999)) -> list[float]:
