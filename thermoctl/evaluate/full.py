@@ -53,7 +53,7 @@ def run_test(config: str, truth: str, names: list[str], model: CompensatorModel 
 
 
 def scaled_truth(plant_file: str | Path, path: Path) -> Path:
-    """The truth plant with the proving rigs' expansions, written to `path`."""
+    """The truth plant with the proving rigs' expansions, written to `path`, whose absolute form is returned."""
     p = plant.load(plant_file)
 
     def change(data: dict) -> None:
@@ -61,7 +61,7 @@ def scaled_truth(plant_file: str | Path, path: Path) -> Path:
             data["parameters"][k]["value"] *= factor
 
     plant.save(p.extended(change), path)
-    return path
+    return path.resolve()                # settings read a relative path from their own file's folder
 
 
 def still(plant_file: Path, test: rigs.Recorded, schedule: experiments.Schedule, seed: int,
