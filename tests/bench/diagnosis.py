@@ -34,9 +34,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from thermoctl.diagnose import locate, observer, prove, run, screen
+from thermoctl.diagnose import locate, observer, prove, run, screen, search
 from thermoctl.diagnose import score as scoring
 from thermoctl.diagnose.effects import Candidate, Rig, candidates, catalogue
+from thermoctl.diagnose.explain import Case, Explanation
+from thermoctl.diagnose.heldout import unseen_errors
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
 from thermoctl.plant.refit import report
@@ -49,23 +51,23 @@ SHORT, MOST, LEVEL = 8, 3, 0.05
 
 # ------------------------------------------------------------------------------------------------------- common parts
 
-def prepared(job: prove.Job) -> tuple[run.Case, run.Explanation, Mapping[str, Any]]:
+def prepared(job: prove.Job) -> tuple[Case, Explanation, Mapping[str, Any]]:
     """The case, its plant refitted, the catalogue."""
-    case = run.Case(load(job.plant), [read_table(r) for r in job.recordings])
+    case = Case(load(job.plant), [read_table(r) for r in job.recordings])
     begun = time.monotonic()
     base = case.explain(case.plant, [], [], iterations=40)
     case.patience = max(4.0, 6 * (time.monotonic() - begun))
     return case, base, catalogue()
 
 
-def rms(case: run.Case, errors: Sequence[np.ndarray]) -> dict[str, float]:
+def rms(case: Case, errors: Sequence[np.ndarray]) -> dict[str, float]:
     """Root mean square per output over all folds."""
     stacked = np.concatenate(list(errors))
     return {o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2))) for j, o in enumerate(case.plant.outputs)
             if np.isfinite(stacked[:, j]).any()}
 
 
-def told(case: run.Case, base: run.Explanation, final: run.Explanation, suspect: str | None = None) -> dict[str, Any]:
+def told(case: Case, base: Explanation, final: Explanation, suspect: str | None = None) -> dict[str, Any]:
     """A peer's result in the form of diagnosis.json. Peers give no probabilities: each finding counts as certain."""
     drives = [final.fit.model.drive(t) for t in case.tables]
     estimates = {e.name: e for e in report(final.fit, drives)} if final.effects else {}
@@ -73,13 +75,13 @@ def told(case: run.Case, base: run.Explanation, final: run.Explanation, suspect:
                  "parameters": {p: {"value": estimates[n].value, "sd": estimates[n].sd} for p, n in own.items() if n in estimates}}
                 for c, own in zip(final.effects, final.own, strict=True)]
     verdict = "explained" if findings else "unexplained" if suspect else "consistent"
-    before = rms(case, run.unseen_errors(case, base.plant))
-    after = rms(case, run.unseen_errors(case, final.plant)) if findings else before
+    before = rms(case, unseen_errors(case, base.plant))
+    after = rms(case, unseen_errors(case, final.plant)) if findings else before
     return {"verdict": verdict, "findings": findings, "alternatives": [], "suspect": suspect,
             "fit": {"held_out_refit_only": before, "held_out_after": after}}
 
 
-def white(e: run.Explanation) -> tuple[float, int]:
+def white(e: Explanation) -> tuple[float, int]:
     """-2 log likelihood of Gaussian white residuals with their own variance per output, and the number of samples."""
     stacked = np.concatenate(e.fit.residuals)
     total, n = 0.0, 0
@@ -91,14 +93,14 @@ def white(e: run.Explanation) -> tuple[float, int]:
     return total, n
 
 
-def forward(case: run.Case, start: run.Explanation, entries: Mapping[str, Any], price: Callable[[int, int], float]) -> run.Explanation:
+def forward(case: Case, start: Explanation, entries: Mapping[str, Any], price: Callable[[int, int], float]) -> Explanation:
     """Add the candidate whose likelihood gains most beyond its price (parameters, samples) until none does."""
     current = start
     for _ in range(MOST):
-        seen = run.look(case, current, entries, draws=0)
+        seen = search.look(case, current, entries, draws=0)
         best, margin = None, 0.0
         now, samples = white(current)
-        for rival in run.compete(case, seen, run.finalists(seen.directions, SHORT)[:SHORT]):
+        for rival in search.compete(case, seen, search.finalists(seen.directions, SHORT)[:SHORT]):
             added = sum(len(case.tables) if rival.plant.parameters[n].per_recording else 1 for n in rival.own[-1].values())
             gain = now - white(rival)[0] - price(added, samples)
             if gain > margin:
@@ -193,7 +195,7 @@ def sindy(job: prove.Job) -> dict[str, Any]:
         direction = screen.Direction(dataclasses.replace(c, rig=Rig(current.plant, drives, rig.columns)),
                                      {k: v for k, v in kept.items() if k and not k.startswith("=")}, 0.0, 1, start)
         try:
-            plant, own = run.extend(current.plant, direction, drives)
+            plant, own = search.extend(current.plant, direction, drives)
             current = case.explain(plant, [*current.effects, c], [*current.own, own])
         except (SimulationError, InputError, np.linalg.LinAlgError):
             continue

@@ -7,8 +7,9 @@ import pytest
 import yaml
 
 from thermoctl.cli import main
-from thermoctl.diagnose import experiment, run
+from thermoctl.diagnose import experiment, search
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
+from thermoctl.diagnose.explain import Case
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.plant.language import loads
 from thermoctl.recording.table import Table, read_table, write_table
@@ -38,11 +39,11 @@ def short_pulses():
 def undecided():
     """A case, and a diagnosis of it that two refitted explanations share; both stand for what a whole diagnosis would hold."""
     table = loads(TRUTH).compile(()).measure(short_pulses(), seed=1)
-    case = run.Case(loads(BELIEF), [table])
+    case = Case(loads(BELIEF), [table])
     base = case.explain(case.plant, [], [], iterations=40)
     entries = {k: e for k, e in catalogue((CATALOGUE,)).items() if k in ("radiation", "temperature_dependent_conductance")}
-    seen = run.look(case, base, entries, draws=0)
-    found = run.compete(case, seen, run.finalists(seen.directions))
+    seen = search.look(case, base, entries, draws=0)
+    found = search.compete(case, seen, search.finalists(seen.directions))
     assert {e.last.effect.name for e in found} == set(entries)
     for e in found:
         e.probability = 0.5
@@ -126,7 +127,7 @@ def test_on_the_programs_own_rig_the_setpoint_is_driven(tmp_path):
     t = np.arange(300.0)
     setpoint = 100 * (t // 50 % 3)
     table = Table("r", "r", t, {"power_w": 0.01 * setpoint, "setpoint_um": setpoint, "air": np.full(300, 20.0), "T_block": 20 + t / 300})
-    case = run.Case(plant, [table])
+    case = Case(plant, [table])
     chosen = experiment.Excitation("hold", 60.0, {"heat": np.array([[0, 0.0], [10, 1.5], [60, 1.5]])}, {"air": 20.0})
     experiment.write(tmp_path, case, {"why": "", "sample_s": 1.0}, chosen)
     schedule = load_experiments(tmp_path / "next_experiment.yaml")["next_experiment"]

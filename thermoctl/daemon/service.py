@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.daemon.socket import ask
+from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 
 UNIT = "thermoctl.service"
 START_S, STOP_S = 60.0, 10.0
-_CHECKOUT = Path(__file__).resolve().parents[2] / "systemd"
-SOURCE = _CHECKOUT if _CHECKOUT.is_dir() else Path(sys.prefix) / "share/thermoctl/systemd"      # where a wheel puts them
+SOURCE = shipped("systemd")
 FILES = {                            # what `service install` puts where
     "thermoctl.service": "/etc/systemd/system/thermoctl.service",
     "thermoctl.sysusers": "/etc/sysusers.d/thermoctl.conf",

@@ -11,6 +11,7 @@ import numpy as np
 
 from thermoctl.diagnose.screen import Metric
 from thermoctl.plant.refit import Fit, Noise
+from thermoctl.plant.simulate import Drive
 from thermoctl.recording.table import Table
 
 STILL = 6.0         # an output whose whole spread is below this many sigmas of its noise does not move
@@ -18,14 +19,13 @@ FOLLOWS = 0.3       # share of an output's variation that a plant of the right r
 BOUNDS = 0.5        # share of the parameters at their bounds from which the rig is doubted
 
 
-def still(fitted: Fit, noise: Sequence[Noise], moving: bool) -> str | None:
-    """No input moves and no output does: nothing of the plant is excited. `moving`: does any input change?"""
-    if moving:
+def still(drives: Sequence[Drive], noise: Sequence[Noise]) -> str | None:
+    """No input moves and no output does: nothing of the plant is excited."""
+    if any(np.ptp(d.u[:, j]) > 0 for d in drives for j in range(d.u.shape[1])):
         return None
-    for j in range(len(noise)):
-        for d, r in zip(fitted.values, fitted.residuals, strict=True):
-            if len(d) and np.isfinite(r[:, j]).any() and _spread(r[:, j]) > STILL * noise[j].sigma:
-                return None
+    for j, n in enumerate(noise):
+        if any(np.isfinite(d.y[:, j]).any() and _spread(d.y[:, j]) > STILL * n.sigma for d in drives):
+            return None
     return ("no input of the plant changes in these recordings and no output moves: next to nothing is excited, so next to nothing "
             "could be seen missing; record a run with the inputs moved")
 

@@ -21,8 +21,9 @@ from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Flow, Input, Node, Parameter, Plant
 from thermoctl.plant.simulate import Drive, Simulation
 from thermoctl.plant.units import dimension
+from thermoctl.shipped import shipped
 
-CATALOGUE = Path(__file__).parents[2] / "config" / "effects"
+CATALOGUE = shipped("config/effects")
 _KEYS = ("effect", "title", "where", "needs", "change", "variants", "shapes", "parameters", "dims", "prior",
          "caution", "excited_by", "mimics", "source")
 _SHAPES = ("onsets", "windows", "times", "lags", "delays", "periods", "phases", "end_levels", "high_levels", "drive_levels",

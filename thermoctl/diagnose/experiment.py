@@ -36,7 +36,8 @@ from thermoctl.recording.table import Table, write_table
 from thermoctl.yamlfile import InputError
 
 if TYPE_CHECKING:
-    from thermoctl.diagnose.run import Case, Diagnosis, Explanation
+    from thermoctl.diagnose.explain import Case, Explanation
+    from thermoctl.diagnose.outcome import Diagnosis
 
 FORMAT = "thermoctl-experiments/1"
 FILES = ("next_experiment.yaml", "next_experiment.csv")
@@ -334,10 +335,10 @@ def propose(case: Case, found: Diagnosis, drivable: Sequence[str] = (),
     outputs = list(case.model.outputs)
     seen = [j for j, o in enumerate(outputs) if any(np.isfinite(d.y[:, j]).any() for d in case.drives)]
 
-    points, deadline = min(POINTS, max(READINGS // len(outputs), 150)), time.monotonic() + SECONDS
+    points, deadline = min(POINTS, max(READINGS // len(outputs), 150)), time.thread_time() + SECONDS
 
     def judged(x: Excitation) -> tuple[float, np.ndarray, list] | None:
-        if time.monotonic() > deadline:
+        if time.thread_time() > deadline:
             return None
         grid = max(step, x.duration_s / points)
         table = x.table(case.plant, grid)

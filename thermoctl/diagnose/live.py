@@ -1,9 +1,9 @@
 """`thermoctl diagnose --live`: the daemon's own recordings, searched for where its model no longer fits, as a recording to
 diagnose.
 
-The 10 Hz tier of the newest session is read back for some hours, averaged to a second, and its innovations go through the
-same sum as in the daemon (daemon/misfit.py). The stretch from well before the onset to now is written as a CSV whose columns
-are those of the thermal plant.
+The 10 Hz tier of the newest session is read back for some hours, and its innovations go through the same sum as in the daemon
+(daemon/misfit.py). The stretch from well before the onset to now is averaged to seconds and written as a CSV whose columns are
+those of the thermal plant.
 """
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STEP_S = 1.0
 
 
 def newest(directory: str | Path, rig: str, hours: float) -> Table:
-    """The newest session of a rig, at most so many hours back, one row a second. Raises InputError where there is none."""
+    """The newest session of a rig, at most so many hours back, as recorded. Raises InputError where there is none."""
     folder = Path(directory)
     files = [p for p in recording_files(folder, TIER) if p.name.startswith(rig + "-")] if folder.is_dir() else []
     parts: list[Table] = []
@@ -36,35 +36,37 @@ def newest(directory: str | Path, rig: str, hours: float) -> Table:
     if not parts:
         raise InputError(f"{directory}: no recording of the rig '{rig}'; the daemon writes them while `recording: enable` is on")
     parts.reverse()
-    t = np.concatenate([p.t for p in parts])
-    bins = np.floor((t - t[0]) / _STEP_S).astype(int)
-    count = np.bincount(bins)
-    there = count > 0
-    columns = {}
-    for name in set.intersection(*(set(p.columns) for p in parts)):
-        values = np.concatenate([p.columns[name] for p in parts])
-        good = np.isfinite(values)
-        total, n = np.bincount(bins[good], values[good], len(count)), np.bincount(bins[good], minlength=len(count))
-        columns[name] = np.where(n > 0, total / np.maximum(n, 1), np.nan)[there]
-    begins = t[0] + np.arange(len(count))[there] * _STEP_S
-    return Table(rig, str(files[-1]), begins, columns)
+    names = set.intersection(*(set(p.columns) for p in parts))
+    return Table(rig, str(files[-1]), np.concatenate([p.t for p in parts]), {n: np.concatenate([p.columns[n] for p in parts]) for n in names})
 
 
 def where(settings: Any, table: Table) -> list[Alarm]:
     """Every time that the model stopped fitting in a table of `newest`."""
     watch = Misfit(compensator(settings))
     out = []
-    for k in range(0, len(table.t), 60):
-        rows = slice(k, k + 60)
-        # Means of a second hold ten samples of the sensor each: their scatter is smaller, a lasting shift is the same.
+    for k in range(0, len(table.t), 10):
+        rows = slice(k, k + 10)         # as the daemon sees them: an alarm that came and went between is not lost
         found = watch.add(table.t[rows], table.columns["innovation_c"][rows], table.columns["kalman_gain"][rows])
         if found is not None:
             out.append(found)
     return out
 
 
+def seconds(table: Table) -> Table:
+    """Means of a second, NaN where nothing was measured in it."""
+    bins = np.floor((table.t - table.t[0]) / _STEP_S).astype(int)
+    there = np.bincount(bins) > 0
+    columns = {}
+    for name, values in table.columns.items():
+        good = np.isfinite(values)
+        total, n = (np.bincount(bins[good], w, len(there)) for w in (values[good], None))
+        columns[name] = np.where(n > 0, total / np.maximum(n, 1), np.nan)[there]
+    return Table(table.name, table.path, table.t[0] + np.flatnonzero(there) * _STEP_S, columns)
+
+
 def extract(plant: Plant, table: Table, alarm: Alarm | None, out: str | Path) -> None:
-    """Write what the plant reads of the table, from BEFORE_S before the alarm on (None: all of it). Raises InputError."""
+    """Write what the plant reads of the table, in means of a second, from BEFORE_S before the alarm on (None: all of it). Raises InputError."""
+    table = seconds(table)
     known = dict(table.columns)
     if {"output_reference_um", "position_raw_um"} <= set(known):
         known.setdefault("position_error_um", known["output_reference_um"] - known["position_raw_um"])

@@ -14,7 +14,8 @@ from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, page, table, unit
 
 if TYPE_CHECKING:
-    from thermoctl.diagnose.run import Case, Diagnosis, Explanation
+    from thermoctl.diagnose.explain import Case, Explanation
+    from thermoctl.diagnose.outcome import Diagnosis
 
 POINTS = 1500           # of a curve; more would only make the page heavy
 SHOWN = 6               # outputs that are drawn, worst first

@@ -278,7 +278,7 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
         tries: int = 0, seed: int = 0, seconds: float = 600.0, progress: Callable[[str], None] | None = None) -> Fit:
     """Fit the active parameters that have a range (and uncertain initial states) to the drives.
 
-    `seconds`: after which no further iteration is begun. `tries`: how many starts drawn over the ranges are looked at
+    `seconds` of this thread's CPU time: after which no further iteration is begun. `tries`: how many starts drawn over the ranges are looked at
     besides the given one; the best two are followed.
     Raises SimulationError where no start can be simulated, InputError where there is nothing to compare."""
     for d in drives:
@@ -301,7 +301,7 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
         starts += [z for _, z in looked[:2]]
     best: Fit | None = None
     failure: SimulationError | None = None
-    deadline = time.monotonic() + seconds
+    deadline = time.thread_time() + seconds
     for z in starts:
         try:
             problem.set_outlier_limits(problem.evaluate(z, False)[3])
@@ -339,7 +339,7 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float,
     for done in range(1, iterations + 1):       # noqa: B007 the count is reported
         held = ((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0))
         free = np.flatnonzero(~held)
-        if not len(free) or time.monotonic() > deadline:
+        if not len(free) or time.thread_time() > deadline:
             break
         improved = False
         for _ in range(12):

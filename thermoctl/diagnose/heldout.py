@@ -1,0 +1,131 @@
+"""What an explanation is worth on data that took no part in its fit."""
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnose.explain import Case, Explanation
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import fit, updated
+from thermoctl.plant.simulate import Drive, Model, SimulationError
+from thermoctl.recording.table import Table
+
+BLOCKS = 16                 # of a single recording, every other one held out
+
+
+def folds(case: Case) -> list[tuple[list[int], list[Table], list[Table]]]:
+    """(test recordings, training tables, test tables): each recording in turn; a single one is cut into blocks, of which
+    every other one is held out, and then the others."""
+    if len(case.tables) > 1:
+        return [([r], [t for q, t in enumerate(case.tables) if q != r], [case.tables[r]]) for r in range(len(case.tables))]
+    (table,) = case.tables
+    span = (table.t - table.t[0]) / max(float(table.t[-1] - table.t[0]), 1e-300)
+    odd = (np.minimum(span * BLOCKS, BLOCKS - 1).astype(int) % 2).astype(bool)
+    measured = {o.column for o in case.plant.outputs.values()}
+
+    def masked(keep: np.ndarray) -> Table:
+        columns = {k: np.where(keep, v, np.nan) if k in measured else v for k, v in table.columns.items()}
+        return dataclasses.replace(table, columns=columns)
+    return [([0], [masked(~held)], [masked(held)]) for held in (odd, ~odd)]
+
+
+def unseen_errors(case: Case, plant: Plant, refit: bool = True) -> list[np.ndarray]:
+    """Free-run errors (N, outputs) on each fold's test data, the plant fitted to that fold's training data only."""
+    out: list[np.ndarray] = []
+    for _, train, test in folds(case):
+        model = plant.compile()
+        drives = [model.drive(t) for t in test]
+        try:
+            dx0 = None
+            if refit:
+                training = [model.drive(t) for t in train]
+                found = fit(model, training, case.noise, iterations=15, seconds=case.patience)
+                model = Model(updated(plant, found, training), model.code)
+                if train[0].path == test[0].path:       # one recording, split: its start took part
+                    dx0 = found.dx0[0]
+            out += [_but_for_start(case, model, d) if dx0 is None and model.uncertain
+                    else d.y - model.run(model.prepare(d), None, dx0).y for d in drives]
+        except SimulationError:
+            out += [np.full_like(d.y, np.nan) for d in drives]
+    return out
+
+
+def _but_for_start(case: Case, model: Model, d: Drive) -> np.ndarray:
+    """Free-run error on a recording that took no part, less what its uncertain start explains at first order: where it began
+    is no physics, and a free axis carries an error of its start to the end."""
+    run = model.run(model.prepare(d), None, None, sensitivities=True)
+    assert run.dy is not None
+    error = d.y - run.y
+    good = np.isfinite(error)
+    scale = np.array([n.sigma for n in case.noise])
+    by_start = run.dy[:, :, len(model.active):]
+    prior = np.array([model.plant.nodes[n].initial_sigma or 1.0 for n in model.uncertain])
+    rows, left = (by_start / scale[None, :, None])[good] * prior, (error / scale)[good]
+    shift = np.linalg.solve(rows.T @ rows + np.eye(len(prior)), rows.T @ left) * prior
+    return error - by_start @ shift
+
+
+def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray],
+                draws: int = 400) -> tuple[float, float, float]:
+    """Ratio of held-out rms after / before over all outputs in units of their noise, with its 90 % interval (paired block
+    bootstrap), whose upper end is a one-sided 95 % bound."""
+    sigma = np.array([n.sigma for n in case.noise])
+    pairs = []
+    for a, b in zip(before, after, strict=True):
+        if not np.isfinite(b[np.isfinite(a)]).all():
+            return np.inf, np.inf, np.inf
+        x, y = np.nansum((a / sigma) ** 2, axis=1), np.nansum((b / sigma) ** 2, axis=1)
+        block = max(5, len(x) // 20)
+        n = len(x) // block
+        x, y = x[:n * block].reshape(n, block).sum(1), y[:n * block].reshape(n, block).sum(1)
+        pairs += [(p, q) for p, q in zip(x, y, strict=True) if p > 0]
+    values = np.array(pairs)
+    if len(values) < 4:
+        return 1.0, 0.0, np.inf
+    index = np.random.default_rng(3).integers(0, len(values), (draws, len(values)))
+    ratio = np.sqrt(values[index, 1].sum(1) / np.maximum(values[index, 0].sum(1), 1e-300))
+    return (float(np.sqrt(values[:, 1].sum() / values[:, 0].sum())), float(np.quantile(ratio, 0.05)),
+            float(np.quantile(ratio, 0.95)))
+
+
+def held_out(case: Case, base: Explanation, final: Explanation) -> dict[str, Any]:
+    """Fit the plant's own parameters, and those of the explanation, without some of the data; errors on that data."""
+    out = {"before": unseen_errors(case, case.plant, refit=False), "refit_only": unseen_errors(case, base.plant)}
+    out["after"] = unseen_errors(case, final.plant) if final.effects else out["refit_only"]
+    figures: dict[str, Any] = {f"held_out_{k}": rms(case.model, v) for k, v in out.items()}
+    figures["gain"] = _gain(case, out["refit_only"], out["after"]) if final.effects else {}
+    return figures
+
+
+def _gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray], draws: int = 400) -> dict[str, Any]:
+    """Per output: held-out rms ratio after / refit only with a 95 % interval by paired block bootstrap."""
+    rng = np.random.default_rng(2)
+    out = {}
+    for j, o in enumerate(case.model.outputs):
+        pairs = []
+        for a, b in zip(before, after, strict=True):
+            good = np.isfinite(a[:, j]) & np.isfinite(b[:, j])
+            if good.sum() < 20:
+                continue
+            block = max(5, int(good.sum()) // 25)
+            x, y = a[good, j] ** 2, b[good, j] ** 2
+            n = len(x) // block
+            pairs += list(zip(x[:n * block].reshape(n, block).mean(1), y[:n * block].reshape(n, block).mean(1), strict=True))
+        if len(pairs) < 4:
+            continue
+        values = np.array(pairs)
+        index = rng.integers(0, len(values), (draws, len(values)))
+        ratio = np.sqrt(values[index, 1].sum(1) / np.maximum(values[index, 0].sum(1), 1e-300))
+        out[o] = {"ratio": float(np.sqrt(values[:, 1].sum() / max(values[:, 0].sum(), 1e-300))),
+                  "interval": [float(np.quantile(ratio, 0.025)), float(np.quantile(ratio, 0.975))]}
+    return out
+
+
+def rms(model: Model, residuals: Sequence[np.ndarray]) -> dict[str, float]:
+    """Root mean square per output that was measured, of residuals per recording (N, outputs)."""
+    stacked = np.concatenate(list(residuals))
+    return {o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2))) for j, o in enumerate(model.outputs)
+            if np.isfinite(stacked[:, j]).any()}

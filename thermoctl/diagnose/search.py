@@ -1,0 +1,424 @@
+"""The search for what was left out: screen the catalogue from an explanation, refit the best entries in full, keep what
+counts, look again."""
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnose import locate, observer
+from thermoctl.diagnose.effects import Candidate, Rig, candidates
+from thermoctl.diagnose.evidence import LARGE
+from thermoctl.diagnose.explain import Case, Explanation
+from thermoctl.diagnose.heldout import pooled_gain, unseen_errors
+from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Noise
+from thermoctl.plant.simulate import Drive, SimulationError
+from thermoctl.yamlfile import InputError
+
+PATIENCE_S = 60.0           # CPU seconds of a diagnosis beyond which it looks at fewer pairs and runners-up
+FINALISTS = 12
+ACCEPT = 12.0               # an effect must lower the score by this much beyond its parameters' price
+CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
+NO_COLOUR, SOME_COLOUR = -35.0, -25.0   # the same in white noise's metric: colour of sensors gives no less than the second
+MOST_IN_PAIRS = 250         # directions that are looked at two by two
+CHI2_MEDIAN = 0.455         # of one degree of freedom
+MARGINAL = 200.0            # a gain in score below this is looked at twice
+DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
+
+
+def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, float]]:
+    """Where a refit may move the effect's parameters: physics' bounds, and wide round the screening's estimate."""
+    out = {}
+    for p in direction.candidate.effect.parameters:
+        value = direction.start[p.name]
+        kind = direction.candidate.effect.shapes.get(p.shape or "", "")
+        if p.shape in ("onset", "start", "end"):
+            if value <= duration:
+                out[p.name] = (0.0, duration)
+            continue
+        if p.shape == "phase":
+            out[p.name] = (-8.0, 8.0)
+            continue
+        if p.shape == "period":
+            out[p.name] = (0.75 * value, 1.33 * value)
+            continue
+        if p.shape == "level":
+            reach = max(abs(value), 1e-9)
+            out[p.name] = (max(p.low, value - 3 * reach), value + 3 * reach) if kind != "small_levels" else (0.0, 5 * reach)
+            continue
+        if p.shape:
+            out[p.name] = (max(p.low, value / 30), min(p.high, value * 30)) if kind != "delays" else (0.0, value * 8)
+            continue
+        floor, ceiling = direction.candidate.bounds(p)
+        if np.isfinite(floor) and np.isfinite(ceiling):
+            out[p.name] = (floor, ceiling)
+            continue
+        reach = 30 * max(abs(value - p.null), 1e-3 * abs(p.null), 1e-12)
+        low, high = max(p.low, p.null - reach), min(p.high, p.null + reach)
+        if p.name == "C" and value > 0:
+            low, high = value / 100, value * 100
+        out[p.name] = (low, high)
+    return out
+
+
+def weaker(direction: Direction, share: float = 0.1) -> Direction:
+    """The direction with a start at a tenth of its size."""
+    effect, start = direction.candidate.effect, dict(direction.start)
+    for p in effect.parameters:
+        if p.amplitude or effect.shapes.get(p.shape or "") in ("small_levels", "lags", "delays"):
+            start[p.name] = p.null + share * (start[p.name] - p.null)
+    return dataclasses.replace(direction, start=start)
+
+
+def extend(base: Plant, direction: Direction, drives: Sequence[Drive]) -> tuple[Plant, dict[str, str]]:
+    """The plant with a screened effect at its starting values, and the plant's names of the effect's parameters."""
+    duration = max(float(d.t[-1]) for d in drives)
+    ranges = ranges_of(direction, duration)
+    values: dict[str, Any] = {}
+    for p in direction.candidate.effect.parameters:
+        value = direction.start[p.name] if p.typical is None else p.typical
+        if p.name in ranges:
+            low, high = ranges[p.name]
+            inside = 1e-4 * (high - low)
+            value = float(np.clip(value, low + inside, high - inside))
+        values[p.name] = value
+    plant = direction.candidate.extend(values, ranges)
+    return plant, {p.name: direction.candidate.own(p.name) for p in direction.candidate.effect.parameters
+                   if direction.candidate.own(p.name) in plant.parameters}
+
+
+@dataclass
+class Round:
+    """One look at the catalogue from one explanation."""
+    base: Explanation
+    metric: Metric
+    rig: Rig
+    directions: list[Direction]
+    chance: np.ndarray | None
+    inflation: float | None = None
+    finalists: list[Explanation] = field(default_factory=list)
+
+    def p_any(self) -> float:
+        """The chance that noise alone makes some candidate look as good as the best one."""
+        if not self.directions or self.chance is None:
+            return 1.0
+        best = self.directions[0].log_p
+        hits = int(np.sum(self.chance <= best))
+        if hits:
+            return (hits + 1) / (len(self.chance) + 1)
+        floor = float(np.quantile(self.chance, 0.1))        # beyond the draws: the tail goes on as it does there
+        return float(min(1 / (len(self.chance) + 1), 0.1 * 10 ** (best - floor)))
+
+
+def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool = False) -> Round:
+    """Screen the catalogue from an explanation; `coloured`: in the metric of the residual's own colour."""
+    model = base.fit.model
+    drives = [model.drive(t) for t in case.tables]
+    for d in drives:
+        model.prepare(d, base.fit.values[drives.index(d)])
+    metric = Metric(dataclasses.replace(base.fit, noise=_colours(base)) if coloured else base.fit, drives)
+    rig = Rig(base.plant, drives, [t.columns for t in case.tables])
+    found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
+    noise = np.random.default_rng(1).standard_normal((len(metric.residual), draws)) if draws else None
+    ranked, chance = screen(metric, rig, found, noise)
+    return Round(base, metric, rig, ranked, chance)
+
+
+def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direction]:
+    """The best directions, and the best of each effect that is not far behind: one per (effect, place)."""
+    taken: dict[tuple[str, str], Direction] = {}
+    if not ranked:
+        return []
+    best = ranked[0].gain
+    for d in ranked:
+        if d.candidate.key not in taken and d.gain > 12:
+            taken[d.candidate.key] = d
+    ordered = list(taken.values())
+    out = ordered[:count]
+    names = {d.candidate.effect.name for d in out}
+    for d in ordered[count:]:
+        if d.candidate.effect.name not in names and d.gain > 0.3 * best and len(out) < count + 8:
+            out.append(d)
+            names.add(d.candidate.effect.name)
+    return out
+
+
+def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explanation]:
+    """Refit each direction in full; best score first."""
+    def tried(direction: Direction) -> Explanation | None:
+        try:
+            plant, own = extend(seen.base.plant, direction, seen.metric.drives)
+            e = case.explain(plant, [*seen.base.effects, direction.candidate], [*seen.base.own, own])
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            return None
+        e.direction = direction
+        return e
+
+    def one(direction: Direction) -> Explanation | None:
+        e = tried(direction)
+        if e is None or e.raw > seen.base.raw:      # led astray by a start too far out: once more from nearer to nothing
+            again = tried(weaker(direction))
+            e = again if e is None or (again is not None and again.score < e.score) else e
+        return e
+    with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
+        done = [e for e in pool.map(one, chosen) if e is not None]
+    case.reprice([seen.base, *done])
+    done.sort(key=lambda e: e.score)
+    return done
+
+
+def pairs(seen: Round, count: int = 4) -> list[tuple[Direction, Direction]]:
+    """Pairs of directions that explain much more together than the better one alone: effects that nearly cancel. From the
+    same first-order rows, without a refit: with a, b the two scores and c the cosine, gain = (a^2 + b^2 - 2abc) / (1 - c^2)."""
+    alone = [d for d in seen.directions if d.vector is not None and d.dims == 1][:MOST_IN_PAIRS]
+    if len(alone) < 2:
+        return []
+    vectors = np.stack([d.vector for d in alone], axis=1).astype(float)     # type: ignore[misc]
+    score = vectors.T @ seen.metric.residual
+    cosine = vectors.T @ vectors
+    a, b = score[:, None], score[None, :]
+    joint = (a ** 2 + b ** 2 - 2 * a * b * cosine) / np.maximum(1 - cosine ** 2, 1e-3)
+    joint[np.tril_indices(len(alone))] = 0.0
+    out: list[tuple[Direction, Direction]] = []
+    for flat in np.argsort(-joint, axis=None)[:200]:
+        i, j = np.unravel_index(flat, joint.shape)
+        first, second = alone[int(i)], alone[int(j)]
+        if joint[i, j] < max(first.gain, second.gain) + 2 * ACCEPT or len(out) >= count:
+            break
+        keys = {first.candidate.key, second.candidate.key}
+        if len(keys) == 2 and all({x.candidate.key, y.candidate.key} != keys for x, y in out):
+            out.append((first, second))
+    return out
+
+
+def compete_pairs(case: Case, seen: Round, chosen: Sequence[tuple[Direction, Direction]]) -> list[Explanation]:
+    """Refit each pair in full; best score first."""
+    def both(item: tuple[Direction, Direction]) -> Explanation | None:
+        first, second = item
+        try:
+            plant, own = extend(seen.base.plant, first, seen.metric.drives)
+            moved = dataclasses.replace(second, candidate=_on(second.candidate, plant))
+            plant, other = extend(plant, moved, seen.metric.drives)
+            e = case.explain(plant, [*seen.base.effects, first.candidate, moved.candidate], [*seen.base.own, own, other])
+        except (SimulationError, InputError, LookupError, np.linalg.LinAlgError):
+            return None
+        e.direction = dataclasses.replace(moved, dims=first.dims + second.dims)
+        return e
+    with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
+        done = [e for e in pool.map(both, chosen) if e is not None]
+    case.reprice([seen.base, *done])
+    return sorted(done, key=lambda e: e.score)
+
+
+def inflation(ranked: Sequence[Direction]) -> float:
+    """How much larger than by chance the catalogue's gains are: noise whose colour the model of noise does not quite hold
+    makes all of them larger. The median over entries without a shape, drawn towards 1 where they are few (Devlin & Roeder
+    1999, genomic control)."""
+    plain = [d.gain for d in ranked if d.dims == 1 and not d.candidate.effect.shapes]
+    if not plain:
+        return 1.0
+    return max(1.0, (len(plain) * float(np.median(plain)) / CHI2_MEDIAN + 10) / (len(plain) + 10))
+
+
+def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) -> bool:
+    """Is an explanation better than what chance alone would make of the best of all candidates? The gain in score is held
+    against the smallest chance p that pure noise showed over the whole catalogue."""
+    assert e.direction is not None
+    gain = seen.base.raw - e.raw
+    if 0 < gain < MARGINAL:
+        if seen.inflation is None:      # beside what was found: an effect that is found inflates no longer
+            seen.inflation = inflation(look(case, e, entries, draws=0, coloured=True).directions)
+        gain /= seen.inflation
+    if seen.chance is None:
+        return e.score < seen.base.score - ACCEPT
+    if log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) < NO_COLOUR and smooth(case, e) > SOME_COLOUR:
+        return True         # with it the residual is white; without it a sensor would need a colour such as none has
+    return gain > 0 and log_p(gain, e.direction.dims) < threshold(seen)
+
+
+def threshold(seen: Round) -> float:
+    """log10 p that an effect must fall below: what the best of all candidates would show by chance, and a little more."""
+    return (min(float(np.min(seen.chance)), -3.5) if seen.chance is not None else -5.0) - 0.3
+
+
+def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
+           start: Explanation | None = None, first: Round | None = None) -> tuple[Explanation, list[Explanation], list[Round]]:
+    """Add effects (to `start`, if given) while the evidence asks for them; then take each out again. `first`: the look from
+    there, where it was taken. Returns the best explanation, its rivals and the looks that were taken."""
+    case.progress("screening the catalogue")
+    current = start or base
+    rounds = [first or look(case, current, entries)]
+    rivals: list[Explanation] = []
+    while len(current.effects) < most:
+        seen = rounds[-1]
+        if seen.p_any() > 1e-3 and max(case.excess(current).values(), default=0.0) < CLEAN:
+            break
+        chosen = finalists(seen.directions)
+        if not chosen:
+            break
+        case.progress(f"refitting {len(chosen)} explanations")
+        seen.finalists = compete(case, seen, chosen)
+        # The best score that also predicts: a rival that merely fits better gives way to the next.
+        before = unseen_errors(case, current.plant)
+        best = next((e for e in seen.finalists[:4] if counts(case, seen, e, entries)
+                     and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0), None)
+        if best is None and not current.effects and seen.p_any() < 1e-3 and time.process_time() - case.begun < PATIENCE_S:
+            case.progress("looking for two effects that hide each other")
+            together = compete_pairs(case, seen, pairs(seen))
+            best = next((e for e in together if counts(case, seen, e, entries)), None)
+            seen.finalists = together + seen.finalists if best else seen.finalists
+        if best is None:
+            break
+        current, rivals = best, [e for e in seen.finalists if e is not best and e.score > best.score - 2 * ACCEPT]
+        if len(current.effects) >= most:
+            break
+        case.progress("screening again")
+        rounds.append(look(case, current, entries))
+        if len(current.effects) == 1 and max(case.excess(current).values()) > LARGE and time.process_time() - case.begun < PATIENCE_S:
+            # A first choice made beside other missing physics can be wrong: the runners-up get their second effect, too.
+            best = None
+            others: list[Explanation] = []
+            for other in _runners_up(seen.finalists):
+                again = rounds[-1] if other is current else look(case, other, entries, draws=0)
+                found = compete(case, again, finalists(again.directions, 6))
+                if found and (best is None or found[0].score < best.score):
+                    best, others = found[0], found[1:]
+            if best is not None and best.score < current.score - ACCEPT:
+                current, rivals = best, others
+                rounds.append(look(case, current, entries))
+    if len(current.effects) > 1:
+        current, rivals = _backward(case, base, current, rivals, entries)
+    return current, rivals, rounds
+
+
+def following(case: Case, base: Explanation, entries: Mapping[str, Any],
+               most: int) -> tuple[Explanation, Explanation, list[Explanation]] | None:
+    """The search with the plant held to the recordings by an observer, then proved in the free run. Returns (explanation
+    in the free run, the same under the observer, its rivals there)."""
+    case.progress("looking again with the plant held to the recording")
+    for trust in (0.01, 0.1):
+        model = base.plant.compile()
+        plant = observer.follows(base.plant, model, [model.drive(t) for t in case.tables], case.noise, trust)
+        if plant is None:
+            return None
+        try:
+            held = Case(plant, case.tables, case.noise, case.progress)
+            held.patience = case.patience
+            start = held.explain(plant, [], [], iterations=25)
+            found, rivals, _ = search(held, start, entries, most)
+            if not found.effects:
+                continue
+            free = case.explain(observer.without(found.plant), found.effects, found.own, iterations=40)
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            continue
+        if energy(case, free) < 0.1 * energy(case, base):
+            return free, found, rivals
+    return None
+
+
+def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanation]:
+    """The leaders, one per effect."""
+    out: list[Explanation] = []
+    for e in found:
+        if e.last.effect.name not in {o.last.effect.name for o in out}:
+            out.append(e)
+    return out[:count]
+
+
+def _colours(e: Explanation) -> tuple[Noise, ...]:
+    return tuple(Noise(c.sigma, 0.0, c.ar, c.ma) for c in e.colours)
+
+
+def smooth(case: Case, e: Explanation, coloured: bool = False) -> float:
+    """log10 p of the best smooth unknown input at one node or on one sensor; 0 where there is none."""
+    drives = [e.fit.model.drive(t) for t in case.tables]
+    for r, d in enumerate(drives):
+        e.fit.model.prepare(d, e.fit.values[r])
+    metric = Metric(dataclasses.replace(e.fit, noise=_colours(e)) if coloured else e.fit, drives)
+    found = locate.suspects(metric)
+    return found[0].log_p if found else 0.0
+
+
+def energy(case: Case, e: Explanation) -> float:
+    """Residual energy beyond the sensors' noise, summed over outputs."""
+    return sum(max(x * x - 1.0, 0.0) for x in case.excess(e).values())
+
+
+def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[Explanation],
+              entries: Mapping[str, Any]) -> tuple[Explanation, list[Explanation]]:
+    """With several effects: take each one out, look again at what would fill its place, and keep the best."""
+    for _ in range(2):
+        changed = False
+        for k in range(len(current.effects)):
+            without = leave_out(case, base, current, k)
+            if without is None:
+                continue
+            if without.score < current.score + ACCEPT / 2:
+                case.progress("one effect is not needed beside the others")
+                return (without, [])
+            seen = look(case, without, entries, draws=0)
+            found = compete(case, seen, finalists(seen.directions, 8))
+            if found and found[0].score < current.score - 2:
+                if found[0].last.key != current.effects[k].key:
+                    changed = True
+                current, rivals = found[0], found[1:]
+            elif found and k == len(current.effects) - 1:
+                rivals = [f for f in found if f.last.key != current.effects[k].key]
+        if not changed:
+            break
+    return current, rivals
+
+
+def leave_out(case: Case, base: Explanation, current: Explanation, k: int) -> Explanation | None:
+    """The explanation without its effect k, refitted; None where that cannot be simulated."""
+    plant, effects, own = base.plant, [], []
+    try:
+        for i, (c, names) in enumerate(zip(current.effects, current.own, strict=True)):
+            if i == k:
+                continue
+            values = {p: current.plant.parameters[n].value for p, n in names.items()}
+            ranges = {p: current.plant.parameters[n].range or (-np.inf, np.inf) for p, n in names.items()}
+            c = _on(c, plant)
+            plant = c.extend(values, ranges)
+            effects.append(c)
+            own.append(names)
+        return case.explain(plant, effects, own) if effects else base
+    except (SimulationError, InputError, LookupError):
+        return None
+
+
+def prune(case: Case, base: Explanation, current: Explanation, notes: list[str]) -> Explanation:
+    """Drop effects that do not lower the error on data that took no part: the interval of the gain must exclude zero."""
+    while current.effects:
+        weakest: tuple[float, Explanation, Candidate] | None = None
+        for k, c in enumerate(current.effects):
+            without = leave_out(case, base, current, k)
+            if without is None:
+                continue
+            before, after = (unseen_errors(case, e.plant) for e in (without, current))
+            high = pooled_gain(case, before, after)[2]
+            if not high < 1.0 and (weakest is None or high > weakest[0]):
+                weakest = (high, without, c)
+        if weakest is None:
+            return current
+        notes.append(f"{weakest[2].effect.name} at {weakest[2].place.where} fits better but does not predict held-out data "
+                     "better; it is not counted")
+        current = weakest[1]
+    return current
+
+
+def _on(c: Candidate, plant: Plant) -> Candidate:
+    """The same effect at the same place of another plant. Raises LookupError where that has no such place."""
+    rig = Rig(plant, c.rig.drives, c.rig.columns)
+    same = [x for x in candidates(rig, {c.effect.name: c.effect}) if (x.key, x.variant, x.label) == (c.key, c.variant, c.label)]
+    if not same:
+        raise LookupError(f"{c.effect.name} has no place {c.place.where} any more")
+    return same[0]
