@@ -1,28 +1,30 @@
 # C types for can_bus.py, which runs in every tick; see there.
 cimport cython
 from hal.devices cimport Device
-from hal.wire cimport SlcanParser
+from hal.wire cimport CanPort, SlcanLine, nearest
 
-cpdef double drive_state(int status_word)
-cpdef int next_control_word(int status_word, bint enable)
+cdef int _SYNC_ID
+cdef double _OFFLINE, _DISABLED, _ENABLED, _FAULT, _RESET_S
 
-cdef class SlcanPort:
+cpdef double drive_state(int status_word) noexcept
+@cython.locals(state=cython.int)
+cpdef int next_control_word(int status_word, bint enable) noexcept
+
+cdef class SlcanPort(SlcanLine):
     cdef public object _port
-    cdef public int _fd
-    cdef public SlcanParser _parser
-    cdef public bytes _out
-
-    cpdef list receive(self)
 
 cdef class Cia402Device(Device):
-    cdef public object _spec, _port, _transmit, _receive, _dictionary
-    cdef public int _node, _status_word, _fault_code
-    cdef public long long _command_limit
-    cdef public list _index, _is_state
-    cdef public double _patience_s, _heard_s, _beat_s, _reset_s
+    cdef public object _spec, _dictionary
+    cdef public CanPort _port
+    cdef public int _node, _master, _status_word, _fault_code, _transmit_size, _receive_size
+    cdef public long long _command_limit, _heard, _emergencies
+    cdef public int[::1] _index, _is_state, _shift, _bits, _signed
+    cdef public double _patience_s, _heartbeat_s, _heard_s, _beat_s, _reset_s, _low, _high, _scale
     cdef public tuple _ids
 
-    @cython.locals(kind=cython.int, can_id=cython.long, i=cython.int, index=cython.int, state=cython.double)
+    @cython.locals(port=CanPort, kind=cython.long, k=cython.int, i=cython.int, size=cython.int, data=cython.ulonglong)
     cpdef read(self, sample, double now_s)
-    @cython.locals(word=cython.int, counts=cython.longlong)
+    @cython.locals(raw=cython.longlong, span=cython.longlong)
+    cdef double _number(self, unsigned long long data, int k) noexcept
+    @cython.locals(port=CanPort, word=cython.int, counts=cython.longlong)
     cpdef write(self, double drive, bint enable, double now_s)

@@ -33,6 +33,7 @@ import re
 import struct
 import threading
 import time
+from array import array
 from typing import Any
 
 import can
@@ -44,61 +45,50 @@ from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, Hardw
 from hal.devices import Device
 from hal.profile import Binding, Cia402, Dbc, LineSettings
 from hal.serial_port import open_port
-from hal.wire import SlcanParser, join_slcan, write_bytes
+from hal.wire import CanPort, SlcanLine, nearest
 from thermoctl.yamlfile import InputError
 
 SYNC_ID, NMT_ID = 0x080, 0x000
 HEARTBEAT_LOST = 0x8130     # CiA 301 error code of a missing heartbeat
-MAX_PENDING = 4096          # bytes or frames that wait for a bus which takes none: then the link counts as lost
 SDO_TIMEOUT_S = 0.3
+MAX_TAKEN = 500             # frames of a bus that one tick takes
 FAULT_RESET_S = 1.0         # between attempts to reset a drive's fault while it is not wanted to drive
 _SLCAN_BITRATES = {10_000: 0, 20_000: 1, 50_000: 2, 100_000: 3, 125_000: 4, 250_000: 5, 500_000: 6, 800_000: 7,
                    1_000_000: 8}
 _FRAME = struct.Struct("=IB3x8s")                       # struct can_frame of the kernel
 _EXTENDED, _REMOTE, _ERROR_FLAG, _BUS_OFF = 0x8000_0000, 0x4000_0000, 0x2000_0000, 0x40
+_SYNC_ID, _RESET_S = SYNC_ID, FAULT_RESET_S
+_OFFLINE, _DISABLED, _ENABLED, _FAULT = AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED, AMP_FAULT        # numbers of C, by can_bus.pxd
 _FORMATS = {datatypes.INTEGER8: "b", datatypes.INTEGER16: "h", datatypes.INTEGER32: "i", datatypes.UNSIGNED8: "B",
             datatypes.UNSIGNED16: "H", datatypes.UNSIGNED32: "I", datatypes.BOOLEAN: "B"}
 
 Frame = tuple[int, bytes]
 
 
-class SlcanPort:
-    """A Lawicel adapter on a serial port; `open` sets bitrate and opens the channel."""
+class SlcanPort(SlcanLine):
+    """A Lawicel adapter on a serial port, opened with its bitrate set."""
 
     def __init__(self, path: str, bitrate: int) -> None:
         if bitrate not in _SLCAN_BITRATES:
             raise HardwareError(f"slcan:{path}: bitrate {bitrate} is not one of {', '.join(map(str, _SLCAN_BITRATES))}")
         self._port = open_port(path, LineSettings(baud=3_000_000), f"slcan:{path}")
-        self._fd = self._port.fileno()
-        self._parser = SlcanParser()
-        self._out = b""
-        os.write(self._fd, b"\r\rC\rS%d\rO\r" % _SLCAN_BITRATES[bitrate])
-
-    def send(self, *frames: Frame) -> None:
-        """Send without waiting, in one write. Raises OSError when the adapter is gone or takes nothing any more."""
-        out = join_slcan(self._out, frames)
-        self._out = out[write_bytes(self._fd, out):]
-        if len(self._out) > MAX_PENDING:
-            raise OSError(errno.ENOBUFS, "the adapter takes no data")
-
-    def receive(self) -> list[Frame]:
-        """What has arrived. Raises OSError when the adapter is gone."""
-        return self._parser.read(self._fd)
+        super().__init__(self._port.fileno())
+        os.write(self._port.fileno(), b"\r\rC\rS%d\rO\r" % _SLCAN_BITRATES[bitrate])
 
     @property
     def bad(self) -> int:
         """Lines that were no frame, and frames that the adapter refused."""
-        return self._parser.bad + self._parser.refused
+        return self.parser.bad + self.parser.refused
 
     def close(self) -> None:
         """Close the channel and the line."""
         with contextlib.suppress(OSError):
-            os.write(self._fd, b"C\r")
+            os.write(self._port.fileno(), b"C\r")
         with contextlib.suppress(OSError):
             self._port.close()
 
 
-class LibraryPort:
+class LibraryPort(CanPort):
     """An interface opened by python-can; SocketCAN frames pass on the bare socket."""
 
     def __init__(self, interface: str, channel: str, bitrate: int, ids: tuple[int, ...]) -> None:
@@ -116,9 +106,9 @@ class LibraryPort:
             self._socket.setblocking(False)
         self.bad = self._pending = 0
 
-    def send(self, *frames: Frame) -> None:
-        """Send without waiting. Raises OSError when the bus is gone or takes nothing any more."""
-        for can_id, data in frames:
+    def flush(self) -> int:
+        """Send what was queued, without waiting. Raises OSError when the bus is gone or takes nothing any more."""
+        for can_id, data in self.queued():
             try:
                 if self._socket is None:
                     self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=can_id > 0x7FF))
@@ -132,6 +122,7 @@ class LibraryPort:
                 if e.errno != errno.ENOBUFS:
                     raise
                 self._queue_full(e)
+        return 0
 
     def _queue_full(self, why: Exception) -> None:
         self.bad += 1
@@ -139,27 +130,29 @@ class LibraryPort:
         if self._pending > 100:
             raise OSError(errno.ENOBUFS, f"nobody on the bus takes frames ({why})")
 
-    def receive(self) -> list[Frame]:
-        """What has arrived. Raises OSError: interface down; HardwareError: bus-off."""
-        frames: list[Frame] = []
-        while True:
+    def take(self) -> int:
+        """Take what has arrived; how many frames. Raises OSError: interface down; HardwareError: bus-off."""
+        self.begin()
+        taken = 0
+        while taken < MAX_TAKEN:
             if self._socket is None:
                 message = self._bus.recv(0)
                 if message is None:
-                    return frames
+                    break
                 if self._wanted is None or message.arbitration_id in self._wanted:
-                    frames.append((message.arbitration_id, bytes(message.data)))
+                    taken += self.deliver(message.arbitration_id, bytes(message.data))
                 continue
             try:
                 raw_id, size, data = _FRAME.unpack(self._socket.recv(16))
             except BlockingIOError:
-                return frames
+                break
             if raw_id & _ERROR_FLAG:
                 self.bad += 1
                 if raw_id & _BUS_OFF:
                     raise HardwareError("CAN bus-off: check wiring, termination and bitrate")
             elif not raw_id & _REMOTE:
-                frames.append((raw_id & 0x1FFF_FFFF, data[:size]))
+                taken += self.deliver(raw_id & 0x1FFF_FFFF, data[:size])
+        return taken
 
     def close(self) -> None:
         """Leave the bus."""
@@ -181,19 +174,22 @@ def open_can(port: str, ids: tuple[int, ...]) -> SlcanPort | LibraryPort:
 def drive_state(status_word: int) -> float:
     """AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED or AMP_FAULT for a CiA-402 status word."""
     if status_word & 0x4F in (0x0F, 0x08):
-        return AMP_FAULT
+        return _FAULT
     if status_word & 0x6F == 0x27:
-        return AMP_ENABLED
-    return AMP_OFFLINE if status_word & 0x4F == 0x00 else AMP_DISABLED
+        return _ENABLED
+    return _OFFLINE if status_word & 0x4F == 0x00 else _DISABLED
 
 
 def next_control_word(status_word: int, enable: bool) -> int:
     """The control word that takes a drive one step towards the wanted state (table in the module's text)."""
+    state = status_word & 0x6F
     if not enable:
-        return 0x06 if status_word & 0x6F in (0x23, 0x27) else 0x00
+        return 0x06 if state in (0x23, 0x27) else 0x00
     if status_word & 0x4F == 0x40:
         return 0x06
-    return {0x21: 0x07, 0x23: 0x0F, 0x27: 0x0F}.get(status_word & 0x6F, 0x00)
+    if state == 0x21:
+        return 0x07
+    return 0x0F if state in (0x23, 0x27) else 0x00
 
 
 def _format(dictionary: Any, index: int) -> str:
@@ -238,24 +234,33 @@ class Cia402Device(Device):
         super().__init__(binding)
         spec: Cia402 = binding.profile.bus_spec
         self._spec, self._node = spec, binding.address
-        self._port: SlcanPort | LibraryPort | None = None
+        self._port: CanPort | None = None
         dictionary = canopen.import_od(str(spec.eds), node_id=self._node)
         try:
-            self._transmit = struct.Struct("<" + "".join(_format(dictionary, i) for i in spec.transmit))
+            formats = [_format(dictionary, i) for i in spec.transmit]
             command = _format(dictionary, spec.command)
         except KeyError as e:
             raise InputError(f"{binding.profile.file}: {spec.eds}: object {e} of the PDOs is not in it") from None
-        self._receive = struct.Struct("<H" + command)
+        if not command.islower():
+            raise InputError(f"{binding.profile.file}: {spec.eds}: the command 0x{spec.command:X} has no sign")
+        sizes = [struct.calcsize(f) for f in formats]
+        self._transmit_size, self._receive_size = sum(sizes), 2 + struct.calcsize(command)
+        self._shift = array("i", [8 * sum(sizes[:k]) for k in range(len(sizes))])
+        self._bits = array("i", [8 * size for size in sizes])
+        self._signed = array("i", [f.islower() for f in formats])
         self._command_limit = 2 ** (8 * struct.calcsize(command) - 1) - 1
         self._dictionary = dictionary
-        if self._transmit.size > 8 or self._receive.size > 8:
-            raise InputError(f"{binding.profile.file}: a PDO has 8 bytes, transmit takes {self._transmit.size}")
-        self._index = [spec.transmit.index(b.channel.source) if b.channel.source in spec.transmit else -1
-                       for b in binding.bounds]
-        self._is_state = [b.channel.source == 0x6041 for b in binding.bounds]
-        self._patience_s = max(3 * spec.heartbeat_s, spec.watchdog_s)
+        if self._transmit_size > 8:
+            raise InputError(f"{binding.profile.file}: a PDO has 8 bytes, transmit takes {self._transmit_size}")
+        self._index = array("i", [spec.transmit.index(b.channel.source) if b.channel.source in spec.transmit else -1
+                                  for b in binding.bounds])
+        self._is_state = array("i", [b.channel.source == 0x6041 for b in binding.bounds])
+        self._patience_s, self._heartbeat_s = max(3 * spec.heartbeat_s, spec.watchdog_s), spec.heartbeat_s
+        self._master = spec.master_id
+        if binding.profile.drive is not None:
+            (self._low, self._high), self._scale = binding.profile.drive.limits, binding.profile.drive.scale
         self._ids = (0x080 + self._node, 0x180 + self._node, 0x580 + self._node, 0x700 + self._node)
-        self._status_word = self._fault_code = 0
+        self._status_word = self._fault_code = self._heard = self._emergencies = 0
         self._heard_s = self._beat_s = self._reset_s = -math.inf
 
     def connect(self) -> None:
@@ -320,47 +325,62 @@ class Cia402Device(Device):
 
     def read(self, sample: Sample, now_s: float) -> None:
         """Take TPDO 1, emergencies and the drive's heartbeat. HardwareError when the heartbeat is missing."""
-        assert self._port is not None
-        for can_id, data in self._port.receive():
-            kind = can_id - self._node
-            if kind == 0x180 and len(data) == self._transmit.size:
-                values = self._transmit.unpack(data)
-                self._status_word = values[0]
-                self.counts["frames"] += 1
-                state = drive_state(values[0])
-                for i, index in enumerate(self._index):
-                    raw = self._fault_code if index < 0 else values[index]
-                    self.put(sample, i, state if self._is_state[i] else raw, now_s)
-            elif kind == 0x700 and len(data) == 1:
-                if data[0] == 0:                                      # boot-up
+        port = self._port
+        if port is None:
+            raise HardwareError("not connected")
+        for k in range(port.take()):
+            kind, size, data = port.can_id(k) - self._node, port.size(k), port.data(k)
+            if kind == 0x180 and size == self._transmit_size:
+                self._status_word = int(self._number(data, 0))
+                self._heard += 1
+                for i in range(len(self._index)):
+                    if self._is_state[i]:
+                        self.put(sample, i, drive_state(self._status_word), now_s)
+                    else:
+                        self.put(sample, i, self._fault_code if self._index[i] < 0 else self._number(data, self._index[i]), now_s)
+            elif kind == 0x700 and size == 1:
+                if data == 0:                                         # boot-up
                     raise HardwareError("the drive restarted")        # its PDO mapping and watchdog are gone
                 self._heard_s = now_s
-                if data[0] == 0x7F:                                   # it left operation when our heartbeat was missing
-                    self._port.send((NMT_ID, bytes((0x01, self._node))))
-            elif kind == 0x080 and len(data) == 8:
-                self._fault_code = int.from_bytes(data[:2], "little")
-                self.counts["emergencies"] = self.counts.get("emergencies", 0) + 1
-        self.counts["errors"] = self._port.bad
+                if data == 0x7F:                                      # it left operation when our heartbeat was missing
+                    port.send((NMT_ID, bytes((0x01, self._node))))
+            elif kind == 0x080 and size == 8:
+                self._fault_code = data & 0xFFFF
+                self._emergencies += 1
         if now_s - self._heard_s > self._patience_s:
             raise HardwareError(f"no heartbeat of node {self._node} for {self._patience_s * 1e3:.0f} ms")
 
+    def _number(self, data: int, k: int) -> float:
+        """Object k of TPDO 1."""
+        span = 1
+        span <<= self._bits[k]
+        raw = data >> self._shift[k] & (span - 1)
+        return raw - span if self._signed[k] and raw >= span // 2 else raw
+
     def write(self, drive: float, enable: bool, now_s: float) -> None:
         """RPDO 1, SYNC, and our heartbeat when it is due, in one write."""
-        assert self._port is not None
-        limits = self.binding.profile.drive
-        assert limits is not None
+        port, counts = self._port, 0
+        if port is None:
+            raise HardwareError("not connected")
         word = next_control_word(self._status_word, enable)
-        counts = 0
-        if enable and drive_state(self._status_word) == AMP_ENABLED:
-            counts = round(min(max(drive, limits.limits[0]), limits.limits[1]) / limits.scale)
+        if enable and drive_state(self._status_word) == _ENABLED:
+            counts = nearest(min(max(drive, self._low), self._high) / self._scale)
             counts = min(max(counts, -self._command_limit), self._command_limit)
-        elif not enable and self._status_word & 0x4F == 0x08 and now_s - self._reset_s >= FAULT_RESET_S:
+        elif not enable and self._status_word & 0x4F == 0x08 and now_s - self._reset_s >= _RESET_S:
             word, self._reset_s = 0x80, now_s
-        frames = [(0x200 + self._node, self._receive.pack(word, counts)), (SYNC_ID, b"")]
-        if now_s - self._beat_s >= self._spec.heartbeat_s:
+        port.queue(0x200 + self._node, word | (counts & 0xFFFFFFFF) << 16, self._receive_size)
+        port.queue(_SYNC_ID, 0, 0)
+        if now_s - self._beat_s >= self._heartbeat_s:
             self._beat_s = now_s
-            frames.append((0x700 + self._spec.master_id, b"\x05"))
-        self._port.send(*frames)
+            port.queue(0x700 + self._master, 0x05, 1)
+        port.flush()
+
+    def counters(self) -> dict[str, int]:
+        """Frames, lines that were none, emergencies, reconnections."""
+        self.counts.update(frames=self._heard, emergencies=self._emergencies)
+        if self._port is not None:
+            self.counts["errors"] = self._port.bad
+        return self.counts
 
 
 class DbcDevice(Device):

@@ -4,14 +4,15 @@ from hal.devices cimport Device
 from hal.wire cimport Framer
 
 cdef class SerialDevice(Device):
-    cdef public object _port, _lines, _invalid
-    cdef public int _fd
+    cdef public object _port, _lines
+    cdef public int _fd, _flags
+    cdef public unsigned long long _bad_flags
     cdef public bint _waited
     cdef public Framer _framer
     cdef public double _due_s
-    cdef public list _index
+    cdef public int[::1] _index
 
     @cython.locals(framer=Framer)
     cpdef bint wait_frame(self, long long until_ns) except -1
-    @cython.locals(framer=Framer, i=cython.int, index=cython.int, field=cython.int, mask=cython.ulonglong)
+    @cython.locals(framer=Framer, i=cython.int, flags=cython.ulonglong)
     cpdef read(self, sample, double now_s)

@@ -10,6 +10,7 @@ import contextlib
 import errno
 import os
 import termios
+from array import array
 from pathlib import Path
 from typing import Any
 
@@ -105,8 +106,9 @@ class SerialDevice(Device):
         self._due_s, self._waited = 0.0, False
         if self._framer:
             names = [n for n, _ in spec.fields]
-            self._index = [(i, names.index(b.channel.source)) for i, b in enumerate(binding.bounds)]
-            self._invalid = (names.index(spec.invalid[0]), spec.invalid[1]) if spec.invalid else (-1, 0)
+            self._index = array("i", [names.index(b.channel.source) for b in binding.bounds])
+            self._flags = names.index(spec.invalid[0]) if spec.invalid else -1
+            self._bad_flags: int = spec.invalid[1] if spec.invalid else 0
 
     def connect(self) -> None:
         """Open the port; frames in its buffer are dropped."""
@@ -142,12 +144,12 @@ class SerialDevice(Device):
             self._take_lines(sample, read_available(self._fd), now_s)
         elif framer.read(self._fd) or self._waited:
             self._waited = False
-            field, mask = self._invalid
-            if field >= 0 and framer.whole(field) & mask:
-                self.fail_all(sample, f"reports an error (status 0x{framer.whole(field) & mask:X}): check the sensor")
+            flags = framer.whole(self._flags) & self._bad_flags if self._flags >= 0 else 0
+            if flags:
+                self.fail_all(sample, f"reports an error (status 0x{flags:X}): check the sensor")
             else:
-                for i, index in self._index:
-                    self.put(sample, i, framer.number(index), now_s)
+                for i in range(len(self._index)):
+                    self.put(sample, i, framer.number(self._index[i]), now_s)
 
     def counters(self) -> dict[str, int]:
         """Frames, wrong frames, gaps of the sequence, reconnections."""

@@ -6,6 +6,9 @@ cdef enum:
     MAX_FRAME = 1024
     MAX_FIELDS = 64
     MAX_MESSAGE = 64            # the longest Lawicel message has 30 bytes
+    MAX_FRAMES = 1024           # of a read: the shortest Lawicel frame has 6 bytes
+    MAX_QUEUED = 32             # frames of one send
+    MAX_PENDING = 4096          # bytes that wait for a line which takes none: then it counts as lost
 
 cdef class Framer:
     cdef readonly object spec
@@ -29,18 +32,44 @@ cdef class Framer:
 cpdef bint wait_readable(int fd, int64_t until_ns) except -1
 
 cpdef bytes encode_slcan(uint32_t can_id, bytes data)
-cpdef bytes join_slcan(bytes before, tuple frames)
-cpdef Py_ssize_t write_bytes(int fd, bytes data) except -1
+
+cdef struct Frame:
+    uint32_t can_id
+    int size
+    uint64_t data               # its bytes, the first one lowest
 
 cdef class SlcanParser:
     cdef public long bad, refused
+    cdef Frame[MAX_FRAMES] _frames
+    cdef int _count
     cdef uint8_t[MAX_MESSAGE] _rest
     cdef int _length
 
     cpdef list feed(self, const uint8_t[::1] data)
-    cpdef list read(self, int fd)
-    cdef int _feed(self, const uint8_t *data, int size, list frames) except -1
-    cdef int _take(self, list frames) except -1
+    cdef void _feed(self, const uint8_t *data, int size) noexcept
+    cdef void _take(self) noexcept
+
+cdef class CanPort:
+    cdef Frame *_in
+    cdef int _count, _queued
+    cdef Frame[MAX_QUEUED] _out
+    cdef Frame[MAX_FRAMES] _own
+
+    cpdef int take(self) except -1
+    cpdef int flush(self) except -1
+    cpdef bint deliver(self, uint32_t can_id, bytes data) except -1
+    cpdef int queue(self, uint32_t can_id, uint64_t data, int size) except -1
+    cpdef uint32_t can_id(self, int k) noexcept
+    cpdef int size(self, int k) noexcept
+    cpdef uint64_t data(self, int k) noexcept
+
+cdef class SlcanLine(CanPort):
+    cdef int fd
+    cdef readonly SlcanParser parser
+    cdef char[8192] _unsent
+    cdef int _unsent_size
+
+cpdef long long nearest(double value) noexcept
 
 cdef class Channels:
     cdef readonly int[::1] roles

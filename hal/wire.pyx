@@ -12,6 +12,7 @@ import os
 import struct
 
 from libc.errno cimport EAGAIN, EINTR, errno as c_errno
+from libc.math cimport llrint
 from libc.stdint cimport int8_t, int16_t, int32_t
 from libc.string cimport memcmp, memcpy, memmove
 from posix.time cimport CLOCK_MONOTONIC, clock_gettime, timespec
@@ -274,35 +275,19 @@ cdef int _encode(char *out, uint32_t can_id, const uint8_t *data, int size) noex
     return at + 1
 
 
+cdef uint64_t _whole(bytes data) except? 1:
+    cdef uint64_t value = 0
+    if len(data) > 8:
+        raise ValueError(f"a CAN frame has at most 8 bytes, not {len(data)}")
+    memcpy(&value, <const char *>data, len(data))
+    return value
+
+
 cpdef bytes encode_slcan(uint32_t can_id, bytes data):
     """A data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR above 0x7FF."""
-    return join_slcan(b"", ((can_id, data),))
-
-
-cpdef bytes join_slcan(bytes before, tuple frames):
-    """`before` and the frames (id, data) after it in Lawicel ASCII, as one write takes them."""
-    cdef char[1024] out
-    cdef int at = 0
-    cdef tuple frame
-    cdef bytes data
-    if len(frames) > 32:
-        raise ValueError(f"{len(frames)} frames at once; at most 32")
-    for frame in frames:
-        data = frame[1]
-        if len(data) > 8:
-            raise ValueError(f"a CAN frame has at most 8 bytes, not {len(data)}")
-        at += _encode(out + at, frame[0], <const uint8_t *><const char *>data, <int>len(data))
-    return before + out[:at] if before else out[:at]
-
-
-cpdef Py_ssize_t write_bytes(int fd, bytes data) except -1:
-    """Bytes of `data` that a descriptor took without waiting, 0 when it takes none now. Raises OSError when it is gone."""
-    cdef Py_ssize_t done = c_write(fd, <const char *>data, len(data))
-    if done >= 0:
-        return done
-    if c_errno == EAGAIN or c_errno == EINTR:
-        return 0
-    raise OSError(c_errno, os.strerror(c_errno))
+    cdef char[MAX_MESSAGE] out
+    cdef uint64_t value = _whole(data)
+    return out[:_encode(out, can_id, <const uint8_t *>&value, <int>len(data))]
 
 
 cdef class SlcanParser:
@@ -316,26 +301,21 @@ cdef class SlcanParser:
 
     cpdef list feed(self, const uint8_t[::1] data):
         """Frames that `data` completed, in order: (id, data)."""
-        frames = []
-        if data.shape[0]:
-            self._feed(&data[0], <int>data.shape[0], frames)
-        return frames
+        cdef Py_ssize_t at, part
+        found = []
+        for at in range(0, data.shape[0], MAX_READ):
+            part = min(<Py_ssize_t>MAX_READ, data.shape[0] - at)
+            self._count = 0
+            self._feed(&data[at], <int>part)
+            found += [_pair(&self._frames[k]) for k in range(self._count)]
+        return found
 
-    cpdef list read(self, int fd):
-        """Frames that arrived at a descriptor. Raises OSError when it is gone."""
-        cdef uint8_t[MAX_READ] data
-        cdef int got = _read(fd, data, MAX_READ)
-        frames = []
-        if got:
-            self._feed(data, got, frames)
-        return frames
-
-    cdef int _feed(self, const uint8_t *data, int size, list frames) except -1:
+    cdef void _feed(self, const uint8_t *data, int size) noexcept:
         cdef int i
         for i in range(size):
             if data[i] == b'\r':
                 if self._length > 0:
-                    self._take(frames)
+                    self._take()
                 self._length = 0
             elif data[i] == b'\a':
                 self.refused += 1
@@ -345,35 +325,147 @@ cdef class SlcanParser:
             elif self._length >= 0:
                 self._rest[self._length] = data[i]
                 self._length += 1
-        return 0
 
-    cdef int _take(self, list frames) except -1:
+    cdef void _take(self) noexcept:
         cdef uint8_t *m = self._rest
-        cdef uint8_t[8] body
         cdef int digits, size, i, high, low
         cdef uint32_t can_id = 0
+        cdef uint64_t body = 0
         if m[0] != b't' and m[0] != b'T':
-            self.bad += m[0] not in (b'z', b'Z', b'r', b'R', b'F', b'V', b'N')
-            return 0
+            self.bad += not (m[0] == b'z' or m[0] == b'Z' or m[0] == b'r' or m[0] == b'R' or m[0] == b'F' or m[0] == b'V'
+                             or m[0] == b'N')
+            return
         digits = 3 if m[0] == b't' else 8
         size = m[1 + digits] - 48 if self._length > 1 + digits else -1
-        if not 0 <= size <= 8 or self._length < 2 + digits + 2 * size:
+        if not 0 <= size <= 8 or self._length < 2 + digits + 2 * size or self._count == MAX_FRAMES:
             self.bad += 1
-            return 0
+            return
         for i in range(digits):
             high = _nibble(m[1 + i])
             if high < 0:
                 self.bad += 1
-                return 0
+                return
             can_id = can_id << 4 | <uint32_t>high
         for i in range(size):
             high, low = _nibble(m[2 + digits + 2 * i]), _nibble(m[3 + digits + 2 * i])
             if high < 0 or low < 0:
                 self.bad += 1
-                return 0
-            body[i] = <uint8_t>(high << 4 | low)
-        frames.append((can_id, (<char *>body)[:size]))
+                return
+            body |= <uint64_t>(high << 4 | low) << 8 * i
+        self._frames[self._count] = Frame(can_id, size, body)
+        self._count += 1
+
+
+cdef tuple _pair(Frame *frame):
+    return frame.can_id, (<char *>&frame.data)[:frame.size]
+
+
+cdef class CanPort:
+    """A CAN bus that the tick uses without waiting. A frame's data is one whole number, its first byte lowest.
+
+    Subclasses implement `take`, which makes the frames that have arrived the ones that `can_id`, `size` and `data` give, and
+    `flush`, which sends what was queued; both raise OSError when the bus is gone. `receive` and `send` do the same with bytes.
+    """
+
+    def __cinit__(self):
+        self._in = self._own
+
+    cpdef int take(self) except -1:
+        """Take what has arrived; how many frames. Raises OSError when the bus is gone."""
+        raise NotImplementedError
+
+    cpdef int flush(self) except -1:
+        """Send what was queued, without waiting. Raises OSError when the bus is gone or takes nothing any more."""
+        raise NotImplementedError
+
+    cpdef bint deliver(self, uint32_t can_id, bytes data) except -1:
+        """For subclasses in Python: one more frame that has arrived since `begin`; False where there is no room."""
+        if self._count == MAX_FRAMES:
+            return False
+        self._own[self._count] = Frame(can_id, <int>len(data), _whole(data))
+        self._count += 1
+        return True
+
+    def begin(self) -> None:
+        """For subclasses in Python: nothing has arrived yet."""
+        self._count = 0
+
+    def queued(self) -> list:
+        """For subclasses in Python: what is to be sent, (id, data); it is queued no more."""
+        found = [_pair(&self._out[k]) for k in range(self._queued)]
+        self._queued = 0
+        return found
+
+    cpdef int queue(self, uint32_t can_id, uint64_t data, int size) except -1:
+        """Add a frame for the next `flush`; at most MAX_QUEUED. Raises ValueError."""
+        if self._queued == MAX_QUEUED or not 0 <= size <= 8:
+            raise ValueError(f"{self._queued} frames wait, one of {size} bytes: at most {MAX_QUEUED}, of 8 bytes")
+        self._out[self._queued] = Frame(can_id, size, data)
+        self._queued += 1
         return 0
+
+    cpdef uint32_t can_id(self, int k) noexcept:
+        """Identifier of frame k of the last `take`."""
+        return self._in[k].can_id
+
+    cpdef int size(self, int k) noexcept:
+        """Bytes of frame k."""
+        return self._in[k].size
+
+    cpdef uint64_t data(self, int k) noexcept:
+        """Data of frame k."""
+        return self._in[k].data
+
+    def send(self, *frames) -> None:
+        """Send frames (id, data) without waiting. Raises OSError as `flush`."""
+        for can_id, data in frames:
+            self.queue(can_id, _whole(data), len(data))
+        self.flush()
+
+    def receive(self) -> list:
+        """What has arrived, (id, data). Raises OSError when the bus is gone."""
+        return [_pair(&self._in[k]) for k in range(self.take())]
+
+
+cdef class SlcanLine(CanPort):
+    """Lawicel ASCII on an open descriptor. What the line does not take at once waits, MAX_PENDING bytes at most."""
+
+    def __init__(self, int fd):
+        self.fd = fd
+        self.parser = SlcanParser()
+        self._in = self.parser._frames
+
+    cpdef int take(self) except -1:
+        cdef uint8_t[MAX_READ] data
+        cdef int got = _read(self.fd, data, MAX_READ)
+        self.parser._count = 0
+        self.parser._feed(data, got)
+        return self.parser._count
+
+    cpdef int flush(self) except -1:
+        cdef int k, done
+        for k in range(self._queued):
+            self._unsent_size += _encode(self._unsent + self._unsent_size, self._out[k].can_id,
+                                         <const uint8_t *>&self._out[k].data, self._out[k].size)
+        self._queued = 0
+        done = <int>c_write(self.fd, self._unsent, self._unsent_size)
+        if done < 0:
+            if c_errno != EAGAIN and c_errno != EINTR:
+                self._unsent_size = 0
+                raise OSError(c_errno, os.strerror(c_errno))
+            done = 0
+        self._unsent_size -= done
+        if self._unsent_size > MAX_PENDING:
+            self._unsent_size = 0
+            raise OSError(errno.ENOBUFS, "the adapter takes no data")
+        if done and self._unsent_size:
+            memmove(self._unsent, self._unsent + done, self._unsent_size)
+        return 0
+
+
+cpdef long long nearest(double value) noexcept:
+    """The nearest whole number, as `round`."""
+    return llrint(value)
 
 
 cdef class Channels:

@@ -125,7 +125,7 @@ def build(trees: dict[str, ast.Module]) -> types.ModuleType:
             if module is not None:
                 sys.modules[f"thermoctl.control.{name}"] = module
                 setattr(package, name, module)
-    made["law"].WARM_UP_TICKS = 6                        # interpreted ticks are slow
+    made["law"].WARM_UP_TICKS = made["law"]._WARM_UP = 6             # interpreted ticks are slow
     made["law"].arming, made["law"].faults = made["arming"], made["faults"]
     return made["law"]
 

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import psutil
 import pytest
-from conftest import ROOT
 
-from tests.daemon.process import LIMIT_S, Daemon, wait
+from tests.daemon.process import LIMIT_S, ROOT, Daemon, wait
 from thermoctl.cli import main
 from thermoctl.daemon.socket import ask
 from thermoctl.settings import load_settings

@@ -4,10 +4,10 @@ import os
 
 import numpy as np
 import pytest
-from conftest import make_model
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.daemon.conftest import make_model
 from thermoctl.control.model import Parameters, zero_model
 from thermoctl.daemon.misfit import BLOCK_S, Misfit
 from thermoctl.daemon.recorder import Recorder

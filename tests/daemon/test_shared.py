@@ -123,7 +123,8 @@ def test_readings_pack_into_two_exact_numbers(channels):
     row, values, outputs = np.zeros(3 + 20 + 2 + 4), np.arange(20.0), np.arange(4.0)
     record = Record(row, 3)
     record.bind(values, fresh, status, outputs)
-    record.fill((7, 8.5, 9))
+    row[:3] = 7, 8.5, 9
+    record.fill()
     np.testing.assert_array_equal(np.delete(row, [23, 24]), [7, 8.5, 9, *values, *outputs])
     packed = row[23], row[24]
     again = np.zeros(20, np.uint8), np.zeros(20, np.uint8)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import make_model
 
 import thermoctl
 from hal.backend import ERROR, OK, ROLE, ROLES, STALE
+from tests.daemon.conftest import make_model
 from thermoctl.control import arming, faults
 from thermoctl.control.law import OUTPUTS
 from thermoctl.daemon.assemble import law_parameters

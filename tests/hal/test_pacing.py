@@ -81,7 +81,7 @@ def test_ticks_follow_the_frames_and_go_on_without_them(encoder):
     shared = Shared.create(f"thermoctl-pace-{os.getpid()}")
     settings = SimpleNamespace(loop=SimpleNamespace(period_s=PERIOD_S, spin_s=0.0, pace="device"))
     parameters = Parameters(kp=0.01, ti_s=0.01, td_s=0.0, output_limit=1.0)
-    rig = Rig(encoder.backend, zero_model(), parameters, PERIOD_S, shared.ring.write, start_s=time.monotonic())
+    rig = Rig(encoder.backend, zero_model(), parameters, PERIOD_S, shared.ring, start_s=time.monotonic())
     muted, done = threading.Event(), threading.Event()
 
     def feed():

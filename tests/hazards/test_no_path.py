@@ -6,11 +6,12 @@ import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from thermoctl.daemon.ring import Box, Mailbox
 
 from hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sample
 from thermoctl.control import arming, faults
 from thermoctl.control.law import WARM_UP_TICKS
-from thermoctl.control.model import CompensatorModel, Parameters
+from thermoctl.control.model import NAMES, CompensatorModel, Parameters
 from thermoctl.daemon.loop import RELOAD, Rig
 from thermoctl.signals import INDEX
 
@@ -75,25 +76,13 @@ class Stage:
         self.drive, self.enable = (drive, True) if enable and math.isfinite(drive) else (0.0, False)
 
 
-class Mail(list):
-    def take(self):
-        return self.pop(0) if self else None
-
-
-class Box:
-    def __init__(self):
-        self.numbers = None
-
-    def get(self):
-        return self.numbers
-
-
 class NoPath(RuleBasedStateMachine):
     """Rules spoil, command and let time pass; every tick is checked in `tick`."""
 
     @initialize(warm=st.booleans())
     def begin(self, warm):
-        self.stage, self.mail, self.box = Stage(), Mail(), Box()
+        self.stage, self.given = Stage(), None
+        self.mail, self.box = Mailbox(np.zeros(2, np.uint64), np.zeros((4, 2))), Box(np.zeros(1, np.uint64), np.zeros(len(NAMES) + 1))
         self.rig = Rig(self.stage, model(), parameters(), PERIOD_S, lambda row: None, self.mail, self.box)
         self.rig.wall_s = lambda: 0.0
         self.now_s, self.before = 0.0, arming.OFF
@@ -102,7 +91,7 @@ class NoPath(RuleBasedStateMachine):
 
     def tick(self, count, dt=PERIOD_S):
         for _ in range(count):
-            law, waiting = self.rig.law, list(self.mail[:1])
+            law, given, self.given = self.rig.law, self.given, None
             self.now_s += PERIOD_S
             self.rig.tick(self.now_s, dt, 0.0, lambda: 0)
             drive, enable = self.stage.writes.pop()
@@ -115,28 +104,33 @@ class NoPath(RuleBasedStateMachine):
             if state == arming.ARMED:
                 assert not tripping
                 if self.before != arming.ARMED:                # only by this tick's ARM, from READY, at rest, without a jump
-                    assert self.before == arming.READY and waiting and waiting[0][0] == arming.ARM
+                    assert self.before == arming.READY and given == arming.ARM
                     assert drive == 0.0 and law.setpoint_um == law.compensated_um == law.reference_um
                 for name in NEEDED:                            # nothing needed is at fault
                     assert law.verdict[ROLE[name]] == 0.0
             elif self.before == arming.ARMED:
                 assert state in (arming.SAFE, arming.FAULT)
-                assert state == arming.FAULT or waiting and waiting[0][0] == arming.DISARM
+                assert state == arming.FAULT or given == arming.DISARM
             if self.before == arming.FAULT and state != arming.FAULT:
-                assert state == arming.SAFE and waiting and waiting[0][0] == arming.DISARM and not tripping
+                assert state == arming.SAFE and given == arming.DISARM and not tripping
             assert np.isfinite(self.rig.row[INDEX["drive"]]) and self.rig.row[INDEX["enable"]] == float(enable)
             self.before = state
+
+    def give(self, command, value=0.0):
+        """One command for the next tick, which takes it."""
+        assert self.mail.push(float(command), value)
+        self.given = command
 
     @rule(command=st.sampled_from([arming.ARM, arming.ARM, arming.DISARM, arming.SETPOINT, arming.NONE, 7.0, -1.0]),
           value=st.one_of(st.floats(-300, 300), st.floats()))
     def command(self, command, value):
-        self.mail.append((float(command), value))
+        self.give(command, value)
         self.tick(1)
 
     @rule()
     def acknowledge_and_arm(self):
         for command in (arming.DISARM, arming.NONE, arming.ARM):
-            self.mail.append((float(command), 0.0))
+            self.give(command)
             self.tick(2)
 
     @rule(count=st.integers(1, 60))
@@ -175,8 +169,8 @@ class NoPath(RuleBasedStateMachine):
 
     @rule(kp=st.floats(0, 0.05), limit=st.floats(0.0, LIMIT), average=st.integers(1, 64), compensate=st.booleans())
     def reload(self, kp, limit, average, compensate):
-        self.box.numbers = parameters(kp=kp, output_limit=limit, moving_average=float(average), compensate=float(compensate)).pack()
-        self.mail.append((RELOAD, 0.0))
+        self.box.put(parameters(kp=kp, output_limit=limit, moving_average=float(average), compensate=float(compensate)).pack())
+        self.give(RELOAD)
         self.tick(1)
 
     @invariant()

@@ -3,6 +3,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from thermoctl.daemon.ring import Histogram
 
 from tests.hazards.harness import ROWS, HazardRig, Row, say
 from thermoctl.control import arming
@@ -196,10 +197,8 @@ def test_a_suspend_shows_in_the_loops_own_clock(quick, monkeypatch):
         def __missing__(self, key):
             return 0.0
 
-    class Count:
-        def add(self, value):
-            pass
-    shared = type("Shared", (), {"counters": Counters(), "lateness": Count(), "busy": Count()})
+    count = Histogram(np.zeros(11, np.uint64), np.zeros(1))
+    shared = type("Shared", (), {"counters": Counters(), "lateness": count, "busy": count})
     rig.rig.publish_row = lambda row: rows.append(row.copy())
 
     def stopping():

@@ -41,3 +41,9 @@ def next_state(state: int, command: int, started: bool, tripped: bool, critical:
     if state == READY and command == ARM:
         return ARMED
     return READY
+
+
+TABLE = bytes(next_state(state, command, started, tripped, critical) for state in range(len(STATES))
+              for command in range(len(COMMANDS)) for started in (False, True) for tripped in (False, True)
+              for critical in (False, True))
+"""`next_state` of every input, the last argument running fastest: how the compiled tick asks it."""

@@ -4,7 +4,8 @@ from libc.stdint cimport uint8_t
 
 ctypedef unsigned long long bits_t
 
-cdef int _OK, _STALE, _ERROR, _ABSENT, _SETPOINT, _OFF, _ARMED, _FAULT, _N, _M
+cdef int _OK, _STALE, _ERROR, _ABSENT, _NONE, _SETPOINT, _OFF, _ARMED, _FAULT, _COMMANDS, _WARM_UP, _N, _M
+cdef const uint8_t[::1] _NEXT
 cdef int _POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL, _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT
 cdef int _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS
 cdef int _B_FOLLOWING, _B_HOT, _B_HOT_MODEL, _B_HEATING, _B_DISAGREES, _B_POWER, _B_STUCK, _B_BOUND, _B_SLEWING
@@ -72,7 +73,7 @@ cdef class Law:
     @cython.locals(coil_new=cython.bint, i=cython.int, j=cython.int, k=cython.int, c=cython.int, s=cython.double,
                    elapsed=cython.double, gain=cython.double, prior=cython.double)
     cdef void _correct(self) noexcept
-    @cython.locals(before=cython.longlong)
+    @cython.locals(before=cython.longlong, known=cython.int, started=cython.bint, tripped=cython.bint, critical=cython.bint)
     cdef _arm(self, int command)
     @cython.locals(o='double[::1]', m=cython.int)
     cdef void _report(self) noexcept

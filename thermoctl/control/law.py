@@ -42,7 +42,6 @@ from array import array
 import numpy as np
 
 from thermoctl.control import arming, faults
-from thermoctl.control.arming import next_state
 from thermoctl.control.model import CompensatorModel, Parameters
 
 OUTPUTS = ("state", "fault_bits", "setpoint_um", "reference_um", "position_um", "compensated_um", "compensation_um",
@@ -56,13 +55,14 @@ WARM_UP_TICKS = 100
 MAX_GAP_S = 10.0            # a longer time between two ticks makes the estimate worthless
 RESUME_LIMIT_C = 2.0        # estimates of an earlier run are kept when the coil's first reading is as close as this
 COPPER_1_K = 0.00393        # temperature coefficient of the coil's resistance, from 20 degC
-_GAP_S, _RESUME_C, _COPPER = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K
+_GAP_S, _RESUME_C, _COPPER, _WARM_UP = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K, WARM_UP_TICKS
 COMPILED = not __file__.endswith(".py")
 """False when this module runs interpreted: right for coverage, a hundred times too slow for a rig."""
 
 # Constants that the compiler turns into C numbers (typed in law.pxd).
 _OK, _STALE, _ERROR, _ABSENT = 0, 1, 2, 3                  # status of a reading, as the back ends give it
-_SETPOINT, _OFF, _ARMED, _FAULT = arming.SETPOINT, arming.OFF, arming.ARMED, arming.FAULT
+_NONE, _SETPOINT, _OFF, _ARMED, _FAULT = arming.NONE, arming.SETPOINT, arming.OFF, arming.ARMED, arming.FAULT
+_NEXT, _COMMANDS = arming.TABLE, len(arming.COMMANDS)
 _N, _M = len(faults.CHANNELS), len(faults.TEMPERATURES)
 _POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL = 0, 1, 2, 3, 4, 5
 _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT = 18, 2, 3
@@ -212,6 +212,9 @@ class Law:
             raise ValueError(f"law: a state of {len(vector)} numbers, expected {size} (another model or version)")
         if not np.isfinite(vector[[_SCALARS.index(name) for name in _WHOLE]]).all():
             raise ValueError("law: a state whose counters are not finite")
+        for name, end in (("state", len(arming.STATES)), ("average_at", MAX_AVERAGE)):      # both are places in a table
+            if not 0 <= vector[_SCALARS.index(name)] < end:
+                raise ValueError(f"law: a state whose {name} is {vector[_SCALARS.index(name)]:g}, expected 0 to {end - 1}")
         for name, number in zip(_SCALARS, vector, strict=False):
             setattr(self, name, float(number) if name not in _WHOLE else int(number))
         start = len(_SCALARS)
@@ -618,9 +621,9 @@ class Law:
 
     def _arm(self, command):
         """The state machine; what tripped stays in `fault_bits` until FAULT is left."""
-        before = self.state
-        started, critical = self.tick > WARM_UP_TICKS, (self.trips & _CRITICAL) != 0
-        self.state = next_state(before, command, started, self.trips != 0, critical)
+        before, known = self.state, command if 0 <= command < _COMMANDS else _NONE
+        started, tripped, critical = self.tick > _WARM_UP, self.trips != 0, (self.trips & _CRITICAL) != 0
+        self.state = _NEXT[(((before * _COMMANDS + known) * 2 + started) * 2 + tripped) * 2 + critical]
         if self.state == _FAULT:
             self.latched = self.latched | self.trips
         else:

@@ -2,10 +2,9 @@
 """The clock of the loop: CLOCK_MONOTONIC in nanoseconds, and sleeping until a point of it.
 
 Absolute clock_nanosleep keeps the phase whatever a tick took, and is the best of the ways to wait that were measured
-(docs/why-cython.md). Both functions release the interpreter's lock while they wait.
+(docs/why-cython.md); the interpreter's lock is released meanwhile.
 """
-from libc.stdint cimport int64_t
-from posix.time cimport CLOCK_MONOTONIC, clock_gettime, timespec
+from posix.time cimport CLOCK_MONOTONIC, CLOCK_REALTIME, clock_gettime, timespec
 
 cdef extern from "<time.h>" nogil:
     enum: CLOCK_BOOTTIME
@@ -19,9 +18,16 @@ cdef inline int64_t _now() noexcept nogil:
     return <int64_t>t.tv_sec * 1000000000 + t.tv_nsec
 
 
-def now_ns() -> int:
+cpdef int64_t now_ns() noexcept:
     """CLOCK_MONOTONIC, ns: the clock of `time.monotonic()` and of every process of the daemon."""
     return _now()
+
+
+cpdef double wall_s() noexcept:
+    """The system's own clock, CLOCK_REALTIME, s: `time.time()`."""
+    cdef timespec t
+    clock_gettime(CLOCK_REALTIME, &t)
+    return <double>t.tv_sec + t.tv_nsec * 1e-9
 
 
 def suspended_ns() -> int:
@@ -32,7 +38,7 @@ def suspended_ns() -> int:
     return <int64_t>t.tv_sec * 1000000000 + t.tv_nsec - _now()
 
 
-def sleep_until(int64_t deadline_ns, int64_t spin_ns=0) -> int:
+cpdef int64_t sleep_until(int64_t deadline_ns, int64_t spin_ns=0) noexcept:
     """Sleep until `deadline_ns`, burning the last `spin_ns` of it; returns the time after, ns.
 
     Returns early only when a signal came, so that Python's handlers run.
@@ -45,8 +51,7 @@ def sleep_until(int64_t deadline_ns, int64_t spin_ns=0) -> int:
             t.tv_sec = until // 1000000000
             t.tv_nsec = until % 1000000000
             if clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL) != 0:
-                with gil:
-                    return _now()
+                deadline_ns = 0
         now = _now()
         while now < deadline_ns:
             now = _now()

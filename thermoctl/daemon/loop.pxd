@@ -1,15 +1,32 @@
 # C types for loop.py, which is the tick; see there.
+cimport cython
+from hal.devices cimport DevicesBackend
 from thermoctl.control.law cimport Law
+from thermoctl.daemon.clock cimport now_ns, sleep_until, wall_s
+from thermoctl.daemon.ring cimport Histogram, Mailbox, Record, Ring
 
 cdef class Rig:
-    cdef public object backend, publish_row, mailbox, parameter_box, state_box, reading, row, record, wall_s
+    cdef public object backend, publish_row, parameter_box, state_box, reading, row, wall_s
+    cdef public Record record
+    cdef public Mailbox mailbox
     cdef public Law law
-    cdef public double start_s, value
+    cdef public double start_s, value, busy_us
     cdef public long long slips, generation, external, write_failed
     cdef public int command
+    cdef double[::1] _head
 
+    cpdef tick(self, double now_s, double dt_s, double lateness_us=*, clock_ns=*)
+    @cython.locals(devices=DevicesBackend)
     cpdef sample(self, double now_s)
     cpdef _obey(self, double kind, double value)
+    @cython.locals(devices=DevicesBackend)
     cpdef actuate(self)
-    cpdef publish(self, double now_s, double dt_s, double lateness_us, double busy_us)
+    @cython.locals(law=Law, head='double[::1]', ring=Ring)
+    cpdef publish(self, double now_s, double dt_s, double lateness_us)
     cpdef keep_state(self)
+
+@cython.locals(paced=cython.bint, lateness=Histogram, busy=Histogram, period_ns=cython.longlong, spin_ns=cython.longlong,
+               before=cython.longlong, now=cython.longlong, deadline=cython.longlong, slept=cython.longlong,
+               slept_before=cython.longlong, gap_ns=cython.longlong, late_ns=cython.longlong, skipped=cython.longlong,
+               lateness_us=cython.double)
+cpdef run_loop(settings, shared, Rig rig, stopping, long long warm_up_ticks=*)

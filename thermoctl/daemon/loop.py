@@ -4,7 +4,8 @@
     sample -> estimate -> compensate -> control -> protect -> actuate -> publish
 
 Nothing in a tick waits, parses, logs or touches a disk. A tick that takes too long costs the ticks it covered: they are
-skipped, counted and published, and the phase is kept (policy `skip`). Real-time measures (priority, locked memory,
+skipped, counted and published, and the phase is kept (policy `skip`). A tick of real devices runs in C from end to end
+(loop.pxd types it): Python's objects are cold after a period of sleep, and each costs a cache miss. Real-time measures (priority, locked memory,
 processor, latency request) are asked for one by one; what the system refuses is one warning each, never a crash.
 """
 from __future__ import annotations
@@ -13,17 +14,17 @@ import ctypes
 import gc
 import os
 import signal
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from hal.devices import DevicesBackend
 from thermoctl.control import arming, faults
 from thermoctl.control.law import Law
 from thermoctl.control.model import CompensatorModel, Parameters
-from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns
-from thermoctl.daemon.ring import Record
+from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns, wall_s
+from thermoctl.daemon.ring import Mailbox, Record, Ring
 from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
 from thermoctl.signals import INDEX, SIGNALS
 
@@ -32,55 +33,58 @@ RELOAD = float(len(arming.COMMANDS))
 SUSPEND_NS = 1_000_000                 # the two clocks are not read at once; less than this is no suspend
 SUSPEND_EVERY = 16                     # ticks between two looks for one
 STATE_EVERY = 1000                     # ticks between two snapshots of the law's state
-_HEAD = INDEX["position_raw_um"]            # numbers of a row before the channels
+_HEAD = INDEX["position_raw_um"]            # numbers of a row before the channels, in the order of `publish`
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
 
 
 class Rig:
     """Back end, law and record of one rig, and the stages of its tick.
 
-    backend: opened; publish: called with the finished row (a ring's `write`, a list's `append`); mailbox, parameters,
-    state: as in shared.Shared, or None where nobody commands (simulation passes its own).
+    backend: opened; publish: the ring that takes the finished rows, or a function that is called with each; mailbox,
+    parameters, state: as in shared.Shared, or None where nobody commands. wall_s: another clock than the system's.
     """
 
     def __init__(self, backend: Any, model: CompensatorModel, parameters: Parameters, period_s: float,
-                 publish: Callable[[np.ndarray], Any], mailbox: Any = None, parameter_box: Any = None,
+                 publish: Ring | Callable[[np.ndarray], Any], mailbox: Mailbox | None = None, parameter_box: Any = None,
                  state_box: Any = None, start_s: float = 0.0):
         self.backend, self.publish_row, self.mailbox = backend, publish, mailbox
         self.parameter_box, self.state_box, self.start_s = parameter_box, state_box, start_s
         self.law = Law(model, parameters, period_s)
         self.reading: Any = None
-        self.row = np.zeros(len(SIGNALS))
+        self.row = self._head = np.zeros(len(SIGNALS))
         self.record = Record(self.row, _HEAD)
         self.slips = self.generation = self.external = self.write_failed = 0
-        self.command, self.value = arming.NONE, 0.0
-        self.wall_s: Callable[[], float] = time.time
+        self.command, self.value, self.busy_us = arming.NONE, 0.0, 0.0
+        self.wall_s: Callable[[], float] | None = None
 
     def tick(self, now_s: float, dt_s: float, lateness_us: float = 0.0,
-             clock_ns: Callable[[], int] = now_ns) -> None:
-        """One tick that began at `now_s`, `dt_s` after the one before; clock_ns times it."""
-        begin = clock_ns()
+             clock_ns: Callable[[], int] | None = None) -> None:
+        """One tick that began at `now_s`, `dt_s` after the one before; clock_ns times it, None: the loop's own clock."""
+        begin = now_ns() if clock_ns is None else clock_ns()
         self.sample(now_s)
         self.law.estimate(dt_s)
         self.law.compensate()
         self.law.control(self.command, self.value)
         self.law.protect(self.command, self.external)
         self.actuate()
-        self.publish(now_s, dt_s, lateness_us, (clock_ns() - begin) * 1e-3)
+        self.busy_us = ((now_ns() if clock_ns is None else clock_ns()) - begin) * 1e-3
+        self.publish(now_s, dt_s, lateness_us)
 
     def sample(self, now_s: float) -> None:
         """New readings into the law's arrays, and the next command."""
-        reading = self.backend.read(now_s)
+        if isinstance(self.backend, DevicesBackend):
+            devices = self.backend
+            reading = devices.read(now_s)
+        else:
+            reading = self.backend.read(now_s)
         if reading is not self.reading:                       # the same object every time, by contract
             self.reading = reading
             fresh = reading.fresh.view(np.uint8)
             self.law.bind(reading.value, fresh, reading.status)
             self.record.bind(reading.value, fresh, reading.status, self.law.outputs)
-        self.command, self.value, self.external = arming.NONE, 0.0, self.write_failed
-        if self.mailbox is not None:
-            message = self.mailbox.take()
-            if message is not None:
-                self._obey(*message)
+        self.command, self.value, self.external = 0, 0.0, self.write_failed
+        if self.mailbox is not None and self.mailbox.waiting():
+            self._obey(*self.mailbox.take())
 
     def _obey(self, kind: float, value: float) -> None:
         if kind == RELOAD:
@@ -95,17 +99,31 @@ class Rig:
     def actuate(self) -> None:
         """The amplifier's command. A failed write is a fault of the next tick."""
         try:
-            self.backend.write(self.law.drive, self.law.enable > 0.0)
+            if isinstance(self.backend, DevicesBackend):
+                devices = self.backend
+                devices.write(self.law.drive, self.law.enable > 0.0)
+            else:
+                self.backend.write(self.law.drive, self.law.enable > 0.0)
             self.write_failed = 0
         except OSError:
             self.write_failed = _AMPLIFIER_WRITE
 
-    def publish(self, now_s: float, dt_s: float, lateness_us: float, busy_us: float) -> None:
+    def publish(self, now_s: float, dt_s: float, lateness_us: float) -> None:
         """The finished row, and now and then the law's state (where a replay may start)."""
-        law = self.law
-        self.record.fill((now_s - self.start_s, self.wall_s(), law.tick, lateness_us, busy_us, self.slips, self.generation,
-                          dt_s, self.command, self.value, self.external))
-        self.publish_row(self.row)
+        law, head = self.law, self._head
+        head[0] = now_s - self.start_s
+        head[1] = wall_s() if self.wall_s is None else self.wall_s()
+        head[2] = law.tick
+        head[3], head[4] = lateness_us, self.busy_us
+        head[5], head[6] = self.slips, self.generation
+        head[7] = dt_s
+        head[8], head[9], head[10] = self.command, self.value, self.external
+        self.record.fill()
+        if isinstance(self.publish_row, Ring):
+            ring = self.publish_row
+            ring.write(head)
+        else:
+            self.publish_row(self.row)
         if law.tick % STATE_EVERY == 1:
             self.keep_state()
 
@@ -122,7 +140,7 @@ def run_loop(settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], boo
     if paced:
         rig.backend.check_pacing()
     shared.counters[START_S], shared.counters[LOOP_PID] = rig.start_s, os.getpid()
-    add_lateness, add_busy, busy = shared.lateness.add, shared.busy.add, INDEX["busy_us"]
+    lateness, busy = shared.lateness, shared.busy
     before, slept_before = now_ns(), suspended_ns()
     deadline = before + period_ns
     while not stopping():
@@ -143,8 +161,8 @@ def run_loop(settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], boo
             slept_before = slept
         rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)
         if rig.law.tick > warm_up_ticks:
-            add_lateness(lateness_us)
-            add_busy(rig.row[busy])
+            lateness.add(lateness_us)
+            busy.add(rig.busy_us)
         before = now
         deadline = now + period_ns if paced else deadline + period_ns
         late_ns = now_ns() - deadline

@@ -7,7 +7,7 @@ Mailbox: (kind, value) commands from one producer to the loop, lock-free, oldest
 Box: one vector with a sequence number (odd while written): parameters to the loop, the law's state from it.
 Histogram: counts of whole microseconds.
 """
-from libc.stdint cimport int64_t, uint64_t
+from libc.stdint cimport uint64_t
 from libc.string cimport memcpy
 
 import numpy as np
@@ -26,9 +26,6 @@ cdef extern from *:
 
 cdef class Ring:
     """`counter` uint64 (1,), `rows` float64 (slots, columns), both in shared memory."""
-    cdef uint64_t[::1] counter
-    cdef double[:, ::1] rows
-    cdef readonly int slots, columns
 
     def __init__(self, uint64_t[::1] counter, double[:, ::1] rows):
         self.counter, self.rows = counter, rows
@@ -39,7 +36,7 @@ cdef class Ring:
         """Rows written since the start."""
         return load_acquire(&self.counter[0])
 
-    cpdef write(self, double[::1] row):
+    cpdef void write(self, double[::1] row) noexcept:
         """Append one row (by the loop only)."""
         cdef uint64_t head = self.counter[0]
         fence()
@@ -82,8 +79,6 @@ cdef class Ring:
 
 cdef class Mailbox:
     """`counters` uint64 (2,): pushed, taken; `slots` float64 (n, 2)."""
-    cdef uint64_t[::1] counters
-    cdef double[:, ::1] slots
 
     def __init__(self, uint64_t[::1] counters, double[:, ::1] slots):
         self.counters, self.slots = counters, slots
@@ -105,6 +100,10 @@ cdef class Mailbox:
     @property
     def pushed(self) -> int:
         return load_acquire(&self.counters[0])
+
+    cpdef bint waiting(self) noexcept:
+        """Whether there is a command to take."""
+        return self.counters[1] != load_acquire(&self.counters[0])
 
     def take(self):
         """The oldest command as (kind, value), or None (by the loop only)."""
@@ -148,13 +147,11 @@ cdef class Box:
 
 cdef class Histogram:
     """`counts` uint64 (bins + 1,): whole microseconds, the last bin takes everything longer; `extremes` float64 (1,)."""
-    cdef uint64_t[::1] counts
-    cdef double[::1] largest
 
     def __init__(self, uint64_t[::1] counts, double[::1] largest):
         self.counts, self.largest = counts, largest
 
-    cpdef add(self, double microseconds):
+    cpdef void add(self, double microseconds) noexcept:
         """Count one value."""
         cdef int last = <int>self.counts.shape[0] - 1
         cdef int k = 0 if microseconds < 0.0 else (last if microseconds >= last else <int>microseconds)
@@ -164,15 +161,12 @@ cdef class Histogram:
 
 
 cdef class Record:
-    """The record row of a tick, filled in place. `bind` gives it what it copies from; head: number of its first scalars.
+    """The record row of a tick, filled in place behind its first `head` scalars, which the loop writes itself. `bind` gives it
+    what it copies from.
 
     Layout (signals.SIGNALS): head scalars | values of the channels | fresh bits (one a channel) | status bits (two) | outputs
     of the law; the bits as whole float64 numbers.
     """
-    cdef double[::1] row, value, outputs
-    cdef unsigned char[::1] fresh, status
-    cdef int head
-
     def __init__(self, double[::1] row, int head):
         self.row, self.head = row, head
 
@@ -182,12 +176,10 @@ cdef class Record:
             raise ValueError(f"{self.head} + {value.shape[0]} + 2 + {outputs.shape[0]} numbers are not a row of {self.row.shape[0]}")
         self.value, self.fresh, self.status, self.outputs = value, fresh, status, outputs
 
-    def fill(self, tuple scalars) -> None:
-        """This tick's row: `head` scalars, and what the bound arrays hold now."""
+    cpdef void fill(self) noexcept:
+        """What the bound arrays hold now into the row."""
         cdef int k, n = <int>self.value.shape[0]
         cdef uint64_t f = 0, s = 0
-        for k in range(self.head):
-            self.row[k] = scalars[k]
         memcpy(&self.row[self.head], &self.value[0], n * sizeof(double))
         for k in range(n):
             f |= <uint64_t>(self.fresh[k] != 0) << k

@@ -14,29 +14,13 @@ import numpy as np
 
 from hal.backend import make_backend
 from thermoctl.control import arming
-from thermoctl.control.model import CompensatorModel, Parameters
+from thermoctl.control.model import NAMES, CompensatorModel, Parameters
 from thermoctl.daemon.assemble import compensator, law_parameters
 from thermoctl.daemon.loop import RELOAD, Rig
+from thermoctl.daemon.ring import Box, Mailbox
 from thermoctl.signals import INDEX, SIGNALS
 
 COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reload": RELOAD}
-
-
-class _Commands(deque):
-    """A mailbox without shared memory."""
-
-    def take(self) -> tuple[float, float] | None:
-        return self.popleft() if self else None
-
-
-class _Parameters:
-    """A parameter box without shared memory."""
-
-    def __init__(self) -> None:
-        self.numbers: np.ndarray | None = None
-
-    def get(self) -> np.ndarray | None:
-        return self.numbers
 
 
 class Simulation:
@@ -49,22 +33,25 @@ class Simulation:
     def __init__(self, settings: Any, model: CompensatorModel | None = None, parameters: Parameters | None = None,
                  publish: Any = None):
         self.period_s = settings.loop.period_s
+        self.ticks, self.now_s = 0, 0.0
         self.backend = make_backend(settings)
         self.backend.open()
-        self.mailbox, self.box, self.quiet = _Commands(), _Parameters(), publish is None
+        self.mailbox, self.box = Mailbox(np.zeros(2, np.uint64), np.zeros((64, 2))), Box(np.zeros(1, np.uint64), np.zeros(len(NAMES) + 1))
+        self.quiet = publish is None
         self.rig = Rig(self.backend, model or compensator(settings), parameters or law_parameters(settings),
                        self.period_s, publish or (lambda row: None), self.mailbox, self.box)
         self.rig.wall_s = lambda: self.now_s
-        self.law, self.row, self.ticks, self.now_s = self.rig.law, self.rig.row, 0, 0.0
+        self.law, self.row = self.rig.law, self.rig.row
 
     def command(self, name: str, value: float = 0.0) -> None:
-        """Give arm, disarm, or setpoint (um) for the next tick."""
-        self.mailbox.append((COMMANDS[name], float(value)))
+        """Give arm, disarm, or setpoint (um) for the next tick. Raises RuntimeError where too many wait."""
+        if not self.mailbox.push(COMMANDS[name], float(value)):
+            raise RuntimeError("more commands than the mailbox holds: let it tick")
 
     def reload(self, parameters: Parameters) -> None:
         """Apply new parameters at the next tick."""
-        self.box.numbers = parameters.pack()
-        self.mailbox.append((RELOAD, 0.0))
+        self.box.put(parameters.pack())
+        self.command("reload")
 
     def tick(self, count: int = 1) -> np.ndarray:
         """Run `count` ticks; returns the newest row (a view). Where nobody takes the rows (`publish`), only the last is made."""

@@ -106,7 +106,7 @@ def _loop_process(settings: Any, shared: Shared, board: Any) -> int:
     backend.open()
     try:
         rig = loops.Rig(backend, compensator(settings), law_parameters(settings), settings.loop.period_s,
-                        shared.ring.write, shared.mailbox, shared.parameters, shared.state, time.monotonic())
+                        shared.ring, shared.mailbox, shared.parameters, shared.state, time.monotonic())
         _resume(settings, shared, rig)
 
         def warn(text: str) -> None:

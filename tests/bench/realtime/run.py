@@ -397,7 +397,7 @@ def hours_simulated(work: Path, hours: float) -> list[tuple[float, int, int]]:
     settings = load_settings(work / "hours.yaml")
     shared = Shared.create(f"thermoctl-bench-{os.getpid()}")
     try:
-        simulation = Simulation(settings, publish=shared.ring.write)
+        simulation = Simulation(settings, publish=shared.ring)
         recorder = make_recorder(settings, shared, lambda *a, **k: None)
         simulation.arm()
         found = []
