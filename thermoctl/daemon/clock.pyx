@@ -30,7 +30,7 @@ cpdef double wall_s() noexcept:
     return <double>t.tv_sec + t.tv_nsec * 1e-9
 
 
-def suspended_ns() -> int:
+cpdef int64_t suspended_ns() noexcept:
     """How long the machine has slept since it was started (CLOCK_BOOTTIME - CLOCK_MONOTONIC), ns: the one clock that
     a suspend shows in. A growth of some 100 ns is the time between the two looks."""
     cdef timespec t

@@ -2,11 +2,13 @@
 cimport cython
 from hal.devices cimport DevicesBackend
 from thermoctl.control.law cimport Law
-from thermoctl.daemon.clock cimport now_ns, sleep_until, wall_s
+from thermoctl.daemon.clock cimport now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring cimport Histogram, Mailbox, Record, Ring
 
+cdef int _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS
+
 cdef class Rig:
-    cdef public object backend, publish_row, parameter_box, state_box, reading, row, wall_s
+    cdef public object backend, publish_row, parameter_box, state_box, reading, row, wall_s, suspended_ns
     cdef public Record record
     cdef public Mailbox mailbox
     cdef public Law law
@@ -15,6 +17,7 @@ cdef class Rig:
     cdef public int command
     cdef double[::1] _head
 
+    @cython.locals(begin=cython.longlong, end=cython.longlong)
     cpdef tick(self, double now_s, double dt_s, double lateness_us=*, clock_ns=*)
     @cython.locals(devices=DevicesBackend)
     cpdef sample(self, double now_s)

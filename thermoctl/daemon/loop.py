@@ -34,6 +34,7 @@ SUSPEND_NS = 1_000_000                 # the two clocks are not read at once; le
 SUSPEND_EVERY = 16                     # ticks between two looks for one
 STATE_EVERY = 1000                     # ticks between two snapshots of the law's state
 _HEAD = INDEX["position_raw_um"]            # numbers of a row before the channels, in the order of `publish`
+_STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = STATE_EVERY, SUSPEND_EVERY, SUSPEND_NS         # numbers of C, by loop.pxd
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
 
 
@@ -41,7 +42,7 @@ class Rig:
     """Back end, law and record of one rig, and the stages of its tick.
 
     backend: opened; publish: the ring that takes the finished rows, or a function that is called with each; mailbox,
-    parameters, state: as in shared.Shared, or None where nobody commands. wall_s: another clock than the system's.
+    parameters, state: as in shared.Shared, or None where nobody commands. wall_s, suspended_ns: other clocks than the system's.
     """
 
     def __init__(self, backend: Any, model: CompensatorModel, parameters: Parameters, period_s: float,
@@ -56,18 +57,20 @@ class Rig:
         self.slips = self.generation = self.external = self.write_failed = 0
         self.command, self.value, self.busy_us = arming.NONE, 0.0, 0.0
         self.wall_s: Callable[[], float] | None = None
+        self.suspended_ns: Callable[[], int] | None = None
 
     def tick(self, now_s: float, dt_s: float, lateness_us: float = 0.0,
              clock_ns: Callable[[], int] | None = None) -> None:
         """One tick that began at `now_s`, `dt_s` after the one before; clock_ns times it, None: the loop's own clock."""
-        begin = now_ns() if clock_ns is None else clock_ns()
+        begin = now_ns() if clock_ns is None else int(clock_ns())
         self.sample(now_s)
         self.law.estimate(dt_s)
         self.law.compensate()
         self.law.control(self.command, self.value)
         self.law.protect(self.command, self.external)
         self.actuate()
-        self.busy_us = ((now_ns() if clock_ns is None else clock_ns()) - begin) * 1e-3
+        end = now_ns() if clock_ns is None else int(clock_ns())
+        self.busy_us = (end - begin) * 1e-3
         self.publish(now_s, dt_s, lateness_us)
 
     def sample(self, now_s: float) -> None:
@@ -112,7 +115,7 @@ class Rig:
         """The finished row, and now and then the law's state (where a replay may start)."""
         law, head = self.law, self._head
         head[0] = now_s - self.start_s
-        head[1] = wall_s() if self.wall_s is None else self.wall_s()
+        head[1] = wall_s() if self.wall_s is None else float(self.wall_s())
         head[2] = law.tick
         head[3], head[4] = lateness_us, self.busy_us
         head[5], head[6] = self.slips, self.generation
@@ -124,7 +127,7 @@ class Rig:
             ring.write(head)
         else:
             self.publish_row(self.row)
-        if law.tick % STATE_EVERY == 1:
+        if law.tick % _STATE_EVERY == 1:
             self.keep_state()
 
     def keep_state(self) -> None:
@@ -141,7 +144,8 @@ def run_loop(settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], boo
         rig.backend.check_pacing()
     shared.counters[START_S], shared.counters[LOOP_PID] = rig.start_s, os.getpid()
     lateness, busy = shared.lateness, shared.busy
-    before, slept_before = now_ns(), suspended_ns()
+    before = now_ns()
+    slept_before = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
     deadline = before + period_ns
     while not stopping():
         if paced:                                              # a frame is late: so is the tick, but not by two periods
@@ -155,9 +159,9 @@ def run_loop(settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], boo
                 continue
         lateness_us = (now - deadline) * 1e-3
         gap_ns = 0
-        if rig.law.tick % SUSPEND_EVERY == 0:                  # CLOCK_MONOTONIC stands while the machine sleeps
-            slept = suspended_ns()
-            gap_ns = slept - slept_before if slept - slept_before > SUSPEND_NS else 0
+        if rig.law.tick % _SUSPEND_EVERY == 0:                 # CLOCK_MONOTONIC stands while the machine sleeps
+            slept = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
+            gap_ns = slept - slept_before if slept - slept_before > _SUSPEND_NS else 0
             slept_before = slept
         rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)
         if rig.law.tick > warm_up_ticks:

@@ -1,7 +1,26 @@
 # cython: language_level=3, boundscheck=False, wraparound=False
-"""The product's compiled law over prepared readings, tick after tick: what its arithmetic costs, without Python in between."""
+"""What the bench needs in C: the product's law over prepared readings, and the probe at the end of a tick."""
+from libc.stdint cimport int64_t
 from libc.string cimport memcpy
+
 from thermoctl.control.law cimport Law
+from thermoctl.daemon.clock cimport now_ns
+
+
+cdef class Probe:
+    """The loop's question `stopping()`, which notes the time in `stamps` before it is asked."""
+    cdef int64_t[::1] stamps
+    cdef object stopping
+    cdef Py_ssize_t at
+
+    def __init__(self, int64_t[::1] stamps, stopping):
+        self.stamps, self.stopping = stamps, stopping
+
+    def __call__(self):
+        if self.at < self.stamps.shape[0]:
+            self.stamps[self.at] = now_ns()
+            self.at += 1
+        return self.stopping()
 
 
 def run(Law law, double[:, ::1] values, unsigned char[:, ::1] fresh, unsigned char[:, ::1] status, double[::1] dt,
