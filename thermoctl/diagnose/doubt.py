@@ -88,7 +88,11 @@ def early(metric: Metric) -> Early | None:
 
 
 def later(table: Table, column: str, seconds: float) -> Table:
-    """The table with one column's samples `seconds` later (whole samples, so that its noise stays what it is)."""
-    index = np.searchsorted(table.t, table.t - seconds + 1e-9) - 1
-    values = np.where(index >= 0, table.columns[column][np.maximum(index, 0)], np.nan)
+    """The table with one column's samples `seconds` later: by whole samples, each used once, so that its noise stays what it
+    is under a jittering clock; NaN where a gap lies between."""
+    step = float(np.median(np.diff(table.t)))
+    count = min(max(round(seconds / step), 0), len(table.t))
+    values = np.full(len(table.t), np.nan)
+    values[count:] = table.columns[column][:len(table.t) - count]
+    values[count:][np.abs(table.t[count:] - table.t[:len(table.t) - count] - seconds) > 1.5 * step] = np.nan
     return dataclasses.replace(table, columns={**table.columns, column: values})

@@ -71,7 +71,7 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         return Diagnosis("consistent", base, base, [], [look(case, base, entries)], [], None, held_out(case, base, base), [*notes, quiet], None,
                          start)
     first = look(case, base, entries)
-    clock = _clock(case, base, base, first, CLEAN)
+    clock = _clock(case, base, base, first)
     followed = None
     if clock:
         most = 0        # a shifted clock that leaves nothing to explain
@@ -152,18 +152,19 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     return Diagnosis(verdict, base, current, rivals, rounds, suspects, missing, held, notes, None, start)
 
 
-def _clock(case: Case, base: Explanation, found: Explanation, first: Round, within: float = np.inf) -> str | None:
+def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> str | None:
     """Does one channel run ahead of the others, rather than physics being missing? The channel is shifted back, the plant
-    refitted, and the score held against that of the best explanation; its residual must then be `within` so many sigmas."""
+    refitted, and the score held against that of the best explanation `found`. Where none is, the shift must promise more than
+    every entry of the catalogue and leave nothing over."""
     if first.p_any() > 1e-3:
         return None
     guess = doubt.early(first.metric)
-    if guess is None or guess.gain < 0.3 * first.directions[0].gain:
+    if guess is None or guess.gain < (0.3 if found.effects else 1.0) * first.directions[0].gain:
         return None
     case.progress(f"trying whether {guess.output} runs ahead of the others")
     column = case.plant.outputs[guess.output].column
     step = max(float(np.median(np.diff(t.t))) for t in case.tables)
-    best, seconds = base, 0.0
+    best, seconds, after = base, 0.0, case
     ahead = guess.seconds
     for _ in range(5):
         total = round((seconds + ahead) / step) * step
@@ -177,13 +178,14 @@ def _clock(case: Case, base: Explanation, found: Explanation, first: Round, with
             break
         if e.raw / max(e.fit.samples, 1) >= best.raw / max(best.fit.samples, 1):
             break
-        best, seconds = e, total
+        best, seconds, after = e, total, shifted
         again = doubt.early(Metric(e.fit, shifted.drives))
         if again is None or again.output != guess.output:
             break
         ahead = again.seconds
     per_sample = base.fit.samples / max(best.fit.samples, 1)        # the shift takes a few samples away
-    if seconds > 0 and best.raw * per_sample < found.raw - ACCEPT and max(case.excess(best).values()) < within:
+    better = seconds > 0 and best.raw * per_sample < found.raw - ACCEPT
+    if better and (found.effects or (max(after.excess(best).values()) < CLEAN and smooth(after, best, coloured=True) > REMAINS)):
         return (f"{guess.output}: its clock runs about {seconds:.3g} s ahead of the other channels' (shifted back, the residual falls from "
                 f"{base.fit.rms()[guess.output]:.3g} to {best.fit.rms()[guess.output]:.3g}); no sensor reads ahead of time. "
                 "Put the channels on one clock and diagnose again")

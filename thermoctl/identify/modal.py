@@ -10,6 +10,10 @@ s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only
 2. Variable projection (Golub and Pereyra 1973) with Kaufman's simplification over x_k = ln(time constant):
    J'J = (dF' P dF) o (T T'), J'r = -diag(dF' r T'), F (J, K) block responses, T the residues, P the projector off F.
 3. The order is the one with the least BIC.
+4. What no input explains is not white: the chamber, the bench and heat nobody measures move temperatures for hours. Plain least squares
+   then fits the slowest, most disturbed part of the record hardest. With `drift_s` = (td, tc) the residual is taken as a first-order drift,
+   forgotten in td, over white noise, the drift standing above the noise below 1/(2 pi tc): outputs and responses pass its whitening filter
+   (1 - exp(-T/td) z^-1)/(1 - exp(-T/tc) z^-1) first (generalised least squares).
 All models are stable by construction.
 """
 from __future__ import annotations
@@ -20,7 +24,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, signal
 
 from thermoctl.identify import kernels
 from thermoctl.identify.statespace import StateSpace, modal
@@ -92,6 +96,15 @@ def _responses(records: list[Blocks], tau: np.ndarray, rest: bool) -> tuple[np.n
     return np.vstack([f for f, _, _ in parts]), np.vstack([d for _, d, _ in parts]), parts[0][2]
 
 
+def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, float] | None) -> np.ndarray:
+    """Stacked rows (J, columns) through the drift's whitening filter, each recording on its own; as they are without `drift_s`."""
+    if drift_s is None:
+        return rows
+    forgotten, corner = (np.exp(-records[0].q * records[0].period_s / t) for t in drift_s)
+    ends = np.cumsum([len(b.u) for b in records])[:-1]
+    return np.vstack([signal.lfilter([1, -forgotten], [1, -corner], part, axis=0) for part in np.split(rows, ends)])
+
+
 def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Block-mean responses F (J, columns) and their derivative by ln tau, and each column's pole index.
 
@@ -150,14 +163,15 @@ def _project(F: np.ndarray, Y: np.ndarray, ridge: float = 1e-7) -> tuple[np.ndar
 
 
 def _fit(blocks: list[Blocks], Y: np.ndarray, weight: np.ndarray, tau: np.ndarray, rest: bool, iterations: int,
-         bounds: tuple[float, float], ridge: float = 1e-7) -> _Fit:
+         bounds: tuple[float, float], ridge: float = 1e-7, drift_s: tuple[float, float] | None = None) -> _Fit:
     """Levenberg-Marquardt on ln tau. `Y` (J, l) is scaled by each output's noise, `weight` (J,) by row."""
     x = np.log(tau)
+    Y = _whitened(Y, blocks, drift_s) * weight[:, None]
     lo, hi = np.log(bounds[0]), np.log(bounds[1])
 
     def evaluate(x: np.ndarray) -> tuple:
         F, D, owner = _responses(blocks, np.exp(x), rest)
-        F, D = F * weight[:, None], D * weight[:, None]
+        F, D = (_whitened(v, blocks, drift_s) * weight[:, None] for v in (F, D))
         Q, theta, r = _project(F, Y, ridge)
         return float((r**2).sum()), Q, theta, r, D, owner
 
@@ -191,13 +205,13 @@ def _fit(blocks: list[Blocks], Y: np.ndarray, weight: np.ndarray, tau: np.ndarra
 
 
 def identify(records: Blocks | list[Blocks], order: int | None = 8, rest: bool = True, iterations: int = 30,
-             tau_range_s: tuple[float, float] | None = None, ridge: float = 1e-7) -> StateSpace:
+             tau_range_s: tuple[float, float] | None = None, ridge: float = 1e-7, drift_s: tuple[float, float] | None = None) -> StateSpace:
     """Model with `order` real poles per input (None: the least BIC of 1..10) from reduced data, at the blocks' sample period.
 
     Several recordings (of one block length) are fitted together; they must begin at `rest`. `ridge` (of a column's norm) holds residues
     that the data hardly tell small: for short records of a network that is not quite linear.
     `rest`: the recording begins in thermal equilibrium (output rises are zero); otherwise every output's free decay is
-    estimated too. Rows where an output is missing are left out for all outputs when the others are whole, else filled by
+    estimated too. `drift_s`: see 4. above. Rows where an output is missing are left out for all outputs when the others are whole, else filled by
     two rounds of the model's own output. Raises InputError when an output was never measured."""
     records = [records] if isinstance(records, Blocks) else records
     blocks = replace(records[0], y=np.vstack([b.y for b in records]), weight=np.vstack([b.weight for b in records]),
@@ -211,7 +225,7 @@ def identify(records: Blocks | list[Blocks], order: int | None = 8, rest: bool =
     if missing.all(0).any():
         raise InputError(f"output {int(np.flatnonzero(missing.all(0))[0]) + 1} has no sample; leave it out")
     if order is None:
-        fits = [identify(records, k, rest, iterations, bounds, ridge) for k in range(1, 11)]
+        fits = [identify(records, k, rest, iterations, bounds, ridge, drift_s) for k in range(1, 11)]
         return min(fits, key=lambda m: m.info["bic"])
     weight = np.sqrt(np.where(missing, 1, blocks.weight).mean(1))
     y = blocks.y.copy()
@@ -224,7 +238,7 @@ def identify(records: Blocks | list[Blocks], order: int | None = 8, rest: bool =
     noise = np.maximum(noise, 1e-2 * np.median(noise))
     tau = np.geomspace(max(1.5 * block_s, bounds[0]), min(0.5 * span, bounds[1]), order)
     for _ in range(3 if gaps else 1):
-        fit = _fit(records, y / noise * weight[:, None], weight, tau, rest, iterations, bounds, ridge)
+        fit = _fit(records, y / noise, weight, tau, rest, iterations, bounds, ridge, drift_s)
         if gaps:
             F, _, _ = _responses(records, fit.tau, rest)
             y[missing] = (F @ fit.theta * noise)[missing]
