@@ -129,10 +129,11 @@ mutants: install                   # protection and arming: every branch reached
 	$(BIN)/python -m tests.control.mutants --page docs/proof/mutants.md
 
 # The loop beside cyclictest, a paired C reference, a C twin and a plain pyserial + python-can loop: idle and under stress.
-# Needs root and Debian's rt-tests and stress-ng; about 10 minutes.
+# Then whether memory or descriptors grow. Needs root and Debian's rt-tests and stress-ng; about 20 minutes.
 .PHONY: bench-realtime
 bench-realtime: install
-	$(BIN)/python tests/bench/realtime/run.py
+	$(BIN)/python -m tests.bench.realtime.run
+	$(BIN)/python -m tests.bench.realtime.steady
 
 .PHONY: systemd-test
 systemd-test: install              # the unit in a really booted systemd (root; Debian: systemd-container, mmdebstrap)

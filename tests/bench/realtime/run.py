@@ -379,72 +379,6 @@ def bench_law(bench: Bench, ticks: int = 20000, repeats: int = 15) -> dict[str, 
             "call_p99_us": float(np.percentile(calls, 99)) * 1e-3, "armed": armed, "ticks": ticks}
 
 
-# ---- hours ----------------------------------------------------------------------------------------------------------
-
-def resident_kb() -> int:
-    return int(Path("/proc/self/status").read_text().split("VmRSS:")[1].split()[0])
-
-
-def hours_simulated(work: Path, hours: float) -> list[tuple[float, int, int]]:
-    """(hour, resident kB, descriptors) while the loop's tick and the recorder run in simulated time."""
-    from thermoctl.daemon.recorder import make_recorder
-    from thermoctl.daemon.shared import Shared
-    from thermoctl.daemon.simulate import Simulation
-    from thermoctl.settings import load_settings
-    text = (ROOT / "config/simulated.yaml").read_text().replace("models/", f"{ROOT}/config/models/")
-    text = text.replace("plants/", f"{ROOT}/config/plants/").replace("../recordings", str(work / "hours"))
-    (work / "hours.yaml").write_text(text)
-    settings = load_settings(work / "hours.yaml")
-    shared = Shared.create(f"thermoctl-bench-{os.getpid()}")
-    try:
-        simulation = Simulation(settings, publish=shared.ring)
-        recorder = make_recorder(settings, shared, lambda *a, **k: None)
-        simulation.arm()
-        found = []
-        for quarter in range(round(4 * hours)):
-            for part in range(9 * 20):
-                simulation.command("setpoint", 50.0 * (part % 3))
-                simulation.tick(5000)
-                recorder.move()
-            found.append(((quarter + 1) / 4, resident_kb(), len(os.listdir("/proc/self/fd"))))
-        recorder.close()
-    finally:
-        shared.remove()
-    return found
-
-
-def hours_wire(bench: Bench, ticks: int) -> list[tuple[float, int, int]]:
-    """The same of the drivers: DevicesBackend read and written without a pause, against the peer; (share, kB, fds)."""
-    from hal.backend import make_backend
-    from thermoctl.settings import load_settings
-    backend = make_backend(load_settings(bench.config))
-    backend.open()
-    found = []
-    try:
-        for part in range(10):
-            for _ in range(ticks // 10):
-                backend.read(time.monotonic())
-                backend.write(0.0, False)
-            found.append(((part + 1) / 10, resident_kb(), len(os.listdir("/proc/self/fd"))))
-    finally:
-        backend.close()
-    return found
-
-
-def in_child(function: Any, *arguments: Any) -> Any:
-    """`function` in a fresh process, so that its memory is its own."""
-    import multiprocessing
-    queue: Any = multiprocessing.get_context("fork").SimpleQueue()
-
-    def main() -> None:
-        queue.put(function(*arguments))
-    child = multiprocessing.get_context("fork").Process(target=main)
-    child.start()
-    result = queue.get()
-    child.join()
-    return result
-
-
 # ---- the whole ------------------------------------------------------------------------------------------------------
 
 @contextlib.contextmanager
@@ -496,7 +430,7 @@ def measure(bench: Bench, rounds: int, seconds: float, stressed: bool) -> Iterat
         yield found
 
 
-def report(law: dict, conditions: dict[str, dict], hours: list, wire: list) -> tuple[list[str], int]:
+def report(law: dict, conditions: dict[str, dict]) -> tuple[list[str], int]:
     """The tables as Markdown lines, and how many bars were missed."""
     lines = ["", "| wake-up latency, us | p50 | p99 | p99.9 | max | overruns in 1000 |", "|---|---|---|---|---|---|"]
     bars: list[tuple[str, str, str, bool | None]] = []
@@ -547,13 +481,6 @@ def report(law: dict, conditions: dict[str, dict], hours: list, wire: list) -> t
               law["ratio"] <= 2.0),
              ("law, called from the tick, p50", f"{law['call_p50_us']:.2f} us (p99 {law['call_p99_us']:.2f})", "< 5 us",
               law["call_p50_us"] < 5.0)]
-    for what, found_hours, unit in (("loop and recorder in simulated time", hours, "h"), ("serial and CAN drivers", wire, "")):
-        if found_hours:
-            first, last = found_hours[0], found_hours[-1]
-            span = f"{last[0]:g} h" if unit else "one million ticks" if last[2] else ""
-            bars += [(f"memory over {span}, {what}", f"{last[1] - first[1]:+d} kB of {first[1]} kB", "<= 1 %",
-                      last[1] - first[1] <= 0.01 * first[1]),
-                     (f"descriptors over {span}, {what}", f"{last[2] - first[2]:+d}", "0", last[2] == first[2])]
     lines += ["", "| figure | measured | bar | met |", "|---|---|---|---|"]
     for name, measured, bar, met in bars:
         said = "-" if met is None and not bar.startswith("aim") else "not reached" if met is None else "yes" if met else "**no**"
@@ -571,8 +498,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each program in each round")
-    parser.add_argument("--hours", type=float, default=2.0, help="of simulated time")
-    parser.add_argument("--wire-ticks", type=int, default=1_000_000)
     parser.add_argument("--cpu", type=int, default=1)
     parser.add_argument("--out", type=Path, help="also write the tables here (Markdown)")
     parser.add_argument("--raw", type=Path, help="also write percentiles of every round here (JSON)")
@@ -593,12 +518,10 @@ def main() -> int:
                     for found in measure(bench, args.rounds, args.seconds, condition == "stress"):
                         conditions[condition] = found
                         if args.out:                                  # so that a run that is cut short leaves its rounds
-                            args.out.write_text("\n".join([*head, *report(law, conditions, [], [])[0], ""]))
-            wire = in_child(hours_wire, bench, args.wire_ticks) if args.wire_ticks else []
+                            args.out.write_text("\n".join([*head, *report(law, conditions)[0], ""]))
         finally:
             bench.stop_peer()
-        hours = in_child(hours_simulated, bench.work, args.hours) if args.hours else []
-    lines, missed = report(law, conditions, hours, wire)
+    lines, missed = report(law, conditions)
     head.append(f"{args.rounds} rounds of {args.seconds:g} s; the rest of the machine was "
                 f"{'shared with other work' if os.getloadavg()[0] > 2.5 else 'quiet'} (load {os.getloadavg()[0]:.1f} at the end)")
     text = "\n".join([*head, *lines, ""])
