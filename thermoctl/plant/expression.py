@@ -18,6 +18,7 @@ FUNCTIONS = {"abs": 1, "sign": 1, "sqrt": 1, "exp": 1, "log": 1, "sin": 1, "cos"
 SPECIAL = ("table", "delay", "first")
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 MAX_LENGTH, MAX_DEPTH, MAX_TOKENS = 20_000, 80, 5_000
+MAX_LEVELS = 250            # of the tree that is read: of brackets, and of terms and factors in a row
 ALLOWED = ("+ - * / **, comparisons, numbers, pi, t, the names of the file, and "
            + " ".join(FUNCTIONS) + " table delay first")
 
@@ -156,7 +157,12 @@ def parse(text: str | int | float) -> Expr:
     result = reader.comparison()
     if reader.at < len(tokens):
         raise ExpressionError(f"'{tokens[reader.at][1]}' was not expected here; an operator or the end was")
-    return result
+    level = [result]
+    for _ in range(MAX_LEVELS):
+        level = [a for e in level for a in e.args]
+        if not level:
+            return result
+    raise ExpressionError(f"more than {MAX_LEVELS} terms or factors in a row: put some of them in brackets")
 
 
 class _Reader:
