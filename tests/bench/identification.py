@@ -17,6 +17,7 @@ import tempfile  # noqa: E402
 import time  # noqa: E402
 import warnings  # noqa: E402
 from functools import partial  # noqa: E402
+from itertools import product  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import numpy as np  # noqa: E402
@@ -321,7 +322,10 @@ def measured_data() -> None:
     """Held-out free-run error on measured recordings: 60 % identifies, the free run that goes on from there is judged on the rest.
 
     Every method gets the same: the raw part (nothing centred), and chooses its order (peers: 1 to 5, and their window of 8 or 15) by the same
-    cross-validation on that part. For information also the best order of each peer with the held-out part looked at."""
+    cross-validation on that part. Where a rig has other recordings that begin at rest (the motor), ours is identified from them too; a peer
+    takes one record: without them, or with them before its own in one record, whichever turns out better for it on the held-out part.
+    For information also the best order of each peer with the held-out part looked at, ours from the one record alone, and what the ratio
+    would be over other stretches of the same length (moving-block bootstrap of the held-out part, 5 to 95 %)."""
     from thermoctl.recording.table import read_table
     folder = Path(os.environ.get("THERMOCTL_RECORDINGS", "../shared/recordings"))
     if not folder.is_dir():
@@ -337,45 +341,69 @@ def measured_data() -> None:
             y = y - np.interp(t, table.t, table.columns[less])[:, None]
         return (u**2 if square else u), y, period
 
-    tclab, motor = (["Q1", "Q2"], ["T1", "T2"], "air", False, 1.0), (["current"], ["temperature"], "air", True, 1.0)
-    sets = {"tclab run 1": block("tclab/run_1.csv", *tclab), "tclab run 3": block("tclab/run_3.csv", *tclab),
-            "tmotor run 1": block("tmotor_ak109/run_1.csv", *motor), "tmotor run 3": block("tmotor_ak109/run_3.csv", *motor),
-            "building": block("building_prbs/run_1.csv", ["outdoor", "solar", "heating"], ["indoor"], None, False, 300.0)}
+    tclab = (["Q1", "Q2"], ["T1", "T2"], "air", False, 1.0)
+    motor = {k: block(f"tmotor_ak109/run_{k}.csv", ["current"], ["temperature"], "air", True, 1.0) for k in (1, 2, 3)}
+    sets = {"tclab run 1": (block("tclab/run_1.csv", *tclab), []), "tclab run 3": (block("tclab/run_3.csv", *tclab), []),
+            "tmotor run 1": (motor[1], [motor[2], motor[3]]), "tmotor run 3": (motor[3], [motor[1], motor[2]]),
+            "building": (block("building_prbs/run_1.csv", ["outdoor", "solar", "heating"], ["indoor"], None, False, 300.0), [])}
     peers = {"ctrlsys": slicot_mimo, "sippy": sippy_mimo, "PSID": ipsid_mimo}
-    for name, (u, y, period) in sets.items():
+    for name, ((u, y, period), others) in sets.items():
         cut = int(0.6 * len(u))
 
-        def judge(m, start: int, stop: int, x0=None, u=u, y=y) -> float:
+        def left(m, start: int, stop: int, x0=None, u=u, y=y) -> np.ndarray:
             x0 = m.initial_state(u[:start], y[:start]) if x0 is None else x0
             with np.errstate(over="ignore", invalid="ignore"):
-                e = float(np.sqrt(np.mean((m.simulate(u[:stop], x0)[start:] - y[start:stop])**2)))
-            return e if np.isfinite(e) else np.inf
+                return m.simulate(u[:stop], x0)[start:] - y[start:stop]
 
-        mine = modal.identify_validated(u[:cut], y[:cut], period)
-        ours = judge(mine, cut, len(u), mine.x0 if mine.info["rest"] else None)
-        fair, looked = {}, {}
+        def rms(e: np.ndarray) -> float:
+            with np.errstate(over="ignore", invalid="ignore"):
+                v = float(np.sqrt(np.mean(e**2)))
+            return v if np.isfinite(v) else np.inf
+
+        def mine(given: list, u=u, y=y, cut=cut, period=period, left=left, rms=rms) -> tuple[StateSpace, np.ndarray]:
+            m = modal.identify_validated(u[:cut], y[:cut], period, others=given)
+            return m, left(m, cut, len(u), m.x0 if m.info["rest"] else None)
+
+        model, e = mine([o[:2] for o in others])
+        ours, alone = rms(e), rms(mine([])[1])
+        fair: dict[str, np.ndarray] = {}
+        looked = {}
         for peer, run in peers.items():
-            chosen = (np.inf, np.inf)
             looked[peer] = np.inf
-            for order in range(1, 6):
-                for i in (8, 15):
-                    def fit(stop: int, run=run, order=order, i=i, u=u, y=y, period=period):
-                        return StateSpace(*(np.asarray(v, float) for v in run(u[:stop], y[:stop], order, i)), period, np.zeros(order))
-                    try:
-                        held = judge(fit(cut), cut, len(u))
-                    except Exception:                            # noqa: BLE001, S112  an order the peer cannot do
-                        continue
-                    looked[peer] = min(looked[peer], held)
-                    e = []
-                    for part in (0.4, 0.6, 0.8):
-                        with contextlib.suppress(Exception):     # a part that is too short for the peer's window
-                            e.append(judge(fit(int(part * cut)), int(part * cut), int((part + 0.2) * cut)))
-                    if e:
-                        chosen = min(chosen, (float(np.sqrt(np.mean(np.square(e)))), held))
-            fair[peer] = chosen[1] if np.isfinite(chosen[1]) else looked[peer]         # in the peer's favour
-        best = min(fair, key=fair.__getitem__)
-        goal(f"{name}: held-out error / best peer ({best})", ours / fair[best], 1.0,
-             f"{ours:.3f} K, order {mine.info['order']}; " + ", ".join(f"{k} {fair[k]:.3f} (looked at: {looked[k]:.3f})" for k in peers))
+            chosen: dict[bool, tuple[float, np.ndarray]] = {}
+            for order, i, joined in product(range(1, 6), (8, 15), {False, bool(others)}):
+                def fit(stop: int, run=run, order=order, i=i, before=others if joined else [], u=u, y=y, period=period):
+                    data = (np.vstack([*(o[k] for o in before), v[:stop]]) for k, v in enumerate((u, y)))
+                    return StateSpace(*(np.asarray(v, float) for v in run(*data, order, i)), period, np.zeros(order))
+                try:
+                    held = left(fit(cut), cut, len(u))
+                except Exception:                            # noqa: BLE001, S112  an order the peer cannot do
+                    continue
+                looked[peer] = min(looked[peer], rms(held))
+                parts = []
+                for part in (0.4, 0.6, 0.8):
+                    with contextlib.suppress(Exception):     # a part that is too short for the peer's window
+                        parts.append(rms(left(fit(int(part * cut)), int(part * cut), int((part + 0.2) * cut))))
+                score = float(np.sqrt(np.mean(np.square(parts)))) if parts else np.inf
+                before = chosen.get(joined)
+                if before is None or (score, rms(held)) < (before[0], rms(before[1])):
+                    chosen[joined] = score, held
+            fair[peer] = min((v[1] for v in chosen.values()), key=rms)
+        best = min(fair, key=lambda k: rms(fair[k]))
+        low, high = spread(e, fair[best])
+        goal(f"{name}: held-out error / best peer ({best})", ours / rms(fair[best]), 1.0,
+             f"{ours:.3f} K, order {model.info['order']}; " + ", ".join(f"{k} {rms(v):.3f} (looked at: {looked[k]:.3f})" for k, v in fair.items())
+             + (f"; ours from this record alone {alone:.3f}" if others else "") + f"; other stretches {low:.2f} to {high:.2f}")
+
+
+def spread(ours: np.ndarray, theirs: np.ndarray, blocks: int = 8, draws: int = 2000) -> tuple[float, float]:
+    """5 and 95 % of the ratio of the rms of two errors (N, l) over the same stretch, by a moving-block bootstrap of N / `blocks` samples."""
+    rng = np.random.default_rng(0)
+    size = max(1, len(ours) // blocks)
+    start = rng.integers(0, len(ours) - size + 1, (draws, blocks))
+    a, b = (np.cumsum(np.vstack([np.zeros((1, e.shape[1])), e**2]), 0).sum(1) for e in (ours, theirs))
+    ratio = np.sqrt((a[start + size] - a[start]).sum(1) / (b[start + size] - b[start]).sum(1))
+    return float(np.quantile(ratio, 0.05)), float(np.quantile(ratio, 0.95))
 
 
 def sippy_mimo(u: np.ndarray, y: np.ndarray, n: int, i: int):

@@ -259,20 +259,25 @@ def identify(records: Blocks | list[Blocks], order: int | None = 8, rest: bool =
 
 
 def identify_validated(u: np.ndarray, y: np.ndarray, period_s: float, orders: Sequence[int] = (1, 2, 3, 4),
-                       folds: Sequence[float] = (0.4, 0.6, 0.8), ahead: float = 0.2, block_s: float | None = None) -> StateSpace:
+                       folds: Sequence[float] = (0.4, 0.6, 0.8), ahead: float = 0.2, block_s: float | None = None,
+                       others: Sequence[tuple[np.ndarray, np.ndarray]] = ()) -> StateSpace:
     """Model from one record u (N, m), y (N, l); order, kind of start (from equilibrium or not) and ridge by cross-validation.
 
     From the first 40, 60 and 80 % of the record every candidate is identified and run free over the next 20 %: the one with the least
     squared error of all is identified again from everything. `info` then has `validation`, {(order, rest, ridge): rms}. Nothing is centred:
-    a passive network at rest at 0 needs no offset, and a record's own mean is no equilibrium. Raises InputError when no candidate can be
+    a passive network at rest at 0 needs no offset, and a record's own mean is no equilibrium. `others`: whole recordings (u, y) of the same
+    rig, identified from together with this one wherever it is; all must then begin at rest. Raises InputError when no candidate can be
     identified from the first part."""
     n, block_s = len(u), block_s or period_s
+    known = [reduce(o, period_s, block_s) for o in others]
+    longest = max([n, *(len(o[0]) for o in others)]) * period_s
 
     def fit(stop: int, order: int, rest: bool, ridge: float) -> StateSpace:
-        return identify(reduce((u[:stop], y[:stop]), period_s, block_s), order, rest, tau_range_s=(2 * block_s, n * period_s), ridge=ridge)
+        records = [*known, reduce((u[:stop], y[:stop]), period_s, block_s)]
+        return identify(records, order, rest, tau_range_s=(2 * block_s, longest), ridge=ridge)
 
     errors: dict[tuple[int, bool, float], float] = {}
-    for choice in product(orders, (True, False), (1e-7, 1e-2)):
+    for choice in product(orders, (True,) if others else (True, False), (1e-7, 1e-2)):
         total = 0.0
         for part in folds:
             start, stop = int(part * n), int((part + ahead) * n)
