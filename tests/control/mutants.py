@@ -5,7 +5,9 @@
 Mutated are arming.py and faults.py whole, and of law.py the functions that judge, compare, protect and arm: a comparison takes
 its neighbour (< <=, > >=, == !=) or is turned round, and / or change places, `not` goes, + - and * / change places, a number grows
 by one, an assignment or a call goes, a condition is always true or never, |= becomes = and &=. A mutant that no scenario breaks is
-listed; WHY says of each why it means the same, or the run fails. Our own mutator because law.py runs here as a module of its own
+listed; WHY says of each why it means the same, or the run fails. One that does not end within LIMIT_S of processor time is broken,
+too: the tick would not return. Every processor takes its share, and a mutant meets first the scenarios that broke its neighbours:
+the whole takes minutes. Our own mutator because law.py runs here as a module of its own
 beside the compiled one, in one process: mutmut and cosmic-ray start pytest anew for each of the mutants.
 """
 from __future__ import annotations
@@ -13,6 +15,9 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import multiprocessing
+import os
+import signal
 import sys
 import time
 import types
@@ -23,12 +28,15 @@ from pathlib import Path
 from tests.control import protection
 from tests.control.test_protection import CONTROL, PROTECTION
 
+LIMIT_S = 10.0              # all scenarios take about 2 s on the source as it is
+
 SWAPS: dict[type, list[type]] = {
     ast.Lt: [ast.LtE, ast.Gt], ast.LtE: [ast.Lt, ast.Gt], ast.Gt: [ast.GtE, ast.Lt], ast.GtE: [ast.Gt, ast.Lt],
     ast.Eq: [ast.NotEq], ast.NotEq: [ast.Eq], ast.In: [ast.NotIn], ast.And: [ast.Or], ast.Or: [ast.And],
     ast.Add: [ast.Sub], ast.Sub: [ast.Add], ast.Mult: [ast.Div], ast.Div: [ast.Mult], ast.BitOr: [ast.BitAnd],
     ast.BitAnd: [ast.BitOr], ast.LShift: [ast.RShift], ast.RShift: [ast.LShift]}
 
+_FLAG = "a flag: only ever looked at as zero or not"
 _NO_DRIVE = "v is 0 wherever enable is 0: control() and _arm() empty it; a second lock on the same door"
 WHY: dict[str, str] = {
     "law.py:_agree: `if self.fresh[_COIL]: self._compare_order()` condition True in `if self.fresh[_COIL]:`":
@@ -40,6 +48,20 @@ WHY: dict[str, str] = {
     "law.py:_agree: `self.last[_CURRENT] if current else 0.0` condition True in "
     "`amperes = self.last[_CURRENT] if current else 0.0`": "amperes is looked at only where `current` holds",
     "law.py:_judge_readings: `1.0 + _K_ERROR` Add -> Sub in `self.verdict[c] = 1.0 + _K_ERROR`": "_K_ERROR is 0",
+    "law.py:_judge_readings: `1.0 + _K_ERROR` Add -> Sub in `self.verdict[c] = 1.0 + _K_ERROR` (2)": "_K_ERROR is 0",
+    "law.py:_judge_readings: `1.0` + 1 in `self.verdict[c] = 1.0 + _K_ERROR`":
+        "of a channel that no device has and nobody requires: its verdict is only looked at as zero or not",
+    "law.py:_judge_readings: `1.0` + 1 in `self.seen[c] = 1.0`": _FLAG,
+    "law.py:_judge_readings: `1` + 1 in `self.hold = 1`": _FLAG,
+    "law.py:_compare_order: `1.0` + 1 in `self.exchanged = 1.0`": _FLAG,
+    "law.py:_agree: `1.0` + 1 in `self.reference_zeroed = 1.0 if self.state != _OFF else 0.0`": _FLAG,
+    "law.py:_agree: `1.0` + 1 in `self.zeroed = 1.0 if self.state != _OFF else 0.0`": _FLAG,
+    "law.py:_arm: `0 <= command < _COMMANDS` LtE -> Lt in `before, known = self.state, command if 0 <= command < _COMMANDS else _NONE`":
+        "command 0 is _NONE itself",
+    "law.py:_arm: `0` + 1 in `before, known = self.state, command if 0 <= command < _COMMANDS else _NONE`": "command 0 is _NONE itself",
+    "law.py:_arm: `(((before * _COMMANDS + known) * 2 + started) * 2 + tripped)` Add -> Sub in "
+    "`self.state = _NEXT[(((before * _COMMANDS + known) * 2 + started) * 2 + tripped) * 2 + crit`":
+        "the place before, critical and not tripped: next_state asks for critical first, and has the same there",
     "law.py:_agree: `0.0` + 1 in `amperes = self.last[_CURRENT] if current else 0.0`":
         "amperes is looked at only where `current` holds",
 }
@@ -75,9 +97,10 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
 
 
 def mutants(path: Path, functions: tuple[str, ...] | None) -> Iterator[tuple[str, ast.Module]]:
-    """(name, tree) of every mutant of a file; of some functions only, or of the whole module but its texts. The tree is
-    the same object every time, changed in one place until the next one is asked for."""
-    source = path.read_text()
+    """(name, tree) of every mutant of a file; of some functions only, or of the whole module but its texts. Lines that are the
+    same have their number behind the name. The tree is the same object every time, changed in one place until the next one
+    is asked for."""
+    source, seen = path.read_text(), dict[str, int]()
     lines, tree = source.splitlines(), ast.parse(source)
     owners = [(f.lineno, f.end_lineno or 0, f.name) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef)]
     places = [(parent, field, k, node) for parent in ast.walk(tree) for field, value in ast.iter_fields(parent)
@@ -90,9 +113,11 @@ def mutants(path: Path, functions: tuple[str, ...] | None) -> Iterator[tuple[str
         segment = " ".join((ast.get_source_segment(source, node) or "").split())
         context = " ".join(lines[line - 1].split())
         for what, new in changes(node):
+            name = f"{path.name}:{owner}: `{segment[:60]}` {what} in `{context[:90]}`"
+            seen[name] = seen.get(name, 0) + 1
             replaced = ast.fix_missing_locations(ast.copy_location(new, node))
             _put(parent, field, k, replaced)
-            yield f"{path.name}:{owner}: `{segment[:60]}` {what} in `{context[:90]}`", tree
+            yield name + f" ({seen[name]})" * (seen[name] > 1), tree
             _put(parent, field, k, node)
 
 
@@ -145,26 +170,54 @@ def survives(trees: dict[str, ast.Module], order: list) -> bool:
     return True
 
 
+class Endless(BaseException):
+    """No scenario may take it for a failure of its own."""
+
+
+def _endless(*_: object) -> None:
+    raise Endless
+
+
+def share(which: int, of: int, only: str) -> tuple[int, list[str]]:
+    """(mutants tried, those that survive) of every of-th mutant, beginning with number `which`."""
+    warnings.simplefilter("ignore")                      # numbers that are not finite are meant
+    signal.signal(signal.SIGPROF, _endless)
+    order, number, tried, left = list(protection.SCENARIOS), 0, 0, []
+    for name, functions in (("arming", None), ("faults", None), ("law", PROTECTION)):
+        for what, tree in mutants(CONTROL / f"{name}.py", functions):
+            number += 1
+            if only not in what or number % of != which:
+                continue
+            tried += 1
+            try:
+                signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
+                found = survives({name: tree}, order)
+            except Endless:
+                found = False
+            finally:
+                signal.setitimer(signal.ITIMER_PROF, 0.0)
+            if found:
+                left.append(what)
+                print("survives:", what, flush=True)
+    return tried, left
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--page")
     parser.add_argument("--only", default="")
     args = parser.parse_args()
-    warnings.simplefilter("ignore")                      # numbers that are not finite are meant
-    begun, order, total, left = time.perf_counter(), list(protection.SCENARIOS), 0, []
-    assert survives({}, order), "a scenario fails on the source as it is"
-    for name, functions in (("arming", None), ("faults", None), ("law", PROTECTION)):
-        for what, tree in mutants(CONTROL / f"{name}.py", functions):
-            if args.only not in what:
-                continue
-            total += 1
-            if survives({name: tree}, order):
-                left.append(what)
-                print("survives:", what, flush=True)
+    begun, order, count = time.perf_counter(), list(protection.SCENARIOS), os.cpu_count() or 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert survives({}, order), "a scenario fails on the source as it is"
+    with multiprocessing.get_context("fork").Pool(count) as pool:
+        found = pool.starmap(share, [(which, count, args.only) for which in range(count)], chunksize=1)
+    total, left = sum(tried for tried, _ in found), sorted(m for _, survivors in found for m in survivors)
     unexplained = [m for m in left if m not in WHY]
     text = (f"{total} mutants of the protection (arming.py, faults.py, {', '.join(PROTECTION)} of law.py), {total - len(left)} broken by "
             f"{len(order)} scenarios, {len(left)} survive, {len(unexplained)} of them unexplained.\n")
-    print(f"{text}{time.perf_counter() - begun:.0f} s")
+    print(f"{text}{time.perf_counter() - begun:.0f} s on {count} processors")
     if args.page:
         rows = "".join(f"| {m.replace('|', chr(92) + '|')} | {WHY.get(m, 'not explained')} |\n" for m in left)
         Path(args.page).write_text("<!-- Written by `make mutants`. -->\n# Mutants\n\nEvery small change of the source that protects must "

@@ -212,6 +212,15 @@ def frozen_to_the_tick(module):
 
 
 @scenario
+def the_first_reading_is_not_the_same_as_nothing(module):
+    """Also where it is 0: frozen counts from the second on."""
+    bench = Bench(module, frozen_s=channels(math.inf, voltage_v=4 * P)).tick(5)
+    assert bench.shown == set()
+    bench.tick()
+    assert bench.shown == {"voltage_frozen"}
+
+
+@scenario
 def the_compensation_waits_for_what_it_needs(module):
     """Voltage, current, air or coil at fault freeze it; the position and what is only watched do not."""
     warm = replace(model(), b2=np.ones(12), C=np.eye(12, 2), expansion_period_s=P)
@@ -394,6 +403,11 @@ def the_coil_and_the_model(module):
             bench.set(coil_c=AIR + sign * k / 16).tick()
         assert bench.state == arming.ARMED and abs(bench.law.model_error_c - sign * 4.0) < 1e-6
         bench.set(coil_c=AIR + sign * 4.25).tick().safe("coil_disagrees")
+    for row, trips in ((0, True), (1, False)):                                         # a model of the coil alone, of the bobbin alone
+        C = np.zeros((12, 2))
+        C[row, row] = 1.0
+        bench = Bench(module, replace(model(), C=C), innovation_limit_c=2.0, innovation_time_s=P).armed().set(coil_c=AIR + 9).tick(2)
+        (bench.safe if trips else bench.well)(*["coil_disagrees"] * trips)
     mute = replace(model(), C=np.zeros((12, 2)))
     bench = Bench(module, mute, innovation_limit_c=2.0, innovation_time_s=P, drift_limit_c=2.0).armed().set(coil_c=AIR + 9)
     bench.tick(3).well()
@@ -431,6 +445,11 @@ def nothing_that_is_not_finite_is_driven(module):
     assert "not_finite" in bench.shown and bench.law.enable == 0.0
     bench = Bench(module, low=channels(-math.inf), high=channels(math.inf)).armed().set(voltage_v=1e200, current_a=1e200).tick()
     assert "not_finite" in bench.shown and bench.law.enable == 0.0
+    C = np.zeros((12, 2))
+    C[0, 0], C[1, 1] = 1e300, 1.0
+    bench = Bench(module, replace(model(), C=C)).armed()                              # the coil's estimate alone overflows
+    bench.law.x[0] = 1e10
+    bench.silent("coil_c").tick().safe("not_finite")
 
 
 @scenario
@@ -461,6 +480,9 @@ def voltage_and_current(module):
     b = bench(agree_time_s=4 * P, resistance_tolerance=0.0, resistance_v=6.0).set(voltage_v=8.0).tick(4).well()    # 2, 3.5, 4.6, 5.5
     b.tick().safe("electrical_disagrees")
     bench(resistance_ohm=0.0).set(current_a=1.0, voltage_v=20.0).tick(3).well()
+    bench(resistance_ohm=0.5).set(current_a=1.0, voltage_v=20.0).tick().safe("electrical_disagrees")
+    b = bench().set(current_a=1.0, voltage_v=4.0).tick(9).well()                       # the scale settles, it does not add up
+    b.set(voltage_v=7.0).tick().safe("electrical_disagrees")
     # The coil's own temperature counts: 100 K more are 39.3 %.
     hot = Bench(module, resistance_ohm=4.0, resistance_tolerance=0.0, resistance_v=0.5, agree_time_s=P).set(air_c=20.0, coil_c=120.0)
     hot.law.x[0] = 0.0
@@ -577,6 +599,7 @@ def exchanged_sensors(module):
     b = Bench(module, replace(model(), C=C), order_limit_c=2.0, innovation_time_s=P).set(bobbin_c=AIR, outer_magnet_c=AIR).armed()
     b.law.x[0], b.law.x[1] = 4.0, 0.0
     b.set(bobbin_c=AIR + 4.0, outer_magnet_c=AIR).tick(2).well("monitored_disagrees")
+    b.say(2, "bobbin_c").tick(2).well("monitored_error")                               # the other one's own fault counts
 
 
 @scenario
@@ -647,6 +670,17 @@ def no_state_but_ready_arms(module):
 
 
 @scenario
+def a_command_that_is_none_does_nothing(module):
+    for command in (-1, -3, 4, 5, 6, 7, 8, 99, 2 ** 31 - 1, -2 ** 31):
+        bench = Bench(module).tick(command=command)
+        assert bench.state == arming.OFF
+        bench.warm().tick(command=command)
+        assert bench.state == arming.READY and bench.law.enable == 0.0
+        bench.armed().tick(command=command).well()
+        bench.say(2, "coil_c").tick().set(coil_c=AIR).tick(3, command=command).safe("coil_error")
+
+
+@scenario
 def what_led_to_the_fault_stays_shown(module):
     bench = Bench(module).armed().say(2, "coil_c").tick().set(coil_c=AIR).say(2, "air_c").tick().safe("coil_error", "air_error")
     bench.set(air_c=AIR).tick(9).safe("coil_error", "air_error")
@@ -654,6 +688,7 @@ def what_led_to_the_fault_stays_shown(module):
     bench.tick(command=arming.DISARM)
     assert bench.shown == set() and bench.law.latched == 0
     bench = Bench(module).armed().say(2, "shaft_1_c", "coil_c").tick().set(shaft_1_c=AIR, coil_c=AIR).tick().safe("coil_error")
+    bench = Bench(module).armed().say(2, "coil_c", "air_c").tick().set(coil_c=AIR, air_c=AIR).tick().safe("coil_error", "air_error")
 
 
 @scenario

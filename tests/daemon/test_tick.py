@@ -238,3 +238,13 @@ def test_rows_are_complete(session):
     assert row[INDEX["tick"]] == session.ticks and row[INDEX["t_s"]] == pytest.approx(session.ticks * 1e-3)
     k = ROLE["supply_v"]
     assert int(row[INDEX["status_bits"]]) >> (2 * k) & 3 == 3 and int(row[INDEX["status_bits"]]) & 3 == OK
+
+
+@pytest.mark.parametrize("name,value", [("command", np.nan), ("command", 1e300), ("external_bits", 0.5), ("fresh_bits", np.inf),
+                                        ("status_bits", -1e99)])
+def test_a_damaged_row_is_not_replayed(session, name, value):
+    session.arm()
+    rows = session.rows
+    rows[5, INDEX[name]] = value
+    with pytest.raises(InputError, match="tick 6 has a command, or bits"):
+        replay(rows, session.metadata)

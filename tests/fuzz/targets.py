@@ -14,6 +14,7 @@ import io
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -315,6 +316,35 @@ def guarded(one: Callable[[bytes], Any], name: str) -> Callable[[bytes], None]:
     return run
 
 
+def guided(args: argparse.Namespace) -> int:
+    """`--atheris`: libFuzzer ends its process, so it has one of its own; its last words become one line."""
+    log = KEPT / f"{args.name}.log"
+    KEPT.mkdir(parents=True, exist_ok=True)
+    child = os.fork()
+    if child == 0:
+        with log.open("w") as f:
+            os.dup2(f.fileno(), 1)
+            os.dup2(f.fileno(), 2)
+        with atheris.instrument_imports(include=["thermoctl", "hal", "yaml", "pymodbus"]):
+            one, seeds = TARGETS[args.name]()
+        corpus = FOLDER / "corpus"
+        corpus.mkdir()
+        for k, seed in enumerate(seeds):
+            (corpus / str(k)).write_bytes(seed[:MAX_INPUT])
+        atheris.Setup([sys.argv[0], f"-max_total_time={args.seconds:.0f}", "-timeout=30", f"-rss_limit_mb={LIMIT_MB}", f"-seed={args.seed}",
+                       f"-max_len={MAX_INPUT}", f"-artifact_prefix={KEPT}/{args.name}-", "-print_final_stats=1", str(corpus)],
+                      guarded(one, args.name))
+        atheris.Fuzz()
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    shutil.rmtree(FOLDER, ignore_errors=True)
+    words = log.read_text(errors="replace")
+    said = {name: (re.findall(pattern, words) or ["-"])[-1] for name, pattern in
+            (("inputs", r"Done (\d+) runs"), ("branches", r" cov: (\d+)"), ("MB", r"peak_rss_mb: +(\d+)"))}
+    print(f"{args.name:10} {said['inputs']:>7} inputs in {args.seconds:5.1f} s, {said['branches']:>4} branches seen by atheris, at most "
+          f"{said['MB']} MB, " + ("no find" if code == 0 else f"FIND, see {log}"))
+    return code
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("name", choices=TARGETS)
@@ -324,10 +354,8 @@ def main() -> int:
     parser.add_argument("--atheris", action="store_true")
     args = parser.parse_args()
     if args.atheris:
-        with atheris.instrument_imports(include=["thermoctl", "hal", "yaml", "pymodbus"]):
-            one, seeds = TARGETS[args.name]()
-    else:
-        one, seeds = TARGETS[args.name]()
+        return guided(args)
+    one, seeds = TARGETS[args.name]()
     run = guarded(one, args.name)
     if args.replay:
         run(Path(args.replay).read_bytes())
@@ -335,14 +363,6 @@ def main() -> int:
     for seed in seeds:
         run(seed)
     KEPT.mkdir(parents=True, exist_ok=True)
-    if args.atheris:
-        corpus = FOLDER / "corpus"
-        corpus.mkdir()
-        for k, seed in enumerate(seeds):
-            (corpus / str(k)).write_bytes(seed[:MAX_INPUT])
-        atheris.Setup([sys.argv[0], f"-max_total_time={args.seconds:.0f}", "-timeout=30", f"-rss_limit_mb={LIMIT_MB}", f"-seed={args.seed}",
-                       f"-max_len={MAX_INPUT}", f"-artifact_prefix={KEPT}/{args.name}-", "-print_final_stats=1", str(corpus)], run)
-        atheris.Fuzz()                                     # ends the process
     signal.signal(signal.SIGPROF, _alarm)                  # processor time: a busy machine is no find
     random_, begun, count, grown = random.Random(args.seed), time.monotonic(), 0, 0.0
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -32,21 +32,27 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
     """
     try:
         found = read_law_metadata(law_metadata)
-        law = Law(found["model"], found["parameters"], found["period_s"])
+        law = Law(found["model"], found["parameters"], float(found["period_s"]))
+        tick = int(found["tick"])
         if found["state"] is not None:
             law.restore(found["state"])
-    except (ValueError, KeyError, TypeError) as e:
+    except (ValueError, KeyError, TypeError, OverflowError) as e:
         raise InputError(f"{name}: holds no usable law to replay ({e}); it was not recorded by this version") from None
     ticks = rows[:, INDEX["tick"]]
-    skipped = int(np.searchsorted(ticks, found["tick"], side="right"))
+    skipped = int(np.searchsorted(ticks, tick, side="right"))
     rows = np.ascontiguousarray(rows[skipped:])
-    if len(rows) and rows[0, INDEX["tick"]] != found["tick"] + 1:
-        raise InputError(f"{name}: the stored state is of tick {found['tick']}, the next row is tick "
+    if len(rows) and rows[0, INDEX["tick"]] != tick + 1:
+        raise InputError(f"{name}: the stored state is of tick {tick}, the next row is tick "
                          f"{rows[0, INDEX['tick']]:.0f}; ticks are missing, so a replay cannot start")
     missing = np.flatnonzero(np.diff(rows[:, INDEX["tick"]]) != 1)
     if len(missing):
         raise InputError(f"{name}: ticks are missing after tick {rows[missing[0], INDEX['tick']]:.0f} (the recorder "
                          "fell behind); a replay would not start from the same state")
+    whole = rows[:, [_COMMAND, _EXTERNAL, _OUTPUTS - 2, _OUTPUTS - 1]]
+    wrong = np.flatnonzero(~((whole == np.floor(whole)) & (np.abs(whole) <= [100, 2.0 ** 53, 2.0 ** 53, 2.0 ** 53])).all(axis=1))
+    if len(wrong):
+        raise InputError(f"{name}: tick {rows[wrong[0], INDEX['tick']]:.0f} has a command, or bits, that are no whole number: "
+                         "damaged")
     n = _OUTPUTS - 2 - _CHANNELS
     value, fresh, status = np.zeros(n), np.zeros(n, dtype=np.uint8), np.zeros(n, dtype=np.uint8)
     law.bind(value, fresh, status)

@@ -52,8 +52,8 @@ def info(path: str | Path) -> Info:
                 wall = batch.column("wall_s")[0].as_py() if "wall_s" in batch.schema.names else np.nan
             rows, ends = rows + batch.num_rows, t[-1].as_py()
     said = {f.name: f.metadata or {} for f in fields}
-    columns = tuple((n, m.get(b"unit", b"").decode(), m.get(b"meaning", b"").decode()) for n, m in said.items())
-    meta = {k.decode(): v.decode(errors="replace") for k, v in (fields.metadata or {}).items()}
+    columns = tuple((n, m.get(b"unit", b"").decode(errors="replace"), m.get(b"meaning", b"").decode(errors="replace")) for n, m in said.items())
+    meta = {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (fields.metadata or {}).items()}
     return Info(str(path), rows, begins, ends, wall, path.stat().st_size, stream.good_bytes, stream.whole, columns,
                 meta)
 

@@ -64,15 +64,18 @@ def open_stream(path: str | Path, columns: Iterable[str] | None = None) -> Strea
     try:
         source = pa.memory_map(str(path))
         reader = pa.ipc.open_stream(source)
-        fields = list(range(len(reader.schema)))
+        names = reader.schema.names
+        fields = list(range(len(names)))
         if columns is not None:
             wanted = set(columns)
-            fields = [i for i, name in enumerate(reader.schema.names) if name in wanted]
+            fields = [i for i, name in enumerate(names) if name in wanted]
             source = pa.memory_map(str(path))
             reader = pa.ipc.open_stream(source, options=pa.ipc.IpcReadOptions(included_fields=fields))
     except pa.ArrowException as e:
         raise InputError(f"{path}: no recording in it ({str(e).splitlines()[0]}): it is not an Arrow stream, or was "
                          "cut before its first row") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: no recording in it: a name of a column is not text") from None
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
     return Stream(path, reader.schema, source, reader, fields, good_bytes=source.tell())

@@ -72,6 +72,8 @@ def read_table(path: str | Path, columns: Iterable[str] | None = None) -> Table:
         raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
     except pa.ArrowException as e:
         raise InputError(f"{path}: not a whole {path.suffix[1:]} file: {str(e).splitlines()[0]}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a whole {path.suffix[1:]} file: a name of a column is not text") from None
 
 
 def write_table(path: str | Path, table: Table) -> None:
