@@ -68,7 +68,7 @@ SHORT = {"position_um": (0.0, 102, {"position_frozen", "position_disagrees", "fo
          "output_reference_um": (0.0, 102, {"monitored_frozen", "monitored_disagrees"}),
          "voltage_v": (0.0, 102, {"voltage_frozen", "electrical_disagrees"}),
          "current_a": (0.0, 102, {"current_frozen", "electrical_disagrees", "amplifier_not_following"}),
-         "air_c": (-242.0, 100, {"air_range"}), "coil_c": (22.0, 20000, {"coil_disagrees", "coil_rate", "coil_frozen"})}
+         "air_c": (-242.0, 100, {"air_range"}), "coil_c": (22.0, 13000, {"electrical_disagrees", "coil_disagrees"})}
 
 
 @pytest.mark.parametrize("role", THERMAL)
@@ -90,7 +90,7 @@ FROZEN = {"position_um": 103, "output_reference_um": 103, "voltage_v": 103, "cur
 def test_frozen_and_duplicated(rig, role, kind):
     """The converter hangs and goes on sending; or a gateway gives its last reading as new in every tick."""
     limit = FROZEN.get(role, 18500)
-    expected = {f"{group(role)}_frozen", "coil_disagrees" if role == "coil_c" else "monitored_disagrees"}
+    expected = {f"{group(role)}_frozen", *(("coil_disagrees", "electrical_disagrees") if role == "coil_c" else ("monitored_disagrees",))}
     rig.ready_to_be_spoiled(250.0 if role.endswith("_c") else 20.0)
     rig.inject("freeze", role)
     if kind == "duplicated":
@@ -116,16 +116,17 @@ def test_jump(rig, role):
 
 
 # Drift a second, and by how much the reading may be wrong when it is found: the limit in ticks follows.
-DRIFT = {"position_um": (10.0, 45.0, {"position_disagrees"}), "output_reference_um": (5.0, 13.0, {"monitored_disagrees"}),
-         "voltage_v": (0.5, 0.7, {"electrical_disagrees"}),
-         "current_a": (0.1, 0.16, {"amplifier_not_following", "electrical_disagrees"}),
-         "air_c": (0.5, 20.0, {"monitored_disagrees", "coil_disagrees"}), "coil_c": (0.5, 9.0, {"coil_disagrees"})}
+DRIFT = {"position_um": (1.0, 4.5, {"position_disagrees"}), "output_reference_um": (1.0, 3.0, {"monitored_disagrees"}),
+         "voltage_v": (0.05, 0.05, {"electrical_disagrees"}),
+         "current_a": (0.01, 0.01, {"amplifier_not_following", "electrical_disagrees"}),
+         "air_c": (0.5, 8.0, {"monitored_disagrees", "coil_disagrees", "electrical_disagrees"}),
+         "coil_c": (0.5, 4.5, {"coil_disagrees", "electrical_disagrees"})}
 
 
 @pytest.mark.parametrize("role", THERMAL)
 def test_drift(rig, role):
     """A reading creeps away between all its limits."""
-    by, wrong, expected = DRIFT.get(role, (1.0, 30.0, {"monitored_disagrees"}))
+    by, wrong, expected = DRIFT.get(role, (1.0, 3.5, {"monitored_disagrees"}))
     limit = math.ceil(wrong / by * 1000)
     rig.ready_to_be_spoiled()
     rig.inject("drift", role, by=by)
@@ -135,9 +136,9 @@ def test_drift(rig, role):
 
 # Plugs exchanged before the rig is switched on, then a move that heats the coil by 10 K.
 SWAPS = [("position_um", "output_reference_um", 16000, {"monitored_disagrees"}), ("voltage_v", "current_a", 2000, {"electrical_disagrees"}),
-         ("air_c", "coil_c", 30000, {"monitored_disagrees", "coil_disagrees"}),
+         ("air_c", "coil_c", 30000, {"monitored_disagrees", "coil_disagrees", "electrical_disagrees"}),
          ("shaft_1_c", "outer_magnet_c", 30000, {"monitored_disagrees"}),
-         *(pytest.param("coil_c", m, 30000, {"monitored_disagrees", "coil_disagrees"},
+         *(pytest.param("coil_c", m, 30000, {"monitored_disagrees", "coil_disagrees", "electrical_disagrees"},
                         marks=() if m in ("bobbin_c", "bobbin_connector_c", "bracket_1_c") else pytest.mark.slow)
            for m in OTHERS)]
 
