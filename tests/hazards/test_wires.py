@@ -2,11 +2,14 @@
 played between two ticks by a frame generator and a CiA-402 drive; plant, loop and law are those of the simulated rig."""
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import select
+import socket
 import struct
 import threading
+import types
 
 import numpy as np
 import pytest
@@ -22,22 +25,66 @@ from thermoctl import yamlfile
 ENCODER, DRIVE = ("position_um",), ("amplifier_state", "amplifier_fault", "supply_v")
 
 
-class Wires:
-    """A back end: position and amplifier through the drivers, all else from the simulated plant."""
+FRAME = struct.Struct("=IB3x8s")                             # struct can_frame of the kernel
+ERROR_FRAME = FRAME.pack(0x2000_0040, 8, bytes(8))           # CAN_ERR_FLAG | CAN_ERR_BUSOFF
 
-    def __init__(self, simulated, settings, folder):
+
+class KernelBus:
+    """SocketCAN's frames through a pair of sockets, with what Wires asks of a terminal and of an adapter; `off`: bus-off, nothing
+    passes either way. (The kernel's own CAN runs in a guest: make qemu-test.)"""
+
+    def __init__(self):
+        self.off, self.master = False, -1
+
+    def plug(self):
+        self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.ours.setblocking(False)
+        self.master, self._slave = self.ours.fileno(), self.theirs.fileno()
+
+    def unplug(self):
+        self.ours.close()
+        self.theirs.close()
+
+    def open(self, channel, interface, bitrate, can_filters):
+        """In place of can.Bus."""
+        return types.SimpleNamespace(socket=self.theirs, shutdown=lambda: None)
+
+    def receive(self):
+        data = b""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                data += self.ours.recv(16)
+        return b"" if self.off else data
+
+    def send(self, data):
+        for at in range(0, len(data), 16):
+            self.ours.send(data[at:at + 16])
+
+    def feed(self, data):
+        return b"", [(i, d[:n]) for i, n, d in FRAME.iter_unpack(data)]
+
+    def encode(self, frames):
+        return b"" if self.off else b"".join(FRAME.pack(i, len(d), d) for i, d in frames)
+
+
+class Wires:
+    """A back end: position and amplifier through the drivers, all else from the simulated plant. bus: a KernelBus, None: an
+    slcan adapter."""
+
+    def __init__(self, simulated, settings, folder, bus=None):
         self.simulated, self.rig, self.sample, self.now_s = simulated, simulated.rig, Sample(), 0.0
-        self.encoder, self.adapter_port = Pty(str(folder / "encoder")), Pty(str(folder / "can"))
+        self.encoder, self.adapter_port = Pty(str(folder / "encoder")), bus or Pty(str(folder / "can"))
         self.encoder.plug()
         self.adapter_port.plug()
         devices = ROOT / "config/devices"
         text = (f"[{{name: encoder, profile: {devices}/encoder-serial.yaml, port: {folder}/encoder, "
                 f"roles: {{position: position_um}}}}, {{name: drive, profile: {devices}/drive-cia402.yaml, "
-                f"port: 'slcan:{folder}/can', roles: {{state: amplifier_state, fault: amplifier_fault, supply: supply_v}}}}]")
+                f"port: '{'socketcan:can0' if bus else f'slcan:{folder}/can'}', "
+                f"roles: {{state: amplifier_state, fault: amplifier_fault, supply: supply_v}}}}]")
         bound = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, devices=tuple(yamlfile.loads(text).value)))
         self.devices = DevicesBackend(make_devices(bound), [])
         self.framer = Framer(self.devices.fast[0].binding.profile.bus_spec)
-        self.drive, self.adapter, self.sequence = drives.Cia402Drive(5), drives.SlcanAdapter(), 0
+        self.drive, self.adapter, self.sequence = drives.Cia402Drive(5), bus or drives.SlcanAdapter(), 0
         self.spoil_frame = lambda frame: frame               # what becomes of an encoder frame on its way
         self.spoil_can = lambda data: data                   # and of the adapter's bytes
         self.status = 0
@@ -105,9 +152,9 @@ class Wires:
 
 
 class WiredRig(HazardRig):
-    def __init__(self, settings, folder):
+    def __init__(self, settings, folder, bus=None):
         super().__init__(settings)
-        self.wires = self.injector.inner = Wires(self.backend, settings, folder)
+        self.wires = self.injector.inner = Wires(self.backend, settings, folder, bus)
         self.wires.open()
 
     def close(self):
@@ -221,7 +268,7 @@ def test_the_drive_leaves_operation_by_itself(wired, state):
         wires.drive.state = code
         wires.drive._step_state = lambda word: step(word) if word == 0 else None
     try:
-        happens(wired, f"drive: {state.lower().replace('_', ' ')} while armed", expected, 1005, stays, "")
+        happens(wired, f"drive: {state.lower().replace('_', ' ')} while armed", expected, 100, stays, "")
     finally:
         vars(wired.wires.drive).pop("_step_state", None)
 
@@ -289,6 +336,27 @@ def test_the_adapter_takes_no_more_data(wired):
     del wires.play_drive
     jump = wired.comes_back(60.0)
     say("Wires", "CAN: the adapter hangs", 25, ticks, found, way, jump)
+
+
+def test_bus_off(quick, tmp_path, monkeypatch):
+    """The kernel's error frame, and then nothing passes: named as such, the drive's own watchdog stops it."""
+    bus = KernelBus()
+    monkeypatch.setattr("can.Bus", bus.open)
+    rig = WiredRig(quick, tmp_path, bus)
+    try:
+        rig.settle(lambda: rig.state == "READY")
+
+        def begin(wires):
+            bus.ours.send(ERROR_FRAME)
+            bus.off = True
+
+        def comes_back(limit_s=20.0, again=rig.comes_back):
+            bus.off = False
+            return again(limit_s)
+        rig.comes_back = comes_back
+        happens(rig, "CAN: bus-off", {"amplifier_error"}, 2, begin, "CAN bus-off: check wiring, termination and bitrate")
+    finally:
+        rig.close()
 
 
 def test_struct_sizes():
