@@ -173,7 +173,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
          ("test_2", {"metavar": "TEST_2"}), ("test_3", {"metavar": "TEST_3"}), ("test_4a", {"metavar": "TEST_4A"}), config,
          ("--models", {"metavar": "DIR", "default": "models", "help": "folder of calibrations (default models)"}),
          ("--method", {"choices": ("better", "paper"), "default": "better", "help": "which compensator (default better)"}),
-         ("--order", {"type": int, "default": 8, "help": "number of real poles (default 8; 0: by BIC)"}))
+         ("--order", {"type": int, "default": 0, "help": "number of real poles (0, the default: by BIC)"}))
     model = _add(sub, "model", "list, show or roll back calibrations", lambda a: room().model(a.action, a.models, a.name),
                  ("action", {"choices": ("list", "show", "rollback")}), ("name", {"nargs": "?", "metavar": "NAME"}))
     model.add_argument("--models", metavar="DIR", default="models", help="folder of calibrations (default models)")
@@ -289,7 +289,7 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
          "outside its folder before it is accepted", calibrate, config,
          ("--out", {"metavar": "DIR", "help": "the calibration's folder (calibration/RIG)"}),
          ("--models", {"metavar": "DIR", "default": "models", "help": "where an accepted model goes (models)"}),
-         ("--order", {"type": int, "default": 8, "help": "number of real poles (8; 0: by BIC)"}),
+         ("--order", {"type": int, "default": 0, "help": "number of real poles (0, the default: by BIC)"}),
          ("--gains", {"action": "store_true", "help": "an acceptance also writes the proposed PID gains"}),
          ("--accept", {"action": "store_true", "help": "install the model when the proof is done"}),
          ("--again", {"action": "store_true", "help": "forget an earlier run in the folder"}))

@@ -22,6 +22,7 @@ from thermoctl.yamlfile import InputError
 
 STEP_K, NOISE_K = 0.25, 0.06
 AIR_FILTER_S = 60.0
+FIRST_ORDER = 6                       # of the better method's model until the air's movement is taken out; then by BIC where none is given
 DRIFT_S = (7200.0, 250.0)             # what no input explains: forgotten in two hours, above the thermometers' noise below 1/(2 pi 250 s)
 PAPER_CHOICES = ((1, 30), (1, 40), (1, 50), (2, 15), (2, 20), (2, 30), (2, 40), (3, 15), (3, 20), (3, 30), (4, 15), (4, 20), (4, 30),
                  (4, 40), (6, 15), (6, 20), (8, 15), (8, 20))             # s, rows i
@@ -75,7 +76,7 @@ def block_mean(v: np.ndarray, q: int) -> np.ndarray:
     return v[:len(v) // q * q].reshape(len(v) // q, q, -1).mean(1)
 
 
-def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = 8) -> Calibration:
+def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = None) -> Calibration:
     """All estimators from the three calibration tests (evaluate.rigs.Recorded or alike, 1 s)."""
     r_v = filter.sensor_variance(STEP_K, NOISE_K)
     # the paper's way
@@ -115,7 +116,7 @@ def identify_paper(test_2: Any, check: Any) -> tuple[StateSpace, filter.Mkf]:
     return best[1], best[2]
 
 
-def calibrate_better(tests: list[Any], order: int | None = 8,
+def calibrate_better(tests: list[Any], order: int | None = None,
                      model: StateSpace | None = None) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion]:
     """The better estimator alone, from any tests: (model, filter, its variances, expansion). `model`: one that is known already."""
     model = model or identify_better(tests, order)
@@ -125,7 +126,7 @@ def calibrate_better(tests: list[Any], order: int | None = 8,
     return model, kalman, variances, fit_expansion(kalman, tests)
 
 
-def calibrate_refined(tests: list[Any], order: int | None = 8) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion, str]:
+def calibrate_refined(tests: list[Any], order: int | None = None) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion, str]:
     """`calibrate_better`, and beside it the same with the thermal model refined by its prediction errors on all tests but the last: of
     the two the one whose filter follows the thermometers of the last test better. (.., what came of it in words)."""
     plain = calibrate_better(tests, order)
@@ -160,10 +161,11 @@ def with_air_alone(model: StateSpace) -> StateSpace:
 
 def identify_better(tests: list[Any], order: int | None) -> StateSpace:
     """Real-pole model from all calibration tests together, with the air's own movement taken out of the data: a change of the air
-    shifts every rise by C b_air, known up to the model, so it is simulated with the model of the round before and subtracted."""
+    shifts every rise by C b_air, known up to the model, so it is simulated with the model of the round before and subtracted.
+    `order` None: by BIC in the last round."""
     moved: list[Any] = [0.0] * len(tests)
-    for round_ in range(3):
-        model = modal.identify([modal.reduce((t.power_w[:, None], rises(t) - m), 1.0) for t, m in zip(tests, moved, strict=True)], order,
+    for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
+        model = modal.identify([modal.reduce((t.power_w[:, None], rises(t) - m), 1.0) for t, m in zip(tests, moved, strict=True)], now,
                                drift_s=DRIFT_S)
         if round_ < 2:
             alone = with_air_alone(model)
