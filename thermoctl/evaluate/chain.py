@@ -21,6 +21,7 @@ from thermoctl.identify.statespace import StateSpace
 from thermoctl.yamlfile import InputError
 
 STEP_K, NOISE_K = 0.25, 0.06
+LONGEST_S = 36000.0                   # no expansion takes longer than ten hours
 AIR_FILTER_S = 60.0
 FIRST_ORDER = 6                       # of the better method's model until the air's movement is taken out; then by BIC where none is given
 DRIFT_S = (7200.0, 250.0)             # what no input explains: forgotten in two hours, above the thermometers' noise below 1/(2 pi 250 s)
@@ -83,6 +84,7 @@ def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = None) 
     paper_model, mkf = identify_paper(test_2, test_4a)
     y4 = test_4a.error_um
     paper_um = expansion.recursive(_mkf_steps(mkf, test_4a), block_mean(y4[:, None], round(mkf.period_s))[:, 0], mkf.period_s)
+    paper_um = replace(paper_um, f1=min(paper_um.f1, float(np.exp(-mkf.period_s / LONGEST_S))))      # the recursion may find f1 >= 1
     coil = filled(rises(test_4a)[:, :1])
     siso_um = expansion.recursive(coil, y4, 1.0)
     # the better way
