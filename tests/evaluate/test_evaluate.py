@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermoctl import plant
-from thermoctl.evaluate import chain, iso230, rigs
+from thermoctl.evaluate import chain, full, iso230, rigs
 from thermoctl.identify import experiments
 from thermoctl.report.page import page, table
 from thermoctl.yamlfile import InputError
@@ -101,6 +101,16 @@ def test_compensators_for_the_daemon_follow_the_estimators(proof):
     wanted = chain.run_kalman(c.kalman, r4)[:n]
     assert np.sqrt(np.mean((out - wanted)**2)) < 0.15
     assert chain.compensator(c, "paper").kind == "mkf"
+
+
+def test_the_full_runs_truth_is_found_from_any_folder(tmp_path, monkeypatch):
+    """Settings read a relative path from their own folder; the truth is written beside the report."""
+    monkeypatch.chdir(tmp_path)
+    Path("out").mkdir()
+    written = full.scaled_truth(ROOT / "config" / "plants" / "actuator_truth.yaml", Path("out") / "truth.yaml")
+    assert written.is_absolute() and written.is_file()
+    was, now = (plant.load(p).parameters["a_bracket_1"].value for p in (ROOT / "config" / "plants" / "actuator_truth.yaml", written))
+    assert now == pytest.approx(rigs.PAPER_SCALE["a_bracket_1"] * was)
 
 
 def test_page_is_self_contained():
