@@ -489,6 +489,16 @@ def voltage_and_current(module):
     hot = replace_gain(module, hot).warm()
     hot.tick(command=arming.ARM).set(current_a=1.0, voltage_v=4.0 * 1.393).tick(2).well()
     hot.set(voltage_v=4.0).tick().safe("electrical_disagrees")
+    # A model that says nothing of the coil: its own reading counts; one at fault does not.
+    C = np.zeros((12, 2))
+    C[1, 1] = 1.0
+    mute = Bench(module, replace(model(), C=C), resistance_ohm=4.0, resistance_tolerance=0.0, resistance_v=0.5, agree_time_s=P,
+                 required=channels(0)).set(air_c=20.0, coil_c=120.0).armed()
+    mute.set(current_a=1.0, voltage_v=4.0 * 1.393).tick(2).well()
+    mute.set(voltage_v=4.0).tick().safe("electrical_disagrees")
+    mute = Bench(module, replace(model(), C=C), resistance_ohm=4.0, resistance_tolerance=0.0, resistance_v=0.5, agree_time_s=P,
+                 required=channels(0)).set(air_c=20.0).say(2, "coil_c").armed()
+    mute.set(current_a=1.0, voltage_v=9.0).tick(9).well("coil_error")                  # no temperature at all: not compared
     # No comparison with a reading at fault, here of channels that need not be there.
     for name in ("voltage_v", "current_a"):
         b = bench(required=channels(0)).set(current_a=1.0, voltage_v=4.0).tick()

@@ -66,7 +66,8 @@ cdef class Law:
     cdef void _forget(self) noexcept
     @cython.locals(i=cython.int, j=cython.int, s=cython.double, left=cython.double, step=cython.double)
     cdef void _predict_corrections(self, double elapsed) noexcept
-    @cython.locals(one=bits_t, m=cython.int, s=cython.double, part=cython.double, amperes=cython.double, current=cython.bint)
+    @cython.locals(one=bits_t, m=cython.int, s=cython.double, part=cython.double, amperes=cython.double, current=cython.bint,
+                   estimated=cython.bint)
     cdef void _agree(self) noexcept
     @cython.locals(m=cython.int, k=cython.int, s=cython.double)
     cdef void _compare_order(self) noexcept

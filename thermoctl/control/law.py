@@ -564,10 +564,11 @@ class Law:
         part = min(1.0, self.dt / self.agree_time_s)
         current = self.verdict[_CURRENT] == 0.0
         amperes = self.last[_CURRENT] if current else 0.0
-        if current and self.verdict[_VOLTAGE] == 0.0 and self.resistance_ohm > 0.0:
-            s = self.resistance_ohm * amperes
-            if self.air_known > 0.0:
-                s *= 1.0 + _COPPER * (self.T[0] + self.air_c - 20.0)
+        estimated = self.predicts[0] and self.air_known > 0.0         # the coil's temperature: estimate, or else its own reading
+        if (current and self.verdict[_VOLTAGE] == 0.0 and self.resistance_ohm > 0.0
+                and (estimated or self.verdict[_COIL] == 0.0)):
+            s = self.T[0] + self.air_c if estimated else self.last[_COIL]
+            s = self.resistance_ohm * amperes * (1.0 + _COPPER * (s - 20.0))
             self.ohm_v += part * (self.last[_VOLTAGE] - s - self.ohm_v)
             self.ohm_scale_v += part * (max(abs(self.last[_VOLTAGE]), abs(s)) - self.ohm_scale_v)
             if abs(self.ohm_v) > self.resistance_tolerance * self.ohm_scale_v + self.resistance_v:

@@ -315,9 +315,10 @@ static void agree(law_t *l) {
     double part = least(1.0, l->dt / l->agree_time_s), s;
     int current = l->verdict[CURRENT] == 0.0;
     double amperes = current ? l->last[CURRENT] : 0.0;
-    if (current && l->verdict[VOLTAGE] == 0.0 && l->resistance_ohm > 0.0) {
-        s = l->resistance_ohm * amperes;
-        if (l->air_known > 0.0) s *= 1.0 + 0.00393 * (l->T[0] + l->air_c - 20.0);
+    int estimated = l->predicts[0] && l->air_known > 0.0;
+    if (current && l->verdict[VOLTAGE] == 0.0 && l->resistance_ohm > 0.0 && (estimated || l->verdict[COIL] == 0.0)) {
+        s = estimated ? l->T[0] + l->air_c : l->last[COIL];
+        s = l->resistance_ohm * amperes * (1.0 + 0.00393 * (s - 20.0));
         l->ohm_v += part * (l->last[VOLTAGE] - s - l->ohm_v);
         double a = fabs(l->last[VOLTAGE]), b = fabs(s);
         l->ohm_scale_v += part * ((b > a ? b : a) - l->ohm_scale_v);
