@@ -128,7 +128,8 @@ class Booted(Container):
         assert len(outside) == len(pids), (outside, pids)
         event = time.monotonic()
         for pid in outside.values():
-            os.kill(pid, number)
+            with contextlib.suppress(ProcessLookupError):             # the first one's end has ended it already
+                os.kill(pid, number)
         return event
 
     def journal(self) -> str:

@@ -498,6 +498,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each program in each round")
+    parser.add_argument("--conditions", nargs="+", choices=("idle", "stress"), default=["idle", "stress"])
     parser.add_argument("--cpu", type=int, default=1)
     parser.add_argument("--out", type=Path, help="also write the tables here (Markdown)")
     parser.add_argument("--raw", type=Path, help="also write percentiles of every round here (JSON)")
@@ -513,8 +514,8 @@ def main() -> int:
         print(f"  law: batch {law['ratio']:.2f} x C, call {law['call_p50_us']:.2f} us", file=sys.stderr)
         try:
             bench.start_peer()
-            for condition, load in (("idle", contextlib.nullcontext()), ("stress", stress(bench.work))):
-                with load:
+            for condition in args.conditions:
+                with stress(bench.work) if condition == "stress" else contextlib.nullcontext():
                     for found in measure(bench, args.rounds, args.seconds, condition == "stress"):
                         conditions[condition] = found
                         if args.out:                                  # so that a run that is cut short leaves its rounds
