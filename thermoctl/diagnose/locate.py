@@ -3,31 +3,48 @@
 A node's unknown flow q(t) (straight lines between knots) drives the linearised plant; a sensor's unknown error adds to its
 output alone. Which one explains most of the residual, at equal freedom, is where the mismatch sits: a sensor's fault does not
 propagate, a node's does. The best node's flow is then recovered on a finer grid, and compared with the recorded signals.
+
+Physics that nobody listed is still a function of the rig's state, which a sensor's noise is not. `patterns` therefore tries, at
+first order, an unknown function g (straight lines between knots) of one signal s at a time,
+
+    storage_n dn/dt += g(s)   at each node      and      rate_f *= 1 + g(s)   in each flow,
+
+with a g for each direction of motion where the node is a velocity.
 """
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.diagnose.screen import Metric, _Column, directions, log_p
+from thermoctl.diagnose.effects import Rig
+from thermoctl.diagnose.screen import Metric, Trajectory, _Column, directions, log_p
 from thermoctl.plant import expression as ex
 
 COARSE, FINE = 10, 40       # knots a recording
+LEVELS = 8                  # knots over the values of a signal
 
 
 @dataclass
 class Suspect:
-    """A node or an output with an unknown smooth input: how much of the residual it explains."""
-    kind: str               # 'node' or 'output'
+    """A node or an output with an unknown smooth input, or a node or flow with an unknown function of a signal: how much of
+    the residual it explains."""
+    kind: str               # 'node', 'output' or 'flow'
     name: str
     gain: float
     dims: int
+    follows: str | None = None      # the signal that it is a function of; None: of time
 
     @property
     def log_p(self) -> float:
         """log10 of the chance of such a gain by noise."""
         return log_p(self.gain, self.dims)
+
+    def sentence(self) -> str:
+        """In words."""
+        what = {"node": "an unknown flow into", "output": "an unknown error of", "flow": "an unknown factor of"}[self.kind]
+        return f"{what} {self.name}, a function of {self.follows or 'time'}, would explain it best"
 
 
 @dataclass
@@ -70,6 +87,54 @@ def suspects(metric: Metric) -> list[Suspect]:
             if dims:
                 found.append(Suspect(kind, label, gain, dims))
     return sorted(found, key=lambda s: s.log_p)
+
+
+def patterns(metric: Metric, rig: Rig) -> list[Suspect]:
+    """Every node and flow with an unknown function of one signal, likeliest first."""
+    at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
+    plant, states = rig.plant, list(metric.model.states)
+    signals = {n: [run.x[:, k] for run in metric.runs] for k, n in enumerate(states)}
+    signals |= {i: [d.u[:, j] for d in metric.drives] for j, i in enumerate(plant.inputs) if i in rig.moving_inputs}
+    hats = {n: _levels(parts) for n, parts in signals.items()}
+    places: list[tuple[str, str, list[tuple[str, float]]]] = [("node", n, [(n, 1.0)]) for n in states]
+    for f in plant.flows.values():
+        places.append(("flow", f.name, [(n, s) for n, s in ((f.source, -1.0), (f.target, 1.0)) if n is not None and n in plant.nodes]))
+    columns: list[_Column] = []
+    for kind, name, ends in places:
+        base = []
+        for trajectory in at:
+            rate = trajectory.value(plant.flows[name].rate, {}) if kind == "flow" else np.ones(len(trajectory.drive.t))
+            base.append({states.index(n): sign * rate / trajectory.value(plant.nodes[n].storage, {}) for n, sign in ends})
+        moving = next((signals[n] for n, _ in ends if n in rig.velocities), None)
+        sides = [[np.ones(len(d.t)) for d in metric.drives]] if moving is None else [[v > 0 for v in moving], [v < 0 for v in moving]]
+        near = [n for n, _ in ends] + [i for i in rig.moving_inputs if kind == "node" or i in ex.names(plant.flows[name].rate)]
+        if moving is not None:
+            near += [n for n in states if n not in near]
+        for s in near:
+            for hat, side in itertools.product(hats[s], sides):
+                column = _Column((kind, name, s), outputs=[{} for _ in at])
+                for forces, h, on in zip(base, hat, side, strict=True):
+                    column.forces.append({k: v * h * on for k, v in forces.items()})
+                columns.append(column)
+    rows: dict[tuple, list[np.ndarray]] = {}
+    for part, block in directions(metric, columns):
+        block = metric.project(block)
+        for k, column in enumerate(part):
+            rows.setdefault(column.item, []).append(block[:, k])
+    found = []
+    for (kind, name, s), vectors in rows.items():
+        gain, dims = _gain(np.stack(vectors, axis=1), metric.residual)
+        if dims:
+            found.append(Suspect(kind, name, gain, dims, s))
+    return sorted(found, key=lambda suspect: suspect.log_p)
+
+
+def _levels(parts: list[np.ndarray]) -> list[list[np.ndarray]]:
+    """Hats over the values of a signal, per hat and recording; none where it takes too few values."""
+    edges = np.unique(np.quantile(np.concatenate(parts), np.linspace(0.01, 0.99, LEVELS)))
+    if len(edges) < 2:
+        return []
+    return [[np.interp(p, edges, row) for p in parts] for row in np.eye(len(edges))]
 
 
 def _gain(rows: np.ndarray, r: np.ndarray) -> tuple[float, int]:
@@ -143,4 +208,4 @@ def _intervals(t: np.ndarray, on: np.ndarray) -> list[list[float]]:
     return out
 
 
-__all__ = ["Missing", "Suspect", "missing_flow", "suspects"]
+__all__ = ["Missing", "Suspect", "missing_flow", "patterns", "suspects"]

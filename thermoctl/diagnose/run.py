@@ -27,7 +27,6 @@ from thermoctl.diagnose.screen import Metric, log_p
 from thermoctl.diagnose.search import (
     ACCEPT,
     CLEAN,
-    NO_COLOUR,
     Round,
     compete,
     counts,
@@ -36,6 +35,7 @@ from thermoctl.diagnose.search import (
     following,
     inflation,
     look,
+    metric_of,
     prune,
     search,
     smooth,
@@ -49,7 +49,8 @@ from thermoctl.yamlfile import InputError
 
 NAME = 0.9                  # one explanation is named alone from this probability on
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
-REMAINS = -8.0              # log10 p of an unknown smooth input from which something is left over
+REMAINS = -9.0              # log10 p of an unknown input, in the residual's own colour, from which something is left over
+UNLIKE_COLOUR, MOST = -25.0, 0.3        # the same in white noise's metric, and its share of the residual's energy beyond white noise
 TEMPERING = 1.25, 2.0       # how much less the score decides than a perfect likelihood would, in white and in coloured noise
 
 
@@ -122,9 +123,12 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     if current.effects:
         share = (worst ** 2 - 1) / max(before_worst ** 2 - 1, 1e-9)
         explained = worst < CLEAN or (share < 0.02 and worst < LARGE)
-        if explained and remains(case, current):
+        if explained and (left := remains(case, current)):
             verdict = "unexplained"
-            notes.append("beside what is named, something remains in the residual that no entry of the catalogue explains")
+            if left.gain > base.raw - current.raw:
+                current, rivals, worst = base, [], before_worst     # the name explains less than what it leaves
+                held = held_out(case, base, current)
+            notes.append(f"beside what is named, something remains that no entry of the catalogue explains: {left.sentence()}")
         elif explained:
             verdict = "explained" if current.probability >= NAME else "ambiguous"
         else:
@@ -134,7 +138,10 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
                 held = held_out(case, base, current)
             notes.append(f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains")
     else:
-        verdict = "unexplained" if before_worst > LARGE or left_over or remains(case, current) else "consistent"
+        left = remains(case, current)
+        verdict = "unexplained" if before_worst > LARGE or left_over or left else "consistent"
+        if left:
+            notes.append(f"something is missing that no entry of the catalogue explains: {left.sentence()}")
     if clock:
         verdict, left_over = "unexplained", True
         notes.insert(0, clock)
@@ -192,10 +199,18 @@ def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> s
     return None
 
 
-def remains(case: Case, e: Explanation) -> bool:
-    """Does a smooth unknown input still explain more of the residual than noise of the residual's own colour would let it, or
-    more than the colour of any sensor would?"""
-    return smooth(case, e, coloured=True) < REMAINS or (not e.effects and smooth(case, e) < NO_COLOUR)
+def remains(case: Case, e: Explanation) -> locate.Suspect | None:
+    """An unknown input in time, or an unknown function of the state, that still explains more of the residual than noise of the
+    residual's own colour would let it; or, in white noise's metric, most of what is there beyond white noise: a sensor's colour
+    spreads over many frequencies and follows nothing."""
+    for coloured, limit in ((True, REMAINS), (False, UNLIKE_COLOUR)):
+        metric = metric_of(case, e, coloured)
+        rig = Rig(e.plant, metric.drives, [t.columns for t in case.tables])
+        beyond = float(metric.residual @ metric.residual) - len(metric.residual)
+        for found in (locate.patterns(metric, rig), locate.suspects(metric)):
+            if found and found[0].log_p < limit and (coloured or found[0].gain > MOST * beyond):
+                return found[0]
+    return None
 
 
 def _unfitted(case: Case) -> dict[str, float]:

@@ -339,12 +339,16 @@ def _colours(e: Explanation) -> tuple[Noise, ...]:
 
 def smooth(case: Case, e: Explanation, coloured: bool = False) -> float:
     """log10 p of the best smooth unknown input at one node or on one sensor; 0 where there is none."""
+    found = locate.suspects(metric_of(case, e, coloured))
+    return found[0].log_p if found else 0.0
+
+
+def metric_of(case: Case, e: Explanation, coloured: bool) -> Metric:
+    """The rows of an explanation's residual, in white noise's metric or in that of the residual's own colour."""
     drives = [e.fit.model.drive(t) for t in case.tables]
     for r, d in enumerate(drives):
         e.fit.model.prepare(d, e.fit.values[r])
-    metric = Metric(dataclasses.replace(e.fit, noise=_colours(e)) if coloured else e.fit, drives)
-    found = locate.suspects(metric)
-    return found[0].log_p if found else 0.0
+    return Metric(dataclasses.replace(e.fit, noise=_colours(e)) if coloured else e.fit, drives)
 
 
 def energy(case: Case, e: Explanation) -> float:
