@@ -78,7 +78,7 @@ def goals(seeds: list[dict[str, Any]], disturbed: list[dict[str, Any]]) -> list[
     goal("uncompensated 2 s, median seed, um", np.median(u), 5, 15, "5 to 15")
     goal("paper's method 2 s / SISO 2 s, median (about a third)", np.median(p / s), 0, THREEFOLD, f"<= {THREEFOLD:g}")
     for k, name in (("paper", "paper's"), ("better", "better")):
-        goal(f"largest filtered temperature error, {name} method, median seed, % of range",
+        goal(f"largest filtered error, {name} method, median, % of range",
              100 * np.median([x["temperature"][k][0] for x in seeds]) / tables.RANGE_K, 0, 1.8, "<= 1.8")
     goal("better 2 s / paper's, median seed", np.median(b / p), 0, 0.45, "<= 0.45")
     goal("better 2 s / paper's, worst seed", np.max(b / p), 0, 0.6, "<= 0.6")
