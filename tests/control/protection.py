@@ -489,6 +489,10 @@ def voltage_and_current(module):
     hot = replace_gain(module, hot).warm()
     hot.tick(command=arming.ARM).set(current_a=1.0, voltage_v=4.0 * 1.393).tick(2).well()
     hot.set(voltage_v=4.0).tick().safe("electrical_disagrees")
+    b = bench(resistance_tolerance=0.0)                                               # the estimate's temperature, not the reading's
+    b.law.x[0] = 100.0
+    b.set(current_a=1.0, voltage_v=4.0 * 1.393).tick(2).well()
+    b.set(voltage_v=4.0).tick().safe("electrical_disagrees")
     # A model that says nothing of the coil: its own reading counts; one at fault does not.
     C = np.zeros((12, 2))
     C[1, 1] = 1.0
