@@ -149,7 +149,7 @@ def daemon(work: Path, minutes: float) -> dict[str, list[Sample]]:
                     found.setdefault(name, []).append((now, *look(pid)))
             rounds += 1
             time.sleep(0.02)
-        assert reloads > rounds // 1000, f"{reloads} reloads of {rounds // 500}"
+        assert reloads, f"none of {rounds // 500} reloads was answered"
     finally:
         process.send_signal(signal.SIGTERM)
         process.wait(30)
