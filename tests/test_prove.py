@@ -78,7 +78,7 @@ def test_a_name_that_the_data_cannot_tell_counts_as_its_class_only():
     told = answer(("radiation", "a")) | {"nearly_the_same": ["natural_convection"]}
     row = score.score("1", told, result("explained", [finding("natural_convection", "a", 0.8)]))
     assert not row.exact and row.alike and row.placed and row.inside and not row.inside_exact
-    assert row.calibration == [(0.8, True)]
+    assert row.calibration == [(0.8, False)]      # of explanations that exclude each other one is true
 
 
 def test_the_true_name_among_the_alternatives_is_inside_the_set():

@@ -37,6 +37,7 @@ class Explanation:
     spread: float = 0.0                                         # of such distances, that the score was taken with
     own: list[dict[str, str]] = field(default_factory=list)     # per effect: its parameter to the plant's name
     direction: Direction | None = None
+    counts: bool = False                                        # more than chance over the whole catalogue would give
     probability: float = 0.0
 
     @property

@@ -112,6 +112,11 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         if kept is not current:
             current, reference = kept, kept
             rivals = [r for r in rivals if len(r.effects) == len(kept.effects)]
+    # That something is missing was proved on data that took no part; which of the rivals it is, all of the data decide.
+    leader = min((e for e in rivals if e.counts), key=lambda e: e.score, default=current)
+    if current is reference and leader.score < current.score and len(leader.effects) == len(current.effects):
+        rivals = [current, *(e for e in rivals if e is not leader)]
+        current = reference = leader
     suspects = locate.suspects(first.metric) if first.directions and first.p_any() < 1e-3 else []
     excess = case.excess(current)
     worst = max(excess.values(), default=0.0)

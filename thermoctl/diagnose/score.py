@@ -154,7 +154,7 @@ def score(
     probabilities = [
         (
             float(f["probability"]),
-            any(near((f["effect"], f["where"]), t) for t in truth) and at((f["effect"], f["where"])),
+            f["effect"] in true_names and at((f["effect"], f["where"])),  # exactly: explanations exclude each other
         )
         for f in [*result["findings"], *result["alternatives"]]
     ]

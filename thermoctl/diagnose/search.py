@@ -266,10 +266,14 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
             break
         case.progress(f"refitting {len(chosen)} explanations")
         seen.finalists = compete(case, seen, chosen)
-        # The best score that also predicts: a rival that merely fits better gives way to the next.
+        # The best score that surely predicts is gone on with; those that fit better stay its rivals.
         before = unseen_errors(case, current.plant)
-        best = next((e for e in seen.finalists[:4] if counts(case, seen, e, entries)
-                     and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0), None)
+        best = None
+        for e in seen.finalists[:4]:
+            e.counts = counts(case, seen, e, entries)
+            if e.counts and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0:
+                best = e
+                break
         if best is None and not current.effects and seen.p_any() < 1e-3 and time.process_time() - case.begun < PATIENCE_S:
             case.progress("looking for two effects that hide each other")
             together = compete_pairs(case, seen, pairs(seen))
