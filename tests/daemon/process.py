@@ -8,6 +8,7 @@ from pathlib import Path
 
 import psutil
 
+from thermoctl.daemon.assemble import shared_name
 from thermoctl.daemon.socket import ask
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
@@ -72,3 +73,4 @@ class Daemon:
             with contextlib.suppress(psutil.Error, OSError):
                 process.kill()
         self.process.wait()
+        Path("/dev/shm", shared_name(self.settings)).unlink(missing_ok=True)       # nobody is left to remove it
