@@ -13,6 +13,7 @@ from thermoctl.plant.refit import fit, updated
 from thermoctl.plant.simulate import Drive, Model, SimulationError
 from thermoctl.recording.table import Table
 
+UNDETERMINED = 20.0
 BLOCKS = 16                 # of a single recording, every other one held out
 
 
@@ -71,10 +72,14 @@ def _but_for_start(case: Case, model: Model, d: Drive) -> np.ndarray:
 def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray],
                 draws: int = 400) -> tuple[float, float, float]:
     """Ratio of held-out rms after / before over all outputs in units of their noise, with its 90 % interval (paired block
-    bootstrap), whose upper end is a one-sided 95 % bound."""
+    bootstrap), whose upper end is a one-sided 95 % bound. A recording that the others do not determine, so that the plant alone
+    misses it UNDETERMINED times as far as the one it predicts best, judges nothing."""
     sigma = np.array([n.sigma for n in case.noise])
+    misses = [float(np.sqrt(np.nanmean((a / sigma) ** 2))) for a in before]
     pairs = []
-    for a, b in zip(before, after, strict=True):
+    for a, b, miss in zip(before, after, misses, strict=True):
+        if miss > UNDETERMINED * min(misses):
+            continue
         if not np.isfinite(b[np.isfinite(a)]).all():
             return np.inf, np.inf, np.inf
         x, y = np.nansum((a / sigma) ** 2, axis=1), np.nansum((b / sigma) ** 2, axis=1)
