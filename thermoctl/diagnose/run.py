@@ -50,7 +50,7 @@ from thermoctl.yamlfile import InputError
 NAME = 0.9                  # one explanation is named alone from this probability on
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 REMAINS = -9.0              # log10 p of an unknown input, in the residual's own colour, from which something is left over
-UNLIKE_COLOUR, MOST = -25.0, 0.3        # the same in white noise's metric, and its share of the residual's energy beyond white noise
+UNLIKE_COLOUR, MOST = -30.0, 0.12       # the same in white noise's metric, and its share of the residual's energy beyond white noise
 TEMPERING = 1.25, 2.0       # how much less the score decides than a perfect likelihood would, in white and in coloured noise
 
 
@@ -206,7 +206,7 @@ def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> s
 
 def remains(case: Case, e: Explanation) -> locate.Suspect | None:
     """An unknown input in time, or an unknown function of the state, that still explains more of the residual than noise of the
-    residual's own colour would let it; or, in white noise's metric, most of what is there beyond white noise: a sensor's colour
+    residual's own colour would let it; or, in white noise's metric, a good part of what is there beyond white noise: a sensor's colour
     spreads over many frequencies and follows nothing."""
     for coloured, limit in ((True, REMAINS), (False, UNLIKE_COLOUR)):
         metric = metric_of(case, e, coloured)
