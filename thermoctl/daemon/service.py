@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.socket import ask, settled
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 
@@ -51,7 +51,7 @@ def _running(settings: Any) -> int | None:
 
 
 def start(settings: Any) -> int:
-    """Start the daemon and wait until it answers; 0, or 3 with the end of its log."""
+    """Start the daemon and wait until it has warmed up and takes commands; 0, or 3 with the end of its log."""
     if _systemd():
         return 3 if _systemctl("start", UNIT) else 0
     if _running(settings):
@@ -68,7 +68,7 @@ def start(settings: Any) -> int:
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline and process.poll() is None:
         with contextlib.suppress(InputError):
-            if ask(settings.socket.path, {"command": "status"}).get("ticks", 0) > 0:
+            if settled(ask(settings.socket.path, {"command": "status"})):
                 print(f"started (pid {process.pid}, log {log})")
                 return 0
         time.sleep(0.1)

@@ -58,6 +58,12 @@ def status(shared: Shared) -> dict[str, Any]:
     }
 
 
+def settled(now: dict[str, Any]) -> bool:
+    """Whether the loop of this status has warmed up: its state changes no more by itself, but for a fault."""
+    state = now.get("state", "OFF")
+    return state != "OFF" and (state != "SAFE" or any(f["severity"] != "warning" for f in now["faults"]))
+
+
 def channel_states(status_bits: int) -> dict[str, str]:
     """Each channel's reading: OK, STALE, ERROR or ABSENT, from the signal status_bits."""
     return {name: ("OK", "STALE", "ERROR", "ABSENT")[status_bits >> (2 * c) & 3]
@@ -144,6 +150,9 @@ class Commands:
                 "error": f"{refusal}: the state is {now['state']}{' because of ' + causes if causes else ''}"}
 
     def _arm(self, request: dict) -> dict[str, Any]:
+        deadline = time.monotonic() + ANSWER_S             # a loop that was just started warms up for 0.1 s
+        while not settled(status(self.shared)) and time.monotonic() < deadline:
+            time.sleep(0.005)
         if self._state() == "ARMED":
             return {"ok": True, "state": "ARMED", "setpoint_um": status(self.shared)["setpoint_um"]}
         if self._state() == "FAULT":
