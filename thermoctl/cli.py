@@ -6,12 +6,16 @@ Exit status: 0 done; 1 the answer is no (a check failed, the daemon is not runni
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from thermoctl import __version__
 from thermoctl.yamlfile import InputError
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):       # before numpy is: two BLAS threads on busy cores wait for each other
+    os.environ.setdefault(_name, "1")
 
 DESCRIPTION = """\
 Holds the output of a precision linear actuator where it belongs while its coil heats up, and says what physics a

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete, dlsim
 
 from thermoctl.cli import main
 from thermoctl.diagnose.effects import catalogue
@@ -103,6 +104,44 @@ def test_heat_from_outside_is_found_with_its_interval(tmp_path):
     assert finding["when"][0] == pytest.approx([500, 900], abs=15)
     value = next(p for n, p in finding["parameters"].items() if n.startswith("Q"))
     assert abs(value["value"] - 0.3) < max(4 * value["sd"], 0.01)
+
+
+def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path):
+    (tmp_path / "plant.yaml").write_text("""
+format: thermoctl-plant/1
+title: Spring-guided stage
+inputs:
+  force: {unit: N}
+parameters:
+  stiffness: {value: 600, unit: N/m, range: [200, 1500]}
+  damping: {value: 30, unit: N*s/m, range: [8, 90]}
+nodes:
+  velocity: {unit: m/s, storage: 1.3, initial: 0}
+  position: {unit: m, storage: 1, initial: 0, initial_sigma: 0.001}
+flows:
+  drive: {into: velocity, rate: force, unit: N}
+  spring: {from: velocity, rate: stiffness * position, unit: N}
+  damper: {from: velocity, rate: damping * velocity, unit: N}
+  travel: {into: position, rate: velocity, unit: m/s}
+outputs:
+  encoder: {value: position, unit: m, noise: 2e-6}
+""")
+    t, period = np.arange(0.0, 20.0, 0.005), 0.25e-3
+    paths = [tmp_path / "plant.yaml"]
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        force = np.interp(t, np.arange(0, 21, 1.0), rng.uniform(-10, 10, 21))
+        A, B, C, D, _ = cont2discrete((np.array([[-33 / 1.3, -640 / 1.3], [1, 0]]), np.array([[1 / 1.3], [0]]),
+                                       np.array([[0, 1]]), np.zeros((1, 1))), 0.005)
+        x = dlsim((A, B, C, D, 0.005), force)[1][:, 0]
+        y = x + 3e-6 * np.sin(2 * np.pi * x / period + 0.7) + rng.normal(0, 2e-6, len(t))
+        assert np.ptp(x) > 70 * period
+        paths.append(tmp_path / f"run_{seed}.csv")
+        np.savetxt(paths[-1], np.column_stack([t, force, y]), delimiter=",", comments="", fmt="%.9g", header="t,force,encoder")
+    r = diagnosed(paths, tmp_path / "out")
+    assert r["verdict"] == "explained" and [(f["effect"], f["where"]) for f in r["findings"]] == [("cyclic_error", "encoder")]
+    found = {k.split("_")[0]: v["value"] for k, v in r["findings"][0]["parameters"].items()}
+    assert found["P"] == pytest.approx(period, rel=1e-3) and abs(found["A"]) == pytest.approx(3e-6, rel=0.1)
 
 
 def test_physics_outside_the_catalogue_is_not_given_a_confident_name(tmp_path):

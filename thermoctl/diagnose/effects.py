@@ -657,8 +657,33 @@ class _Builder:
             self.flows[p.flow] = dataclasses.replace(f, rate=ex.substitute(f.rate, change))
 
 
-
 # ---------------------------------------------------------------------------------------------------------- shapes
+
+SLOW_TURNS, FINE_TURNS = 60.0, 4000     # periods over the span: each looked at up to the first, the strongest up to the second
+
+
+def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count: int = 16) -> np.ndarray:
+    """The strongest numbers of turns beyond SLOW_TURNS in output errors (N,) per recording, over the signal x of all of them:
+    peaks of their spectrum over x. What moves slowly in time is taken off first."""
+    fast = []
+    for e in errors:
+        e = np.nan_to_num(e)
+        total = np.concatenate([[0.0], np.cumsum(e)])
+        half = max(len(e) // 200, 4)
+        low, high = np.maximum(np.arange(len(e)) - half, 0), np.minimum(np.arange(len(e)) + half + 1, len(e))
+        fast.append(e - (total[high] - total[low]) / (high - low))
+    e = np.concatenate(fast)
+    e = np.clip(e, *(np.array([-8, 8]) * (1.4826 * float(np.median(np.abs(e))) or np.inf)))
+    good = np.isfinite(x)
+    if not good.any():
+        return np.zeros(0)
+    bins = 8 * FINE_TURNS
+    index = np.clip(((x[good] - np.min(x[good])) / span * bins).astype(int), 0, bins - 1)
+    power = np.abs(np.fft.rfft(np.bincount(index, e[good], bins), 4 * bins))[:4 * FINE_TURNS]      # by a quarter of a turn
+    power[:int(4 * SLOW_TURNS)] = 0.0
+    peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+    return peaks[np.argsort(-power[peaks])[:count]] / 4
+
 
 def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24) -> list[dict[str, float]]:
     """The values of a shape to look at in screening."""
@@ -695,7 +720,11 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
         span = float(np.ptp(x[np.isfinite(x)])) or 1.0
         if kind == "periods":
             # neighbouring periods differ by a quarter of a turn over the span
-            turns = np.arange(0.75, 60.0, 0.25)
+            turns = np.arange(0.75, SLOW_TURNS, 0.25)
+            errors = [d.y - run.y for d, run in zip(rig.drives, runs, strict=True)]
+            if candidate.place.output:
+                j = list(rig.plant.outputs).index(candidate.place.output)
+                turns = np.concatenate([turns, _fine_turns(x, [e[:, j] for e in errors], span)])
             return [{"period": float(span / n)} for n in turns]
         if kind == "phases":
             return [{"phase": 0.0}, {"phase": float(np.pi / 2)}]

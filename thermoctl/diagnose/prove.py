@@ -112,8 +112,6 @@ def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     import dask
     from distributed import Client, LocalCluster
 
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # two BLAS threads on busy cores wait for each other
-        os.environ.setdefault(name, "1")
     with dask.config.set(
         {
             "distributed.scheduler.allowed-failures": RETRIES,
