@@ -686,7 +686,7 @@ def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count:
 
 
 def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24) -> list[dict[str, float]]:
-    """The values of a shape to look at in screening."""
+    """The values of a shape to look at in screening; `picked_from`: of how many the residual itself picked this one."""
     rig = candidate.rig
     duration = max(float(d.t[-1]) for d in rig.drives)
     dt = min(float(np.median(np.diff(d.t))) for d in rig.drives if len(d.t) > 1)
@@ -724,7 +724,9 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
             errors = [d.y - run.y for d, run in zip(rig.drives, runs, strict=True)]
             if candidate.place.output:
                 j = list(rig.plant.outputs).index(candidate.place.output)
-                turns = np.concatenate([turns, _fine_turns(x, [e[:, j] for e in errors], span)])
+                fine = _fine_turns(x, [e[:, j] for e in errors], span)
+                return [{"period": float(span / n)} for n in turns] + \
+                    [{"period": float(span / n), "picked_from": 4.0 * FINE_TURNS} for n in fine]
             return [{"period": float(span / n)} for n in turns]
         if kind == "phases":
             return [{"phase": 0.0}, {"phase": float(np.pi / 2)}]

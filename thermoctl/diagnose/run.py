@@ -21,7 +21,7 @@ from thermoctl.diagnose import doubt, experiment, locate
 from thermoctl.diagnose.effects import CATALOGUE, Rig, catalogue
 from thermoctl.diagnose.evidence import LARGE, white_sigma
 from thermoctl.diagnose.explain import Case, Explanation
-from thermoctl.diagnose.heldout import held_out, rms
+from thermoctl.diagnose.heldout import held_out, pooled_gain, rms, unseen_errors
 from thermoctl.diagnose.outcome import Diagnosis, result
 from thermoctl.diagnose.screen import Metric, log_p
 from thermoctl.diagnose.search import (
@@ -96,7 +96,8 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         tinted = look(case, base, entries, coloured=True)
         if tinted.directions:
             best = tinted.directions[0]
-            left_over = tinted.p_any() < 1e-3 and log_p(best.gain / inflation(tinted.directions), best.dims) < threshold(tinted)
+            left_over = tinted.p_any() < 1e-3 and \
+                log_p(best.gain / inflation(tinted.directions), best.dims) + best.elsewhere < threshold(tinted)
         if left_over:
             tinted.finalists = compete(case, tinted, finalists(tinted.directions))
             if tinted.finalists and counts(case, tinted, tinted.finalists[0], entries):
@@ -112,11 +113,16 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         if kept is not current:
             current, reference = kept, kept
             rivals = [r for r in rivals if len(r.effects) == len(kept.effects)]
-    # That something is missing was proved on data that took no part; which of the rivals it is, all of the data decide.
-    leader = min((e for e in rivals if e.counts), key=lambda e: e.score, default=current)
-    if current is reference and leader.score < current.score and len(leader.effects) == len(current.effects):
-        rivals = [current, *(e for e in rivals if e is not leader)]
-        current = reference = leader
+    # That something is missing was proved on data that took no part; which of the rivals it is, all of the data decide, among
+    # those that predict better than the plant, too.
+    better = [e for e in rivals if e.counts and e.score < current.score and len(e.effects) == len(current.effects)]
+    if better and current is reference:
+        before = unseen_errors(case, base.plant)
+        leader = next((e for e in sorted(better, key=lambda e: e.score)
+                       if pooled_gain(case, before, unseen_errors(case, e.plant))[0] < 1.0), None)
+        if leader:
+            rivals = [current, *(e for e in rivals if e is not leader)]
+            current = reference = leader
     suspects = locate.suspects(first.metric) if first.directions and first.p_any() < 1e-3 else []
     excess = case.excess(current)
     worst = max(excess.values(), default=0.0)

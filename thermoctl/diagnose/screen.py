@@ -38,11 +38,12 @@ class Direction:
     start: dict[str, float]
     vector: np.ndarray | None = None        # unit direction in projected space, for likeness between candidates
     excited: float = 0.0                    # share of the direction that the plant's own parameters leave
+    elsewhere: float = 0.0                  # log10 of how many shapes this one was picked from by the residual itself
 
     @property
     def log_p(self) -> float:
         """log10 of the chance of such a gain where nothing is missing."""
-        return log_p(self.gain, self.dims)
+        return log_p(self.gain, self.dims) + self.elsewhere
 
 
 def log_p(gain: float, dims: int) -> float:
@@ -379,7 +380,7 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metri
         s = list(np.array([e[0].item[2][1] for e in entries]).T @ coefficient)
     else:
         s = [1.0]
-        factor = float(np.clip(coefficient[0], 0.1, 5.0))
+        factor = float(np.clip(coefficient[0], 1e-3, 5.0))          # a short lag or delay changes the outputs in proportion
         shape = {k: v * factor if k == "tau" else v for k, v in shape.items()}
     _keep(best, c, shape, gain, int(useful.sum()), parameter_values(c, shape, s), rows @ coefficient, float(left[useful].max()))
     return chance
@@ -393,7 +394,9 @@ def _allowed(p, coefficient: float) -> bool:
 
 def _keep(best: dict[int, Direction], c: Candidate, shape: dict[str, float], gain: float, dims: int, start: dict[str, float],
           vector: np.ndarray, excited: float) -> None:
+    size = float(np.linalg.norm(vector))
+    new = Direction(c, {k: v for k, v in shape.items() if k != "picked_from"}, gain, dims, start,
+                    (vector / size).astype(np.float32) if size > 0 else None, excited, float(np.log10(shape.get("picked_from", 1.0))))
     old = best.get(id(c))
-    if old is None or gain > old.gain:
-        size = float(np.linalg.norm(vector))
-        best[id(c)] = Direction(c, dict(shape), gain, dims, start, (vector / size).astype(np.float32) if size > 0 else None, excited)
+    if old is None or new.log_p < old.log_p:
+        best[id(c)] = new

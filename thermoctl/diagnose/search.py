@@ -30,6 +30,8 @@ CLEAN = 1.25                # residual rms over sensor noise up to which the sen
 NO_COLOUR, SOME_COLOUR = -35.0, -25.0   # the same in white noise's metric: colour of sensors gives no less than the second
 MOST_IN_PAIRS = 250         # directions that are looked at two by two
 CHI2_MEDIAN = 0.455         # of one degree of freedom
+LOOK = 0.01                 # chance of noise looking as good as the best direction, below which the best are refitted
+ALARM = 0.005               # chance of noise counting as an effect (twice that in the tail of 1000 draws); unseen data then have their say
 MARGINAL = 200.0            # a gain in score below this is looked at twice
 DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
 
@@ -106,16 +108,16 @@ class Round:
     inflation: float | None = None
     finalists: list[Explanation] = field(default_factory=list)
 
+    def trials(self) -> float:
+        """To how many independent looks the catalogue amounts: that many make the smallest p of pure noise what the draws saw."""
+        p = np.clip(10.0 ** np.asarray(self.chance), 0.0, 1 - 1e-9)
+        return max(1.0, -len(p) / float(np.sum(np.log1p(-p))))
+
     def p_any(self) -> float:
         """The chance that noise alone makes some candidate look as good as the best one."""
         if not self.directions or self.chance is None:
             return 1.0
-        best = self.directions[0].log_p
-        hits = int(np.sum(self.chance <= best))
-        if hits:
-            return (hits + 1) / (len(self.chance) + 1)
-        floor = float(np.quantile(self.chance, 0.1))        # beyond the draws: the tail goes on as it does there
-        return float(min(1 / (len(self.chance) + 1), 0.1 * 10 ** (best - floor)))
+        return float(-np.expm1(self.trials() * np.log1p(-min(10.0 ** self.directions[0].log_p, 1 - 1e-9))))
 
 
 def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool = False) -> Round:
@@ -239,14 +241,14 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
         gain /= seen.inflation
     if seen.chance is None:
         return e.score < seen.base.score - ACCEPT
-    if log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) < NO_COLOUR and smooth(case, e) > SOME_COLOUR:
+    if log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) + e.direction.elsewhere < NO_COLOUR and smooth(case, e) > SOME_COLOUR:
         return True         # with it the residual is white; without it a sensor would need a colour such as none has
-    return gain > 0 and log_p(gain, e.direction.dims) < threshold(seen)
+    return gain > 0 and log_p(gain, e.direction.dims) + e.direction.elsewhere < threshold(seen)
 
 
 def threshold(seen: Round) -> float:
-    """log10 p that an effect must fall below: what the best of all candidates would show by chance, and a little more."""
-    return (min(float(np.min(seen.chance)), -3.5) if seen.chance is not None else -5.0) - 0.3
+    """log10 p that an effect must fall below, so that noise alone makes one of the catalogue do so in ALARM of all cases."""
+    return min(float(np.log10(ALARM / seen.trials())), -3.5) if seen.chance is not None else -5.0
 
 
 def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
@@ -259,7 +261,7 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
     rivals: list[Explanation] = []
     while len(current.effects) < most:
         seen = rounds[-1]
-        if seen.p_any() > 1e-3 and max(case.excess(current).values(), default=0.0) < CLEAN:
+        if seen.p_any() > LOOK and max(case.excess(current).values(), default=0.0) < CLEAN:
             break
         chosen = finalists(seen.directions)
         if not chosen:
@@ -274,7 +276,7 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
             if e.counts and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0:
                 best = e
                 break
-        if best is None and not current.effects and seen.p_any() < 1e-3 and time.process_time() - case.begun < PATIENCE_S:
+        if best is None and not current.effects and seen.p_any() < LOOK and time.process_time() - case.begun < PATIENCE_S:
             case.progress("looking for two effects that hide each other")
             together = compete_pairs(case, seen, pairs(seen))
             best = next((e for e in together if counts(case, seen, e, entries)), None)
