@@ -27,6 +27,8 @@ from scipy.signal import lfilter
 LARGE = 1.6         # coloured residual beyond this many sigmas of white noise is physics, not a sensor's colour
 WEIGHT = 0.1        # of the residual's energy beside its innovations, where it is larger than that
 
+AS_LIKELY = 12.0    # kinds of colour whose scores differ by less are both possible
+
 _PHI = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 0.9995)
 _SHARE = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99)       # theta / phi
 _FLICKER = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)               # variance of the fastest first-order part over the white one's
@@ -68,18 +70,38 @@ def flicker(variance: float, slope: float = 1.0) -> tuple[tuple[float, ...], tup
 
 
 def colour(parts: Sequence[np.ndarray], floor: float) -> Colour:
-    """Fit ARMA(1,1) to residual sequences (N,) of one channel; NaN are left out. `floor`: a sigma below which the sensor
+    """Fit every colour to residual sequences (N,) of one channel; NaN are left out. `floor`: a sigma below which the sensor
     does not go, so that an explanation is not paid for fitting noise."""
+    return min(_kinds(parts, floor), key=lambda c: c.score)
+
+
+def _kinds(parts: Sequence[np.ndarray], floor: float) -> tuple[Colour, Colour]:
+    """The best white or first-order colour, and the best flicker noise (or none)."""
     parts = [p[np.isfinite(p)] for p in parts]
     parts = [p for p in parts if len(p) > 8]
     n = sum(map(len, parts))
-    best = Colour(floor, (1.0,), (1.0,), np.inf if n else 0.0)
+    best = [Colour(floor, (1.0,), (1.0,), np.inf if n else 0.0)] * 2
     for ar, ma, parameters in _filters() if n else ():
         variance = max(_variance(parts, ar, ma), floor ** 2)
-        score = n * np.log(variance) + parameters * np.log(n)
-        if score < best.score - 1e-9:
-            best = Colour(float(np.sqrt(variance)), ar, ma, float(score))
-    return best
+        found = Colour(float(np.sqrt(variance)), ar, ma, n * float(np.log(variance)) + parameters * float(np.log(n)))
+        for kind in (0, 1) if len(ar) == 1 else (0,) if len(ar) == 2 else (1,):
+            if found.score < best[kind].score - 1e-9:
+                best[kind] = found
+    return best[0], best[1]
+
+
+def least_gain(before: Sequence[np.ndarray], after: Sequence[np.ndarray], sigmas: Sequence[float]) -> float:
+    """By how much the score falls from one explanation's residuals to another's when every channel has, of the kinds of colour
+    that are as likely before, the one that is paid least: a short record does not tell flicker noise from first-order noise,
+    and the slowest patterns are unlikely in one and nothing special in the other."""
+    total = 0.0
+    for j, sigma in enumerate(sigmas):
+        old, new = ([r[:, j] for r in residuals] for residuals in (before, after))
+        kinds = list(zip(_kinds(old, 0.6 * sigma), _kinds(new, 0.6 * sigma), strict=True))
+        likely = min(a.score for a, _ in kinds) + AS_LIKELY
+        total += min(a.score - b.score for a, b in kinds if a.score <= likely)
+        total += sum(_price(a, sigma) - _price(b, sigma) for a, b in zip(old, new, strict=True))
+    return total
 
 
 def _variance(parts: Sequence[np.ndarray], ar: tuple[float, ...], ma: tuple[float, ...]) -> float:

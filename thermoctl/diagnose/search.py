@@ -14,7 +14,7 @@ import numpy as np
 
 from thermoctl.diagnose import locate, observer
 from thermoctl.diagnose.effects import Candidate, Rig, candidates
-from thermoctl.diagnose.evidence import LARGE
+from thermoctl.diagnose.evidence import LARGE, least_gain
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.diagnose.heldout import pooled_gain, unseen_errors
 from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
@@ -212,7 +212,8 @@ def compete_pairs(case: Case, seen: Round, chosen: Sequence[tuple[Direction, Dir
             e = case.explain(plant, [*seen.base.effects, first.candidate, moved.candidate], [*seen.base.own, own, other])
         except (SimulationError, InputError, LookupError, np.linalg.LinAlgError):
             return None
-        e.direction = dataclasses.replace(moved, dims=first.dims + second.dims)
+        e.direction = dataclasses.replace(moved, dims=first.dims + second.dims, elsewhere=first.elsewhere + second.elsewhere
+                                          + float(np.log10(0.5 * seen.trials())))      # as many more pairs than single ones
         return e
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
         done = [e for e in pool.map(both, chosen) if e is not None]
@@ -236,6 +237,7 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
     assert e.direction is not None
     gain = seen.base.raw - e.raw
     if 0 < gain < MARGINAL:
+        gain = min(gain, least_gain(seen.base.fit.residuals, e.fit.residuals, [n.sigma for n in case.noise]))
         if seen.inflation is None:      # beside what was found: an effect that is found inflates no longer
             seen.inflation = inflation(look(case, e, entries, draws=0, coloured=True).directions)
         gain /= seen.inflation
