@@ -142,6 +142,15 @@ def channels(residuals: Sequence[np.ndarray], sigmas: Sequence[float]) -> list[C
     return out
 
 
+def possible(residuals: Sequence[np.ndarray], sigmas: Sequence[float]) -> list[list[Colour]]:
+    """Colours of all channels, as `channels` finds them and, where channels have another kind as likely, with that one."""
+    pairs = [_kinds([r[:, j] for r in residuals], 0.6 * sigma) for j, sigma in enumerate(sigmas)]
+    best = [min(kinds, key=lambda c: c.score) for kinds in pairs]
+    other = [max(kinds, key=lambda c: c.score) for kinds in pairs]
+    other = [o if o.score < b.score + AS_LIKELY else b for b, o in zip(best, other, strict=True)]
+    return [best] if other == best else [best, other]
+
+
 def _price(e: np.ndarray, sigma: float) -> float:
     e = np.abs(e[np.isfinite(e)])
     if not len(e):

@@ -19,7 +19,7 @@ import numpy as np
 
 from thermoctl.diagnose import doubt, experiment, locate
 from thermoctl.diagnose.effects import CATALOGUE, Rig, catalogue
-from thermoctl.diagnose.evidence import LARGE, white_sigma
+from thermoctl.diagnose.evidence import LARGE, Colour, possible, white_sigma
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.diagnose.heldout import held_out, pooled_gain, rms, unseen_errors
 from thermoctl.diagnose.outcome import Diagnosis, result
@@ -96,11 +96,10 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         tinted = look(case, base, entries, coloured=True)
         if tinted.directions:
             best = tinted.directions[0]
-            left_over = tinted.p_any() < 1e-3 and \
-                log_p(best.gain / inflation(tinted.directions), best.dims) + best.elsewhere < threshold(tinted)
-        if left_over:
-            tinted.finalists = compete(case, tinted, finalists(tinted.directions))
+            if log_p(best.gain / inflation(tinted.directions), best.dims) + best.elsewhere < threshold(tinted):
+                tinted.finalists = compete(case, tinted, finalists(tinted.directions))
             if tinted.finalists and counts(case, tinted, tinted.finalists[0], entries):
+                left_over = True
                 current = reference = tinted.finalists[0]
                 rivals = tinted.finalists[1:]
     clock = clock or _clock(case, base, current, first)
@@ -211,17 +210,19 @@ def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> s
 
 
 def remains(case: Case, e: Explanation) -> locate.Suspect | None:
-    """An unknown input in time, or an unknown function of the state, that still explains more of the residual than noise of the
-    residual's own colour would let it; or, in white noise's metric, a good part of what is there beyond white noise: a sensor's colour
-    spreads over many frequencies and follows nothing."""
-    for coloured, limit in ((True, REMAINS), (False, UNLIKE_COLOUR)):
-        metric = metric_of(case, e, coloured)
+    """An unknown input in time, or an unknown function of the state, that still explains more of the residual than noise of any colour
+    that the residual may have would let it; or, in white noise's metric, a good part of what is there beyond white noise: a sensor's
+    colour spreads over many frequencies and follows nothing."""
+    def strongest(colours: Sequence[Colour] | None) -> tuple[locate.Suspect | None, float]:
+        metric = metric_of(case, e, colours)
         rig = Rig(e.plant, metric.drives, [t.columns for t in case.tables])
-        beyond = float(metric.residual @ metric.residual) - len(metric.residual)
-        for found in (locate.patterns(metric, rig), locate.suspects(metric)):
-            if found and found[0].log_p < limit and (coloured or found[0].gain > MOST * beyond):
-                return found[0]
-    return None
+        found = [s[0] for s in (locate.patterns(metric, rig), locate.suspects(metric)) if s]
+        return min(found, key=lambda s: s.log_p, default=None), float(metric.residual @ metric.residual) - len(metric.residual)
+    tinted = [strongest(c)[0] for c in possible(e.fit.residuals, [n.sigma for n in case.noise])]
+    if all(s and s.log_p < REMAINS for s in tinted):
+        return tinted[0]
+    plain, beyond = strongest(None)
+    return plain if plain and plain.log_p < UNLIKE_COLOUR and plain.gain > MOST * beyond else None
 
 
 def _unfitted(case: Case) -> dict[str, float]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from thermoctl.diagnose import locate, observer
 from thermoctl.diagnose.effects import Candidate, Rig, candidates
-from thermoctl.diagnose.evidence import LARGE, least_gain
+from thermoctl.diagnose.evidence import LARGE, Colour, least_gain
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.diagnose.heldout import pooled_gain, unseen_errors
 from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
@@ -126,7 +126,7 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
     drives = [model.drive(t) for t in case.tables]
     for d in drives:
         model.prepare(d, base.fit.values[drives.index(d)])
-    metric = Metric(dataclasses.replace(base.fit, noise=_colours(base)) if coloured else base.fit, drives)
+    metric = Metric(dataclasses.replace(base.fit, noise=_noise(base.colours)) if coloured else base.fit, drives)
     rig = Rig(base.plant, drives, [t.columns for t in case.tables])
     found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
     noise = np.random.default_rng(1).standard_normal((len(metric.residual), draws)) if draws else None
@@ -341,22 +341,22 @@ def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanatio
     return out[:count]
 
 
-def _colours(e: Explanation) -> tuple[Noise, ...]:
-    return tuple(Noise(c.sigma, 0.0, c.ar, c.ma) for c in e.colours)
+def _noise(colours: Sequence[Colour]) -> tuple[Noise, ...]:
+    return tuple(Noise(c.sigma, 0.0, c.ar, c.ma) for c in colours)
 
 
 def smooth(case: Case, e: Explanation, coloured: bool = False) -> float:
     """log10 p of the best smooth unknown input at one node or on one sensor; 0 where there is none."""
-    found = locate.suspects(metric_of(case, e, coloured))
+    found = locate.suspects(metric_of(case, e, e.colours if coloured else None))
     return found[0].log_p if found else 0.0
 
 
-def metric_of(case: Case, e: Explanation, coloured: bool) -> Metric:
-    """The rows of an explanation's residual, in white noise's metric or in that of the residual's own colour."""
+def metric_of(case: Case, e: Explanation, colours: Sequence[Colour] | None) -> Metric:
+    """The rows of an explanation's residual, in the metric of colours, one a channel, or in white noise's."""
     drives = [e.fit.model.drive(t) for t in case.tables]
     for r, d in enumerate(drives):
         e.fit.model.prepare(d, e.fit.values[r])
-    return Metric(dataclasses.replace(e.fit, noise=_colours(e)) if coloured else e.fit, drives)
+    return Metric(dataclasses.replace(e.fit, noise=_noise(colours)) if colours else e.fit, drives)
 
 
 def energy(case: Case, e: Explanation) -> float:
