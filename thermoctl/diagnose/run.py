@@ -216,13 +216,15 @@ def remains(case: Case, e: Explanation) -> locate.Suspect | None:
     def strongest(colours: Sequence[Colour] | None) -> tuple[locate.Suspect | None, float]:
         metric = metric_of(case, e, colours)
         rig = Rig(e.plant, metric.drives, [t.columns for t in case.tables])
-        found = [s[0] for s in (locate.patterns(metric, rig), locate.suspects(metric)) if s]
+        limit = REMAINS if colours else UNLIKE_COLOUR
+        found = [s for s in (*locate.patterns(metric, rig), *locate.suspects(metric))
+                 if s.log_p < (2 * limit if s.kind == "output" else limit)]         # sensors wander by themselves
         return min(found, key=lambda s: s.log_p, default=None), float(metric.residual @ metric.residual) - len(metric.residual)
     tinted = [strongest(c)[0] for c in possible(e.fit.residuals, [n.sigma for n in case.noise])]
-    if all(s and s.log_p < REMAINS for s in tinted):
+    if all(tinted):
         return tinted[0]
     plain, beyond = strongest(None)
-    return plain if plain and plain.log_p < UNLIKE_COLOUR and plain.gain > MOST * beyond else None
+    return plain if plain and plain.gain > MOST * beyond else None
 
 
 def _unfitted(case: Case) -> dict[str, float]:
