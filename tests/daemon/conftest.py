@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.daemon.process import patient
 from thermoctl.control.model import CompensatorModel
 from thermoctl.settings import load_settings
 
@@ -14,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture
 def config(tmp_path):
     """Path of a configuration like config/simulated.yaml, socket and recordings in tmp_path, no real-time priority."""
-    text = (ROOT / "config/simulated.yaml").read_text()
+    text = patient((ROOT / "config/simulated.yaml").read_text())
     for old, new in (("plants/", f"{ROOT}/config/plants/"), ("../run/", f"{tmp_path}/"),
                      ("../recordings", f"{tmp_path}/recordings"), ("models/", f"{ROOT}/config/models/")):
         text = text.replace(old, new)

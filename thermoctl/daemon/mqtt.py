@@ -10,6 +10,7 @@ state counts, and the recording has the rest.
 """
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import threading
@@ -99,7 +100,8 @@ class Bridge:
     def close(self) -> None:
         """Say `offline` and leave."""
         if self.connected.is_set():
-            self.client.publish(f"{self.topic}/availability", OFFLINE, qos=1, retain=True).wait_for_publish(2.0)
+            with contextlib.suppress(RuntimeError, ValueError):      # the connection went at this moment: the last will says it
+                self.client.publish(f"{self.topic}/availability", OFFLINE, qos=1, retain=True).wait_for_publish(2.0)
         self.client.disconnect()
         self.client.loop_stop()
 
