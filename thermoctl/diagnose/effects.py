@@ -219,6 +219,10 @@ class Rig:
         """A flow of force that an input drives."""
         return bool((f.target in self.velocities or f.source in self.velocities) and ex.names(f.rate) & self.moving_inputs)
 
+    def is_pump(self, f: Flow) -> bool:
+        """A flow from outside, of something else than heat or force, that an input drives."""
+        return f.source is None and f.target not in (None, *self.temperatures, *self.velocities)
+
     def drives_of(self, f: Flow) -> list[str]:
         """The inputs that drive a flow (temperatures, positions and references aside)."""
         return [i for i in self.physics.inputs if i in ex.names(f.rate) and i in self.moving_inputs
@@ -300,7 +304,7 @@ def _motors(rig: Rig) -> Iterator[Place]:
 
 def _drives(rig: Rig) -> Iterator[Place]:
     for f in rig.physics.flows.values():
-        if rig.is_motor(f):
+        if rig.is_motor(f) or rig.is_pump(f):
             for u in rig.drives_of(f):
                 yield Place(f.name, {"u": name(u)}, flow=f.name, input=u)
 
@@ -429,7 +433,7 @@ class Candidate:
 def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     """Every effect at every place it can sit, with every choice of the signals it needs."""
     out = []
-    motor_inputs = {u for f in rig.physics.flows.values() if rig.is_motor(f) for u in rig.drives_of(f)}
+    driving = {place.input for place in _drives(rig)}
     for effect in effects.values():
         for place in PLACES[effect.where](rig):
             near = place.nodes.get("v")
@@ -449,7 +453,7 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
                         continue
                     if effect.name == "sensor_gain" and place.where == rig.air:
                         continue
-                    if effect.name in ("sensor_delay", "sensor_saturation") and place.input in motor_inputs:
+                    if effect.name in ("sensor_delay", "sensor_saturation") and place.input in driving:
                         continue        # a drive that acts late or is clipped is the actuator's entry
                     out.append(candidate)
     return out

@@ -17,38 +17,38 @@ UNDETERMINED = 20.0
 BLOCKS = 16                 # of a single recording, every other one held out
 
 
-def folds(case: Case) -> list[tuple[list[int], list[Table], list[Table]]]:
-    """(test recordings, training tables, test tables): each recording in turn; a single one is cut into blocks, of which
-    every other one is held out, and then the others."""
-    if len(case.tables) > 1:
-        return [([r], [t for q, t in enumerate(case.tables) if q != r], [case.tables[r]]) for r in range(len(case.tables))]
-    (table,) = case.tables
-    span = (table.t - table.t[0]) / max(float(table.t[-1] - table.t[0]), 1e-300)
-    odd = (np.minimum(span * BLOCKS, BLOCKS - 1).astype(int) % 2).astype(bool)
+def folds(case: Case, blocks: bool = False) -> list[tuple[list[Table], list[Table]]]:
+    """(training tables, test tables): each recording in turn; or each cut into `blocks`, of which every other one is held out,
+    and then the others. A single recording is always cut."""
+    if len(case.tables) > 1 and not blocks:
+        return [([t for q, t in enumerate(case.tables) if q != r], [case.tables[r]]) for r in range(len(case.tables))]
     measured = {o.column for o in case.plant.outputs.values()}
 
-    def masked(keep: np.ndarray) -> Table:
+    def masked(table: Table, parity: int) -> Table:
+        span = (table.t - table.t[0]) / max(float(table.t[-1] - table.t[0]), 1e-300)
+        keep = np.minimum(span * BLOCKS, BLOCKS - 1).astype(int) % 2 == parity
         columns = {k: np.where(keep, v, np.nan) if k in measured else v for k, v in table.columns.items()}
         return dataclasses.replace(table, columns=columns)
-    return [([0], [masked(~held)], [masked(held)]) for held in (odd, ~odd)]
+    even, odd = ([masked(t, parity) for t in case.tables] for parity in (0, 1))
+    return [(even, odd), (odd, even)]
 
 
-def unseen_errors(case: Case, plant: Plant, refit: bool = True) -> list[np.ndarray]:
+def unseen_errors(case: Case, plant: Plant, refit: bool = True, blocks: bool = False) -> list[np.ndarray]:
     """Free-run errors (N, outputs) on each fold's test data, the plant fitted to that fold's training data only."""
     out: list[np.ndarray] = []
-    for _, train, test in folds(case):
+    for train, test in folds(case, blocks):
         model = plant.compile()
         drives = [model.drive(t) for t in test]
         try:
-            dx0 = None
+            dx0: Sequence[np.ndarray | None] = [None] * len(test)
             if refit:
                 training = [model.drive(t) for t in train]
                 found = fit(model, training, case.noise, iterations=15, seconds=case.patience)
                 model = Model(updated(plant, found, training), model.code)
-                if train[0].path == test[0].path:       # one recording, split: its start took part
-                    dx0 = found.dx0[0]
-            out += [_but_for_start(case, model, d) if dx0 is None and model.uncertain
-                    else d.y - model.run(model.prepare(d), None, dx0).y for d in drives]
+                if train[0].path == test[0].path:       # recordings, split: their starts took part
+                    dx0 = list(found.dx0)
+            out += [_but_for_start(case, model, d) if begin is None and model.uncertain
+                    else d.y - model.run(model.prepare(d), None, begin).y for d, begin in zip(drives, dx0, strict=True)]
         except SimulationError:
             out += [np.full_like(d.y, np.nan) for d in drives]
     return out
@@ -67,6 +67,25 @@ def _but_for_start(case: Case, model: Model, d: Drive) -> np.ndarray:
     rows, left = (by_start / scale[None, :, None])[good] * prior, (error / scale)[good]
     shift = np.linalg.solve(rows.T @ rows + np.eye(len(prior)), rows.T @ left) * prior
     return error - by_start @ shift
+
+
+def prediction(case: Case, before: Plant, after: Plant, found: dict[tuple[int, bool], list[np.ndarray]] | None = None
+               ) -> tuple[float, float, float, bool]:
+    """`pooled_gain` of one plant over another, and whether it is that of blocks: what a single recording does not determine, an
+    encoder's phase, a share of two paths, predicts no other recording, but the blocks between those that it was fitted to.
+    `found`: errors that are known already, by plant and kind of fold."""
+    found = {} if found is None else found
+
+    def errors(plant: Plant, blocks: bool) -> list[np.ndarray]:
+        key = (id(plant), blocks)
+        if key not in found:
+            found[key] = unseen_errors(case, plant, blocks=blocks)
+        return found[key]
+    gain = pooled_gain(case, errors(before, False), errors(after, False))
+    if gain[2] < 1.0 or len(case.tables) == 1:
+        return *gain, False
+    between = pooled_gain(case, errors(before, True), errors(after, True))
+    return (*between, True) if between[2] < 1.0 else (*gain, False)
 
 
 def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray],
@@ -97,10 +116,17 @@ def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.nda
 
 
 def held_out(case: Case, base: Explanation, final: Explanation) -> dict[str, Any]:
-    """Fit the plant's own parameters, and those of the explanation, without some of the data; errors on that data."""
-    out = {"before": unseen_errors(case, case.plant, refit=False), "refit_only": unseen_errors(case, base.plant)}
-    out["after"] = unseen_errors(case, final.plant) if final.effects else out["refit_only"]
+    """Fit the plant's own parameters, and those of the explanation, without some of the data; errors on that data: each recording in
+    turn, or blocks of all where only those show what the explanation is worth (`data` says which)."""
+    known: dict[tuple[int, bool], list[np.ndarray]] = {}
+    blocks = len(case.tables) == 1 or bool(final.effects) and prediction(case, base.plant, final.plant, known)[3]
+
+    def errors(plant: Plant) -> list[np.ndarray]:
+        return known.get((id(plant), blocks)) or unseen_errors(case, plant, blocks=blocks)
+    out = {"before": unseen_errors(case, case.plant, False, blocks), "refit_only": errors(base.plant)}
+    out["after"] = errors(final.plant) if final.effects else out["refit_only"]
     figures: dict[str, Any] = {f"held_out_{k}": rms(case.model, v) for k, v in out.items()}
+    figures["data"] = "blocks" if blocks else "recordings"
     figures["gain"] = _gain(case, out["refit_only"], out["after"]) if final.effects else {}
     return figures
 

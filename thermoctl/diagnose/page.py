@@ -131,8 +131,8 @@ def _worth(case: Case, found: Diagnosis) -> str:
         rows.append((_named(o, out.unit), n.sigma, *(fit.get(k, {}).get(o) for k in
                      ("before", "refit_only", "after", "held_out_before", "held_out_refit_only", "held_out_after")),
                      f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else None))
-    how = ("each recording in turn, fitted without it" if len(case.tables) > 1
-           else "the last two fifths of the recording, fitted without them")
+    how = ("each recording in turn, fitted without it" if found.held["data"] == "recordings"
+           else "every other one of 16 blocks of each recording, fitted without them, and then the others")
     return table(("rms error of", "sensor allows", "as it came", "refitted", "with finding", "held out: as it came", "refitted",
                   "with finding", "ratio (95 %)"), rows,
                  f"Held out: {how}. Ratio: with the finding over refitted, paired block bootstrap; below 1 is better.")

@@ -21,7 +21,7 @@ from thermoctl.diagnose import doubt, experiment, locate
 from thermoctl.diagnose.effects import CATALOGUE, Rig, catalogue
 from thermoctl.diagnose.evidence import LARGE, Colour, possible, white_sigma
 from thermoctl.diagnose.explain import Case, Explanation
-from thermoctl.diagnose.heldout import held_out, pooled_gain, rms, unseen_errors
+from thermoctl.diagnose.heldout import held_out, prediction, rms
 from thermoctl.diagnose.outcome import Diagnosis, result
 from thermoctl.diagnose.screen import Metric, log_p
 from thermoctl.diagnose.search import (
@@ -116,9 +116,8 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     # those that predict better than the plant, too.
     better = [e for e in rivals if e.counts and e.score < current.score and len(e.effects) == len(current.effects)]
     if better and current is reference:
-        before = unseen_errors(case, base.plant)
-        leader = next((e for e in sorted(better, key=lambda e: e.score)
-                       if pooled_gain(case, before, unseen_errors(case, e.plant))[0] < 1.0), None)
+        known: dict = {}
+        leader = next((e for e in sorted(better, key=lambda e: e.score) if prediction(case, base.plant, e.plant, known)[0] < 1.0), None)
         if leader:
             rivals = [current, *(e for e in rivals if e is not leader)]
             current = reference = leader
@@ -159,6 +158,9 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         verdict, current, rivals = "unexplained", base, []
         held = held_out(case, base, base)
         notes.insert(0, refused)
+    if current.effects and held["data"] == "blocks" and len(case.tables) > 1:
+        notes.append("one recording alone does not determine this well enough to predict another; the held-out figures are of blocks "
+                     "of all recordings, fitted without them")
     notes += [c.effect.caution for c in current.effects if c.effect.caution]
     missing = None
     if verdict != "consistent":

@@ -26,6 +26,7 @@ from thermoctl.plant.simulate import Drive, Simulation
 ROWS = 8_000               # rows of the screening, all recordings together
 EPSILON = 1e-4              # amplitude at which a direction is taken
 CHUNK = 96
+NEAR = 4.0                  # a lag or delay this many times shorter or longer than the one looked at changes the outputs in proportion
 
 
 @dataclass
@@ -370,7 +371,12 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metri
     gain = float(g @ coefficient)
     if len(g) == 1:
         p = amplitudes[0] if amplitudes else None
-        allowed = coefficient[0] > 0 if p is None else _allowed(p, coefficient[0])
+        if p is not None:
+            allowed = _allowed(p, coefficient[0])
+        elif "tau" in shape and entries[0][0].item[1] != (0,):      # in proportion only from one lag of the grid to the next
+            allowed = 1 / NEAR < coefficient[0] < NEAR
+        else:
+            allowed = coefficient[0] > 0
         if not allowed:
             gain = 0.0
     if "phases" in c.effect.shapes.values():

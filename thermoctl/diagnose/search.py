@@ -16,7 +16,7 @@ from thermoctl.diagnose import locate, observer
 from thermoctl.diagnose.effects import Candidate, Rig, candidates
 from thermoctl.diagnose.evidence import LARGE, Colour, least_gain
 from thermoctl.diagnose.explain import Case, Explanation
-from thermoctl.diagnose.heldout import pooled_gain, unseen_errors
+from thermoctl.diagnose.heldout import prediction
 from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Noise
@@ -32,6 +32,7 @@ MOST_IN_PAIRS = 250         # directions that are looked at two by two
 CHI2_MEDIAN = 0.455         # of one degree of freedom
 LOOK = 0.01                 # chance of noise looking as good as the best direction, below which the best are refitted
 ALARM = 0.005               # chance of noise counting as an effect (twice that in the tail of 1000 draws); unseen data then have their say
+ASTRAY = 0.3                # a refit that gains less than this share of what was screened is begun again, more carefully
 MARGINAL = 200.0            # a gain in score below this is looked at twice
 DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
 
@@ -155,26 +156,38 @@ def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direc
 
 def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explanation]:
     """Refit each direction in full; best score first."""
-    def tried(direction: Direction) -> Explanation | None:
+    def tried(direction: Direction, stepwise: bool = False) -> Explanation | None:
         try:
             plant, own = extend(seen.base.plant, direction, seen.metric.drives)
-            e = case.explain(plant, [*seen.base.effects, direction.candidate], [*seen.base.own, own])
+            effects, owns = [*seen.base.effects, direction.candidate], [*seen.base.own, own]
+            if stepwise:                    # the plant's own parameters first, round the effect as it was screened
+                ranges = {n: plant.parameters[n].range for n in own.values()}
+                plant = _ranged(case.explain(_ranged(plant, dict.fromkeys(ranges)), effects, owns).plant, ranges)
+            e = case.explain(plant, effects, owns)
         except (SimulationError, InputError, np.linalg.LinAlgError):
             return None
         e.direction = direction
         return e
 
     def one(direction: Direction) -> Explanation | None:
-        e = tried(direction)
-        if e is None or e.raw > seen.base.raw:      # led astray by a start too far out: once more from nearer to nothing
-            again = tried(weaker(direction))
-            e = again if e is None or (again is not None and again.score < e.score) else e
-        return e
+        found = [tried(direction)]
+        for nearer in (False, True):        # led astray by its first steps: once more step by step, once from nearer to nothing
+            best = min((e for e in found if e is not None), key=lambda e: e.score, default=None)
+            gained = 0.0 if best is None else max(seen.base.raw - best.raw, seen.base.fit.cost - best.fit.cost)
+            if best is None or best.raw > seen.base.raw or gained < ASTRAY * direction.gain:
+                found.append(tried(weaker(direction)) if nearer else tried(direction, stepwise=True))
+        return min((e for e in found if e is not None), key=lambda e: e.score, default=None)
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
         done = [e for e in pool.map(one, chosen) if e is not None]
     case.reprice([seen.base, *done])
     done.sort(key=lambda e: e.score)
     return done
+
+
+def _ranged(plant: Plant, ranges: Mapping[str, tuple[float, float] | None]) -> Plant:
+    """The plant with other ranges of some parameters; None holds one where it is."""
+    return dataclasses.replace(plant, parameters={n: dataclasses.replace(p, range=ranges[n]) if n in ranges else p
+                                                  for n, p in plant.parameters.items()})
 
 
 def pairs(seen: Round, count: int = 4) -> list[tuple[Direction, Direction]]:
@@ -271,11 +284,11 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
         case.progress(f"refitting {len(chosen)} explanations")
         seen.finalists = compete(case, seen, chosen)
         # The best score that surely predicts is gone on with; those that fit better stay its rivals.
-        before = unseen_errors(case, current.plant)
+        known: dict = {}
         best = None
         for e in seen.finalists[:4]:
             e.counts = counts(case, seen, e, entries)
-            if e.counts and pooled_gain(case, before, unseen_errors(case, e.plant))[2] < 1.0:
+            if e.counts and prediction(case, current.plant, e.plant, known)[2] < 1.0:
                 best = e
                 break
         if best is None and not current.effects and seen.p_any() < LOOK and time.process_time() - case.begun < PATIENCE_S:
@@ -415,8 +428,7 @@ def prune(case: Case, base: Explanation, current: Explanation, notes: list[str])
             without = leave_out(case, base, current, k)
             if without is None:
                 continue
-            before, after = (unseen_errors(case, e.plant) for e in (without, current))
-            high = pooled_gain(case, before, after)[2]
+            high = prediction(case, without.plant, current.plant)[2]
             if not high < 1.0 and (weakest is None or high > weakest[0]):
                 weakest = (high, without, c)
         if weakest is None:
