@@ -9,6 +9,8 @@ from scipy.signal import cont2discrete, dlsim
 
 from thermoctl.cli import main
 from thermoctl.diagnose.effects import catalogue
+from thermoctl.diagnose.explain import Case
+from thermoctl.diagnose.heldout import prediction
 from thermoctl.plant import load
 from thermoctl.recording.table import read_table
 from thermoctl.yamlfile import InputError
@@ -142,6 +144,75 @@ outputs:
     assert r["verdict"] == "explained" and [(f["effect"], f["where"]) for f in r["findings"]] == [("cyclic_error", "encoder")]
     found = {k.split("_")[0]: v["value"] for k, v in r["findings"][0]["parameters"].items()}
     assert found["P"] == pytest.approx(period, rel=1e-3) and abs(found["A"]) == pytest.approx(3e-6, rel=0.1)
+
+
+TANK = """
+format: thermoctl-plant/1
+title: A pumped tank
+inputs:
+  pump: {unit: V}
+  level_start: {unit: V}
+parameters:
+  k_pump: {value: 0.05, unit: 1/s, range: [0.02, 0.12]}
+  k_out: {value: 0.06, unit: V**0.5/s, range: [0.02, 0.2]}
+nodes:
+  tank: {unit: V, storage: 1, initial: level_start, initial_sigma: 0.05}
+flows:
+  pumped: {into: tank, rate: k_pump * pump, unit: V/s}
+  outflow: {from: tank, rate: "k_out * sqrt(max(tank, 0))", unit: V/s}
+outputs:
+  level: {value: tank, unit: V, noise: 0.02}
+"""
+
+
+def test_a_pump_that_is_clipped_is_the_actuators_entry(tmp_path):
+    """What was asked of the pump is recorded, and was never saturated; what it gave ends at 3.1 V."""
+    (tmp_path / "plant.yaml").write_text(TANK)
+    paths = [tmp_path / "plant.yaml"]
+    t = np.arange(0.0, 1200.0, 2.0)
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        pump = rng.uniform(0.8, 4.0, 30)[(t // 40).astype(int)]
+        x = np.empty(len(t))
+        x[0] = 2.0
+        for k in range(len(t) - 1):
+            given = min(pump[k], 3.1)
+            x[k + 1] = solve_ivp(lambda s, q, given=given: 0.047 * given - 0.066 * np.sqrt(max(q[0], 0.0)), (t[k], t[k + 1]), [x[k]],
+                                 rtol=1e-7, atol=1e-9).y[0, -1]
+        path = tmp_path / f"run_{seed}.csv"
+        np.savetxt(path, np.column_stack([t, pump, np.full(len(t), 2.0), x + rng.normal(0, 0.02, len(t))]), delimiter=",", comments="",
+                   fmt="%.7g", header="t,pump,level_start,level")
+        paths.append(path)
+    r = diagnosed(paths, tmp_path / "out")
+    (f,) = r["findings"]
+    assert (r["verdict"], f["effect"], f["where"]) == ("explained", "actuator_saturation", "pumped")
+    (u,) = f["parameters"].values()
+    assert u["value"] == pytest.approx(3.1, abs=0.03)
+
+
+def test_what_one_recording_does_not_determine_is_proved_on_blocks_of_all(tmp_path):
+    """Two heaters that go together in one recording and against each other in the other: neither tells their shares, both do."""
+    text = HEATER.replace("  heat: {unit: W}", "  heat: {unit: W}\n  more: {unit: W}").replace(
+        "  G_12:", "  A: {value: 1, unit: '1', range: [0, 2]}\n  B: {unit: '1', BELIEF}\n  G_12:").replace(
+        "rate: heat,", "rate: A * heat + B * more,").replace("5, unit: J/K, range: [2, 14]", "5, unit: J/K")
+    for name, belief in (("before", "value: 0"), ("after", "value: -1, range: [-2, 2]")):
+        (tmp_path / f"{name}.yaml").write_text(text.replace("BELIEF", belief).replace("C_1: {value: 6, unit: J/K, range: [2, 14]}",
+                                                                                     "C_1: {value: 5.2, unit: J/K}"))
+    (tmp_path / "a").mkdir()
+    _, *runs = heater(tmp_path / "a", lambda t, x, air: (0.0, 0.0))
+    tables = []
+    for sign, path in zip((1.0, -1.0), runs, strict=True):
+        heat = np.loadtxt(path, delimiter=",", skiprows=1)
+        heat = np.column_stack([heat[:, :2], sign * heat[:, 1], heat[:, 2:]])
+        heat[:, 1] /= 1.0 + sign * 0.3                  # what heated the block is 1 * heat + 0.3 * more
+        heat[:, 2] = sign * heat[:, 1]
+        np.savetxt(path, heat, delimiter=",", comments="", fmt="%.7g", header="t,heat,more,air_temperature,temperature_1,temperature_2")
+        tables.append(read_table(str(path)))
+    before, after = (load(tmp_path / f"{name}.yaml") for name in ("before", "after"))
+    case = Case(before, tables)
+    ratio, _, high, blocks = prediction(case, before, after)
+    assert blocks and ratio < high < 0.9
+    assert not prediction(case, before, before)[3]      # nothing gained, nothing proved
 
 
 def test_physics_outside_the_catalogue_is_not_given_a_confident_name(tmp_path):
