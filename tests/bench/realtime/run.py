@@ -39,6 +39,7 @@ ROOT = Path(__file__).resolve().parents[3]
 HERE = Path(__file__).resolve().parent
 PERIOD_NS = 1_000_000
 PRIORITY, PEER_PRIORITY = 80, 85
+FAR_US = 200.0                # the bar of the paired difference's p99.9
 CONFIG = """
 rig: {{name: wire}}
 loop: {{period_s: 1 ms, cpu: {cpu}, priority: {priority}}}
@@ -106,12 +107,14 @@ def rows_of(path: Path, columns: int) -> np.ndarray:
     return np.fromfile(path, np.int64).reshape(-1, columns)
 
 
-def paired(rows: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """us by which each wake-up of `rows` (deadline, wake, ..) came after the reference's at the same deadline."""
+def paired(rows: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """us by which each wake-up of `rows` (deadline, wake, end) came after the reference's at the same deadline; how late the reference
+    was itself; and how long before the deadline the tick before had ended."""
     key = np.round((reference[:, 0] - rows[0, 0]) / PERIOD_NS).astype(np.int64)
     own = np.round((rows[:, 0] - rows[0, 0]) / PERIOD_NS).astype(np.int64)
     _, a, b = np.intersect1d(own, key, return_indices=True)
-    return (rows[a, 1] - reference[b, 1]) * 1e-3
+    return ((rows[a, 1] - reference[b, 1]) * 1e-3, (reference[b, 1] - reference[b, 0]) * 1e-3,
+            (rows[a, 0] - rows[np.maximum(a - 1, 0), 2]) * 1e-3)
 
 
 def run_cyclictest(bench: Bench, seconds: float) -> np.ndarray:
@@ -148,11 +151,15 @@ def run_twin(bench: Bench, seconds: float) -> dict[str, Any]:
 
 def figures(rows: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
     """Of rows deadline, wake, end: wake (lateness, us) and tick (wake-up to end of all work, us) until the reference came
-    beside it, paired from then on; ticks and slips of both."""
+    beside it, paired from then on; ticks and slips of both. far: ticks paired more than FAR_US apart; those of them in which the
+    reference was late, too; and in which the tick before had ended in time."""
     span = round((rows[-1, 0] - rows[0, 0]) / PERIOD_NS) + 1
     alone = rows[rows[:, 0] < reference[0, 0]] if len(reference) else rows
-    return {"wake": (alone[:, 1] - alone[:, 0]) * 1e-3, "tick": (alone[:, 2] - alone[:, 1]) * 1e-3,
-            "paired": paired(rows, reference) if len(reference) else np.array([]), "ticks": len(rows), "slips": span - len(rows)}
+    late, of_reference, free = paired(rows, reference) if len(reference) else (np.array([]),) * 3
+    far = late > FAR_US
+    return {"wake": (alone[:, 1] - alone[:, 0]) * 1e-3, "tick": (alone[:, 2] - alone[:, 1]) * 1e-3, "paired": late,
+            "far": np.array([far.sum(), (far & (of_reference > FAR_US / 2)).sum(), (far & (free > 0)).sum()]),
+            "ticks": len(rows), "slips": span - len(rows)}
 
 
 def run_plain(bench: Bench, seconds: float) -> dict[str, Any]:
@@ -450,6 +457,12 @@ def report(law: dict, conditions: dict[str, dict]) -> tuple[list[str], int]:
     for name, found in conditions.items():
         for who, key in (("daemon", "daemon"), ("a second C loop (the twin)", "twin")):
             lines.append(f"| {who}, {name} | " + " | ".join(f"{v:.1f}" for v in percentiles(pool(found, key, "paired"))) + " |")
+    lines += ["", f"| more than {FAR_US:g} us later than the reference | ticks | of | the reference was late, too | the tick before had ended |",
+              "|---|---|---|---|---|"]
+    for name, found in conditions.items():
+        for who, key in (("daemon", "daemon"), ("the twin", "twin")):
+            far, late, free = np.sum([r["far"] for r in found[key]], axis=0)
+            lines.append(f"| {who}, {name} | {far} | {sum(len(r['paired']) for r in found[key])} | {late} | {free} |")
     lines += ["", "| whole tick, wake-up to end of all work, us | p50 | p99 | p99.9 | max |", "|---|---|---|---|---|"]
     for name, found in conditions.items():
         for who, key in (("daemon", "daemon"), ("C twin", "twin"), ("pyserial + python-can", "plain")):
