@@ -1,4 +1,6 @@
 """Simulation and sensitivities against scipy's Radau at rtol 1e-10, interval by interval, on plants of every kind."""
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -6,6 +8,7 @@ from scipy.integrate import solve_ivp
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import loads
 from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
 
 HEAD = "format: thermoctl-plant/1\n"
 PLANTS = {
@@ -150,3 +153,13 @@ def test_static_plant_has_no_states():
     table = Table("s", "s.csv", np.arange(4.0), {"P": np.array([1.0, 2.0, np.nan, 3.0])})
     run = plant.compile().simulate(table, sensitivities=True)
     assert run.y[:, 0].tolist() == [2, 8, 8, 18] and run.dy[:, 0, 0].tolist() == [1, 4, 4, 9]
+
+
+def test_a_delay_within_a_delay_is_refused_also_where_an_effect_makes_it():
+    """A late sensor of a voltage that is already read late: a program that laid one over the other must get an error, not a crash."""
+    plant = loads(HEAD + 'inputs: {i: {unit: A}}\nparameters: {R: {value: 5}}\noutputs: {v: {value: "delay(R * i, 2)"}}')
+    inner = ex.parse("delay(i, 3)")
+    late = ex.substitute(plant.outputs["v"].value, lambda e: inner if e.op == "name" and e.value == "i" else None)
+    nested = dataclasses.replace(plant, outputs={"v": dataclasses.replace(plant.outputs["v"], value=late)})
+    with pytest.raises(InputError, match="within a delay"):
+        nested.compile()

@@ -89,6 +89,9 @@ class Code:
             if not ex.names(signal) <= set(self.plant.inputs):
                 raise InputError(f"{self.plant.file}: delay() in a rate may read inputs only, not '{signal}'")
         self.values = [ex.substitute(o.value, named(self.output_delays, "delayed_")) for o in self.plant.outputs.values()]
+        for signal, _ in self.output_delays.values():           # a file cannot say it (language.py), an effect laid over a plant could
+            if ex.names(signal) & self.output_delays.keys():
+                raise InputError(f"{self.plant.file}: a delay() within a delay() is not part of the language; add the seconds")
 
     def _widths(self) -> None:
         """The jumps that are smoothed: by argument, 'state' or 'time'."""
