@@ -122,7 +122,7 @@ class ProtectionSettings:
     idle_s: float = option("for how long either may be larger", 0.5, "s", 0.0, 60.0)
     saturation_s: float = option("longest time at the drive's limit", 0.5, "s", 0.0, 3600.0)
     amplifier_s: float = option("longest time until an enabled amplifier reports that it drives", 1.0, "s", 0.0, 60.0)
-    late_s: float = option("longest time between two ticks", 0.1, "s", 0.0, 60.0)
+    late_s: float = option("longest time between two ticks; above 1 s also what the supervisor lets the loop stand still", 0.1, "s", 0.0, 60.0)
     agree_time_s: float = option("time constant of the means in which readings are compared with each other", 0.5, "s", 1e-3, 60.0)
     drift_limit_c: float = option("largest difference of the coil's reading from the model without corrections", 8.0, "K", 0.0, 1e3)
     monitored_limit_c: float = option("largest mean difference of a watched temperature from its estimate", 8.0, "K", 0.0, 1e3)

@@ -31,7 +31,7 @@ def wait(condition, what, limit_s=LIMIT_S):
 
 def patient(text):
     """config/simulated.yaml's text for a machine that runs tests: it stalls for longer than a rig's may, and is forgiven."""
-    for strict, instead in ((r"stale_s: \{.*", "stale_s: {position_um: 5}"), (r"frozen_s: \{.*", "frozen_s: {coil_c: 900}\n  late_s: 30")):
+    for strict, instead in ((r"stale_s: \{.*", "stale_s: {position_um: 5}"), (r"frozen_s: \{.*", "frozen_s: {coil_c: 900}\n  late_s: 10")):
         text, replaced = re.subn(strict, instead, text)
         assert replaced == 1, strict
     return text

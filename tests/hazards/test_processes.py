@@ -101,6 +101,27 @@ def test_the_loop_stopped_for_a_while(daemon):
     say("SIGSTOP, SIGCONT after 0.3 s: loop", "first tick", "first tick after it", "amplifier off; re-armed without a jump", "`loop_late`")
 
 
+def test_the_whole_machine_stands_for_a_while(daemon):
+    """Every process stands, the loop's watcher too: that is no loop that hangs. The loop finds the gap itself and drives on
+    only when armed anew."""
+    daemon.armed()
+    everyone = [daemon.process.pid, *(p.pid for p in daemon.family)]
+    for pid in everyone:
+        os.kill(pid, signal.SIGSTOP)
+    begin = time.monotonic()
+    wait(lambda: time.monotonic() - begin > 3.0, "3 s")
+    os.kill(everyone[0], signal.SIGCONT)                    # the supervisor first: it looks, and sees no tick since
+    begin = time.monotonic()
+    wait(lambda: time.monotonic() - begin > 0.2, "0.2 s")
+    for pid in everyone[1:]:
+        os.kill(pid, signal.SIGCONT)
+    now, _ = wait(lambda: (s := daemon.ask("status"))["state"] == "FAULT" and s, "FAULT")
+    assert "loop_late" in [f["name"] for f in now["faults"]] and now["enable"] == 0.0
+    daemon.armed()
+    assert daemon.process.poll() is None and "stands still" not in daemon.log
+    say("SIGSTOP, SIGCONT after 3 s: every process", "first tick", "first tick after it", "amplifier off; re-armed without a jump", "`loop_late`")
+
+
 def test_the_recorder_stopped_for_a_while_loses_nothing(daemon):
     daemon.armed()
     pid = daemon.child("recorder")

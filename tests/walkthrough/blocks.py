@@ -59,5 +59,6 @@ def run(block, folder, path, seconds=None):
         assert seconds, f"{block.where}: not done within {LIMIT_S:g} s:\n{block.text}\n{said}"
         assert process.returncode in (0, 2, 130, -signal.SIGINT), f"{block.where}: ended with {process.returncode}:\n{said}"
         return said
-    assert process.returncode == 0, f"{block.where}: exit status {process.returncode}:\n{block.text}\n{said}"
+    logs = "".join(f"\n{p}:\n{p.read_text(errors='replace')[-3000:]}" for p in sorted(folder.glob("run/*.log"))) if process.returncode else ""
+    assert process.returncode == 0, f"{block.where}: exit status {process.returncode}:\n{block.text}\n{said}{logs}"
     return said

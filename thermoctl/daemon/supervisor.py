@@ -42,7 +42,8 @@ from thermoctl.yamlfile import InputError
 
 HANG_S = 15.0               # a helper that did no round for so long is killed and started again
 READY_S = 60.0              # the first tick comes within this: devices connect before it
-STALL_S = 1.0               # a loop that made no tick for so long is ended
+STALL_S = 1.0               # a loop that made no tick for so long (or for protection.late_s, where a rig forgives more) is ended
+LOOK_S, LOOK_LONGEST_S = 0.1, 0.2    # between two looks; a longer one tells of a machine that stood, not of the loop
 LOOP_STOP_S, STOP_S = 3.0, 10.0      # the loop, or a helper, that was asked to stop is killed after this
 RESTART_S = 0.5             # pause before a child is started again, doubled up to
 RESTART_LONGEST_S = 30.0
@@ -334,19 +335,21 @@ def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child]
         signal.signal(number, lambda n, _: asked.append(n))
     signal.signal(signal.SIGHUP, lambda *_: reload_asked.append(1))
     notify, watcher = _Notify(), _Watcher(shared, log)
-    code, ready, ticks, ticked = EXIT_OK, False, 0, time.monotonic()
-    started = kept_at = time.monotonic()
+    code, ready, ticks, stood_s = EXIT_OK, False, 0, 0.0
+    started = kept_at = looked = time.monotonic()
+    stall_s = max(STALL_S, settings.protection.late_s)
     model = compensator(settings)
     try:
         for child in (loop, *others):
             child.start()
         while not asked:
-            time.sleep(0.1)
+            time.sleep(LOOK_S)
             watcher.look()
             now = time.monotonic()
+            stood_s, looked = stood_s + min(now - looked, LOOK_LONGEST_S), now
             head = shared.ring.head
             if head != ticks:
-                ticks, ticked = head, now
+                ticks, stood_s = head, 0.0
                 if ready:
                     notify("WATCHDOG=1")
             if not ready and head > loops.STATE_EVERY // 5:
@@ -357,8 +360,8 @@ def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child]
                 log("the loop ended", exit=loop.process.exitcode)
                 code = loop.process.exitcode if loop.process.exitcode in (EXIT_INPUT, EXIT_HARDWARE) else EXIT_FAILED
                 break
-            if now - ticked > (STALL_S if head > 0 else READY_S):
-                log("the loop stands still: ended", seconds=round(now - ticked, 1), pid=int(shared.counters[LOOP_PID]))
+            if stood_s > (stall_s if head > 0 else READY_S):
+                log("the loop stands still: ended", seconds=round(stood_s, 1), pid=int(shared.counters[LOOP_PID]))
                 loop.process.kill()
                 loop.process.join()
                 code = EXIT_FAILED
