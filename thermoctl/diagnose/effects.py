@@ -28,6 +28,7 @@ _KEYS = ("effect", "title", "where", "needs", "change", "variants", "shapes", "p
          "caution", "excited_by", "mimics", "source")
 _SHAPES = ("onsets", "windows", "times", "lags", "delays", "periods", "phases", "end_levels", "high_levels", "drive_levels",
            "small_levels", "speeds", "creep_speeds", "distances")
+STRAIGHT = "_straight"      # what an input that holds is called where it goes on straight lines
 TEMPERATURE = {"degC", "K", "kelvin", "celsius", "degree_Celsius", "delta_degC", "°C"}
 
 
@@ -159,7 +160,7 @@ class Rig:
     def __init__(self, plant: Plant, drives: Sequence[Drive], columns: Sequence[Mapping[str, np.ndarray]]):
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
         # What an observer (observer.py) added is no physics that an effect could sit in.
-        p = dataclasses.replace(plant, inputs={k: v for k, v in plant.inputs.items() if not k.startswith("seen_")},
+        p = dataclasses.replace(plant, inputs={k: v for k, v in plant.inputs.items() if not k.startswith("seen_") and not k.endswith(STRAIGHT)},
                                 flows={k: v for k, v in plant.flows.items() if not k.startswith("correct_")})
         self.physics = p
         self.temperatures = [n.name for n in p.nodes.values() if _dimension(n.unit) == "temperature" and not _READINGS.match(n.name)]
@@ -408,6 +409,12 @@ class Candidate:
         origin = self.rig.drives[0].first.get(self.rig.air or "", 0.0) if p.origin == "first_air" else 0.0
         return origin + p.low, origin + p.high
 
+    @property
+    def jumps(self) -> bool:
+        """Does what a sensor reads hold inputs that go in steps?"""
+        y, inputs = self.place.symbols.get("y"), self.rig.plant.inputs
+        return y is not None and any(i in self.rig.moving_inputs and not inputs[i].linear for i in ex.names(y))
+
     def surprise(self, plant: Plant) -> float:
         """-2 log of how likely the values are that `plant` holds for the effect, summed over recordings where it has a
         value for each."""
@@ -453,13 +460,15 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
                         continue
                     if effect.name == "sensor_gain" and place.where == rig.air:
                         continue
+                    if effect.name == "sensor_lag" and variant and not candidate.jumps:
+                        continue        # on straight lines it is the same
                     if effect.name in ("sensor_delay", "sensor_saturation") and place.input in driving:
                         continue        # a drive that acts late or is clipped is the actuator's entry
                     out.append(candidate)
     return out
 
 
-_CHANGES = ("flow", "rate", "value", "storage", "node", "split", "drive", "spill", "exponent", "resistance")
+_CHANGES = ("flow", "rate", "value", "storage", "node", "split", "drive", "spill", "exponent", "resistance", "straight")
 
 
 class _Builder:
@@ -591,8 +600,10 @@ class _Builder:
         self.symbols[what["name"]] = name(label)
         special = {"start_of_T": "T", "start_of_y": "y", "start_of_x": "x"}
         text = str(what["initial"])
+        spread = what.get("initial_sigma")
         if text in special:
             source = self.symbols[special[text]]
+            spread = spread or self._spread_at_start(source)
 
             def start(e: Expr) -> Expr | None:
                 return self.base.nodes[e.value].initial if e.op == "name" and e.value in self.base.nodes else \
@@ -602,8 +613,30 @@ class _Builder:
             initial = name(self.rig.air or "")
         else:
             initial = self.expression(what["initial"])
-        self.nodes[label] = Node(label, self.expression(what["storage"]), initial, self._unit(what.get("unit")),
-                                 what.get("initial_sigma"))
+        self.nodes[label] = Node(label, self.expression(what["storage"]), initial, self._unit(what.get("unit")), spread)
+
+    def _spread_at_start(self, source: Expr) -> float | None:
+        """How uncertain the start of what begins where `source` does is: as uncertain as the nodes in it."""
+        known = {q: p.value for q, p in self.base.parameters.items()}
+        source = ex.substitute(source, lambda e: e.args[0] if e.op == "delay" else None)
+        total = 0.0
+        for n in ex.names(source) & set(self.base.nodes):
+            slope = ex.derivative(source, n)
+            if ex.names(slope) <= set(known):
+                total += (float(ex.evaluate(slope, known)) * (self.base.nodes[n].initial_sigma or 0.0)) ** 2
+        return float(np.sqrt(total)) or None
+
+    def _straight(self, symbol: str) -> None:
+        """Inputs that hold go on straight lines in this symbol: a sensor's lag is short against a sample, and would otherwise be a
+        sample late."""
+        def change(e: Expr) -> Expr | None:
+            i = self.base.inputs.get(e.value) if e.op == "name" else None       # type: ignore[arg-type]
+            if i is None or i.linear:
+                return None
+            twin = f"{i.name}{STRAIGHT}"
+            self.inputs[twin] = dataclasses.replace(i, name=twin, column=i.column or i.name, linear=True)
+            return name(twin)
+        self.symbols[symbol] = ex.substitute(self.symbols[symbol], change)
 
     def _split(self, what: Mapping[str, Any]) -> None:
         share = name(self.c.own(what["share"]))

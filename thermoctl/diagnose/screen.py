@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from thermoctl.diagnose.effects import Candidate, Rig, shape_grid
+from thermoctl.diagnose.effects import STRAIGHT, Candidate, Rig, shape_grid
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
@@ -114,9 +114,13 @@ class Trajectory:
         self.drive, self.run = d, run
         self.values: dict[str, np.ndarray | float] = {
             **{c: _hold(rig.columns[r][c]) for c in rig.spare}, **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
+            **{i + STRAIGHT: u for i, u in zip(rig.plant.inputs, d.u.T, strict=False)},
             **dict(zip(metric.model.parameters, map(float, metric.fit.values[r]), strict=True)),
             **dict(zip(metric.model.states, run.x.T, strict=True)), "t": d.t, "pi": np.pi}
         self.first = d.first
+        # inputs that hold, as they were until each sample
+        self.until = {i: np.concatenate([u[:1], u[:-1]]) for i, u, linear in
+                      zip(rig.plant.inputs, d.u.T, d.linear, strict=False) if not linear}
 
     def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
         """The value of an expression along the trajectory."""
@@ -170,7 +174,7 @@ def changes(base: Plant, extended: Plant, values: Mapping[str, float], at: Traje
 
 
 def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], at: Trajectory) -> np.ndarray:
-    """A new node alone, along the trajectory: dn/dt = a(t) - b(t) n, exact for held a and b."""
+    """A new node alone, along the trajectory: dn/dt = a(t) - b(t) n, exact for a and b that do not change between samples."""
     n = plant.nodes[node]
     net: ex.Expr = ex.ZERO
     for f in plant.flows.values():
@@ -187,7 +191,8 @@ def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], 
     if not a.any() and not b.any():
         return np.full(t.shape, start)
     h = np.diff(t)
-    mid_a, mid_b = 0.5 * (a[1:] + a[:-1]), np.maximum(0.5 * (b[1:] + b[:-1]), 0.0)
+    before = at.value(net, {**extra, **at.until, node: 0.0}) / storage if ex.names(net) & set(at.until) else a
+    mid_a, mid_b = 0.5 * (before[1:] + a[:-1]), np.maximum(0.5 * (b[1:] + b[:-1]), 0.0)
     decay = np.exp(-mid_b * h)
     gain = np.where(mid_b * h > 1e-9, -np.expm1(-mid_b * h) / np.maximum(mid_b, 1e-300), h) * mid_a
     out = np.empty(len(t))
@@ -373,7 +378,8 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metri
         p = amplitudes[0] if amplitudes else None
         if p is not None:
             allowed = _allowed(p, coefficient[0])
-        elif "tau" in shape and entries[0][0].item[1] != (0,):      # in proportion only from one lag of the grid to the next
+        elif "tau" in shape and (entries[0][0].item[1] != (0,) or (c.jumps and not c.variant)):
+            # in proportion only from one lag of the grid to the next
             allowed = 1 / NEAR < coefficient[0] < NEAR
         else:
             allowed = coefficient[0] > 0

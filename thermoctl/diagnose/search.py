@@ -379,9 +379,11 @@ def energy(case: Case, e: Explanation) -> float:
 
 def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[Explanation],
               entries: Mapping[str, Any]) -> tuple[Explanation, list[Explanation]]:
-    """With several effects: take each one out, look again at what would fill its place, and keep the best."""
+    """With several effects: take each one out, look again at what would fill its place, and keep the best. What else could
+    fill a place is a rival, so that each effect's probability is its own."""
     for _ in range(2):
         changed = False
+        others: list[Explanation] = []
         for k in range(len(current.effects)):
             without = leave_out(case, base, current, k)
             if without is None:
@@ -391,12 +393,12 @@ def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[
                 return (without, [])
             seen = look(case, without, entries, draws=0)
             found = compete(case, seen, finalists(seen.directions, 8))
+            key = current.effects[k].key
             if found and found[0].score < current.score - 2:
-                if found[0].last.key != current.effects[k].key:
-                    changed = True
-                current, rivals = found[0], found[1:]
-            elif found and k == len(current.effects) - 1:
-                rivals = [f for f in found if f.last.key != current.effects[k].key]
+                changed |= found[0].last.key != key
+                current = found[0]
+            others += [f for f in found if f is not current and f.last.key not in {c.key for c in current.effects}]
+        rivals = others or rivals
         if not changed:
             break
     return current, rivals
