@@ -2,8 +2,9 @@
 
 Each output channel's residual is white noise plus, where the data ask for it, a coloured part: first order, ARMA(1,1)
     e_k = phi e_(k-1) + w_k - theta w_(k-1),    phi = 0 .. 0.9995
-or flicker noise (1/f^a, as a sum of first-order parts a factor of eight apart), fitted anew under every explanation. A white
-likelihood on coloured residuals would call every long drift a discovery.
+or flicker noise (1/f^a, as a sum of first-order parts a factor of eight apart), or flicker noise beside a first-order part, fitted
+anew under every explanation. A white likelihood on coloured residuals would call every long drift a discovery; so would a
+first-order one where an amplifier's filter colours what is fast and its flicker what is slow.
 
     score = sum over channels of N log(s^2) + sum over channels and recordings of h(excess)     (smaller is better)
 
@@ -27,13 +28,16 @@ from scipy.signal import lfilter
 LARGE = 1.6         # coloured residual beyond this many sigmas of white noise is physics, not a sensor's colour
 WEIGHT = 0.1        # of the residual's energy beside its innovations, where it is larger than that
 
-AS_LIKELY = 12.0    # kinds of colour whose scores differ by less are both possible
+AS_LIKELY = 8.0     # colours whose scores differ by less are both possible (95 % region of three parameters)
 
 _PHI = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 0.9995)
 _SHARE = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99)       # theta / phi
 _FLICKER = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)               # variance of the fastest first-order part over the white one's
 _SLOPES = (0.5, 0.75, 1.0, 1.3)                             # 1/f^slope
 _TIMES = 2.0 * 8.0 ** np.arange(5)                          # their time constants in samples
+_BESIDE = (0.3, 0.5, 0.7, 0.85, 0.93)                       # phi of a first-order part beside flicker noise
+_LARGE = (0.1, 0.25, 0.5)                                   # its variance over the white one's
+_SMALL = (0.003, 0.01, 0.03)                                # the flicker's there, slope 1
 
 
 @dataclass(frozen=True)
@@ -48,16 +52,27 @@ class Colour:
 
 @cache
 def _filters() -> tuple[tuple[tuple[float, ...], tuple[float, ...], int], ...]:
-    """(ar, ma, parameters) of every colour that is tried."""
+    """(ar, ma, parameters) of white noise, first-order colours and flicker noise."""
     arma = [((1.0, -phi), (1.0, -phi * share), 2) for phi in _PHI for share in (_SHARE if phi else (0.0,))]
     return ((1.0,), (1.0,), 0), *arma[1:], *((*flicker(v, slope), 2) for v in _FLICKER for slope in _SLOPES)
 
 
-def flicker(variance: float, slope: float = 1.0) -> tuple[tuple[float, ...], tuple[float, ...]]:
+@cache
+def _mixed() -> tuple[tuple[tuple[float, ...], tuple[float, ...], int], ...]:
+    """(ar, ma, parameters) of flicker noise beside a first-order part."""
+    return tuple((*flicker(v, 1.0, phi, large), 3) for phi in _BESIDE for large in _LARGE for v in _SMALL)
+
+
+def flicker(variance: float, slope: float = 1.0, beside: float | None = None, large: float = 0.0
+            ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """(ar, ma) of white noise of variance 1 beside first-order parts, the fastest of `variance`: the spectrum
-    1 + sum q / |1 - phi e^(-iw)|^2 in factors. With y = cos(w) - 1 its zeros are real and lie between its poles."""
+    1 + sum q / |1 - phi e^(-iw)|^2 in factors. With y = cos(w) - 1 its zeros are real and lie between its poles. `beside`: phi
+    of one more first-order part, of variance `large`."""
     phi = np.exp(-1 / _TIMES[::-1])                     # the slowest part's pole comes first in y
     q = variance * (_TIMES[::-1] / _TIMES[0]) ** (slope - 1) * (1 - phi ** 2)
+    if beside is not None:
+        at = int(np.searchsorted(-phi, -beside))
+        phi, q = np.insert(phi, at, beside), np.insert(q, at, large * (1 - beside ** 2))
     edge = (1 - phi) ** 2 / (2 * phi)
 
     def spectrum(y: float) -> float:
@@ -75,31 +90,41 @@ def colour(parts: Sequence[np.ndarray], floor: float) -> Colour:
     return min(_kinds(parts, floor), key=lambda c: c.score)
 
 
-def _kinds(parts: Sequence[np.ndarray], floor: float) -> tuple[Colour, Colour]:
-    """The best white or first-order colour, and the best flicker noise (or none)."""
+def _tried(parts: Sequence[np.ndarray], floor: float) -> list[Colour]:
+    """Every colour, white first; none where there is no data."""
     parts = [p[np.isfinite(p)] for p in parts]
     parts = [p for p in parts if len(p) > 8]
     n = sum(map(len, parts))
-    best = [Colour(floor, (1.0,), (1.0,), np.inf if n else 0.0)] * 2
-    for ar, ma, parameters in _filters() if n else ():
+
+    def tried(ar: tuple[float, ...], ma: tuple[float, ...], parameters: int) -> Colour:
         variance = max(_variance(parts, ar, ma), floor ** 2)
-        found = Colour(float(np.sqrt(variance)), ar, ma, n * float(np.log(variance)) + parameters * float(np.log(n)))
-        for kind in (0, 1) if len(ar) == 1 else (0,) if len(ar) == 2 else (1,):
-            if found.score < best[kind].score - 1e-9:
-                best[kind] = found
-    return best[0], best[1]
+        return Colour(float(np.sqrt(variance)), ar, ma, n * float(np.log(variance)) + parameters * float(np.log(n)))
+    if not n:
+        return []
+    found = [tried(*f) for f in _filters()]
+    if found[0].score - min(c.score for c in found) > AS_LIKELY:        # not white, so a first-order part and flicker may both be there
+        found += [tried(*f) for f in _mixed()]
+    return found
+
+
+def _kinds(parts: Sequence[np.ndarray], floor: float) -> tuple[Colour, Colour]:
+    """The best white or first-order colour, and the best with flicker noise (or none)."""
+    found = _tried(parts, floor) or [Colour(floor, (1.0,), (1.0,), 0.0)]
+    plain = min((c for c in found if len(c.ar) <= 2), key=lambda c: c.score)
+    return plain, min((c for c in found if len(c.ar) > 2), key=lambda c: c.score, default=plain)
 
 
 def least_gain(before: Sequence[np.ndarray], after: Sequence[np.ndarray], sigmas: Sequence[float]) -> float:
-    """By how much the score falls from one explanation's residuals to another's when every channel has, of the kinds of colour
-    that are as likely before, the one that is paid least: a short record does not tell flicker noise from first-order noise,
-    and the slowest patterns are unlikely in one and nothing special in the other."""
+    """By how much the score falls from one explanation's residuals to another's when every channel has, of the colours that
+    are as likely before, the one that is paid least: a short record does not tell flicker noise from first-order noise, and
+    the slowest patterns are unlikely in one and nothing special in the other."""
     total = 0.0
     for j, sigma in enumerate(sigmas):
         old, new = ([r[:, j] for r in residuals] for residuals in (before, after))
-        kinds = list(zip(_kinds(old, 0.6 * sigma), _kinds(new, 0.6 * sigma), strict=True))
-        likely = min(a.score for a, _ in kinds) + AS_LIKELY
-        total += min(a.score - b.score for a, b in kinds if a.score <= likely)
+        was, now = _tried(old, 0.6 * sigma), {(c.ar, c.ma): c.score for c in _tried(new, 0.6 * sigma)}
+        likely = min((c.score for c in was), default=0.0) + AS_LIKELY
+        best = min(now.values(), default=0.0)
+        total += min((c.score - max(now.get((c.ar, c.ma), best), best) for c in was if c.score <= likely), default=0.0)
         total += sum(_price(a, sigma) - _price(b, sigma) for a, b in zip(old, new, strict=True))
     return total
 

@@ -7,9 +7,11 @@ propagate, a node's does. The best node's flow is then recovered on a finer grid
 Physics that nobody listed is still a function of the rig's state, which a sensor's noise is not. `patterns` therefore tries, at
 first order, an unknown function g (straight lines between knots) of one signal s at a time,
 
-    storage_n dn/dt += g(s)   at each node      and      rate_f *= 1 + g(s)   in each flow,
+    storage_n dn/dt += g(s)   at each node,      rate_f *= 1 + g(s)   in each flow      and      storage_n /= 1 + g(n)   of each node,
 
-with a g for each direction of motion where the node is a velocity.
+the first two with a g for each direction of motion where the node is a velocity, and dynamics that the plant lacks between a flow
+that follows inputs and its nodes: the flow through a bank of damped resonators (poles exp((-DAMPING +- i) w_k h), frequencies over
+the whole band) beside itself. Noise is independent of past inputs, whatever its colour (Ljung, System Identification, 16.6).
 """
 from __future__ import annotations
 
@@ -17,6 +19,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from thermoctl.diagnose.effects import Rig
 from thermoctl.diagnose.screen import Metric, Trajectory, _Column, directions, log_p
@@ -24,13 +27,15 @@ from thermoctl.plant import expression as ex
 
 COARSE, FINE = 10, 40       # knots a recording
 LEVELS = 8                  # knots over the values of a signal
+RESONATORS, DAMPING = 12, 0.1       # from two periods a recording to a quarter of the sampling rate
+PEAKS = 16                  # the same for a storage, where a change of phase is narrow
 
 
 @dataclass
 class Suspect:
-    """A node or an output with an unknown smooth input, or a node or flow with an unknown function of a signal: how much of
-    the residual it explains."""
-    kind: str               # 'node', 'output' or 'flow'
+    """A node or an output with an unknown smooth input, a node, flow or storage with an unknown function of a signal, or a flow
+    with unknown dynamics: how much of the residual it explains."""
+    kind: str               # 'node', 'output', 'flow', 'storage' or 'dynamics'
     name: str
     gain: float
     dims: int
@@ -43,7 +48,10 @@ class Suspect:
 
     def sentence(self) -> str:
         """In words."""
-        what = {"node": "an unknown flow into", "output": "an unknown error of", "flow": "an unknown factor of"}[self.kind]
+        if self.kind == "dynamics":
+            return f"dynamics between {self.name} and what it drives (a resonance, a slow part) would explain it best"
+        what = {"node": "an unknown flow into", "output": "an unknown error of", "flow": "an unknown factor of",
+                "storage": "an unknown factor of the storage of"}[self.kind]
         return f"{what} {self.name}, a function of {self.follows or 'time'}, would explain it best"
 
 
@@ -95,23 +103,41 @@ def patterns(metric: Metric, rig: Rig) -> list[Suspect]:
     plant, states = rig.plant, list(metric.model.states)
     signals = {n: [run.x[:, k] for run in metric.runs] for k, n in enumerate(states)}
     signals |= {i: [d.u[:, j] for d in metric.drives] for j, i in enumerate(plant.inputs) if i in rig.moving_inputs}
-    hats = {n: _levels(parts) for n, parts in signals.items()}
+    hats = {n: _levels(parts, LEVELS) for n, parts in signals.items()}
+    peaks = {n: _levels(signals[n], PEAKS) for n in states}
     places: list[tuple[str, str, list[tuple[str, float]]]] = [("node", n, [(n, 1.0)]) for n in states]
     for f in plant.flows.values():
         places.append(("flow", f.name, [(n, s) for n, s in ((f.source, -1.0), (f.target, 1.0)) if n is not None and n in plant.nodes]))
     columns: list[_Column] = []
+    for f in plant.flows.values():
+        if ex.names(f.rate) & rig.moving_inputs and not ex.names(f.rate) & set(states):
+            ends = [(n, s) for n, s in ((f.source, -1.0), (f.target, 1.0)) if n is not None and n in plant.nodes]
+            parts = []
+            for trajectory in at:
+                bank = _resonators(trajectory.value(f.rate, {}), trajectory.drive.t)
+                parts.append([{states.index(n): sign * b / trajectory.value(plant.nodes[n].storage, {}) for n, sign in ends} for b in bank])
+            columns += [_Column(("dynamics", f.name, None), list(forces), [{} for _ in at]) for forces in zip(*parts, strict=True)]
+    places += [("storage", n, [(n, 1.0)]) for n in states]
     for kind, name, ends in places:
         base = []
         for trajectory in at:
+            if kind == "storage":
+                k = states.index(name)
+                base.append({k: np.gradient(trajectory.run.x[:, k], trajectory.drive.t)})
+                continue
             rate = trajectory.value(plant.flows[name].rate, {}) if kind == "flow" else np.ones(len(trajectory.drive.t))
             base.append({states.index(n): sign * rate / trajectory.value(plant.nodes[n].storage, {}) for n, sign in ends})
         moving = next((signals[n] for n, _ in ends if n in rig.velocities), None)
         sides = [[np.ones(len(d.t)) for d in metric.drives]] if moving is None else [[v > 0 for v in moving], [v < 0 for v in moving]]
-        near = [n for n, _ in ends] + [i for i in rig.moving_inputs if kind == "node" or i in ex.names(plant.flows[name].rate)]
-        if moving is not None:
+        near = [n for n, _ in ends]
+        if kind == "storage":
+            sides = [[np.ones(len(d.t)) for d in metric.drives]]
+        else:
+            near += [i for i in rig.moving_inputs if kind == "node" or i in ex.names(plant.flows[name].rate)]
+        if moving is not None and kind != "storage":
             near += [n for n in states if n not in near]
         for s in near:
-            for hat, side in itertools.product(hats[s], sides):
+            for hat, side in itertools.product((peaks if kind == "storage" else hats)[s], sides):
                 column = _Column((kind, name, s), outputs=[{} for _ in at])
                 for forces, h, on in zip(base, hat, side, strict=True):
                     column.forces.append({k: v * h * on for k, v in forces.items()})
@@ -129,9 +155,20 @@ def patterns(metric: Metric, rig: Rig) -> list[Suspect]:
     return sorted(found, key=lambda suspect: suspect.log_p)
 
 
-def _levels(parts: list[np.ndarray]) -> list[list[np.ndarray]]:
+def _resonators(u: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
+    """What each of the bank makes of a signal, both quadratures."""
+    h = float(np.median(np.diff(t)))
+    out = []
+    for w in np.geomspace(4 * np.pi * h / float(t[-1] - t[0]), np.pi / 2, RESONATORS):
+        pole = np.exp((-DAMPING + 1j) * w)
+        z = lfilter([1 - abs(pole)], [1, -pole], u - u[0])
+        out += [z.real, z.imag]
+    return out
+
+
+def _levels(parts: list[np.ndarray], count: int) -> list[list[np.ndarray]]:
     """Hats over the values of a signal, per hat and recording; none where it takes too few values."""
-    edges = np.unique(np.quantile(np.concatenate(parts), np.linspace(0.01, 0.99, LEVELS)))
+    edges = np.unique(np.quantile(np.concatenate(parts), np.linspace(0.01, 0.99, count)))
     if len(edges) < 2:
         return []
     return [[np.interp(p, edges, row) for p in parts] for row in np.eye(len(edges))]
