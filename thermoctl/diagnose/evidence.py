@@ -117,14 +117,19 @@ def _kinds(parts: Sequence[np.ndarray], floor: float) -> tuple[Colour, Colour]:
 def least_gain(before: Sequence[np.ndarray], after: Sequence[np.ndarray], sigmas: Sequence[float]) -> float:
     """By how much the score falls from one explanation's residuals to another's when every channel has, of the colours that
     are as likely before, the one that is paid least: a short record does not tell flicker noise from first-order noise, and
-    the slowest patterns are unlikely in one and nothing special in the other."""
+    the slowest patterns are unlikely in one and nothing special in the other. A channel that is white afterwards had no
+    colour of its own."""
     total = 0.0
     for j, sigma in enumerate(sigmas):
         old, new = ([r[:, j] for r in residuals] for residuals in (before, after))
-        was, now = _tried(old, 0.6 * sigma), {(c.ar, c.ma): c.score for c in _tried(new, 0.6 * sigma)}
-        likely = min((c.score for c in was), default=0.0) + AS_LIKELY
-        best = min(now.values(), default=0.0)
-        total += min((c.score - max(now.get((c.ar, c.ma), best), best) for c in was if c.score <= likely), default=0.0)
+        was, now = _tried(old, 0.6 * sigma), _tried(new, 0.6 * sigma)
+        if was and now:
+            first, best = min(c.score for c in was), min(now, key=lambda c: c.score)
+            if len(best.ar) == 1:
+                total += first - best.score
+            else:
+                same = {(c.ar, c.ma): c.score for c in now}
+                total += min(c.score - same.get((c.ar, c.ma), best.score) for c in was if c.score <= first + AS_LIKELY)
         total += sum(_price(a, sigma) - _price(b, sigma) for a, b in zip(old, new, strict=True))
     return total
 

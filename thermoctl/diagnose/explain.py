@@ -5,6 +5,7 @@
 """
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +17,8 @@ from thermoctl.diagnose.evidence import Colour, channels
 from thermoctl.diagnose.screen import Direction
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit, Noise, Scale, default_noise, fit, updated
+from thermoctl.plant.refit import Fit, Noise, Problem, Scale, default_noise, fit, report, updated
+from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
@@ -66,6 +68,10 @@ class Case:
         self.noise = tuple(noise or default_noise(plant, self.drives))
         self.spread = SPREAD[1]     # how far the plant's parameters lie from what was believed, in shares of their ranges
 
+    def drives_of(self, e: Explanation) -> list[Drive]:
+        """The recordings as an explanation's plant reads them."""
+        return [e.fit.model.drive(t) for t in self.tables]
+
     def explain(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], iterations: int = 25,
                 tries: int = 0) -> Explanation:
         """Refit a plant to all recordings and score it."""
@@ -73,6 +79,21 @@ class Case:
         drives = [model.drive(t) for t in self.tables]
         found = fit(model, drives, self.noise, iterations=iterations, tries=tries, seconds=self.patience)
         return self.scored(updated(plant, found, drives), effects, own, found)
+
+    def polished(self, e: Explanation) -> Explanation:
+        """The same explanation fitted in the colour of its residual, whose standard errors that colour widens; as it is where
+        it is white, or where that fits visibly worse (what is missing is no colour)."""
+        if all(len(c.ar) == 1 for c in e.colours):
+            return e
+        model = e.plant.compile()
+        drives = [model.drive(t) for t in self.tables]
+        try:
+            found = fit(model, drives, noise_of(e.colours), iterations=15, seconds=self.patience)
+        except (SimulationError, np.linalg.LinAlgError):
+            return e
+        better = dataclasses.replace(e, plant=updated(e.plant, found, drives), fit=found)
+        before, after = self.excess(e), self.excess(better)
+        return better if all(after[o] < 1.01 * before[o] for o in before) else e
 
     def scored(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], found: Fit) -> Explanation:
         """The score of a fit: coloured -2 log likelihood and the price of its parameters."""
@@ -116,6 +137,48 @@ class Case:
             if len(parts):
                 out[o] = float(np.sqrt(np.mean(np.minimum(np.abs(parts), 8 * max(n.sigma, np.median(np.abs(parts)))) ** 2)) / n.sigma)
         return out
+
+
+def noise_of(colours: Sequence[Colour]) -> tuple[Noise, ...]:
+    """The noise of a fit that colours describe."""
+    return tuple(Noise(c.sigma, 0.0, c.ar, c.ma) for c in colours)
+
+
+def standard_errors(e: Explanation, drives: Sequence[Drive]) -> dict[str, float]:
+    """Of each parameter of the effects: the Gauss-Newton one, or half the width over which the likelihood falls by two (-2 log by
+    3.84) over 1.96 where that is wider: an onset, a threshold, the depth of a dead zone have no slope to go by."""
+    problem = Problem(e.fit.model, drives, e.fit.noise)
+    problem.set_outlier_limits(e.fit.residuals)
+    z = e.fit.z
+    least, _, _, _ = problem.evaluate(z, False)
+    fall = 3.84 * max(e.fit.cost / max(e.fit.samples - len(z), 1), 1.0)
+    known = {x.name: x.sd for x in report(e.fit)}
+    out = {}
+    for name in (n for own in e.own for n in own.values()):
+        k = next((k for k, (q, r) in enumerate(e.fit.unknowns) if q == name and r is None), None)
+        if name not in known or k is None:
+            out[name] = known.get(name, 0.0)
+            continue
+        slope = Scale(e.plant.parameters[name]).slope(float(e.fit.values[0, e.fit.model.parameters.index(name)]))
+
+        def falls(by: float, k: int = k) -> bool:
+            moved = z.copy()
+            moved[k] += by
+            try:
+                return problem.evaluate(moved, False)[0] - least > fall
+            except SimulationError:
+                return True
+        widest = max(1.96 * known[name] / slope, 1e-7)
+        for sign, room in ((1.0, 1.0 - z[k]), (-1.0, z[k])):
+            low, high = 0.0, widest
+            while high < room and not falls(sign * high):
+                low, high = high, 2 * high
+            for _ in range(4 if low else 0):
+                middle = 0.5 * (low + min(high, room))
+                low, high = (low, middle) if falls(sign * middle) else (middle, high)
+            widest = max(widest, low)
+        out[name] = widest * slope / 1.96
+    return out
 
 
 def implausible(away: np.ndarray, spread: float) -> float:

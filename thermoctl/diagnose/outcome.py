@@ -10,7 +10,7 @@ import numpy as np
 
 from thermoctl.diagnose import locate
 from thermoctl.diagnose.effects import Candidate
-from thermoctl.diagnose.explain import Case, Explanation
+from thermoctl.diagnose.explain import Case, Explanation, standard_errors
 from thermoctl.diagnose.search import Round
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
@@ -36,12 +36,12 @@ class Diagnosis:
 
 def result(case: Case, d: Diagnosis) -> dict[str, Any]:
     """The contract's JSON (thermoctl-diagnosis/1)."""
-    estimates = {e.name: e for e in report(d.final.fit)}
+    errors = standard_errors(d.final, case.drives_of(d.final)) if d.final.effects and d.verdict != "consistent" else {}
     excess = case.excess(d.base)
     findings = []
     if d.verdict != "consistent":
         for c, own in zip(d.final.effects, d.final.own, strict=True):
-            findings.append(_finding(d, c, own, estimates))
+            findings.append(_finding(d, c, own, errors))
     shown = []
     if d.final.effects:
         seen = {tuple(sorted(c.key for c in d.final.effects))}
@@ -79,7 +79,7 @@ def result(case: Case, d: Diagnosis) -> dict[str, Any]:
         "notes": d.notes})
 
 
-def _finding(d: Diagnosis, c: Candidate, own: Mapping[str, str], estimates: Mapping[str, Any]) -> dict[str, Any]:
+def _finding(d: Diagnosis, c: Candidate, own: Mapping[str, str], errors: Mapping[str, float]) -> dict[str, Any]:
     plant = d.final.plant
     values = {p: plant.parameters[n].value for p, n in own.items()}
     equation = _equation(d, c)
@@ -88,7 +88,7 @@ def _finding(d: Diagnosis, c: Candidate, own: Mapping[str, str], estimates: Mapp
         when = [[values["T0"], min(values["T1"], max(float(x.t[-1]) for x in d.rounds[0].metric.drives))]]
     elif "T0" in values:
         when = [[values["T0"], max(float(x.t[-1]) for x in d.rounds[0].metric.drives)]]
-    parameters = {n: {"value": plant.parameters[n].value, "sd": estimates[n].sd if n in estimates else 0.0,
+    parameters = {n: {"value": plant.parameters[n].value, "sd": errors.get(n, 0.0),
                       "unit": plant.parameters[n].unit} for n in own.values()}
     figures = ", ".join(f"{p} = {v:.4g}" + (f" {plant.parameters[own[p]].unit}" if plant.parameters[own[p]].unit not in (None, "1") else "")
                         for p, v in values.items())

@@ -168,7 +168,8 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         if nodes:
             at = rounds[0]
             missing = locate.missing_flow(at.metric, nodes[0].name, _signals(case, at))
-    return Diagnosis(verdict, base, current, rivals, rounds, suspects, missing, held, notes, None, start)
+    final = case.polished(current) if current.effects and verdict != "unexplained" else current
+    return Diagnosis(verdict, base, final, rivals, rounds, suspects, missing, held, notes, None, start)
 
 
 def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> str | None:

@@ -26,6 +26,7 @@ from thermoctl.plant.simulate import Drive, Simulation
 ROWS = 8_000               # rows of the screening, all recordings together
 EPSILON = 1e-4              # amplitude at which a direction is taken
 CHUNK = 96
+ONSETS = 24                 # of a grid over the recordings
 NEAR = 4.0                  # a lag or delay this many times shorter or longer than the one looked at changes the outputs in proportion
 
 
@@ -268,14 +269,46 @@ def screen(metric: Metric, rig: Rig, found: Sequence[Candidate], draws: np.ndarr
     return sorted(best.values(), key=lambda d: d.log_p), chance
 
 
-def _columns(c: Candidate, metric: Metric, at: Sequence[Trajectory]) -> list[_Column]:
-    """The columns that one candidate needs. item = (candidate, group, (shape, dim), columns in the group)."""
+def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
+    """The direction with its onset (or start and end) to the sample: a refit cannot move them, since what it sees at a jump
+    is the jump's own slope. Each look has a grid four times as fine round the best of the last."""
+    kinds = found.candidate.effect.shapes.values()
+    if "onsets" not in kinds and "windows" not in kinds:
+        return found
+    duration = max(float(d.t[-1]) for d in metric.drives)
+    step, sample = duration / ONSETS, min(float(np.median(np.diff(d.t))) for d in metric.drives)
+    at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
+    while step > 0.5 * sample:
+        near = np.concatenate([found.shape[k] + step * np.arange(-4, 5) / 4 for k in ("onset", "start", "end")
+                               if found.shape.get(k, np.inf) <= duration])
+        edges = np.unique(near[(near >= 0) & (near < duration)])
+        best: dict[int, Direction] = {}
+        pending: dict[tuple, list[tuple[_Column, np.ndarray, float]]] = {}
+        for part, rows in directions(metric, _columns(found.candidate, metric, at, edges)):
+            full, rows = np.linalg.norm(rows, axis=0), metric.project(rows)
+            for k, column in enumerate(part):
+                entries = pending.setdefault(column.item[1], [])
+                entries.append((column, rows[:, k], float(full[k])))
+                if len(entries) == column.item[3]:
+                    _score(found.candidate, entries, metric, best, None, None)
+        for d in best.values():
+            if d.gain > found.gain:
+                found = d
+        step /= 4
+    return found
+
+
+def _columns(c: Candidate, metric: Metric, at: Sequence[Trajectory], edges: np.ndarray | None = None) -> list[_Column]:
+    """The columns that one candidate needs. item = (candidate, group, (shape, dim), columns in the group). `edges`: onsets to
+    look at instead of the whole grid."""
     effect = c.effect
-    grids = {key: shape_grid(kind, c, metric.runs) for key, kind in effect.shapes.items() if kind not in ("phases", "windows")}
+    grids = {key: shape_grid(kind, c, metric.runs) if edges is None or kind != "onsets" else [{"onset": float(v)} for v in edges]
+             for key, kind in effect.shapes.items() if kind not in ("phases", "windows")}
     windowed = "windows" in effect.shapes.values()
     if windowed:
         duration = max(float(d.t[-1]) for d in metric.drives)
-        grids["window"] = [{"start": float(v), "end": 10 * duration} for v in np.linspace(0, duration, 25)[:-1]]
+        grids["window"] = [{"start": float(v), "end": 10 * duration}
+                           for v in (np.linspace(0, duration, ONSETS + 1)[:-1] if edges is None else edges)]
     phases = [{"phase": 0.0}, {"phase": float(np.pi / 2)}] if "phases" in effect.shapes.values() else [{}]
     shapes = [{k: v for part in combination for k, v in part.items()} for combination in itertools.product(*grids.values())] or [{}]
     amplitudes = [p for p in effect.parameters if p.amplitude]

@@ -15,11 +15,10 @@ import numpy as np
 from thermoctl.diagnose import locate, observer
 from thermoctl.diagnose.effects import Candidate, Rig, candidates
 from thermoctl.diagnose.evidence import LARGE, Colour, least_gain
-from thermoctl.diagnose.explain import Case, Explanation
+from thermoctl.diagnose.explain import Case, Explanation, noise_of
 from thermoctl.diagnose.heldout import prediction
-from thermoctl.diagnose.screen import Direction, Metric, log_p, screen
+from thermoctl.diagnose.screen import Direction, Metric, log_p, screen, sharpened
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Noise
 from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.yamlfile import InputError
 
@@ -127,7 +126,7 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
     drives = [model.drive(t) for t in case.tables]
     for d in drives:
         model.prepare(d, base.fit.values[drives.index(d)])
-    metric = Metric(dataclasses.replace(base.fit, noise=_noise(base.colours)) if coloured else base.fit, drives)
+    metric = Metric(dataclasses.replace(base.fit, noise=noise_of(base.colours)) if coloured else base.fit, drives)
     rig = Rig(base.plant, drives, [t.columns for t in case.tables])
     found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
     noise = np.random.default_rng(1).standard_normal((len(metric.residual), draws)) if draws else None
@@ -170,6 +169,7 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
         return e
 
     def one(direction: Direction) -> Explanation | None:
+        direction = sharpened(seen.metric, seen.rig, direction)
         found = [tried(direction)]
         for nearer in (False, True):        # led astray by its first steps: once more step by step, once from nearer to nothing
             best = min((e for e in found if e is not None), key=lambda e: e.score, default=None)
@@ -354,10 +354,6 @@ def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanatio
     return out[:count]
 
 
-def _noise(colours: Sequence[Colour]) -> tuple[Noise, ...]:
-    return tuple(Noise(c.sigma, 0.0, c.ar, c.ma) for c in colours)
-
-
 def smooth(case: Case, e: Explanation, coloured: bool = False) -> float:
     """log10 p of the best smooth unknown input at one node or on one sensor; 0 where there is none."""
     found = locate.suspects(metric_of(case, e, e.colours if coloured else None))
@@ -369,7 +365,7 @@ def metric_of(case: Case, e: Explanation, colours: Sequence[Colour] | None) -> M
     drives = [e.fit.model.drive(t) for t in case.tables]
     for r, d in enumerate(drives):
         e.fit.model.prepare(d, e.fit.values[r])
-    return Metric(dataclasses.replace(e.fit, noise=_noise(colours)) if colours else e.fit, drives)
+    return Metric(dataclasses.replace(e.fit, noise=noise_of(colours)) if colours else e.fit, drives)
 
 
 def energy(case: Case, e: Explanation) -> float:
