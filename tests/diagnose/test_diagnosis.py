@@ -5,10 +5,10 @@ import re
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.signal import cont2discrete, dlsim
+from scipy.signal import cont2discrete, dlsim, lsim
 
 from thermoctl.cli import main
-from thermoctl.diagnose.effects import catalogue
+from thermoctl.diagnose.effects import Rig, candidates, catalogue
 from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.heldout import prediction
 from thermoctl.plant import load
@@ -42,8 +42,9 @@ outputs:
 LEVELS = (0.0, 2.5, 0.8, 0.0, 1.6, 3.0, 0.0, 2.0)
 
 
-def heater(folder, extra=lambda t, x, air: (0.0, 0.0), seeds=(1, 2), sensor=lambda t, y: y):
-    """Two recordings of a two-block heater that has `extra` watts into its blocks; returns the plant's and their paths."""
+def heater(folder, extra=lambda t, x, air: (0.0, 0.0), seeds=(1, 2), sensor=lambda t, y: y, start=0.0, heavier=lambda x: 1.0):
+    """Two recordings of a two-block heater that has `extra` watts into its blocks, begins `start` above the air and whose first
+    block's capacity is multiplied by `heavier(temperature)`; returns the plant's and their paths."""
     (folder / "plant.yaml").write_text(HEATER)
     paths = [folder / "plant.yaml"]
     c, g, g12 = (5.2, 7.1), (0.062, 0.043), 0.026
@@ -53,13 +54,13 @@ def heater(folder, extra=lambda t, x, air: (0.0, 0.0), seeds=(1, 2), sensor=lamb
         heat = np.array(rng.permutation(LEVELS))[(t // 200).astype(int)]
         air = 21.5 + 0.4 * np.sin(t / 700 + seed)
         x = np.empty((len(t), 2))
-        x[0] = air[0]
+        x[0] = air[0] + start
         for k in range(len(t) - 1):
             def slope(s, q, k=k, heat=heat, air=air):
                 a = np.interp(s, t, air)
                 e = extra(s, q, a)
                 flow = g12 * (q[0] - q[1])
-                return [(heat[k] - flow - g[0] * (q[0] - a) + e[0]) / c[0], (flow - g[1] * (q[1] - a) + e[1]) / c[1]]
+                return [(heat[k] - flow - g[0] * (q[0] - a) + e[0]) / c[0] / heavier(q[0]), (flow - g[1] * (q[1] - a) + e[1]) / c[1]]
             x[k + 1] = solve_ivp(slope, (t[k], t[k + 1]), x[k], rtol=1e-6, atol=1e-8).y[:, -1]
         y = sensor(t, x) + rng.normal(0, 0.1, x.shape)
         path = folder / f"run_{seed}.csv"
@@ -106,6 +107,53 @@ def test_heat_from_outside_is_found_with_its_interval(tmp_path):
     assert finding["when"][0] == pytest.approx([500, 900], abs=15)
     value = next(p for n, p in finding["parameters"].items() if n.startswith("Q"))
     assert abs(value["value"] - 0.3) < max(4 * value["sd"], 0.01)
+
+
+def test_an_offset_begins_at_its_sample_and_says_how_surely(tmp_path):
+    def sensor(t, y):
+        return y + np.column_stack([0 * t, 0.3 * (t >= 777.0)])
+    r = diagnosed(heater(tmp_path, sensor=sensor), tmp_path / "out")
+    (finding,) = r["findings"]
+    assert (finding["effect"], finding["where"], r["verdict"]) == ("sensor_offset_step", "temperature_2", "explained")
+    found = {n.split("_")[0]: p for n, p in finding["parameters"].items()}
+    assert found["T0"]["value"] == pytest.approx(777.0, abs=6.0)                # three samples: steps of 3 sigma in noise
+    assert 0.3 < found["T0"]["sd"] < 6.0 and abs(found["T0"]["value"] - 777.0) < 3 * found["T0"]["sd"]
+    assert abs(found["A"]["value"] - 0.3) < 3 * found["A"]["sd"]
+
+
+def test_a_lag_begins_where_what_it_follows_begins(tmp_path):
+    """The blocks begin 0.7 K off the air: what is read of them late begins there, too, and is no delay instead."""
+    def sensor(t, y):
+        late, keep = y.copy(), np.exp(-2.0 / 6.0)
+        for k in range(1, len(t)):          # exact for straight lines between samples
+            slope = (y[k, 0] - y[k - 1, 0]) / 2.0
+            late[k, 0] = y[k, 0] - slope * 6.0 + (late[k - 1, 0] - y[k - 1, 0] + slope * 6.0) * keep
+        return late
+    r = diagnosed(heater(tmp_path, sensor=sensor, start=0.7), tmp_path / "out")
+    assert (r["findings"][0]["effect"], r["findings"][0]["where"]) == ("sensor_lag", "temperature_1")
+    (tau,) = r["findings"][0]["parameters"].values()
+    assert abs(tau["value"] - 6.0) < 3 * tau["sd"] < 2.0
+
+
+def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
+    """A voltage over a resistance, read 0.2 s late, sampled every 2 s: held, the reading would be a whole sample late."""
+    _, run, _ = heater(tmp_path)
+    (tmp_path / "plant.yaml").write_text(HEATER.replace("outputs:", "outputs:\n  voltage: {value: 3 * heat, unit: V, noise: 0.02}"))
+    rows = np.loadtxt(run, delimiter=",", skiprows=1)
+    np.savetxt(run, np.column_stack([rows, 3 * rows[:, 1]]), delimiter=",", comments="",
+               header="t,heat,air_temperature,temperature_1,temperature_2,voltage")
+    plant, table = load(tmp_path / "plant.yaml"), read_table(run)
+    drive = plant.compile().drive(table)
+    lags = [c for c in candidates(Rig(plant, [drive], [table.columns]), {"sensor_lag": catalogue()["sensor_lag"]}) if c.place.where == "voltage"]
+    held, straight = (c.extend({"TAU": 0.2}).compile().simulate(table).y[:, 0] for c in lags)
+    u, t = 3 * rows[:, 1], rows[:, 0]
+    line = lsim(([1.0], [0.2, 1.0]), u, t, interp=True)[1] + u[0] * np.exp(-t / 0.2)
+    stair = lsim(([1.0], [0.2, 1.0]), u, t, interp=False)[1] + u[0] * np.exp(-t / 0.2)
+    assert np.allclose(straight, line, atol=1e-4 * np.ptp(u)) and np.allclose(held, stair, atol=1e-4 * np.ptp(u))
+    assert np.abs(straight - held).max() > 0.5 * np.abs(np.diff(u)).max()
+    # Where what is read is a node, there is one form.
+    assert len([c for c in candidates(Rig(plant, [drive], [table.columns]), {"sensor_lag": catalogue()["sensor_lag"]})
+                if c.place.where == "temperature_1"]) == 1
 
 
 def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path):
@@ -220,6 +268,48 @@ def test_physics_outside_the_catalogue_is_not_given_a_confident_name(tmp_path):
     r = diagnosed(heater(tmp_path, boiling), tmp_path / "out")
     assert r["verdict"] == "unexplained" or max((f["probability"] for f in r["findings"]), default=0) < 0.9
     assert r["mismatch"] and {"channel", "rms", "expected_rms", "node"} <= set(r["mismatch"][0])
+
+
+def test_a_change_of_phase_is_unknown_and_sits_in_the_storage(tmp_path):
+    """The first block melts round 40 degC, in 0.8 K: no entry says that."""
+    r = diagnosed(heater(tmp_path, heavier=lambda x: 1 + 1.0 * np.exp(-0.5 * ((x - 40.0) / 0.8) ** 2)), tmp_path / "out")
+    assert r["verdict"] == "unexplained"
+    assert any("the storage of one" in n for n in r["notes"]), r["notes"]
+
+
+def test_a_resonance_is_unknown_and_sits_between_drive_and_carriage(tmp_path):
+    """A second mass on a spring on a carriage that runs against a damper: no entry says that."""
+    (tmp_path / "plant.yaml").write_text("""
+format: thermoctl-plant/1
+title: Carriage
+inputs:
+  force: {unit: N}
+parameters:
+  mass: {value: 12, unit: kg, range: [5, 25]}
+  damping: {value: 30, unit: N*s/m, range: [8, 90]}
+nodes:
+  velocity: {unit: m/s, storage: mass, initial: 0}
+  position: {unit: m, storage: 1, initial: 0}
+flows:
+  motor: {into: velocity, rate: force, unit: N}
+  damper: {from: velocity, rate: damping * velocity, unit: N}
+  travel: {into: position, rate: velocity, unit: m/s}
+outputs:
+  encoder: {value: position, unit: m, noise: 2e-5}
+""")
+    t, paths = np.arange(0.0, 20.0, 0.005), [tmp_path / "plant.yaml"]
+    m, m2, k, d, b = 10.0, 1.0, 900.0, 1.2, 35.0
+    A = np.array([[-(b + d) / m, -k / m, d / m, k / m], [1, 0, 0, 0], [d / m2, k / m2, -d / m2, -k / m2], [0, 0, 1, 0]])
+    A, B, C, D, _ = cont2discrete((A, np.array([[1 / m], [0], [0], [0]]), np.array([[0, 1, 0, 0]]), np.zeros((1, 1))), 0.005)
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        force = rng.choice([-6.0, 0.0, 6.0], 40)[(t // 0.5).astype(int)]
+        y = dlsim((A, B, C, D, 0.005), force)[1][:, 0] + rng.normal(0, 2e-5, len(t))
+        paths.append(tmp_path / f"run_{seed}.csv")
+        np.savetxt(paths[-1], np.column_stack([t, force, y]), delimiter=",", comments="", fmt="%.9g", header="t,force,encoder")
+    r = diagnosed(paths, tmp_path / "out")
+    assert r["verdict"] == "unexplained"
+    assert any("dynamics between motor" in n for n in r["notes"]), r["notes"]
 
 
 @pytest.mark.parametrize(("spoil", "words"), [

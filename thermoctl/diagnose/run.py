@@ -145,7 +145,8 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
             if energy(case, current) > 0.55 * energy(case, base):
                 current, rivals, worst = base, [], before_worst     # what was found explains too little to be named
                 held = held_out(case, base, current)
-            notes.append(f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains")
+            notes.append(f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains"
+                         + (f": {left.sentence()}" if (left := remains(case, current)) else ""))
     else:
         left = remains(case, current)
         verdict = "unexplained" if before_worst > LARGE or left_over or left else "consistent"

@@ -1,0 +1,54 @@
+"""The likelihood of coloured residuals against spectra and draws made here."""
+import numpy as np
+import pytest
+from scipy.fft import idct
+from scipy.signal import lfilter
+
+from thermoctl.diagnose.evidence import channels, flicker, least_gain
+
+
+@pytest.mark.parametrize(("beside", "large"), [(None, 0.0), (0.7, 0.25), (0.93, 0.5)])
+def test_a_flicker_filter_has_the_spectrum_of_its_parts(beside, large):
+    ar, ma = flicker(0.01, 1.0, beside, large)
+    z = np.exp(-1j * np.linspace(1e-3, np.pi, 200))
+    made = np.abs(np.polyval(ma[::-1], z) / np.polyval(ar[::-1], z)) ** 2
+    parts = 1 + sum(0.01 * (1 - p ** 2) / np.abs(1 - p * z) ** 2 for p in np.exp(-1 / (2.0 * 8.0 ** np.arange(5))))
+    if beside:
+        parts = parts + large * (1 - beside ** 2) / np.abs(1 - beside * z) ** 2
+    assert np.ptp(made / parts) < 1e-3 * np.mean(made / parts)
+    assert np.abs(np.roots(ma)).max() < 1 and np.abs(np.roots(ar)).max() < 1
+
+
+def mixed(n, rng):
+    """White noise, a first-order part and a 1/f part, standard deviation about 1."""
+    slow = np.zeros(n)
+    slow[1:] = 1 / np.arange(1, n)
+    return (0.88 * rng.standard_normal(n) + lfilter([0.45 * np.sqrt(1 - 0.5 ** 2)], [1, -0.5], rng.standard_normal(n))
+            + 0.15 * idct(rng.standard_normal(n) * np.sqrt(slow * n / slow.sum()), norm="ortho"))
+
+
+def test_a_slow_wave_is_not_paid_for_in_noise_that_has_a_fast_and_a_slow_part():
+    """A sine of a few periods is fitted to pure noise and taken out: what that pays, against what white noise would pay."""
+    n, paid, white = 8000, [], []
+    t = np.arange(n)
+    for seed in range(12):
+        noise = mixed(n, np.random.default_rng(seed))
+        best = None
+        for turns in np.arange(1.0, 8.0, 0.25):
+            X = np.column_stack([np.sin(2 * np.pi * turns * t / n), np.cos(2 * np.pi * turns * t / n)])
+            left = noise - X @ np.linalg.lstsq(X, noise, rcond=None)[0]
+            if best is None or left @ left < best @ best:
+                best = left
+        white.append(noise @ noise - best @ best)
+        paid.append(least_gain([noise[:, None]], [best[:, None]], [1.0]))
+    assert np.median(white) > 25 and max(paid) < 12
+
+
+def test_what_leaves_white_noise_behind_is_paid_in_full():
+    """A drift of three sigmas' size that no sensor would have: with it gone the residual is white."""
+    rng = np.random.default_rng(0)
+    noise, t = rng.standard_normal(4000), np.linspace(0, 1, 4000)
+    drift = 0.35 * np.tanh(8 * (t - 0.4))
+    before, after = (noise + drift)[:, None], noise[:, None]
+    found = channels([before], [1.0])[0].score - channels([after], [1.0])[0].score
+    assert least_gain([before], [after], [1.0]) == pytest.approx(found, rel=1e-6) and found > 30
