@@ -66,6 +66,7 @@ class Case:
         self.patience = 60.0        # CPU seconds for one refit; set from the time that the plant's own refit took
         self.begun = time.process_time()
         self.noise = tuple(noise or default_noise(plant, self.drives))
+        self.unseen: dict[tuple[int, bool], tuple[Plant, list[np.ndarray]]] = {}        # held-out errors that are known (heldout.py)
         self.spread = SPREAD[1]     # how far the plant's parameters lie from what was believed, in shares of their ranges
 
     def drives_of(self, e: Explanation) -> list[Drive]:

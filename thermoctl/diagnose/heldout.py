@@ -69,22 +69,21 @@ def _but_for_start(case: Case, model: Model, d: Drive) -> np.ndarray:
     return error - by_start @ shift
 
 
-def prediction(case: Case, before: Plant, after: Plant, found: dict[tuple[int, bool], list[np.ndarray]] | None = None
-               ) -> tuple[float, float, float, bool]:
-    """`pooled_gain` of one plant over another, and whether it is that of blocks: what a single recording does not determine, an
-    encoder's phase, a share of two paths, predicts no other recording, but the blocks between those that it was fitted to.
-    `found`: errors that are known already, by plant and kind of fold."""
-    found = {} if found is None else found
+def errors_of(case: Case, plant: Plant, blocks: bool) -> list[np.ndarray]:
+    """`unseen_errors` of a plant, kept by the case: search, proof and report ask for the same ones."""
+    key = (id(plant), blocks)
+    if key not in case.unseen:
+        case.unseen[key] = (plant, unseen_errors(case, plant, blocks=blocks))
+    return case.unseen[key][1]
 
-    def errors(plant: Plant, blocks: bool) -> list[np.ndarray]:
-        key = (id(plant), blocks)
-        if key not in found:
-            found[key] = unseen_errors(case, plant, blocks=blocks)
-        return found[key]
-    gain = pooled_gain(case, errors(before, False), errors(after, False))
+
+def prediction(case: Case, before: Plant, after: Plant) -> tuple[float, float, float, bool]:
+    """`pooled_gain` of one plant over another, and whether it is that of blocks: what a single recording does not determine, an
+    encoder's phase, a share of two paths, predicts no other recording, but the blocks between those that it was fitted to."""
+    gain = pooled_gain(case, errors_of(case, before, False), errors_of(case, after, False))
     if gain[2] < 1.0 or len(case.tables) == 1:
         return *gain, False
-    between = pooled_gain(case, errors(before, True), errors(after, True))
+    between = pooled_gain(case, errors_of(case, before, True), errors_of(case, after, True))
     return (*between, True) if between[2] < 1.0 else (*gain, False)
 
 
@@ -118,13 +117,9 @@ def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.nda
 def held_out(case: Case, base: Explanation, final: Explanation) -> dict[str, Any]:
     """Fit the plant's own parameters, and those of the explanation, without some of the data; errors on that data: each recording in
     turn, or blocks of all where only those show what the explanation is worth (`data` says which)."""
-    known: dict[tuple[int, bool], list[np.ndarray]] = {}
-    blocks = len(case.tables) == 1 or bool(final.effects) and prediction(case, base.plant, final.plant, known)[3]
-
-    def errors(plant: Plant) -> list[np.ndarray]:
-        return known.get((id(plant), blocks)) or unseen_errors(case, plant, blocks=blocks)
-    out = {"before": unseen_errors(case, case.plant, False, blocks), "refit_only": errors(base.plant)}
-    out["after"] = errors(final.plant) if final.effects else out["refit_only"]
+    blocks = len(case.tables) == 1 or bool(final.effects) and prediction(case, base.plant, final.plant)[3]
+    out = {"before": unseen_errors(case, case.plant, False, blocks), "refit_only": errors_of(case, base.plant, blocks)}
+    out["after"] = errors_of(case, final.plant, blocks) if final.effects else out["refit_only"]
     figures: dict[str, Any] = {f"held_out_{k}": rms(case.model, v) for k, v in out.items()}
     figures["data"] = "blocks" if blocks else "recordings"
     figures["gain"] = _gain(case, out["refit_only"], out["after"]) if final.effects else {}

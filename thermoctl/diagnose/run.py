@@ -51,7 +51,7 @@ NAME = 0.9                  # one explanation is named alone from this probabili
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 REMAINS = -9.0              # log10 p of an unknown input, in the residual's own colour, from which something is left over
 UNLIKE_COLOUR, MOST = -30.0, 0.12       # the same in white noise's metric, and its share of the residual's energy beyond white noise
-TEMPERING = 1.25, 2.0       # how much less the score decides than a perfect likelihood would, in white and in coloured noise
+TEMPERING = 1.9, 3.0        # how much less the score decides than a perfect likelihood would, in white and in coloured noise
 
 
 def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
@@ -116,8 +116,7 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     # those that predict better than the plant, too.
     better = [e for e in rivals if e.counts and e.score < current.score and len(e.effects) == len(current.effects)]
     if better and current is reference:
-        known: dict = {}
-        leader = next((e for e in sorted(better, key=lambda e: e.score) if prediction(case, base.plant, e.plant, known)[0] < 1.0), None)
+        leader = next((e for e in sorted(better, key=lambda e: e.score) if prediction(case, base.plant, e.plant)[0] < 1.0), None)
         if leader:
             rivals = [current, *(e for e in rivals if e is not leader)]
             current = reference = leader

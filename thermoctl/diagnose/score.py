@@ -13,6 +13,7 @@ Held-out gain: with e the mean over outputs of (rms / oracle's rms)^2 on data th
 from __future__ import annotations
 
 import math
+import random
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -154,7 +155,8 @@ def score(
     probabilities = [
         (
             float(f["probability"]),
-            f["effect"] in true_names and at((f["effect"], f["where"])),  # exactly: explanations exclude each other
+            # exactly: explanations exclude each other
+            any(f["effect"] == e and _same_place(e, f["where"], w) for e, w in truth) or (f["effect"], f["where"]) in also,
         )
         for f in [*result["findings"], *result["alternatives"]]
     ]
@@ -262,6 +264,14 @@ def reliability(pairs: Sequence[tuple[float, bool]], bins: int = 10) -> tuple[li
     return table, sum(b["n"] * abs(b["probability"] - b["right"]) for b in table) / len(pairs)
 
 
+def by_chance(pairs: Sequence[tuple[float, bool]], draws: int = 400) -> float | None:
+    """The calibration error that so few findings would show in the mean if their probabilities were exactly right."""
+    rng = random.Random(5)
+    errors = [reliability([(p, rng.random() < p) for p, _ in pairs])[1] for _ in range(draws)]
+    given = [e for e in errors if e is not None]
+    return sum(given) / len(given) if given else None
+
+
 def _quantile(values: Iterable[float | None], q: float) -> float | None:
     given = sorted(v for v in values if v is not None)
     if not given:
@@ -302,11 +312,13 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "interval_coverage": share(p["covered"] for r in rows for p in r.parameters),
         "failed": share(r.verdict == "failed" for r in rows),
     }
-    table, ece = reliability([x for r in rows for x in r.calibration])
+    given = [x for r in rows for x in r.calibration]
+    table, ece = reliability(given)
     gains = [r.gain for r in known if r.detected and r.findings]
     figures = {k: s.value for k, s in shares.items()} | {
         "cases": len(rows),
         "calibration_error": ece,
+        "calibration_error_by_chance": by_chance(given),
         "gain_median": _quantile(gains, 0.5),
         "gain_worst_tenth": _quantile(gains, 0.1),
         "seconds_median": _quantile((r.seconds for r in rows), 0.5),

@@ -168,13 +168,15 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
         e.direction = direction
         return e
 
+    strongest = max((d.gain for d in chosen), default=0.0)
+
     def one(direction: Direction) -> Explanation | None:
         direction = sharpened(seen.metric, seen.rig, direction)
         found = [tried(direction)]
         for nearer in (False, True):        # led astray by its first steps: once more step by step, once from nearer to nothing
             best = min((e for e in found if e is not None), key=lambda e: e.score, default=None)
             gained = 0.0 if best is None else max(seen.base.raw - best.raw, seen.base.fit.cost - best.fit.cost)
-            if best is None or best.raw > seen.base.raw or gained < ASTRAY * direction.gain:
+            if direction.gain > 0.5 * strongest and (best is None or best.raw > seen.base.raw or gained < ASTRAY * direction.gain):
                 found.append(tried(weaker(direction)) if nearer else tried(direction, stepwise=True))
         return min((e for e in found if e is not None), key=lambda e: e.score, default=None)
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
@@ -284,11 +286,10 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
         case.progress(f"refitting {len(chosen)} explanations")
         seen.finalists = compete(case, seen, chosen)
         # The best score that surely predicts is gone on with; those that fit better stay its rivals.
-        known: dict = {}
         best = None
         for e in seen.finalists[:4]:
             e.counts = counts(case, seen, e, entries)
-            if e.counts and prediction(case, current.plant, e.plant, known)[2] < 1.0:
+            if e.counts and prediction(case, current.plant, e.plant)[2] < 1.0:
                 best = e
                 break
         if best is None and not current.effects and seen.p_any() < LOOK and time.process_time() - case.begun < PATIENCE_S:
