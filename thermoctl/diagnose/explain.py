@@ -201,5 +201,6 @@ def surprise(c: Candidate) -> float:
 def _free_member(c: Candidate, side: str) -> bool:
     """Does the displacement already hold this side's temperature with a coefficient that a refit moves?"""
     plant = c.rig.plant
-    slope = ex.derivative(c.place.symbols["y"], str(c.place.symbols[side].value))
+    now = ex.substitute(c.place.symbols["y"], lambda e: e.args[0] if e.op == "delay" else None)
+    slope = ex.derivative(now, str(c.place.symbols[side].value))
     return any(n in plant.parameters and plant.parameters[n].range for n in ex.names(slope))

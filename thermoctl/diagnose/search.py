@@ -22,7 +22,7 @@ from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.yamlfile import InputError
 
-PATIENCE_S = 60.0           # CPU seconds of a diagnosis beyond which it looks at fewer pairs and runners-up
+PATIENCE_S = 60.0           # CPU seconds of a diagnosis beyond which it looks at fewer pairs, runners-up and rivals of several effects
 FINALISTS = 12
 ACCEPT = 12.0               # an effect must lower the score by this much beyond its parameters' price
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
@@ -380,6 +380,7 @@ def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[
     fill a place is a rival, so that each effect's probability is its own."""
     for _ in range(2):
         changed = False
+        late = time.process_time() - case.begun > 2 * PATIENCE_S
         others: list[Explanation] = []
         for k in range(len(current.effects)):
             without = leave_out(case, base, current, k)
@@ -389,14 +390,14 @@ def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[
                 case.progress("one effect is not needed beside the others")
                 return (without, [])
             seen = look(case, without, entries, draws=0)
-            found = compete(case, seen, finalists(seen.directions, 8))
+            found = compete(case, seen, finalists(seen.directions, 4 if late else 8))
             key = current.effects[k].key
             if found and found[0].score < current.score - 2:
                 changed |= found[0].last.key != key
                 current = found[0]
             others += [f for f in found if f is not current and f.last.key not in {c.key for c in current.effects}]
         rivals = others or rivals
-        if not changed:
+        if not changed or late:
             break
     return current, rivals
 
