@@ -118,14 +118,14 @@ def least_gain(before: Sequence[np.ndarray], after: Sequence[np.ndarray], sigmas
     """By how much the score falls from one explanation's residuals to another's when every channel has, of the colours that
     are as likely before, the one that is paid least: a short record does not tell flicker noise from first-order noise, and
     the slowest patterns are unlikely in one and nothing special in the other. A channel that is white afterwards had no
-    colour of its own."""
+    colour of its own, nor has one whose residual is larger than a sensor's colour can be."""
     total = 0.0
     for j, sigma in enumerate(sigmas):
         old, new = ([r[:, j] for r in residuals] for residuals in (before, after))
         was, now = _tried(old, 0.6 * sigma), _tried(new, 0.6 * sigma)
         if was and now:
             first, best = min(c.score for c in was), min(now, key=lambda c: c.score)
-            if len(best.ar) == 1:
+            if len(best.ar) == 1 or max(_power(r, sigma) for r in old) > LARGE ** 2:
                 total += first - best.score
             else:
                 same = {(c.ar, c.ma): c.score for c in now}
@@ -181,12 +181,16 @@ def possible(residuals: Sequence[np.ndarray], sigmas: Sequence[float]) -> list[l
     return [best] if other == best else [best, other]
 
 
-def _price(e: np.ndarray, sigma: float) -> float:
+def _power(e: np.ndarray, sigma: float) -> float:
+    """Mean square in units of the white noise's, outliers cut; 0 where there is no data."""
     e = np.abs(e[np.isfinite(e)])
-    if not len(e):
-        return 0.0
-    limit = 8 * max(sigma, 1.5 * float(np.median(e)))
-    power = float(np.mean(np.minimum(e, limit) ** 2)) / sigma ** 2
+    limit = 8 * max(sigma, 1.5 * float(np.median(e))) if len(e) else 0.0
+    return float(np.mean(np.minimum(e, limit) ** 2)) / sigma ** 2 if len(e) else 0.0
+
+
+def _price(e: np.ndarray, sigma: float) -> float:
+    e = e[np.isfinite(e)]
+    power = _power(e, sigma)
     excess = max(power - 1.0, 0.0)
     return 0.5 * (excess if excess <= 30 else 30 * (1 + float(np.log(excess / 30)))) \
         + WEIGHT * len(e) * max(float(np.log(max(power, 1e-9) / LARGE ** 2)), 0.0)
