@@ -135,7 +135,10 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
 
 
 def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direction]:
-    """The best directions, and the best of each effect that is not far behind: one per (effect, place)."""
+    """The best directions, and the best of each effect that is not far behind (of its places at inputs, and of all others: a lag
+    of what drives and one of what is read look alike at first order): one per (effect, place)."""
+    def kind(d: Direction) -> tuple[str, bool]:
+        return d.candidate.effect.name, bool(d.candidate.place.input)
     taken: dict[tuple[str, str], Direction] = {}
     if not ranked:
         return []
@@ -145,11 +148,11 @@ def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direc
             taken[d.candidate.key] = d
     ordered = list(taken.values())
     out = ordered[:count]
-    names = {d.candidate.effect.name for d in out}
+    names = {kind(d) for d in out}
     for d in ordered[count:]:
-        if d.candidate.effect.name not in names and d.gain > 0.3 * best and len(out) < count + 8:
+        if kind(d) not in names and d.gain > 0.3 * best and len(out) < count + 8:
             out.append(d)
-            names.add(d.candidate.effect.name)
+            names.add(kind(d))
     return out
 
 
