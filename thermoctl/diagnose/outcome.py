@@ -16,8 +16,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import report
 
-# How often what was found by such a verdict holds the truth at all (concealed cases of the seeds 9090 and 60601, docs/proof): the
-# rest is for what nobody refitted, or nobody knows.
+# How often the set of such a verdict holds the truth at all: set by judgement on the concealed cases of the seeds 9090 and 60601
+# (docs/proof), not fitted. The rest is for what nobody refitted, or nobody knows.
 TRUST = {"explained": 0.93, "ambiguous": 0.9, "unexplained": 0.5}
 
 

@@ -239,13 +239,14 @@ def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Seq
 
 
 def screen(metric: Metric, rig: Rig, found: Sequence[Candidate], draws: np.ndarray | None = None,
-           progress: Callable[[float], None] | None = None) -> tuple[list[Direction], np.ndarray | None]:
-    """Every candidate's best direction, best first. With `draws` (rows, B) of standard normal noise also, per draw, the
-    smallest log10 p that any candidate would have shown by chance (B,)."""
+           progress: Callable[[float], None] | None = None,
+           edges: np.ndarray | None = None) -> tuple[list[Direction], np.ndarray | None]:
+    """Every candidate's best direction, best first; `edges`: onsets to look at instead of the whole grid. With `draws` (rows, B)
+    of standard normal noise also, per draw, the smallest log10 p that any candidate would have shown by chance (B,)."""
     at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     columns: list[_Column] = []
     for c in found:
-        columns += _columns(c, metric, at)
+        columns += _columns(c, metric, at, edges)
     best: dict[int, Direction] = {}
     chance = None if draws is None else np.zeros(draws.shape[1])
     if draws is not None:
@@ -277,23 +278,12 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
         return found
     duration = max(float(d.t[-1]) for d in metric.drives)
     step, sample = duration / ONSETS, min(float(np.median(np.diff(d.t))) for d in metric.drives)
-    at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     while step > 0.5 * sample:
         near = np.concatenate([found.shape[k] + step * np.arange(-4, 5) / 4 for k in ("onset", "start", "end")
                                if found.shape.get(k, np.inf) <= duration])
-        edges = np.unique(near[(near >= 0) & (near < duration)])
-        best: dict[int, Direction] = {}
-        pending: dict[tuple, list[tuple[_Column, np.ndarray, float]]] = {}
-        for part, rows in directions(metric, _columns(found.candidate, metric, at, edges)):
-            full, rows = np.linalg.norm(rows, axis=0), metric.project(rows)
-            for k, column in enumerate(part):
-                entries = pending.setdefault(column.item[1], [])
-                entries.append((column, rows[:, k], float(full[k])))
-                if len(entries) == column.item[3]:
-                    _score(found.candidate, entries, metric, best, None, None)
-        for d in best.values():
-            if d.gain > found.gain:
-                found = d
+        better, _ = screen(metric, rig, [found.candidate], edges=np.unique(near[(near >= 0) & (near < duration)]))
+        if better and better[0].gain > found.gain:
+            found = better[0]
         step /= 4
     return found
 
