@@ -471,6 +471,9 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
 _CHANGES = ("flow", "rate", "value", "storage", "node", "split", "drive", "spill", "exponent", "resistance", "straight")
 
 
+_form = cache(ex.parse)            # the catalogue's forms are read once
+
+
 class _Builder:
     def __init__(self, c: Candidate, values: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]]):
         self.c, self.rig, self.base = c, c.rig, c.rig.plant
@@ -545,7 +548,7 @@ class _Builder:
         """A form of the catalogue with its symbols filled in."""
         def change(e: Expr) -> Expr | None:
             return self.symbols.get(e.value) if e.op == "name" else None
-        return ex.substitute(ex.parse(text), change)
+        return ex.substitute(_form(text), change)
 
     def plant(self) -> Plant:
         for item in self.c.effect.changes[self.c.variant]:

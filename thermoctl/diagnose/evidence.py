@@ -23,7 +23,8 @@ from functools import cache
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.signal import lfilter
+
+from thermoctl.diagnose.innovations import variances
 
 LARGE = 1.6         # coloured residual beyond this many sigmas of white noise is physics, not a sensor's colour
 WEIGHT = 0.1        # of the residual's energy beside its innovations, where it is larger than that
@@ -40,6 +41,9 @@ _LARGE = (0.1, 0.25, 0.5)                                   # its variance over 
 _SMALL = (0.003, 0.01, 0.03)                                # the flicker's there, slope 1
 
 
+_Filter = tuple[tuple[float, ...], tuple[float, ...], int]
+
+
 @dataclass(frozen=True)
 class Colour:
     """The noise of one channel under an explanation: innovation's sigma, the filter ar(z)/ma(z) that turns it into white
@@ -51,14 +55,14 @@ class Colour:
 
 
 @cache
-def _filters() -> tuple[tuple[tuple[float, ...], tuple[float, ...], int], ...]:
+def _filters() -> tuple[_Filter, ...]:
     """(ar, ma, parameters) of white noise, first-order colours and flicker noise."""
     arma = [((1.0, -phi), (1.0, -phi * share), 2) for phi in _PHI for share in (_SHARE if phi else (0.0,))]
     return ((1.0,), (1.0,), 0), *arma[1:], *((*flicker(v, slope), 2) for v in _FLICKER for slope in _SLOPES)
 
 
 @cache
-def _mixed() -> tuple[tuple[tuple[float, ...], tuple[float, ...], int], ...]:
+def _mixed() -> tuple[_Filter, ...]:
     """(ar, ma, parameters) of flicker noise beside a first-order part."""
     return tuple((*flicker(v, 1.0, phi, large), 3) for phi in _BESIDE for large in _LARGE for v in _SMALL)
 
@@ -96,15 +100,28 @@ def _tried(parts: Sequence[np.ndarray], floor: float) -> list[Colour]:
     parts = [p for p in parts if len(p) > 8]
     n = sum(map(len, parts))
 
-    def tried(ar: tuple[float, ...], ma: tuple[float, ...], parameters: int) -> Colour:
-        variance = max(_variance(parts, ar, ma), floor ** 2)
-        return Colour(float(np.sqrt(variance)), ar, ma, n * float(np.log(variance)) + parameters * float(np.log(n)))
     if not n:
         return []
-    found = [tried(*f) for f in _filters()]
+    e, ends = np.concatenate(parts), np.cumsum([len(p) for p in parts], dtype=np.intp)
+
+    def tried(filters: Sequence[_Filter]) -> list[Colour]:
+        found = np.maximum(variances(e, ends, *_arrays(filters)), floor ** 2)
+        return [Colour(float(np.sqrt(v)), ar, ma, n * float(np.log(v)) + parameters * float(np.log(n)))
+                for v, (ar, ma, parameters) in zip(found, filters, strict=True)]
+    found = tried(_filters())
     if found[0].score - min(c.score for c in found) > AS_LIKELY:        # not white, so a first-order part and flicker may both be there
-        found += [tried(*f) for f in _mixed()]
+        found += tried(_mixed())
     return found
+
+
+@cache
+def _arrays(filters: Sequence[_Filter]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ar and ma (F, K), filled up with zeros, and orders (F,)."""
+    orders = np.array([len(ar) - 1 for ar, _, _ in filters], dtype=np.intp)
+    ar, ma = (np.zeros((len(filters), int(orders.max()) + 1)) for _ in range(2))
+    for k, f in enumerate(filters):
+        ar[k, :orders[k] + 1], ma[k, :orders[k] + 1] = f[0], f[1]
+    return ar, ma, orders
 
 
 def _kinds(parts: Sequence[np.ndarray], floor: float) -> tuple[Colour, Colour]:
@@ -132,26 +149,6 @@ def least_gain(before: Sequence[np.ndarray], after: Sequence[np.ndarray], sigmas
                 total += min(c.score - same.get((c.ar, c.ma), best.score) for c in was if c.score <= first + AS_LIKELY)
         total += sum(_price(a, sigma) - _price(b, sigma) for a, b in zip(old, new, strict=True))
     return total
-
-
-def _variance(parts: Sequence[np.ndarray], ar: tuple[float, ...], ma: tuple[float, ...]) -> float:
-    """Variance of the innovations, outliers beyond 5 sigmas counted as 5."""
-    w = np.concatenate([_innovations(p, ar, ma) for p in parts])
-    spread = 1.4826 * float(np.median(np.abs(w))) or float(np.std(w))
-    raw = float(np.mean(w ** 2))
-    if spread <= 0:
-        return raw
-    limit = 5 * max(spread, 0.3 * np.sqrt(raw))
-    return float(np.mean(np.minimum(np.abs(w), limit) ** 2))
-
-
-def _innovations(e: np.ndarray, ar: tuple[float, ...], ma: tuple[float, ...]) -> np.ndarray:
-    if len(ar) == 1:
-        return e
-    w = lfilter(ar, ma, e)
-    if len(ar) == 2:
-        w[0] *= np.sqrt(1 - ar[1] ** 2)      # the first sample comes from the stationary distribution
-    return w
 
 
 def white_sigma(parts: Sequence[np.ndarray]) -> float:

@@ -78,7 +78,7 @@ class Case:
         """Refit a plant to all recordings and score it."""
         model = plant.compile()
         drives = [model.drive(t) for t in self.tables]
-        found = fit(model, drives, self.noise, iterations=iterations, tries=tries, seconds=self.patience)
+        found = fit(model, drives, self.noise, iterations=iterations, tolerance=1e-3, tries=tries, seconds=self.patience)
         return self.scored(updated(plant, found, drives), effects, own, found)
 
     def polished(self, e: Explanation) -> Explanation:

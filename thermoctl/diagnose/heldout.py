@@ -43,7 +43,7 @@ def unseen_errors(case: Case, plant: Plant, refit: bool = True, blocks: bool = F
             dx0: Sequence[np.ndarray | None] = [None] * len(test)
             if refit:
                 training = [model.drive(t) for t in train]
-                found = fit(model, training, case.noise, iterations=15, seconds=case.patience)
+                found = fit(model, training, case.noise, iterations=15, tolerance=1e-3, seconds=case.patience)
                 model = Model(updated(plant, found, training), model.code)
                 if train[0].path == test[0].path:       # recordings, split: their starts took part
                     dx0 = list(found.dx0)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import stats
+from scipy.special import gammaincc
 
 from thermoctl.diagnose.effects import STRAIGHT, Candidate, Rig, shape_grid
 from thermoctl.plant import expression as ex
@@ -50,8 +50,13 @@ class Direction:
 
 def log_p(gain: float, dims: int) -> float:
     """log10 of the chi-square tail, also where that is too small for a float."""
-    value = float(stats.chi2.logsf(gain, dims) / np.log(10))
-    return value if np.isfinite(value) else -(gain - (dims - 2) * np.log(max(gain, 1.0))) / (2 * np.log(10))
+    return float(_log_p(np.asarray(gain), dims))
+
+
+def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        value = np.log10(gammaincc(0.5 * dims, 0.5 * np.maximum(gain, 0.0)))
+    return np.where(np.isfinite(value), value, -(gain - (dims - 2) * np.log(np.maximum(gain, 1.0))) / (2 * np.log(10)))
 
 
 class Metric:
@@ -370,7 +375,7 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metri
                 if top * top / bottom > gains:
                     gains, at = top * top / bottom, (a, b, top / bottom)
                 if chance is not None and z is not None:
-                    chance = np.minimum(chance, stats.chi2.logsf(z * z / bottom, 1) / np.log(10))
+                    chance = np.minimum(chance, _log_p(z * z / bottom, 1))
         if gains < 0:
             return chance
         a, b, amplitude = at
@@ -392,7 +397,7 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metri
         sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
         inverse = np.linalg.pinv(sub, rcond=1e-8, hermitian=True)
         z = noise[useful] / scale[useful, None]
-        chance = np.minimum(chance, stats.chi2.logsf(np.einsum("kb,kl,lb->b", z, inverse, z), int(useful.sum())) / np.log(10))
+        chance = np.minimum(chance, _log_p(np.einsum("kb,kl,lb->b", z, inverse, z), int(useful.sum())))
     sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
     coefficient = np.zeros(len(g))
     coefficient[useful] = np.linalg.pinv(sub, rcond=1e-8, hermitian=True) @ (g[useful] / scale[useful]) / scale[useful]

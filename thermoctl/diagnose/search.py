@@ -257,7 +257,8 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
     if 0 < gain < MARGINAL:
         gain = min(gain, least_gain(seen.base.fit.residuals, e.fit.residuals, [n.sigma for n in case.noise]))
         if seen.inflation is None:      # beside what was found: an effect that is found inflates no longer
-            seen.inflation = inflation(look(case, e, entries, draws=0, coloured=True).directions)
+            plain = {k: f for k, f in entries.items() if not f.shapes}
+            seen.inflation = inflation(look(case, e, plain, draws=0, coloured=True).directions)
         gain /= seen.inflation
     if seen.chance is None:
         return e.score < seen.base.score - ACCEPT

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -305,18 +305,20 @@ class _Reader:
 
 # ---------------------------------------------------------------------------------------------------------- looking
 
-def walk(expr: Expr) -> Iterable[Expr]:
+@lru_cache(maxsize=20_000)
+def walk(expr: Expr) -> tuple[Expr, ...]:
     """Every distinct node, arguments before their users."""
     seen: set[int] = set()
-    stack = [(expr, False)]
+    stack, out = [(expr, False)], []
     while stack:
         node, done = stack.pop()
         if done:
-            yield node
+            out.append(node)
         elif id(node) not in seen:
             seen.add(id(node))
             stack.append((node, True))
             stack.extend((a, False) for a in reversed(node.args))
+    return tuple(out)
 
 
 @lru_cache(maxsize=100_000)
@@ -381,6 +383,7 @@ def _text(e: Expr, outer: int) -> str:
 
 # ------------------------------------------------------------------------------------------------------ derivatives
 
+@lru_cache(maxsize=50_000)
 def derivative(expr: Expr, by: str) -> Expr:
     """d expr / d name, exact; kinks (abs, min, max, table) take one side, jumps the slope of their smooth form."""
     done: dict[int, Expr] = {}
@@ -463,6 +466,11 @@ def evaluate(expr: Expr, values: Mapping[str, Any], first: Callable[[str], float
     return done[id(expr)]
 
 
+_NUMPY: dict[str, Callable] = {
+    "+": np.add, "*": np.multiply, "/": np.divide, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt,
+    "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tanh": np.tanh, "min": np.minimum, "max": np.maximum}
+
+
 def _value(e: Expr, a: list[Any], values: Mapping[str, Any], first: Callable[[str], float] | None,
            width: Callable[[Expr], float] | None) -> Any:
     op = e.op
@@ -474,11 +482,8 @@ def _value(e: Expr, a: list[Any], values: Mapping[str, Any], first: Callable[[st
         if first is None:
             raise ExpressionError("first() may stand in 'initial' only")
         return first(e.value)
-    simple: dict[str, Callable] = {
-        "+": np.add, "*": np.multiply, "/": np.divide, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt,
-        "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tanh": np.tanh, "min": np.minimum, "max": np.maximum}
-    if op in simple:
-        return simple[op](*a)
+    if op in _NUMPY:
+        return _NUMPY[op](*a)
     if op == "**":
         return np.power(np.asarray(a[0], float), a[1])
     if op in ("step", "sign", ">", ">=", "<", "<=", "bump"):

@@ -25,6 +25,8 @@ from thermoctl.yamlfile import InputError
 
 HUBER = 4.0             # residuals beyond this many sigmas count linearly
 BELIEF_WEIGHT = 0.02    # a whole range away from the belief costs as much as a fiftieth of a sigma, once
+PROBE = 0.1             # of a step, over which the curvature of the residuals is taken
+BENT = 0.75             # geodesic acceleration over the step up to which it is believed
 
 
 @dataclass(frozen=True)
@@ -233,8 +235,10 @@ class Problem:
         assert run.dy is not None
         return k, run.dy[:, :, used] * slope
 
-    def evaluate(self, z: np.ndarray, jacobian: bool) -> tuple[float, np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Cost, gradient/2 and Gauss-Newton matrix by the unknowns, raw residuals. Raises SimulationError."""
+    def evaluate(self, z: np.ndarray, jacobian: bool,
+                 keep: list[_Rows] | None = None) -> tuple[float, np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Cost, gradient/2 and Gauss-Newton matrix by the unknowns, raw residuals; what `curvature` needs goes to `keep`. Raises
+        SimulationError."""
         values, dx0 = self.unpack(z)
         n = len(z)
         gradient, matrix = np.zeros(n), np.zeros((n, n))
@@ -258,10 +262,13 @@ class Problem:
                 if not jacobian or run.dy is None:
                     continue
                 jac = self.whiten(r, j, run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used])
+                root = None
                 if a.max(initial=0.0) > limit:
                     root = np.sqrt(np.where(a <= limit, 1.0, limit / np.maximum(a, limit)))
                     jac *= root[:, None]
                     w = w * root
+                if keep is not None:
+                    keep.append(_Rows(r, j, k, slope, jac, w, root))
                 part_gradient += jac.T @ w
                 part_matrix += jac.T @ jac
             if jacobian:
@@ -271,6 +278,31 @@ class Problem:
         away = z - self.belief
         cost += float(np.sum(prior * away ** 2))
         return cost, gradient - prior * away, matrix + np.diag(prior), residuals
+
+    def curvature(self, z: np.ndarray, step: np.ndarray, kept: Sequence[_Rows]) -> np.ndarray:
+        """J^T d2w/dh2 of the whitened residuals w(z + h step), from one more simulation. Raises SimulationError."""
+        values, dx0 = self.unpack(z + PROBE * step)
+        errors = [d.y - self.model.run(d, values[r], dx0[r], buffers=self.buffers).y for r, d in enumerate(self.drives)]
+        out = np.zeros(len(z))
+        for rows in kept:
+            moved = self.whiten(rows.recording, rows.output, errors[rows.recording][:, rows.output])
+            if rows.root is not None:
+                moved = moved * rows.root
+            second = (moved - rows.w) / PROBE + rows.jac @ (rows.slope * step[rows.unknowns])
+            np.add.at(out, rows.unknowns, rows.slope * (rows.jac.T @ second))
+        return out * (2 / PROBE)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Whitened residuals w of an output in a recording with their slopes (M, k) by the unknowns' physical values, outliers' weights in."""
+    recording: int
+    output: int
+    unknowns: np.ndarray
+    slope: np.ndarray
+    jac: np.ndarray
+    w: np.ndarray
+    root: np.ndarray | None
 
 
 def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = None,
@@ -334,7 +366,8 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float,
     low = np.concatenate([np.zeros(problem.n_parameters), np.full(len(z) - problem.n_parameters, -8.0)])
     high = np.concatenate([np.ones(problem.n_parameters), np.full(len(z) - problem.n_parameters, 8.0)])
     z = np.clip(z, low, high)
-    cost, gradient, matrix, residuals = problem.evaluate(z, True)
+    kept: list[_Rows] = []
+    cost, gradient, matrix, residuals = problem.evaluate(z, True, kept)
     damping, done = 1e-3, 0
     for done in range(1, iterations + 1):       # noqa: B007 the count is reported
         held = ((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0))
@@ -357,9 +390,9 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float,
                 left = np.setdiff1d(left, out)
                 if not len(left):
                     break
-            trial = np.clip(z + step, low, high)
             predicted = float(2 * gradient @ step - step @ matrix @ step)
             try:
+                trial = np.clip(z + step + _bend(problem, z, step, matrix, damping, left, kept), low, high)
                 new_cost = problem.evaluate(trial, False)[0]
             except SimulationError:
                 new_cost = np.inf
@@ -374,7 +407,8 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float,
             break
         gain = cost - new_cost
         z = trial
-        cost, gradient, matrix, residuals = problem.evaluate(z, True)
+        kept.clear()
+        cost, gradient, matrix, residuals = problem.evaluate(z, True, kept)
         if gain < tolerance * max(1.0, 1e-3 * cost):
             break
     values, dx0 = problem.unpack(z)
@@ -386,6 +420,20 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float,
             at_bound[q] = "high"
     return Fit(problem.model, values, dx0, cost, problem.unknowns, z, matrix, residuals, problem.noise, done, problem.samples,
                at_bound)
+
+
+def _bend(problem: Problem, z: np.ndarray, step: np.ndarray, matrix: np.ndarray, damping: float, free: np.ndarray,
+          kept: Sequence[_Rows]) -> np.ndarray:
+    """Half the geodesic acceleration: a plant's parameters trade in valleys that are curved, and a straight step leaves them
+    (Transtrum & Sethna 2012, arXiv:1201.5885). Nothing where it is not small beside the step."""
+    out = np.zeros_like(step)
+    if len(free):
+        sub = matrix[np.ix_(free, free)]
+        weight = np.diag(sub)
+        out[free] = 0.5 * np.linalg.solve(sub + damping * np.diag(weight), problem.curvature(z, step, kept)[free])
+        if not weight @ out[free] ** 2 <= (0.5 * BENT) ** 2 * (weight @ step[free] ** 2):
+            return np.zeros_like(step)
+    return out
 
 
 # ------------------------------------------------------------------------------------------------------------ reports
