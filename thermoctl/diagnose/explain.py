@@ -74,11 +74,11 @@ class Case:
         return [e.fit.model.drive(t) for t in self.tables]
 
     def explain(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], iterations: int = 25,
-                tries: int = 0) -> Explanation:
-        """Refit a plant to all recordings and score it."""
+                tries: int = 0, goal: float = np.inf) -> Explanation:
+        """Refit a plant to all recordings and score it; `goal`: a cost that it does not go on for when that is out of reach."""
         model = plant.compile()
         drives = [model.drive(t) for t in self.tables]
-        found = fit(model, drives, self.noise, iterations=iterations, tolerance=1e-3, tries=tries, seconds=self.patience)
+        found = fit(model, drives, self.noise, iterations=iterations, tolerance=1e-3, tries=tries, seconds=self.patience, goal=goal)
         return self.scored(updated(plant, found, drives), effects, own, found)
 
     def polished(self, e: Explanation) -> Explanation:

@@ -29,27 +29,33 @@ COARSE, FINE = 10, 40       # knots a recording
 LEVELS = 8                  # knots over the values of a signal
 RESONATORS, DAMPING = 12, 0.1       # from two periods a recording to a quarter of the sampling rate
 PEAKS = 16                  # the same for a storage, where a change of phase is narrow
+CYCLES = 3, 200             # fewest and most of a rhythm in the longest recording
+HARMONICS = (1, 2, 4)       # that are summed
 
 
 @dataclass
 class Suspect:
     """A node or an output with an unknown smooth input, a node, flow or storage with an unknown function of a signal, or a flow
     with unknown dynamics: how much of the residual it explains."""
-    kind: str               # 'node', 'output', 'flow', 'storage' or 'dynamics'
+    kind: str               # 'node', 'output', 'flow', 'storage', 'dynamics' or 'rhythm'
     name: str
     gain: float
     dims: int
     follows: str | None = None      # the signal that it is a function of; None: of time
+    period: float = 0.0             # of a rhythm, s
+    looks: int = 1                  # of which this is the best
 
     @property
     def log_p(self) -> float:
         """log10 of the chance of such a gain by noise."""
-        return log_p(self.gain, self.dims)
+        return log_p(self.gain, self.dims) + float(np.log10(self.looks))
 
     def sentence(self) -> str:
         """In words."""
         if self.kind == "dynamics":
             return f"dynamics between {self.name} and what it drives (a resonance, a slow part) would explain it best"
+        if self.kind == "rhythm":
+            return f"a rhythm of {self.period:.4g} s of its own in {self.name} would explain it best"
         what = {"node": "an unknown flow into", "output": "an unknown error of", "flow": "an unknown factor of",
                 "storage": "an unknown factor of the storage of"}[self.kind]
         return f"{what} {self.name}, a function of {self.follows or 'time'}, would explain it best"
@@ -155,6 +161,47 @@ def patterns(metric: Metric, rig: Rig) -> list[Suspect]:
     return sorted(found, key=lambda suspect: suspect.log_p)
 
 
+def rhythms(metric: Metric) -> list[Suspect]:
+    """The best period of each output, likeliest first."""
+    span = max(float(d.t[-1] - d.t[0]) for d in metric.drives)
+    parts: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    at = 0
+    for r, d in enumerate(metric.drives):
+        for j, (index, _, _) in enumerate(metric.problem.rows[r]):
+            t = d.t[index]
+            if metric.blocks > 1 and len(t):
+                t = t[:len(t) // metric.blocks * metric.blocks].reshape(-1, metric.blocks).mean(axis=1)
+            w = metric.residual[at:at + len(t)]
+            at += len(t)
+            if len(t) > 4 * CYCLES[0]:
+                parts.setdefault(j, []).append((t, np.clip(w, -4, 4) if np.std(w) < 2 else w))
+    found = []
+    for j, series in parts.items():
+        fastest = min(0.25 / float(np.median(np.diff(t))) for t, _ in series)       # 1/s
+        f = np.arange(CYCLES[0] / span, min(fastest, CYCLES[1] / span), 1 / (3 * span))
+        if not len(f):
+            continue
+        power = np.zeros(len(f) * max(HARMONICS))                                   # at f_0 + k/(3 span), also for harmonics
+        grid = f[0] + np.arange(len(power)) / (3 * span)
+        grid = grid[grid <= fastest]
+        for t, w in series:
+            size = max(float(np.var(w)), 1.0)
+            power[:len(grid)] += 2 * np.abs(np.exp(-2j * np.pi * grid[:, None] * t) @ w) ** 2 / (len(t) * size)
+        for count in HARMONICS:
+            total, dims = np.zeros(len(f)), np.zeros(len(f), dtype=int)
+            for h in range(1, count + 1):
+                k = np.rint((h * f - f[0]) * 3 * span).astype(int)
+                inside = h * f <= grid[-1]
+                total[inside] += power[k[inside]]
+                dims[inside] += 2 * len(series)
+            full = dims == 2 * len(series) * count
+            if full.any():
+                best = int(np.argmax(np.where(full, total, 0.0)))
+                found.append(Suspect("rhythm", metric.model.outputs[j], float(total[best]), int(dims[best]), None, float(1 / f[best]),
+                                     len(f) * len(HARMONICS)))
+    return sorted(found, key=lambda s: s.log_p)
+
+
 def _resonators(u: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
     """What each of the bank makes of a signal, both quadratures."""
     h = float(np.median(np.diff(t)))
@@ -245,4 +292,4 @@ def _intervals(t: np.ndarray, on: np.ndarray) -> list[list[float]]:
     return out
 
 
-__all__ = ["Missing", "Suspect", "missing_flow", "patterns", "suspects"]
+__all__ = ["Missing", "Suspect", "missing_flow", "patterns", "rhythms", "suspects"]

@@ -50,6 +50,7 @@ from thermoctl.yamlfile import InputError
 NAME = 0.9                  # one explanation is named alone from this probability on
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 REMAINS = -9.0              # log10 p of an unknown input, in the residual's own colour, from which something is left over
+RHYTHM = -5.0               # the same of a period, whose chance in noise of any colour is what it should be (tests/diagnose)
 UNLIKE_COLOUR, MOST = -30.0, 0.12       # the same in white noise's metric, and its share of the residual's energy beyond white noise
 TEMPERING = 1.9, 3.0        # how much less the score decides than a perfect likelihood would, in white and in coloured noise
 
@@ -213,7 +214,7 @@ def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> s
 
 
 def remains(case: Case, e: Explanation) -> locate.Suspect | None:
-    """An unknown input in time, or an unknown function of the state, that still explains more of the residual than noise of any colour
+    """An unknown input in time, an unknown function of the state, or a rhythm, that still explains more of the residual than noise of any colour
     that the residual may have would let it; or, in white noise's metric, a good part of what is there beyond white noise: a sensor's
     colour spreads over many frequencies and follows nothing."""
     def strongest(colours: Sequence[Colour] | None) -> tuple[locate.Suspect | None, float]:
@@ -222,6 +223,7 @@ def remains(case: Case, e: Explanation) -> locate.Suspect | None:
         limit = REMAINS if colours else UNLIKE_COLOUR
         found = [s for s in (*locate.patterns(metric, rig), *locate.suspects(metric))
                  if s.log_p < (2 * limit if s.kind == "output" else limit)]         # sensors wander by themselves
+        found += [s for s in locate.rhythms(metric)[:1] if colours and s.log_p < RHYTHM]
         return min(found, key=lambda s: s.log_p, default=None), float(metric.residual @ metric.residual) - len(metric.residual)
     tinted = [strongest(c)[0] for c in possible(e.fit.residuals, [n.sigma for n in case.noise])]
     if all(tinted):

@@ -157,7 +157,10 @@ def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direc
 
 
 def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explanation]:
-    """Refit each direction in full; best score first."""
+    """Refit each direction in full; best score first. The two strongest set the cost that the others must come near to be followed
+    to their end."""
+    goal = np.inf
+
     def tried(direction: Direction, stepwise: bool = False) -> Explanation | None:
         try:
             plant, own = extend(seen.base.plant, direction, seen.metric.drives)
@@ -165,7 +168,7 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
             if stepwise:                    # the plant's own parameters first, round the effect as it was screened
                 ranges = {n: plant.parameters[n].range for n in own.values()}
                 plant = _ranged(case.explain(_ranged(plant, dict.fromkeys(ranges)), effects, owns).plant, ranges)
-            e = case.explain(plant, effects, owns)
+            e = case.explain(plant, effects, owns, goal=goal + 2 * ACCEPT)
         except (SimulationError, InputError, np.linalg.LinAlgError):
             return None
         e.direction = direction
@@ -182,8 +185,11 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
             if direction.gain > 0.5 * strongest and (best is None or best.raw > seen.base.raw or gained < ASTRAY * direction.gain):
                 found.append(tried(weaker(direction)) if nearer else tried(direction, stepwise=True))
         return min((e for e in found if e is not None), key=lambda e: e.score, default=None)
+    done: list[Explanation] = []
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
-        done = [e for e in pool.map(one, chosen) if e is not None]
+        for part in (chosen[:2], chosen[2:]):
+            done += [e for e in pool.map(one, part) if e is not None]
+            goal = min((e.fit.cost for e in done), default=goal)
     case.reprice([seen.base, *done])
     done.sort(key=lambda e: e.score)
     return done

@@ -26,6 +26,7 @@ from thermoctl.yamlfile import InputError
 HUBER = 4.0             # residuals beyond this many sigmas count linearly
 BELIEF_WEIGHT = 0.02    # a whole range away from the belief costs as much as a fiftieth of a sigma, once
 PROBE = 0.1             # of a step, over which the curvature of the residuals is taken
+HOPELESS = 20.0         # steps, each like the last three
 BENT = 0.75             # geodesic acceleration over the step up to which it is believed
 
 
@@ -307,11 +308,11 @@ class _Rows:
 
 def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = None,
         start: Mapping[str, float] | np.ndarray | None = None, iterations: int = 40, tolerance: float = 1e-4,
-        tries: int = 0, seed: int = 0, seconds: float = 600.0, progress: Callable[[str], None] | None = None) -> Fit:
+        tries: int = 0, seed: int = 0, seconds: float = 600.0, goal: float = np.inf, progress: Callable[[str], None] | None = None) -> Fit:
     """Fit the active parameters that have a range (and uncertain initial states) to the drives.
 
     `seconds` of this thread's CPU time: after which no further iteration is begun. `tries`: how many starts drawn over the ranges are looked at
-    besides the given one; the best two are followed.
+    besides the given one; the best two are followed. `goal`: a cost that would take HOPELESS more steps like the last ones is not followed.
     Raises SimulationError where no start can be simulated, InputError where there is nothing to compare."""
     for d in drives:
         if d.scale is None:
@@ -338,11 +339,11 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
         try:
             problem.set_outlier_limits(problem.evaluate(z, False)[3])
             if best is not None:        # another start is followed to its end only if a few steps bring it below
-                z = _descend(problem, z, 12, tolerance, deadline).z
+                z = _descend(problem, z, 12, tolerance, deadline, goal).z
                 if _sum_of_squares(problem, problem.evaluate(z, False)[3]) > 0.98 * _sum_of_squares(problem, best.residuals):
                     continue
             for _ in range(4):
-                found = _descend(problem, z, iterations, tolerance, deadline)
+                found = _descend(problem, z, iterations, tolerance, deadline, goal)
                 z = found.z
                 if not problem.set_outlier_limits(found.residuals):
                     break
@@ -362,13 +363,13 @@ def _sum_of_squares(problem: Problem, residuals: Sequence[np.ndarray]) -> float:
     return float(sum(np.sum(problem.whiten(r, j, e[:, j]) ** 2) for r, e in enumerate(residuals) for j in range(len(problem.noise))))
 
 
-def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float, deadline: float) -> Fit:
+def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float, deadline: float, goal: float) -> Fit:
     low = np.concatenate([np.zeros(problem.n_parameters), np.full(len(z) - problem.n_parameters, -8.0)])
     high = np.concatenate([np.ones(problem.n_parameters), np.full(len(z) - problem.n_parameters, 8.0)])
     z = np.clip(z, low, high)
     kept: list[_Rows] = []
     cost, gradient, matrix, residuals = problem.evaluate(z, True, kept)
-    damping, done = 1e-3, 0
+    damping, done, hopeless = 1e-3, 0, 0
     for done in range(1, iterations + 1):       # noqa: B007 the count is reported
         held = ((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0))
         free = np.flatnonzero(~held)
@@ -409,7 +410,8 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float,
         z = trial
         kept.clear()
         cost, gradient, matrix, residuals = problem.evaluate(z, True, kept)
-        if gain < tolerance * max(1.0, 1e-3 * cost):
+        hopeless = hopeless + 1 if HOPELESS * gain < cost - goal else 0
+        if gain < tolerance * max(1.0, 1e-3 * cost) or hopeless >= 3:
             break
     values, dx0 = problem.unpack(z)
     at_bound = {}
