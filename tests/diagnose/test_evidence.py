@@ -5,6 +5,11 @@ from scipy.fft import idct
 from scipy.signal import lfilter
 
 from thermoctl.diagnose.evidence import channels, flicker, least_gain
+from thermoctl.diagnose.explain import Case
+from thermoctl.diagnose.locate import rhythms
+from thermoctl.diagnose.search import metric_of
+from thermoctl.plant import load
+from thermoctl.recording.table import Table
 
 
 @pytest.mark.parametrize(("beside", "large"), [(None, 0.0), (0.7, 0.25), (0.93, 0.5)])
@@ -52,3 +57,46 @@ def test_what_leaves_white_noise_behind_is_paid_in_full():
     before, after = (noise + drift)[:, None], noise[:, None]
     found = channels([before], [1.0])[0].score - channels([after], [1.0])[0].score
     assert least_gain([before], [after], [1.0]) == pytest.approx(found, rel=1e-6) and found > 30
+
+
+@pytest.fixture
+def block(tmp_path):
+    """A heated block whose two recordings are the plant's own simulation, and what is added to its temperature."""
+    path = tmp_path / "plant.yaml"
+    path.write_text("format: thermoctl-plant/1\ninputs: {P: {unit: W}, air: {unit: degC}}\n"
+                    "parameters: {C: {value: 30, unit: J/K, range: [10, 90]}, G: {value: 0.5, unit: W/K, range: [0.1, 1]}}\n"
+                    "nodes: {T: {unit: degC, storage: C, initial: air}}\n"
+                    "flows: {heat: {into: T, rate: P, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}\n"
+                    "outputs: {y: {value: T, unit: degC, noise: 0.1}}\n")
+
+    def best(added):
+        """The likeliest rhythm in the colour of the residual."""
+        plant, tables = load(path), []
+        for k in range(2):
+            t = np.arange(3000.0)
+            table = Table(f"r{k}", f"r{k}", t, {"P": 6.0 * np.random.default_rng(k).integers(0, 2, 60).repeat(50), "air": 21 + 0 * t})
+            table.columns["y"] = plant.compile(()).simulate(table).y[:, 0] + added(t, np.random.default_rng(100 + k))
+            tables.append(table)
+        case = Case(plant, tables)
+        e = case.explain(plant, [], [])
+        return rhythms(metric_of(case, e, e.colours))[0]
+    return best
+
+
+def test_a_rhythm_is_found_with_its_period_though_its_phase_changes(block):
+    def bursts(t, rng):
+        return 0.1 * rng.standard_normal(len(t)) - 0.12 * ((t + rng.uniform(0, 240)) % 240 < 40)
+    found = block(bursts)
+    assert found.log_p < -8 and found.period == pytest.approx(240, rel=0.02) and "rhythm of 2" in found.sentence()
+
+
+@pytest.mark.parametrize("kind", ["white", "first order", "flicker"])
+def test_noise_of_any_colour_has_no_rhythm(block, kind):
+    """Of twenty draws a colour the smallest p is what twenty of pure chance would show."""
+    def noise(t, rng, seed):
+        rng = np.random.default_rng([seed, *rng.integers(0, 9, 2)])
+        white = 0.1 * rng.standard_normal(len(t))
+        return white if kind == "white" else white + lfilter([0.02], [1, -0.97], rng.standard_normal(len(t))) if kind == "first order" \
+            else 0.1 * mixed(len(t), rng)
+    least = sorted(block(lambda t, rng, seed=seed: noise(t, rng, seed)).log_p for seed in range(20))
+    assert least[0] > -3.5 and np.median(least) > -1
