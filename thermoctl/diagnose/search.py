@@ -23,7 +23,8 @@ from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.yamlfile import InputError
 
 PATIENCE_S = 60.0           # CPU seconds of a diagnosis beyond which it looks at fewer pairs, runners-up and rivals of several effects
-FINALISTS = 12
+FINALISTS, ALIKE = 12, 8    # refitted after a screening, and of one effect
+LEADERS = 4                 # effects that are refitted once more where parameters ended at the end of their ranges
 ACCEPT = 12.0               # an effect must lower the score by this much beyond its parameters' price
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
 NO_COLOUR, SOME_COLOUR = -35.0, -25.0   # the same in white noise's metric: colour of sensors gives no less than the second
@@ -57,7 +58,7 @@ def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, f
             out[p.name] = (max(p.low, value - 3 * reach), value + 3 * reach) if kind != "small_levels" else (0.0, 5 * reach)
             continue
         if p.shape:
-            out[p.name] = (max(p.low, value / 30), min(p.high, value * 30)) if kind != "delays" else (0.0, value * 8)
+            out[p.name] = (max(p.low, value / 30), min(p.high, value * 30)) if kind != "delays" else (0.0, max(value * 8, 0.05 * duration))
             continue
         floor, ceiling = direction.candidate.bounds(p)
         if np.isfinite(floor) and np.isfinite(ceiling):
@@ -147,9 +148,12 @@ def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direc
         if d.candidate.key not in taken and d.gain > 12:
             taken[d.candidate.key] = d
     ordered = list(taken.values())
-    out = ordered[:count]
+    out: list[Direction] = []
+    for d in ordered:
+        if len(out) < count and sum(o.candidate.effect is d.candidate.effect for o in out) < ALIKE:
+            out.append(d)
     names = {kind(d) for d in out}
-    for d in ordered[count:]:
+    for d in ordered:
         if kind(d) not in names and d.gain > 0.3 * best and len(out) < count + 8:
             out.append(d)
             names.add(kind(d))
@@ -190,9 +194,26 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
         for part in (chosen[:2], chosen[2:]):
             done += [e for e in pool.map(one, part) if e is not None]
             goal = min((e.fit.cost for e in done), default=goal)
+        done.sort(key=lambda e: e.score)
+        leaders = [e for e in _runners_up(done, LEADERS) if set(e.fit.at_bound) & set(case.plant.parameters)]
+        better = {id(e): found for e, found in zip(leaders, pool.map(lambda e: _released(case, e, goal), leaders), strict=True)}
+    done = [better.get(id(e), e) for e in done]
     case.reprice([seen.base, *done])
     done.sort(key=lambda e: e.score)
     return done
+
+
+def _released(case: Case, e: Explanation, goal: float) -> Explanation:
+    """Refitted once more with what is pressed against the end of its range back where it was believed: missing physics pushes
+    parameters to walls at which they stay when it is found."""
+    parameters = {n: dataclasses.replace(p, value=case.plant.parameters[n].value, values=case.plant.parameters[n].values)
+                  if n in e.fit.at_bound and n in case.plant.parameters else p for n, p in e.plant.parameters.items()}
+    try:
+        found = case.explain(dataclasses.replace(e.plant, parameters=parameters), e.effects, e.own, goal=goal + 2 * ACCEPT)
+    except (SimulationError, np.linalg.LinAlgError):
+        return e
+    found.direction = e.direction
+    return found if found.score < e.score else e
 
 
 def _ranged(plant: Plant, ranges: Mapping[str, tuple[float, float] | None]) -> Plant:
@@ -268,7 +289,9 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
         gain /= seen.inflation
     if seen.chance is None:
         return e.score < seen.base.score - ACCEPT
-    if log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) + e.direction.elsewhere < NO_COLOUR and smooth(case, e) > SOME_COLOUR:
+    alone = len(e.effects) == len(seen.base.effects) + 1
+    if alone and log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) + e.direction.elsewhere < NO_COLOUR \
+            and smooth(case, e) > SOME_COLOUR:
         return True         # with it the residual is white; without it a sensor would need a colour such as none has
     return gain > 0 and log_p(gain, e.direction.dims) + e.direction.elsewhere < threshold(seen)
 
@@ -398,7 +421,7 @@ def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[
                 continue
             if without.score < current.score + ACCEPT / 2:
                 case.progress("one effect is not needed beside the others")
-                return (without, [])
+                return (without if without.score < base.score - ACCEPT else base, [])
             seen = look(case, without, entries, draws=0)
             found = compete(case, seen, finalists(seen.directions, 4 if late else 8))
             key = current.effects[k].key
