@@ -223,7 +223,8 @@ def remains(case: Case, e: Explanation) -> locate.Suspect | None:
         limit = REMAINS if colours else UNLIKE_COLOUR
         found = [s for s in (*locate.patterns(metric, rig), *locate.suspects(metric))
                  if s.log_p < (2 * limit if s.kind == "output" else limit)]         # sensors wander by themselves
-        found += [s for s in locate.rhythms(metric)[:1] if colours and s.log_p < RHYTHM]
+        if not found and colours:       # what follows a signal may ring: a rhythm of its own is said where nothing else explains it
+            found = [s for s in locate.rhythms(metric)[:1] if s.log_p < RHYTHM]
         return min(found, key=lambda s: s.log_p, default=None), float(metric.residual @ metric.residual) - len(metric.residual)
     tinted = [strongest(c)[0] for c in possible(e.fit.residuals, [n.sigma for n in case.noise])]
     if all(tinted):
