@@ -135,6 +135,15 @@ def test_a_lag_begins_where_what_it_follows_begins(tmp_path):
     assert abs(tau["value"] - 6.0) < 3 * tau["sd"] < 2.0
 
 
+def test_a_delay_of_very_many_samples_is_found(tmp_path):
+    """The screening sees a short one: parameters of the plant take up most of it, and stand far off until it is there."""
+    def late(t, x):
+        return np.column_stack([x[:, 0], np.interp(t - 70.0, t, x[:, 1])])
+    r = diagnosed(heater(tmp_path, sensor=late), tmp_path / "out")
+    assert [(f["effect"], f["where"]) for f in r["findings"]] == [("sensor_delay", "temperature_2")]
+    assert r["findings"][0]["parameters"]["TD_sensor_delay_temperature_2"]["value"] == pytest.approx(70, rel=0.05)
+
+
 def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
     """A voltage over a resistance, read 0.2 s late, sampled every 2 s: held, the reading would be a whole sample late."""
     _, run, _ = heater(tmp_path)
