@@ -46,7 +46,7 @@ class Job:
     def fingerprint(self) -> str:
         """Of the contents of all inputs and of the program that diagnoses: a result of other code is not this job's."""
         package = Path(__file__).parents[1]
-        code = [f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.py"))]
+        code = [f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.py*"))]
         entries = [f for folder in (CATALOGUE, *map(Path, self.effects)) for f in sorted(folder.glob("*.yaml"))]
         digest = hashlib.sha256()
         for path in (*map(Path, (self.plant, *self.recordings)), *entries, *code):
