@@ -10,6 +10,7 @@ from thermoctl.daemon.clock import now_ns, sleep_until
 from thermoctl.daemon.ring import Box, Histogram, Mailbox, Record, Ring, unpack_readings
 
 from thermoctl.daemon.shared import Shared, percentiles
+from thermoctl.daemon.socket import latency
 from thermoctl.yamlfile import InputError
 
 
@@ -102,6 +103,32 @@ def test_box_gives_the_last_vector():
     np.testing.assert_array_equal(box.get(), [3.0, np.nan, 5.0])
     with pytest.raises(ValueError, match="do not fit"):
         box.put(np.zeros(5))
+
+
+def _count(name):
+    shared = Shared.attach(name)
+    counts = shared.areas["lateness"]
+    while True:
+        counts[:] = 0
+        counts[:] = 1
+
+
+def test_latency_is_told_while_the_loop_counts_on():
+    """Bins that fill while they are read ended the command process once in some hundred runs of the tests."""
+    name = f"thermoctl-test-{os.getpid()}-counting"
+    shared = Shared.create(name)
+    child = multiprocessing.get_context("fork").Process(target=_count, args=(name,), daemon=True)
+    child.start()
+    try:
+        filled = 0
+        deadline = now_ns() + 60_000_000_000
+        while filled < 300 and now_ns() < deadline:
+            filled += len(latency(shared, 1e-3)["lateness"]["bins_us"]) > 0
+        assert filled >= 300
+    finally:
+        child.kill()
+        child.join()
+        shared.remove()
 
 
 def test_histogram_and_percentiles():

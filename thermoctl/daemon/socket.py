@@ -76,7 +76,7 @@ def latency(shared: Shared, period_s: float) -> dict[str, Any]:
     answer: dict[str, Any] = {"period_us": period_s * 1e6, "ticks": 0 if row is None else int(row[INDEX["tick"]]),
                               "slips": 0 if row is None else int(row[INDEX["slips"]])}
     for k, name in enumerate(("lateness", "busy", "reference")):
-        counts = shared.areas[name]
+        counts = shared.areas[name].copy()          # the loop counts on meanwhile
         p50, p99, p999 = percentiles(counts)
         answer[name] = {"count": int(counts.sum()), "p50_us": _or_none(p50), "p99_us": _or_none(p99),
                         "p999_us": _or_none(p999), "largest_us": float(shared.areas["largest"][k]),
