@@ -289,7 +289,7 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
         gain /= seen.inflation
     if seen.chance is None:
         return e.score < seen.base.score - ACCEPT
-    alone = len(e.effects) == len(seen.base.effects) + 1
+    alone = len(e.effects) == len(seen.base.effects) + 1        # two at once leave a residual white more easily
     if alone and log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) + e.direction.elsewhere < NO_COLOUR \
             and smooth(case, e) > SOME_COLOUR:
         return True         # with it the residual is white; without it a sensor would need a colour such as none has

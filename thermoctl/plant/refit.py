@@ -5,8 +5,12 @@
 
 phi is the channel's noise colour (AR(1), over one median sampling interval), rho Huber's function (outliers), z the
 parameter's place in its range (0..1, on a log scale where the range spans a factor of three or more) and w a weight so
-small that it decides only in flat directions. Gauss-Newton with Levenberg's damping on the normal equations; a parameter
-that meets its bound is held there until the gradient leads back inside. Sensitivities are exact (compile.py).
+small that it decides only in flat directions. Gauss-Newton with Levenberg's damping on the normal equations and half the
+geodesic acceleration (Transtrum & Sethna 2012),
+
+    (J'J + l D) v = J' r,    (J'J + l D) a = J' d2r/dh2 along v,    z <- z + v + a/2        r = (measured - simulated) / s, J = -dr/dz
+
+a parameter that meets its bound is held there until the gradient leads back inside. Sensitivities are exact (compile.py).
 """
 from __future__ import annotations
 
