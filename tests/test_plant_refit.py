@@ -2,11 +2,14 @@
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import multivariate_normal
 
 from thermoctl.cli import main
+from thermoctl.diagnose.explain import occam
+from thermoctl.plant import expression as ex
 from thermoctl.plant.language import loads
 from thermoctl.plant.noise import coloured, innovations
-from thermoctl.plant.refit import Problem, fit, report
+from thermoctl.plant.refit import Belief, Problem, fit, report
 from thermoctl.recording.table import Table, write_table
 
 BLOCK = """format: thermoctl-plant/1
@@ -146,3 +149,28 @@ def test_parameters_that_trade_along_a_curve_are_followed_in_fewer_steps(monkeyp
         costs = [fit(model, [model.drive(table)], start=np.random.default_rng(k).uniform(0.35, 0.65, 6)).cost for k in range(8)]
         assert max(costs) < min(costs) + 1 and costs[0] == pytest.approx(3000, rel=0.1)
     assert slopes[0] < 0.8 * slopes[1], slopes
+
+
+def test_what_is_believed_of_parameters_gives_the_posterior_and_the_evidence_of_a_straight_line():
+    """Against the closed form: y = A u + B + noise with A, B ~ N(1, 0.2^2), N(A, 0.5^2); evidence is y's own density, N(X m, s^2 I + X V X')."""
+    line = loads("""format: thermoctl-plant/1
+inputs: {u: {unit: K}}
+parameters: {C: {value: 1, unit: J/K}, A: {value: 0, unit: "1", range: [-50, 50]}, B: {value: 0, unit: K, range: [-50, 50]}}
+nodes: {T: {unit: degC, storage: C, initial: "20"}}
+flows: {heat: {into: T, rate: "0 * C * T", unit: W}}
+outputs: {y: {value: "A * u + B", unit: K, noise: 0.3}}
+""")
+    rng = np.random.default_rng(4)
+    u = rng.normal(0, 1, 12)
+    y = 1.4 * u + 1.1 + rng.normal(0, 0.3, 12)
+    model = line.compile()
+    drive = model.drive(Table("a", "a", np.arange(12.0), {"u": u, "y": y}))
+    belief = Belief("a", ex.parse("((A - 1) / 0.2)**2 + ((B - A) / 0.5)**2"))
+    found = fit(model, [drive], beliefs=[belief, Belief("another recording", ex.parse("A**2"))], tolerance=1e-9)
+    m, X = np.array([1.0, 1.0]), np.column_stack([u, np.ones(12)])
+    V = np.array([[0.04, 0.04], [0.04, 0.04 + 0.25]])
+    P = np.linalg.inv(V) + X.T @ X / 0.09
+    assert [found.parameters()[q] for q in "AB"] == pytest.approx(np.linalg.solve(P, np.linalg.inv(V) @ m + X.T @ y / 0.09), abs=1e-4)
+    assert np.sqrt(np.diag(np.linalg.inv(P))) == pytest.approx(100 * np.sqrt(np.diag(np.linalg.inv(found.hessian))), rel=1e-3)
+    evidence = -2 * multivariate_normal(X @ m, 0.09 * np.eye(12) + X @ V @ X.T).logpdf(y)
+    assert occam(found, {"A", "B"}) + found.cost + 12 * np.log(2 * np.pi * 0.09) == pytest.approx(evidence, abs=0.01)

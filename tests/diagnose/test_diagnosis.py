@@ -264,8 +264,9 @@ def test_what_one_recording_does_not_determine_is_proved_on_blocks_of_all(tmp_pa
         heat[:, 2] = sign * heat[:, 1]
         np.savetxt(path, heat, delimiter=",", comments="", fmt="%.7g", header="t,heat,more,air_temperature,temperature_1,temperature_2")
         tables.append(read_table(str(path)))
-    before, after = (load(tmp_path / f"{name}.yaml") for name in ("before", "after"))
-    case = Case(before, tables)
+    plants = [load(tmp_path / f"{name}.yaml") for name in ("before", "after")]
+    case = Case(plants[0], tables)
+    before, after = (case.explain(p, [], []) for p in plants)
     ratio, _, high, blocks = prediction(case, before, after)
     assert blocks and ratio < high < 0.9
     assert not prediction(case, before, before)[3]      # nothing gained, nothing proved

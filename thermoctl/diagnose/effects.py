@@ -19,6 +19,7 @@ from thermoctl import yamlfile
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Flow, Input, Node, Parameter, Plant
+from thermoctl.plant.refit import Belief
 from thermoctl.plant.simulate import Drive, Simulation
 from thermoctl.plant.units import dimension
 from thermoctl.shipped import shipped
@@ -415,18 +416,29 @@ class Candidate:
         y, inputs = self.place.symbols.get("y"), self.rig.plant.inputs
         return y is not None and any(i in self.rig.moving_inputs and not inputs[i].linear for i in ex.names(y))
 
-    def surprise(self, plant: Plant) -> float:
-        """-2 log of how likely the values are that `plant` holds for the effect, summed over recordings where it has a
-        value for each."""
+    def beliefs(self, plant: Plant) -> list[Belief]:
+        """What physics says of the effect's parameters in `plant`, for each recording."""
         if self.effect.prior is None:
-            return 0.0
-        total = 0.0
+            return []
+        # what has no value of its own in each recording is believed once
+        share = 1.0 if any(p.per_recording for p in self.effect.parameters) else 1.0 / len(self.rig.drives)
+        out = []
         for d in self.rig.drives:
-            known = {p.name: plant.parameters[self.own(p.name)].values.get(d.name, plant.parameters[self.own(p.name)].value)
-                     for p in self.effect.parameters if self.own(p.name) in plant.parameters}
-            total += float(ex.evaluate(self.effect.prior, {**known, "duration": float(d.t[-1] - d.t[0]),
-                                                           "first_air": d.first.get(self.rig.air or "", 0.0)}))
-        return total if any(p.per_recording for p in self.effect.parameters) else total / max(len(self.rig.drives), 1)
+            known = {"duration": num(float(d.t[-1] - d.t[0])), "first_air": num(d.first.get(self.rig.air or "", 0.0)),
+                     **{p.name: name(self.own(p.name)) for p in self.effect.parameters if self.own(p.name) in plant.parameters}}
+
+            def told(e: Expr, known: Mapping[str, Expr] = known) -> Expr | None:
+                return known.get(str(e.value)) if e.op == "name" else None
+            out.append(Belief(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, told))))
+        return out
+
+    def surprise(self, plant: Plant) -> float:
+        """-2 log of how likely the values are that `plant` holds for the effect, over all recordings."""
+        total = 0.0
+        for b in self.beliefs(plant):
+            total += float(ex.evaluate(b.surprise, {n: plant.parameters[n].values.get(b.recording, plant.parameters[n].value)
+                                                    for n in ex.names(b.surprise)}))
+        return total
 
     def own(self, parameter: str) -> str:
         """The plant's name of one of the effect's parameters."""

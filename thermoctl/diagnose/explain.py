@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +17,7 @@ from thermoctl.diagnose.evidence import Colour, channels
 from thermoctl.diagnose.screen import Direction
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit, Noise, Problem, Scale, default_noise, fit, report, updated
+from thermoctl.plant.refit import BELIEF_WEIGHT, Fit, Noise, Problem, Scale, default_noise, fit, report, updated
 from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
@@ -78,7 +78,8 @@ class Case:
         """Refit a plant to all recordings and score it; `goal`: a cost that it does not go on for when that is out of reach."""
         model = plant.compile()
         drives = [model.drive(t) for t in self.tables]
-        found = fit(model, drives, self.noise, iterations=iterations, tolerance=1e-3, tries=tries, seconds=self.patience, goal=goal)
+        found = fit(model, drives, self.noise, iterations=iterations, tolerance=1e-3, tries=tries, seconds=self.patience, goal=goal,
+                    beliefs=[b for c in effects for b in c.beliefs(plant)])
         return self.scored(updated(plant, found, drives), effects, own, found)
 
     def polished(self, e: Explanation) -> Explanation:
@@ -89,7 +90,7 @@ class Case:
         model = e.plant.compile()
         drives = [model.drive(t) for t in self.tables]
         try:
-            found = fit(model, drives, noise_of(e.colours), iterations=15, seconds=self.patience)
+            found = fit(model, drives, noise_of(e.colours), iterations=15, seconds=self.patience, beliefs=e.fit.beliefs)
         except (SimulationError, np.linalg.LinAlgError):
             return e
         better = dataclasses.replace(e, plant=updated(e.plant, found, drives), fit=found)
@@ -99,8 +100,7 @@ class Case:
     def scored(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], found: Fit) -> Explanation:
         """The score of a fit: coloured -2 log likelihood and the price of its parameters."""
         colours = channels(found.residuals, [n.sigma for n in self.noise])
-        added = sum(len(self.tables) if plant.parameters[n].per_recording else 1 for o in own for n in o.values())
-        price = added * np.log(max(found.samples, 2)) + sum(surprise(c) + c.surprise(plant) for c in effects)
+        price = occam(found, {n for o in own for n in o.values()}) + sum(surprise(c) + c.surprise(plant) for c in effects)
         raw = sum(c.score for c in colours)
         away, spread = self._away(found)
         self.spread = min(self.spread, spread)
@@ -148,7 +148,7 @@ def noise_of(colours: Sequence[Colour]) -> tuple[Noise, ...]:
 def standard_errors(e: Explanation, drives: Sequence[Drive]) -> dict[str, float]:
     """Of each parameter of the effects: the Gauss-Newton one, or half the width over which the likelihood falls by two (-2 log by
     3.84) over 1.96 where that is wider: an onset, a threshold, the depth of a dead zone have no slope to go by."""
-    problem = Problem(e.fit.model, drives, e.fit.noise)
+    problem = Problem(e.fit.model, drives, e.fit.noise, e.fit.beliefs)
     problem.set_outlier_limits(e.fit.residuals)
     z = e.fit.z
     least, _, _, _ = problem.evaluate(z, False)
@@ -180,6 +180,19 @@ def standard_errors(e: Explanation, drives: Sequence[Drive]) -> dict[str, float]
             widest = max(widest, low)
         out[name] = widest * slope / 1.96
     return out
+
+
+def occam(found: Fit, added: Set[str]) -> float:
+    """The price of added parameters: Schwarz's log n each; of those that physics has a belief of Laplace's, log det of what is
+    known of them by data and belief over what was believed."""
+    believed = {n for b in found.beliefs for n in ex.names(b.surprise)}
+    price = float(sum(q in added and q not in believed for q, _ in found.unknowns) * np.log(max(found.samples, 2)))
+    told = np.array([q in believed for q, _ in found.unknowns])
+    if told.any():
+        floor = BELIEF_WEIGHT ** 2 * np.eye(int(told.sum()))
+        price += float(np.linalg.slogdet(found.hessian)[1] - np.linalg.slogdet(found.hessian[np.ix_(~told, ~told)])[1]
+                       - np.linalg.slogdet(found.believed[np.ix_(told, told)] + floor)[1])
+    return price
 
 
 def implausible(away: np.ndarray, spread: float) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import fit, updated
+from thermoctl.plant.refit import Belief, fit, updated
 from thermoctl.plant.simulate import Drive, Model, SimulationError
 from thermoctl.recording.table import Table
 
@@ -33,7 +33,7 @@ def folds(case: Case, blocks: bool = False) -> list[tuple[list[Table], list[Tabl
     return [(even, odd), (odd, even)]
 
 
-def unseen_errors(case: Case, plant: Plant, refit: bool = True, blocks: bool = False) -> list[np.ndarray]:
+def unseen_errors(case: Case, plant: Plant, refit: bool = True, blocks: bool = False, beliefs: Sequence[Belief] = ()) -> list[np.ndarray]:
     """Free-run errors (N, outputs) on each fold's test data, the plant fitted to that fold's training data only."""
     out: list[np.ndarray] = []
     for train, test in folds(case, blocks):
@@ -43,7 +43,7 @@ def unseen_errors(case: Case, plant: Plant, refit: bool = True, blocks: bool = F
             dx0: Sequence[np.ndarray | None] = [None] * len(test)
             if refit:
                 training = [model.drive(t) for t in train]
-                found = fit(model, training, case.noise, iterations=15, tolerance=1e-3, seconds=case.patience)
+                found = fit(model, training, case.noise, iterations=15, tolerance=1e-3, seconds=case.patience, beliefs=beliefs)
                 model = Model(updated(plant, found, training), model.code)
                 if train[0].path == test[0].path:       # recordings, split: their starts took part
                     dx0 = list(found.dx0)
@@ -69,16 +69,16 @@ def _but_for_start(case: Case, model: Model, d: Drive) -> np.ndarray:
     return error - by_start @ shift
 
 
-def errors_of(case: Case, plant: Plant, blocks: bool) -> list[np.ndarray]:
-    """`unseen_errors` of a plant, kept by the case: search, proof and report ask for the same ones."""
-    key = (id(plant), blocks)
+def errors_of(case: Case, e: Explanation, blocks: bool) -> list[np.ndarray]:
+    """`unseen_errors` of an explanation, kept by the case: search, proof and report ask for the same ones."""
+    key = (id(e.plant), blocks)
     if key not in case.unseen:
-        case.unseen[key] = (plant, unseen_errors(case, plant, blocks=blocks))
+        case.unseen[key] = (e.plant, unseen_errors(case, e.plant, blocks=blocks, beliefs=e.fit.beliefs))
     return case.unseen[key][1]
 
 
-def prediction(case: Case, before: Plant, after: Plant) -> tuple[float, float, float, bool]:
-    """`pooled_gain` of one plant over another, and whether it is that of blocks: what a single recording does not determine, an
+def prediction(case: Case, before: Explanation, after: Explanation) -> tuple[float, float, float, bool]:
+    """`pooled_gain` of one explanation over another, and whether it is that of blocks: what a single recording does not determine, an
     encoder's phase, a share of two paths, predicts no other recording, but the blocks between those that it was fitted to."""
     gain = pooled_gain(case, errors_of(case, before, False), errors_of(case, after, False))
     if gain[2] < 1.0 or len(case.tables) == 1:
@@ -117,9 +117,9 @@ def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.nda
 def held_out(case: Case, base: Explanation, final: Explanation) -> dict[str, Any]:
     """Fit the plant's own parameters, and those of the explanation, without some of the data; errors on that data: each recording in
     turn, or blocks of all where only those show what the explanation is worth (`data` says which)."""
-    blocks = len(case.tables) == 1 or bool(final.effects) and prediction(case, base.plant, final.plant)[3]
-    out = {"before": unseen_errors(case, case.plant, False, blocks), "refit_only": errors_of(case, base.plant, blocks)}
-    out["after"] = errors_of(case, final.plant, blocks) if final.effects else out["refit_only"]
+    blocks = len(case.tables) == 1 or bool(final.effects) and prediction(case, base, final)[3]
+    out = {"before": unseen_errors(case, case.plant, False, blocks), "refit_only": errors_of(case, base, blocks)}
+    out["after"] = errors_of(case, final, blocks) if final.effects else out["refit_only"]
     figures: dict[str, Any] = {f"held_out_{k}": rms(case.model, v) for k, v in out.items()}
     figures["data"] = "blocks" if blocks else "recordings"
     figures["gain"] = _gain(case, out["refit_only"], out["after"]) if final.effects else {}

@@ -117,7 +117,7 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     # those that predict better than the plant, too.
     better = [e for e in rivals if e.counts and e.score < current.score and len(e.effects) == len(current.effects)]
     if better and current is reference:
-        leader = next((e for e in sorted(better, key=lambda e: e.score) if prediction(case, base.plant, e.plant)[0] < 1.0), None)
+        leader = next((e for e in sorted(better, key=lambda e: e.score) if prediction(case, base, e)[0] < 1.0), None)
         if leader:
             rivals = [current, *(e for e in rivals if e is not leader)]
             current = reference = leader

@@ -322,7 +322,7 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
         best = None
         for e in seen.finalists[:4]:
             e.counts = counts(case, seen, e, entries)
-            if e.counts and prediction(case, current.plant, e.plant)[2] < 1.0:
+            if e.counts and prediction(case, current, e)[2] < 1.0:
                 best = e
                 break
         if best is None and not current.effects and seen.p_any() < LOOK and time.process_time() - case.begun < PATIENCE_S:
@@ -461,7 +461,7 @@ def prune(case: Case, base: Explanation, current: Explanation, notes: list[str])
             without = leave_out(case, base, current, k)
             if without is None:
                 continue
-            high = prediction(case, without.plant, current.plant)[2]
+            high = prediction(case, without, current)[2]
             if not high < 1.0 and (weakest is None or high > weakest[0]):
                 weakest = (high, without, c)
         if weakest is None:

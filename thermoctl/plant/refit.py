@@ -5,8 +5,8 @@
 
 phi is the channel's noise colour (AR(1), over one median sampling interval), rho Huber's function (outliers), z the
 parameter's place in its range (0..1, on a log scale where the range spans a factor of three or more) and w a weight so
-small that it decides only in flat directions. Gauss-Newton with Levenberg's damping on the normal equations and half the
-geodesic acceleration (Transtrum & Sethna 2012),
+small that it decides only in flat directions; what else is believed of parameters (`Belief`) adds its own -2 log.
+Gauss-Newton with Levenberg's damping on the normal equations and half the geodesic acceleration (Transtrum & Sethna 2012),
 
     (J'J + l D) v = J' r,    (J'J + l D) a = J' d2r/dh2 along v,    z <- z + v + a/2        r = (measured - simulated) / s, J = -dr/dz
 
@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.signal import lfilter
 
+from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulate import Drive, Model, SimulationError
 from thermoctl.yamlfile import InputError
@@ -44,6 +45,14 @@ class Noise:
     ma: tuple[float, ...] = (1.0,)
 
 
+@dataclass(frozen=True)
+class Belief:
+    """-2 log of how likely parameters' values are, whatever the data: an expression of the plant's parameters (their values in
+    the recording of this name) that is nowhere concave."""
+    recording: str
+    surprise: ex.Expr
+
+
 @dataclass
 class Fit:
     """What a refit found. `values`: (recordings, parameters) in the model's order; `dx0`: (recordings, uncertain states);
@@ -60,6 +69,8 @@ class Fit:
     iterations: int
     samples: int
     at_bound: dict[str, str] = field(default_factory=dict)
+    beliefs: tuple[Belief, ...] = ()
+    believed: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))      # their share of the hessian
 
     def parameters(self, recording: int = 0) -> dict[str, float]:
         """All parameter values of one recording."""
@@ -126,8 +137,9 @@ def _rows(d: Drive, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarra
 class Problem:
     """Residuals and Jacobian of a model on several recordings, in the metric of the noise."""
 
-    def __init__(self, model: Model, drives: Sequence[Drive], noise: Sequence[Noise]):
+    def __init__(self, model: Model, drives: Sequence[Drive], noise: Sequence[Noise], beliefs: Sequence[Belief] = ()):
         self.model, self.drives, self.noise = model, list(drives), tuple(noise)
+        self.beliefs = tuple(b for b in beliefs if b.recording in {d.name for d in drives})
         if not drives:
             raise InputError("no recording to fit")
         parameters = model.plant.parameters
@@ -279,10 +291,29 @@ class Problem:
             if jacobian:
                 np.add.at(gradient, k, part_gradient * slope)
                 matrix[np.ix_(k, k)] += part_matrix * np.outer(slope, slope)
+        part, slope, bend = self.believed(values, jacobian)
+        cost, gradient, matrix = cost + part, gradient - slope, matrix + bend
         prior = self.prior()
         away = z - self.belief
         cost += float(np.sum(prior * away ** 2))
         return cost, gradient - prior * away, matrix + np.diag(prior), residuals
+
+    def believed(self, values: np.ndarray, derivatives: bool) -> tuple[float, np.ndarray, np.ndarray]:
+        """The beliefs' terms of the cost, and half their first and second derivatives by the unknowns."""
+        n = len(self.unknowns)
+        cost, gradient, matrix = 0.0, np.zeros(n), np.zeros((n, n))
+        for belief in self.beliefs:
+            r = next(r for r, d in enumerate(self.drives) if d.name == belief.recording)
+            known = dict(zip(self.model.parameters, map(float, values[r]), strict=True))
+            cost += float(ex.evaluate(belief.surprise, known))
+            felt = [(q, self.columns[r, c], self.scales[q].slope(known[q])) for c, q in enumerate(self.model.active)
+                    if derivatives and self.columns[r, c] >= 0 and q in ex.names(belief.surprise)]
+            for q, k, slope in felt:
+                first = ex.derivative(belief.surprise, q)
+                gradient[k] += 0.5 * slope * float(ex.evaluate(first, known))
+                for q2, k2, slope2 in felt:
+                    matrix[k, k2] += 0.5 * slope * slope2 * float(ex.evaluate(ex.derivative(first, q2), known))
+        return cost, gradient, matrix
 
     def curvature(self, z: np.ndarray, step: np.ndarray, kept: Sequence[_Rows]) -> np.ndarray:
         """J^T d2w/dh2 of the whitened residuals w(z + h step), from one more simulation. Raises SimulationError."""
@@ -312,7 +343,8 @@ class _Rows:
 
 def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = None,
         start: Mapping[str, float] | np.ndarray | None = None, iterations: int = 40, tolerance: float = 1e-4,
-        tries: int = 0, seed: int = 0, seconds: float = 600.0, goal: float = np.inf, progress: Callable[[str], None] | None = None) -> Fit:
+        tries: int = 0, seed: int = 0, seconds: float = 600.0, goal: float = np.inf, beliefs: Sequence[Belief] = (),
+        progress: Callable[[str], None] | None = None) -> Fit:
     """Fit the active parameters that have a range (and uncertain initial states) to the drives.
 
     `seconds` of this thread's CPU time: after which no further iteration is begun. `tries`: how many starts drawn over the ranges are looked at
@@ -321,7 +353,7 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
     for d in drives:
         if d.scale is None:
             model.prepare(d)
-    problem = Problem(model, drives, noise or default_noise(model.plant, drives))
+    problem = Problem(model, drives, noise or default_noise(model.plant, drives), beliefs)
     z0 = problem.start(start or {}) if not isinstance(start, np.ndarray) else start
     starts = [z0]
     if tries:
@@ -425,7 +457,7 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float,
         elif z[k] >= 1 - 1e-6:
             at_bound[q] = "high"
     return Fit(problem.model, values, dx0, cost, problem.unknowns, z, matrix, residuals, problem.noise, done, problem.samples,
-               at_bound)
+               at_bound, problem.beliefs, problem.believed(values, True)[2])
 
 
 def _bend(problem: Problem, z: np.ndarray, step: np.ndarray, matrix: np.ndarray, damping: float, free: np.ndarray,
