@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from thermoctl.diagnose.evidence import channels, flicker, least_gain
 from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.locate import rhythms
-from thermoctl.diagnose.search import metric_of
+from thermoctl.diagnose.remains import metric_of
 from thermoctl.plant import load
 from thermoctl.recording.table import Table
 

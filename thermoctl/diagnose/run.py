@@ -19,10 +19,11 @@ import numpy as np
 
 from thermoctl.diagnose import doubt, experiment, locate
 from thermoctl.diagnose.effects import CATALOGUE, Rig, catalogue
-from thermoctl.diagnose.evidence import LARGE, Colour, possible, white_sigma
+from thermoctl.diagnose.evidence import LARGE, white_sigma
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.diagnose.heldout import held_out, prediction, rms
 from thermoctl.diagnose.outcome import Diagnosis, result
+from thermoctl.diagnose.remains import REMAINS, energy, remains, smooth
 from thermoctl.diagnose.screen import Metric, log_p
 from thermoctl.diagnose.search import (
     ACCEPT,
@@ -30,15 +31,12 @@ from thermoctl.diagnose.search import (
     Round,
     compete,
     counts,
-    energy,
     finalists,
     following,
     inflation,
     look,
-    metric_of,
     prune,
     search,
-    smooth,
     threshold,
 )
 from thermoctl.plant import load, save
@@ -49,9 +47,6 @@ from thermoctl.yamlfile import InputError
 
 NAME = 0.9                  # one explanation is named alone from this probability on
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
-REMAINS = -9.0              # log10 p of an unknown input, in the residual's own colour, from which something is left over
-RHYTHM = -5.0               # the same of a period, whose chance in noise of any colour is what it should be (tests/diagnose)
-UNLIKE_COLOUR, MOST = -30.0, 0.12       # the same in white noise's metric, and its share of the residual's energy beyond white noise
 TEMPERING = 1.9, 3.0        # how much less the score decides than a perfect likelihood would, in white and in coloured noise
 
 
@@ -211,26 +206,6 @@ def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> s
                 f"{base.fit.rms()[guess.output]:.3g} to {best.fit.rms()[guess.output]:.3g}); no sensor reads ahead of time. "
                 "Put the channels on one clock and diagnose again")
     return None
-
-
-def remains(case: Case, e: Explanation) -> locate.Suspect | None:
-    """An unknown input in time, an unknown function of the state, or a rhythm, that still explains more of the residual than noise of any colour
-    that the residual may have would let it; or, in white noise's metric, a good part of what is there beyond white noise: a sensor's
-    colour spreads over many frequencies and follows nothing."""
-    def strongest(colours: Sequence[Colour] | None) -> tuple[locate.Suspect | None, float]:
-        metric = metric_of(case, e, colours)
-        rig = Rig(e.plant, metric.drives, [t.columns for t in case.tables])
-        limit = REMAINS if colours else UNLIKE_COLOUR
-        found = [s for s in (*locate.patterns(metric, rig), *locate.suspects(metric))
-                 if s.log_p < (2 * limit if s.kind == "output" else limit)]         # sensors wander by themselves
-        if not found and colours:       # what follows a signal may ring: a rhythm of its own is said where nothing else explains it
-            found = [s for s in locate.rhythms(metric)[:1] if s.log_p < RHYTHM]
-        return min(found, key=lambda s: s.log_p, default=None), float(metric.residual @ metric.residual) - len(metric.residual)
-    tinted = [strongest(c)[0] for c in possible(e.fit.residuals, [n.sigma for n in case.noise])]
-    if all(tinted):
-        return tinted[0]
-    plain, beyond = strongest(None)
-    return plain if plain and plain.gain > MOST * beyond else None
 
 
 def _unfitted(case: Case) -> dict[str, float]:

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose import locate, observer
+from thermoctl.diagnose import observer
 from thermoctl.diagnose.effects import Candidate, Rig, candidates
-from thermoctl.diagnose.evidence import LARGE, Colour, least_gain
+from thermoctl.diagnose.evidence import LARGE, least_gain
 from thermoctl.diagnose.explain import Case, Explanation, noise_of
 from thermoctl.diagnose.heldout import prediction
+from thermoctl.diagnose.remains import energy, remains, smooth
 from thermoctl.diagnose.screen import Direction, Metric, log_p, screen, sharpened
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Drive, SimulationError
@@ -24,6 +25,7 @@ from thermoctl.yamlfile import InputError
 
 PATIENCE_S = 60.0           # CPU seconds of a diagnosis beyond which it looks at fewer pairs, runners-up and rivals of several effects
 FINALISTS, ALIKE = 12, 8    # refitted after a screening, and of one effect
+BEGINNINGS = 8              # effects, the best first ones, that are looked at for a second one where something remains
 LEADERS = 4                 # effects that are refitted once more where parameters ended at the end of their ranges
 ACCEPT = 12.0               # an effect must lower the score by this much beyond its parameters' price
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
@@ -104,6 +106,7 @@ class Round:
     base: Explanation
     metric: Metric
     rig: Rig
+    entries: Mapping[str, Any]
     directions: list[Direction]
     chance: np.ndarray | None
     inflation: float | None = None
@@ -132,7 +135,7 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
     found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
     noise = np.random.default_rng(1).standard_normal((len(metric.residual), draws)) if draws else None
     ranked, chance = screen(metric, rig, found, noise)
-    return Round(base, metric, rig, ranked, chance)
+    return Round(base, metric, rig, entries, ranked, chance)
 
 
 def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direction]:
@@ -337,21 +340,32 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
             break
         case.progress("screening again")
         rounds.append(look(case, current, entries))
-        if len(current.effects) == 1 and max(case.excess(current).values()) > LARGE and time.process_time() - case.begun < PATIENCE_S:
-            # A first choice made beside other missing physics can be wrong: the runners-up get their second effect, too.
-            best = None
-            others: list[Explanation] = []
-            for other in _runners_up(seen.finalists):
-                again = rounds[-1] if other is current else look(case, other, entries, draws=0)
-                found = compete(case, again, finalists(again.directions, 6))
-                if found and (best is None or found[0].score < best.score):
-                    best, others = found[0], found[1:]
-            if best is not None and best.score < current.score - ACCEPT:
-                current, rivals = best, others
+        if len(current.effects) == 1 and (max(case.excess(current).values()) > LARGE or remains(case, current)):
+            found = otherwise(case, seen, rounds[-1])
+            if found and found[0].score < current.score - ACCEPT:
+                current, rivals = found[0], found[1:]
                 rounds.append(look(case, current, entries))
     if len(current.effects) > 1:
         current, rivals = _backward(case, base, current, rivals, entries)
     return current, rivals, rounds
+
+
+def otherwise(case: Case, seen: Round, after: Round) -> list[Explanation]:
+    """Two effects, best score first: a first choice made beside other missing physics can be wrong, so those that came near it
+    (`seen.finalists`) are looked at again, as the choice itself was (`after`), and the most promising get their second effect, too."""
+    promising = []
+    for e in _runners_up(seen.finalists, BEGINNINGS):
+        if time.process_time() - case.begun > PATIENCE_S:
+            break
+        again = after if e is after.base else look(case, e, after.entries, draws=0)
+        if again.directions:
+            promising.append((e.fit.cost - again.directions[0].gain, again))
+    best: list[Explanation] = []
+    for _, again in sorted(promising, key=lambda p: p[0])[:3]:
+        found = compete(case, again, finalists(again.directions, 6))
+        if found and (not best or found[0].score < best[0].score):
+            best = found
+    return best
 
 
 def following(case: Case, base: Explanation, entries: Mapping[str, Any],
@@ -386,25 +400,6 @@ def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanatio
         if e.last.effect.name not in {o.last.effect.name for o in out}:
             out.append(e)
     return out[:count]
-
-
-def smooth(case: Case, e: Explanation, coloured: bool = False) -> float:
-    """log10 p of the best smooth unknown input at one node or on one sensor; 0 where there is none."""
-    found = locate.suspects(metric_of(case, e, e.colours if coloured else None))
-    return found[0].log_p if found else 0.0
-
-
-def metric_of(case: Case, e: Explanation, colours: Sequence[Colour] | None) -> Metric:
-    """The rows of an explanation's residual, in the metric of colours, one a channel, or in white noise's."""
-    drives = [e.fit.model.drive(t) for t in case.tables]
-    for r, d in enumerate(drives):
-        e.fit.model.prepare(d, e.fit.values[r])
-    return Metric(dataclasses.replace(e.fit, noise=noise_of(colours)) if colours else e.fit, drives)
-
-
-def energy(case: Case, e: Explanation) -> float:
-    """Residual energy beyond the sensors' noise, summed over outputs."""
-    return sum(max(x * x - 1.0, 0.0) for x in case.excess(e).values())
 
 
 def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[Explanation],
