@@ -116,6 +116,13 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         if leader:
             rivals = [current, *(e for e in rivals if e is not leader)]
             current = reference = leader
+    if current.effects and current is reference and remains(case, current):
+        # What leaves something is ruled out by what fits about as well and leaves nothing.
+        near = sorted((e for e in rivals if len(e.effects) == len(current.effects) and abs(e.score - current.score) < ACCEPT), key=lambda e: e.score)
+        whole = next((e for e in near if prediction(case, base, e)[2] < 1.0 and not remains(case, e)), None)
+        if whole:
+            current = reference = whole
+            rivals = [e for e in rivals if e.score > whole.score]
     suspects = locate.suspects(first.metric) if first.directions and first.p_any() < 1e-3 else []
     excess = case.excess(current)
     worst = max(excess.values(), default=0.0)

@@ -346,7 +346,7 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
                 current, rivals = found[0], found[1:]
                 rounds.append(look(case, current, entries))
     if len(current.effects) > 1:
-        current, rivals = _backward(case, base, current, rivals, entries)
+        current, rivals = _backward(case, base, current, rivals, entries, rounds[0].finalists if not start else [])
     return current, rivals, rounds
 
 
@@ -402,10 +402,11 @@ def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanatio
     return out[:count]
 
 
-def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[Explanation],
-              entries: Mapping[str, Any]) -> tuple[Explanation, list[Explanation]]:
+def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[Explanation], entries: Mapping[str, Any],
+              alone: Sequence[Explanation]) -> tuple[Explanation, list[Explanation]]:
     """With several effects: take each one out, look again at what would fill its place, and keep the best. What else could
-    fill a place is a rival, so that each effect's probability is its own."""
+    fill a place is a rival, so that each effect's probability is its own; an effect that is left over by itself has those that
+    competed with it `alone`."""
     for _ in range(2):
         changed = False
         late = time.process_time() - case.begun > 2 * PATIENCE_S
@@ -416,7 +417,11 @@ def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[
                 continue
             if without.score < current.score + ACCEPT / 2:
                 case.progress("one effect is not needed beside the others")
-                return (without if without.score < base.score - ACCEPT else base, [])
+                if without.score > base.score - ACCEPT:
+                    return base, []
+                if len(without.effects) > 1:
+                    return _backward(case, base, without, [], entries, alone)
+                return without, [e for e in alone if len(e.effects) == 1 and e.last.key != without.last.key]
             seen = look(case, without, entries, draws=0)
             found = compete(case, seen, finalists(seen.directions, 4 if late else 8))
             key = current.effects[k].key

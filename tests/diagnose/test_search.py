@@ -1,0 +1,138 @@
+"""How the search goes on from a first choice that another missing effect led astray, and which rivals are kept."""
+import numpy as np
+import pytest
+
+from thermoctl.diagnose import run, search
+from thermoctl.diagnose.effects import catalogue
+from thermoctl.diagnose.explain import Case
+from thermoctl.diagnose.locate import Suspect
+from thermoctl.plant.language import loads
+from thermoctl.recording.table import Table
+
+STAGE = """format: thermoctl-plant/1
+title: Linear stage with a free carriage
+inputs:
+  force: {unit: N}
+parameters:
+  mass: {value: 59, unit: kg, range: [26, 106]}
+  damping: {value: 132, unit: N*s/m, range: [13, 528]}
+nodes:
+  velocity: {unit: m/s, storage: mass, initial: 0}
+  position: {unit: m, storage: 1, initial: 0, initial_sigma: 0.001}
+flows:
+  motor: {into: velocity, rate: force, unit: N}
+  damper: {from: velocity, rate: damping * velocity, unit: N}
+  travel: {into: position, rate: velocity, unit: m/s}
+outputs:
+  encoder: {value: position, unit: m, noise: 5e-6, resolution: 1e-5}
+"""
+
+
+def stage(seeds=(1, 2)):
+    """A stage of 44 kg and 82 N s/m with cogging of 39 mm and a hysteresis before sliding, by small steps of Euler's method."""
+    h, every = 0.0005, 4
+    tables = []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        t = np.arange(4000) * h * every
+        force = np.interp(t, np.arange(0, 9, 0.4), rng.uniform(-8, 8, 23))
+        v = x = strain = 0.0
+        y = np.empty(len(t))
+        for k, f in enumerate(force):
+            y[k] = x
+            for _ in range(every):
+                push = f - 82 * v + 0.02 * np.sin(2 * np.pi * x / 0.039 + 0.7) - 0.006 * strain
+                strain += (v - abs(v) * strain) / 0.0006 * h
+                v += push / 44 * h
+                x += v * h
+        y = np.round((y + rng.normal(0, 5e-6, len(t))) / 1e-5) * 1e-5
+        tables.append(Table(f"run_{seed}", f"run_{seed}", t, {"force": force, "encoder": y}))
+    return tables
+
+
+def entries(*names):
+    return {n: catalogue()[n] for n in names}
+
+
+@pytest.fixture(scope="module")
+def looked():
+    """The stage's case, its refit and a first look in which hysteresis, cogging and a reading that steps competed."""
+    case = Case(loads(STAGE), stage())
+    base = case.explain(case.plant, [], [])
+    seen = search.look(case, base, entries("cogging", "backlash_hysteresis", "sensor_offset_step"))
+    seen.finalists = search.compete(case, seen, search.finalists(seen.directions))
+    return case, base, seen
+
+
+def names(explanation):
+    return {c.effect.name for c in explanation.effects}
+
+
+def test_a_wrong_first_choice_is_mended_by_the_second_effects_of_those_that_came_near(looked):
+    case, _, seen = looked
+    wrong = next(e for e in seen.finalists if names(e) == {"sensor_offset_step"})
+    found = search.otherwise(case, seen, search.look(case, wrong, seen.entries, draws=0))
+    assert names(found[0]) == {"cogging", "backlash_hysteresis"}
+    assert {q: found[0].plant.parameters[q].value for q in found[0].plant.parameters if q[:2] in ("P_", "A_")} == pytest.approx(
+        {"P_cogging_velocity": 0.039, "A_cogging_velocity": 0.02}, rel=0.02)
+    case.begun -= 2 * search.PATIENCE_S         # later than it has patience for
+    assert search.otherwise(case, seen, search.look(case, wrong, seen.entries, draws=0)) == []
+    case.begun += 2 * search.PATIENCE_S
+
+
+def test_an_effect_that_is_left_by_itself_keeps_those_that_competed_with_it(looked, monkeypatch):
+    case, base, seen = looked
+    best, *others = seen.finalists
+    second = next(e for e in others if names(e) != names(best))
+    beside = search.compete(case, search.look(case, best, entries(*names(second)), draws=0),
+                            search.look(case, best, entries(*names(second)), draws=0).directions[:1])[0]
+    monkeypatch.setattr(search, "leave_out", lambda case, base, current, k: best)
+    beside.score = best.score               # no better than without
+    kept, rivals = search._backward(case, base, beside, [], seen.entries, seen.finalists)
+    assert kept is best and rivals and all(r in others and names(r) != names(best) for r in rivals)
+
+
+def test_what_leaves_something_gives_way_to_what_fits_alike_and_leaves_nothing(monkeypatch):
+    """Natural convection and radiation from a block fit alike; which of them leaves something is said by the test."""
+    case = heated()
+    left = {}
+    for spoilt in ("natural_convection", "radiation"):
+        def remains(case, e, spoilt=spoilt):
+            return Suspect("node", "block", 60.0, 3) if spoilt in names(e) else None
+        monkeypatch.setattr(run, "remains", remains)
+        left[spoilt] = names(run.examine(case, entries("natural_convection", "radiation")).final)
+    assert left == {"natural_convection": {"radiation"}, "radiation": {"natural_convection"}}
+
+
+HEATER = """format: thermoctl-plant/1
+title: A heated block
+inputs:
+  heat: {unit: W}
+  air: {unit: degC, between_samples: linear}
+parameters:
+  C: {value: 6, unit: J/K, range: [2, 14]}
+  G: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
+nodes:
+  block: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}
+flows:
+  power: {into: block, rate: heat, unit: W}
+  loss: {from: block, rate: G * (block - air), unit: W}
+outputs:
+  temperature: {value: block, unit: degC, noise: 0.1}
+"""
+
+
+def heated():
+    """Two recordings of a block that natural convection cools, too."""
+    tables = []
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0.0, 1600.0, 2.0)
+        heat = rng.permutation([0.0, 2.5, 0.8, 0.0, 1.6, 3.0, 0.0, 2.0])[(t // 200).astype(int)]
+        air, x = 21.5 + 0.4 * np.sin(t / 700 + seed), np.empty(len(t))
+        x[0] = air[0]
+        for k in range(len(t) - 1):         # a hundredth of the time constant a step
+            over = x[k] - air[k]
+            x[k + 1] = x[k] + 2.0 * (heat[k] - 0.04 * over - 0.0008 * over * abs(over) ** 0.25) / 5.2
+        tables.append(Table(f"run_{seed}", f"run_{seed}", t, {"heat": heat, "air": air, "temperature": x + rng.normal(0, 0.1, len(t))}))
+    return Case(loads(HEATER), tables)
