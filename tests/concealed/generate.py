@@ -41,7 +41,7 @@ _PERIOD += "one one pair one none one one none one none one unknown one one none
 KINDS = tuple(_PERIOD.split())
 ATTEMPTS = 24
 STEP = 2e-4  # of a parameter's range, for the derivatives by which a refit is judged
-CHUNK = 24  # rivals measured at a time: a large rig's signals are hundreds of megabytes
+ROOM = 20e6  # numbers that the rivals measured at a time may fill: a large rig's signals are hundreds of megabytes
 FIXED = ("copper_resistance", "resistance_temperature")  # copper's coefficient: the drive's strength decides how visible
 
 
@@ -151,8 +151,9 @@ class Bench:
         """For each left-over signal (M,): every suspect of the rig at a place, and what it would leave of the signal."""
         found: list[list[tuple[Suspect, float]]] = [[] for _ in signals]
         rivals = self.scene.suspects
-        for begin in range(0, len(rivals), CHUNK):
-            part = rivals[begin : begin + CHUNK]
+        chunk = max(8, int(ROOM / sum(2 * y.size for y in self.base)))
+        for begin in range(0, len(rivals), chunk):
+            part = rivals[begin : begin + chunk]
             rows = [Variant(effects=[(s.effect, s.where, s.make(z * min(1, s.top)))]) for s in part for z in (0.1, 1)]
             d = [self.scene.outputs_of(k, rows) - self.base[k] for k in range(len(self.scene.runs))]
             left = self.judge.left_over(self.judge.whiten(d))
