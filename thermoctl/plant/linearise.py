@@ -53,15 +53,19 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
         if column not in outputs:
             raise InputError(f"{plant.file}: no output for the column '{column}'; a compensator needs all twelve "
                              f"temperatures and {ERROR}")
-    nodes = list(plant.nodes)
+    nodes = list(plant.nodes)           # those that are states: the rest stays where it was
     point: dict[str, float] = {p.name: p.value for p in plant.parameters.values()} | {i: 0.0 for i in plant.inputs} \
         | {n: at_c for n in nodes} | {inputs[AIR]: at_c, "t": 0.0}
-    slopes = []
+    slopes, capacities = [], []
     for n in plant.nodes.values():
         net = ex.ZERO
         for f in plant.flows.values():
             net = ex.add(net, f.rate if f.target == n.name else ex.neg(f.rate) if f.source == n.name else ex.ZERO)
+        if net is ex.ZERO:              # nothing flows: it remembers the start, from which growth is counted anyway
+            nodes.remove(n.name)
+            continue
         slopes.append(ex.div(net, n.storage))
+        capacities.append(n.storage)
 
     def values(exprs: list[ex.Expr], where: dict[str, float]) -> np.ndarray:
         return np.array([float(ex.evaluate(e, where)) for e in exprs])
@@ -78,7 +82,7 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
     a = values([ex.derivative(growth, n) for n in nodes], point)
     air = float(a.sum()) + float(ex.evaluate(ex.derivative(growth, inputs[AIR]), point))
     variance = np.array([(outputs[c].noise or 0.0) ** 2 + (outputs[c].resolution or 0.0) ** 2 / 12 for c in TEMPERATURES])
-    capacity = values([n.storage for n in plant.nodes.values()], point)
+    capacity = values(capacities, point)
     return Thermal(A, one_watt - rest, C, a, air, capacity, np.where(variance > 0, variance, 1e-4))
 
 
