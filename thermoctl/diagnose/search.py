@@ -26,6 +26,7 @@ from thermoctl.yamlfile import InputError
 PATIENCE_S = 60.0           # CPU seconds of a diagnosis beyond which it looks at fewer pairs, runners-up and rivals of several effects
 FINALISTS, ALIKE = 12, 8    # refitted after a screening, and of one effect
 BEGINNINGS = 8              # effects, the best first ones, that are looked at for a second one where something remains
+SPONGE = 1.1                # an unknown function of time that leaves much has to fit better than constant physics by this factor in cost
 LEADERS = 4                 # effects that are refitted once more where parameters ended at the end of their ranges
 ACCEPT = 12.0               # an effect must lower the score by this much beyond its parameters' price
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
@@ -203,7 +204,16 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
     done = [better.get(id(e), e) for e in done]
     case.reprice([seen.base, *done])
     done.sort(key=lambda e: e.score)
+    first = next((e for e in done if done[0].fit.cost > e.fit.cost / SPONGE and not _soaks(case, e)), None)
+    if first and _soaks(case, done[0]):
+        done.remove(first)
+        done.insert(0, first)
     return done
+
+
+def _soaks(case: Case, e: Explanation) -> bool:
+    """Is the effect added last an unknown function of time beside which much remains? It soaks up whatever else is missing."""
+    return any(p.per_recording for p in e.last.effect.parameters) and max(case.excess(e).values()) > LARGE
 
 
 def _released(case: Case, e: Explanation, goal: float) -> Explanation:
@@ -286,10 +296,11 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
     gain = seen.base.raw - e.raw
     if 0 < gain < MARGINAL:
         gain = min(gain, least_gain(seen.base.fit.residuals, e.fit.residuals, [n.sigma for n in case.noise]))
-        if seen.inflation is None:      # beside what was found: an effect that is found inflates no longer
-            plain = {k: f for k, f in entries.items() if not f.shapes}
-            seen.inflation = inflation(look(case, e, plain, draws=0, coloured=True).directions)
-        gain /= seen.inflation
+        if max(case.excess(e).values()) <= LARGE:       # what remains may be noise; beyond that it is other physics
+            if seen.inflation is None:      # beside what was found: an effect that is found inflates no longer
+                plain = {k: f for k, f in entries.items() if not f.shapes}
+                seen.inflation = inflation(look(case, e, plain, draws=0, coloured=True).directions)
+            gain /= seen.inflation
     if seen.chance is None:
         return e.score < seen.base.score - ACCEPT
     alone = len(e.effects) == len(seen.base.effects) + 1        # two at once leave a residual white more easily
@@ -354,7 +365,7 @@ def otherwise(case: Case, seen: Round, after: Round) -> list[Explanation]:
     """Two effects, best score first: a first choice made beside other missing physics can be wrong, so those that came near it
     (`seen.finalists`) are looked at again, as the choice itself was (`after`), and the most promising get their second effect, too."""
     promising = []
-    for e in _runners_up(seen.finalists, BEGINNINGS):
+    for e in (e for e in _runners_up(seen.finalists, BEGINNINGS) if e is after.base or not _soaks(case, e)):
         if time.process_time() - case.begun > PATIENCE_S:
             break
         again = after if e is after.base else look(case, e, after.entries, draws=0)
