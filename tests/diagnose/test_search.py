@@ -104,6 +104,35 @@ def test_what_leaves_something_gives_way_to_what_fits_alike_and_leaves_nothing(m
     assert left == {"natural_convection": {"radiation"}, "radiation": {"natural_convection"}}
 
 
+def test_an_unknown_function_of_time_that_leaves_much_gives_way_to_constant_physics_that_fits_alike(monkeypatch):
+    case = heated()
+    base = case.explain(case.plant, [], [])
+    seen = search.look(case, base, entries("natural_convection", "radiation", "second_ambient"), draws=0)
+    done = {next(iter(names(e))): e for e in search.compete(case, seen, search.finalists(seen.directions))}
+    soaking, constant = done["second_ambient"], done["radiation"]
+    soaking.score = min(e.score for e in done.values()) - 50
+    assert search._ordered(case, [constant, soaking])[0] is soaking             # nothing remains beside it
+    monkeypatch.setattr(case, "excess", lambda e: {"temperature": 9.0})
+    assert search._ordered(case, [constant, soaking]) == [constant, soaking]
+    constant.fit.cost = 2 * soaking.fit.cost
+    assert search._ordered(case, [constant, soaking])[0] is soaking             # it fits much better
+    assert search._ordered(case, []) == []
+
+
+def test_other_missing_physics_is_no_inflated_noise(monkeypatch):
+    """Where much remains beside an effect, the gains of the rest of the catalogue say nothing of noise."""
+    case = heated()
+    base = case.explain(case.plant, [], [])
+    seen = search.look(case, base, entries("natural_convection"))
+    found = search.compete(case, seen, search.finalists(seen.directions))[0]
+    seen.inflation = 1e9
+    monkeypatch.setattr(search, "MARGINAL", 1e9)        # both ways by which a gain as large as this one counts anyway
+    monkeypatch.setattr(search, "NO_COLOUR", -1e9)
+    assert not search.counts(case, seen, found, seen.entries)
+    monkeypatch.setattr(case, "excess", lambda e: {"temperature": 9.0})
+    assert search.counts(case, seen, found, seen.entries)
+
+
 HEATER = """format: thermoctl-plant/1
 title: A heated block
 inputs:

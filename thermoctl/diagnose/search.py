@@ -203,12 +203,16 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
         better = {id(e): found for e, found in zip(leaders, pool.map(lambda e: _released(case, e, goal), leaders), strict=True)}
     done = [better.get(id(e), e) for e in done]
     case.reprice([seen.base, *done])
-    done.sort(key=lambda e: e.score)
-    first = next((e for e in done if done[0].fit.cost > e.fit.cost / SPONGE and not _soaks(case, e)), None)
-    if first and _soaks(case, done[0]):
-        done.remove(first)
-        done.insert(0, first)
-    return done
+    return _ordered(case, done)
+
+
+def _ordered(case: Case, done: Sequence[Explanation]) -> list[Explanation]:
+    """Best score first; but what soaks up whatever is missing gives way to constant physics that fits about as well."""
+    ordered = sorted(done, key=lambda e: e.score)
+    if ordered and _soaks(case, ordered[0]):
+        rival = next((e for e in ordered if e.fit.cost < SPONGE * ordered[0].fit.cost and not _soaks(case, e)), None)
+        ordered = [rival, *(e for e in ordered if e is not rival)] if rival else ordered
+    return ordered
 
 
 def _soaks(case: Case, e: Explanation) -> bool:
