@@ -32,6 +32,7 @@ from tests.concealed import generate, sensors  # noqa: E402
 from tests.concealed.judge import snr  # noqa: E402
 from tests.concealed.rig import Scene  # noqa: E402
 from thermoctl.diagnose import run as diagnosis  # noqa: E402
+from thermoctl.diagnose.prove import program  # noqa: E402
 from thermoctl.evaluate.iso230 import mean_and_two_s  # noqa: E402
 from thermoctl.plant import load, save  # noqa: E402
 from thermoctl.plant.linearise import linearise  # noqa: E402
@@ -146,10 +147,11 @@ def unseen(plant_file: Path, recording: Path) -> dict[str, float]:
 
 
 def tell(story: Story, seed: int, out: Path) -> dict[str, Any]:
-    """The chain for one effect; kept in OUT/EFFECT/result.json."""
+    """The chain for one effect; kept in OUT/EFFECT/result.json for the same seed and program."""
     folder = out / story.effect
-    if (folder / "result.json").exists():
-        return json.loads((folder / "result.json").read_text())
+    made_by = {"seed": seed, "program": program()}
+    if (folder / "result.json").exists() and made_by.items() <= (kept := json.loads((folder / "result.json").read_text())).items():
+        return kept
     say(f"{story.effect}: concealed in a {story.family}")
     scene, effect, true, sigmas = conceal(story, seed, folder)
     begun = time.monotonic()
@@ -161,7 +163,8 @@ def tell(story: Story, seed: int, out: Path) -> dict[str, Any]:
     drives = [model.drive(read_table(folder / "run_1.csv"))]
     save(updated(plant, fit(model, drives), drives), folder / "refitted.yaml")
     files = {"as it came": folder / "plant.yaml", "refitted": folder / "refitted.yaml", "extended": folder / "diagnosis" / "plant.yaml"}
-    told: dict[str, Any] = {**dataclasses.asdict(story), "sigmas": sigmas, "true": effect[2], "verdict": result["verdict"], "seconds": seconds,
+    told: dict[str, Any] = {**made_by, **dataclasses.asdict(story), "sigmas": sigmas, "true": effect[2],
+                            "verdict": result["verdict"], "seconds": seconds,
                             "findings": [[f["effect"], f["where"], f["probability"]] for f in result["findings"]],
                             "fit": {}, "position_um": {}, "curves": {}}
     for name, file in files.items():

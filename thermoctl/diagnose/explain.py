@@ -14,6 +14,7 @@ import numpy as np
 
 from thermoctl.diagnose.effects import PLACES, Candidate
 from thermoctl.diagnose.evidence import Colour, channels
+from thermoctl.diagnose.locate import Suspect
 from thermoctl.diagnose.screen import Direction
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
@@ -67,6 +68,7 @@ class Case:
         self.begun = time.process_time()
         self.noise = tuple(noise or default_noise(plant, self.drives))
         self.unseen: dict[tuple[int, bool], tuple[Plant, list[np.ndarray]]] = {}        # held-out errors that are known (heldout.py)
+        self.left: dict[int, tuple[Explanation, Suspect | None]] = {}       # what explanations leave, where it is known (remains.py)
         self.spread = SPREAD[1]     # how far the plant's parameters lie from what was believed, in shares of their ranges
 
     def drives_of(self, e: Explanation) -> list[Drive]:

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,13 +45,26 @@ class Job:
 
     def fingerprint(self) -> str:
         """Of the contents of all inputs and of the program that diagnoses: a result of other code is not this job's."""
-        package = Path(__file__).parents[1]
-        code = [f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.py*"))]
-        entries = [f for folder in (CATALOGUE, *map(Path, self.effects)) for f in sorted(folder.glob("*.yaml"))]
-        digest = hashlib.sha256()
-        for path in (*map(Path, (self.plant, *self.recordings)), *entries, *code):
-            digest.update(hashlib.sha256(path.read_bytes()).digest())
-        return digest.hexdigest()
+        entries = [f for folder in map(Path, self.effects) for f in sorted(folder.glob("*.yaml"))]
+        return _digest((*map(Path, (self.plant, *self.recordings)), *entries, *_program()))
+
+
+def program() -> str:
+    """The fingerprint of the program that diagnoses, with its catalogue: a result of another one is out of date."""
+    return _digest(_program())
+
+
+def _program() -> list[Path]:
+    package = Path(__file__).parents[1]
+    code = [f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.py*"))]
+    return [*sorted(CATALOGUE.glob("*.yaml")), *code]
+
+
+def _digest(paths: Iterable[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
 
 
 def find_jobs(folder: str | Path, number: int | None = None, apart: Sequence[str] = ()) -> list[Job]:

@@ -37,7 +37,13 @@ def smooth(case: Case, e: Explanation, coloured: bool = False) -> float:
 def remains(case: Case, e: Explanation) -> locate.Suspect | None:
     """An unknown input in time, an unknown function of the state, or a rhythm, that still explains more of the residual than noise of any colour
     that the residual may have would let it; or, in white noise's metric, a good part of what is there beyond white noise: a sensor's
-    colour spreads over many frequencies and follows nothing."""
+    colour spreads over many frequencies and follows nothing. Kept by the case: search and verdict ask for the same ones."""
+    if id(e) not in case.left:
+        case.left[id(e)] = (e, _remains(case, e))
+    return case.left[id(e)][1]
+
+
+def _remains(case: Case, e: Explanation) -> locate.Suspect | None:
     def strongest(colours: Sequence[Colour] | None) -> tuple[locate.Suspect | None, float]:
         metric = metric_of(case, e, colours)
         rig = Rig(e.plant, metric.drives, [t.columns for t in case.tables])

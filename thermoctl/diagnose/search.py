@@ -355,7 +355,8 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
             break
         case.progress("screening again")
         rounds.append(look(case, current, entries))
-        if len(current.effects) == 1 and (max(case.excess(current).values()) > LARGE or remains(case, current)):
+        if len(current.effects) == 1 and time.process_time() - case.begun < PATIENCE_S \
+                and (max(case.excess(current).values()) > LARGE or remains(case, current)):
             found = otherwise(case, seen, rounds[-1])
             if found and found[0].score < current.score - ACCEPT:
                 current, rivals = found[0], found[1:]
