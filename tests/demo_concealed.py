@@ -82,7 +82,8 @@ def conceal(story: Story, seed: int, folder: Path) -> tuple[Scene, tuple[str, st
     bench.measure(held)
     size = generate._size_for(bench.curve[0], min(SIGMAS, 0.95 * float(np.max(snr(bench.curve[0][2])))))
     effect = (story.effect, story.where, held[0].make(size))
-    left, true = bench.left_of([effect])
+    true = bench.readings([effect])
+    left = bench.refit(true)
     tables = []
     for k, recording in enumerate(scene.runs):
         columns = [("t", recording["t"]), *((c, recording[key]) for c, key in scene.columns.items())]

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.optimize import lsq_linear
 
 from tests.concealed import sensors
 from tests.concealed.judge import BANDS, TELL_APART, Judge, beyond, snr
@@ -41,6 +42,9 @@ _PERIOD += "one one pair one none one one none one none one unknown one one none
 KINDS = tuple(_PERIOD.split())
 ATTEMPTS = 24
 STEP = 2e-4  # of a parameter's range, for the derivatives by which a refit is judged
+REFIT = 4  # steps of Gauss and Newton that an honest refit may take
+STRIDES = (1.0, 0.6, 0.3, 0.1)  # lengths of a step that are tried
+RESIZED = 3  # times a size is chosen again because a refit from the truth's model leaves another signal than a straight one
 ROOM = 20e6  # numbers that the rivals measured at a time may fill: a large rig's signals are hundreds of megabytes
 FIXED = ("copper_resistance", "resistance_temperature")  # copper's coefficient: the drive's strength decides how visible
 
@@ -113,39 +117,80 @@ class Bench:
             )
         self.judge = Judge(spectra)
 
+    def _variants(self, x: np.ndarray) -> list[Variant]:
+        """By run: the truth with its parameters and starts moved by x (np,), in quarters of their ranges and sigmas."""
+        scene, n = self.scene, len(self.scene.ranges)
+        moved = zip(scene.ranges.items(), x, strict=False)
+        theta = {p: scene.theta[p] + v * (high - low) / 4 for (p, (low, high)), v in moved}
+        starts = x[n:].reshape(len(scene.runs), -1)
+        return [Variant(theta, {p: v * s for (p, s), v in zip(scene.starts.items(), row, strict=True)}) for row in starts]
+
+    def _at(self, points: list[np.ndarray]) -> list[np.ndarray]:
+        """Noiseless readings (m, N, ny) by run at these parameters and starts."""
+        rows = [self._variants(x) for x in points]
+        return [self.scene.outputs_of(k, [r[k] for r in rows]) for k in range(len(self.scene.runs))]
+
+    def tangents(self, x: np.ndarray) -> np.ndarray:
+        """Whitened derivatives (np, M) at x (np,) by the parameters and by the starts of each run."""
+        n, ns, runs = len(self.scene.ranges), len(self.scene.starts), range(len(self.scene.runs))
+        h = np.append(np.full(n, 4 * STEP), np.full(ns, 0.1))
+        moved = []
+        for k in runs:
+            points = np.tile(x, (1 + n + ns, 1))
+            own = np.append(np.arange(n), n + k * ns + np.arange(ns))
+            points[1 + np.arange(n + ns), own] += h
+            y = self.scene.outputs_of(k, [self._variants(p)[k] for p in points])
+            moved.append((y[1:] - y[:1]) / h[:, None, None])
+        whole = [self.judge.whiten([d[:n] for d in moved])]
+        for k in runs:  # each run has its own start
+            whole.append(self.judge.whiten([d[n:] if j == k else np.zeros_like(d[n:]) for j, d in enumerate(moved)]))
+        return np.concatenate(whole)
+
+    def _whitened(self, readings: list[np.ndarray], models: list[np.ndarray]) -> np.ndarray:
+        """Whitened differences (m, M) of readings (N, ny by run) from each of the models' rows (m, N, ny)."""
+        return self.judge.whiten([y - m for y, m in zip(readings, models, strict=True)])
+
     def measure(self, pool: list[Suspect]) -> None:
-        """What a refit leaves of each of `pool` at SIZES (`curve`: suspect, sizes, rows), all in one batch per run."""
+        """What a straight refit leaves of each of `pool` at SIZES (`curve`: suspect, sizes, rows)."""
         scene = self.scene
-        rows, steps = [Variant()], []
-        for name, (low, high) in scene.ranges.items():
-            steps.append(STEP * (high - low))
-            rows.append(Variant(theta={name: scene.theta[name] + steps[-1]}))
-        n_theta = len(rows)
-        rows += [Variant(start={n: 0.1 * s}) for n, s in scene.starts.items()]
-        n_nuisance = len(rows)
-        sized = [(s, [z for z in SIZES if z <= s.top]) for s in pool]
-        for s, sizes in sized:
-            rows += [Variant(effects=[(s.effect, s.where, s.make(z))]) for z in sizes]
-        runs = [scene.outputs_of(k, rows) for k in range(len(scene.runs))]
-        self.base = [y[0] for y in runs]
-        d = [y - y[:1] for y in runs]
-        tangents = [d[k][1:n_theta] / np.array(steps)[:, None, None] for k in range(len(runs))]
-        scale = np.array([(h - lo) / 4 for lo, h in scene.ranges.values()])
-        whole = [self.judge.whiten([x * scale[:, None, None] for x in tangents])] if len(scale) else []
-        for k in range(len(runs)):  # each run has its own start
-            alone = [
-                np.zeros_like(d[j][n_theta:n_nuisance]) if j != k else d[j][n_theta:n_nuisance] / 0.1
-                for j in range(len(runs))
-            ]
-            if n_nuisance > n_theta:
-                whole.append(self.judge.whiten(alone))
-        self.judge.set_parameters(np.concatenate(whole))
-        left = self.judge.left_over(self.judge.whiten([x[n_nuisance:] for x in d]))
-        at = 0
-        self.curve = []
-        for s, sizes in sized:
-            self.curve.append((s, np.array(sizes), left[at : at + len(sizes)]))
-            at += len(sizes)
+        self.base = self.readings([])
+        self.derivatives = self.tangents(np.zeros(len(scene.ranges) + len(scene.runs) * len(scene.starts)))
+        self.judge.set_parameters(self.derivatives)
+        sized = [(s, np.array([z for z in SIZES if z <= s.top])) for s in pool]
+        rows = [Variant(effects=[(s.effect, s.where, s.make(z))]) for s, sizes in sized for z in sizes]
+        d = [scene.outputs_of(k, rows) - base if rows else np.zeros((0, *base.shape)) for k, base in enumerate(self.base)]
+        left = self.judge.left_over(self.judge.whiten(d))
+        ends = np.cumsum([len(sizes) for _, sizes in sized])
+        self.curve = [(s, z, left[end - len(z) : end]) for (s, z), end in zip(sized, ends, strict=True)]
+
+    def refit(self, readings: list[np.ndarray]) -> np.ndarray:
+        """What an honest refit leaves of these readings (N, ny by run): least squares over all parameters, inside their
+        ranges, and starts, with the truth's own model; whitened, with the ridge behind (M + np,)."""
+        scene, free = self.scene, len(self.derivatives)
+        walls = np.full((2, free), [[-np.inf], [np.inf]])
+        for j, (p, (low, high)) in enumerate(scene.ranges.items()):
+            walls[:, j] = np.array([min(low - scene.theta[p], 0), max(high - scene.theta[p], 0)]) * 4 / (high - low)
+        x, slope = np.zeros(free), self.derivatives
+        left = self._whitened(readings, [b[None] for b in self.base])[0]
+        cost = float(snr(left))
+        for _ in range(REFIT):
+            # least squares of  left - slope' step  and of the ridge  x + step,  on the triangle of a QR decomposition
+            wide = np.concatenate([np.concatenate([slope, -np.eye(free)], axis=1).T, np.append(left, x)[:, None]], axis=1)
+            triangle = np.linalg.qr(wide, mode="r")
+            step = lsq_linear(triangle[:-1, :-1], triangle[:-1, -1], (walls[0] - x - 1e-9, walls[1] - x + 1e-9)).x
+            hoped = float(np.linalg.norm(triangle[:, -1] - triangle[:, :-1] @ step))
+            trial = [x + a * step for a in STRIDES]
+            rows = self._whitened(readings, self._at(trial))
+            costs = np.hypot(snr(rows), snr(np.array(trial)))
+            best = int(np.nanargmin(costs))
+            if not costs[best] < cost:
+                break
+            gain, cost = cost - costs[best], float(costs[best])
+            x, left = trial[best], rows[best]
+            if cost < 1.03 * hoped or gain < 0.05 * cost:
+                break
+            slope = self.tangents(x)
+        return np.append(left, -x)
 
     def beyond_rivals(self, signals: list[np.ndarray]) -> list[list[tuple[Suspect, float]]]:
         """For each left-over signal (M,): every suspect of the rig at a place, and what it would leave of the signal."""
@@ -162,11 +207,9 @@ class Bench:
                     row.append((s, beyond(signal, left[2 * i : 2 * i + 2])))
         return found
 
-    def left_of(self, effects: list[tuple[str, str, dict]]) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Left-over row (M,) and readings of the truth with these effects."""
-        runs = [self.scene.outputs_of(k, [Variant(effects=effects)])[0] for k in range(len(self.scene.runs))]
-        d = self.judge.whiten([(y - b)[None] for y, b in zip(runs, self.base, strict=True)])
-        return self.judge.left_over(d)[0], runs
+    def readings(self, effects: list[tuple[str, str, dict]]) -> list[np.ndarray]:
+        """Noiseless readings (N, ny) of the truth with these effects, by run."""
+        return [self.scene.outputs_of(k, [Variant(effects=effects)])[0] for k in range(len(self.scene.runs))]
 
 
 def _alike(rivals: list[tuple[Suspect, float]], truth: Suspect) -> list[tuple[str, str]]:
@@ -267,8 +310,7 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
     kind = slot.kind
     told: dict = {"alike": [], "band": None, "snr": [], "onset": None, "aliases": []}
     if kind == "none":
-        bench.base = [scene.outputs_of(k, [Variant()])[0] for k in range(len(scene.runs))]
-        return ([], bench.base, told, bench), None
+        return ([], bench.readings([]), told, bench), None
     pool = scene.unknowns if kind == "unknown" else scene.suspects
     names = sorted({s.effect for s in pool})  # every effect alike, whatever its number of places
     picks = [slot.effect] if slot.effect else list(rng.permutation(names))[: 4 if kind == "unknown" else 8]
@@ -280,14 +322,22 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
     low, high = BANDS[band]
     seen = None
     for curve in bench.curve:
-        size = _size_for(curve, float(np.exp(rng.uniform(np.log(low * 1.1), np.log(high * 0.9)))))
+        target = float(np.exp(rng.uniform(np.log(low * 1.1), np.log(high * 0.9))))
+        size = _size_for(curve, target)
         s = curve[0]
         if size is None:
             seen = float(np.max(snr(curve[2])))
             continue
-        effects = [(s.effect, s.where, s.make(size))]
-        left, runs = bench.left_of(effects)
-        seen = float(snr(left))
+        for _ in range(RESIZED):
+            effects = [(s.effect, s.where, s.make(size))]
+            runs = bench.readings(effects)
+            left = bench.refit(runs)
+            seen = float(snr(left))
+            if low <= seen < high * (4 if band == "large" else 1):
+                break
+            size *= float(np.clip(target / max(seen, 1e-3), 0.2, 5.0))
+            if size > s.top:  # a refit swallows it at any sensible size
+                break
         if not low <= seen < high * (4 if band == "large" else 1):
             continue
         rivals = bench.beyond_rivals([left])[0]
@@ -323,8 +373,9 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
         return None
     _, one, two, sizes = best
     effects = [(s.effect, s.where, s.make(z)) for s, z in zip((one, two), sizes, strict=True)]
-    alone = [bench.left_of([e])[0] for e in effects]
-    left, runs = bench.left_of(effects)
+    alone = [bench.refit(bench.readings([e])) for e in effects]
+    runs = bench.readings(effects)
+    left = bench.refit(runs)
     if snr(left) < 6 or not 10 < min(map(snr, alone)) <= max(map(snr, alone)) < 240:
         return None
     if kind == "cancel" and snr(left) ** 2 > 0.75 * sum(snr(a) ** 2 for a in alone):

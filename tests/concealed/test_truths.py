@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
 
 from tests.concealed import generate, rigs_motion, rigs_tanks, rigs_thermal, sensors, thermal
 from tests.concealed.judge import Judge, beyond, snr
@@ -134,6 +135,30 @@ def test_what_a_refit_leaves_does_not_hang_on_the_step_of_its_derivatives(family
         bench.measure([next(s for s in scene.suspects if s.effect == "sensor_drift")])
         found.append(snr(bench.curve[0][2]))
     assert np.allclose(*found, rtol=0.05)
+
+
+@pytest.mark.parametrize("family", ["tanks", "heater"])
+def test_an_honest_refit_leaves_what_scipy_leaves(family):
+    """Of a large effect and moved parameters: the same sigmas as least squares of scipy's own, and never more than the
+    moved parameters themselves are worth where nothing is missing."""
+    scene = generate.FAMILIES[family].scene(np.random.default_rng(7), "designed", True)
+    bench = generate.Bench(scene, np.random.default_rng(7))
+    bench.measure([])
+    free, n = len(bench.derivatives), len(scene.ranges)
+    moved = np.append(np.full(n, 0.3), np.zeros(free - n))
+    assert snr(bench.refit([y[0] for y in bench._at([moved])])) < np.linalg.norm(moved) + 0.3
+    s = next(x for x in scene.suspects if x.effect in ("orifice_exponent", "radiation"))
+    readings = bench.readings([(s.effect, s.where, s.make(s.top))])
+
+    def residual(x):
+        return np.append(bench._whitened(readings, bench._at([x]))[0], x)
+
+    walls = [
+        np.array([(r[i] - scene.theta[p]) * 4 / (r[1] - r[0]) for p, r in scene.ranges.items()] + [e * np.inf] * (free - n))
+        for i, e in ((0, -1), (1, 1))
+    ]
+    peer = least_squares(residual, np.zeros(free), bounds=walls, diff_step=1e-4, xtol=1e-6)
+    assert snr(bench.refit(readings)) == pytest.approx(np.sqrt(2 * peer.cost), rel=0.05)
 
 
 def test_size_is_what_a_refit_leaves_in_sigmas():
