@@ -8,8 +8,9 @@ whitened difference an effect makes,
 
 so white noise of sd s on N samples gives SNR = rms(r) sqrt(N) / s, and the SNR is the expected value of an ideal
 single-effect test statistic in standard deviations. This straight line chooses a size; what an effect of that size leaves
-is then measured by a refit that follows the curve and respects the ranges (`generate.Bench.refit`): of 5 effects of a
-straight 10 to 25 sigmas such a refit swallowed 4, and where a range is a wall it leaves more than the line says. Bands: small 3-6, middle 6-15, large above 15. Two
+is then measured by a refit that follows the curve and respects the ranges (`generate.Bench.refit`): it can swallow four
+fifths of what the line says (a hidden thermal mass, 24.7 to 5.1 sigmas), or leave more, where a range is a wall.
+Bands: small 3-6, middle 6-15, large above 15. Two
 explanations are `nearly the same` when less than 3.5 of the true one's signal is left after the other, too, is fitted.
 """
 
