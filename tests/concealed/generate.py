@@ -15,7 +15,7 @@ import hashlib
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -35,6 +35,7 @@ FAMILIES = {f.name: f for f in (Heater(), FreeStage(), Drive(), Flexure(), Tanks
 SCHEDULES = ("production-like", "designed", "warm-up", "designed")
 # physics outside the catalogue must leave this many sigmas after every single catalogue effect, or nobody can tell
 STRANGE = 8.0
+ONSETS = 24  # times from which an effect that begins once is tried against it
 SIZES = 10.0 ** np.arange(-2.0, 1.51, 0.5)
 # one period of kinds: 600 cases hold 150 of nothing missing, 360 single effects, 45 unknown, 30 pairs, 15 that cancel
 _PERIOD = "one none one one none one one unknown one none one pair one one none one one unknown one none "
@@ -192,10 +193,14 @@ class Bench:
             slope = self.tangents(x)
         return np.append(left, -x)
 
-    def beyond_rivals(self, signals: list[np.ndarray]) -> list[list[tuple[Suspect, float]]]:
-        """For each left-over signal (M,): every suspect of the rig at a place, and what it would leave of the signal."""
+    def beyond_rivals(self, signals: list[np.ndarray], onsets: int = 1) -> list[list[tuple[Suspect, float]]]:
+        """For each left-over signal (M,): every suspect of the rig at a place, and what it would leave of the signal.
+        More than one of `onsets`: what begins at some time is tried from that many times."""
         found: list[list[tuple[Suspect, float]]] = [[] for _ in signals]
-        rivals = self.scene.suspects
+        rivals = list(self.scene.suspects)
+        if onsets > 1:
+            end = max(float(run["t"][-1]) for run in self.scene.runs)
+            rivals += [_begun(s, t) for s in rivals if s.onset for t in np.linspace(0, end, onsets + 2)[1:-1]]
         chunk = max(8, int(ROOM / sum(2 * y.size for y in self.base)))
         for begin in range(0, len(rivals), chunk):
             part = rivals[begin : begin + chunk]
@@ -210,6 +215,17 @@ class Bench:
     def readings(self, effects: list[tuple[str, str, dict]]) -> list[np.ndarray]:
         """Noiseless readings (N, ny) of the truth with these effects, by run."""
         return [self.scene.outputs_of(k, [Variant(effects=effects)])[0] for k in range(len(self.scene.runs))]
+
+
+def _begun(s: Suspect, at: float) -> Suspect:
+    """The same suspect from another time on, for as long."""
+
+    def make(size: float) -> dict:
+        p = s.make(size)
+        later = at - p["T0"]
+        return {k: v + later if k in ("T0", "T1") else v for k, v in p.items()}
+
+    return replace(s, make=make)
 
 
 def _alike(rivals: list[tuple[Suspect, float]], truth: Suspect) -> list[tuple[str, str]]:
@@ -340,7 +356,7 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
                 break
         if not low <= seen < high * (4 if band == "large" else 1):
             continue
-        rivals = bench.beyond_rivals([left])[0]
+        rivals = bench.beyond_rivals([left], ONSETS if kind == "unknown" else 1)[0]
         if kind == "unknown" and min(stays for _, stays in rivals) < STRANGE:
             continue
         told |= {

@@ -57,4 +57,4 @@ def _remains(case: Case, e: Explanation) -> locate.Suspect | None:
     if all(tinted):
         return tinted[0]
     plain, beyond = strongest(None)
-    return plain if plain and plain.gain > MOST * beyond else None
+    return plain if plain and plain.kind != "output" and plain.gain > MOST * beyond else None

@@ -110,7 +110,7 @@ class Round:
     entries: Mapping[str, Any]
     directions: list[Direction]
     chance: np.ndarray | None
-    inflation: float | None = None
+    inflation: dict[int, float] = field(default_factory=dict)       # by how many effects were added
     finalists: list[Explanation] = field(default_factory=list)
 
     def trials(self) -> float:
@@ -274,13 +274,18 @@ def compete_pairs(case: Case, seen: Round, chosen: Sequence[tuple[Direction, Dir
             e = case.explain(plant, [*seen.base.effects, first.candidate, moved.candidate], [*seen.base.own, own, other])
         except (SimulationError, InputError, LookupError, np.linalg.LinAlgError):
             return None
-        e.direction = dataclasses.replace(moved, dims=first.dims + second.dims, elsewhere=first.elsewhere + second.elsewhere
-                                          + float(np.log10(0.5 * seen.trials())))      # as many more pairs than single ones
+        e.direction = _both(seen, first, moved)
         return e
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
         done = [e for e in pool.map(both, chosen) if e is not None]
     case.reprice([seen.base, *done])
     return sorted(done, key=lambda e: e.score)
+
+
+def _both(seen: Round, first: Direction, second: Direction) -> Direction:
+    """The second with the dimensions and the looks of both: there are as many more pairs than single directions."""
+    return dataclasses.replace(second, dims=first.dims + second.dims,
+                               elsewhere=first.elsewhere + second.elsewhere + float(np.log10(0.5 * seen.trials())))
 
 
 def inflation(ranked: Sequence[Direction]) -> float:
@@ -298,20 +303,26 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
     against the smallest chance p that pure noise showed over the whole catalogue."""
     assert e.direction is not None
     gain = seen.base.raw - e.raw
+    added = len(e.effects) - len(seen.base.effects)
     if 0 < gain < MARGINAL:
         gain = min(gain, least_gain(seen.base.fit.residuals, e.fit.residuals, [n.sigma for n in case.noise]))
         if max(case.excess(e).values()) <= LARGE:       # what remains may be noise; beyond that it is other physics
-            if seen.inflation is None:      # beside what was found: an effect that is found inflates no longer
+            if added not in seen.inflation:     # beside what was found: an effect that is found inflates no longer
                 plain = {k: f for k, f in entries.items() if not f.shapes}
-                seen.inflation = inflation(look(case, e, plain, draws=0, coloured=True).directions)
-            gain /= seen.inflation
+                seen.inflation[added] = inflation(look(case, e, plain, draws=0, coloured=True).directions)
+            gain /= seen.inflation[added]
     if seen.chance is None:
         return e.score < seen.base.score - ACCEPT
-    alone = len(e.effects) == len(seen.base.effects) + 1        # two at once leave a residual white more easily
-    if alone and log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) + e.direction.elsewhere < NO_COLOUR \
+    # two at once leave a residual white more easily
+    if added == 1 and log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) + e.direction.elsewhere < NO_COLOUR \
             and smooth(case, e) > SOME_COLOUR:
         return True         # with it the residual is white; without it a sensor would need a colour such as none has
-    return gain > 0 and log_p(gain, e.direction.dims) + e.direction.elsewhere < threshold(seen)
+    return _stands(seen, e.direction, gain)
+
+
+def _stands(seen: Round, direction: Direction, gain: float) -> bool:
+    """Is a gain in score more than what noise makes of the best of all candidates?"""
+    return gain > 0 and log_p(gain, direction.dims) + direction.elsewhere < threshold(seen)
 
 
 def threshold(seen: Round) -> float:
@@ -347,6 +358,15 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
             case.progress("looking for two effects that hide each other")
             together = compete_pairs(case, seen, pairs(seen))
             best = next((e for e in together if counts(case, seen, e, entries)), None)
+            single = {e.last.key: e.direction for e in seen.finalists if e.direction}
+            beside = next((e for e in seen.finalists[:4] if _stands(seen, single[e.last.key], seen.base.raw - e.raw)), None)
+            if best is None and beside:
+                # Beside it the whole catalogue looks good: perhaps not the noise's colour, but other physics.
+                together = otherwise(case, seen, look(case, beside, entries, draws=0))
+                for e in together:
+                    assert e.direction is not None
+                    e.direction = _both(seen, single[e.effects[-2].key], e.direction)
+                best = next((e for e in together if counts(case, seen, e, entries)), None)
             seen.finalists = together + seen.finalists if best else seen.finalists
         if best is None:
             break
