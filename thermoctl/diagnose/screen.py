@@ -6,7 +6,8 @@
 
 d comes from the effect laid over the plant: its change of the slopes dx/dt along the fitted trajectory drives the linearised
 plant (`Model.respond`), its change of the outputs adds directly. New nodes are integrated alone along that trajectory.
-Rows are sums over blocks of samples (white noise stays white), so that thousands of directions fit in memory.
+Rows are sums over blocks of samples (white noise stays white), so that thousands of directions fit in memory; shorter blocks
+where something moves.
 """
 from __future__ import annotations
 
@@ -24,6 +25,7 @@ from thermoctl.plant.refit import Fit, Problem
 from thermoctl.plant.simulate import Drive, Simulation
 
 ROWS = 8_000               # rows of the screening, all recordings together
+FINE_ROWS = 64_000         # of what moves: it passes a pattern's period, or turns, within a block's time
 EPSILON = 1e-4              # amplitude at which a direction is taken
 CHUNK = 96
 ONSETS = 24                 # of a grid over the recordings
@@ -62,10 +64,10 @@ def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
 class Metric:
     """Whitened, blocked rows of a fit: the residual, the basis of the plant's own parameters and how to bring more in."""
 
-    def __init__(self, fitted: Fit, drives: Sequence[Drive]):
+    def __init__(self, fitted: Fit, drives: Sequence[Drive], rows: int = ROWS):
         self.fit, self.drives, self.model = fitted, list(drives), fitted.model
         self.problem = Problem(self.model, drives, fitted.noise)
-        self.blocks = max(1, int(np.ceil(self.problem.samples / ROWS)))
+        self.blocks = max(1, int(np.ceil(self.problem.samples / rows)))
         self.runs: list[Simulation] = []
         columns = []
         for r, d in enumerate(self.drives):
@@ -104,6 +106,15 @@ class Metric:
                 w = w[:full].reshape(full // b, b, *w.shape[1:]).sum(axis=1) / np.sqrt(b)
             parts.append(w)
         return np.concatenate(parts)
+
+    def sketch(self, d: np.ndarray) -> np.ndarray:
+        """Directions (rows, k) in ROWS rows at most that keep their products but for a per cent: sums over blocks with random signs
+        (Charikar, Chen & Farach-Colton 2002, count sketch), to which what is fast is worth as much as what is slow."""
+        b = int(np.ceil(len(d) / ROWS))
+        if b <= 1:
+            return d
+        signed = d * np.random.default_rng(7).choice([-1.0, 1.0], len(d))[:, None]
+        return np.add.reduceat(signed, np.arange(0, len(d), b), axis=0)
 
     def project(self, d: np.ndarray) -> np.ndarray:
         """What the plant's own parameters leave of directions (rows, k)."""
@@ -247,28 +258,28 @@ def screen(metric: Metric, rig: Rig, found: Sequence[Candidate], draws: np.ndarr
            progress: Callable[[float], None] | None = None,
            edges: np.ndarray | None = None) -> tuple[list[Direction], np.ndarray | None]:
     """Every candidate's best direction, best first; `edges`: onsets to look at instead of the whole grid. With `draws` (rows, B)
-    of standard normal noise also, per draw, the smallest log10 p that any candidate would have shown by chance (B,)."""
+    of standard normal noise, as many rows as a `sketch` has, also, per draw, the smallest log10 p that any candidate would have
+    shown by chance (B,)."""
     at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     columns: list[_Column] = []
     for c in found:
         columns += _columns(c, metric, at, edges)
     best: dict[int, Direction] = {}
     chance = None if draws is None else np.zeros(draws.shape[1])
-    if draws is not None:
-        draws = metric.project(draws)
-    pending: dict[tuple, list[tuple[_Column, np.ndarray, float]]] = {}
+    pending: dict[tuple, list[tuple[_Column, np.ndarray, float, np.ndarray | None]]] = {}
     done = 0
     for part, rows in directions(metric, columns):
         full = np.linalg.norm(rows, axis=0)
         rows = metric.project(rows)
+        by_chance = None if draws is None else metric.sketch(rows).T @ draws
         for k, column in enumerate(part):
             candidate, group, _, count = column.item
             entries = pending.setdefault((id(candidate), group), [])
-            entries.append((column, rows[:, k].copy(), float(full[k])))
+            entries.append((column, rows[:, k].copy(), float(full[k]), None if by_chance is None else by_chance[k]))
             if len(entries) < count:
                 continue
             del pending[id(candidate), group]
-            chance = _score(candidate, entries, metric, best, draws, chance)
+            chance = _score(candidate, entries, metric, best, chance)
         done += len(part)
         if progress:
             progress(done / max(len(columns), 1))
@@ -348,8 +359,8 @@ def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float
     return out
 
 
-def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metric: Metric, best: dict[int, Direction],
-           draws: np.ndarray | None, chance: np.ndarray | None) -> np.ndarray | None:
+def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float, np.ndarray | None]], metric: Metric,
+           best: dict[int, Direction], chance: np.ndarray | None) -> np.ndarray | None:
     rows = np.stack([e[1] for e in entries], axis=1)
     full = np.array([e[2] for e in entries])
     shape, dim = entries[0][0].item[2]
@@ -357,7 +368,7 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float]], metri
     g, m = rows.T @ r, rows.T @ rows
     amplitudes = [p for p in c.effect.parameters if p.amplitude]
     windowed = "windows" in c.effect.shapes.values()
-    noise = None if draws is None else rows.T @ draws
+    noise = None if chance is None else np.stack([e[3] for e in entries if e[3] is not None])
     if windowed:
         edges = [e[0].item[2][0]["start"] for e in entries]
         ends = [*edges[1:], 10 * edges[-1]]

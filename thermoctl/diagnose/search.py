@@ -18,7 +18,7 @@ from thermoctl.diagnose.evidence import LARGE, least_gain
 from thermoctl.diagnose.explain import Case, Explanation, noise_of
 from thermoctl.diagnose.heldout import prediction
 from thermoctl.diagnose.remains import energy, remains, smooth
-from thermoctl.diagnose.screen import Direction, Metric, log_p, screen, sharpened
+from thermoctl.diagnose.screen import FINE_ROWS, ROWS, Direction, Metric, log_p, screen, sharpened
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.yamlfile import InputError
@@ -131,10 +131,11 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
     drives = [model.drive(t) for t in case.tables]
     for d in drives:
         model.prepare(d, base.fit.values[drives.index(d)])
-    metric = Metric(dataclasses.replace(base.fit, noise=noise_of(base.colours)) if coloured else base.fit, drives)
     rig = Rig(base.plant, drives, [t.columns for t in case.tables])
+    metric = Metric(dataclasses.replace(base.fit, noise=noise_of(base.colours)) if coloured else base.fit, drives,
+                    FINE_ROWS if rig.velocities else ROWS)
     found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
-    noise = np.random.default_rng(1).standard_normal((len(metric.residual), draws)) if draws else None
+    noise = np.random.default_rng(1).standard_normal((len(metric.sketch(metric.residual[:, None])), draws)) if draws else None
     ranked, chance = screen(metric, rig, found, noise)
     return Round(base, metric, rig, entries, ranked, chance)
 
