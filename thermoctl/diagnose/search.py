@@ -30,12 +30,15 @@ SPONGE = 1.1                # an unknown function of time that leaves much has t
 LEADERS = 4                 # effects that are refitted once more where parameters ended at the end of their ranges
 ACCEPT = 12.0               # an effect must lower the score by this much beyond its parameters' price
 CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
-NO_COLOUR, SOME_COLOUR = -35.0, -25.0   # the same in white noise's metric: colour of sensors gives no less than the second
+# log10 p in white noise's metric of an effect, and of the best smooth unknown beside it, from which no colour of a sensor is likely
+# to have made the first: colour takes up much, or where it is gone leaves nothing
+NO_COLOUR = ((-35.0, -25.0), (-20.0, -3.0))
 MOST_IN_PAIRS = 250         # directions that are looked at two by two
 CHI2_MEDIAN = 0.455         # of one degree of freedom
 LOOK = 0.01                 # chance of noise looking as good as the best direction, below which the best are refitted
 ALARM = 0.005               # chance of noise counting as an effect (twice that in the tail of 1000 draws); unseen data then have their say
 ASTRAY = 0.3                # a refit that gains less than this share of what was screened is begun again, more carefully
+INFLATED = 2.0              # gains of the whole catalogue this much larger than by chance may be other physics that is missing, too
 MARGINAL = 200.0            # a gain in score below this is looked at twice
 DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
 
@@ -315,15 +318,17 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
     if seen.chance is None:
         return e.score < seen.base.score - ACCEPT
     # two at once leave a residual white more easily
-    if added == 1 and log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) + e.direction.elsewhere < NO_COLOUR \
-            and smooth(case, e) > SOME_COLOUR:
-        return True         # with it the residual is white; without it a sensor would need a colour such as none has
+    white = log_p(max(seen.base.fit.cost - e.fit.cost, 0.0), e.direction.dims) + e.direction.elsewhere
+    if added == 1 and any(white < least for least, _ in NO_COLOUR):
+        left = smooth(case, e)
+        if any(white < least and left > most for least, most in NO_COLOUR):
+            return True     # with it the residual is white; without it a sensor would need a colour such as none has
     return _stands(seen, e.direction, gain)
 
 
-def _stands(seen: Round, direction: Direction, gain: float) -> bool:
+def _stands(seen: Round, direction: Direction | None, gain: float) -> bool:
     """Is a gain in score more than what noise makes of the best of all candidates?"""
-    return gain > 0 and log_p(gain, direction.dims) + direction.elsewhere < threshold(seen)
+    return direction is not None and gain > 0 and log_p(gain, direction.dims) + direction.elsewhere < threshold(seen)
 
 
 def threshold(seen: Round) -> float:
@@ -359,14 +364,14 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
             case.progress("looking for two effects that hide each other")
             together = compete_pairs(case, seen, pairs(seen))
             best = next((e for e in together if counts(case, seen, e, entries)), None)
-            single = {e.last.key: e.direction for e in seen.finalists if e.direction}
-            beside = next((e for e in seen.finalists[:4] if _stands(seen, single[e.last.key], seen.base.raw - e.raw)), None)
-            if best is None and beside:
+            beside = next((e for e in seen.finalists[:4] if _stands(seen, e.direction, seen.base.raw - e.raw)), None)
+            if best is None and beside and seen.inflation.get(1, 1.0) > INFLATED:
                 # Beside it the whole catalogue looks good: perhaps not the noise's colour, but other physics.
+                single = {e.last.key: e.direction for e in seen.finalists if e.direction}
                 together = otherwise(case, seen, look(case, beside, entries, draws=0))
                 for e in together:
-                    assert e.direction is not None
-                    e.direction = _both(seen, single[e.effects[-2].key], e.direction)
+                    if e.direction:
+                        e.direction = _both(seen, single[e.effects[-2].key], e.direction)
                 best = next((e for e in together if counts(case, seen, e, entries)), None)
             seen.finalists = together + seen.finalists if best else seen.finalists
         if best is None:
