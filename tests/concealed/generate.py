@@ -182,8 +182,8 @@ class Bench:
             hoped = float(np.linalg.norm(triangle[:, -1] - triangle[:, :-1] @ step))
             trial = [x + a * step for a in STRIDES]
             rows = self._whitened(readings, self._at(trial))
-            costs = np.hypot(snr(rows), snr(np.array(trial)))
-            best = int(np.nanargmin(costs))
+            costs = np.nan_to_num(np.hypot(snr(rows), snr(np.array(trial))), nan=np.inf)  # a step may run away
+            best = int(np.argmin(costs))
             if not costs[best] < cost:
                 break
             gain, cost = cost - costs[best], float(costs[best])
@@ -349,7 +349,7 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
             runs = bench.readings(effects)
             left = bench.refit(runs)
             seen = float(snr(left))
-            if low <= seen < high * (4 if band == "large" else 1):
+            if not np.isfinite(seen) or low <= seen < high * (4 if band == "large" else 1):
                 break
             size *= float(np.clip(target / max(seen, 1e-3), 0.2, 5.0))
             if size > s.top:  # a refit swallows it at any sensible size
@@ -392,7 +392,7 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
     alone = [bench.refit(bench.readings([e])) for e in effects]
     runs = bench.readings(effects)
     left = bench.refit(runs)
-    if snr(left) < 6 or not 10 < min(map(snr, alone)) <= max(map(snr, alone)) < 240:
+    if not snr(left) >= 6 or not 10 < min(map(snr, alone)) <= max(map(snr, alone)) < 240:
         return None
     if kind == "cancel" and snr(left) ** 2 > 0.75 * sum(snr(a) ** 2 for a in alone):
         return None
