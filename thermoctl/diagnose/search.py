@@ -404,6 +404,8 @@ def otherwise(case: Case, seen: Round, after: Round) -> list[Explanation]:
             promising.append((e.fit.cost - again.directions[0].gain, again))
     best: list[Explanation] = []
     for _, again in sorted(promising, key=lambda p: p[0])[:3]:
+        if best and time.process_time() - case.begun > 2 * PATIENCE_S:
+            break
         found = compete(case, again, finalists(again.directions, 6))
         if found and (not best or found[0].score < best[0].score):
             best = found
