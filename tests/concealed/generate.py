@@ -131,21 +131,23 @@ class Bench:
         rows = [self._variants(x) for x in points]
         return [self.scene.outputs_of(k, [r[k] for r in rows]) for k in range(len(self.scene.runs))]
 
-    def tangents(self, x: np.ndarray) -> np.ndarray:
-        """Whitened derivatives (np, M) at x (np,) by the parameters and by the starts of each run."""
+    def tangents(self, x: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+        """Readings (N, ny) by run at x (np,), and their whitened derivatives (np, M) by the parameters and by the starts of
+        each run."""
         n, ns, runs = len(self.scene.ranges), len(self.scene.starts), range(len(self.scene.runs))
         h = np.append(np.full(n, 4 * STEP), np.full(ns, 0.1))
-        moved = []
+        base, moved = [], []
         for k in runs:
             points = np.tile(x, (1 + n + ns, 1))
             own = np.append(np.arange(n), n + k * ns + np.arange(ns))
             points[1 + np.arange(n + ns), own] += h
             y = self.scene.outputs_of(k, [self._variants(p)[k] for p in points])
+            base.append(y[0])
             moved.append((y[1:] - y[:1]) / h[:, None, None])
         whole = [self.judge.whiten([d[:n] for d in moved])]
         for k in runs:  # each run has its own start
             whole.append(self.judge.whiten([d[n:] if j == k else np.zeros_like(d[n:]) for j, d in enumerate(moved)]))
-        return np.concatenate(whole)
+        return base, np.concatenate(whole)
 
     def _whitened(self, readings: list[np.ndarray], models: list[np.ndarray]) -> np.ndarray:
         """Whitened differences (m, M) of readings (N, ny by run) from each of the models' rows (m, N, ny)."""
@@ -154,8 +156,7 @@ class Bench:
     def measure(self, pool: list[Suspect]) -> None:
         """What a straight refit leaves of each of `pool` at SIZES (`curve`: suspect, sizes, rows)."""
         scene = self.scene
-        self.base = self.readings([])
-        self.derivatives = self.tangents(np.zeros(len(scene.ranges) + len(scene.runs) * len(scene.starts)))
+        self.base, self.derivatives = self.tangents(np.zeros(len(scene.ranges) + len(scene.runs) * len(scene.starts)))
         self.judge.set_parameters(self.derivatives)
         sized = [(s, np.array([z for z in SIZES if z <= s.top])) for s in pool]
         rows = [Variant(effects=[(s.effect, s.where, s.make(z))]) for s, sizes in sized for z in sizes]
@@ -190,7 +191,7 @@ class Bench:
             x, left = trial[best], rows[best]
             if cost < 1.03 * hoped or gain < 0.05 * cost:
                 break
-            slope = self.tangents(x)
+            _, slope = self.tangents(x)
         return np.append(left, -x)
 
     def beyond_rivals(self, signals: list[np.ndarray], onsets: int = 1) -> list[list[tuple[Suspect, float]]]:
@@ -336,6 +337,7 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
         return _two(bench, kind, rng, told), None
     band = slot.band or "large"
     low, high = BANDS[band]
+    top = 4 * high if band == "large" else high
     seen = None
     for curve in bench.curve:
         target = float(np.exp(rng.uniform(np.log(low * 1.1), np.log(high * 0.9))))
@@ -349,12 +351,11 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
             runs = bench.readings(effects)
             left = bench.refit(runs)
             seen = float(snr(left))
-            if not np.isfinite(seen) or low <= seen < high * (4 if band == "large" else 1):
-                break
+            asked = low <= seen < top
             size *= float(np.clip(target / max(seen, 1e-3), 0.2, 5.0))
-            if size > s.top:  # a refit swallows it at any sensible size
+            if asked or not size <= s.top:  # beyond it a refit swallows the effect at any sensible size
                 break
-        if not low <= seen < high * (4 if band == "large" else 1):
+        if not asked:
             continue
         rivals = bench.beyond_rivals([left], ONSETS if kind == "unknown" else 1)[0]
         if kind == "unknown" and min(stays for _, stays in rivals) < STRANGE:

@@ -37,7 +37,8 @@ def smooth(case: Case, e: Explanation, coloured: bool = False) -> float:
 def remains(case: Case, e: Explanation) -> locate.Suspect | None:
     """An unknown input in time, an unknown function of the state, or a rhythm, that still explains more of the residual than noise of any colour
     that the residual may have would let it; or, in white noise's metric, a good part of what is there beyond white noise: a sensor's
-    colour spreads over many frequencies and follows nothing. Kept by the case: search and verdict ask for the same ones."""
+    colour spreads over many frequencies and follows nothing. There an error of the sensor alone says nothing: it may be its colour.
+    Kept by the case: search and verdict ask for the same ones."""
     if id(e) not in case.left:
         case.left[id(e)] = (e, _remains(case, e))
     return case.left[id(e)][1]
