@@ -3,10 +3,11 @@ import numpy as np
 import pytest
 from scipy.fft import idct
 from scipy.signal import lfilter
+from scipy.stats import kstest
 
 from thermoctl.diagnose.evidence import channels, flicker, least_gain
 from thermoctl.diagnose.explain import Case
-from thermoctl.diagnose.locate import rhythms
+from thermoctl.diagnose.locate import rhythms, together
 from thermoctl.diagnose.remains import metric_of
 from thermoctl.plant import load
 from thermoctl.recording.table import Table
@@ -100,3 +101,43 @@ def test_noise_of_any_colour_has_no_rhythm(block, kind):
             else 0.1 * mixed(len(t), rng)
     least = sorted(block(lambda t, rng, seed=seed: noise(t, rng, seed)).log_p for seed in range(20))
     assert least[0] > -3.5 and np.median(least) > -1
+
+
+@pytest.fixture
+def three(tmp_path):
+    """A plant with three outputs, two of them of one sensor."""
+    path = tmp_path / "plant.yaml"
+    path.write_text("format: thermoctl-plant/1\ninputs: {P: {unit: W}}\nparameters: {C: {value: 30, unit: J/K}}\n"
+                    "nodes: {T: {unit: degC, storage: C, initial: 20}}\nflows: {heat: {into: T, rate: P, unit: W}}\n"
+                    "outputs: {a: {value: T, unit: degC}, b: {value: 2 * T, unit: degC}, c: {value: T, unit: degC, column: a}}\n")
+    return load(path)
+
+
+def of_any_colour(n, rng):
+    """White noise, first-order noise or noise with flicker."""
+    kind, white = rng.integers(3), rng.standard_normal(n)
+    return white if kind == 0 else white + lfilter([0.2], [1, -0.97], rng.standard_normal(n)) if kind == 1 else mixed(n, rng)
+
+
+def test_sensors_of_any_colour_share_nothing(three):
+    """The chance that is told is uniform where there is nothing to find; gaps and a second recording do not matter."""
+    told = []
+    for seed in range(120):
+        rng = np.random.default_rng(seed)
+        residuals = [np.stack([of_any_colour(n, rng) for _ in range(3)], axis=1) for n in (3000, 2000)]
+        residuals[0][500:700, 0] = np.nan
+        found = {s.name: s for s in together(residuals, channels(residuals, [1.0] * 3), three)}
+        assert set(found) == {"a and b", "b and c"}         # a and c are of one sensor
+        told.append(10 ** found["a and b"].log_p / found["a and b"].looks)
+    assert kstest(told, "uniform").pvalue > 0.01
+
+
+def test_what_two_sensors_share_is_no_noise_of_theirs(three):
+    """A disturbance of 0.4 sigmas in one and, later and slower, in the other: each takes it for a sensor's colour."""
+    rng = np.random.default_rng(0)
+    wave = lfilter([0.1], [1, -0.95], rng.standard_normal(6000))
+    r = rng.standard_normal((6000, 3)) + np.stack([1.25 * wave, lfilter([0.05], [1, -0.95], np.roll(wave, 8)), 0 * wave], axis=1)
+    colours = channels([r], [1.0] * 3)
+    assert len(colours[0].ar) > 1
+    best = together([r], colours, three)[0]
+    assert best.name == "a and b" and best.log_p < -8 and "share" in best.sentence()

@@ -16,14 +16,17 @@ the whole band) beside itself. Noise is independent of past inputs, whatever its
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import lfilter
 
 from thermoctl.diagnose.effects import Rig
+from thermoctl.diagnose.evidence import Colour
 from thermoctl.diagnose.screen import Metric, Trajectory, _Column, directions, log_p
 from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
 
 COARSE, FINE = 10, 40       # knots a recording
 LEVELS = 8                  # knots over the values of a signal
@@ -31,13 +34,14 @@ RESONATORS, DAMPING = 12, 0.1       # from two periods a recording to a quarter 
 PEAKS = 16                  # the same for a storage, where a change of phase is narrow
 CYCLES = 3, 200             # fewest and most of a rhythm in the longest recording
 HARMONICS = (1, 2, 4)       # that are summed
+BANDS, SLOWEST, LEAST = 14, 2, 4    # of frequencies, from two cycles a recording on; fewest coefficients of one
 
 
 @dataclass
 class Suspect:
-    """A node or an output with an unknown smooth input, a node, flow or storage with an unknown function of a signal, or a flow
-    with unknown dynamics: how much of the residual it explains."""
-    kind: str               # 'node', 'output', 'flow', 'storage', 'dynamics' or 'rhythm'
+    """A node or an output with an unknown smooth input, a node, flow or storage with an unknown function of a signal, a flow
+    with unknown dynamics, or two outputs that share something: how much of the residual it explains."""
+    kind: str               # 'node', 'output', 'flow', 'storage', 'dynamics', 'rhythm' or 'together'
     name: str
     gain: float
     dims: int
@@ -56,6 +60,8 @@ class Suspect:
             return f"dynamics between {self.name} and what it drives (a resonance, a slow part) would explain it best"
         if self.kind == "rhythm":
             return f"a rhythm of {self.period:.4g} s of its own in {self.name} would explain it best"
+        if self.kind == "together":
+            return f"{self.name} share what is left of them, which the noise of two sensors does not"
         what = {"node": "an unknown flow into", "output": "an unknown error of", "flow": "an unknown factor of",
                 "storage": "an unknown factor of the storage of"}[self.kind]
         return f"{what} {self.name}, a function of {self.follows or 'time'}, would explain it best"
@@ -202,6 +208,34 @@ def rhythms(metric: Metric) -> list[Suspect]:
     return sorted(found, key=lambda s: s.log_p)
 
 
+def together(residuals: Sequence[np.ndarray], colours: Sequence[Colour], plant: Plant) -> list[Suspect]:
+    """Every pair of outputs, measured by themselves, in what their residuals (N, outputs; per recording) share; likeliest first."""
+    columns = [o.column for o in plant.outputs.values()]
+    names, longest = list(plant.outputs), max(map(len, residuals))
+    spectra = []
+    for r in residuals:
+        innovations = [np.clip(lfilter(c.ar, c.ma, np.nan_to_num(r[:, j])) / c.sigma, -5, 5) for j, c in enumerate(colours)]
+        spectra.append(np.fft.rfft(np.stack(innovations, axis=1), axis=0))
+    edges = np.geomspace(SLOWEST, max(longest // 2, SLOWEST + 1), BANDS)
+    bands = []
+    for low, high in itertools.pairwise(edges):
+        parts = [s[round(low * len(r) / longest):round(high * len(r) / longest)] for s, r in zip(spectra, residuals, strict=True)]
+        bands.append(np.concatenate(parts))
+    bands = [b for b in bands if len(b) >= LEAST]
+    pairs = [(i, j) for i, j in itertools.combinations(range(len(names)), 2) if columns[i] != columns[j]]
+    found = []
+    for i, j in pairs:
+        gain = 0.0
+        for b in bands:
+            power = np.vdot(b[:, i], b[:, i]).real * np.vdot(b[:, j], b[:, j]).real
+            if power > 0:
+                shared = min(float(abs(np.vdot(b[:, i], b[:, j])) ** 2 / power), 1 - 1e-12)
+                gain -= 2 * (len(b) - 1) * float(np.log1p(-shared))
+        if bands:
+            found.append(Suspect("together", f"{names[i]} and {names[j]}", gain, 2 * len(bands), looks=len(pairs)))
+    return sorted(found, key=lambda s: s.log_p)
+
+
 def _resonators(u: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
     """What each of the bank makes of a signal, both quadratures."""
     h = float(np.median(np.diff(t)))
@@ -292,4 +326,4 @@ def _intervals(t: np.ndarray, on: np.ndarray) -> list[list[float]]:
     return out
 
 
-__all__ = ["Missing", "Suspect", "missing_flow", "patterns", "rhythms", "suspects"]
+__all__ = ["Missing", "Suspect", "missing_flow", "patterns", "rhythms", "suspects", "together"]

@@ -12,6 +12,7 @@ from thermoctl.diagnose.screen import Metric
 
 REMAINS = -9.0              # log10 p of an unknown input, in the residual's own colour, from which something is left over
 RHYTHM = -5.0               # the same of a period, whose chance in noise of any colour is what it should be (tests/diagnose)
+TOGETHER = -5.0             # the same of what two sensors share, whose chance is known, too
 UNLIKE_COLOUR, MOST = -30.0, 0.12       # the same in white noise's metric, and its share of the residual's energy beyond white noise
 
 
@@ -38,7 +39,7 @@ def remains(case: Case, e: Explanation) -> locate.Suspect | None:
     """An unknown input in time, an unknown function of the state, or a rhythm, that still explains more of the residual than noise of any colour
     that the residual may have would let it; or, in white noise's metric, a good part of what is there beyond white noise: a sensor's
     colour spreads over many frequencies and follows nothing. There an error of the sensor alone says nothing: it may be its colour.
-    Kept by the case: search and verdict ask for the same ones."""
+    Or what two sensors share. Kept by the case: search and verdict ask for the same ones."""
     if id(e) not in case.left:
         case.left[id(e)] = (e, _remains(case, e))
     return case.left[id(e)][1]
@@ -58,4 +59,6 @@ def _remains(case: Case, e: Explanation) -> locate.Suspect | None:
     if all(tinted):
         return tinted[0]
     plain, beyond = strongest(None)
-    return plain if plain and plain.kind != "output" and plain.gain > MOST * beyond else None
+    if plain and plain.kind != "output" and plain.gain > MOST * beyond:
+        return plain
+    return next((s for s in locate.together(e.fit.residuals, e.colours, e.plant)[:1] if s.log_p < TOGETHER), None)
