@@ -37,6 +37,7 @@ MOST_IN_PAIRS = 250         # directions that are looked at two by two
 CHI2_MEDIAN = 0.455         # of one degree of freedom
 LOOK = 0.01                 # chance of noise looking as good as the best direction, below which the best are refitted
 ALARM = 0.005               # chance of noise counting as an effect (twice that in the tail of 1000 draws); unseen data then have their say
+STICKING = 300.0            # times slower than it is screened with dry friction may creep, and is begun a second time: what sticks rests for long
 ASTRAY = 0.3                # a refit that gains less than this share of what was screened is begun again, more carefully
 INFLATED = 2.0              # gains of the whole catalogue this much larger than by chance may be other physics that is missing, too
 MARGINAL = 200.0            # a gain in score below this is looked at twice
@@ -64,7 +65,8 @@ def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, f
             out[p.name] = (max(p.low, value - 3 * reach), value + 3 * reach) if kind != "small_levels" else (0.0, 5 * reach)
             continue
         if p.shape:
-            out[p.name] = (max(p.low, value / 30), min(p.high, value * 30)) if kind != "delays" else (0.0, max(value * 8, 0.05 * duration))
+            least = STICKING if kind == "creep_speeds" else 30
+            out[p.name] = (max(p.low, value / least), min(p.high, value * 30)) if kind != "delays" else (0.0, max(value * 8, 0.05 * duration))
             continue
         floor, ceiling = direction.candidate.bounds(p)
         if np.isfinite(floor) and np.isfinite(ceiling):
@@ -85,6 +87,13 @@ def weaker(direction: Direction, share: float = 0.1) -> Direction:
         if p.amplitude or effect.shapes.get(p.shape or "") in ("small_levels", "lags", "delays"):
             start[p.name] = p.null + share * (start[p.name] - p.null)
     return dataclasses.replace(direction, start=start)
+
+
+def sticking(direction: Direction) -> Direction | None:
+    """The direction with a start at dry friction that sticks, from where creep is no slope to follow; None where nothing creeps."""
+    effect = direction.candidate.effect
+    start = {p.name: direction.start[p.name] / STICKING for p in effect.parameters if effect.shapes.get(p.shape or "") == "creep_speeds"}
+    return dataclasses.replace(direction, start={**direction.start, **start}) if start else None
 
 
 def extend(base: Plant, direction: Direction, drives: Sequence[Drive]) -> tuple[Plant, dict[str, str]]:
@@ -191,6 +200,9 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
     def one(direction: Direction) -> Explanation | None:
         direction = sharpened(seen.metric, seen.rig, direction)
         found = [tried(direction)]
+        stuck = sticking(direction) if direction.gain > 0.5 * strongest else None
+        if stuck:
+            found.append(tried(stuck))
         for nearer in (False, True):        # led astray by its first steps: once more step by step, once from nearer to nothing
             best = min((e for e in found if e is not None), key=lambda e: e.score, default=None)
             gained = 0.0 if best is None else max(seen.base.raw - best.raw, seen.base.fit.cost - best.fit.cost)
