@@ -204,6 +204,48 @@ outputs:
     assert found["P"] == pytest.approx(period, rel=1e-3) and abs(found["A"]) == pytest.approx(3e-6, rel=0.1)
 
 
+def test_dry_friction_that_sticks_is_no_load(tmp_path):
+    """A stage on springs comes to rest up to a micrometre beside where it would, and stays there: half a sensor's noise."""
+    (tmp_path / "plant.yaml").write_text("""
+format: thermoctl-plant/1
+title: Flexure stage
+inputs:
+  force: {unit: N}
+parameters:
+  stiffness: {value: 700, unit: N/m, range: [300, 1500]}
+  damping: {value: 6, unit: N*s/m, range: [2, 20]}
+nodes:
+  velocity: {unit: m/s, storage: 0.7, initial: 0}
+  position: {unit: m, storage: 1, initial: 0, initial_sigma: 1e-5}
+flows:
+  drive: {into: velocity, rate: force, unit: N}
+  spring: {from: velocity, rate: stiffness * position, unit: N}
+  damper: {from: velocity, rate: damping * velocity, unit: N}
+  travel: {into: position, rate: velocity, unit: m/s}
+outputs:
+  encoder: {value: position, unit: m, noise: 2e-6}
+""")
+    paths, h, m, k, b, dry = [tmp_path / "plant.yaml"], 1e-4, 0.7, 740.0, 5.0, 8e-4
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        step = np.arange(300_000)
+        force = np.where(step % 30_000 < 10_000, rng.uniform(0.02, 0.08, 10)[step // 30_000], 0.0)
+        x, v, seen = 0.0, 0.0, np.empty(len(step))
+        for i, f in enumerate(force):       # symplectic Euler, friction as the set-valued law that it is
+            seen[i] = x
+            v += h * (f - k * x - b * v) / m
+            v = np.sign(v) * max(abs(v) - h * dry / m, 0.0)
+            x += h * v
+        assert np.ptp(seen[step % 30_000 > 29_000]) > 1e-6
+        rows = np.column_stack([step * h, force, seen + rng.normal(0, 2e-6, len(step))])[::50]
+        paths.append(tmp_path / f"run_{seed}.csv")
+        np.savetxt(paths[-1], rows, delimiter=",", comments="", fmt="%.9g", header="t,force,encoder")
+    r = diagnosed(paths, tmp_path / "out")
+    assert [(f["effect"], f["where"]) for f in r["findings"]] == [("coulomb_friction", "velocity")] and r["verdict"] != "unexplained"
+    found = {k.split("_")[0]: v["value"] for k, v in r["findings"][0]["parameters"].items()}
+    assert found["F"] == pytest.approx(dry, rel=0.15)
+
+
 TANK = """
 format: thermoctl-plant/1
 title: A pumped tank
@@ -286,6 +328,15 @@ def test_a_change_of_phase_is_unknown_and_sits_in_the_storage(tmp_path):
     r = diagnosed(heater(tmp_path, heavier=lambda x: 1 + 1.0 * np.exp(-0.5 * ((x - 40.0) / 0.8) ** 2)), tmp_path / "out")
     assert r["verdict"] == "unexplained"
     assert any("the storage of one" in n for n in r["notes"]), r["notes"]
+
+
+@pytest.mark.parametrize("common", [0.0, 0.06])
+def test_what_two_sensors_share_is_no_noise_of_theirs(tmp_path, common):
+    """The converter's reference, which both readings share, is half as noisy as either sensor: nothing says so but the two together."""
+    reference = np.random.default_rng(5).standard_normal((800, 1))
+    r = diagnosed(heater(tmp_path, sensor=lambda t, x: x + common * reference), tmp_path / "out")
+    assert not r["findings"] and r["verdict"] == ("unexplained" if common else "consistent")
+    assert any("temperature_1 and temperature_2 share" in n for n in r["notes"]) == bool(common), r["notes"]
 
 
 def test_a_resonance_is_unknown_and_sits_between_drive_and_carriage(tmp_path):
