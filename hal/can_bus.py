@@ -208,6 +208,7 @@ class _SetupNetwork(canopen.Network):
         self._thread.start()
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """As canopen asks for it; `remote` frames are none of what we send."""
         self._port.send((can_id, bytes(data)))
 
     def _pass_on(self) -> None:
@@ -223,6 +224,7 @@ class _SetupNetwork(canopen.Network):
                 self._done.wait(0.0005)
 
     def finish(self) -> None:
+        """Stop passing frames on, and wait for the thread."""
         self._done.set()
         self._thread.join(1.0)
 

@@ -33,6 +33,15 @@ def mixed(n, rng):
             + 0.15 * idct(rng.standard_normal(n) * np.sqrt(slow * n / slow.sum()), norm="ortho"))
 
 
+KINDS = ("white", "first order", "flicker")
+
+
+def noise_of(kind, n, rng):
+    """Noise of one of KINDS, its white part of standard deviation about 1."""
+    white = rng.standard_normal(n)
+    return white if kind == "white" else white + lfilter([0.2], [1, -0.97], rng.standard_normal(n)) if kind == "first order" else mixed(n, rng)
+
+
 def test_a_slow_wave_is_not_paid_for_in_noise_that_has_a_fast_and_a_slow_part():
     """A sine of a few periods is fitted to pure noise and taken out: what that pays, against what white noise would pay."""
     n, paid, white = 8000, [], []
@@ -91,14 +100,11 @@ def test_a_rhythm_is_found_with_its_period_though_its_phase_changes(block):
     assert found.log_p < -8 and found.period == pytest.approx(240, rel=0.02) and "rhythm of 2" in found.sentence()
 
 
-@pytest.mark.parametrize("kind", ["white", "first order", "flicker"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_noise_of_any_colour_has_no_rhythm(block, kind):
     """Of twenty draws a colour the smallest p is what twenty of pure chance would show."""
     def noise(t, rng, seed):
-        rng = np.random.default_rng([seed, *rng.integers(0, 9, 2)])
-        white = 0.1 * rng.standard_normal(len(t))
-        return white if kind == "white" else white + lfilter([0.02], [1, -0.97], rng.standard_normal(len(t))) if kind == "first order" \
-            else 0.1 * mixed(len(t), rng)
+        return 0.1 * noise_of(kind, len(t), np.random.default_rng([seed, *rng.integers(0, 9, 2)]))
     least = sorted(block(lambda t, rng, seed=seed: noise(t, rng, seed)).log_p for seed in range(20))
     assert least[0] > -3.5 and np.median(least) > -1
 
@@ -113,18 +119,12 @@ def three(tmp_path):
     return load(path)
 
 
-def of_any_colour(n, rng):
-    """White noise, first-order noise or noise with flicker."""
-    kind, white = rng.integers(3), rng.standard_normal(n)
-    return white if kind == 0 else white + lfilter([0.2], [1, -0.97], rng.standard_normal(n)) if kind == 1 else mixed(n, rng)
-
-
 def test_sensors_of_any_colour_share_nothing(three):
     """The chance that is told is uniform where there is nothing to find; gaps and a second recording do not matter."""
     told = []
     for seed in range(120):
         rng = np.random.default_rng(seed)
-        residuals = [np.stack([of_any_colour(n, rng) for _ in range(3)], axis=1) for n in (3000, 2000)]
+        residuals = [np.stack([noise_of(rng.choice(KINDS), n, rng) for _ in range(3)], axis=1) for n in (3000, 2000)]
         residuals[0][500:700, 0] = np.nan
         found = {s.name: s for s in together(residuals, channels(residuals, [1.0] * 3), three)}
         assert set(found) == {"a and b", "b and c"}         # a and c are of one sensor

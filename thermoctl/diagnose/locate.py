@@ -222,17 +222,16 @@ def together(residuals: Sequence[np.ndarray], colours: Sequence[Colour], plant: 
         parts = [s[round(low * len(r) / longest):round(high * len(r) / longest)] for s, r in zip(spectra, residuals, strict=True)]
         bands.append(np.concatenate(parts))
     bands = [b for b in bands if len(b) >= LEAST]
+    if not bands:
+        return []
+    gain = np.zeros((len(names), len(names)))
+    for b in bands:
+        cross = b.conj().T @ b
+        power = np.diag(cross).real
+        shared = np.abs(cross) ** 2 / np.maximum(np.outer(power, power), 1e-30)
+        gain -= 2 * (len(b) - 1) * np.log1p(-np.minimum(shared, 1 - 1e-12))
     pairs = [(i, j) for i, j in itertools.combinations(range(len(names)), 2) if columns[i] != columns[j]]
-    found = []
-    for i, j in pairs:
-        gain = 0.0
-        for b in bands:
-            power = np.vdot(b[:, i], b[:, i]).real * np.vdot(b[:, j], b[:, j]).real
-            if power > 0:
-                shared = min(float(abs(np.vdot(b[:, i], b[:, j])) ** 2 / power), 1 - 1e-12)
-                gain -= 2 * (len(b) - 1) * float(np.log1p(-shared))
-        if bands:
-            found.append(Suspect("together", f"{names[i]} and {names[j]}", gain, 2 * len(bands), looks=len(pairs)))
+    found = [Suspect("together", f"{names[i]} and {names[j]}", float(gain[i, j]), 2 * len(bands), looks=len(pairs)) for i, j in pairs]
     return sorted(found, key=lambda s: s.log_p)
 
 
