@@ -214,6 +214,7 @@ class Code:
 
 
 _PRELUDE = """#include <math.h>
+typedef double lanes __attribute__((vector_size(64), aligned(8)));       /* columns of sensitivities, eight at a time */
 static inline double sign_(double z, double w) { return w > 0 ? tanh(z / w) : (z > 0) - (z < 0); }
 static inline double step_(double z, double w) { return w > 0 ? 0.5 * (1 + tanh(z / w)) : z >= 0; }
 static inline double strict_(double z, double w) { return w > 0 ? 0.5 * (1 + tanh(z / w)) : z > 0; }
@@ -240,7 +241,7 @@ def _ints(label: str, values: Iterable[int]) -> str:
 
 
 def _sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, int]:
-    """C for M = I - a J: factors without pivoting in minimum-degree order (Markowitz), and solves for one and for many
+    """C for M = I - a J: factors without pivoting in minimum-degree order (Markowitz), and solves for one and for eight
     right-hand sides. A small pivot is refused; the integrator then takes a smaller step. Returns (text, entries of M)."""
     rows: list[set[int]] = [{i} for i in range(n)]
     for i, k in pattern:
@@ -276,16 +277,9 @@ def _sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, int]:
         backward.append((k, -1, index[k, k]))
     single = "".join(f"r[{i}] -= M[{m}] * r[{k}];\n" for i, k, m in forward)
     single += "".join(f"r[{k}] *= M[{m}];\n" if j < 0 else f"r[{k}] -= M[{m}] * r[{j}];\n" for k, j, m in backward)
-    many = (f"static const int LU_OPS = {len(forward) + len(backward)};\n"
-            + _ints("LU_TO", [i for i, _, _ in forward] + [k for k, _, _ in backward]) + "\n"
-            + _ints("LU_FROM", [k for _, k, _ in forward] + [j for _, j, _ in backward]) + "\n"
-            + _ints("LU_M", [m for *_, m in forward] + [m for *_, m in backward]) + "\n"
-            "static void solve_many_(const double *M, double *R, int nc) {\n  for (int q = 0; q < LU_OPS; q++) {\n"
-            "    const double m = M[LU_M[q]]; double *to = R + (long)LU_TO[q] * nc;\n"
-            "    if (LU_FROM[q] < 0) { for (int c = 0; c < nc; c++) to[c] *= m; continue; }\n"
-            "    const double *from = R + (long)LU_FROM[q] * nc;\n    for (int c = 0; c < nc; c++) to[c] -= m * from[c];\n  }\n}\n")
     return (f"static int factor_(double a, const double *J, double *M) {{ (void)a; (void)J;\n{''.join(put)}return 1; }}\n"
-            f"static void solve_(const double *M, double *r) {{ (void)M; (void)r;\n{single}}}\n{many}", len(index))
+            f"static void solve_(const double *M, double *r) {{ (void)M; (void)r;\n{single}}}\n"
+            f"static inline void solve_lanes_(const double *restrict M, lanes *restrict r) {{ (void)M; (void)r;\n{single}}}\n", len(index))
 
 
 # ------------------------------------------------------------------------------------------------ building and loading

@@ -1,5 +1,5 @@
 /* The integrator behind every compiled plant. The generated file defines the sizes, the pattern of the Jacobian and the
-   functions rhs_, jac_, sens_, factor_, lower_upper_ and includes this file.
+   functions rhs_, jac_, sens_, factor_, solve_, solve_lanes_ and includes this file.
 
    ESDIRK4(3)6L[2]SA of Kennedy & Carpenter, Appl. Numer. Math. 44 (2003) 139-181: order 4, six stages, first one
    explicit, L-stable, stiffly accurate, embedded order 3. Each stage X_i solves X_i = base_i + h g f(X_i) by Newton with
@@ -90,50 +90,88 @@ static double try_step(double t, double h, double ta, double dt, const double *u
   return norm_(e, x, xn, rtol, atol);
 }
 
-/* The sensitivities over the step that try_step accepted; S (NX x nc) is advanced in place. */
+/* The columns of S go through a step LANES at a time, in the processor's registers. Entries V of F_p belong to columns: `entry`
+   lists them by group of lanes, those of group g from begin[g] on, and `slot` their places in the group's (NX, LANES). */
+#define LANES 8
+typedef struct { int nc, groups, count, *begin, *entry, *slot; double *V, *S; } Columns;
+
+static int columns_(Columns *c, int nc, const double *S0, const Forces *force) {
+  const int *row = force ? force->row : V_ROW, *col = force ? force->col : V_COL;
+  c->nc = nc;
+  c->groups = (nc + LANES - 1) / LANES;
+  c->count = force ? force->count : NV;
+  size_t size = (size_t)c->groups * NX * LANES;
+  c->S = calloc(size + STAGES * (size_t)c->count + 1, sizeof(double));
+  c->begin = calloc((size_t)c->groups + 1 + 2 * (size_t)c->count, sizeof(int));
+  if (!c->S || !c->begin) { free(c->S); free(c->begin); return 0; }
+  c->V = c->S + size;
+  c->entry = c->begin + c->groups + 1;
+  c->slot = c->entry + c->count;
+  for (int g = 0, at = 0; g < c->groups; g++) {
+    for (int e = 0; e < c->count; e++) if (col[e] / LANES == g) { c->entry[at] = e; c->slot[at++] = row[e] * LANES + col[e] % LANES; }
+    c->begin[g + 1] = at;
+  }
+  for (int i = 0; i < NX; i++) for (int k = 0; k < nc; k++)
+    c->S[((size_t)(k / LANES) * NX + i) * LANES + k % LANES] = S0[(size_t)i * nc + k];
+  return 1;
+}
+
+static void columns_out_(const Columns *c, double *S) {
+  for (int g = 0; g < c->groups; g++) {
+    int wide = c->nc - g * LANES < LANES ? c->nc - g * LANES : LANES;
+    for (int i = 0; i < NX; i++) memcpy(S + (size_t)i * c->nc + g * LANES, c->S + ((size_t)g * NX + i) * LANES, wide * sizeof(double));
+  }
+}
+
+/* The sensitivities over the step that try_step accepted; c->S is advanced in place. Ms: the stages' factors. */
 static int sens_step(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
-                     const double *p, const double *w, const double *xs, double *S, int nc, double *ks, double *M,
-                     double *hfac, const Forces *force, int n) {
-  double u[NU + 1], J[NJ + 1], own[NV + 1], *V = own;
-  const int nv = force ? force->count : NV, *v_row = force ? force->row : V_ROW, *v_col = force ? force->col : V_COL;
-  if (force) V = ks + (STAGES + 2) * (size_t)NX * nc;
-  size_t block = (size_t)NX * nc;
+                     const double *p, const double *w, const double *xs, Columns *c, double *Ms, double *hfac, const Forces *force, int n) {
+  double u[NU + 1], J[NJ + 1], J0[NJ + 1];
   for (int s = 0; s < STAGES; s++) {
-    double ts = t + C_[s] * h, *K = ks + s * block, *R = ks + STAGES * block;
+    double ts = t + C_[s] * h, *V = c->V + (size_t)s * c->count;
     const double *X = xs + s * NX;
     inputs_at((ts - ta) / dt, u0, u1, lin, u);
     if (force) {
-      const double *q0 = force->q + (size_t)n * nv, *q1 = q0 + nv, part = (ts - ta) / dt;
-      for (int e = 0; e < nv; e++) V[e] = q0[e] + part * (q1[e] - q0[e]);
+      const double *q0 = force->q + (size_t)n * c->count, *q1 = q0 + c->count, part = (ts - ta) / dt;
+      for (int e = 0; e < c->count; e++) V[e] = q0[e] + part * (q1[e] - q0[e]);
     } else sens_(ts, X, u, p, w, V);
-    if (s == 0) {
+    if (s == 0) jac_(ts, X, u, p, w, J0);
+    else if (!LINEAR || *hfac != h) {
       jac_(ts, X, u, p, w, J);
-      memset(K, 0, block * sizeof(double));
-      for (int q = 0; q < NJ; q++) {
-        double *to = K + (size_t)J_ROW[q] * nc;
-        const double *from = S + (size_t)J_COL[q] * nc;
-        for (int c = 0; c < nc; c++) to[c] += J[q] * from[c];
+      if (!factor_(h * G, J, Ms + (LINEAR ? 0 : s * (NM + 1)))) return 0;
+      if (LINEAR) *hfac = h;
+    }
+  }
+  for (int g = 0; g < c->groups; g++) {
+    lanes K[STAGES][NX + 1], R[NX + 1], *S = (lanes *)(c->S + (size_t)g * NX * LANES);
+    double F[(NX + 1) * LANES];
+    const double back = 1 / (h * G);
+    const int first = c->begin[g], last = c->begin[g + 1];
+    memset(F, 0, sizeof F);
+    for (int s = 0; s < STAGES; s++) {
+      const double *V = c->V + (size_t)s * c->count;
+      for (int e = first; e < last; e++) F[c->slot[e]] += V[c->entry[e]];
+      lanes *const k = K[s];
+      const lanes *const f = (const lanes *)F;
+      if (s == 0) {
+        for (int i = 0; i < NX; i++) k[i] = f[i];
+        for (int q = 0; q < NJ; q++) k[J_ROW[q]] += J0[q] * S[J_COL[q]];
+      } else {
+        const double a0 = h * A_[s][0], a1 = h * A_[s][1], a2 = h * A_[s][2], a3 = h * A_[s][3], a4 = h * A_[s][4];
+        switch (s) {
+          case 1: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i]; break;
+          case 2: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i] + a1 * K[1][i]; break;
+          case 3: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i] + a1 * K[1][i] + a2 * K[2][i]; break;
+          case 4: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i] + a1 * K[1][i] + a2 * K[2][i] + a3 * K[3][i]; break;
+          default: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i] + a2 * K[2][i] + a3 * K[3][i] + a4 * K[4][i];
+        }
+        for (int i = 0; i < NX; i++) k[i] = R[i] + h * G * f[i];
+        solve_lanes_(Ms + (LINEAR ? 0 : s * (NM + 1)), k);
+        if (s == STAGES - 1) for (int i = 0; i < NX; i++) S[i] = k[i];
+        else for (int i = 0; i < NX; i++) k[i] = (k[i] - R[i]) * back;
       }
-      for (int q = 0; q < nv; q++) K[(size_t)v_row[q] * nc + v_col[q]] += V[q];
-      continue;
+      for (int e = first; e < last; e++) F[c->slot[e]] = 0;
     }
-    memcpy(R, S, block * sizeof(double));
-    for (int q = 0; q < s; q++) {
-      double a = h * A_[s][q];
-      const double *Kq = ks + q * block;
-      if (a != 0) for (size_t c = 0; c < block; c++) R[c] += a * Kq[c];
-    }
-    memcpy(K, R, block * sizeof(double));
-    for (int q = 0; q < nv; q++) K[(size_t)v_row[q] * nc + v_col[q]] += h * G * V[q];
-    if (!LINEAR || *hfac != h) {
-      jac_(ts, X, u, p, w, J);
-      if (!factor_(h * G, J, M)) return 0;
-      *hfac = LINEAR ? h : 0;
-    }
-    solve_many_(M, K, nc);
-    if (s == STAGES - 1) { memcpy(S, K, block * sizeof(double)); return 1; }
-    double g = 1 / (h * G);
-    for (size_t c = 0; c < block; c++) K[c] = (K[c] - R[c]) * g;
   }
   return 1;
 }
@@ -143,17 +181,15 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
 int integrate(int N, const double *t, const double *U, const int *lin, const double *p, const double *w, const double *x0,
               const double *S0, int nc, double rtol, const double *atol, int max_steps, double *X, double *SX,
               double *info, const Forces *force) {
-  double x[NX + 1], xn[NX + 1], k[STAGES * (NX + 1)], xs[STAGES * (NX + 1)], M[NM + 1];
+  double x[NX + 1], xn[NX + 1], k[STAGES * (NX + 1)], xs[STAGES * (NX + 1)], M[NM + 1], Ms[(LINEAR ? 1 : STAGES) * (NM + 1)];
   size_t block = (size_t)NX * nc;
-  double *ks = NULL, *S = NULL;
-  double want = 0, hfac = 0, hfac_s = 0, Ms[NM + 1];
+  double want = 0, hfac = 0, hfac_s = 0;
+  Columns c = {0};
   if (SX) {
-    ks = malloc(((STAGES + 2) * (block + 1) + (force ? force->count : 0)) * sizeof(double));
-    if (!ks) return -1;
-    S = ks + (STAGES + 1) * block;
-    memcpy(S, S0, block * sizeof(double));
+    if (!columns_(&c, nc, S0, force)) return -1;
     memcpy(SX, S0, block * sizeof(double));
   }
+  int failed_at = 0;
   memcpy(x, x0, NX * sizeof(double));
   memcpy(X, x0, NX * sizeof(double));
   info[0] = info[1] = 0;
@@ -167,15 +203,15 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
       int last = h >= left;
       if (last) h = left;
       if (last && at == ta && fabs(h - hfac) < 1e-9 * h) h = hfac;  /* a clock equal but for rounding: same factors */
-      if (++steps > max_steps) { free(ks); return n + 1; }
+      if (++steps > max_steps) { failed_at = n + 1; goto out; }
       double err = try_step(at, h, ta, dt, u0, u1, lin, p, w, x, rtol, atol, k, xs, xn, M, &hfac);
       if (!(err >= 0 && err <= 1)) {
         info[1]++;
         want = err > 1 && err < 1e9 ? h * fmax(0.1, 0.9 * pow(err, -0.25)) : h * 0.1;
-        if (want < 1e-12 * dt || ++failed > 60) { free(ks); return n + 1; }
+        if (want < 1e-12 * dt || ++failed > 60) { failed_at = n + 1; goto out; }
         continue;
       }
-      if (SX && !sens_step(at, h, ta, dt, u0, u1, lin, p, w, xs, S, nc, ks, Ms, &hfac_s, force, n)) { free(ks); return n + 1; }
+      if (SX && !sens_step(at, h, ta, dt, u0, u1, lin, p, w, xs, &c, Ms, &hfac_s, force, n)) { failed_at = n + 1; goto out; }
       memcpy(x, xn, NX * sizeof(double));
       info[0]++;
       double grow = h * fmin(4, 0.9 * pow(fmax(err, 1e-6), -0.25));
@@ -183,10 +219,12 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
       at = last ? t[n + 1] : at + h;
     }
     memcpy(X + (size_t)(n + 1) * NX, x, NX * sizeof(double));
-    if (SX) memcpy(SX + (n + 1) * block, S, block * sizeof(double));
+    if (SX) columns_out_(&c, SX + (n + 1) * block);
   }
-  free(ks);
-  return 0;
+out:
+  free(c.S);
+  free(c.begin);
+  return failed_at;
 }
 
 /* Outputs of one list (o = 0: the outputs, 1: the arguments of their delays) at N samples. D: N x ND values of the delays

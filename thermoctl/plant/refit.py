@@ -32,6 +32,7 @@ HUBER = 4.0             # residuals beyond this many sigmas count linearly
 BELIEF_WEIGHT = 0.02    # a whole range away from the belief costs as much as a fiftieth of a sigma, once
 PROBE = 0.1             # of a step, over which the curvature of the residuals is taken
 HOPELESS = 20.0         # steps, each like the last three
+ODD = 0.25              # share of rows up to which those that weigh less are taken off a product of all rows
 BENT = 0.75             # geodesic acceleration over the step up to which it is believed
 
 
@@ -219,6 +220,23 @@ class Problem:
             part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
         return part / scale.reshape(shape)
 
+    def _weighted(self, r: int, j: int, k: np.ndarray, slope: np.ndarray, w: np.ndarray, weight: np.ndarray, jac: np.ndarray) -> _Rows:
+        """Output j's rows of recording r, from its whitened residuals and their weights (M,) and its slopes (N, k). White noise of
+        one size only scales slopes: they are not copied, and what is missing weighs nothing."""
+        index, phi, _ = self.rows[r][j]
+        noise = self.noise[j]
+        if len(noise.ar) > 1 or phi.any() or len(index) < (1 - ODD) * len(jac):
+            return _Rows(r, j, k, slope, self.whiten(r, j, jac), w, weight)
+        return _Rows(r, j, k, slope / noise.sigma, jac, self._spread(r, j, w, len(jac)), self._spread(r, j, weight, len(jac)))
+
+    def _spread(self, r: int, j: int, w: np.ndarray, n: int) -> np.ndarray:
+        """Values (M,) of output j's measured samples as `n` rows: as they are, or with a zero for each that is missing."""
+        if len(w) == n:
+            return w
+        out = np.zeros(n)
+        out[self.rows[r][j][0]] = w
+        return out
+
     def set_outlier_limits(self, residuals: Sequence[np.ndarray]) -> bool:
         """Huber's limit of each output from the spread of its residuals: what a plant that lacks physics misses is no
         outlier, nor is what happens in more than one sample of fifty. True where a limit changed by more than a half."""
@@ -278,19 +296,15 @@ class Problem:
                 cost += float(np.sum(np.where(a <= limit, w * w, 2 * limit * a - limit ** 2)))
                 if not jacobian or run.dy is None:
                     continue
-                jac = self.whiten(r, j, run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used])
-                root = None
-                if a.max(initial=0.0) > limit:
-                    root = np.sqrt(np.where(a <= limit, 1.0, limit / np.maximum(a, limit)))
-                    jac *= root[:, None]
-                    w = w * root
+                dy = run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used]
+                rows = self._weighted(r, j, k, slope, w, np.where(a <= limit, 1.0, limit / np.maximum(a, limit)), dy)
                 if keep is not None:
-                    keep.append(_Rows(r, j, k, slope, jac, w, root))
-                part_gradient += jac.T @ w
-                part_matrix += jac.T @ jac
+                    keep.append(rows)
+                part_gradient += rows.slope * (rows.jac.T @ (rows.weight * rows.w))
+                part_matrix += _gram(rows.jac, rows.weight) * np.outer(rows.slope, rows.slope)
             if jacobian:
-                np.add.at(gradient, k, part_gradient * slope)
-                matrix[np.ix_(k, k)] += part_matrix * np.outer(slope, slope)
+                np.add.at(gradient, k, part_gradient)
+                matrix[np.ix_(k, k)] += part_matrix
         part, slope, bend = self.believed(values, jacobian)
         cost, gradient, matrix = cost + part, gradient - slope, matrix + bend
         prior = self.prior()
@@ -321,24 +335,33 @@ class Problem:
         errors = [d.y - self.model.run(d, values[r], dx0[r], buffers=self.buffers).y for r, d in enumerate(self.drives)]
         out = np.zeros(len(z))
         for rows in kept:
-            moved = self.whiten(rows.recording, rows.output, errors[rows.recording][:, rows.output])
-            if rows.root is not None:
-                moved = moved * rows.root
+            r, j = rows.recording, rows.output
+            moved = self._spread(r, j, self.whiten(r, j, errors[r][:, j]), len(rows.w))
             second = (moved - rows.w) / PROBE + rows.jac @ (rows.slope * step[rows.unknowns])
-            np.add.at(out, rows.unknowns, rows.slope * (rows.jac.T @ second))
+            np.add.at(out, rows.unknowns, rows.slope * (rows.jac.T @ (rows.weight * second)))
         return out * (2 / PROBE)
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """Whitened residuals w of an output in a recording with their slopes (M, k) by the unknowns' physical values, outliers' weights in."""
+    """Whitened residuals w (M,) of an output in a recording, what they weigh, and -dw (M, k) by the unknowns over their `slope`."""
     recording: int
     output: int
     unknowns: np.ndarray
     slope: np.ndarray
     jac: np.ndarray
     w: np.ndarray
-    root: np.ndarray | None
+    weight: np.ndarray
+
+
+def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """J^T W J; where few rows weigh less than one, less what they would add if they did not."""
+    odd = np.flatnonzero(weight != 1.0)
+    if len(odd) > ODD * len(jac):
+        jac = jac * np.sqrt(weight)[:, None]
+        odd = odd[:0]
+    few = jac[odd] * np.sqrt(1.0 - weight[odd])[:, None]
+    return jac.T @ jac - few.T @ few
 
 
 def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = None,

@@ -216,7 +216,7 @@ class Model:
     def run(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None = None, dx0: np.ndarray | None = None,
             sensitivities: bool = False, rtol: float = RTOL, buffers: dict[str, np.ndarray] | None = None) -> Simulation:
         """Free run on a drive. `buffers`: a dict that keeps the large arrays between runs (the next run with it changes
-        what the last one returned). Raises SimulationError."""
+        the states' slopes that the last one returned, and the outputs' of the last one on this drive). Raises SimulationError."""
         if drive.scale is None:
             self.prepare(drive, parameters)
         return self._run(drive, self.vector(parameters, drive.name), dx0, sensitivities, rtol, buffers)
@@ -298,7 +298,7 @@ class Model:
             lib.observe(1, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, None, None, _p(g), _p(dg), own)
             delayed, slopes = self._shift(drive.t, g, dg, p, own)
         y = np.empty((n, ny))
-        dy = _buffer(buffers, "dy", (n, ny, nq)) if sensitivities else None
+        dy = _buffer(buffers, f"dy {id(drive)}", (n, ny, nq)) if sensitivities else None
         lib.observe(0, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, _p(delayed), _p(slopes), _p(y), _p(dy), own)
         return y, dy
 
