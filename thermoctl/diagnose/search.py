@@ -23,7 +23,8 @@ from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.yamlfile import InputError
 
-PATIENCE_S = 60.0           # CPU seconds of a diagnosis beyond which it looks at fewer pairs, runners-up and rivals of several effects
+PATIENCE_S = 60.0           # CPU seconds of a diagnosis beyond which it looks at fewer pairs and runners-up,
+HASTE_S = 75.0              # and beyond which it looks for no further effect and at fewer rivals of several
 FINALISTS, ALIKE = 12, 8    # refitted after a screening, and of one effect
 BEGINNINGS = 8              # effects, the best first ones, that are looked at for a second one where something remains
 SPONGE = 1.1                # an unknown function of time that leaves much has to fit better than constant physics by this factor in cost
@@ -372,7 +373,7 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
             if e.counts and prediction(case, current, e)[2] < 1.0:
                 best = e
                 break
-        if best is None and not current.effects and seen.p_any() < LOOK and time.process_time() - case.begun < PATIENCE_S:
+        if best is None and not current.effects and seen.p_any() < LOOK and _spent(case) < PATIENCE_S:
             case.progress("looking for two effects that hide each other")
             together = compete_pairs(case, seen, pairs(seen))
             best = next((e for e in together if counts(case, seen, e, entries)), None)
@@ -389,19 +390,26 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
         if best is None:
             break
         current, rivals = best, [e for e in seen.finalists if e is not best and e.score > best.score - 2 * ACCEPT]
-        if len(current.effects) >= most:
+        if len(current.effects) >= most or (len(current.effects) > 1 and _spent(case) > HASTE_S):
             break
         case.progress("screening again")
         rounds.append(look(case, current, entries))
-        if len(current.effects) == 1 and time.process_time() - case.begun < PATIENCE_S \
+        if len(current.effects) == 1 and _spent(case) < PATIENCE_S \
                 and (max(case.excess(current).values()) > LARGE or remains(case, current)):
             found = otherwise(case, seen, rounds[-1])
             if found and found[0].score < current.score - ACCEPT:
                 current, rivals = found[0], found[1:]
+                if _spent(case) > HASTE_S:
+                    break
                 rounds.append(look(case, current, entries))
     if len(current.effects) > 1:
         current, rivals = _backward(case, base, current, rivals, entries, rounds[0].finalists if not start else [])
     return current, rivals, rounds
+
+
+def _spent(case: Case) -> float:
+    """CPU seconds since the diagnosis began."""
+    return time.process_time() - case.begun
 
 
 def otherwise(case: Case, seen: Round, after: Round) -> list[Explanation]:
@@ -409,14 +417,14 @@ def otherwise(case: Case, seen: Round, after: Round) -> list[Explanation]:
     (`seen.finalists`) are looked at again, as the choice itself was (`after`), and the most promising get their second effect, too."""
     promising = []
     for e in (e for e in _runners_up(seen.finalists, BEGINNINGS) if e is after.base or not _soaks(case, e)):
-        if time.process_time() - case.begun > PATIENCE_S:
+        if _spent(case) > PATIENCE_S:
             break
         again = after if e is after.base else look(case, e, after.entries, draws=0)
         if again.directions:
             promising.append((e.fit.cost - again.directions[0].gain, again))
     best: list[Explanation] = []
     for _, again in sorted(promising, key=lambda p: p[0])[:3]:
-        if best and time.process_time() - case.begun > 2 * PATIENCE_S:
+        if best and _spent(case) > HASTE_S:
             break
         found = compete(case, again, finalists(again.directions, 6))
         if found and (not best or found[0].score < best[0].score):
@@ -465,7 +473,7 @@ def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[
     competed with it `alone`."""
     for _ in range(2):
         changed = False
-        late = time.process_time() - case.begun > 2 * PATIENCE_S
+        late = _spent(case) > HASTE_S
         others: list[Explanation] = []
         for k in range(len(current.effects)):
             without = leave_out(case, base, current, k)
