@@ -13,6 +13,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from thermoctl.diagnose import prove, score
@@ -183,6 +184,33 @@ def test_summary_of_a_hand_made_set():
         "radiation": 1,
     }
     assert s["by_effect"]["radiation"]["exact"] == 1
+    assert s["found_by_size"] == {"all": None, "white": None, "coloured": None}
+
+
+def test_the_size_found_half_of_the_time_is_that_of_scipy_and_its_interval_holds_the_truth():
+    from scipy.optimize import minimize
+
+    rng, held = np.random.default_rng(3), 0
+    for _ in range(60):
+        sizes = np.exp(rng.uniform(np.log(3), np.log(40), 120))
+        found = rng.random(120) < 1 / (1 + (6 / sizes) ** 4)
+        curve = score.found_by_size(sizes.tolist(), found.tolist())
+        assert curve is not None
+        held += curve["low"] <= 6 <= curve["high"]
+
+        def against(v, sizes=sizes, found=found):
+            odds = v[1] * (np.log(sizes) - v[0])
+            return np.logaddexp(0, np.where(found, -odds, odds)).sum()
+
+        best = minimize(against, [np.log(6), 4], method="Nelder-Mead")
+        assert curve["half"] == pytest.approx(np.exp(best.x[0]), rel=0.03)
+    assert held >= 52  # of 57 in the mean
+    assert score.found_by_size([5.0] * 20, [True] * 20) is None and score.found_by_size([3.0, 9.0], [False, True]) is None
+
+
+def test_a_kept_result_is_of_the_integrator_too_and_not_of_what_scores_it():
+    names = {f.name for f in prove._program()}
+    assert {"integrator.h", "refit.py", "search.py", "radiation.yaml"} <= names and not names & {"score.py", "prove.py"}
 
 
 # --- running -------------------------------------------------------------------------------------------------------------

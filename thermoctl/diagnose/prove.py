@@ -56,7 +56,8 @@ def program() -> str:
 
 def _program() -> list[Path]:
     package = Path(__file__).parents[1]
-    code = [f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.py*"))]
+    files = [f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.[ph]*"))]
+    code = [f for f in files if f.name not in ("prove.py", "score.py")]  # these read results and make none
     return [*sorted(CATALOGUE.glob("*.yaml")), *code]
 
 
@@ -306,6 +307,9 @@ _TITLES = {
     "failed": "diagnosis failed",
 }
 _NUMBERS = {
+    "half_found_at_all": "found half of the time, sigmas of an ideal test",
+    "half_found_at_white": "the same in white noise",
+    "half_found_at_coloured": "the same in coloured noise",
     "calibration_error": "calibration error of the probabilities",
     "gain_median": "held-out gain, share of the oracle's, median",
     "gain_worst_tenth": "held-out gain, worst tenth",
@@ -358,7 +362,9 @@ def _lines(content: dict[str, Any]) -> Iterator[tuple[str, str, str, str, str, b
         value = content["figures"][key]
         if value is not None:
             text, reached = goal(key, False)
-            yield title, f"{value:.3g}", "", "", text, reached
+            curve = content["found_by_size"].get(key.removeprefix("half_found_at_"))
+            wide, of = (f"{curve['low']:.1f}–{curve['high']:.1f}", str(curve["n"])) if curve else ("", "")
+            yield title, f"{value:.3g}", wide, of, text, reached
 
 
 def page(content: dict[str, Any], rows: Sequence[scoring.Row]) -> str:

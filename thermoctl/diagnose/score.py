@@ -5,6 +5,9 @@ Detection, false alarms and all shares carry Wilson's 95 % interval
     (p + z^2/2n +- z sqrt(p (1-p)/n + z^2/4n^2)) / (1 + z^2/n),  z = 1.96
 
 Calibration: the expected error  ECE = sum_b (n_b/n) |mean probability_b - share right_b|  over ten bins of width 0.1.
+Detection over size s, in sigmas of an ideal single test (the curve of MIL-HDBK-1823A), by maximum likelihood on a grid,
+
+    P(found | s) = 1 / (1 + (half / s)^slope),  95 % interval of `half`: where twice the log likelihood has fallen by 3.84
 Held-out gain: with e the mean over outputs of (rms / oracle's rms)^2 on data that took no part,
 
     share = (e_refit - e_after) / (e_refit - 1)      1: as good as the true physics; 0: no better than a refit alone.
@@ -18,6 +21,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
+
+import numpy as np
 
 from thermoctl.yamlfile import InputError
 
@@ -84,6 +89,8 @@ class Row:
     family: str
     kind: str
     band: str | None
+    size: float | None  # sigmas of an ideal single test that are left of the effect after a refit
+    colour: str | None  # of the noise
     truth: list[tuple[str, str]]
     verdict: str
     called: str
@@ -174,6 +181,8 @@ def score(
         family=str(answer.get("family", "")),
         kind=kind,
         band=answer.get("band"),
+        size=answer["snr"][0] if kind == "one" and answer.get("snr") else None,
+        colour=answer.get("colour"),
         truth=truth,
         verdict=verdict,
         called=called,
@@ -272,6 +281,21 @@ def by_chance(pairs: Sequence[tuple[float, bool]], draws: int = 400) -> float | 
     return sum(given) / len(given) if given else None
 
 
+def found_by_size(sizes: Sequence[float], found: Sequence[bool]) -> dict[str, float] | None:
+    """The size found half of the time with its 95 % interval (`low`, `high`), the one found nine times in ten, and the slope;
+    None for fewer than ten sizes or where all or none were found."""
+    if len(sizes) < 10 or all(found) or not any(found):
+        return None
+    half, slope = np.geomspace(0.5, 100.0, 400), np.geomspace(0.5, 30.0, 60)
+    s, hit = np.log(np.asarray(sizes, float)), np.asarray(found, bool)
+    odds = slope[None, :, None] * (s - np.log(half)[:, None, None])
+    likely = -np.logaddexp(0.0, np.where(hit, -odds, odds)).sum(axis=2)
+    i, j = np.unravel_index(int(np.argmax(likely)), likely.shape)
+    inside = half[2 * (likely.max() - likely.max(axis=1)) <= 3.84]
+    return {"half": float(half[i]), "low": float(inside[0]), "high": float(inside[-1]),
+            "nine_in_ten": float(half[i] * 9 ** (1 / slope[j])), "slope": float(slope[j]), "n": len(sizes)}
+
+
 def _quantile(values: Iterable[float | None], q: float) -> float | None:
     given = sorted(v for v in values if v is not None)
     if not given:
@@ -312,6 +336,15 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "interval_coverage": share(p["covered"] for r in rows for p in r.parameters),
         "failed": share(r.verdict == "failed" for r in rows),
     }
+    sized = [(r.size, r.detected, r.colour) for r in single if r.size]
+    by_size = {
+        name: found_by_size([z for z, _, _ in group], [d for _, d, _ in group])
+        for name, group in (
+            ("all", sized),
+            ("white", [g for g in sized if g[2] == "white"]),
+            ("coloured", [g for g in sized if g[2] not in (None, "white")]),
+        )
+    }
     given = [x for r in rows for x in r.calibration]
     table, ece = reliability(given)
     gains = [r.gain for r in known if r.detected and r.findings]
@@ -319,6 +352,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "cases": len(rows),
         "calibration_error": ece,
         "calibration_error_by_chance": by_chance(given),
+        **{f"half_found_at_{name}": c["half"] if c else None for name, c in by_size.items()},
         "gain_median": _quantile(gains, 0.5),
         "gain_worst_tenth": _quantile(gains, 0.1),
         "seconds_median": _quantile((r.seconds for r in rows), 0.5),
@@ -348,6 +382,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
             for k, (g, side) in GOALS.items()
         },
         "reliability": table,
+        "found_by_size": by_size,
         "confusion": {t: dict(c) for t, c in sorted(confusion.items())},
         "by_family": {f: _brief([r for r in rows if r.family == f]) for f in sorted({r.family for r in rows})},
         "by_effect": {

@@ -232,6 +232,7 @@ class _Column:
 
 def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Sequence[_Column], np.ndarray]]:
     """Whitened rows (rows, k) of columns, a chunk at a time."""
+    buffers: dict[str, np.ndarray] = {}
     for at in range(0, len(columns), CHUNK):
         part = columns[at:at + CHUNK]
         blocks = []
@@ -244,7 +245,7 @@ def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Seq
             shape = (len(d.t), len(metric.model.outputs), len(part))
             if forces:
                 q = np.nan_to_num(np.stack(values, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
-                dy = metric.model.respond(d, metric.fit.values[r], metric.fit.dx0[r], forces, q, len(part))
+                dy = metric.model.respond(d, metric.fit.values[r], metric.fit.dx0[r], forces, q, len(part), buffers=buffers)
             else:
                 dy = np.zeros(shape)
             for c, column in enumerate(part):

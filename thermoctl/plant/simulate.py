@@ -263,9 +263,10 @@ class Model:
         return Simulation(drive.t, x, y, dx, dy, int(info[0]), int(info[1]))
 
     def respond(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None, dx0: np.ndarray | None,
-                forces: Sequence[tuple[int, int]], q: np.ndarray, columns: int, rtol: float = 1e-5) -> np.ndarray:
+                forces: Sequence[tuple[int, int]], q: np.ndarray, columns: int, rtol: float = 1e-5,
+                buffers: dict[str, np.ndarray] | None = None) -> np.ndarray:
         """The outputs' first-order response (N, ny, columns) to forces on dx/dt that the plant does not have. Entry e of
-        `forces` is (state, column) and has its values, per second, in q[:, e] (N, entries)."""
+        `forces` is (state, column) and has its values, per second, in q[:, e] (N, entries). `buffers`: as of `run`."""
         lib, n, nx = self.code.library, len(drive.t), len(self.states)
         p = self.vector(parameters, drive.name)
         if drive.scale is None or drive.width is None:
@@ -278,12 +279,12 @@ class Model:
         q = np.ascontiguousarray(q, float)
         force = _Forces(len(rows), _p(rows), _p(cols), _p(q))
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
-        dx = np.empty((n, nx, columns))
+        dx = _buffer(buffers, "dx", (n, nx, columns))
         atol = rtol * drive.scale
         if nx and lib.integrate(n, _p(drive.t), _p(u), _p(drive.linear), _p(p), _p(drive.width), _p(x0), _p(s0), columns, rtol,
                                 _p(atol), MAX_STEPS, _p(x), _p(dx), _p(info), ctypes.addressof(force)):
             raise SimulationError(f"{drive.name}: the plant cannot be simulated")
-        _, dy = self._observe(drive, u, p, drive.width, x, dx, columns, True, None, 0)
+        _, dy = self._observe(drive, u, p, drive.width, x, dx, columns, True, buffers, 0)
         assert dy is not None
         return dy
 
