@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from thermoctl.diagnose import run, screen, search
-from thermoctl.diagnose.effects import catalogue
+from thermoctl.diagnose.effects import Rig, candidates, catalogue
 from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.locate import Suspect
 from thermoctl.plant.language import loads
@@ -195,3 +195,58 @@ def test_a_sketch_keeps_what_directions_have_in_common():
     short = metric.sketch(rows)
     assert len(short) <= screen.ROWS
     assert np.allclose(short.T @ short / len(rows), rows.T @ rows / len(rows), atol=0.05)
+
+
+MOTOR = """format: thermoctl-plant/1
+title: A motor on a frame that grows
+inputs: {current: {unit: A}, speed: {unit: rad/s}, air: {unit: degC, between_samples: linear}}
+parameters:
+  C_winding: {value: 60, unit: J/K, range: [20, 200]}
+  C_housing: {value: 300, unit: J/K, range: [100, 900]}
+  G: {value: 1.2, unit: W/K, range: [0.3, 4]}
+  H: {value: 0.8, unit: W/K, range: [0.2, 3]}
+  fan: {value: 0.001, unit: W/K/(rad/s)}
+  R: {value: 1.2, unit: ohm, range: [0.6, 2.4]}
+  growth: {value: 2.0, unit: um/K, range: [0.5, 8]}
+nodes: {winding: {unit: degC, storage: C_winding, initial: air}, housing: {unit: degC, storage: C_housing, initial: air}}
+flows:
+  joule: {into: winding, rate: R * current**2 * (1 + 0.00393 * (winding - 20)), unit: W}
+  link: {from: winding, into: housing, rate: G * (winding - housing), unit: W}
+  draught: {into: housing, rate: (H + fan * abs(speed)) * (air - housing), unit: W}
+outputs:
+  winding_c: {value: winding, unit: degC, noise: 0.1}
+  housing_c: {value: housing, unit: degC, noise: 0.1}
+  error: {value: growth * (housing - 20), unit: um, noise: 0.05}
+"""
+
+
+@pytest.fixture(scope="module")
+def motor():
+    t = np.arange(0.0, 3000.0, 10.0)
+    plant = loads(MOTOR)
+    table = Table("run", "run", t, {"current": 3.0 * (np.sin(t / 200) > 0), "speed": 50 + 50 * np.cos(t / 150), "air": 21 + np.sin(t / 700)})
+    return Case(plant, [plant.compile().measure(table)])
+
+
+def offered(case, plant, name):
+    rig = Rig(plant, [plant.compile().drive(t) for t in case.tables], [t.columns for t in case.tables])
+    return {c.place.where: c for c in candidates(rig, entries(name))}
+
+
+def test_heat_that_copper_makes_may_go_elsewhere_and_what_a_draught_carries_off_may_not(motor):
+    assert set(offered(motor, motor.plant, "heat_split")) == {"winding-housing"}
+
+
+def test_a_reading_of_growth_may_follow_the_air_as_a_temperature_does(motor):
+    assert set(offered(motor, motor.plant, "cold_junction_drift")) == {"winding_c", "housing_c", "error"}
+
+
+def test_what_was_left_out_is_not_looked_for_in_what_another_effect_assumed(motor):
+    mass = offered(motor, motor.plant, "hidden_thermal_mass")["housing"]
+    plant = mass.extend({"G": 0.5, "C": 100.0, **{p.name: p.null for p in mass.effect.parameters if p.name not in "GC"}})
+    hidden = set(plant.nodes) - set(motor.plant.nodes)
+    assert len(hidden) == 1 and any(hidden & c.place.parts() for c in offered(motor, plant, "missing_link").values())
+    e = motor.explain(plant, [mass], [{p.name: mass.own(p.name) for p in mass.effect.parameters}], iterations=2)
+    seen = search.look(motor, e, entries("missing_link", "natural_convection", "conductance_step", "sensor_gain"), draws=0)
+    assert {d.candidate.effect.name for d in seen.directions} >= {"natural_convection", "conductance_step", "sensor_gain"}
+    assert not any("hidden" in d.candidate.place.where for d in seen.directions)

@@ -243,6 +243,11 @@ class Place:
     output: str | None = None
     input: str | None = None
 
+    def parts(self) -> set[str]:
+        """The nodes and the flow that it names (not those that a reading is made of)."""
+        named = {str(e.value) for s, e in self.symbols.items() if s != "y" and e.op == "name"}
+        return {*self.nodes.values(), *named} | ({self.flow} if self.flow else set())
+
 
 def _nodes(rig: Rig, which: Sequence[str], symbol: str) -> Iterator[Place]:
     for n in which:
@@ -285,9 +290,18 @@ def _heated_pairs(rig: Rig) -> Iterator[Place]:
 
 
 def _heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
-    """Flows of heat from outside into a node that follow inputs, not temperatures of the network."""
+    """Flows of heat from outside into a node that follow inputs, not temperatures of the network: where these change it (copper's
+    resistance), there is none of it while the inputs rest."""
     return [f for f in plant.flows.values() if f.target == node and f.source is None and ex.names(f.rate) & rig.moving_inputs
-            and not ex.names(f.rate) & set(rig.heat_inputs) and node not in ex.names(f.rate)]
+            and not ex.names(f.rate) & set(rig.heat_inputs) and (node not in ex.names(f.rate) or _rests(plant, f))]
+
+
+def _rests(plant: Plant, f: Flow) -> bool:
+    """Is a flow nothing while all inputs are zero, whatever the temperatures?"""
+    if any(e.op == "delay" for e in ex.walk(f.rate)):
+        return False
+    at = {**{p.name: p.value for p in plant.parameters.values()}, **dict.fromkeys(plant.inputs, 0.0), "t": 0.0}
+    return all(float(ex.evaluate(f.rate, {**at, **dict.fromkeys(plant.nodes, T)})) == 0 for T in (10.0, 60.0))
 
 
 def _joule_flows(rig: Rig) -> Iterator[Place]:
@@ -382,7 +396,7 @@ def _resistive(rig: Rig) -> Iterator[Place]:
 PLACES = {
     "temperature_node": _temperature_nodes, "velocity_node": _velocity_nodes, "conductance": _conductances,
     "temperature_pair": _pairs, "heated_pair": _heated_pairs, "joule_flow": _joule_flows, "motor": _motors, "drive": _drives,
-    "sensor": _sensors, "temperature_sensor": lambda rig: _sensors(rig, "temperature"),
+    "sensor": _sensors, "reading_in_air": lambda rig: (*_sensors(rig, "temperature"), *_displacements(rig)),
     "position_sensor": lambda rig: _sensors(rig, "length"), "displacement": _displacements, "member": _members,
     "bending_pair": _bending_pairs, "voltage_sensor": _voltages, "level_node": _levels, "orifice": _orifices,
     "resistive": _resistive}

@@ -139,7 +139,8 @@ class Round:
 
 
 def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool = False) -> Round:
-    """Screen the catalogue from an explanation; `coloured`: in the metric of the residual's own colour."""
+    """Screen the catalogue from an explanation, at the places of the plant as it came: what was left out is the rig's, not that of a
+    part which another effect assumed. `coloured`: in the metric of the residual's own colour."""
     model = base.fit.model
     drives = [model.drive(t) for t in case.tables]
     for d in drives:
@@ -147,7 +148,8 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
     rig = Rig(base.plant, drives, [t.columns for t in case.tables])
     metric = Metric(dataclasses.replace(base.fit, noise=noise_of(base.colours)) if coloured else base.fit, drives,
                     FINE_ROWS if rig.velocities else ROWS)
-    found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects}]
+    added = (base.plant.nodes.keys() | base.plant.flows.keys()) - (case.plant.nodes.keys() | case.plant.flows.keys())
+    found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects} and not c.place.parts() & added]
     noise = np.random.default_rng(1).standard_normal((len(metric.sketch(metric.residual[:, None])), draws)) if draws else None
     ranked, chance = screen(metric, rig, found, noise)
     return Round(base, metric, rig, entries, ranked, chance)
