@@ -163,7 +163,7 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
           case 2: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i] + a1 * K[1][i]; break;
           case 3: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i] + a1 * K[1][i] + a2 * K[2][i]; break;
           case 4: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i] + a1 * K[1][i] + a2 * K[2][i] + a3 * K[3][i]; break;
-          default: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i] + a2 * K[2][i] + a3 * K[3][i] + a4 * K[4][i];
+          default: for (int i = 0; i < NX; i++) R[i] = S[i] + a0 * K[0][i] /* a1 is 0 */ + a2 * K[2][i] + a3 * K[3][i] + a4 * K[4][i];
         }
         for (int i = 0; i < NX; i++) k[i] = R[i] + h * G * f[i];
         solve_lanes_(Ms + (LINEAR ? 0 : s * (NM + 1)), k);
