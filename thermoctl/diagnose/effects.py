@@ -752,7 +752,8 @@ def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count:
 
 
 def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24) -> list[dict[str, float]]:
-    """The values of a shape to look at in screening; `picked_from`: of how many the residual itself picked this one."""
+    """The values of a shape to look at in screening. Beside them `picked_from`: of how many the residual itself picked this one, and
+    `longest`: beyond which a period would not have come once."""
     rig = candidate.rig
     duration = max(float(d.t[-1]) for d in rig.drives)
     dt = min(float(np.median(np.diff(d.t))) for d in rig.drives if len(d.t) > 1)
@@ -786,14 +787,14 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
         span = float(np.ptp(x[np.isfinite(x)])) or 1.0
         if kind == "periods":
             # neighbouring periods differ by a quarter of a turn over the span
-            turns = np.arange(0.75, SLOW_TURNS, 0.25)
+            turns = np.arange(1.0, SLOW_TURNS, 0.25)
             errors = [d.y - run.y for d, run in zip(rig.drives, runs, strict=True)]
             if candidate.place.output:
                 j = list(rig.plant.outputs).index(candidate.place.output)
                 fine = _fine_turns(x, [e[:, j] for e in errors], span)
-                return [{"period": float(span / n)} for n in turns] + \
-                    [{"period": float(span / n), "picked_from": 4.0 * FINE_TURNS} for n in fine]
-            return [{"period": float(span / n)} for n in turns]
+                return [{"period": float(span / n), "longest": span} for n in turns] + \
+                    [{"period": float(span / n), "longest": span, "picked_from": 4.0 * FINE_TURNS} for n in fine]
+            return [{"period": float(span / n), "longest": span} for n in turns]
         if kind == "phases":
             return [{"phase": 0.0}, {"phase": float(np.pi / 2)}]
         return [{"distance": float(v)} for v in np.geomspace(1e-3 * span, 0.5 * span, 8)]

@@ -46,6 +46,7 @@ from thermoctl.recording.table import read_table
 from thermoctl.yamlfile import InputError
 
 NAME = 0.9                  # one explanation is named alone from this probability on
+MANY = 3                    # effects at once, which one that the catalogue lacks explains better
 FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
 TEMPERING = 1.9, 3.0        # how much less the score decides than a perfect likelihood would, in white and in coloured noise
 
@@ -140,6 +141,9 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
                 current, rivals, worst = base, [], before_worst     # the name explains less than what it leaves
                 held = held_out(case, base, current)
             notes.append(f"beside what is named, something remains that no entry of the catalogue explains: {left.sentence()}")
+        elif explained and len(current.effects) >= MANY:
+            verdict = "unexplained"
+            notes.append(f"{len(current.effects)} entries of the catalogue together fit; so many at once rather stand in for one thing that it lacks")
         elif explained:
             verdict = "explained" if current.probability >= NAME else "ambiguous"
         else:

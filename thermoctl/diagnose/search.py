@@ -39,6 +39,7 @@ CHI2_MEDIAN = 0.455         # of one degree of freedom
 LOOK = 0.01                 # chance of noise looking as good as the best direction, below which the best are refitted
 ALARM = 0.005               # chance of noise counting as an effect (twice that in the tail of 1000 draws); unseen data then have their say
 STICKING = 300.0            # times slower than it is screened with dry friction may creep, and is begun a second time: what sticks rests for long
+THRESHOLDS = 3              # times that a threshold at which an effect jumps is sought, each round a refit
 ASTRAY = 0.3                # a refit that gains less than this share of what was screened is begun again, more carefully
 INFLATED = 2.0              # gains of the whole catalogue this much larger than by chance may be other physics that is missing, too
 MARGINAL = 200.0            # a gain in score below this is looked at twice
@@ -59,7 +60,7 @@ def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, f
             out[p.name] = (-8.0, 8.0)
             continue
         if p.shape == "period":
-            out[p.name] = (0.75 * value, 1.33 * value)
+            out[p.name] = (0.75 * value, max(value, min(1.33 * value, direction.shape.get("longest", np.inf))))
             continue
         if p.shape == "level":
             reach = max(abs(value), 1e-9)
@@ -202,7 +203,7 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
 
     def one(direction: Direction) -> Explanation | None:
         direction = sharpened(seen.metric, seen.rig, direction)
-        found = [tried(direction)]
+        found = [_stepped(case, e) if (e := tried(direction)) else None]
         stuck = sticking(direction) if direction.gain > 0.5 * strongest else None
         if stuck:
             found.append(tried(stuck))
@@ -223,6 +224,46 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
     done = [better.get(id(e), e) for e in done]
     case.reprice([seen.base, *done])
     return _ordered(case, done)
+
+
+def _stepped(case: Case, e: Explanation) -> Explanation:
+    """Refitted with the threshold at which its last effect jumps moved to where it fits best: at a jump a refit has no slope to go by.
+    Each threshold is simulated; the other parameters follow at first order."""
+    names = [e.own[-1][p.name] for p in e.last.effect.parameters if e.last.effect.shapes.get(p.shape or "") == "small_levels"]
+    if not e.last.variant or not names or names[0] not in e.plant.parameters:
+        return e
+    low, high = e.plant.parameters[names[0]].range or (0.0, np.inf)
+    for _ in range(THRESHOLDS):
+        metric = Metric(e.fit, [e.fit.model.drive(t) for t in case.tables], FINE_ROWS)
+        k = e.fit.model.parameters.index(names[0])
+
+        def cost(value: float, metric: Metric = metric, k: int = k) -> float:
+            parts = []
+            for r, d in enumerate(metric.drives):
+                values = metric.fit.values[r].copy()
+                values[k] = value
+                parts.append(metric.rows(r, d.y - metric.model.run(d, values, metric.fit.dx0[r]).y))
+            left = metric.project(np.concatenate(parts)[:, None])
+            return float(np.sum(left ** 2))
+        now = best = float(e.fit.values[0, k])
+        try:
+            least, ratio = cost(now), 1.3
+            while ratio > 1.002:
+                tried = {v: cost(v) for v in best * ratio ** np.arange(-8.0, 8.5) if low < v < high}
+                value = min(tried, key=lambda v: tried[v], default=best)
+                best, least = (value, tried[value]) if tried and tried[value] < least else (best, least)
+                ratio = ratio ** 0.25
+            if abs(best - now) < 0.002 * now:
+                return e
+            p = e.plant.parameters[names[0]]
+            plant = dataclasses.replace(e.plant, parameters={**e.plant.parameters, names[0]: dataclasses.replace(p, value=best)})
+            moved = case.explain(plant, e.effects, e.own)
+        except (SimulationError, np.linalg.LinAlgError):
+            return e
+        if moved.score >= e.score:
+            return e
+        moved.direction, e = e.direction, moved
+    return e
 
 
 def _ordered(case: Case, done: Sequence[Explanation]) -> list[Explanation]:
