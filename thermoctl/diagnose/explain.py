@@ -48,6 +48,11 @@ class Explanation:
         """The effect added last."""
         return self.effects[-1]
 
+    @property
+    def white(self) -> bool:
+        """Is every residual white? Then noise's chance of whatever is seen in it is known exactly."""
+        return all(len(c.ar) == 1 for c in self.colours)
+
 
 class Case:
     """The recordings and the plant as they came; refits and scores explanations of them."""
@@ -87,7 +92,7 @@ class Case:
     def polished(self, e: Explanation) -> Explanation:
         """The same explanation fitted in the colour of its residual, whose standard errors that colour widens; as it is where
         it is white, or where that fits visibly worse (what is missing is no colour)."""
-        if all(len(c.ar) == 1 for c in e.colours):
+        if e.white:
             return e
         model = e.plant.compile()
         drives = [model.drive(t) for t in self.tables]

@@ -48,13 +48,11 @@ def remains(case: Case, e: Explanation) -> locate.Suspect | None:
 
 
 def _remains(case: Case, e: Explanation) -> locate.Suspect | None:
-    white = all(len(c.ar) == 1 for c in e.colours)
-
     def strongest(colours: Sequence[Colour] | None) -> tuple[locate.Suspect | None, float]:
         metric = metric_of(case, e, colours)
         rig = Rig(e.plant, metric.drives, [t.columns for t in case.tables])
         looks = [*locate.patterns(metric, rig), *locate.suspects(metric)]
-        limit = WHITE - log10(max(len(looks), 1)) if white else REMAINS if colours else UNLIKE_COLOUR
+        limit = WHITE - log10(max(len(looks), 1)) if e.white else REMAINS if colours else UNLIKE_COLOUR
         found = [s for s in looks if s.log_p < (2 * limit if s.kind == "output" else limit)]    # sensors wander by themselves
         if not found and colours:       # what follows a signal may ring: a rhythm of its own is said where nothing else explains it
             found = [s for s in locate.rhythms(metric)[:1] if s.log_p < RHYTHM]
@@ -62,7 +60,7 @@ def _remains(case: Case, e: Explanation) -> locate.Suspect | None:
     tinted = [strongest(c)[0] for c in possible(e.fit.residuals, [n.sigma for n in case.noise])]
     if all(tinted):
         return tinted[0]
-    plain, beyond = (None, 0.0) if white else strongest(None)
+    plain, beyond = (None, 0.0) if e.white else strongest(None)
     if plain and plain.kind != "output" and plain.gain > MOST * beyond:
         return plain
     return next((s for s in locate.together(e.fit.residuals, e.colours, e.plant)[:1] if s.log_p < TOGETHER), None)

@@ -265,8 +265,7 @@ def _weigh(current: Explanation, rivals: Sequence[Explanation]) -> None:
         if key not in best or e.score < best[key].score:
             best[key] = e
     scores = np.array([e.score for e in best.values()])
-    white = all(len(c.ar) == 1 for c in min(best.values(), key=lambda e: e.score).colours)
-    weights = np.exp(-0.5 * (scores - scores.min()) / TEMPERING[0 if white else 1])
+    weights = np.exp(-0.5 * (scores - scores.min()) / TEMPERING[0 if min(best.values(), key=lambda e: e.score).white else 1])
     weights /= weights.sum()
     for e, w in zip(best.values(), weights, strict=True):
         e.probability = float(min(w, 0.995))

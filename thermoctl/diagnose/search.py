@@ -36,7 +36,7 @@ CLEAN = 1.25                # residual rms over sensor noise up to which the sen
 NO_COLOUR = ((-35.0, -25.0), (-20.0, -3.0))
 MOST_IN_PAIRS = 250         # directions that are looked at two by two
 CHI2_MEDIAN = 0.455         # of one degree of freedom
-LOOK = 0.01                 # chance of noise looking as good as the best direction, below which the best are refitted
+LOOK = 0.05                 # chance of noise looking as good as the best direction, below which the best are refitted
 ALARM = 0.005               # chance of noise counting as an effect (twice that in the tail of 1000 draws); unseen data then have their say
 STICKING = 300.0            # times slower than it is screened with dry friction may creep, and is begun a second time: what sticks rests for long
 THRESHOLDS = 3              # times that a threshold at which an effect jumps is sought, each round a refit
@@ -366,7 +366,7 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
     added = len(e.effects) - len(seen.base.effects)
     if 0 < gain < MARGINAL:
         gain = min(gain, least_gain(seen.base.fit.residuals, e.fit.residuals, [n.sigma for n in case.noise]))
-        if max(case.excess(e).values()) <= LARGE:       # what remains may be noise; beyond that it is other physics
+        if not e.white and max(case.excess(e).values()) <= LARGE:       # what remains may be noise; beyond that it is other physics
             if added not in seen.inflation:     # beside what was found: an effect that is found inflates no longer
                 plain = {k: f for k, f in entries.items() if not f.shapes}
                 seen.inflation[added] = inflation(look(case, e, plain, draws=0, coloured=True).directions)
@@ -413,7 +413,7 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
         best = None
         for e in seen.finalists[:4]:
             e.counts = counts(case, seen, e, entries)
-            if e.counts and prediction(case, current, e)[2] < 1.0:
+            if e.counts and predicts(case, current, e) < 1.0:
                 best = e
                 break
         if best is None and not current.effects and seen.p_any() < LOOK and _spent(case) < PATIENCE_S:
@@ -560,15 +560,22 @@ def leave_out(case: Case, base: Explanation, current: Explanation, k: int) -> Ex
         return None
 
 
+def predicts(case: Case, before: Explanation, after: Explanation) -> float:
+    """Below 1 where an explanation predicts data that took no part better: the upper end of the ratio of errors' interval, so that
+    a sensor's colour is not taken for physics; where the residual is white, and chance known, the ratio itself."""
+    gain = prediction(case, before, after)
+    return gain[0] if after.white else gain[2]
+
+
 def prune(case: Case, base: Explanation, current: Explanation, notes: list[str]) -> Explanation:
-    """Drop effects that do not lower the error on data that took no part: the interval of the gain must exclude zero."""
+    """Drop effects that do not lower the error on data that took no part."""
     while current.effects:
         weakest: tuple[float, Explanation, Candidate] | None = None
         for k, c in enumerate(current.effects):
             without = leave_out(case, base, current, k)
             if without is None:
                 continue
-            high = prediction(case, without, current)[2]
+            high = predicts(case, without, current)
             if not high < 1.0 and (weakest is None or high > weakest[0]):
                 weakest = (high, without, c)
         if weakest is None:
