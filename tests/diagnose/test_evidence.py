@@ -7,8 +7,8 @@ from scipy.stats import kstest
 
 from thermoctl.diagnose.evidence import channels, flicker, least_gain
 from thermoctl.diagnose.explain import Case
-from thermoctl.diagnose.locate import rhythms, together
-from thermoctl.diagnose.remains import metric_of
+from thermoctl.diagnose.locate import rhythms, suspects, together
+from thermoctl.diagnose.remains import REMAINS, WHITE, metric_of, remains
 from thermoctl.plant import load
 from thermoctl.recording.table import Table
 
@@ -79,8 +79,7 @@ def block(tmp_path):
                     "flows: {heat: {into: T, rate: P, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}\n"
                     "outputs: {y: {value: T, unit: degC, noise: 0.1}}\n")
 
-    def best(added):
-        """The likeliest rhythm in the colour of the residual."""
+    def refitted(added):
         plant, tables = load(path), []
         for k in range(2):
             t = np.arange(3000.0)
@@ -88,15 +87,19 @@ def block(tmp_path):
             table.columns["y"] = plant.compile(()).simulate(table).y[:, 0] + added(t, np.random.default_rng(100 + k))
             tables.append(table)
         case = Case(plant, tables)
-        e = case.explain(plant, [], [])
-        return rhythms(metric_of(case, e, e.colours))[0]
-    return best
+        return case, case.explain(plant, [], [])
+    return refitted
+
+
+def rhythm(case, e):
+    """The likeliest rhythm in the colour of the residual."""
+    return rhythms(metric_of(case, e, e.colours))[0]
 
 
 def test_a_rhythm_is_found_with_its_period_though_its_phase_changes(block):
     def bursts(t, rng):
         return 0.1 * rng.standard_normal(len(t)) - 0.12 * ((t + rng.uniform(0, 240)) % 240 < 40)
-    found = block(bursts)
+    found = rhythm(*block(bursts))
     assert found.log_p < -8 and found.period == pytest.approx(240, rel=0.02) and "rhythm of 2" in found.sentence()
 
 
@@ -105,8 +108,26 @@ def test_noise_of_any_colour_has_no_rhythm(block, kind):
     """Of twenty draws a colour the smallest p is what twenty of pure chance would show."""
     def noise(t, rng, seed):
         return 0.1 * noise_of(kind, len(t), np.random.default_rng([seed, *rng.integers(0, 9, 2)]))
-    least = sorted(block(lambda t, rng, seed=seed: noise(t, rng, seed)).log_p for seed in range(20))
+    least = sorted(rhythm(*block(lambda t, rng, seed=seed: noise(t, rng, seed))).log_p for seed in range(20))
     assert least[0] > -3.5 and np.median(least) > -1
+
+
+def test_what_white_noise_leaves_has_the_chance_that_is_told(block):
+    """An unknown flow into the block, a function of time: uniform; and of all looks the one that remains is none."""
+    told, left = [], []
+    for seed in range(80):
+        case, e = block(lambda t, rng, seed=seed: 0.1 * np.random.default_rng([seed, *rng.integers(0, 9, 2)]).standard_normal(len(t)))
+        told.append(10 ** next(s for s in suspects(metric_of(case, e, e.colours)) if s.kind == "node").log_p)
+        left.append(e.white and remains(case, e))
+    assert kstest(told, "uniform").pvalue > 0.01
+    assert not any(left)
+
+
+def test_little_that_remains_in_white_noise_is_seen(block):
+    """A swing of an eighth of the noise, 6.6 sigmas in all, is none that could be colour."""
+    case, e = block(lambda t, rng: 0.1 * rng.standard_normal(len(t)) + 0.012 * np.sin(2 * np.pi * t / 900))
+    left = remains(case, e)
+    assert e.white and left is not None and REMAINS < left.log_p < WHITE
 
 
 @pytest.fixture

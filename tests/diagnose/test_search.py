@@ -1,9 +1,11 @@
 """How the search goes on from a first choice that another missing effect led astray, and which rivals are kept."""
+import dataclasses
+
 import numpy as np
 import pytest
 
 from thermoctl.diagnose import run, screen, search
-from thermoctl.diagnose.effects import Rig, candidates, catalogue
+from thermoctl.diagnose.effects import Rig, candidates, catalogue, shape_grid
 from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.locate import Suspect
 from thermoctl.plant.language import loads
@@ -28,8 +30,9 @@ outputs:
 """
 
 
-def stage(seeds=(1, 2)):
-    """A stage of 44 kg and 82 N s/m with cogging of 39 mm and a hysteresis before sliding, by small steps of Euler's method."""
+def stage(seeds=(1, 2), idle=0.0, cogging=0.02, strength=0.006):
+    """A stage of 44 kg and 82 N s/m with cogging of 39 mm and a hysteresis before sliding, by small steps of Euler's method; `idle`: of
+    a force below which there is none."""
     h, every = 0.0005, 4
     tables = []
     for seed in seeds:
@@ -38,10 +41,10 @@ def stage(seeds=(1, 2)):
         force = np.interp(t, np.arange(0, 9, 0.4), rng.uniform(-8, 8, 23))
         v = x = strain = 0.0
         y = np.empty(len(t))
-        for k, f in enumerate(force):
+        for k, f in enumerate(np.where(np.abs(force) < idle, 0.0, force)):
             y[k] = x
             for _ in range(every):
-                push = f - 82 * v + 0.02 * np.sin(2 * np.pi * x / 0.039 + 0.7) - 0.006 * strain
+                push = f - 82 * v + cogging * np.sin(2 * np.pi * x / 0.039 + 0.7) - strength * strain
                 strain += (v - abs(v) * strain) / 0.0006 * h
                 v += push / 44 * h
                 x += v * h
@@ -92,6 +95,45 @@ def test_an_effect_that_is_left_by_itself_keeps_those_that_competed_with_it(look
     assert kept is best and rivals and all(r in others and names(r) != names(best) for r in rivals)
 
 
+def test_a_threshold_at_which_a_drive_jumps_is_found_from_a_start_far_away():
+    """The cost has steps there and no slope: from 0.5 N a refit by slopes alone stays at 0.5 N."""
+    case = Case(loads(STAGE), stage(idle=0.8, cogging=0.0, strength=0.0))
+    base = case.explain(case.plant, [], [])
+    seen = search.look(case, base, entries("actuator_dead_zone"), draws=0)
+    jump = next(d for d in seen.directions if d.candidate.variant)
+    far = dataclasses.replace(jump, start={"U": 0.5})
+    found = search.compete(case, seen, [far])[0]
+    assert found.plant.parameters["U_actuator_dead_zone_motor"].value == pytest.approx(0.8, rel=0.02)
+
+
+def test_a_period_that_has_not_come_once_is_not_offered():
+    """What bends once over the travel is no cogging, whatever it is."""
+    case = Case(loads(STAGE), stage())
+    base = case.explain(case.plant, [], [])
+    rig = Rig(base.plant, case.drives, [t.columns for t in case.tables])
+    runs = [case.model.run(d) for d in case.drives]
+    travel = np.ptp(np.concatenate([r.x[:, 1] for r in runs]))
+    found = next(iter(candidates(rig, entries("cogging"))))
+    offered = [s["period"] for s in shape_grid("periods", found, runs)]
+    assert max(offered) == pytest.approx(travel) and min(offered) < travel / 50
+    seen = search.look(case, base, entries("cogging"), draws=0)
+    longest = max(search.ranges_of(d, 8.0)["P"][1] for d in seen.directions)
+    assert longest <= 1.001 * np.ptp(np.concatenate([r.x[:, 1] for r in seen.metric.runs]))
+
+
+def test_three_effects_at_once_are_not_said_to_explain(looked, monkeypatch):
+    case, base, seen = looked
+    best = seen.finalists[0]
+    three = dataclasses.replace(best, effects=best.effects * 3, own=best.own * 3)
+    monkeypatch.setattr(run, "search", lambda *a, **k: (three, [], [seen]))
+    monkeypatch.setattr(run, "following", lambda *a: None)
+    monkeypatch.setattr(run, "prune", lambda case, base, current, notes: current)
+    monkeypatch.setattr(run, "remains", lambda case, e: None)
+    monkeypatch.setattr(run, "CLEAN", 1e9)
+    said = run.examine(Case(case.plant, case.tables), entries("cogging"))
+    assert said.verdict == "unexplained" and any(n.startswith("3 entries of the catalogue") for n in said.notes)
+
+
 def test_what_leaves_something_gives_way_to_what_fits_alike_and_leaves_nothing(monkeypatch):
     """Natural convection and radiation from a block fit alike; which of them leaves something is said by the test."""
     case = heated()
@@ -128,6 +170,8 @@ def test_other_missing_physics_is_no_inflated_noise(monkeypatch):
     seen.inflation[1] = 1e9
     monkeypatch.setattr(search, "MARGINAL", 1e9)        # both ways by which a gain as large as this one counts anyway
     monkeypatch.setattr(search, "NO_COLOUR", ())
+    assert found.white and search.counts(case, seen, found, seen.entries)       # what is left has its own chance
+    monkeypatch.setattr(type(found), "white", False)
     assert not search.counts(case, seen, found, seen.entries)
     monkeypatch.setattr(case, "excess", lambda e: {"temperature": 9.0})
     assert search.counts(case, seen, found, seen.entries)
