@@ -787,14 +787,13 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
         span = float(np.ptp(x[np.isfinite(x)])) or 1.0
         if kind == "periods":
             # neighbouring periods differ by a quarter of a turn over the span
-            turns = np.arange(1.0, SLOW_TURNS, 0.25)
+            slow = [{"period": float(span / n), "longest": span} for n in np.arange(1.0, SLOW_TURNS, 0.25)]
             errors = [d.y - run.y for d, run in zip(rig.drives, runs, strict=True)]
             if candidate.place.output:
                 j = list(rig.plant.outputs).index(candidate.place.output)
                 fine = _fine_turns(x, [e[:, j] for e in errors], span)
-                return [{"period": float(span / n), "longest": span} for n in turns] + \
-                    [{"period": float(span / n), "longest": span, "picked_from": 4.0 * FINE_TURNS} for n in fine]
-            return [{"period": float(span / n), "longest": span} for n in turns]
+                return slow + [{"period": float(span / n), "longest": span, "picked_from": 4.0 * FINE_TURNS} for n in fine]
+            return slow
         if kind == "phases":
             return [{"phase": 0.0}, {"phase": float(np.pi / 2)}]
         return [{"distance": float(v)} for v in np.geomspace(1e-3 * span, 0.5 * span, 8)]

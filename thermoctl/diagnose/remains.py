@@ -60,7 +60,8 @@ def _remains(case: Case, e: Explanation) -> locate.Suspect | None:
     tinted = [strongest(c)[0] for c in possible(e.fit.residuals, [n.sigma for n in case.noise])]
     if all(tinted):
         return tinted[0]
-    plain, beyond = (None, 0.0) if e.white else strongest(None)
-    if plain and plain.kind != "output" and plain.gain > MOST * beyond:
-        return plain
+    if not e.white:
+        plain, beyond = strongest(None)
+        if plain and plain.kind != "output" and plain.gain > MOST * beyond:
+            return plain
     return next((s for s in locate.together(e.fit.residuals, e.colours, e.plant)[:1] if s.log_p < TOGETHER), None)

@@ -265,7 +265,8 @@ def _weigh(current: Explanation, rivals: Sequence[Explanation]) -> None:
         if key not in best or e.score < best[key].score:
             best[key] = e
     scores = np.array([e.score for e in best.values()])
-    weights = np.exp(-0.5 * (scores - scores.min()) / TEMPERING[0 if min(best.values(), key=lambda e: e.score).white else 1])
+    likeliest = min(best.values(), key=lambda e: e.score)
+    weights = np.exp(-0.5 * (scores - likeliest.score) / TEMPERING[0 if likeliest.white else 1])
     weights /= weights.sum()
     for e, w in zip(best.values(), weights, strict=True):
         e.probability = float(min(w, 0.995))

@@ -19,7 +19,7 @@ from thermoctl.diagnose.explain import Case, Explanation, noise_of
 from thermoctl.diagnose.heldout import prediction
 from thermoctl.diagnose.remains import energy, remains, smooth
 from thermoctl.diagnose.screen import FINE_ROWS, ROWS, Direction, Metric, log_p, screen, sharpened
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.yamlfile import InputError
 
@@ -227,36 +227,17 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
 
 
 def _stepped(case: Case, e: Explanation) -> Explanation:
-    """Refitted with the threshold at which its last effect jumps moved to where it fits best: at a jump a refit has no slope to go by.
-    Each threshold is simulated; the other parameters follow at first order."""
+    """Refitted with the threshold at which its last effect jumps moved to where it fits best: at a jump a refit has no slope to go by."""
     names = [e.own[-1][p.name] for p in e.last.effect.parameters if e.last.effect.shapes.get(p.shape or "") == "small_levels"]
     if not e.last.variant or not names or names[0] not in e.plant.parameters:
         return e
-    low, high = e.plant.parameters[names[0]].range or (0.0, np.inf)
     for _ in range(THRESHOLDS):
-        metric = Metric(e.fit, [e.fit.model.drive(t) for t in case.tables], FINE_ROWS)
-        k = e.fit.model.parameters.index(names[0])
-
-        def cost(value: float, metric: Metric = metric, k: int = k) -> float:
-            parts = []
-            for r, d in enumerate(metric.drives):
-                values = metric.fit.values[r].copy()
-                values[k] = value
-                parts.append(metric.rows(r, d.y - metric.model.run(d, values, metric.fit.dx0[r]).y))
-            left = metric.project(np.concatenate(parts)[:, None])
-            return float(np.sum(left ** 2))
-        now = best = float(e.fit.values[0, k])
+        p = e.plant.parameters[names[0]]
         try:
-            least, ratio = cost(now), 1.3
-            while ratio > 1.002:
-                tried = {v: cost(v) for v in best * ratio ** np.arange(-8.0, 8.5) if low < v < high}
-                value = min(tried, key=lambda v: tried[v], default=best)
-                best, least = (value, tried[value]) if tried and tried[value] < least else (best, least)
-                ratio = ratio ** 0.25
-            if abs(best - now) < 0.002 * now:
+            best = _threshold(case, e, p)
+            if abs(best - p.value) < 0.002 * p.value:
                 return e
-            p = e.plant.parameters[names[0]]
-            plant = dataclasses.replace(e.plant, parameters={**e.plant.parameters, names[0]: dataclasses.replace(p, value=best)})
+            plant = dataclasses.replace(e.plant, parameters={**e.plant.parameters, p.name: dataclasses.replace(p, value=best)})
             moved = case.explain(plant, e.effects, e.own)
         except (SimulationError, np.linalg.LinAlgError):
             return e
@@ -264,6 +245,28 @@ def _stepped(case: Case, e: Explanation) -> Explanation:
             return e
         moved.direction, e = e.direction, moved
     return e
+
+
+def _threshold(case: Case, e: Explanation, p: Parameter) -> float:
+    """The value of a parameter that fits best, on finer and finer grids: each is simulated, the other parameters follow at first order."""
+    metric = Metric(e.fit, case.drives_of(e), FINE_ROWS)
+    k = e.fit.model.parameters.index(p.name)
+    low, high = p.range or (0.0, np.inf)
+
+    def cost(value: float) -> float:
+        parts = []
+        for r, d in enumerate(metric.drives):
+            values = e.fit.values[r].copy()
+            values[k] = value
+            parts.append(metric.rows(r, d.y - metric.model.run(d, values, e.fit.dx0[r]).y))
+        return float(np.sum(metric.project(np.concatenate(parts)) ** 2))
+    best, ratio = float(e.fit.values[0, k]), 1.3
+    costs = {best: cost(best)}
+    while ratio > 1.002:
+        costs |= {float(v): cost(v) for v in best * ratio ** np.arange(-8.0, 8.5) if low < v < high}
+        best = min(costs, key=lambda v: costs[v])
+        ratio **= 0.25
+    return best
 
 
 def _ordered(case: Case, done: Sequence[Explanation]) -> list[Explanation]:
