@@ -8,7 +8,7 @@ SOURCES := pyproject.toml setup.py $(shell find thermoctl hal -name '*.pyx') $(T
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run rig-hour bench-law test lint install clean reproduce bench-identification test-identification prove
+.PHONY: run rig-hour bench-law test lint format install clean reproduce bench-identification test-identification prove
 run: install
 	$(BIN)/thermoctl demo --config config/simulated.yaml
 
@@ -34,7 +34,12 @@ prove: install
 
 lint: install
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+format: install
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
 
 install: $(VENV)/.installed
 $(VENV)/.installed: $(SOURCES)

@@ -1,4 +1,5 @@
 """Builds the compiled parts: every .pyx, and every .py with its C types in a .pxd. The rest is in pyproject.toml."""
+
 from pathlib import Path
 
 import numpy
@@ -6,12 +7,23 @@ from Cython.Build import cythonize
 from setuptools import Extension, setup
 
 typed = [p for root in ("thermoctl", "hal") for p in Path(root).rglob("*.p[xy][xd]")]
-sources = sorted({p.with_suffix(".pyx") if p.with_suffix(".pyx").exists() else p.with_suffix(".py") for p in typed})
+sources = sorted(
+    {p.with_suffix(".pyx") if p.with_suffix(".pyx").exists() else p.with_suffix(".py") for p in typed}
+)
 
 # -ffp-contract=off: the law gives the same bits on every machine that a recording is replayed on.
-setup(ext_modules=cythonize(
-    [Extension(".".join(p.with_suffix("").parts), [str(p)], include_dirs=[numpy.get_include()],
-               extra_compile_args=["-O2", "-ffp-contract=off"],
-               define_macros=[("NPY_NO_DEPRECATED_API", "NPY_1_7_API_VERSION")])
-     for p in sources],
-    compiler_directives={"language_level": "3"}))
+setup(
+    ext_modules=cythonize(
+        [
+            Extension(
+                ".".join(p.with_suffix("").parts),
+                [str(p)],
+                include_dirs=[numpy.get_include()],
+                extra_compile_args=["-O2", "-ffp-contract=off"],
+                define_macros=[("NPY_NO_DEPRECATED_API", "NPY_1_7_API_VERSION")],
+            )
+            for p in sources
+        ],
+        compiler_directives={"language_level": "3"},
+    )
+)

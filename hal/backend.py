@@ -36,18 +36,40 @@ shared memory; the back end made with `make_backend(settings, board)` merges the
 (`make_backend(settings)`: doctor, tests) it polls them from threads of its own.
 `fast_devices(settings)` lists those that are read inside the tick.
 """
+
 from __future__ import annotations
 
 from typing import Any, Protocol
 
 import numpy as np
 
-TEMPERATURES = ("coil_c", "bobbin_c", "inner_magnet_c", "outer_magnet_c", "inner_stator_c", "outer_stator_c",
-                "stator_connector_c", "bobbin_connector_c", "shaft_1_c", "shaft_2_c", "bracket_1_c", "bracket_2_c")
+TEMPERATURES = (
+    "coil_c",
+    "bobbin_c",
+    "inner_magnet_c",
+    "outer_magnet_c",
+    "inner_stator_c",
+    "outer_stator_c",
+    "stator_connector_c",
+    "bobbin_connector_c",
+    "shaft_1_c",
+    "shaft_2_c",
+    "bracket_1_c",
+    "bracket_2_c",
+)
 """The twelve measured temperatures in the paper's order, degC."""
 
-ROLES = ("position_um", "output_reference_um", "voltage_v", "current_a", "air_c", *TEMPERATURES,
-         "supply_v", "amplifier_state", "amplifier_fault")
+ROLES = (
+    "position_um",
+    "output_reference_um",
+    "voltage_v",
+    "current_a",
+    "air_c",
+    *TEMPERATURES,
+    "supply_v",
+    "amplifier_state",
+    "amplifier_fault",
+)
 """What a channel can be to the controller. `voltage_v` and `current_a` are the coil's; `supply_v` the amplifier's DC
 link; `amplifier_state` one of AMP_*; `amplifier_fault` the error code (CiA-402 object 0x603F, 0 healthy)."""
 
@@ -64,6 +86,7 @@ class HardwareError(Exception):
 
 class Sample:
     """One reading of every role; the arrays are described in the module's text."""
+
     __slots__ = ("value", "time_s", "fresh", "status")
 
     def __init__(self) -> None:
@@ -105,17 +128,21 @@ def make_backend(settings: Any, board: Any = None) -> Backend:
     backend: Backend
     if kind == "simulated":
         from hal.simulated import simulated_backend
+
         backend = simulated_backend(settings)
     elif kind == "replay":
         from hal.replay import replay_backend
+
         backend = replay_backend(settings)
     elif kind == "devices":
         from hal.devices import DevicesBackend
+
         backend = DevicesBackend(fast_devices(settings), slow_devices(settings), board)
     else:
         raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated, devices or replay")
     if settings.hal.faults:
         from hal.faulty import FaultInjector, schedule
+
         backend = FaultInjector(backend, schedule(settings.hal.faults), seed=settings.hal.seed)
     return backend
 
@@ -123,10 +150,12 @@ def make_backend(settings: Any, board: Any = None) -> Backend:
 def fast_devices(settings: Any) -> list:
     """The devices of `hal.devices` that are read and written inside the tick, not yet open (hal.devices.Device)."""
     from hal.devices import make_devices
+
     return [d for d in make_devices(settings) if not d.slow]
 
 
 def slow_devices(settings: Any) -> list:
     """The devices of `hal.devices` with a blocking poll(), not yet open (class hal.modbus.ModbusDevice)."""
     from hal.devices import make_devices
+
     return [d for d in make_devices(settings) if d.slow]

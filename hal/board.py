@@ -4,6 +4,7 @@ Shared memory holds one row per role: sequence, value, time, status and a line o
 device have one writer, and the sequence of its first row guards them: it is odd while they are being written (a seqlock).
 A reader that meets an odd or changed sequence takes the rows at its next tick; an unchanged one costs it a look.
 """
+
 from __future__ import annotations
 
 import mmap
@@ -54,7 +55,9 @@ class Board:
         try:
             fd = os.open(path, os.O_RDWR)
         except OSError as e:
-            raise HardwareError(f"board '{name}': {e.strerror}; the supervisor creates it before any poller") from None
+            raise HardwareError(
+                f"board '{name}': {e.strerror}; the supervisor creates it before any poller"
+            ) from None
         try:
             return cls(mmap.mmap(fd, _SIZE), path, False)
         except ValueError:
@@ -75,12 +78,18 @@ class Board:
     def post(self, sample: Sample, device: Device) -> None:
         """Write the device's roles from `sample`. A device has one writer."""
         first = device.roles[0]
-        writing = int(self._sequence[first]) | 1        # also after a writer that was killed while it wrote
+        writing = int(self._sequence[first]) | 1  # also after a writer that was killed while it wrote
         self._sequence[first] = writing
         for role in device.roles:
             row = self.rows[role]
-            row["value"], row["time_s"], row["status"] = sample.value[role], sample.time_s[role], sample.status[role]
-            row["text"] = device.problems.get(role, "").encode()[:400] if sample.status[role] == ERROR else b""
+            row["value"], row["time_s"], row["status"] = (
+                sample.value[role],
+                sample.time_s[role],
+                sample.status[role],
+            )
+            row["text"] = (
+                device.problems.get(role, "").encode()[:400] if sample.status[role] == ERROR else b""
+            )
         self._sequence[first] = writing + 1
 
     def merge(self, sample: Sample, roles: list[int], seen: int) -> int:
@@ -95,7 +104,11 @@ class Board:
         for role, row in zip(roles, rows, strict=True):
             sample.status[role] = row["status"]
             if row["time_s"] > sample.time_s[role]:
-                sample.value[role], sample.time_s[role], sample.fresh[role] = row["value"], row["time_s"], True
+                sample.value[role], sample.time_s[role], sample.fresh[role] = (
+                    row["value"],
+                    row["time_s"],
+                    True,
+                )
         return int(before)
 
     def beat(self, roles: list[int]) -> int:
@@ -133,7 +146,7 @@ def poll_until(device: Device, board: Board, stop: threading.Event) -> None:
         board.post(sample, device)
         due += period_s if device.up else RECONNECT_S
         now = time.monotonic()
-        if due < now:                  # a slow answer: keep the phase, drop the polls that were missed
+        if due < now:  # a slow answer: keep the phase, drop the polls that were missed
             due = now
         stop.wait(due - now)
     device.up = False
@@ -146,12 +159,13 @@ def run_poller(settings: Any, device_name: str, board_name: str) -> None:
     board = Board.attach(board_name)
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    signal.signal(signal.SIGINT, signal.SIG_IGN)           # Ctrl-C goes to the group; the supervisor stops us
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the group; the supervisor stops us
     parent = os.getppid()
 
     def watch_parent() -> None:
         while not stop.wait(0.5):
             if os.getppid() != parent:
                 stop.set()
+
     threading.Thread(target=watch_parent, daemon=True).start()
     poll_until(device, board, stop)

@@ -22,6 +22,7 @@ canopen and the EDS file.
       0x4F  0x0F  fault reaction active          -
       0x4F  0x08  fault                          0x80 fault reset (rising edge), only while we do not want to drive
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -49,18 +50,39 @@ from hal.wire import CanPort, SlcanLine, nearest
 from thermoctl.yamlfile import InputError
 
 SYNC_ID, NMT_ID = 0x080, 0x000
-HEARTBEAT_LOST = 0x8130     # CiA 301 error code of a missing heartbeat
+HEARTBEAT_LOST = 0x8130  # CiA 301 error code of a missing heartbeat
 SDO_TIMEOUT_S = 0.3
-MAX_TAKEN = 500             # frames of a bus that one tick takes
-FAULT_RESET_S = 1.0         # between attempts to reset a drive's fault while it is not wanted to drive
-_SLCAN_BITRATES = {10_000: 0, 20_000: 1, 50_000: 2, 100_000: 3, 125_000: 4, 250_000: 5, 500_000: 6, 800_000: 7,
-                   1_000_000: 8}
-_FRAME = struct.Struct("=IB3x8s")                       # struct can_frame of the kernel
+MAX_TAKEN = 500  # frames of a bus that one tick takes
+FAULT_RESET_S = 1.0  # between attempts to reset a drive's fault while it is not wanted to drive
+_SLCAN_BITRATES = {
+    10_000: 0,
+    20_000: 1,
+    50_000: 2,
+    100_000: 3,
+    125_000: 4,
+    250_000: 5,
+    500_000: 6,
+    800_000: 7,
+    1_000_000: 8,
+}
+_FRAME = struct.Struct("=IB3x8s")  # struct can_frame of the kernel
 _EXTENDED, _REMOTE, _ERROR_FLAG, _BUS_OFF = 0x8000_0000, 0x4000_0000, 0x2000_0000, 0x40
 _SYNC_ID, _RESET_S = SYNC_ID, FAULT_RESET_S
-_OFFLINE, _DISABLED, _ENABLED, _FAULT = AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED, AMP_FAULT        # numbers of C, by can_bus.pxd
-_FORMATS = {datatypes.INTEGER8: "b", datatypes.INTEGER16: "h", datatypes.INTEGER32: "i", datatypes.UNSIGNED8: "B",
-            datatypes.UNSIGNED16: "H", datatypes.UNSIGNED32: "I", datatypes.BOOLEAN: "B"}
+_OFFLINE, _DISABLED, _ENABLED, _FAULT = (
+    AMP_OFFLINE,
+    AMP_DISABLED,
+    AMP_ENABLED,
+    AMP_FAULT,
+)  # numbers of C, by can_bus.pxd
+_FORMATS = {
+    datatypes.INTEGER8: "b",
+    datatypes.INTEGER16: "h",
+    datatypes.INTEGER32: "i",
+    datatypes.UNSIGNED8: "B",
+    datatypes.UNSIGNED16: "H",
+    datatypes.UNSIGNED32: "I",
+    datatypes.BOOLEAN: "B",
+}
 
 Frame = tuple[int, bytes]
 
@@ -70,7 +92,9 @@ class SlcanPort(SlcanLine):
 
     def __init__(self, path: str, bitrate: int) -> None:
         if bitrate not in _SLCAN_BITRATES:
-            raise HardwareError(f"slcan:{path}: bitrate {bitrate} is not one of {', '.join(map(str, _SLCAN_BITRATES))}")
+            raise HardwareError(
+                f"slcan:{path}: bitrate {bitrate} is not one of {', '.join(map(str, _SLCAN_BITRATES))}"
+            )
         self._port = open_port(path, LineSettings(baud=3_000_000), f"slcan:{path}")
         super().__init__(self._port.fileno())
         os.write(self._port.fileno(), b"\r\rC\rS%d\rO\r" % _SLCAN_BITRATES[bitrate])
@@ -92,15 +116,23 @@ class LibraryPort(CanPort):
     """An interface opened by python-can; SocketCAN frames pass on the bare socket."""
 
     def __init__(self, interface: str, channel: str, bitrate: int, ids: tuple[int, ...]) -> None:
-        in_kernel = [{"can_id": i, "can_mask": 0x1FFF_FFFF if i > 0x7FF else 0x7FF, "extended": i > 0x7FF}
-                     for i in ids] if interface == "socketcan" else None
+        in_kernel = (
+            [
+                {"can_id": i, "can_mask": 0x1FFF_FFFF if i > 0x7FF else 0x7FF, "extended": i > 0x7FF}
+                for i in ids
+            ]
+            if interface == "socketcan"
+            else None
+        )
         self._wanted = None if in_kernel or not ids else frozenset(ids)
         self._bus: Any
         try:
             self._bus = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=in_kernel)
         except (can.CanError, OSError, ValueError, ImportError) as e:
-            raise HardwareError(f"{interface}:{channel}: cannot be opened ({e}); is the interface up (ip link set "
-                                f"{channel} up type can bitrate {bitrate})?") from None
+            raise HardwareError(
+                f"{interface}:{channel}: cannot be opened ({e}); is the interface up (ip link set "
+                f"{channel} up type can bitrate {bitrate})?"
+            ) from None
         self._socket = self._bus.socket if interface == "socketcan" else None
         if self._socket is not None:
             self._socket.setblocking(False)
@@ -111,7 +143,9 @@ class LibraryPort(CanPort):
         for can_id, data in self.queued():
             try:
                 if self._socket is None:
-                    self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=can_id > 0x7FF))
+                    self._bus.send(
+                        can.Message(arbitration_id=can_id, data=data, is_extended_id=can_id > 0x7FF)
+                    )
                 else:
                     flag = _EXTENDED if can_id > 0x7FF else 0
                     self._socket.send(_FRAME.pack(can_id | flag, len(data), data))
@@ -164,7 +198,9 @@ def open_can(port: str, ids: tuple[int, ...]) -> SlcanPort | LibraryPort:
     """Open "interface:channel@bitrate"; `ids` are the frames wanted (the kernel filters where it can)."""
     match = re.fullmatch(r"(\w+):(.+?)(?:@(\d+))?", port)
     if match is None:
-        raise HardwareError(f"port '{port}': interface:channel@bitrate was expected, as slcan:/dev/ttyACM0@1000000")
+        raise HardwareError(
+            f"port '{port}': interface:channel@bitrate was expected, as slcan:/dev/ttyACM0@1000000"
+        )
     bitrate = int(match[3] or 1_000_000)
     if match[1] == "slcan":
         return SlcanPort(match[2], bitrate)
@@ -242,9 +278,13 @@ class Cia402Device(Device):
             formats = [_format(dictionary, i) for i in spec.transmit]
             command = _format(dictionary, spec.command)
         except KeyError as e:
-            raise InputError(f"{binding.profile.file}: {spec.eds}: object {e} of the PDOs is not in it") from None
+            raise InputError(
+                f"{binding.profile.file}: {spec.eds}: object {e} of the PDOs is not in it"
+            ) from None
         if not command.islower():
-            raise InputError(f"{binding.profile.file}: {spec.eds}: the command 0x{spec.command:X} has no sign")
+            raise InputError(
+                f"{binding.profile.file}: {spec.eds}: the command 0x{spec.command:X} has no sign"
+            )
         sizes = [struct.calcsize(f) for f in formats]
         self._transmit_size, self._receive_size = sum(sizes), 2 + struct.calcsize(command)
         self._shift = array("i", [8 * sum(sizes[:k]) for k in range(len(sizes))])
@@ -253,9 +293,16 @@ class Cia402Device(Device):
         self._command_limit = 2 ** (8 * struct.calcsize(command) - 1) - 1
         self._dictionary = dictionary
         if self._transmit_size > 8:
-            raise InputError(f"{binding.profile.file}: a PDO has 8 bytes, transmit takes {self._transmit_size}")
-        self._index = array("i", [spec.transmit.index(b.channel.source) if b.channel.source in spec.transmit else -1
-                                  for b in binding.bounds])
+            raise InputError(
+                f"{binding.profile.file}: a PDO has 8 bytes, transmit takes {self._transmit_size}"
+            )
+        self._index = array(
+            "i",
+            [
+                spec.transmit.index(b.channel.source) if b.channel.source in spec.transmit else -1
+                for b in binding.bounds
+            ],
+        )
         self._is_state = array("i", [b.channel.source == 0x6041 for b in binding.bounds])
         self._patience_s, self._heartbeat_s = max(3 * spec.heartbeat_s, spec.watchdog_s), spec.heartbeat_s
         self._master = spec.master_id
@@ -274,8 +321,10 @@ class Cia402Device(Device):
         except (canopen.SdoAbortedError, canopen.SdoCommunicationError, KeyError, OSError) as e:
             network.finish()
             port.close()
-            raise HardwareError(f"{self.name}: {self.binding.port} node {self._node}: set-up failed "
-                                f"({network.failure or e}): check power, node id, bitrate and termination") from None
+            raise HardwareError(
+                f"{self.name}: {self.binding.port} node {self._node}: set-up failed "
+                f"({network.failure or e}): check power, node id, bitrate and termination"
+            ) from None
         except HardwareError:
             network.finish()
             port.close()
@@ -287,41 +336,49 @@ class Cia402Device(Device):
         self._beat_s = self._reset_s = -math.inf
 
     def _set_up(self, network: _SetupNetwork) -> None:
-        logging.getLogger("canopen").setLevel(logging.CRITICAL)       # what it would log, we raise
+        logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what it would log, we raise
         spec = self._spec
         node = network.add_node(self._node, self._dictionary)
         assert isinstance(node, canopen.RemoteNode)
         node.sdo.RESPONSE_TIMEOUT, node.sdo.MAX_RETRIES = SDO_TIMEOUT_S, 1
-        network.send_message(NMT_ID, bytes((0x80, self._node)))       # pre-operational: PDOs rest while they are mapped
+        network.send_message(
+            NMT_ID, bytes((0x80, self._node))
+        )  # pre-operational: PDOs rest while they are mapped
         device_type = node.sdo[0x1000].raw
         if device_type & 0xFFFF != 402:
-            raise HardwareError(f"{self.name}: node {self._node} says device profile {device_type & 0xFFFF}, "
-                                "402 (drive) was expected: is the node id right?")
+            raise HardwareError(
+                f"{self.name}: node {self._node} says device profile {device_type & 0xFFFF}, "
+                "402 (drive) was expected: is the node id right?"
+            )
         node.sdo[0x1016][1].raw = spec.master_id << 16 | round(spec.watchdog_s * 1000)
         node.sdo[0x1017].raw = round(spec.heartbeat_s * 1000)
         node.sdo[0x6040].raw = 0
         node.sdo[0x6060].raw = spec.mode
         for index, sub, value in spec.start_up:
             (node.sdo[index][sub] if sub else node.sdo[index]).raw = value
-        for pdo, cob_id, objects in ((node.tpdo[1], 0x180, spec.transmit),
-                                     (node.rpdo[1], 0x200, (0x6040, spec.command))):
+        for pdo, cob_id, objects in (
+            (node.tpdo[1], 0x180, spec.transmit),
+            (node.rpdo[1], 0x200, (0x6040, spec.command)),
+        ):
             pdo.clear()
             for index in objects:
                 pdo.add_variable(index)
             pdo.cob_id, pdo.trans_type, pdo.enabled = cob_id + self._node, 1, True
             pdo.save()
         self._fault_code = node.sdo[0x603F].raw
-        if self._fault_code == HEARTBEAT_LOST:      # it missed us while we were away: no news
+        if self._fault_code == HEARTBEAT_LOST:  # it missed us while we were away: no news
             node.sdo[0x6040].raw = 0x80
             node.sdo[0x6040].raw = 0
             self._fault_code = node.sdo[0x603F].raw
-        network.send_message(NMT_ID, bytes((0x01, self._node)))       # operational
+        network.send_message(NMT_ID, bytes((0x01, self._node)))  # operational
 
     def disconnect(self) -> None:
         """Send the drive back to its power-on state and close the port."""
         port, self._port = self._port, None
         if port is not None:
-            with contextlib.suppress(OSError):      # reset communication: PDOs and watchdog are forgotten, it is off
+            with contextlib.suppress(
+                OSError
+            ):  # reset communication: PDOs and watchdog are forgotten, it is off
                 port.send((NMT_ID, bytes((0x82, self._node))))
             port.close()
 
@@ -339,12 +396,17 @@ class Cia402Device(Device):
                     if self._is_state[i]:
                         self.put(sample, i, drive_state(self._status_word), now_s)
                     else:
-                        self.put(sample, i, self._fault_code if self._index[i] < 0 else self._number(data, self._index[i]), now_s)
+                        self.put(
+                            sample,
+                            i,
+                            self._fault_code if self._index[i] < 0 else self._number(data, self._index[i]),
+                            now_s,
+                        )
             elif kind == 0x700 and size == 1:
-                if data == 0:                                         # boot-up
-                    raise HardwareError("the drive restarted")        # its PDO mapping and watchdog are gone
+                if data == 0:  # boot-up
+                    raise HardwareError("the drive restarted")  # its PDO mapping and watchdog are gone
                 self._heard_s = now_s
-                if data == 0x7F:                                      # it left operation when our heartbeat was missing
+                if data == 0x7F:  # it left operation when our heartbeat was missing
                     port.send((NMT_ID, bytes((0x01, self._node))))
             elif kind == 0x080 and size == 8:
                 self._fault_code = data & 0xFFFF

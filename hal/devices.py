@@ -4,6 +4,7 @@
 A driver knows one protocol. Its `connect` may block (opening, configuring); `read` and `write`, called in the tick, may
 not. A link that fails is closed, its channels say ERROR, and a thread connects it again while the tick goes on.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -19,7 +20,7 @@ from hal.profile import Binding, bind, check_rig
 from hal.wire import Ages, Channels, wait_readable
 from thermoctl.yamlfile import InputError
 
-RECONNECT_S = 0.25          # between attempts to open a device that is gone
+RECONNECT_S = 0.25  # between attempts to open a device that is gone
 SLOW_BUSES = ("modbus",)
 
 
@@ -62,8 +63,12 @@ class Device:
         """Store reading `raw` of the bound channel number `bound`, scaled; out of range or not finite is ERROR."""
         if not self._channels.put(sample, bound, raw, time_s):
             b = self.binding.bounds[bound]
-            self.fail(sample, bound, f"reading {raw * b.scale + b.offset:g} is outside {b.low:g} .. {b.high:g}: "
-                                     "check sensor and wiring")
+            self.fail(
+                sample,
+                bound,
+                f"reading {raw * b.scale + b.offset:g} is outside {b.low:g} .. {b.high:g}: "
+                "check sensor and wiring",
+            )
 
     def fail(self, sample: Sample, bound: int, problem: str) -> None:
         """Mark the bound channel number `bound` as ERROR; the last valid value stays."""
@@ -102,11 +107,14 @@ def _driver(binding: Binding) -> Device:
     bus = binding.profile.bus
     if bus == "modbus":
         from hal.modbus import ModbusDevice
+
         return ModbusDevice(binding)
     if bus.startswith("can"):
         from hal.can_bus import Cia402Device, DbcDevice
+
         return Cia402Device(binding) if bus == "can-cia402" else DbcDevice(binding)
     from hal.serial_port import SerialDevice
+
     return SerialDevice(binding)
 
 
@@ -118,9 +126,9 @@ class DevicesBackend:
         self.fast, self.slow, self.board = fast, slow, board
         self.sample = Sample()
         self._owner = {role: d for d in [*fast, *slow] for role in d.roles}
-        self._pacing: Any = self._owner.get(ROLE["position_um"])     # loop.pace: device
+        self._pacing: Any = self._owner.get(ROLE["position_um"])  # loop.pace: device
         self._seen = dict.fromkeys(slow, 0)
-        limit_s = np.full(len(ROLES), np.inf)                   # age at which a reading is stale
+        limit_s = np.full(len(ROLES), np.inf)  # age at which a reading is stale
         for b in (b for d in self._owner.values() for b in d.binding.bounds):
             limit_s[ROLE[b.role]] = b.channel.stale_after_s
         self._ages = Ages(self.sample, limit_s)
@@ -147,10 +155,15 @@ class DevicesBackend:
             self.sample.status[device.roles] = STALE
         if self.board is None and self.slow:
             from hal.board import Board, poll_until
+
             self.board = Board.private()
             for device in self.slow:
-                thread = threading.Thread(target=poll_until, args=(device, self.board, self._stop), daemon=True,
-                                          name=f"poll {device.name}")
+                thread = threading.Thread(
+                    target=poll_until,
+                    args=(device, self.board, self._stop),
+                    daemon=True,
+                    name=f"poll {device.name}",
+                )
                 thread.start()
                 self._threads.append(thread)
 
@@ -175,8 +188,10 @@ class DevicesBackend:
         device = self._pacing
         if device is None or device.binding.profile.bus != "serial-binary":
             what = "no device" if device is None else f"{device.name} ({device.binding.profile.bus})"
-            raise InputError(f"loop.pace: device: the position comes from {what}; an encoder that streams frames "
-                             "(bus: serial-binary) was expected: set loop.pace: clock")
+            raise InputError(
+                f"loop.pace: device: the position comes from {what}; an encoder that streams frames "
+                "(bus: serial-binary) was expected: set loop.pace: clock"
+            )
 
     def wait_frame(self, due_ns: int, until_ns: int) -> None:
         """Wait until the position's device has sent a whole frame, at most until `until_ns`; only until `due_ns` while it is
@@ -192,7 +207,7 @@ class DevicesBackend:
 
     def write(self, drive: float, enable: bool) -> None:
         """Command to the device that drives; see hal.backend."""
-        if not enable or drive - drive != 0.0:                      # not finite
+        if not enable or drive - drive != 0.0:  # not finite
             drive, enable = 0.0, False
         for device in self.fast:
             if device.drives and device.up:
@@ -233,9 +248,14 @@ class DevicesBackend:
 
     def _lost(self, device: Device, why: Exception) -> None:
         device.up = False
-        device.fail_all(self.sample, f"lost on {device.binding.port} ({getattr(why, 'strerror', None) or why}); "
-                                     "reconnecting: check cable and power")
-        thread = threading.Thread(target=self._repair, args=(device,), daemon=True, name=f"reconnect {device.name}")
+        device.fail_all(
+            self.sample,
+            f"lost on {device.binding.port} ({getattr(why, 'strerror', None) or why}); "
+            "reconnecting: check cable and power",
+        )
+        thread = threading.Thread(
+            target=self._repair, args=(device,), daemon=True, name=f"reconnect {device.name}"
+        )
         self._repairs[device] = thread
         thread.start()
 

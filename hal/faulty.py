@@ -16,6 +16,7 @@
     disconnect  error, and commands do not arrive: the amplifier stops by its own watchdog
     stuck       the amplifier drives `by`, whatever it is told (no role)
 """
+
 from __future__ import annotations
 
 import math
@@ -30,14 +31,28 @@ from hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Backend, Sample
 from hal.profile import Section
 from thermoctl.yamlfile import Node, suggest
 
-KINDS = ("drop", "delay", "duplicate", "corrupt", "freeze", "nan", "step", "drift", "set", "swap", "error",
-         "disconnect", "stuck")
-MAX_DELAYED = 100_000       # readings of one role under way
+KINDS = (
+    "drop",
+    "delay",
+    "duplicate",
+    "corrupt",
+    "freeze",
+    "nan",
+    "step",
+    "drift",
+    "set",
+    "swap",
+    "error",
+    "disconnect",
+    "stuck",
+)
+MAX_DELAYED = 100_000  # readings of one role under way
 
 
 @dataclass(frozen=True)
 class Fault:
     """One entry of the schedule; active while at_s <= t < until_s."""
+
     kind: str
     roles: tuple[int, ...]
     at_s: float
@@ -55,8 +70,15 @@ def schedule(nodes: Iterable[Node]) -> list[Fault]:
         kind = s.text("kind", choices=KINDS)
         at = s.number("at_s", 0.0, 0.0)
         until = at + s.number("for_s", math.inf if s.get("for_s", False) is None else None, 0.0)
-        fault = Fault(kind, _roles(s, kind), at, until, s.number("by", 0.0), s.number("probability", 1.0, 0.0, 1.0),
-                      s.number("stale_after_s", 0.05, 0.0))
+        fault = Fault(
+            kind,
+            _roles(s, kind),
+            at,
+            until,
+            s.number("by", 0.0),
+            s.number("probability", 1.0, 0.0, 1.0),
+            s.number("stale_after_s", 0.05, 0.0),
+        )
         if kind in ("step", "drift", "set", "delay") and s.get("by", False) is None:
             raise node.error(f"{kind}: 'by' is missing")
         if kind == "delay" and fault.by <= 0.0:
@@ -77,7 +99,9 @@ def _roles(s: Section, kind: str) -> tuple[int, ...]:
         return tuple(range(len(ROLES)))
     for name in names:
         if name not in ROLES:
-            raise node.error(f"role: '{name}' is no role{suggest(str(name), ROLES)}; roles: all, {', '.join(ROLES)}")
+            raise node.error(
+                f"role: '{name}' is no role{suggest(str(name), ROLES)}; roles: all, {', '.join(ROLES)}"
+            )
     return tuple(ROLE[n] for n in names)
 
 
@@ -91,12 +115,22 @@ class FaultInjector:
         self._random = np.random.default_rng(seed)
         self._start_s = math.nan
         self._t = 0.0
-        self._value, self._time_s = self.sample.value.copy(), self.sample.time_s.copy()     # before this read
-        self._held: dict[tuple[int, int], float] = {}                   # (fault, role) -> frozen value
+        self._value, self._time_s = self.sample.value.copy(), self.sample.time_s.copy()  # before this read
+        self._held: dict[tuple[int, int], float] = {}  # (fault, role) -> frozen value
         self._late: dict[tuple[int, int], deque[tuple[float, float]]] = {}
-        self._apply = {"drop": self._drop, "delay": self._delay, "duplicate": self._duplicate, "corrupt": self._corrupt,
-                       "freeze": self._freeze, "nan": self._nan, "step": self._step, "drift": self._drift,
-                       "set": self._set, "error": self._error, "disconnect": self._error}
+        self._apply = {
+            "drop": self._drop,
+            "delay": self._delay,
+            "duplicate": self._duplicate,
+            "corrupt": self._corrupt,
+            "freeze": self._freeze,
+            "nan": self._nan,
+            "step": self._step,
+            "drift": self._drift,
+            "set": self._set,
+            "error": self._error,
+            "disconnect": self._error,
+        }
 
     def open(self) -> None:
         """The inner back end's; the schedule starts with the first read."""
@@ -108,7 +142,7 @@ class FaultInjector:
         inner, out = self.inner.read(now_s), self.sample
         if math.isnan(self._start_s):
             self._start_s = now_s
-        self._t = now_s - self._start_s + 1e-9          # a time on a tick's edge belongs to that tick
+        self._t = now_s - self._start_s + 1e-9  # a time on a tick's edge belongs to that tick
         self._value[:], self._time_s[:] = out.value, out.time_s
         np.copyto(out.value, inner.value, where=inner.fresh)
         np.copyto(out.time_s, inner.time_s, where=inner.fresh)
@@ -120,8 +154,12 @@ class FaultInjector:
                     self._late.pop((number, role), None)
             elif fault.kind == "swap":
                 a, b = fault.roles
-                for spoiled, true in ((out.value, inner.value), (out.time_s, inner.time_s),
-                                      (out.fresh, inner.fresh), (out.status, inner.status)):
+                for spoiled, true in (
+                    (out.value, inner.value),
+                    (out.time_s, inner.time_s),
+                    (out.fresh, inner.fresh),
+                    (out.status, inner.status),
+                ):
                     spoiled[a], spoiled[b] = true[b], true[a]
             elif fault.kind != "stuck":
                 for role in fault.roles:
@@ -182,7 +220,7 @@ class FaultInjector:
             value, _ = late.popleft()
             self._held[number, role] = value
             out.fresh[role] = True
-            out.time_s[role] = now_s                   # a late reading looks new: that is what makes it a hazard
+            out.time_s[role] = now_s  # a late reading looks new: that is what makes it a hazard
         out.value[role] = self._held.get((number, role), self._value[role])
 
     def _duplicate(self, fault: Fault, number: int, role: int, now_s: float) -> None:
@@ -192,7 +230,7 @@ class FaultInjector:
 
     def _corrupt(self, fault: Fault, number: int, role: int, now_s: float) -> None:
         if self.sample.fresh[role] and self._hit(fault):
-            bits = self.sample.value[role:role + 1].view(np.uint64)
+            bits = self.sample.value[role : role + 1].view(np.uint64)
             bits ^= np.uint64(1) << np.uint64(self._random.integers(64))
 
     def _freeze(self, fault: Fault, number: int, role: int, now_s: float) -> None:

@@ -4,6 +4,7 @@ Ports: "tcp:host:port" or "rtu:/dev/serial/by-id/...". Channels are registers; n
 of several words is put together by its word order (bytes inside a word are big-endian, by the protocol); sentinel
 numbers, such as an open thermocouple's, make the channel an ERROR while the others stay OK.
 """
+
 from __future__ import annotations
 
 import logging
@@ -24,13 +25,23 @@ from hal.devices import Device
 from hal.profile import FIELD_TYPES, Binding, Modbus, Register
 from hal.serial_port import open_port
 
-EXCEPTIONS = {1: "illegal function", 2: "illegal register address", 3: "illegal value", 4: "device failure",
-              5: "acknowledge", 6: "device busy", 8: "memory parity", 10: "gateway path", 11: "gateway target silent"}
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal register address",
+    3: "illegal value",
+    4: "device failure",
+    5: "acknowledge",
+    6: "device busy",
+    8: "memory parity",
+    10: "gateway path",
+    11: "gateway target silent",
+}
 
 
 @dataclass(frozen=True)
 class Block:
     """Registers read by one request; `members` are (number of the bound channel, register)."""
+
     kind: str
     address: int
     count: int
@@ -42,8 +53,12 @@ def plan_blocks(registers: Sequence[Register], spec: Modbus) -> list[Block]:
     blocks: list[Block] = []
     for i, r in sorted(enumerate(registers), key=lambda item: (item[1].kind, item[1].address)):
         last = blocks[-1] if blocks else None
-        if last and last.kind == r.kind and r.address - last.address - last.count <= spec.max_gap and \
-                r.address + r.words - last.address <= spec.max_block:
+        if (
+            last
+            and last.kind == r.kind
+            and r.address - last.address - last.count <= spec.max_gap
+            and r.address + r.words - last.address <= spec.max_block
+        ):
             count = max(last.count, r.address + r.words - last.address)
             blocks[-1] = Block(r.kind, last.address, count, (*last.members, (i, r)))
         else:
@@ -54,7 +69,9 @@ def plan_blocks(registers: Sequence[Register], spec: Modbus) -> list[Block]:
 def decode(words: Sequence[int], register: Register) -> float:
     """The raw number in `words` (uint16, as the wire has them)."""
     ordered = words if register.word_order == "big" else words[::-1]
-    return float(struct.unpack(">" + FIELD_TYPES[register.type], struct.pack(f">{len(ordered)}H", *ordered))[0])
+    return float(
+        struct.unpack(">" + FIELD_TYPES[register.type], struct.pack(f">{len(ordered)}H", *ordered))[0]
+    )
 
 
 class ModbusDevice(Device):
@@ -64,7 +81,7 @@ class ModbusDevice(Device):
         super().__init__(binding)
         self._client: Any = None
         self._blocks = plan_blocks([b.channel.source for b in binding.bounds], binding.profile.bus_spec)
-        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)      # what it would log, we raise
+        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what it would log, we raise
 
     def connect(self) -> None:
         """Open the connection or the serial port. Raises HardwareError."""
@@ -73,11 +90,19 @@ class ModbusDevice(Device):
         tcp = re.fullmatch(r"tcp:(\[[^]]+\]|[^:]+):(\d+)", port)
         try:
             if tcp:
-                self._client = ModbusTcpClient(tcp[1].strip("[]"), port=int(tcp[2]), timeout=spec.timeout_s, retries=0)
+                self._client = ModbusTcpClient(
+                    tcp[1].strip("[]"), port=int(tcp[2]), timeout=spec.timeout_s, retries=0
+                )
             elif port.startswith("rtu:"):
-                open_port(port[4:], line, self.name).close()          # its message is better, and it sets the latency
-                self._client = ModbusSerialClient(port[4:], baudrate=line.baud, parity=line.parity,
-                                                  stopbits=line.stop_bits, timeout=spec.timeout_s, retries=0)
+                open_port(port[4:], line, self.name).close()  # its message is better, and it sets the latency
+                self._client = ModbusSerialClient(
+                    port[4:],
+                    baudrate=line.baud,
+                    parity=line.parity,
+                    stopbits=line.stop_bits,
+                    timeout=spec.timeout_s,
+                    retries=0,
+                )
             else:
                 raise HardwareError(f"{self.name}: port '{port}': tcp:host:port or rtu:/dev/... was expected")
             connected = self._client.connect()
@@ -97,7 +122,11 @@ class ModbusDevice(Device):
         """Read every block. A device that answers with an exception makes the block's channels ERROR; one that does not
         answer raises HardwareError."""
         for block in self._blocks:
-            read = self._client.read_input_registers if block.kind == "input" else self._client.read_holding_registers
+            read = (
+                self._client.read_input_registers
+                if block.kind == "input"
+                else self._client.read_holding_registers
+            )
             try:
                 answer = read(block.address, count=block.count, device_id=self.binding.address)
             except (ModbusException, OSError, serial.SerialException) as e:
@@ -116,11 +145,15 @@ class ModbusDevice(Device):
                 self.counts["frames"] += 1
             for i, register in block.members:
                 if problem:
-                    self.fail(sample, i, f"{problem} to {block.kind} registers {block.address}.."
-                                         f"{block.address + block.count - 1}: check the register map")
+                    self.fail(
+                        sample,
+                        i,
+                        f"{problem} to {block.kind} registers {block.address}.."
+                        f"{block.address + block.count - 1}: check the register map",
+                    )
                     continue
                 at = register.address - block.address
-                raw = decode(answer.registers[at:at + register.words], register)
+                raw = decode(answer.registers[at : at + register.words], register)
                 if raw in register.sentinels or math.isnan(raw):
                     self.fail(sample, i, f"register {register.address} reads {raw:g}: open or missing sensor")
                 else:

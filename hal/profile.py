@@ -8,6 +8,7 @@ and says where on its bus the raw number is found. Buses: serial-binary (framed 
 (any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). A binding, one item of `hal.devices`, is
 profile, port and which channel plays which role of `hal.backend.ROLES`.
 """
+
 from __future__ import annotations
 
 import math
@@ -24,16 +25,29 @@ from thermoctl.yamlfile import InputError, Node, suggest
 
 FORMAT = "thermoctl-device/1"
 BUSES = ("serial-binary", "serial-lines", "can-dbc", "can-cia402", "modbus")
-FIELD_TYPES = {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q",
-               "uint64": "Q", "float32": "f", "float64": "d"}
+FIELD_TYPES = {
+    "int8": "b",
+    "uint8": "B",
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+}
 CRCS = ("ccitt-false", "xmodem", "modbus")
 _NAME = re.compile(r"[A-Za-z_]\w{0,59}$", re.ASCII)
 
 # A channel's unit must be convertible to its role's: role suffix -> {unit: (factor, offset)}.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "um": {"um": (1, 0), "nm": (1e-3, 0), "mm": (1e3, 0), "m": (1e6, 0)},
-    "v": {"V": (1, 0), "mV": (1e-3, 0)}, "a": {"A": (1, 0), "mA": (1e-3, 0)},
-    "c": {"degC": (1, 0), "K": (1, -273.15)}, "": {"1": (1, 0)}}
+    "v": {"V": (1, 0), "mV": (1e-3, 0)},
+    "a": {"A": (1, 0), "mA": (1e-3, 0)},
+    "c": {"degC": (1, 0), "K": (1, -273.15)},
+    "": {"1": (1, 0)},
+}
 
 
 class Section:
@@ -60,10 +74,14 @@ class Section:
         if not isinstance(node.value, str):
             raise node.error(f"{key}: text was expected, found {_kind(node)}")
         if choices and node.value not in choices:
-            raise node.error(f"{key}: '{node.value}' is not one of {', '.join(choices)}{suggest(node.value, choices)}")
+            raise node.error(
+                f"{key}: '{node.value}' is not one of {', '.join(choices)}{suggest(node.value, choices)}"
+            )
         return node.value
 
-    def number(self, key: str, default: float | None = None, low: float = -math.inf, high: float = math.inf) -> float:
+    def number(
+        self, key: str, default: float | None = None, low: float = -math.inf, high: float = math.inf
+    ) -> float:
         """The number of `key` within low..high. Raises InputError with its place."""
         node = self.get(key, default is None)
         return float(default or 0.0) if node is None else _number(node, key, low, high)
@@ -120,8 +138,10 @@ class Section:
         """Raise where a key stands that is not known here."""
         for key, node in self.node.value.items():
             if key not in self.asked:
-                raise node.error(f"{self.what}: unknown key '{key}'{suggest(key, self.asked)}; "
-                                 f"known here: {', '.join(sorted(self.asked))}")
+                raise node.error(
+                    f"{self.what}: unknown key '{key}'{suggest(key, self.asked)}; "
+                    f"known here: {', '.join(sorted(self.asked))}"
+                )
 
 
 def _must(node: Node | None) -> Node:
@@ -137,7 +157,11 @@ def _kind(node: Node) -> str:
 
 
 def _number(node: Node, key: str, low: float = -math.inf, high: float = math.inf) -> float:
-    if isinstance(node.value, bool) or not isinstance(node.value, int | float) or not math.isfinite(node.value):
+    if (
+        isinstance(node.value, bool)
+        or not isinstance(node.value, int | float)
+        or not math.isfinite(node.value)
+    ):
         raise node.error(f"{key}: a number was expected, found {_kind(node)}")
     if not low <= node.value <= high:
         raise node.error(f"{key}: {node.value:g} is outside {low:g} .. {high:g}")
@@ -158,6 +182,7 @@ def _integer(node: Node, key: str, low: int = 0, high: int = 2**32) -> int:
 @dataclass(frozen=True)
 class Channel:
     """One reading of a device. `source` is where its bus has it: field, DBC signal, drive object, register."""
+
     name: str
     unit: str
     scale: float
@@ -172,6 +197,7 @@ class Channel:
 @dataclass(frozen=True)
 class Drive:
     """The command that a device takes: counts = drive / scale, drive clipped to `limits` (in `unit`)."""
+
     unit: str
     scale: float
     limits: tuple[float, float]
@@ -180,6 +206,7 @@ class Drive:
 @dataclass(frozen=True)
 class LineSettings:
     """A serial line. `latency_timer_ms` is set where the adapter (FTDI) has one; 0 leaves it."""
+
     baud: int = 115200
     parity: str = "N"
     stop_bits: int = 1
@@ -192,6 +219,7 @@ class BinaryFrame:
 
     `sequence` names a counter field (lost frames are counted); `invalid` = (field, mask): any of those bits set marks
     the readings of the frame as errors."""
+
     sync: bytes
     fields: tuple[tuple[str, str], ...]
     endian: str = "<"
@@ -210,6 +238,7 @@ class BinaryFrame:
 @dataclass(frozen=True)
 class TextLine:
     """A line that matches `pattern` gives its named groups as readings; `request` is sent every 1/request_hz."""
+
     pattern: re.Pattern[str]
     request: bytes = b""
     request_hz: float = 0.0
@@ -218,6 +247,7 @@ class TextLine:
 @dataclass(frozen=True)
 class Dbc:
     """A CAN device that a DBC file describes."""
+
     file: Path
     database: Any = field(compare=False)
 
@@ -225,6 +255,7 @@ class Dbc:
 @dataclass(frozen=True)
 class DbcSource:
     """A signal of a message of the DBC file."""
+
     message: str
     signal: str
 
@@ -232,20 +263,22 @@ class DbcSource:
 @dataclass(frozen=True)
 class Cia402:
     """A CiA-402 drive: EDS, the object that takes the command, the two PDOs, and the times of both heartbeats."""
+
     eds: Path
     node_id: int
-    mode: int                         # 0x6060 mode of operation: 4 profile torque, 10 cyclic torque, < 0 vendor's
-    command: int                      # object that takes the drive
-    transmit: tuple[int, ...]         # objects of TPDO 1, the first is the status word 0x6041
-    master_id: int = 127              # our own node id: its heartbeat is what the drive watches
-    heartbeat_s: float = 0.02         # we send ours and ask the drive for its own this often
-    watchdog_s: float = 0.1           # the drive stops when ours is missing for so long
-    start_up: tuple[tuple[int, int, int], ...] = ()     # further (index, subindex, value) written at set-up
+    mode: int  # 0x6060 mode of operation: 4 profile torque, 10 cyclic torque, < 0 vendor's
+    command: int  # object that takes the drive
+    transmit: tuple[int, ...]  # objects of TPDO 1, the first is the status word 0x6041
+    master_id: int = 127  # our own node id: its heartbeat is what the drive watches
+    heartbeat_s: float = 0.02  # we send ours and ask the drive for its own this often
+    watchdog_s: float = 0.1  # the drive stops when ours is missing for so long
+    start_up: tuple[tuple[int, int, int], ...] = ()  # further (index, subindex, value) written at set-up
 
 
 @dataclass(frozen=True)
 class Modbus:
     """A register device: answers within `timeout_s`; neighbours are read in one block over gaps <= max_gap."""
+
     unit_id: int
     timeout_s: float = 0.3
     max_gap: int = 8
@@ -255,6 +288,7 @@ class Modbus:
 @dataclass(frozen=True)
 class Register:
     """A value in Modbus registers. `sentinels` are raw numbers that mean 'no reading' (an open thermocouple)."""
+
     kind: str
     address: int
     type: str
@@ -270,6 +304,7 @@ class Register:
 @dataclass(frozen=True)
 class Profile:
     """A checked device description; `bus_spec` is one of BinaryFrame, TextLine, Dbc, Cia402, Modbus."""
+
     vendor: str
     model: str
     bus: str
@@ -283,6 +318,7 @@ class Profile:
 @dataclass(frozen=True)
 class Bound:
     """A channel in a role: role value = raw * scale + offset, in the role's unit, allowed inside [low, high]."""
+
     role: str
     channel: Channel
     scale: float
@@ -294,10 +330,11 @@ class Bound:
 @dataclass(frozen=True)
 class Binding:
     """One device of this rig: profile + port (+ address where several share a bus) + roles."""
+
     name: str
     profile: Profile
     port: str
-    address: int                      # node id or Modbus unit; the profile's where the binding names none
+    address: int  # node id or Modbus unit; the profile's where the binding names none
     bounds: tuple[Bound, ...]
     place: str
 
@@ -335,8 +372,12 @@ def _line(top: Section) -> LineSettings:
     s = top.section("line", False)
     if s is None:
         return LineSettings()
-    line = LineSettings(s.integer("baud", 115200, 50, 20_000_000), s.text("parity", "N", "NEO"),
-                        s.integer("stop_bits", 1, 1, 2), s.integer("latency_timer_ms", 1, 0, 255))
+    line = LineSettings(
+        s.integer("baud", 115200, 50, 20_000_000),
+        s.text("parity", "N", "NEO"),
+        s.integer("stop_bits", 1, 1, 2),
+        s.integer("latency_timer_ms", 1, 0, 255),
+    )
     s.end()
     return line
 
@@ -345,13 +386,24 @@ def _channel(name: str, s: Section, bus: str, spec: Any) -> Channel:
     rate = s.number("rate_hz", low=1e-3, high=1e5)
     stale = s.number("stale_after_s", low=1e-4, high=3600)
     if stale < 1.0 / rate:
-        raise _must(s.get("stale_after_s")).error(f"stale_after_s: {stale:g} s is shorter than the period of rate_hz "
-                                                  f"({1 / rate:g} s): every reading would be stale")
+        raise _must(s.get("stale_after_s")).error(
+            f"stale_after_s: {stale:g} s is shorter than the period of rate_hz "
+            f"({1 / rate:g} s): every reading would be stale"
+        )
     scale = s.number("scale", 1.0)
     if scale == 0.0:
         raise _must(s.get("scale")).error("scale: 0 makes every reading the same")
-    channel = Channel(name, s.text("unit"), scale, s.number("offset", 0.0), s.interval("range"), rate, stale,
-                      _SOURCES[bus](s, spec), s.node.place)
+    channel = Channel(
+        name,
+        s.text("unit"),
+        scale,
+        s.number("offset", 0.0),
+        s.interval("range"),
+        rate,
+        stale,
+        _SOURCES[bus](s, spec),
+        s.node.place,
+    )
     s.end()
     return channel
 
@@ -360,7 +412,9 @@ def _named(s: Section, key: str, names: Iterable[str]) -> str:
     names = list(names)
     value = s.text(key)
     if value not in names:
-        raise _must(s.get(key)).error(f"{key}: '{value}' is not one of {', '.join(names)}{suggest(value, names)}")
+        raise _must(s.get(key)).error(
+            f"{key}: '{value}' is not one of {', '.join(names)}{suggest(value, names)}"
+        )
     return value
 
 
@@ -384,11 +438,20 @@ def _binary_frame(top: Section, folder: Path) -> BinaryFrame:
         i.end()
     sequence = _named(s, "sequence", names) if s.get("sequence", False) else ""
     order = {"little": "<", "big": ">"}
-    frame = BinaryFrame(sync, tuple(fields), order[s.text("endian", "little", order)], s.flag("length", True),
-                        s.text("crc", "ccitt-false", CRCS), order[s.text("crc_endian", "little", order)], sequence,
-                        invalid)
+    frame = BinaryFrame(
+        sync,
+        tuple(fields),
+        order[s.text("endian", "little", order)],
+        s.flag("length", True),
+        s.text("crc", "ccitt-false", CRCS),
+        order[s.text("crc_endian", "little", order)],
+        sequence,
+        invalid,
+    )
     if frame.payload.size > 255:
-        raise _must(s.get("fields")).error(f"fields: {frame.payload.size} bytes; at most 255 fit the length byte")
+        raise _must(s.get("fields")).error(
+            f"fields: {frame.payload.size} bytes; at most 255 fit the length byte"
+        )
     s.end()
     return frame
 
@@ -413,13 +476,14 @@ def _text_line(top: Section, folder: Path) -> TextLine:
 
 def _dbc(top: Section, folder: Path) -> Dbc:
     import cantools
+
     path = folder / top.text("dbc")
     node = _must(top.get("dbc"))
     try:
         return Dbc(path, cantools.database.load_file(str(path), database_format="dbc"))
     except OSError as e:
         raise node.error(f"dbc: {path} cannot be read: {e.strerror}") from None
-    except Exception as e:              # cantools raises parse errors of several libraries
+    except Exception as e:  # cantools raises parse errors of several libraries
         raise node.error(f"dbc: {path} is not a DBC file: {str(e).splitlines()[0]}") from None
 
 
@@ -431,19 +495,36 @@ def _cia402(top: Section, folder: Path) -> Cia402:
         raise _must(s.get("eds")).error(f"eds: {eds} cannot be read: no such file")
     transmit = tuple(_integer(n, "transmit", 0x1000, 0xFFFF) for n in s.list("transmit"))
     if not transmit or transmit[0] != 0x6041:
-        raise _must(s.get("transmit")).error("transmit: the objects of TPDO 1, the status word '0x6041' first")
+        raise _must(s.get("transmit")).error(
+            "transmit: the objects of TPDO 1, the status word '0x6041' first"
+        )
     start_up = []
     for node in s.list("start_up", False):
         w = Section(node, "start_up")
-        start_up.append((w.integer("index", low=0x1000, high=0xFFFF), w.integer("sub", 0, 0, 255),
-                         w.integer("value", low=-2**31)))
+        start_up.append(
+            (
+                w.integer("index", low=0x1000, high=0xFFFF),
+                w.integer("sub", 0, 0, 255),
+                w.integer("value", low=-(2**31)),
+            )
+        )
         w.end()
-    spec = Cia402(eds, s.integer("node_id", 1, 1, 126), s.integer("mode", low=-128, high=127),
-                  s.integer("command", low=0x1000, high=0xFFFF), transmit, s.integer("master_id", 127, 1, 127),
-                  s.number("heartbeat_s", 0.02, 1e-3, 1), s.number("watchdog_s", 0.1, 2e-3, 10), tuple(start_up))
+    spec = Cia402(
+        eds,
+        s.integer("node_id", 1, 1, 126),
+        s.integer("mode", low=-128, high=127),
+        s.integer("command", low=0x1000, high=0xFFFF),
+        transmit,
+        s.integer("master_id", 127, 1, 127),
+        s.number("heartbeat_s", 0.02, 1e-3, 1),
+        s.number("watchdog_s", 0.1, 2e-3, 10),
+        tuple(start_up),
+    )
     if spec.watchdog_s < 2 * spec.heartbeat_s:
-        raise s.node.error(f"watchdog_s: {spec.watchdog_s:g} s is below two heartbeats of {spec.heartbeat_s:g} s: "
-                           "the drive would stop by itself")
+        raise s.node.error(
+            f"watchdog_s: {spec.watchdog_s:g} s is below two heartbeats of {spec.heartbeat_s:g} s: "
+            "the drive would stop by itself"
+        )
     s.end()
     return spec
 
@@ -451,40 +532,60 @@ def _cia402(top: Section, folder: Path) -> Cia402:
 def _modbus(top: Section, folder: Path) -> Modbus:
     s = top.section("modbus")
     assert s is not None
-    spec = Modbus(s.integer("unit_id", 1, 0, 247), s.number("timeout_s", 0.3, 0.01, 10),
-                  s.integer("max_gap", 8, 0, 100), s.integer("max_block", 100, 1, 125))
+    spec = Modbus(
+        s.integer("unit_id", 1, 0, 247),
+        s.number("timeout_s", 0.3, 0.01, 10),
+        s.integer("max_gap", 8, 0, 100),
+        s.integer("max_block", 100, 1, 125),
+    )
     s.end()
     return spec
 
 
 def _dbc_source(s: Section, spec: Dbc) -> DbcSource:
     message = _named(s, "message", [m.name for m in spec.database.messages])
-    return DbcSource(message, _named(s, "signal", [x.name for x in spec.database.get_message_by_name(message).signals]))
+    return DbcSource(
+        message, _named(s, "signal", [x.name for x in spec.database.get_message_by_name(message).signals])
+    )
 
 
 def _cia402_source(s: Section, spec: Cia402) -> int:
     index = s.integer("object", low=0x1000, high=0xFFFF)
     if index not in spec.transmit and index not in (0x603F,):
-        raise _must(s.get("object")).error(f"object: 0x{index:04X} is not sent by the drive; add it to 'transmit'")
+        raise _must(s.get("object")).error(
+            f"object: 0x{index:04X} is not sent by the drive; add it to 'transmit'"
+        )
     return index
 
 
 def _register(s: Section, spec: Modbus) -> Register:
     types = [t for t, c in FIELD_TYPES.items() if struct.calcsize(c) >= 2]
-    source = Register(s.text("kind", "input", ("input", "holding")), s.integer("register", high=65535),
-                      s.text("type", "int16", types), s.text("word_order", "big", ("big", "little")),
-                      tuple(_number(n, "sentinels") for n in s.list("sentinels", False)))
+    source = Register(
+        s.text("kind", "input", ("input", "holding")),
+        s.integer("register", high=65535),
+        s.text("type", "int16", types),
+        s.text("word_order", "big", ("big", "little")),
+        tuple(_number(n, "sentinels") for n in s.list("sentinels", False)),
+    )
     if source.address + source.words > 65536 or source.words > spec.max_block:
         raise s.node.error(f"register: {source.words} registers from {source.address} do not fit")
     return source
 
 
-_BUS_SPECS: dict[str, Any] = {"serial-binary": _binary_frame, "serial-lines": _text_line, "can-dbc": _dbc,
-                              "can-cia402": _cia402, "modbus": _modbus}
+_BUS_SPECS: dict[str, Any] = {
+    "serial-binary": _binary_frame,
+    "serial-lines": _text_line,
+    "can-dbc": _dbc,
+    "can-cia402": _cia402,
+    "modbus": _modbus,
+}
 _SOURCES: dict[str, Any] = {
     "serial-binary": lambda s, spec: _named(s, "field", [n for n, _ in spec.fields]),
     "serial-lines": lambda s, spec: _named(s, "field", spec.pattern.groupindex),
-    "can-dbc": _dbc_source, "can-cia402": _cia402_source, "modbus": _register}
+    "can-dbc": _dbc_source,
+    "can-cia402": _cia402_source,
+    "modbus": _register,
+}
 
 
 def resolve_port(port: str, folder: Path) -> str:
@@ -492,7 +593,7 @@ def resolve_port(port: str, folder: Path) -> str:
     match = re.fullmatch(r"((?:slcan:|rtu:)?)(\.\.?/.*)", port)
     if match is None:
         return port
-    path = Path(match[2])                   # the last part may be a link: it is the link that is meant
+    path = Path(match[2])  # the last part may be a link: it is the link that is meant
     return f"{match[1]}{(folder / path.parent).resolve() / path.name}"
 
 
@@ -507,23 +608,40 @@ def bind(node: Node, folder: Path) -> Binding:
         raise profile_node.error(f"profile: {path} cannot be read: no such file")
     profile = load_profile(path)
     if (stale := s.number("stale_after_s", 0.0, 1e-4, 3600.0)) > 0.0:
-        profile = replace(profile, channels={n: replace(c, stale_after_s=stale) for n, c in profile.channels.items()})
+        profile = replace(
+            profile, channels={n: replace(c, stale_after_s=stale) for n, c in profile.channels.items()}
+        )
     if (watchdog := s.get("watchdog_s", False)) is not None:
         if profile.bus != "can-cia402":
             raise watchdog.error(f"watchdog_s: a {profile.bus} device has none")
-        profile = replace(profile, bus_spec=replace(profile.bus_spec, watchdog_s=s.number(
-            "watchdog_s", 0.0, 2 * profile.bus_spec.heartbeat_s, 10.0)))
+        profile = replace(
+            profile,
+            bus_spec=replace(
+                profile.bus_spec,
+                watchdog_s=s.number("watchdog_s", 0.0, 2 * profile.bus_spec.heartbeat_s, 10.0),
+            ),
+        )
     bounds = []
     for name, role in Section(_must(s.get("roles")), "roles").node.value.items():
         if name not in profile.channels:
-            raise role.error(f"roles: {profile.model} has no channel '{name}'{suggest(name, profile.channels)}; "
-                             f"it has {', '.join(profile.channels)}")
+            raise role.error(
+                f"roles: {profile.model} has no channel '{name}'{suggest(name, profile.channels)}; "
+                f"it has {', '.join(profile.channels)}"
+            )
         if role.value not in ROLES:
-            raise role.error(f"roles: '{role.value}' is no role{suggest(role.value, ROLES)}; roles: {', '.join(ROLES)}")
+            raise role.error(
+                f"roles: '{role.value}' is no role{suggest(role.value, ROLES)}; roles: {', '.join(ROLES)}"
+            )
         bounds.append(_bound(role, profile.channels[name]))
     default = getattr(profile.bus_spec, "node_id", getattr(profile.bus_spec, "unit_id", 0))
-    binding = Binding(s.text("name", profile.model), profile, resolve_port(s.text("port"), folder),
-                      s.integer("address", default, 0, 247), tuple(bounds), node.place)
+    binding = Binding(
+        s.text("name", profile.model),
+        profile,
+        resolve_port(s.text("port"), folder),
+        s.integer("address", default, 0, 247),
+        tuple(bounds),
+        node.place,
+    )
     s.end()
     return binding
 
@@ -536,11 +654,19 @@ def role_units(role: str) -> dict[str, tuple[float, float]]:
 def _bound(role: Node, channel: Channel) -> Bound:
     units = role_units(role.value)
     if channel.unit not in units:
-        raise role.error(f"roles: channel '{channel.name}' is in {channel.unit}, the role {role.value} takes "
-                         f"{' or '.join(units)}")
+        raise role.error(
+            f"roles: channel '{channel.name}' is in {channel.unit}, the role {role.value} takes "
+            f"{' or '.join(units)}"
+        )
     factor, shift = units[channel.unit]
-    return Bound(role.value, channel, channel.scale * factor, channel.offset * factor + shift,
-                 channel.range[0] * factor + shift, channel.range[1] * factor + shift)
+    return Bound(
+        role.value,
+        channel,
+        channel.scale * factor,
+        channel.offset * factor + shift,
+        channel.range[0] * factor + shift,
+        channel.range[1] * factor + shift,
+    )
 
 
 def check_rig(bindings: Iterable[Binding]) -> None:
@@ -549,6 +675,8 @@ def check_rig(bindings: Iterable[Binding]) -> None:
     for b in bindings:
         for role in [x.role for x in b.bounds] + (["drive"] if b.profile.drive else []):
             if role in claimed:
-                raise InputError(f"{b.place}: '{role}' is given by {b.name} and by {claimed[role].name} "
-                                 f"({claimed[role].place}); keep one of them")
+                raise InputError(
+                    f"{b.place}: '{role}' is given by {b.name} and by {claimed[role].name} "
+                    f"({claimed[role].place}); keep one of them"
+                )
             claimed[role] = b

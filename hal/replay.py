@@ -4,6 +4,7 @@ Columns play the role of their own name, or what `hal.roles` says: `column: role
 where it differs from the role's, as `q: position_um [m]`. A missing cell is a sensor that had nothing new. After the
 last row every channel is stale and `finished` is True.
 """
+
 from __future__ import annotations
 
 import math
@@ -19,7 +20,7 @@ from hal.profile import role_units
 from thermoctl.recording.table import Table, read_table
 from thermoctl.yamlfile import InputError, suggest
 
-STALE_PERIODS = 5           # a channel is stale after so many of its usual periods without a sample
+STALE_PERIODS = 5  # a channel is stale after so many of its usual periods without a sample
 
 
 def replay_backend(settings: Any) -> ReplayBackend:
@@ -33,11 +34,13 @@ class ReplayBackend:
     def __init__(self, table: Table, roles: Mapping[str, str]) -> None:
         for column in roles:
             if column not in table.columns:
-                raise InputError(f"{table.path}: no column '{column}' for hal.roles{suggest(column, table.columns)}; "
-                                 f"columns: {', '.join(table.columns)}")
+                raise InputError(
+                    f"{table.path}: no column '{column}' for hal.roles{suggest(column, table.columns)}; "
+                    f"columns: {', '.join(table.columns)}"
+                )
         self.sample, self.finished = Sample(), False
         self._t = table.t - table.t[0]
-        self._channels: list[tuple[int, np.ndarray, float]] = []       # role, values (N,), stale after s
+        self._channels: list[tuple[int, np.ndarray, float]] = []  # role, values (N,), stale after s
         for column, values in table.columns.items():
             role, factor, shift = self._role(table, column, roles.get(column, column))
             if role in ROLES:
@@ -45,8 +48,10 @@ class ReplayBackend:
                 period = float(np.median(np.diff(times))) if len(times) > 1 else math.inf
                 self._channels.append((ROLE[role], values * factor + shift, STALE_PERIODS * period))
         if not self._channels:
-            raise InputError(f"{table.path}: no column plays a role; say which in hal.roles "
-                             f"(columns: {', '.join(table.columns)}; roles: {', '.join(ROLES)})")
+            raise InputError(
+                f"{table.path}: no column plays a role; say which in hal.roles "
+                f"(columns: {', '.join(table.columns)}; roles: {', '.join(ROLES)})"
+            )
         taken = [r for r, _, _ in self._channels]
         if twice := {ROLES[r] for r in taken if taken.count(r) > 1}:
             raise InputError(f"{table.path}: hal.roles gives {', '.join(sorted(twice))} to two columns")
@@ -57,14 +62,17 @@ class ReplayBackend:
         match = re.fullmatch(r"(\w+)(?: \[([^]]+)\])?", text.strip())
         role = match[1] if match else text
         if text != column and role not in ROLES:
-            raise InputError(f"{table.path}: hal.roles: '{role}' is no role{suggest(role, ROLES)}; "
-                             f"roles: {', '.join(ROLES)}")
+            raise InputError(
+                f"{table.path}: hal.roles: '{role}' is no role{suggest(role, ROLES)}; "
+                f"roles: {', '.join(ROLES)}"
+            )
         if match is None or match[2] is None:
             return role, 1.0, 0.0
         units = role_units(role)
         if match[2] not in units:
-            raise InputError(f"{table.path}: hal.roles: column '{column}' in {match[2]}: {role} takes "
-                             f"{' or '.join(units)}")
+            raise InputError(
+                f"{table.path}: hal.roles: column '{column}' in {match[2]}: {role} takes {' or '.join(units)}"
+            )
         return role, *units[match[2]]
 
     def open(self) -> None:
@@ -81,7 +89,7 @@ class ReplayBackend:
             self._start_s = now_s
         begin, t = self._next, now_s - self._start_s + 1e-9
         end = begin + 1 if begin < len(self._t) and self._t[begin] <= t else begin
-        if end < len(self._t) and self._t[end] <= t:                   # more than one row since the last read
+        if end < len(self._t) and self._t[end] <= t:  # more than one row since the last read
             end = int(np.searchsorted(self._t, t, "right"))
         self._next = end
         self.finished = end == len(self._t) and t > self._t[-1] + 2e-9

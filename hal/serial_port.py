@@ -4,6 +4,7 @@
 pyserial opens and configures the line (exclusive, so that a second program is refused); the tick then reads and writes
 the bare descriptor without waiting. Frames are cut out of the bytes by hal.wire.Framer.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -21,7 +22,7 @@ from hal.devices import Device
 from hal.profile import BinaryFrame, Binding, LineSettings
 from hal.wire import Framer, read_available, wait_readable
 
-MAX_LINE = 1024             # a text line longer than this is garbage
+MAX_LINE = 1024  # a text line longer than this is garbage
 
 
 class LineReader:
@@ -53,21 +54,29 @@ class LineReader:
 def open_port(path: str, line: LineSettings, what: str) -> serial.Serial:
     """Open and configure a serial port exclusively, non-blocking. Raises HardwareError with what to do."""
     try:
-        port = serial.Serial(path, line.baud, parity=line.parity, stopbits=line.stop_bits, timeout=0, write_timeout=0,
-                             exclusive=True)
+        port = serial.Serial(
+            path,
+            line.baud,
+            parity=line.parity,
+            stopbits=line.stop_bits,
+            timeout=0,
+            write_timeout=0,
+            exclusive=True,
+        )
     except (OSError, ValueError, termios.error) as e:
         code = getattr(e, "errno", None)
-        hint = {errno.ENOENT: "no such device: is it plugged in? prefer a name of /dev/serial/by-id",
-                errno.EACCES: "permission denied: add the user to the group of the device (dialout)",
-                errno.EAGAIN: "in use by another program: stop it first",
-                errno.EBUSY: "in use by another program: stop it first",
-                errno.EINVAL:
-                f"cannot do {line.baud} baud, parity {line.parity}: see the profile's 'line'"}.get(code or 0, str(e))
+        hint = {
+            errno.ENOENT: "no such device: is it plugged in? prefer a name of /dev/serial/by-id",
+            errno.EACCES: "permission denied: add the user to the group of the device (dialout)",
+            errno.EAGAIN: "in use by another program: stop it first",
+            errno.EBUSY: "in use by another program: stop it first",
+            errno.EINVAL: f"cannot do {line.baud} baud, parity {line.parity}: see the profile's 'line'",
+        }.get(code or 0, str(e))
         raise HardwareError(f"{what}: {path}: {hint}") from None
     if line.latency_timer_ms:
         set_latency_timer(path, line.latency_timer_ms)
     settings = termios.tcgetattr(port.fileno())
-    settings[6][termios.VMIN] = 1           # so that 'nothing yet' (EAGAIN) differs from 'gone' (no bytes)
+    settings[6][termios.VMIN] = 1  # so that 'nothing yet' (EAGAIN) differs from 'gone' (no bytes)
     termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
     os.set_blocking(port.fileno(), False)
     return port
@@ -76,7 +85,9 @@ def open_port(path: str, line: LineSettings, what: str) -> serial.Serial:
 def set_latency_timer(path: str, ms: int, sys_root: str = "/sys") -> bool:
     """Set an FTDI adapter's latency timer (it holds bytes back for up to 16 ms by default). False where the port has
     none or the system refuses."""
-    timer = Path(sys_root, "bus/usb-serial/devices", os.path.basename(os.path.realpath(path)), "latency_timer")
+    timer = Path(
+        sys_root, "bus/usb-serial/devices", os.path.basename(os.path.realpath(path)), "latency_timer"
+    )
     try:
         timer.write_text(str(ms))
         return True
@@ -86,7 +97,9 @@ def set_latency_timer(path: str, ms: int, sys_root: str = "/sys") -> bool:
 
 def latency_timer_ms(path: str, sys_root: str = "/sys") -> int | None:
     """The FTDI latency timer in ms, or None where the port has none (for doctor)."""
-    timer = Path(sys_root, "bus/usb-serial/devices", os.path.basename(os.path.realpath(path)), "latency_timer")
+    timer = Path(
+        sys_root, "bus/usb-serial/devices", os.path.basename(os.path.realpath(path)), "latency_timer"
+    )
     try:
         return int(timer.read_text())
     except (OSError, ValueError):

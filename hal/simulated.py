@@ -8,6 +8,7 @@ The plant that plays the hardware may differ from the one that the compensator w
 a left-out effect is shown. Outputs play the role of their own name, or the one that `hal.roles` gives them. The plant's
 other inputs (the chamber's air) follow `hal.inputs`: mean + swing * sin(2 pi t / period_s).
 """
+
 from __future__ import annotations
 
 import math
@@ -18,21 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import (
-    AMP_DISABLED,
-    AMP_ENABLED,
-    ERROR,
-    OK,
-    ROLE,
-    ROLES,
-    STALE,
-    Sample,
-)
+from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample
 from hal.profile import Section
 from thermoctl.plant import load
 from thermoctl.yamlfile import InputError, Node, suggest
 
-MAX_CATCH_UP = 1000         # periods in one read; a clock that jumps further (suspend) moves the plant's time instead
+MAX_CATCH_UP = (
+    1000  # periods in one read; a clock that jumps further (suspend) moves the plant's time instead
+)
 _STATE = ROLE["amplifier_state"]
 EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
 
@@ -40,6 +34,7 @@ EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
 @dataclass(frozen=True)
 class Surrounding:
     """A plant input that nobody commands, and the sensor that measures it."""
+
     mean: float
     swing: float = 0.0
     period_s: float = 86400.0
@@ -58,8 +53,13 @@ def surroundings(node: Node | None) -> dict[str, Surrounding]:
     found = {}
     for name, item in Section(node, "inputs").node.value.items():
         s = Section(item, name)
-        found[name] = Surrounding(s.number("mean"), s.number("swing", 0.0), s.number("period_s", 86400.0, 1.0),
-                                  s.number("noise", 0.0, 0.0), s.number("resolution", 0.0, 0.0))
+        found[name] = Surrounding(
+            s.number("mean"),
+            s.number("swing", 0.0),
+            s.number("period_s", 86400.0, 1.0),
+            s.number("noise", 0.0, 0.0),
+            s.number("resolution", 0.0, 0.0),
+        )
         s.end()
     return found
 
@@ -68,19 +68,30 @@ class PlantRig:
     """A plant that lives: `step` advances it, `sense` reads a sensor. Shared by the simulated back end and the virtual
     rig at the wire."""
 
-    def __init__(self, path: str | Path, period_s: float, drive_input: str, surroundings: Mapping[str, Surrounding],
-                 roles: Mapping[str, str], seed: int) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        period_s: float,
+        drive_input: str,
+        surroundings: Mapping[str, Surrounding],
+        roles: Mapping[str, str],
+        seed: int,
+    ) -> None:
         """surroundings: the plant's inputs other than the drive; roles: output -> role where they differ in name.
         Raises InputError where the plant and these do not fit."""
         plant = load(path)
         model = plant.compile(())
         if drive_input not in model.inputs:
-            raise InputError(f"{path}: no input '{drive_input}' to drive{suggest(drive_input, model.inputs)}; "
-                             f"hal.drive_input must be one of {', '.join(model.inputs)}")
+            raise InputError(
+                f"{path}: no input '{drive_input}' to drive{suggest(drive_input, model.inputs)}; "
+                f"hal.drive_input must be one of {', '.join(model.inputs)}"
+            )
         free = [n for n in model.inputs if n != drive_input]
         for name in surroundings:
             if name not in free:
-                raise InputError(f"{path}: hal.inputs: the plant has no free input '{name}'{suggest(name, free)}")
+                raise InputError(
+                    f"{path}: hal.inputs: the plant has no free input '{name}'{suggest(name, free)}"
+                )
         missing = [n for n in free if n not in surroundings]
         if missing:
             raise InputError(f"{path}: hal.inputs must say what {', '.join(missing)} is")
@@ -92,7 +103,7 @@ class PlantRig:
         self.stepper = model.stepper(period_s, self.u)
         self._draw = _draws(np.random.default_rng(seed)).__next__
         self.y = self.stepper.step(self.u)
-        self.index: dict[str, int] = {}             # role -> output; after the outputs come the surroundings
+        self.index: dict[str, int] = {}  # role -> output; after the outputs come the surroundings
         for i, name in enumerate(model.outputs):
             role = roles.get(name, name)
             if role in ROLES:
@@ -101,13 +112,19 @@ class PlantRig:
                 raise InputError(f"{path}: hal.roles: '{role}' is no role{suggest(role, ROLES)}")
         for name in roles:
             if name not in model.outputs:
-                raise InputError(f"{path}: hal.roles: the plant has no output '{name}'{suggest(name, model.outputs)}")
+                raise InputError(
+                    f"{path}: hal.roles: the plant has no output '{name}'{suggest(name, model.outputs)}"
+                )
         if "position_um" not in self.index:
-            raise InputError(f"{path}: no output plays position_um; name one in hal.roles "
-                             f"(outputs: {', '.join(model.outputs)})")
+            raise InputError(
+                f"{path}: no output plays position_um; name one in hal.roles "
+                f"(outputs: {', '.join(model.outputs)})"
+            )
         outputs = [plant.outputs[n] for n in model.outputs]
         self._noise = [o.noise or 0.0 for o in outputs] + [s.noise for _, s in self._surroundings]
-        self._resolution = [o.resolution or 0.0 for o in outputs] + [s.resolution for _, s in self._surroundings]
+        self._resolution = [o.resolution or 0.0 for o in outputs] + [
+            s.resolution for _, s in self._surroundings
+        ]
         for k, name in enumerate(surroundings):
             role = next((r for r in (name, plant.inputs[name].column) if r in ROLES), "")
             if role and role not in self.index:
@@ -153,8 +170,14 @@ def _draws(random: np.random.Generator) -> Iterator[float]:
 def make_rig(settings: Any) -> PlantRig:
     """The plant that `settings.hal` names as the hardware's truth. Paths are relative to the config file."""
     hal = settings.hal
-    return PlantRig(Path(settings.path).parent / (hal.truth or hal.plant), settings.loop.period_s, hal.drive_input,
-                    surroundings(hal.inputs), hal.roles, hal.seed)
+    return PlantRig(
+        Path(settings.path).parent / (hal.truth or hal.plant),
+        settings.loop.period_s,
+        hal.drive_input,
+        surroundings(hal.inputs),
+        hal.roles,
+        hal.seed,
+    )
 
 
 def simulated_backend(settings: Any) -> SimulatedBackend:
@@ -207,7 +230,7 @@ class SimulatedBackend:
         sample.fresh[roles], sample.time_s[roles], sample.status[roles] = True, now_s, OK
         for role, i in channels:
             value = read(i)
-            if value - value == 0.0:                       # finite
+            if value - value == 0.0:  # finite
                 sample.value[role] = value
             else:
                 sample.status[role] = ERROR
@@ -226,7 +249,11 @@ class SimulatedBackend:
         status = self.sample.status[ROLE[role]]
         if status == OK:
             return ""
-        return f"{role}: the plant's output is not finite" if status == ERROR else f"{role}: not an output of the plant"
+        return (
+            f"{role}: the plant's output is not finite"
+            if status == ERROR
+            else f"{role}: not an output of the plant"
+        )
 
     def counters(self) -> dict[str, int]:
         """Periods simulated."""

@@ -12,6 +12,7 @@ For each effect below, none of which is told to the program:
                puts it (mean and 2 s); other rigs: free-run error of the second recording over its noise
 Done effects in --out are not run again; the page is DIR/demo.html.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -42,7 +43,7 @@ from thermoctl.report import page  # noqa: E402
 from thermoctl.yamlfile import InputError  # noqa: E402
 
 SIGMAS = 120.0
-LATE = 1e9      # seconds: the joint is as it is after the recordings
+LATE = 1e9  # seconds: the joint is as it is after the recordings
 
 
 @dataclass(frozen=True)
@@ -66,14 +67,20 @@ STORIES = (
 )
 
 
-def conceal(story: Story, seed: int, folder: Path) -> tuple[Scene, tuple[str, str, dict], list[np.ndarray], float]:
+def conceal(
+    story: Story, seed: int, folder: Path
+) -> tuple[Scene, tuple[str, str, dict], list[np.ndarray], float]:
     """Write plant.yaml, run_1.csv and run_2.csv; returns the scene, the effect with its parameters, the true readings of each
     run (N, outputs) and how many sigmas the effect leaves after a refit. An actuator's columns get the program's names."""
     for attempt in range(400):
         rng = np.random.default_rng([seed, attempt])
         scene = generate.FAMILIES[story.family].scene(rng, "designed", True)
         # the judge's `top` is the largest sensible size for a case; the demonstration may go beyond it
-        held = [dataclasses.replace(s, top=40.0) for s in scene.suspects if (s.effect, s.where) == (story.effect, story.where)]
+        held = [
+            dataclasses.replace(s, top=40.0)
+            for s in scene.suspects
+            if (s.effect, s.where) == (story.effect, story.where)
+        ]
         if held and (story.family != "actuator" or len(scene.outputs) == 13):
             break
     else:
@@ -87,8 +94,10 @@ def conceal(story: Story, seed: int, folder: Path) -> tuple[Scene, tuple[str, st
     tables = []
     for k, recording in enumerate(scene.runs):
         columns = [("t", recording["t"]), *((c, recording[key]) for c, key in scene.columns.items())]
-        columns += [(c, sensors.record(true[k][:, j], bench.noise[j], scene.sd[j], scene.resolution[j], {}, rng))
-                    for j, c in enumerate(scene.output_columns)]
+        columns += [
+            (c, sensors.record(true[k][:, j], bench.noise[j], scene.sd[j], scene.resolution[j], {}, rng))
+            for j, c in enumerate(scene.output_columns)
+        ]
         tables.append(columns)
     plant = scene.plant
     if story.family == "actuator":
@@ -100,12 +109,23 @@ def conceal(story: Story, seed: int, folder: Path) -> tuple[Scene, tuple[str, st
 
 def in_signals(plant: dict, columns: list) -> tuple[dict, list]:
     """An actuator's plant file and columns by the program's names of signals, which its compensator knows."""
-    names = {"voltage": "voltage_v", "current": "current_a", "air_temperature": "air_c", "position_error": "position_error_um"}
+    names = {
+        "voltage": "voltage_v",
+        "current": "current_a",
+        "air_temperature": "air_c",
+        "position_error": "position_error_um",
+    }
     names |= {o: o.replace("_temperature", "_c") for o in plant["outputs"] if o.endswith("_temperature")}
 
     def named(part: str) -> dict:
-        return {n: {**x, "column": names.get(x.get("column", n), x.get("column", n))} for n, x in plant[part].items()}
-    return {**plant, "inputs": named("inputs"), "outputs": named("outputs")}, [(names.get(n, n), x) for n, x in columns]
+        return {
+            n: {**x, "column": names.get(x.get("column", n), x.get("column", n))}
+            for n, x in plant[part].items()
+        }
+
+    return {**plant, "inputs": named("inputs"), "outputs": named("outputs")}, [
+        (names.get(n, n), x) for n, x in columns
+    ]
 
 
 def compensated(plant_file: Path, recording: Path, true_um: np.ndarray, t_now_s: float) -> np.ndarray:
@@ -134,7 +154,10 @@ def at_time(plant: Any, t_s: float) -> Any:
 
     def now(e: Any) -> Any:
         return ex.substitute(e, lambda part: ex.num(t_s) if part.op == "name" and part.value == "t" else None)
-    return dataclasses.replace(plant, flows={k: dataclasses.replace(f, rate=now(f.rate)) for k, f in plant.flows.items()})
+
+    return dataclasses.replace(
+        plant, flows={k: dataclasses.replace(f, rate=now(f.rate)) for k, f in plant.flows.items()}
+    )
 
 
 def unseen(plant_file: Path, recording: Path) -> dict[str, float]:
@@ -143,7 +166,10 @@ def unseen(plant_file: Path, recording: Path) -> dict[str, float]:
     model = plant.compile(())
     drive = model.drive(read_table(recording))
     found = fit(model, [drive])
-    noise = {o.name: float(np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12))) for o in plant.outputs.values()}
+    noise = {
+        o.name: float(np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12)))
+        for o in plant.outputs.values()
+    }
     return {o: r / noise[o] for o, r in found.rms().items() if np.isfinite(r) and noise[o]}
 
 
@@ -151,7 +177,9 @@ def tell(story: Story, seed: int, out: Path) -> dict[str, Any]:
     """The chain for one effect; kept in OUT/EFFECT/result.json for the same seed and program."""
     folder = out / story.effect
     made_by = {"seed": seed, "program": program()}
-    if (folder / "result.json").exists() and made_by.items() <= (kept := json.loads((folder / "result.json").read_text())).items():
+    if (folder / "result.json").exists() and made_by.items() <= (
+        kept := json.loads((folder / "result.json").read_text())
+    ).items():
         return kept
     say(f"{story.effect}: concealed in a {story.family}")
     scene, effect, true, sigmas = conceal(story, seed, folder)
@@ -163,11 +191,23 @@ def tell(story: Story, seed: int, out: Path) -> dict[str, Any]:
     model = plant.compile()
     drives = [model.drive(read_table(folder / "run_1.csv"))]
     save(updated(plant, fit(model, drives), drives), folder / "refitted.yaml")
-    files = {"as it came": folder / "plant.yaml", "refitted": folder / "refitted.yaml", "extended": folder / "diagnosis" / "plant.yaml"}
-    told: dict[str, Any] = {**made_by, **dataclasses.asdict(story), "sigmas": sigmas, "true": effect[2],
-                            "verdict": result["verdict"], "seconds": seconds,
-                            "findings": [[f["effect"], f["where"], f["probability"]] for f in result["findings"]],
-                            "fit": {}, "position_um": {}, "curves": {}}
+    files = {
+        "as it came": folder / "plant.yaml",
+        "refitted": folder / "refitted.yaml",
+        "extended": folder / "diagnosis" / "plant.yaml",
+    }
+    told: dict[str, Any] = {
+        **made_by,
+        **dataclasses.asdict(story),
+        "sigmas": sigmas,
+        "true": effect[2],
+        "verdict": result["verdict"],
+        "seconds": seconds,
+        "findings": [[f["effect"], f["where"], f["probability"]] for f in result["findings"]],
+        "fit": {},
+        "position_um": {},
+        "curves": {},
+    }
     for name, file in files.items():
         told["fit"][name] = unseen(file, folder / "run_2.csv")
         if story.family == "actuator":
@@ -207,21 +247,36 @@ def fits(all_told: Sequence[dict[str, Any]]) -> list[list[Any]]:
     rows = []
     for x in all_told:
         found = ", ".join(f"{e} at {w} ({p:.2f})" for e, w, p in x["findings"]) or "nothing"
-        rows.append([f"{x['effect']} at {x['where']}", x["family"], f"{x['verdict']}: {found}", "yes" if right(x) else "no",
-                     *(worst(x["fit"][n]) for n in FILES)])
+        rows.append(
+            [
+                f"{x['effect']} at {x['where']}",
+                x["family"],
+                f"{x['verdict']}: {found}",
+                "yes" if right(x) else "no",
+                *(worst(x["fit"][n]) for n in FILES),
+            ]
+        )
     return rows
 
 
 def positions(all_told: Sequence[dict[str, Any]]) -> list[list[str]]:
     """One row an actuator: position error, mean and 2 s in um, without and with the compensator made from each plant."""
+
     def figure(v: Any) -> str:
         return v if isinstance(v, str) else f"{v[0]:+.3f} ± {v[1]:.3f}"
-    return [[x["effect"], *(figure(x["position_um"][n]) for n in (FREE, *FILES))] for x in all_told if x["position_um"]]
+
+    return [
+        [x["effect"], *(figure(x["position_um"][n]) for n in (FREE, *FILES))]
+        for x in all_told
+        if x["position_um"]
+    ]
 
 
 FREE, FILES = "no compensation", ("as it came", "refitted", "extended")
 HEAD = ("concealed", "rig", "diagnosis", "right", *FILES)
-FIT_NOTE = "Worst output's free-run error on a recording that took no part, in units of its noise, by plant file."
+FIT_NOTE = (
+    "Worst output's free-run error on a recording that took no part, in units of its noise, by plant file."
+)
 POSITION_NOTE = "Position error of that recording in um (mean ± 2 s, ISO 230-2), corrected by the compensator made from each plant file."
 
 
@@ -230,18 +285,29 @@ def write(all_told: Sequence[dict[str, Any]], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    parts = [(HEAD, fits(all_told), FIT_NOTE), (("concealed", FREE, *FILES), positions(all_told), POSITION_NOTE)]
+    parts = [
+        (HEAD, fits(all_told), FIT_NOTE),
+        (("concealed", FREE, *FILES), positions(all_told), POSITION_NOTE),
+    ]
     for head, rows, note in parts:
         t = Table(*head, caption=note)
         for row in rows:
             t.add_row(*(f"{c:.2f}" if isinstance(c, float) else str(c) for c in row))
         Console(width=150).print(t)
-    sections = [("Before and after", "".join(f"<p>{note}</p>{page.table(head, rows)}" for head, rows, note in parts if rows))]
+    sections = [
+        (
+            "Before and after",
+            "".join(f"<p>{note}</p>{page.table(head, rows)}" for head, rows, note in parts if rows),
+        )
+    ]
     for x in all_told:
-        body = f"<p>Concealed: {x['meaning']} ({x['effect']} at {x['where']}, {x['sigmas']:.0f} sigmas after a refit). " \
-               f"Diagnosis took {x['seconds']:.0f} s: {x['verdict']}.</p>"
+        body = (
+            f"<p>Concealed: {x['meaning']} ({x['effect']} at {x['where']}, {x['sigmas']:.0f} sigmas after a refit). "
+            f"Diagnosis took {x['seconds']:.0f} s: {x['verdict']}.</p>"
+        )
         if x["curves"]:
             from matplotlib.figure import Figure
+
             figure = Figure(figsize=(9, 2.8), layout="constrained")
             axes = figure.subplots()
             for name, curve in x["curves"].items():
@@ -251,7 +317,9 @@ def write(all_told: Sequence[dict[str, Any]], out: Path) -> None:
             body += page.figure(figure, "Position error on the second recording, zeroed at its start")
         sections.append((x["effect"], body))
     out.mkdir(parents=True, exist_ok=True)
-    (out / "demo.html").write_text(page.page("Concealed physics, from the error to the cure", sections, "make demo-concealed"))
+    (out / "demo.html").write_text(
+        page.page("Concealed physics, from the error to the cure", sections, "make demo-concealed")
+    )
     say(f"written: {out / 'demo.html'}")
 
 
@@ -264,7 +332,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     a = p.parse_args(argv)
     names = [n for n in a.only.split(",") if n]
     if unknown := set(names) - {s.effect for s in STORIES}:
-        p.error(f"--only: {', '.join(sorted(unknown))}: expected some of {', '.join(s.effect for s in STORIES)}")
+        p.error(
+            f"--only: {', '.join(sorted(unknown))}: expected some of {', '.join(s.effect for s in STORIES)}"
+        )
     told = [tell(s, a.seed, a.out) for s in STORIES if not names or s.effect in names]
     write(told, a.out)
     refused = any(isinstance(v, str) for x in told for v in x["position_um"].values())

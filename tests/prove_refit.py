@@ -7,6 +7,7 @@ the plant with its own (wrong) beliefs refitted. Counted are parameters that the
 own figure is right. Coloured noise: AR(1) of the same standard deviation, correlation PHI between neighbouring samples, of
 which the refit is told nothing: it is measured on the residuals, as `thermoctl refit --noise ar1` does.
 """
+
 import argparse
 import sys
 import time
@@ -23,7 +24,8 @@ from thermoctl.recording.table import Table
 
 HEAD = "format: thermoctl-plant/1\n"
 RIGS = {
-    "two heated blocks": HEAD + """
+    "two heated blocks": HEAD
+    + """
 inputs: {heat: {unit: W}, air: {unit: degC, between_samples: linear}}
 parameters: {C_1: {value: 6, unit: J/K, range: [2, 14]}, C_2: {value: 6, unit: J/K, range: [2, 14]},
              G_1: {value: 0.05, unit: W/K, range: [0.015, 0.15]}, G_12: {value: 0.02, unit: W/K, range: [0.004, 0.08]},
@@ -32,7 +34,8 @@ nodes: {a: {unit: degC, storage: C_1, initial: air, initial_sigma: 0.3}, b: {uni
 flows: {power: {into: a, rate: heat, unit: W}, ab: {from: a, into: b, rate: G_12 * (a - b), unit: W},
         a_air: {from: a, rate: G_1 * (a - air), unit: W}, b_air: {from: b, rate: G_2 * (b - air), unit: W}}
 outputs: {T_a: {value: a, unit: degC, noise: 0.08, resolution: 0.1}, T_b: {value: b, unit: degC, noise: 0.08, resolution: 0.1}}""",
-    "free carriage": HEAD + """
+    "free carriage": HEAD
+    + """
 inputs: {heat: {unit: V}, air: {unit: degC}}
 parameters: {mass: {value: 90, unit: kg, range: [40, 160]}, damping: {value: 200, unit: N*s/m, range: [20, 800]},
              stiffness: {value: 30, unit: N/m, range: [5, 100]}}
@@ -40,7 +43,8 @@ nodes: {v: {unit: m/s, storage: mass, initial: 0}, x: {unit: m, storage: 1, init
 flows: {motor: {into: v, rate: 8 * (heat - 1) * (air > 0), unit: N}, damper: {from: v, rate: damping * v, unit: N},
         spring: {from: v, rate: stiffness * x, unit: N}, travel: {into: x, rate: v, unit: m/s}}
 outputs: {encoder: {value: x * 1e3, unit: mm, noise: 0.5}}""",
-    "cascaded tanks": HEAD + """
+    "cascaded tanks": HEAD
+    + """
 inputs: {heat: {unit: V}, air: {unit: V}}
 parameters: {k: {value: 0.05, unit: 1/s, range: [0.03, 0.1]}, k_1: {value: 0.06, unit: V**0.5/s, range: [0.04, 0.15]},
              k_2: {value: 0.06, unit: V**0.5/s, range: [0.04, 0.15]}}
@@ -53,7 +57,7 @@ outputs: {level: {value: lower, unit: V, noise: 0.03}}""",
 
 
 ACTUATOR = Path(__file__).parents[1] / "config/plants/actuator_thermal.yaml"
-PHI = 0.8               # of the coloured noise
+PHI = 0.8  # of the coloured noise
 
 
 def recording(rng, n=900, step_s=2.0):
@@ -61,7 +65,12 @@ def recording(rng, n=900, step_s=2.0):
     heat = np.repeat(rng.choice([0.0, 1.0, 2.5], n // 45 + 1), 45)[:n]
     t = np.arange(n) * step_s
     air = 22 + 0.3 * np.sin(t / 400)
-    return Table("truth", "truth", t, {"heat": heat, "air": air, "air_c": air, "current_a": 0.4 * heat, "voltage_v": 2.0 * heat})
+    return Table(
+        "truth",
+        "truth",
+        t,
+        {"heat": heat, "air": air, "air_c": air, "current_a": 0.4 * heat, "voltage_v": 2.0 * heat},
+    )
 
 
 def one(plant, model, rng, colour, **size):
@@ -69,7 +78,9 @@ def one(plant, model, rng, colour, **size):
     free = {p.name: p for p in plant.parameters.values() if p.range}
     truth = {q: Scale(p).value(rng.uniform(0.15, 0.85)) for q, p in free.items()}
     drive = model.drive(recording(rng, **size))
-    dx0 = np.array([plant.nodes[n].initial_sigma for n in model.uncertain]) * rng.normal(size=len(model.uncertain))
+    dx0 = np.array([plant.nodes[n].initial_sigma for n in model.uncertain]) * rng.normal(
+        size=len(model.uncertain)
+    )
     try:
         clean = model.run(drive, truth, dx0).y
     except SimulationError:
@@ -77,8 +88,8 @@ def one(plant, model, rng, colour, **size):
     phi = PHI if colour else 0.0
     for j, o in enumerate(plant.outputs.values()):
         white = rng.normal(size=len(clean))
-        white[0] /= np.sqrt(1 - phi ** 2)
-        y = clean[:, j] + o.noise * np.sqrt(1 - phi ** 2) * lfilter([1.0], [1.0, -phi], white)
+        white[0] /= np.sqrt(1 - phi**2)
+        y = clean[:, j] + o.noise * np.sqrt(1 - phi**2) * lfilter([1.0], [1.0, -phi], white)
         drive.y[:, j] = np.round(y / o.resolution) * o.resolution if o.resolution else y
     drive.scale = None
     found = fit(model, [drive])
@@ -102,15 +113,22 @@ def main():
         model = plant.compile()
         for colour in (False, True):
             begin = time.process_time()
-            results = [r for k in range(args.truths) if (r := one(plant, model, np.random.default_rng([7, k]), colour, **size))]
+            results = [
+                r
+                for k in range(args.truths)
+                if (r := one(plant, model, np.random.default_rng([7, k]), colour, **size))
+            ]
             inside, counted = (sum(r[i] for r in results) for i in (0, 1))
             total = len(results) * len(model.active)
             share = inside / max(counted, 1)
             met = 0.90 <= share <= 0.98
             good &= met
-            print(f"{kind}, {f'AR(1) {PHI}' if colour else 'white'} noise: {len(results)} truths, {counted} of {total} parameters 'ok', "
-                  f"95 % intervals hold {100 * share:.1f} % ({'met' if met else 'NOT met'}; "
-                  f"{time.process_time() - begin:.0f} s of processor time)", flush=True)
+            print(
+                f"{kind}, {f'AR(1) {PHI}' if colour else 'white'} noise: {len(results)} truths, {counted} of {total} parameters 'ok', "
+                f"95 % intervals hold {100 * share:.1f} % ({'met' if met else 'NOT met'}; "
+                f"{time.process_time() - begin:.0f} s of processor time)",
+                flush=True,
+            )
     return 0 if good else 1
 
 

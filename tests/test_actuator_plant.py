@@ -2,6 +2,7 @@
 
 The references are computed here with scipy from the plant file's equations, not with the program's integrator.
 """
+
 from pathlib import Path
 
 import numpy as np
@@ -23,19 +24,29 @@ def plant():
 def slopes(plant, point):
     out = []
     for n in plant.nodes.values():
-        net = sum((1 if f.target == n.name else -1) * ex.evaluate(f.rate, point) for f in plant.flows.values()
-                  if n.name in (f.source, f.target))
+        net = sum(
+            (1 if f.target == n.name else -1) * ex.evaluate(f.rate, point)
+            for f in plant.flows.values()
+            if n.name in (f.source, f.target)
+        )
         out.append(net / ex.evaluate(n.storage, point))
     return np.array(out, float)
 
 
 def linear(plant, names, at=22.0):
     """A of the named nodes by central differences (exact for linear ones), and the point."""
-    point = {p.name: p.value for p in plant.parameters.values()} | {n: 0.0 if n in ELECTRIC else at for n in plant.nodes}
+    point = {p.name: p.value for p in plant.parameters.values()} | {
+        n: 0.0 if n in ELECTRIC else at for n in plant.nodes
+    }
     point |= {"drive": 0.0, "air": at, "t": 0.0}
     rows = [list(plant.nodes).index(n) for n in names]
-    A = np.array([(slopes(plant, point | {n: point[n] + 1e-3}) - slopes(plant, point | {n: point[n] - 1e-3}))[rows] / 2e-3
-                  for n in names]).T
+    A = np.array(
+        [
+            (slopes(plant, point | {n: point[n] + 1e-3}) - slopes(plant, point | {n: point[n] - 1e-3}))[rows]
+            / 2e-3
+            for n in names
+        ]
+    ).T
     B = (slopes(plant, point | {"drive": 1.0}) - slopes(plant, point))[rows]
     return A, B, point
 
@@ -63,7 +74,7 @@ def test_coil_reaches_63_percent_of_its_rise_after_370_s(plant):
 def test_hour_of_trapezoids_brings_28_degrees_and_5_to_15_um(plant):
     values = {p.name: p.value for p in plant.parameters.values()}
     t = np.arange(0, 3600, 5.0) % 75
-    x = 250e-6 * np.interp(t, [0, 15, 37.5, 52.5, 75], [0, 1, 1, 0, 0])         # 16.7 um/s: 1 mm/min
+    x = 250e-6 * np.interp(t, [0, 15, 37.5, 52.5, 75], [0, 1, 1, 0, 0])  # 16.7 um/s: 1 mm/min
     power = values["R_20"] * (values["k_flexure"] * x / values["k_T"]) ** 2
     names, rise, _ = heating(plant, power, 1.0)
     assert 22 + rise[-1, 0] == pytest.approx(28, abs=0.8)
@@ -79,10 +90,12 @@ def test_paper_gains_hold_the_position_at_1_ms(plant, kp, ti, td, average):
     for n in range(3000):
         readings = [*readings[1:], x[3] * 1e6]
         errors = [min(n * 1e-3 * 1000 / 60, 20.0) - np.mean(readings), *errors[:2]]
-        v += kp * ((1 + 1e-3 / ti + td / 1e-3) * errors[0] - (1 + 2 * td / 1e-3) * errors[1] + td / 1e-3 * errors[2])
+        v += kp * (
+            (1 + 1e-3 / ti + td / 1e-3) * errors[0] - (1 + 2 * td / 1e-3) * errors[1] + td / 1e-3 * errors[2]
+        )
         x = full[:4, :4] @ x + full[:4, 4] * v
         out.append(x[3] * 1e6)
-    assert np.abs(np.array(out[-500:]) - 20.0).max() < 0.005       # the encoder's step
+    assert np.abs(np.array(out[-500:]) - 20.0).max() < 0.005  # the encoder's step
     assert max(out) < 20.5
 
 

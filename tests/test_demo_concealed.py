@@ -15,7 +15,9 @@ from thermoctl.plant import load
 
 @pytest.fixture(scope="module")
 def demo():
-    spec = importlib.util.spec_from_file_location("demo_concealed", Path(__file__).parent / "demo_concealed.py")
+    spec = importlib.util.spec_from_file_location(
+        "demo_concealed", Path(__file__).parent / "demo_concealed.py"
+    )
     module = importlib.util.module_from_spec(spec)
     import sys
 
@@ -33,8 +35,17 @@ def test_a_plant_with_the_true_values_compensates_the_true_growth(demo, tmp_path
             break
     true = scene.outputs_of(1, [Variant()])[0]
     run = scene.runs[1]
-    plant, columns = demo.in_signals(scene.plant, [("t", run["t"]), *((c, run[k]) for c, k in scene.columns.items()), *(
-        (c, sensors.record(true[:, j], sensors.Noise(scene.sd[j]), scene.sd[j], 0.0, {}, rng)) for j, c in enumerate(scene.output_columns))])
+    plant, columns = demo.in_signals(
+        scene.plant,
+        [
+            ("t", run["t"]),
+            *((c, run[k]) for c, k in scene.columns.items()),
+            *(
+                (c, sensors.record(true[:, j], sensors.Noise(scene.sd[j]), scene.sd[j], 0.0, {}, rng))
+                for j, c in enumerate(scene.output_columns)
+            ),
+        ],
+    )
     for name, value in scene.theta.items():
         plant["parameters"][name]["value"] = value
     generate.write_case(tmp_path, plant, [columns])

@@ -1,4 +1,5 @@
 """Every public module, class and function of the product says what it is."""
+
 import ast
 from pathlib import Path
 
@@ -7,6 +8,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def undocumented(path):
     """'file:line name' of each public definition without a docstring; what a function defines inside itself is its own affair."""
+
     def look(node, inside):
         for child in getattr(node, "body", ()):
             if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -17,6 +19,7 @@ def undocumented(path):
                     yield from look(child, f"{name}.")
             elif isinstance(child, ast.If | ast.Try):
                 yield from look(child, inside)
+
     tree = ast.parse(path.read_text())
     if ast.get_docstring(tree) is None and tree.body:
         yield f"{path.relative_to(ROOT)}:1 module"

@@ -1,4 +1,5 @@
 """linearise, show and the plant commands, from outside."""
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -26,10 +27,12 @@ def plant(request):
 
 def remembering(plant):
     """The plant as a diagnosis writes it when a bracket's growth was left out: counted from a node that remembers the start."""
+
     def add(d):
         d["nodes"]["memory"] = {"unit": "degC", "storage": 1.0, "initial": "air", "initial_sigma": 0.2}
         d["flows"]["kept"] = {"into": "memory", "rate": 0.0}
         d["outputs"]["position_error_um"]["value"] += " + (bracket_2 - memory) * a_bracket_1"
+
     return plant.extended(add)
 
 
@@ -40,7 +43,9 @@ def test_model_predicts_what_the_plant_does(plant, also):
     model, n, step = linearise(plant, period_s=1.0, expansion_period_s=1.0), 3600, 1.0
     t = np.arange(n) * step
     current, air = 0.8 * ((t // 300) % 2), 22 + t / 1800
-    run = plant.compile(()).simulate(Table("x", "x", t, {"voltage_v": 5 * current, "current_a": current, "air_c": air}))
+    run = plant.compile(()).simulate(
+        Table("x", "x", t, {"voltage_v": 5 * current, "current_a": current, "air_c": air})
+    )
     x, rises = np.zeros(12), []
     for k in range(n):
         rises.append(model.C @ x)
@@ -96,10 +101,22 @@ def test_shipped_models_are_those_of_the_plant_file(plant, rig):
 
 def test_linearise_writes_a_model_and_its_gains(tmp_path):
     out = tmp_path / "m.yaml"
-    arguments = ["plant", "linearise", THERMAL, "--out", str(out), "--kind", "mkf", "--gains", str(tmp_path / "g.csv"), "--samples", "50"]
+    arguments = [
+        "plant",
+        "linearise",
+        THERMAL,
+        "--out",
+        str(out),
+        "--kind",
+        "mkf",
+        "--gains",
+        str(tmp_path / "g.csv"),
+        "--samples",
+        "50",
+    ]
     assert main(arguments) == 0
     assert load_model(out, "simulated").kind == "mkf" and len(read_table(tmp_path / "g.csv")) == 50
-    assert main(arguments) == 2                     # a calibration is never overwritten unasked
+    assert main(arguments) == 2  # a calibration is never overwritten unasked
 
 
 @pytest.mark.parametrize("suffix", ["svg", "png"])
@@ -137,30 +154,79 @@ def block(tmp_path):
     plant, rng = load(tmp_path / "p.yaml"), np.random.default_rng(1)
     for name in ("a", "b"):
         t = np.arange(600.0)
-        table = Table(name, name, t, {"P": 6.0 * rng.integers(0, 2, 12).repeat(50), "air": np.full(600, 21.0)})
-        table.columns["y"] = plant.compile().simulate(table, {"C": 46.0, "G": 0.31}).y[:, 0] + rng.normal(0, 0.1, 600)
+        table = Table(
+            name, name, t, {"P": 6.0 * rng.integers(0, 2, 12).repeat(50), "air": np.full(600, 21.0)}
+        )
+        table.columns["y"] = plant.compile().simulate(table, {"C": 46.0, "G": 0.31}).y[:, 0] + rng.normal(
+            0, 0.1, 600
+        )
         write_table(tmp_path / f"{name}.csv", table)
     return tmp_path
 
 
 def test_simulate_writes_plots_and_predicts_ahead(block, capsys):
     both = [str(block / "a.csv"), str(block / "b.csv")]
-    assert main(["simulate", "--plant", str(block / "p.yaml"), *both, "--out", str(block / "o.csv"), "--plot", str(block / "o.png")]) == 0
+    assert (
+        main(
+            [
+                "simulate",
+                "--plant",
+                str(block / "p.yaml"),
+                *both,
+                "--out",
+                str(block / "o.csv"),
+                "--plot",
+                str(block / "o.png"),
+            ]
+        )
+        == 0
+    )
     free = read_table(block / "o_a.csv").columns
     assert (block / "o_b.png").stat().st_size > 10_000
-    assert main(["simulate", "--plant", str(block / "p.yaml"), both[0], "--horizon", "10", "--out", str(block / "h.csv")]) == 0
+    assert (
+        main(
+            [
+                "simulate",
+                "--plant",
+                str(block / "p.yaml"),
+                both[0],
+                "--horizon",
+                "10",
+                "--out",
+                str(block / "h.csv"),
+            ]
+        )
+        == 0
+    )
     ahead = read_table(block / "h.csv").columns
     errors = [np.sqrt(np.mean((c["y"] - c["y_simulated"]) ** 2)) for c in (free, ahead)]
-    assert errors[1] < 0.3 * errors[0]              # the wrong belief has ten seconds only to go astray
+    assert errors[1] < 0.3 * errors[0]  # the wrong belief has ten seconds only to go astray
     assert "free run" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("noise", ["white", "ar1"])
 def test_refit_finds_the_truth_and_judges_on_held_out_data(block, capsys, noise):
-    assert main(["refit", "--plant", str(block / "p.yaml"), str(block / "a.csv"), "--held-out", str(block / "b.csv"),
-                 "--out", str(block / "p2.yaml"), "--noise", noise]) == 0
+    assert (
+        main(
+            [
+                "refit",
+                "--plant",
+                str(block / "p.yaml"),
+                str(block / "a.csv"),
+                "--held-out",
+                str(block / "b.csv"),
+                "--out",
+                str(block / "p2.yaml"),
+                "--noise",
+                noise,
+            ]
+        )
+        == 0
+    )
     found = load(block / "p2.yaml").parameters
-    assert found["C"].value == pytest.approx(46, rel=0.03) and found["G"].value == pytest.approx(0.31, rel=0.03)
+    assert found["C"].value == pytest.approx(46, rel=0.03) and found["G"].value == pytest.approx(
+        0.31, rel=0.03
+    )
     held = next(line for line in capsys.readouterr().out.splitlines() if "│ b " in line and "no" in line)
     before, after = (float(q) for q in held.replace("│", " ").split()[-2:])
     assert after < 0.12 < before
@@ -179,14 +245,22 @@ def test_arrows_end_at_the_boxes_and_not_under_them(file):
     from matplotlib.text import Annotation
 
     from thermoctl.plant.show import drawing
+
     figure = drawing(load(file))
     axes = figure.axes[0]
     for dpi in (100, 170):
         figure.set_dpi(dpi)
         figure.canvas.draw()
-        boxes = np.array([q.get_bbox_patch().get_window_extent().get_points() for q in axes.texts
-                          if not isinstance(q, Annotation) and q.get_zorder() == 3])
+        boxes = np.array(
+            [
+                q.get_bbox_patch().get_window_extent().get_points()
+                for q in axes.texts
+                if not isinstance(q, Annotation) and q.get_zorder() == 3
+            ]
+        )
         heads = np.array([axes.transData.transform(q.xy) for q in axes.texts if isinstance(q, Annotation)])
         assert len(heads) > 20
-        depth = np.minimum(heads[:, None] - boxes[None, :, 0], boxes[None, :, 1] - heads[:, None]).min(axis=2)   # pixels inside
+        depth = np.minimum(heads[:, None] - boxes[None, :, 0], boxes[None, :, 1] - heads[:, None]).min(
+            axis=2
+        )  # pixels inside
         assert np.abs(depth).min(axis=1).max() < 3, dpi

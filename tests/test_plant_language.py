@@ -1,4 +1,5 @@
 """The parser: a wrong file of each kind gives its one error; nothing crashes, hangs, runs code or eats memory."""
+
 import contextlib
 import time
 import tracemalloc
@@ -14,12 +15,20 @@ from thermoctl.plant.language import from_plain, loads
 from thermoctl.yamlfile import InputError
 
 GOOD = {
-    "format": "thermoctl-plant/1", "title": "block",
+    "format": "thermoctl-plant/1",
+    "title": "block",
     "inputs": {"P": {"unit": "W"}, "air": {"unit": "degC", "between_samples": "linear"}},
-    "parameters": {"C": {"value": 46.0, "unit": "J/K", "range": [20, 90]}, "G": {"value": 0.31, "unit": "W/K"}},
+    "parameters": {
+        "C": {"value": 46.0, "unit": "J/K", "range": [20, 90]},
+        "G": {"value": 0.31, "unit": "W/K"},
+    },
     "nodes": {"T": {"unit": "degC", "storage": "C", "initial": "air"}},
-    "flows": {"heat": {"into": "T", "rate": "P", "unit": "W"}, "loss": {"from": "T", "rate": "G * (T - air)", "unit": "W"}},
-    "outputs": {"y": {"value": "T", "unit": "degC", "noise": 0.1}}}
+    "flows": {
+        "heat": {"into": "T", "rate": "P", "unit": "W"},
+        "loss": {"from": "T", "rate": "G * (T - air)", "unit": "W"},
+    },
+    "outputs": {"y": {"value": "T", "unit": "degC", "noise": 0.1}},
+}
 
 
 def changed(path, value):
@@ -39,46 +48,49 @@ def test_good_file_survives_a_round_trip():
     assert from_plain(plant.plain()).plain() == plant.plain()
 
 
-@pytest.mark.parametrize(("path", "value", "words"), [
-    (("format",), "thermoctl-plant/9", "thermoctl-plant/1"),
-    (("outputs",), None, "outputs"),
-    (("outputs",), {}, "outputs"),
-    (("inputs", "P", "unti"), "W", "unit"),                             # unknown key, with a suggestion
-    (("inputs", "P", "between_samples"), "spline", "hold"),
-    (("inputs", "spare"), {"unit": "V"}, "nothing reads it"),
-    (("parameters", "spare"), {"value": 1}, "nothing uses it"),
-    (("parameters", "C", "value"), "many", "value"),
-    (("parameters", "C", "range"), [90, 20], "range"),
-    (("parameters", "C", "range"), [50, 90], "range"),                  # the belief outside
-    (("parameters", "C", "value"), None, "value"),
-    (("nodes", "lonely"), {"storage": 1, "initial": 0}, "no flow touches it"),
-    (("nodes", "T", "initial_sigma"), -1, "initial_sigma"),
-    (("flows", "loss", "from"), "U", "'U'"),
-    (("flows", "loss"), {"rate": "G * (T - air)"}, "neither"),
-    (("flows", "loss"), {"from": "T", "into": "T", "rate": "G * (T - air)"}, "itself"),
-    (("flows", "loss", "rate"), "G * (T - iar)", "air"),                # did you mean
-    (("flows", "loss", "rate"), "G * (T - air", ")"),
-    (("flows", "loss", "rate"), "", ""),
-    (("flows", "loss", "rate"), "G * delay(T, 3)", "delay"),
-    (("flows", "loss", "rate"), "G * first(air)", "first"),
-    (("flows", "loss", "rate"), "__import__('os').system('true')", "'"),
-    (("flows", "loss", "rate"), "T.__class__", "."),
-    (("flows", "loss", "rate"), "eval(T)", "eval"),
-    (("flows", "loss", "rate"), "[T for T in G]", ""),
-    (("flows", "loss", "rate"), "lambda: G", ""),
-    (("flows", "loss", "rate"), "G if T else air", ""),
-    (("flows", "loss", "rate"), "table(T, [0, 1], [0])", "table"),
-    (("flows", "loss", "rate"), "table(T, [1, 0], [0, 1])", "increase"),
-    (("flows", "loss", "rate"), "G * 1e999", "large"),
-    (("flows", "loss", "unit"), "J", "W"),
-    (("flows", "T"), {"from": "T", "rate": "G * (T - air)"}, "T"),      # a name used twice
-    (("nodes", "sin"), {"storage": 1, "initial": 0}, "sin"),
-    (("nodes", "2x"), {"storage": 1, "initial": 0}, "name"),
-    (("nodes", "T", "storage"), "air * C", "storage"),
-    (("nodes", "T", "initial"), "T", "initial"),
-    (("outputs", "y", "noise"), "some", "noise"),
-    (("flows",), [1, 2], "flows"),
-])
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (("format",), "thermoctl-plant/9", "thermoctl-plant/1"),
+        (("outputs",), None, "outputs"),
+        (("outputs",), {}, "outputs"),
+        (("inputs", "P", "unti"), "W", "unit"),  # unknown key, with a suggestion
+        (("inputs", "P", "between_samples"), "spline", "hold"),
+        (("inputs", "spare"), {"unit": "V"}, "nothing reads it"),
+        (("parameters", "spare"), {"value": 1}, "nothing uses it"),
+        (("parameters", "C", "value"), "many", "value"),
+        (("parameters", "C", "range"), [90, 20], "range"),
+        (("parameters", "C", "range"), [50, 90], "range"),  # the belief outside
+        (("parameters", "C", "value"), None, "value"),
+        (("nodes", "lonely"), {"storage": 1, "initial": 0}, "no flow touches it"),
+        (("nodes", "T", "initial_sigma"), -1, "initial_sigma"),
+        (("flows", "loss", "from"), "U", "'U'"),
+        (("flows", "loss"), {"rate": "G * (T - air)"}, "neither"),
+        (("flows", "loss"), {"from": "T", "into": "T", "rate": "G * (T - air)"}, "itself"),
+        (("flows", "loss", "rate"), "G * (T - iar)", "air"),  # did you mean
+        (("flows", "loss", "rate"), "G * (T - air", ")"),
+        (("flows", "loss", "rate"), "", ""),
+        (("flows", "loss", "rate"), "G * delay(T, 3)", "delay"),
+        (("flows", "loss", "rate"), "G * first(air)", "first"),
+        (("flows", "loss", "rate"), "__import__('os').system('true')", "'"),
+        (("flows", "loss", "rate"), "T.__class__", "."),
+        (("flows", "loss", "rate"), "eval(T)", "eval"),
+        (("flows", "loss", "rate"), "[T for T in G]", ""),
+        (("flows", "loss", "rate"), "lambda: G", ""),
+        (("flows", "loss", "rate"), "G if T else air", ""),
+        (("flows", "loss", "rate"), "table(T, [0, 1], [0])", "table"),
+        (("flows", "loss", "rate"), "table(T, [1, 0], [0, 1])", "increase"),
+        (("flows", "loss", "rate"), "G * 1e999", "large"),
+        (("flows", "loss", "unit"), "J", "W"),
+        (("flows", "T"), {"from": "T", "rate": "G * (T - air)"}, "T"),  # a name used twice
+        (("nodes", "sin"), {"storage": 1, "initial": 0}, "sin"),
+        (("nodes", "2x"), {"storage": 1, "initial": 0}, "name"),
+        (("nodes", "T", "storage"), "air * C", "storage"),
+        (("nodes", "T", "initial"), "T", "initial"),
+        (("outputs", "y", "noise"), "some", "noise"),
+        (("flows",), [1, 2], "flows"),
+    ],
+)
 def test_wrong_file_gives_its_one_error(path, value, words):
     with pytest.raises(InputError) as e:
         loads(changed(path, value), "bad.yaml")
@@ -92,20 +104,36 @@ NAMES = st.sampled_from(["T", "air", "P", "C", "G", "t", "pi"])
 
 def joined(inner):
     return st.one_of(
-        st.tuples(inner, st.sampled_from(["+", "-", "*", "/", "<", ">="]), inner).map(lambda q: f"({q[0]} {q[1]} {q[2]})"),
-        st.tuples(st.sampled_from(["abs", "sign", "tanh", "sin", "cos", "step"]), inner).map(lambda q: f"{q[0]}({q[1]})"),
-        st.tuples(inner, inner).map(lambda q: f"max({q[0]}, min({q[1]}, 2))"), inner.map(lambda q: f"-{q}"))
+        st.tuples(inner, st.sampled_from(["+", "-", "*", "/", "<", ">="]), inner).map(
+            lambda q: f"({q[0]} {q[1]} {q[2]})"
+        ),
+        st.tuples(st.sampled_from(["abs", "sign", "tanh", "sin", "cos", "step"]), inner).map(
+            lambda q: f"{q[0]}({q[1]})"
+        ),
+        st.tuples(inner, inner).map(lambda q: f"max({q[0]}, min({q[1]}, 2))"),
+        inner.map(lambda q: f"-{q}"),
+    )
 
 
-EXPRESSIONS = st.recursive(st.one_of(NAMES, st.floats(0.1, 9).map(lambda q: f"{q:.3g}")), joined, max_leaves=12)
+EXPRESSIONS = st.recursive(
+    st.one_of(NAMES, st.floats(0.1, 9).map(lambda q: f"{q:.3g}")), joined, max_leaves=12
+)
 
 
 @given(EXPRESSIONS)
 def test_an_expression_means_what_python_means_by_it(text):
     values = {"T": 1.7, "air": -0.4, "P": 2.3, "C": 0.9, "G": 3.1, "t": 0.6}
-    functions = {"abs": abs, "sign": lambda q: float(np.sign(float(q))), "tanh": lambda q: float(np.tanh(float(q))),
-                 "sin": lambda q: float(np.sin(float(q))), "cos": lambda q: float(np.cos(float(q))), "max": max, "min": min,
-                 "step": lambda q: float(q >= 0), "pi": np.pi}
+    functions = {
+        "abs": abs,
+        "sign": lambda q: float(np.sign(float(q))),
+        "tanh": lambda q: float(np.tanh(float(q))),
+        "sin": lambda q: float(np.sin(float(q))),
+        "cos": lambda q: float(np.cos(float(q))),
+        "max": max,
+        "min": min,
+        "step": lambda q: float(q >= 0),
+        "pi": np.pi,
+    }
     try:
         expected = float(eval(text, {"__builtins__": {}}, functions | values))
     except ZeroDivisionError:
@@ -133,10 +161,20 @@ def test_any_text_is_an_expression_or_one_error(text):
         assert str(e)
 
 
-@given(st.dictionaries(st.text(max_size=6), st.recursive(
-    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8)),
-    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=6), inner, max_size=3)), max_leaves=8),
-    max_size=5), st.sampled_from(["inputs", "parameters", "nodes", "flows", "outputs", "title"]))
+@given(
+    st.dictionaries(
+        st.text(max_size=6),
+        st.recursive(
+            st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8)),
+            lambda inner: st.one_of(
+                st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=6), inner, max_size=3)
+            ),
+            max_leaves=8,
+        ),
+        max_size=5,
+    ),
+    st.sampled_from(["inputs", "parameters", "nodes", "flows", "outputs", "title"]),
+)
 @settings(max_examples=40, deadline=None)
 def test_any_yaml_in_any_section_is_a_plant_or_one_error(data, section):
     try:
@@ -145,8 +183,19 @@ def test_any_yaml_in_any_section_is_a_plant_or_one_error(data, section):
         assert "\n" not in str(e)
 
 
-@pytest.mark.parametrize("text", ["(" * 50_000 + "T" + ")" * 50_000, "-" * 100_000 + "T", "T" + "+T" * 100_000, "T**" * 3000 + "T",
-                                  "9**9**9**9**9", "abs(" * 500 + "T" + ")" * 500, "1" * 30_000, "T" * 30_000])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "(" * 50_000 + "T" + ")" * 50_000,
+        "-" * 100_000 + "T",
+        "T" + "+T" * 100_000,
+        "T**" * 3000 + "T",
+        "9**9**9**9**9",
+        "abs(" * 500 + "T" + ")" * 500,
+        "1" * 30_000,
+        "T" * 30_000,
+    ],
+)
 def test_monsters_are_refused_or_read_quickly_in_bounded_memory(text):
     tracemalloc.start()
     begin = time.process_time()

@@ -1,4 +1,5 @@
 """What a refit reports, and the noise that it measures, against truths that are known."""
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -30,8 +31,8 @@ def recorded(truth, n=900, name="a", seed=1, noise=0.1, phi=0.0, step=None):
     rng = np.random.default_rng(seed)
     t = np.arange(float(n))
     table = Table(name, name, t, {"P": 6.0 * rng.integers(0, 2, n // 50).repeat(50), "air": np.full(n, 21.0)})
-    white = rng.normal(0, noise * np.sqrt(1 - phi ** 2), n)
-    white[0] /= np.sqrt(1 - phi ** 2)
+    white = rng.normal(0, noise * np.sqrt(1 - phi**2), n)
+    white[0] /= np.sqrt(1 - phi**2)
     y = truth.compile(()).simulate(table).y[:, 0] + lfilter([1.0], [1.0, -phi], white)
     table.columns["y"] = np.round(y / step) * step if step else y
     return table
@@ -42,17 +43,25 @@ def judged(believed, table):
     return {e.name: e for e in report(fit(model, [model.drive(table)]))}
 
 
-TRUTH = plant().extended(lambda d: (d["parameters"]["C"].update(value=46.0), d["parameters"]["G"].update(value=0.31)))
+TRUTH = plant().extended(
+    lambda d: (d["parameters"]["C"].update(value=46.0), d["parameters"]["G"].update(value=0.31))
+)
 
 
 def test_good_parameters_are_ok_with_errors_that_hold_the_truth():
     found = judged(plant(), recorded(TRUTH))
     assert {e.state for e in found.values()} == {"ok"}
-    assert all(abs(found[q].value - v) < 4 * found[q].sd and found[q].sd < 0.02 * v for q, v in (("C", 46.0), ("G", 0.31)))
+    assert all(
+        abs(found[q].value - v) < 4 * found[q].sd and found[q].sd < 0.02 * v
+        for q, v in (("C", 46.0), ("G", 0.31))
+    )
 
 
 def test_a_parameter_that_the_data_do_not_feel_is_dead():
-    found = judged(plant(", K: {value: 1, unit: W/K, range: [0.1, 5]}", "G * (T - air) + K * max(T - 500, 0)"), recorded(TRUTH))
+    found = judged(
+        plant(", K: {value: 1, unit: W/K, range: [0.1, 5]}", "G * (T - air) + K * max(T - 500, 0)"),
+        recorded(TRUTH),
+    )
     assert found["K"].state == "dead" and found["C"].state == "ok"
 
 
@@ -63,18 +72,37 @@ def test_a_parameter_pressed_against_its_range_is_at_bound():
 
 
 def test_two_of_which_only_the_sum_is_felt_are_flat_and_trade():
-    found = judged(plant(", H: {value: 0.3, unit: W/K, range: [0.02, 1]}", "(G + H) * (T - air)"), recorded(TRUTH))
+    found = judged(
+        plant(", H: {value: 0.3, unit: W/K, range: [0.02, 1]}", "(G + H) * (T - air)"), recorded(TRUTH)
+    )
     assert found["G"].state == found["H"].state == "flat"
-    assert found["G"].trades_with == ("H",) and found["H"].trades_with == ("G",) and found["C"].trades_with == ()
+    assert (
+        found["G"].trades_with == ("H",) and found["H"].trades_with == ("G",) and found["C"].trades_with == ()
+    )
 
 
 def test_the_command_says_all_of_it(tmp_path, capsys):
-    (tmp_path / "p.yaml").write_text(BLOCK.replace("EXTRA", ", H: {value: 0.3, unit: W/K, range: [0.02, 1]}, "
-                                                  "K: {value: 1, unit: W/K, range: [0.1, 5]}")
-                                     .replace("LOSS", "(G + H) * (T - air) + K * max(T - 500, 0)"))
+    (tmp_path / "p.yaml").write_text(
+        BLOCK.replace(
+            "EXTRA",
+            ", H: {value: 0.3, unit: W/K, range: [0.02, 1]}, K: {value: 1, unit: W/K, range: [0.1, 5]}",
+        ).replace("LOSS", "(G + H) * (T - air) + K * max(T - 500, 0)")
+    )
     for name, seed in (("a", 1), ("b", 2)):
         write_table(tmp_path / f"{name}.csv", recorded(TRUTH, name=name, seed=seed))
-    assert main(["refit", "--plant", str(tmp_path / "p.yaml"), str(tmp_path / "a.csv"), "--held-out", str(tmp_path / "b.csv")]) == 0
+    assert (
+        main(
+            [
+                "refit",
+                "--plant",
+                str(tmp_path / "p.yaml"),
+                str(tmp_path / "a.csv"),
+                "--held-out",
+                str(tmp_path / "b.csv"),
+            ]
+        )
+        == 0
+    )
     told = " ".join(capsys.readouterr().out.split())
     for words in ("standard error", "dead", "flat", "trades with", "before", "after"):
         assert words in told, words
@@ -82,7 +110,7 @@ def test_the_command_says_all_of_it(tmp_path, capsys):
 
 def test_outliers_hardly_move_a_fit():
     clean, hit = recorded(TRUTH), recorded(TRUTH)
-    hit.columns["y"][::90] += 15.0                  # one reading of ninety
+    hit.columns["y"][::90] += 15.0  # one reading of ninety
     a, b = (judged(plant(), t) for t in (clean, hit))
     assert all(abs(a[q].value - b[q].value) < 3 * a[q].sd for q in ("C", "G"))
 
@@ -105,7 +133,9 @@ def test_innovations_form_has_the_variance_and_the_correlation_of_its_parts():
     noise = innovations(0.7, 0.1, 1.0)
     response = noise.sigma * lfilter(noise.ma, noise.ar, np.r_[1.0, np.zeros(400)])
     assert response @ response == pytest.approx(1.0)
-    assert response[1:] @ response[:-1] == pytest.approx(0.7 * 0.9) and response[2:] @ response[:-2] == pytest.approx(0.49 * 0.9)
+    assert response[1:] @ response[:-1] == pytest.approx(0.7 * 0.9) and response[2:] @ response[
+        :-2
+    ] == pytest.approx(0.49 * 0.9)
 
 
 CHAIN = """format: thermoctl-plant/1
@@ -133,8 +163,12 @@ outputs: {y: {value: T, unit: degC, noise: 0.02}}
 def test_parameters_that_trade_along_a_curve_are_followed_in_fewer_steps(monkeypatch):
     """Two bodies that nobody measures behind the one that is: from eight starts, the same fit as by straight steps and sooner."""
     believed, slopes = loads(CHAIN), []
-    truth = believed.extended(lambda d: [d["parameters"][q].update(value=v) for q, v in
-                                         (("C", 12.0), ("D", 40.0), ("E", 90.0), ("K", 0.8), ("L", 1.5), ("G", 0.3))])
+    truth = believed.extended(
+        lambda d: [
+            d["parameters"][q].update(value=v)
+            for q, v in (("C", 12.0), ("D", 40.0), ("E", 90.0), ("K", 0.8), ("L", 1.5), ("G", 0.3))
+        ]
+    )
     table = recorded(truth, n=3000, noise=0.02)
     model = believed.compile()
     evaluate = Problem.evaluate
@@ -142,11 +176,15 @@ def test_parameters_that_trade_along_a_curve_are_followed_in_fewer_steps(monkeyp
     def counted(self, z, jacobian, *more):
         slopes[-1] += jacobian
         return evaluate(self, z, jacobian, *more)
+
     monkeypatch.setattr(Problem, "evaluate", counted)
     for bent in (0.75, 0.0):
         monkeypatch.setattr("thermoctl.plant.refit.BENT", bent)
         slopes.append(0)
-        costs = [fit(model, [model.drive(table)], start=np.random.default_rng(k).uniform(0.35, 0.65, 6)).cost for k in range(8)]
+        costs = [
+            fit(model, [model.drive(table)], start=np.random.default_rng(k).uniform(0.35, 0.65, 6)).cost
+            for k in range(8)
+        ]
         assert max(costs) < min(costs) + 1 and costs[0] == pytest.approx(3000, rel=0.1)
     assert slopes[0] < 0.8 * slopes[1], slopes
 
@@ -166,11 +204,19 @@ outputs: {y: {value: "A * u + B", unit: K, noise: 0.3}}
     model = line.compile()
     drive = model.drive(Table("a", "a", np.arange(12.0), {"u": u, "y": y}))
     belief = Belief("a", ex.parse("((A - 1) / 0.2)**2 + ((B - A) / 0.5)**2"))
-    found = fit(model, [drive], beliefs=[belief, Belief("another recording", ex.parse("A**2"))], tolerance=1e-9)
+    found = fit(
+        model, [drive], beliefs=[belief, Belief("another recording", ex.parse("A**2"))], tolerance=1e-9
+    )
     m, X = np.array([1.0, 1.0]), np.column_stack([u, np.ones(12)])
     V = np.array([[0.04, 0.04], [0.04, 0.04 + 0.25]])
     P = np.linalg.inv(V) + X.T @ X / 0.09
-    assert [found.parameters()[q] for q in "AB"] == pytest.approx(np.linalg.solve(P, np.linalg.inv(V) @ m + X.T @ y / 0.09), abs=1e-4)
-    assert np.sqrt(np.diag(np.linalg.inv(P))) == pytest.approx(100 * np.sqrt(np.diag(np.linalg.inv(found.hessian))), rel=1e-3)
+    assert [found.parameters()[q] for q in "AB"] == pytest.approx(
+        np.linalg.solve(P, np.linalg.inv(V) @ m + X.T @ y / 0.09), abs=1e-4
+    )
+    assert np.sqrt(np.diag(np.linalg.inv(P))) == pytest.approx(
+        100 * np.sqrt(np.diag(np.linalg.inv(found.hessian))), rel=1e-3
+    )
     evidence = -2 * multivariate_normal(X @ m, 0.09 * np.eye(12) + X @ V @ X.T).logpdf(y)
-    assert occam(found, {"A", "B"}) + found.cost + 12 * np.log(2 * np.pi * 0.09) == pytest.approx(evidence, abs=0.01)
+    assert occam(found, {"A", "B"}) + found.cost + 12 * np.log(2 * np.pi * 0.09) == pytest.approx(
+        evidence, abs=0.01
+    )

@@ -1,4 +1,5 @@
 """Simulation and sensitivities against scipy's Radau at rtol 1e-10, interval by interval, on plants of every kind."""
+
 import dataclasses
 
 import numpy as np
@@ -56,7 +57,7 @@ def recording(uneven=True, n=120, seed=3):
     t = np.cumsum(rng.uniform(0.5, 1.5, n)) if uneven else np.arange(n, dtype=float)
     power = np.where((t // 17) % 2 > 0, 6.0, 1.0) + rng.normal(0, 0.2, n)
     air = 22 + 2 * np.sin(t / 30)
-    power[::11], air[5::7] = np.nan, np.nan         # missing samples of a held and of a linear signal
+    power[::11], air[5::7] = np.nan, np.nan  # missing samples of a held and of a linear signal
     return Table("r", "r.csv", t, {"P": power, "air": air})
 
 
@@ -77,15 +78,24 @@ def radau(plant, table, values):
     nodes = list(plant.nodes)
 
     def point(s, x, k, seconds):
-        at = {n: q[k] + ((q[k + 1] - q[k]) * s / seconds if plant.inputs[n].linear and k + 1 < len(t) else 0.0)
-              for n, q in inputs.items()}
+        at = {
+            n: q[k] + ((q[k + 1] - q[k]) * s / seconds if plant.inputs[n].linear and k + 1 < len(t) else 0.0)
+            for n, q in inputs.items()
+        }
         return values | at | dict(zip(nodes, x, strict=True)) | {"t": t[k] + s}
 
     def slopes(s, x, k, seconds):
         p = point(s, x, k, seconds)
         rates = {f.name: ex.evaluate(f.rate, p) for f in plant.flows.values()}
-        return [(sum(r for f, r in rates.items() if plant.flows[f].target == n)
-                 - sum(r for f, r in rates.items() if plant.flows[f].source == n)) / ex.evaluate(plant.nodes[n].storage, p) for n in nodes]
+        return [
+            (
+                sum(r for f, r in rates.items() if plant.flows[f].target == n)
+                - sum(r for f, r in rates.items() if plant.flows[f].source == n)
+            )
+            / ex.evaluate(plant.nodes[n].storage, p)
+            for n in nodes
+        ]
+
     start = values | {n: q[0] for n, q in inputs.items()}
     x = np.array([float(ex.evaluate(plant.nodes[n].initial, start)) for n in nodes])
     rows = [x]
@@ -95,7 +105,12 @@ def radau(plant, table, values):
         assert done.success
         x = done.y[:, -1]
         rows.append(x)
-    return np.array([[float(ex.evaluate(o.value, point(0.0, x, k, 1.0))) for o in plant.outputs.values()] for k, x in enumerate(rows)])
+    return np.array(
+        [
+            [float(ex.evaluate(o.value, point(0.0, x, k, 1.0))) for o in plant.outputs.values()]
+            for k, x in enumerate(rows)
+        ]
+    )
 
 
 @pytest.mark.parametrize("kind", PLANTS)
@@ -129,12 +144,15 @@ def test_sensitivities_are_the_slopes_of_the_fine_simulation(kind):
 
 
 def test_delay_of_a_reading_and_of_an_input():
-    text = HEAD + """
+    text = (
+        HEAD
+        + """
 inputs: {P: {unit: W, between_samples: linear}, air: {unit: degC}}
 parameters: {C: {value: 10, range: [1, 90]}, TD: {value: 3.5, unit: s, range: [0, 9]}}
 nodes: {T: {storage: C, initial: air}}
 flows: {heat: {into: T, rate: "delay(P, TD)"}, out: {from: T, rate: 0.5 * (T - air)}}
 outputs: {y: {value: T}, late: {value: "delay(T, TD)"}}"""
+    )
     model = loads(text).compile()
     t = np.arange(0, 60, 0.25)
     table = Table("d", "d.csv", t, {"P": np.sin(t / 5) ** 2 * 4, "air": np.full(len(t), 20.0)})
@@ -144,12 +162,15 @@ outputs: {y: {value: T}, late: {value: "delay(T, TD)"}}"""
     slope = (step[1] - step[0]) / 2e-3
     c = model.active.index("TD")
     # both are exact away from the samples' kinks, where a straight line's slope jumps
-    assert np.sqrt(np.mean((run.dy[:, :, c] - slope) ** 2)) < 0.1 * np.sqrt(np.mean(slope ** 2))
+    assert np.sqrt(np.mean((run.dy[:, :, c] - slope) ** 2)) < 0.1 * np.sqrt(np.mean(slope**2))
     assert run.y[0, 1] == pytest.approx(20.0)
 
 
 def test_static_plant_has_no_states():
-    plant = loads(HEAD + "inputs: {P: {unit: V}}\nparameters: {a: {value: 2, range: [0, 9]}}\noutputs: {y: {value: a * P**2}}")
+    plant = loads(
+        HEAD
+        + "inputs: {P: {unit: V}}\nparameters: {a: {value: 2, range: [0, 9]}}\noutputs: {y: {value: a * P**2}}"
+    )
     table = Table("s", "s.csv", np.arange(4.0), {"P": np.array([1.0, 2.0, np.nan, 3.0])})
     run = plant.compile().simulate(table, sensitivities=True)
     assert run.y[:, 0].tolist() == [2, 8, 8, 18] and run.dy[:, 0, 0].tolist() == [1, 4, 4, 9]
@@ -157,9 +178,13 @@ def test_static_plant_has_no_states():
 
 def test_a_delay_within_a_delay_is_refused_also_where_an_effect_makes_it():
     """A late sensor of a voltage that is already read late: a program that laid one over the other must get an error, not a crash."""
-    plant = loads(HEAD + 'inputs: {i: {unit: A}}\nparameters: {R: {value: 5}}\noutputs: {v: {value: "delay(R * i, 2)"}}')
+    plant = loads(
+        HEAD + 'inputs: {i: {unit: A}}\nparameters: {R: {value: 5}}\noutputs: {v: {value: "delay(R * i, 2)"}}'
+    )
     inner = ex.parse("delay(i, 3)")
-    late = ex.substitute(plant.outputs["v"].value, lambda e: inner if e.op == "name" and e.value == "i" else None)
+    late = ex.substitute(
+        plant.outputs["v"].value, lambda e: inner if e.op == "name" and e.value == "i" else None
+    )
     nested = dataclasses.replace(plant, outputs={"v": dataclasses.replace(plant.outputs["v"], value=late)})
     with pytest.raises(InputError, match="within a delay"):
         nested.compile()

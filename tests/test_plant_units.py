@@ -1,4 +1,5 @@
 """The unit check: what pint says, what the spec forgives, what is refused with the line and both dimensions."""
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,34 +29,42 @@ def plant(**change):
     return loads(PLANT.format(**(GOOD | change)), "p.yaml")
 
 
-@pytest.mark.parametrize("change", [
-    {"y": "T * 1e6 + v * 2", "y_unit": "um"},               # bare numbers take any dimension
-    {"loss": "G * (T + 273.15 - air)"},
-    {"loss": "G * (T - air) * tanh(v / 2e-4)"},
-    {"loss": "G * (T - air) * (v > 0.1)"},
-    {"G": "kW/K", "heat": "mW"},                            # prefixes are alike
-    {"G": "J/s/K"}, {"G": "kg*m**2/s^3/K"}, {"G": "V*A/degC"},
-    {"y": "delay(T, 3)", "y_unit": "K"},
-    {"y": "table(v, [0, 1], [2, 3])", "y_unit": "bar", "loss": "G * (T - air)"},
-    {"loss": "G * (T - air) * abs(v)**0.5 * 2", "G": "W/K"},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"y": "T * 1e6 + v * 2", "y_unit": "um"},  # bare numbers take any dimension
+        {"loss": "G * (T + 273.15 - air)"},
+        {"loss": "G * (T - air) * tanh(v / 2e-4)"},
+        {"loss": "G * (T - air) * (v > 0.1)"},
+        {"G": "kW/K", "heat": "mW"},  # prefixes are alike
+        {"G": "J/s/K"},
+        {"G": "kg*m**2/s^3/K"},
+        {"G": "V*A/degC"},
+        {"y": "delay(T, 3)", "y_unit": "K"},
+        {"y": "table(v, [0, 1], [2, 3])", "y_unit": "bar", "loss": "G * (T - air)"},
+        {"loss": "G * (T - air) * abs(v)**0.5 * 2", "G": "W/K"},
+    ],
+)
 def test_accepts(change):
     plant(**change)
 
 
-@pytest.mark.parametrize(("change", "line", "words"), [
-    ({"heat": "J"}, 9, ("heat", "J = kg m2 s-2", "W = kg m2 s-3")),
-    ({"G": "W"}, 10, ("loss", "K")),
-    ({"loss": "G * T * v"}, 10, ("loss",)),
-    ({"loss": "G * (T - v)"}, 10, ("K", "m s-1", "alike")),
-    ({"loss": "G * (T - air) * exp(v)"}, 10, ("exp", "dimensionless")),
-    ({"loss": "G * (T - air) * 2**v"}, 10, ("exponent",)),
-    ({"y": "T", "y_unit": "um"}, 12, ("y", "K", "m")),
-    ({"y": "delay(T, v)"}, 12, ()),
-    ({"G": "W/Kelv1n"}, 5, ("pint knows no unit",)),
-    ({"G": "W//K"}, 5, ("not a unit",)),
-    ({"loss": "G * min(T, v)"}, 10, ("alike",)),
-])
+@pytest.mark.parametrize(
+    ("change", "line", "words"),
+    [
+        ({"heat": "J"}, 9, ("heat", "J = kg m2 s-2", "W = kg m2 s-3")),
+        ({"G": "W"}, 10, ("loss", "K")),
+        ({"loss": "G * T * v"}, 10, ("loss",)),
+        ({"loss": "G * (T - v)"}, 10, ("K", "m s-1", "alike")),
+        ({"loss": "G * (T - air) * exp(v)"}, 10, ("exp", "dimensionless")),
+        ({"loss": "G * (T - air) * 2**v"}, 10, ("exponent",)),
+        ({"y": "T", "y_unit": "um"}, 12, ("y", "K", "m")),
+        ({"y": "delay(T, v)"}, 12, ()),
+        ({"G": "W/Kelv1n"}, 5, ("pint knows no unit",)),
+        ({"G": "W//K"}, 5, ("not a unit",)),
+        ({"loss": "G * min(T, v)"}, 10, ("alike",)),
+    ],
+)
 def test_refuses_with_line_and_dimensions(change, line, words):
     with pytest.raises(InputError) as e:
         plant(**({"loss": GOOD["loss"]} | change))
@@ -82,11 +91,12 @@ def test_table_of_common_units_is_pints(symbol):
     pint = pytest.importorskip("pint")
     registry = _registry(pint)
     bases = {"[length]": "m", "[mass]": "kg", "[time]": "s", "[current]": "A", "[temperature]": "K"}
-    assert {bases[k]: float(v) for k, v in registry.get_dimensionality(symbol).items()} == \
-        {k: float(v) for k, v in dimension(symbol)}
+    assert {bases[k]: float(v) for k, v in registry.get_dimensionality(symbol).items()} == {
+        k: float(v) for k, v in dimension(symbol)
+    }
 
 
-def _registry(pint, kept=[]):       # noqa: B006 one registry for all cases: half a second each
+def _registry(pint, kept=[]):  # noqa: B006 one registry for all cases: half a second each
     if not kept:
         kept.append(pint.UnitRegistry())
     return kept[0]

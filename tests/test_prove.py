@@ -21,7 +21,13 @@ from thermoctl.yamlfile import InputError
 
 
 def finding(effect: str, where: str, probability: float, **more) -> dict:
-    return {"effect": effect, "where": where, "probability": probability, "when": None, "parameters": {}} | more
+    return {
+        "effect": effect,
+        "where": where,
+        "probability": probability,
+        "when": None,
+        "parameters": {},
+    } | more
 
 
 def result(verdict: str, findings=(), alternatives=(), **fit) -> dict:
@@ -48,7 +54,9 @@ def test_reliability_by_hand():
     """Bins 0.9: (0.9 + 0.98)/2 given, 1 of 2 right; 0.2: 0.2 given, 0 of 1; 1.0 goes into the last bin."""
     table, ece = score.reliability([(0.92, True), (0.98, False), (0.2, False), (1.0, True)])
     assert [b["n"] for b in table] == [1, 3]
-    assert table[1]["probability"] == pytest.approx((0.92 + 0.98 + 1) / 3) and table[1]["right"] == pytest.approx(2 / 3)
+    assert table[1]["probability"] == pytest.approx((0.92 + 0.98 + 1) / 3) and table[1][
+        "right"
+    ] == pytest.approx(2 / 3)
     assert ece == pytest.approx((1 * 0.2 + 3 * (2.9 / 3 - 2 / 3)) / 4)
 
 
@@ -79,7 +87,7 @@ def test_a_name_that_the_data_cannot_tell_counts_as_its_class_only():
     told = answer(("radiation", "a")) | {"nearly_the_same": ["natural_convection"]}
     row = score.score("1", told, result("explained", [finding("natural_convection", "a", 0.8)]))
     assert not row.exact and row.alike and row.placed and row.inside and not row.inside_exact
-    assert row.calibration == [(0.8, False)]      # of explanations that exclude each other one is true
+    assert row.calibration == [(0.8, False)]  # of explanations that exclude each other one is true
 
 
 def test_the_true_name_among_the_alternatives_is_inside_the_set():
@@ -115,7 +123,10 @@ def test_unknown_and_failed():
 
 def test_onset_gain_and_parameters_by_hand():
     told = answer(
-        ("conductance_step", "f"), onset=1000.0, oracle_rms={"y": 0.1, "z": 1.0}, parameters=[{"A": -0.5, "T0": 1000.0}]
+        ("conductance_step", "f"),
+        onset=1000.0,
+        oracle_rms={"y": 0.1, "z": 1.0},
+        parameters=[{"A": -0.5, "T0": 1000.0}],
     )
     row = score.score(
         "1",
@@ -150,7 +161,10 @@ def test_summary_of_a_hand_made_set():
         for i, (a, r) in enumerate(
             [
                 (answer(kind="none"), NONE),
-                (answer(kind="none"), result("explained", [finding("sensor_drift", "y", 0.9)])),  # false alarm
+                (
+                    answer(kind="none"),
+                    result("explained", [finding("sensor_drift", "y", 0.9)]),
+                ),  # false alarm
                 (
                     answer(("radiation", "a"), kind="one", band="large"),
                     result("explained", [finding("radiation", "a", 0.9)]),
@@ -205,12 +219,18 @@ def test_the_size_found_half_of_the_time_is_that_of_scipy_and_its_interval_holds
         best = minimize(against, [np.log(6), 4], method="Nelder-Mead")
         assert curve["half"] == pytest.approx(np.exp(best.x[0]), rel=0.03)
     assert held >= 52  # of 57 in the mean
-    assert score.found_by_size([5.0] * 20, [True] * 20) is None and score.found_by_size([3.0, 9.0], [False, True]) is None
+    assert (
+        score.found_by_size([5.0] * 20, [True] * 20) is None
+        and score.found_by_size([3.0, 9.0], [False, True]) is None
+    )
 
 
 def test_a_kept_result_is_of_the_integrator_too_and_not_of_what_scores_it():
     names = {f.name for f in prove._program()}
-    assert {"integrator.h", "refit.py", "search.py", "radiation.yaml"} <= names and not names & {"score.py", "prove.py"}
+    assert {"integrator.h", "refit.py", "search.py", "radiation.yaml"} <= names and not names & {
+        "score.py",
+        "prove.py",
+    }
 
 
 # --- running -------------------------------------------------------------------------------------------------------------
@@ -245,7 +265,12 @@ def test_a_killed_worker_loses_nothing_and_done_cases_are_not_run_again(tmp_path
     cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the workers need not find this file
     jobs = prove.find_jobs(a_set(tmp_path / "cases"))
     seen = []
-    assert prove.run_all(jobs, tmp_path / "out/cases", workers=2, task=fake, progress=lambda *x: seen.append(x[:2])) == 4
+    assert (
+        prove.run_all(
+            jobs, tmp_path / "out/cases", workers=2, task=fake, progress=lambda *x: seen.append(x[:2])
+        )
+        == 4
+    )
     assert (tmp_path / "out/cases/died").exists()
     assert sorted(set((tmp_path / "out/cases/log").read_text().split())) == ["a", "b", "c", "d"]
     assert [count for count, _ in seen] == [1, 2, 3, 4]
@@ -267,10 +292,25 @@ def dies_once(job, out: str) -> dict:
 @contextmanager
 def a_dask_by_hand(folder: Path):
     """A scheduler and two workers as one starts them on three machines: (address, worker processes)."""
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL,
-             "env": {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}}  # the task of this file must be found there
+    quiet = {
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+        "env": {**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+    }  # the task of this file must be found there
     file = folder / "scheduler.json"
-    command = [sys.executable, "-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
+    command = [
+        sys.executable,
+        "-m",
+        "dask",
+        "scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--no-dashboard",
+        "--scheduler-file",
+        str(file),
+    ]
     started = [subprocess.Popen(command, **quiet)]
     try:
         limit = time.monotonic() + 120
@@ -278,7 +318,17 @@ def a_dask_by_hand(folder: Path):
             assert time.monotonic() < limit and started[0].poll() is None, "no scheduler"
             time.sleep(0.05)
         address = json.loads(file.read_text())["address"]
-        worker = [sys.executable, "-m", "dask", "worker", address, "--no-nanny", "--nthreads", "1", "--no-dashboard"]
+        worker = [
+            sys.executable,
+            "-m",
+            "dask",
+            "worker",
+            address,
+            "--no-nanny",
+            "--nthreads",
+            "1",
+            "--no-dashboard",
+        ]
         started += [subprocess.Popen([*worker, "--local-directory", str(folder)], **quiet) for _ in range(2)]
         yield address, started[1:]
     finally:
@@ -295,17 +345,42 @@ def test_a_remote_scheduler_loses_nothing_when_one_of_two_workers_is_killed(tmp_
 
     from tests.concealed import generate
 
-    generate.main(["--out", str(tmp_path / "cases"), "--number", "3", "--families", "tanks", "--kind", "none", "--smoke"])
+    generate.main(
+        [
+            "--out",
+            str(tmp_path / "cases"),
+            "--number",
+            "3",
+            "--families",
+            "tanks",
+            "--kind",
+            "none",
+            "--smoke",
+        ]
+    )
     jobs = prove.find_jobs(tmp_path / "cases")
     with a_dask_by_hand(tmp_path) as (address, workers):
         with Client(address) as client:
             client.wait_for_workers(2, timeout=120)
         told = []
-        assert prove.run_all(jobs, tmp_path / "out/cases", scheduler=address, task=dies_once, progress=lambda *x: told.append(x[2])) == 3
+        assert (
+            prove.run_all(
+                jobs,
+                tmp_path / "out/cases",
+                scheduler=address,
+                task=dies_once,
+                progress=lambda *x: told.append(x[2]),
+            )
+            == 3
+        )
         assert [x["error"] for x in told] == [None] * 3
-        assert sorted(w.poll() for w in workers if w.poll() is not None) == [-signal.SIGKILL]  # one is dead, one lives
+        assert sorted(w.poll() for w in workers if w.poll() is not None) == [
+            -signal.SIGKILL
+        ]  # one is dead, one lives
     assert (tmp_path / "out/cases/died").exists()
-    content = prove.prove(tmp_path / "cases", tmp_path / "out", tmp_path / "cases_answers", workers=1)  # nothing is run again
+    content = prove.prove(
+        tmp_path / "cases", tmp_path / "out", tmp_path / "cases_answers", workers=1
+    )  # nothing is run again
     assert content["figures"]["cases"] == 3 and content["figures"]["failed"] == 0
 
 
@@ -315,7 +390,21 @@ def test_diagnose_over_a_folder_of_rigs(tmp_path, capsys):
     from tests.concealed import generate
     from thermoctl.cli import main
 
-    generate.main(["--out", str(tmp_path / "c"), "--number", "1", "--families", "tanks", "--kind", "none", "--smoke", "--seed", "4"])
+    generate.main(
+        [
+            "--out",
+            str(tmp_path / "c"),
+            "--number",
+            "1",
+            "--families",
+            "tanks",
+            "--kind",
+            "none",
+            "--smoke",
+            "--seed",
+            "4",
+        ]
+    )
     case = tmp_path / "c" / "0001"
     for rig in ("north", "south"):
         (tmp_path / "fleet" / rig).mkdir(parents=True)
@@ -323,12 +412,25 @@ def test_diagnose_over_a_folder_of_rigs(tmp_path, capsys):
             (tmp_path / "fleet" / rig / run).write_bytes((case / run).read_bytes())
     (tmp_path / "fleet" / "east").mkdir()
     (tmp_path / "fleet" / "east" / "bad.csv").write_text("t,pump\n0,1\n0,2\n")
-    words = ["diagnose", str(tmp_path / "fleet"), "--plant", str(case / "plant.yaml"), "--out", str(tmp_path / "out"), "--workers", "2"]
+    words = [
+        "diagnose",
+        str(tmp_path / "fleet"),
+        "--plant",
+        str(case / "plant.yaml"),
+        "--out",
+        str(tmp_path / "out"),
+        "--workers",
+        "2",
+    ]
     assert main([*words, "--json"]) == 0
     told = {x["rig"]: x for x in json.loads(capsys.readouterr().out)}
     assert set(told) == {"north", "south", "east"}
     assert told["east"]["verdict"] is None and "bad.csv" in told["east"]["error"]
-    assert told["north"]["verdict"] == told["south"]["verdict"] == json.loads((tmp_path / "out/north/diagnosis.json").read_text())["verdict"]
+    assert (
+        told["north"]["verdict"]
+        == told["south"]["verdict"]
+        == json.loads((tmp_path / "out/north/diagnosis.json").read_text())["verdict"]
+    )
     assert len(told["north"]["recordings"]) == 2 and (tmp_path / "out/south/report.html").exists()
     before = (tmp_path / "out/north/run.json").stat().st_mtime_ns
     assert main([*words, "--quiet"]) == 0
@@ -428,7 +530,21 @@ def test_bench_counts_a_peer_by_the_same_scoring(tmp_path, capsys):
     from tests.concealed import generate
 
     cases = str(tmp_path / "cases")
-    generate.main(["--out", cases, "--answers", "inside", "--number", "2", "--families", "tanks,heater", "--kind", "none", "--smoke"])
+    generate.main(
+        [
+            "--out",
+            cases,
+            "--answers",
+            "inside",
+            "--number",
+            "2",
+            "--families",
+            "tanks,heater",
+            "--kind",
+            "none",
+            "--smoke",
+        ]
+    )
     argv = [cases, "--methods", "latent", "--out", str(tmp_path)]
     assert bench.main(argv) == 0
     found = json.loads((tmp_path / "figures.json").read_text())["latent"]

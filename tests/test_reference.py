@@ -1,4 +1,5 @@
 """The reference pages say what the code says."""
+
 import shutil
 
 from thermoctl.control.faults import FAULTS

@@ -1,4 +1,5 @@
 """A bad configuration gives one good line: file, line, column, what was expected."""
+
 import re
 from pathlib import Path
 
@@ -18,31 +19,34 @@ def loaded(tmp_path, old="", new=""):
     return settings.load_settings(path)
 
 
-@pytest.mark.parametrize("old, new, says", [
-    ("  kp: 0.01", "  kpp: 0.01", r"kpp.*did you mean 'kp'"),
-    ("control: ", "controll: ", r"controll.*did you mean 'control'"),
-    ("  kp: 0.01", "  kp: fast", r"control\.kp.*number.*fast|fast.*number"),
-    ("  kp: 0.01", "  kp: -1", r"control\.kp"),
-    ("  kp: 0.01", "  kp: .nan", r"control\.kp"),
-    ("  kp: 0.01", "  kp: 0.01\n  kp: 0.02", r"'kp' stands twice"),
-    ("  kp: 0.01", "  kp: [0.01]", r"control\.kp"),
-    ("  kp: 0.01", "  kp:", r"control\.kp"),
-    ("period_s: 1 ms", "period_s: 1 mm", r"period_s.*\bs\b"),
-    ("period_s: 1 ms", "period_s: 1 h", r"period_s"),
-    ("period_s: 1 ms", "period_s: 1 xyz", r"period_s.*xyz"),
-    ("priority: 80", "priority: 80.5", r"priority.*whole"),
-    ("priority: 80", "priority: 1000", r"priority"),
-    ("enable: true", "enable: 1", r"enable.*true or false"),
-    ("backend: simulated", "backend: simulatd", r"backend.*did you mean 'simulated'"),
-    ("backend: simulated", "backend: devices", r"hal\.devices is missing"),
-    ("rate: {position_um: 50000", "rate: {positon_um: 50000", r"positon_um.*did you mean 'position_um'"),
-    ("low:  {position_um: -400", "low:  {position_um: 500", r"high\.position_um must be above"),
-    ("required: [position_um", "required: [positon_um", r"positon_um.*did you mean 'position_um'"),
-    ("rig: {name: simulated}", "rig: simulated", r"rig"),
-    ("rig: {name: simulated}", "rig: {name: 3}", r"rig\.name"),
-    ("rig: {name: simulated}", "rig: {name: 'a", r"not valid YAML"),
-    ("rig: {name: simulated}", "\trig: {name: simulated}", r"tab"),
-])
+@pytest.mark.parametrize(
+    "old, new, says",
+    [
+        ("  kp: 0.01", "  kpp: 0.01", r"kpp.*did you mean 'kp'"),
+        ("control: ", "controll: ", r"controll.*did you mean 'control'"),
+        ("  kp: 0.01", "  kp: fast", r"control\.kp.*number.*fast|fast.*number"),
+        ("  kp: 0.01", "  kp: -1", r"control\.kp"),
+        ("  kp: 0.01", "  kp: .nan", r"control\.kp"),
+        ("  kp: 0.01", "  kp: 0.01\n  kp: 0.02", r"'kp' stands twice"),
+        ("  kp: 0.01", "  kp: [0.01]", r"control\.kp"),
+        ("  kp: 0.01", "  kp:", r"control\.kp"),
+        ("period_s: 1 ms", "period_s: 1 mm", r"period_s.*\bs\b"),
+        ("period_s: 1 ms", "period_s: 1 h", r"period_s"),
+        ("period_s: 1 ms", "period_s: 1 xyz", r"period_s.*xyz"),
+        ("priority: 80", "priority: 80.5", r"priority.*whole"),
+        ("priority: 80", "priority: 1000", r"priority"),
+        ("enable: true", "enable: 1", r"enable.*true or false"),
+        ("backend: simulated", "backend: simulatd", r"backend.*did you mean 'simulated'"),
+        ("backend: simulated", "backend: devices", r"hal\.devices is missing"),
+        ("rate: {position_um: 50000", "rate: {positon_um: 50000", r"positon_um.*did you mean 'position_um'"),
+        ("low:  {position_um: -400", "low:  {position_um: 500", r"high\.position_um must be above"),
+        ("required: [position_um", "required: [positon_um", r"positon_um.*did you mean 'position_um'"),
+        ("rig: {name: simulated}", "rig: simulated", r"rig"),
+        ("rig: {name: simulated}", "rig: {name: 3}", r"rig\.name"),
+        ("rig: {name: simulated}", "rig: {name: 'a", r"not valid YAML"),
+        ("rig: {name: simulated}", "\trig: {name: simulated}", r"tab"),
+    ],
+)
 def test_bad_configuration(tmp_path, old, new, says):
     with pytest.raises(InputError) as e:
         loaded(tmp_path, old, new)
@@ -50,9 +54,9 @@ def test_bad_configuration(tmp_path, old, new, says):
     assert re.match(rf"{re.escape(str(tmp_path))}/rig\.yaml:\d+:\d+: ", message), message
     assert re.search(says, message) and "\n" not in message, message
     text, line = TEXT.replace(old, new, 1), int(message.split(":")[1])
-    first = text[:text.index(new)].count("\n") + 1
-    if "end of stream" not in message:                               # an open quote is noticed at the file's end
-        assert first <= line <= first + 12, message                   # at the place, or at the first value below it
+    first = text[: text.index(new)].count("\n") + 1
+    if "end of stream" not in message:  # an open quote is noticed at the file's end
+        assert first <= line <= first + 12, message  # at the place, or at the first value below it
 
 
 def test_what_is_in_force_is_written_and_taken_back(tmp_path):

@@ -1,4 +1,5 @@
 """The manual page and the shells' completions, written from the command line's own declaration, and their installation."""
+
 from __future__ import annotations
 
 import argparse
@@ -10,31 +11,53 @@ import shtab
 from thermoctl import __version__
 from thermoctl.yamlfile import InputError
 
-PLACES = {                           # below the root, where man and the shells look for what is not from a distribution
+PLACES = {  # below the root, where man and the shells look for what is not from a distribution
     "man": "usr/local/share/man/man1/thermoctl.1",
     "bash": "usr/local/share/bash-completion/completions/thermoctl",
     "zsh": "usr/local/share/zsh/site-functions/_thermoctl",
 }
-_FILES = (("$THERMOCTL_CONFIG", "configuration, when --config is not given"),
-          ("config/simulated.yaml", "the one of the simulated rig, used where neither is given"),
-          ("/etc/thermoctl/rig.yaml", "the one of a rig, used when there is no other"),
-          ("/var/lib/thermoctl/recordings", "a service's recordings"))
-_STATUS = ((0, "done"), (1, "the answer is no: a check failed, the daemon is not running, a fault stands"),
-           (2, "unusable input; one line says what, where and what was expected"), (3, "the hardware or the system refused"),
-           (130, "interrupted"))
+_FILES = (
+    ("$THERMOCTL_CONFIG", "configuration, when --config is not given"),
+    ("config/simulated.yaml", "the one of the simulated rig, used where neither is given"),
+    ("/etc/thermoctl/rig.yaml", "the one of a rig, used when there is no other"),
+    ("/var/lib/thermoctl/recordings", "a service's recordings"),
+)
+_STATUS = (
+    (0, "done"),
+    (1, "the answer is no: a check failed, the daemon is not running, a fault stands"),
+    (2, "unusable input; one line says what, where and what was expected"),
+    (3, "the hardware or the system refused"),
+    (130, "interrupted"),
+)
 
 
 def manual_page(parser: argparse.ArgumentParser) -> str:
     """thermoctl(1) in roff (man macros): every command with its options."""
     first = (parser.description or "").split("\n\n")[0]
-    lines = [f'.TH {parser.prog.upper()} 1 "" "{parser.prog} {__version__}" "User Commands"', ".SH NAME",
-             f"{parser.prog} \\- thermal compensation of a precision linear actuator, and the diagnosis of left-out physics",
-             ".SH SYNOPSIS", f".B {parser.prog}", ".I COMMAND", "[\\fIOPTIONS\\fR]", ".SH DESCRIPTION", _text(first), ".SH COMMANDS"]
+    lines = [
+        f'.TH {parser.prog.upper()} 1 "" "{parser.prog} {__version__}" "User Commands"',
+        ".SH NAME",
+        f"{parser.prog} \\- thermal compensation of a precision linear actuator, and the diagnosis of left-out physics",
+        ".SH SYNOPSIS",
+        f".B {parser.prog}",
+        ".I COMMAND",
+        "[\\fIOPTIONS\\fR]",
+        ".SH DESCRIPTION",
+        _text(first),
+        ".SH COMMANDS",
+    ]
     for command, help in _commands(parser):
-        lines += [".SS " + _text(" ".join(command.prog.split()[1:])), _text(help or command.description or "")]
+        lines += [
+            ".SS " + _text(" ".join(command.prog.split()[1:])),
+            _text(help or command.description or ""),
+        ]
         for action in command._actions:
             if not isinstance(action, argparse._HelpAction | argparse._SubParsersAction):
-                lines += [".TP", _option(action), _text((action.help or "").replace("%(default)s", str(action.default)))]
+                lines += [
+                    ".TP",
+                    _option(action),
+                    _text((action.help or "").replace("%(default)s", str(action.default))),
+                ]
     lines += [".SH FILES"] + [x for path, what in _FILES for x in (".TP", f".I {_text(path)}", _text(what))]
     lines += [".SH EXIT STATUS"] + [x for code, what in _STATUS for x in (".TP", f".B {code}", _text(what))]
     return "\n".join(line for line in lines if line) + "\n"
@@ -69,7 +92,11 @@ def install(parser: argparse.ArgumentParser, root: str | Path = "/") -> list[Pat
     """Write the manual page and the completions of bash and zsh below `root`; their paths.
 
     Raises InputError where one cannot be written."""
-    texts = {"man": manual_page(parser), "bash": shtab.complete(parser, "bash"), "zsh": shtab.complete(parser, "zsh")}
+    texts = {
+        "man": manual_page(parser),
+        "bash": shtab.complete(parser, "bash"),
+        "zsh": shtab.complete(parser, "zsh"),
+    }
     written = []
     for kind, place in PLACES.items():
         path = Path(root, place)
@@ -77,7 +104,9 @@ def install(parser: argparse.ArgumentParser, root: str | Path = "/") -> list[Pat
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(texts[kind])
         except OSError as e:
-            raise InputError(f"{path}: cannot be written: {e.strerror}; run it as root, or give --root") from None
+            raise InputError(
+                f"{path}: cannot be written: {e.strerror}; run it as root, or give --root"
+            ) from None
         written.append(path)
     return written
 

@@ -3,6 +3,7 @@
 docs/reference/{configuration,signals,faults,effects,cli}.md and docs/faults/NAME.md. With --check nothing is written;
 exit status 1 says which page is stale.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -20,14 +21,19 @@ from thermoctl.signals import SIGNALS
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 _HEAD = "<!-- Written by `python -m thermoctl.reference`; change the table in the code, not this page. -->\n"
-_SEVERITY = {"warning": "a warning: shown and recorded, drives nothing off.",
-             "fault": "a fault: disables the amplifier when armed, and keeps the rig from being armed.",
-             "critical": "critical: disables the amplifier and latches FAULT from every state."}
+_SEVERITY = {
+    "warning": "a warning: shown and recorded, drives nothing off.",
+    "fault": "a fault: disables the amplifier when armed, and keeps the rig from being armed.",
+    "critical": "critical: disables the amplifier and latches FAULT from every state.",
+}
 
 
 def _table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     lines = [list(header)]
-    lines += [["---"] * len(lines[0]), *([str(c).replace("|", "\\|").replace("\n", " ") for c in row] for row in rows)]
+    lines += [
+        ["---"] * len(lines[0]),
+        *([str(c).replace("|", "\\|").replace("\n", " ") for c in row] for row in rows),
+    ]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
@@ -57,12 +63,23 @@ def _default(field: dataclasses.Field) -> str:
 
 def configuration() -> str:
     """Every option: unit, range, default, whether it needs a restart, meaning."""
-    text = (_HEAD + "# Configuration\n\nOne YAML file describes a rig. `thermoctl check FILE` says whether it is "
-            "right; `thermoctl reload` applies the options that need no restart between two ticks.\n")
+    text = (
+        _HEAD + "# Configuration\n\nOne YAML file describes a rig. `thermoctl check FILE` says whether it is "
+        "right; `thermoctl reload` applies the options that need no restart between two ticks.\n"
+    )
     for section, cls in SECTIONS.items():
-        rows = [(f"`{key.split('.')[1]}`", o.unit, ", ".join(o.choices) or _range(o.low, o.high),
-                 _default(f), "restart" if o.restart else "live", o.meaning)
-                for key, f, o in options() if key.startswith(section + ".")]
+        rows = [
+            (
+                f"`{key.split('.')[1]}`",
+                o.unit,
+                ", ".join(o.choices) or _range(o.low, o.high),
+                _default(f),
+                "restart" if o.restart else "live",
+                o.meaning,
+            )
+            for key, f, o in options()
+            if key.startswith(section + ".")
+        ]
         text += f"\n## {section}\n{(cls.__doc__ or '').strip()}\n\n"
         text += _table(("option", "unit", "range", "default", "a change", "meaning"), rows)
     return text
@@ -70,39 +87,61 @@ def configuration() -> str:
 
 def signals() -> str:
     """Every column of a recording."""
-    return (_HEAD + "# Signals\n\nOne record row a tick, in this order, float64. A recording's 10 Hz tier holds the "
-            "mean under the same name and `_min` and `_max` beside it; words of bits (`*_bits`) are or-ed.\n\n"
-            + _table(("signal", "unit", "plausible", "meaning"),
-                     ((f"`{s.name}`", s.unit, _range(s.low, s.high), s.meaning) for s in SIGNALS)))
+    return (
+        _HEAD
+        + "# Signals\n\nOne record row a tick, in this order, float64. A recording's 10 Hz tier holds the "
+        "mean under the same name and `_min` and `_max` beside it; words of bits (`*_bits`) are or-ed.\n\n"
+        + _table(
+            ("signal", "unit", "plausible", "meaning"),
+            ((f"`{s.name}`", s.unit, _range(s.low, s.high), s.meaning) for s in SIGNALS),
+        )
+    )
 
 
 def faults() -> str:
     """The table of faults."""
-    return (_HEAD + "# Faults\n\n" + "".join(f"- {t}\n" for t in _SEVERITY.values()) + "\n"
-            + _table(("bit", "fault", "severity", "meaning"),
-                     ((f.bit, f"[`{f.name}`](../faults/{f.name}.md)", f.severity, f.meaning) for f in FAULTS)))
+    return (
+        _HEAD
+        + "# Faults\n\n"
+        + "".join(f"- {t}\n" for t in _SEVERITY.values())
+        + "\n"
+        + _table(
+            ("bit", "fault", "severity", "meaning"),
+            ((f.bit, f"[`{f.name}`](../faults/{f.name}.md)", f.severity, f.meaning) for f in FAULTS),
+        )
+    )
 
 
 def fault(f: Fault) -> str:
     """The page of one fault."""
-    return (f"{_HEAD}# {f.name}\n\n{f.meaning[0].upper()}{f.meaning[1:]}.\n\nThis is {_SEVERITY[f.severity]} Bit {f.bit} "
-            f"of `fault_bits` (value {1 << f.bit}).\n\n## What to do\n\n{f.remedy[0].upper()}{f.remedy[1:]}.\n\nThen "
-            "`thermoctl status` shows whether it stands; `thermoctl disarm` acknowledges a latched one, and "
-            "`thermoctl arm` starts again from the measured position.\n\n"
-            "All faults: [reference](../reference/faults.md).\n")
+    return (
+        f"{_HEAD}# {f.name}\n\n{f.meaning[0].upper()}{f.meaning[1:]}.\n\nThis is {_SEVERITY[f.severity]} Bit {f.bit} "
+        f"of `fault_bits` (value {1 << f.bit}).\n\n## What to do\n\n{f.remedy[0].upper()}{f.remedy[1:]}.\n\nThen "
+        "`thermoctl status` shows whether it stands; `thermoctl disarm` acknowledges a latched one, and "
+        "`thermoctl arm` starts again from the measured position.\n\n"
+        "All faults: [reference](../reference/faults.md).\n"
+    )
 
 
 def effects() -> str:
     """The catalogue of left-out physics."""
     entries = catalogue().values()
-    text = (_HEAD + "# Catalogue of left-out physics\n\nWhat `thermoctl diagnose` can name; one file each in "
-            "config/effects/. A file of your own beside them is an entry like any other.\n\n")
-    text += _table(("effect", "what it is", "where", "excited by", "hard to tell from", "source"),
-                   ((f"`{e.name}`", e.title, e.where.replace("_", " "), e.excited_by, ", ".join(e.mimics), e.source)
-                    for e in entries))
+    text = (
+        _HEAD + "# Catalogue of left-out physics\n\nWhat `thermoctl diagnose` can name; one file each in "
+        "config/effects/. A file of your own beside them is an entry like any other.\n\n"
+    )
+    text += _table(
+        ("effect", "what it is", "where", "excited by", "hard to tell from", "source"),
+        (
+            (f"`{e.name}`", e.title, e.where.replace("_", " "), e.excited_by, ", ".join(e.mimics), e.source)
+            for e in entries
+        ),
+    )
     for e in entries:
-        rows = ((f"`{p.name}`", p.unit or "", f"{p.low:g} to {p.high:g}" if _numbers(p.low, p.high) else "")
-                for p in e.parameters)
+        rows = (
+            (f"`{p.name}`", p.unit or "", f"{p.low:g} to {p.high:g}" if _numbers(p.low, p.high) else "")
+            for p in e.parameters
+        )
         text += f"\n## {e.name}\n{e.title}.\n\n" + _table(("parameter", "unit", "bounds"), rows)
     return text
 
@@ -114,6 +153,7 @@ def _numbers(*values: object) -> bool:
 def cli() -> str:
     """Every command's help."""
     from thermoctl.cli import parser  # the one place beside `main` that looks at the commands
+
     os.environ["COLUMNS"] = "110"
     top = parser()
     pages: list[str] = []
@@ -124,27 +164,37 @@ def cli() -> str:
             if isinstance(action, argparse._SubParsersAction):
                 for below in dict.fromkeys(action.choices.values()):
                     walk(below)
+
     walk(top)
     return _HEAD + "# Commands\n\n" + "\n".join(pages)
 
 
 def pages() -> dict[Path, str]:
     """Every generated page by its path below docs/."""
-    made = {Path("reference", f"{make.__name__}.md"): make() for make in (configuration, signals, faults, effects, cli)}
+    made = {
+        Path("reference", f"{make.__name__}.md"): make()
+        for make in (configuration, signals, faults, effects, cli)
+    }
     return made | {Path("faults", f"{f.name}.md"): fault(f) for f in FAULTS}
 
 
 def stale(docs: Path = DOCS) -> list[str]:
     """The pages that differ from what the code says, and pages of faults that there are no more."""
     wanted = pages()
-    wrong = [str(p) for p, text in wanted.items() if not (docs / p).is_file() or (docs / p).read_text() != text]
-    return wrong + [f"faults/{p.name}" for p in (docs / "faults").glob("*.md") if Path("faults", p.name) not in wanted]
+    wrong = [
+        str(p) for p, text in wanted.items() if not (docs / p).is_file() or (docs / p).read_text() != text
+    ]
+    return wrong + [
+        f"faults/{p.name}" for p in (docs / "faults").glob("*.md") if Path("faults", p.name) not in wanted
+    ]
 
 
 def main(argv: list[str] | None = None) -> int:
     """Write the pages, or with --check say which are stale (exit status 1)."""
     parser = argparse.ArgumentParser(prog="python -m thermoctl.reference", description=__doc__)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit status 1 when a page is stale")
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; exit status 1 when a page is stale"
+    )
     if parser.parse_args(argv).check:
         wrong = stale()
         for page in wrong:

@@ -6,6 +6,7 @@ something is close, "did you mean". A number may carry a unit ("5 ms", "1 mm/min
 
 The dataclasses below are the table; `options()` lists it for the reference page and for `reload`.
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -22,9 +23,17 @@ import yaml
 from thermoctl.signals import SIGNALS
 from thermoctl.yamlfile import InputError, Node, load, suggest
 
-CHANNELS = ("position_um", "output_reference_um", "voltage_v", "current_a", "air_c",
-            *(s.name for s in SIGNALS if s.unit == "degC" and s.meaning.endswith(": measured")),
-            "supply_v", "amplifier_state", "amplifier_fault")
+CHANNELS = (
+    "position_um",
+    "output_reference_um",
+    "voltage_v",
+    "current_a",
+    "air_c",
+    *(s.name for s in SIGNALS if s.unit == "degC" and s.meaning.endswith(": measured")),
+    "supply_v",
+    "amplifier_state",
+    "amplifier_fault",
+)
 """Channel roles that protection limits may name (the back end's roles)."""
 
 TEMPERATURES = "temperatures_c"
@@ -35,6 +44,7 @@ _TWELVE = tuple(n for n in CHANNELS if n.endswith("_c") and n != "air_c")
 @dataclass(frozen=True)
 class Option:
     """What the table says of one option besides its type and default."""
+
     unit: str
     low: float
     high: float
@@ -43,43 +53,73 @@ class Option:
     choices: tuple[str, ...] = ()
 
 
-def option(meaning: str, default: Any = dataclasses.MISSING, unit: str = "", low: float = -math.inf, high: float = math.inf,
-           restart: bool = False, choices: tuple[str, ...] = (), factory: Any = dataclasses.MISSING) -> Any:
+def option(
+    meaning: str,
+    default: Any = dataclasses.MISSING,
+    unit: str = "",
+    low: float = -math.inf,
+    high: float = math.inf,
+    restart: bool = False,
+    choices: tuple[str, ...] = (),
+    factory: Any = dataclasses.MISSING,
+) -> Any:
     """One row of the table; without default or factory the option must be given."""
-    return field(default=default, default_factory=factory, kw_only=True,
-                 metadata={"option": Option(unit, low, high, restart, meaning, choices)})
+    return field(
+        default=default,
+        default_factory=factory,
+        kw_only=True,
+        metadata={"option": Option(unit, low, high, restart, meaning, choices)},
+    )
 
 
 @dataclass(frozen=True)
 class RigSettings:
     """What this rig is called."""
+
     name: str = option("a name for recordings and pages", "rig", restart=True)
 
 
 @dataclass(frozen=True)
 class LoopSettings:
     """The tick."""
+
     period_s: float = option("period of the tick", 0.001, "s", 2e-4, 0.1, restart=True)
-    cpu: int = option("processor the loop is pinned to; -1: wherever the scheduler likes", -1, "1", -1, 1023, restart=True)
+    cpu: int = option(
+        "processor the loop is pinned to; -1: wherever the scheduler likes", -1, "1", -1, 1023, restart=True
+    )
     priority: int = option("SCHED_FIFO priority; 0: no real-time scheduling", 80, "1", 0, 99, restart=True)
-    spin_s: float = option("how long before a deadline the loop waits burning the processor", 0.0, "s", 0.0, 5e-4,
-                           restart=True)
-    pace: str = option("what starts a tick: the clock, or the position encoder's frame (the clock, when none came for two "
-                       "periods)", "clock", restart=True, choices=("clock", "device"))
-    overrun: str = option("what happens after a tick that took too long: skip the ticks it covered and keep the phase",
-                          "skip", restart=True, choices=("skip",))
-    reference: bool = option("run an idle loop of the same clock beside it, for `thermoctl latency`", False, restart=True)
+    spin_s: float = option(
+        "how long before a deadline the loop waits burning the processor", 0.0, "s", 0.0, 5e-4, restart=True
+    )
+    pace: str = option(
+        "what starts a tick: the clock, or the position encoder's frame (the clock, when none came for two "
+        "periods)",
+        "clock",
+        restart=True,
+        choices=("clock", "device"),
+    )
+    overrun: str = option(
+        "what happens after a tick that took too long: skip the ticks it covered and keep the phase",
+        "skip",
+        restart=True,
+        choices=("skip",),
+    )
+    reference: bool = option(
+        "run an idle loop of the same clock beside it, for `thermoctl latency`", False, restart=True
+    )
 
 
 @dataclass(frozen=True)
 class ControlSettings:
     """The position loop, equation (41)."""
+
     kp: float = option("proportional gain, drive unit per um of error", unit="1/um", low=0.0, high=1e3)
     ti_s: float = option("integral time", unit="s", low=1e-5, high=1e6)
     td_s: float = option("derivative time", 0.0, "s", 0.0, 1e3)
     output_limit: float = option("largest drive, in the amplifier's unit", unit="1", low=0.0, high=1e6)
-    setpoint_rate_um_s: float = option("how fast the reference follows the setpoint (1 mm/min)", 1000.0 / 60.0, "um/s", 1e-3,
-                                       1e6)
+    setpoint_rate_um_s: float = option(
+        "how fast the reference follows the setpoint (1 mm/min)", 1000.0 / 60.0, "um/s", 1e-3, 1e6
+    )
     setpoint_low_um: float = option("smallest setpoint taken", -1e6, "um", -1e6, 1e6)
     setpoint_high_um: float = option("largest setpoint taken", 1e6, "um", -1e6, 1e6)
     moving_average: int = option("frames of the position encoder in its mean", 1, "1", 1, 64)
@@ -88,10 +128,16 @@ class ControlSettings:
 @dataclass(frozen=True)
 class CompensationSettings:
     """The thermal error and its compensation."""
-    model: str = option("model file made by identification, relative to this file; empty: no compensation", "", restart=True)
+
+    model: str = option(
+        "model file made by identification, relative to this file; empty: no compensation", "", restart=True
+    )
     enable: bool = option("act on the estimated thermal error", True)
-    tune: bool = option("learn the expansion model while the reference encoder is there; better ones become calibrations in the folder `model`",
-                        False, restart=True)
+    tune: bool = option(
+        "learn the expansion model while the reference encoder is there; better ones become calibrations in the folder `model`",
+        False,
+        restart=True,
+    )
     bound_um: float = option("largest believable thermal error", 50.0, "um", 0.0, 1e4)
     slew_um_s: float = option("fastest change of the compensation while armed", 1.0, "um/s", 1e-4, 1e4)
 
@@ -100,73 +146,137 @@ class CompensationSettings:
 class ProtectionSettings:
     """When the amplifier is disabled. Mappings are channel: limit; a channel that is not named has none; temperatures_c
     stands for all twelve temperatures that are not named themselves."""
-    required: tuple[str, ...] = option("channels without which nothing is driven; others only warn",
-                                       ("position_um", "voltage_v", "current_a", "coil_c"))
+
+    required: tuple[str, ...] = option(
+        "channels without which nothing is driven; others only warn",
+        ("position_um", "voltage_v", "current_a", "coil_c"),
+    )
     low: dict[str, float] = option("smallest believable reading", factory=dict)
     high: dict[str, float] = option("largest believable reading", factory=dict)
     rate: dict[str, float] = option("largest believable change per second", factory=dict, low=0.0)
     stale_s: dict[str, float] = option("longest time without a new reading", factory=dict, unit="s", low=0.0)
-    frozen_s: dict[str, float] = option("longest time with exactly the same reading", factory=dict, unit="s", low=0.0)
-    following_um: float = option("largest distance from the reference; twice as much trips at once", 20.0, "um", 0.0, 1e6)
+    frozen_s: dict[str, float] = option(
+        "longest time with exactly the same reading", factory=dict, unit="s", low=0.0
+    )
+    following_um: float = option(
+        "largest distance from the reference; twice as much trips at once", 20.0, "um", 0.0, 1e6
+    )
     following_s: float = option("for how long it may be larger", 0.05, "s", 0.0, 60.0)
     coil_limit_c: float = option("hottest coil, measured or estimated", 80.0, "degC", 0.0, 250.0)
     coil_rate_k_s: float = option("fastest heating of the coil", 0.5, "K/s", 0.0, 100.0)
     coil_rate_time_s: float = option("time constant of that rate", 30.0, "s", 0.1, 3600.0)
-    innovation_limit_c: float = option("largest mean difference of measured and estimated coil temperature", 5.0, "K", 0.0,
-                                       1e3)
+    innovation_limit_c: float = option(
+        "largest mean difference of measured and estimated coil temperature", 5.0, "K", 0.0, 1e3
+    )
     innovation_time_s: float = option("time constant of that mean", 30.0, "s", 0.1, 3600.0)
     power_limit_w: float = option("largest mean electrical power", 15.0, "W", 0.0, 1e5)
     power_time_s: float = option("time constant of that mean", 10.0, "s", 0.01, 3600.0)
-    idle_current_a: float = option("largest coil current while the amplifier is disabled", 0.05, "A", 0.0, 1e3)
+    idle_current_a: float = option(
+        "largest coil current while the amplifier is disabled", 0.05, "A", 0.0, 1e3
+    )
     idle_power_w: float = option("largest power while the amplifier is disabled", 0.5, "W", 0.0, 1e5)
     idle_s: float = option("for how long either may be larger", 0.5, "s", 0.0, 60.0)
     saturation_s: float = option("longest time at the drive's limit", 0.5, "s", 0.0, 3600.0)
-    amplifier_s: float = option("longest time until an enabled amplifier reports that it drives", 1.0, "s", 0.0, 60.0)
-    late_s: float = option("longest time between two ticks; above 1 s also what the supervisor lets the loop stand still", 0.1, "s", 0.0, 60.0)
-    agree_time_s: float = option("time constant of the means in which readings are compared with each other", 0.5, "s", 1e-3, 60.0)
-    drift_limit_c: float = option("largest difference of the coil's reading from the model without corrections", 8.0, "K", 0.0, 1e3)
-    monitored_limit_c: float = option("largest mean difference of a watched temperature from its estimate", 8.0, "K", 0.0, 1e3)
-    resistance_ohm: float = option("the coil's resistance at 20 degC, against which voltage and current are compared; 0: not",
-                                   0.0, "ohm", 0.0, 1e6)
-    resistance_tolerance: float = option("how far voltage and resistance x current may be apart, as a share of the larger",
-                                         0.2, "1", 0.0, 1.0)
+    amplifier_s: float = option(
+        "longest time until an enabled amplifier reports that it drives", 1.0, "s", 0.0, 60.0
+    )
+    late_s: float = option(
+        "longest time between two ticks; above 1 s also what the supervisor lets the loop stand still",
+        0.1,
+        "s",
+        0.0,
+        60.0,
+    )
+    agree_time_s: float = option(
+        "time constant of the means in which readings are compared with each other", 0.5, "s", 1e-3, 60.0
+    )
+    drift_limit_c: float = option(
+        "largest difference of the coil's reading from the model without corrections", 8.0, "K", 0.0, 1e3
+    )
+    monitored_limit_c: float = option(
+        "largest mean difference of a watched temperature from its estimate", 8.0, "K", 0.0, 1e3
+    )
+    resistance_ohm: float = option(
+        "the coil's resistance at 20 degC, against which voltage and current are compared; 0: not",
+        0.0,
+        "ohm",
+        0.0,
+        1e6,
+    )
+    resistance_tolerance: float = option(
+        "how far voltage and resistance x current may be apart, as a share of the larger", 0.2, "1", 0.0, 1.0
+    )
     resistance_v: float = option("and this much more", 0.3, "V", 0.0, 1e3)
-    current_per_drive: float = option("what a current amplifier makes of a unit of drive, compared while armed; 0: not",
-                                      0.0, "A", -1e3, 1e3)
-    current_tolerance_a: float = option("largest mean difference of the coil's current from the one asked for", 0.1, "A", 0.0, 1e3)
-    flexure_um_per_a: float = option("how far the current moves a stage on flexures, compared with the position; 0: not",
-                                     0.0, "um/A", -1e6, 1e6)
-    position_tolerance_um: float = option("largest mean difference of position and current x flexure_um_per_a", 40.0, "um", 0.0, 1e6)
-    reference_tolerance_um: float = option("largest mean difference of the output reference from the estimated output", 10.0, "um",
-                                           0.0, 1e6)
-    order_limit_c: float = option("how far two temperatures may stand the other way round than their estimates", 1.2, "K", 0.0, 1e3)
+    current_per_drive: float = option(
+        "what a current amplifier makes of a unit of drive, compared while armed; 0: not", 0.0, "A", -1e3, 1e3
+    )
+    current_tolerance_a: float = option(
+        "largest mean difference of the coil's current from the one asked for", 0.1, "A", 0.0, 1e3
+    )
+    flexure_um_per_a: float = option(
+        "how far the current moves a stage on flexures, compared with the position; 0: not",
+        0.0,
+        "um/A",
+        -1e6,
+        1e6,
+    )
+    position_tolerance_um: float = option(
+        "largest mean difference of position and current x flexure_um_per_a", 40.0, "um", 0.0, 1e6
+    )
+    reference_tolerance_um: float = option(
+        "largest mean difference of the output reference from the estimated output", 10.0, "um", 0.0, 1e6
+    )
+    order_limit_c: float = option(
+        "how far two temperatures may stand the other way round than their estimates", 1.2, "K", 0.0, 1e3
+    )
 
 
 @dataclass(frozen=True)
 class RecordingSettings:
     """The recorder."""
+
     enable: bool = option("record every tick", True, restart=True)
     directory: str = option("where recordings go, relative to this file", "../recordings", restart=True)
     file_mb: float = option("a new file after this much", 512.0, "MB", 1.0, 1e5, restart=True)
     file_s: float = option("a new file after this long", 3600.0, "s", 1.0, 1e6, restart=True)
-    budget_gb: float = option("disk budget of the full rate; the oldest files go", 20.0, "GB", 0.001, 1e6, restart=True)
-    tier_budget_gb: float = option("disk budget of the 10 Hz tier (min, mean, max)", 5.0, "GB", 0.001, 1e6, restart=True)
+    budget_gb: float = option(
+        "disk budget of the full rate; the oldest files go", 20.0, "GB", 0.001, 1e6, restart=True
+    )
+    tier_budget_gb: float = option(
+        "disk budget of the 10 Hz tier (min, mean, max)", 5.0, "GB", 0.001, 1e6, restart=True
+    )
 
 
 @dataclass(frozen=True)
 class HalSettings:
     """The hardware."""
-    backend: str = option("what stands behind the loop", restart=True, choices=("simulated", "devices", "replay"))
-    plant: str = option("plant file that the compensator believes in, relative to this file", "", restart=True)
+
+    backend: str = option(
+        "what stands behind the loop", restart=True, choices=("simulated", "devices", "replay")
+    )
+    plant: str = option(
+        "plant file that the compensator believes in, relative to this file", "", restart=True
+    )
     truth: str = option("plant file that plays the hardware, when it is another", "", restart=True)
     drive_input: str = option("the plant's input that the amplifier moves", "drive", restart=True)
-    inputs: Node | None = option("other plant inputs: name: {mean, swing, period_s, noise, resolution}", None, restart=True)
-    roles: dict[str, str] = option("plant output: channel role, where they differ in name", factory=dict, restart=True)
+    inputs: Node | None = option(
+        "other plant inputs: name: {mean, swing, period_s, noise, resolution}", None, restart=True
+    )
+    roles: dict[str, str] = option(
+        "plant output: channel role, where they differ in name", factory=dict, restart=True
+    )
     seed: int = option("seed of the simulated noise", 1, "1", 0, 2**31, restart=True)
-    sensor_period_s: float = option("period of the simulated slow sensors", 0.1, "s", 1e-3, 60.0, restart=True)
-    recording: str = option("the recording that back end `replay` plays, relative to this file", "", restart=True)
-    run_dir: str = option("where the virtual rig keeps its control socket and reference recording, relative to this file",
-                          "../run/wire", restart=True)
+    sensor_period_s: float = option(
+        "period of the simulated slow sensors", 0.1, "s", 1e-3, 60.0, restart=True
+    )
+    recording: str = option(
+        "the recording that back end `replay` plays, relative to this file", "", restart=True
+    )
+    run_dir: str = option(
+        "where the virtual rig keeps its control socket and reference recording, relative to this file",
+        "../run/wire",
+        restart=True,
+    )
     devices: tuple[Node, ...] = option("bindings of profile, port and channel roles", (), restart=True)
     faults: tuple[Node, ...] = option("faults to inject, for tests", (), restart=True)
 
@@ -174,13 +284,17 @@ class HalSettings:
 @dataclass(frozen=True)
 class SocketSettings:
     """The command socket."""
-    path: str = option("the Unix socket; lock, pid and log stand beside it", "../run/thermoctl.sock", restart=True)
+
+    path: str = option(
+        "the Unix socket; lock, pid and log stand beside it", "../run/thermoctl.sock", restart=True
+    )
     group: str = option("group that may command; empty: the daemon's own", "", restart=True)
 
 
 @dataclass(frozen=True)
 class Settings:
     """A whole configuration; `path` is the file it came from."""
+
     path: str
     rig: RigSettings
     loop: LoopSettings
@@ -192,9 +306,16 @@ class Settings:
     socket: SocketSettings
 
 
-SECTIONS: dict[str, type] = {"rig": RigSettings, "loop": LoopSettings, "control": ControlSettings,
-                             "compensation": CompensationSettings, "protection": ProtectionSettings,
-                             "recording": RecordingSettings, "hal": HalSettings, "socket": SocketSettings}
+SECTIONS: dict[str, type] = {
+    "rig": RigSettings,
+    "loop": LoopSettings,
+    "control": ControlSettings,
+    "compensation": CompensationSettings,
+    "protection": ProtectionSettings,
+    "recording": RecordingSettings,
+    "hal": HalSettings,
+    "socket": SocketSettings,
+}
 
 
 def options() -> Iterator[tuple[str, dataclasses.Field, Option]]:
@@ -239,7 +360,9 @@ def load_settings(path: str | Path) -> Settings:
         raise root.error(f"a mapping with the sections {', '.join(SECTIONS)} was expected")
     for name, node in root.value.items():
         if name not in SECTIONS:
-            raise node.error(f"unknown section '{name}'{suggest(name, SECTIONS)}; expected one of {', '.join(SECTIONS)}")
+            raise node.error(
+                f"unknown section '{name}'{suggest(name, SECTIONS)}; expected one of {', '.join(SECTIONS)}"
+            )
     sections = {name: _section(name, cls, root.value.get(name), root) for name, cls in SECTIONS.items()}
     settings = Settings(path=str(path), **sections)
     _together(settings, root)
@@ -247,8 +370,13 @@ def load_settings(path: str | Path) -> Settings:
     return dataclasses.replace(
         settings,
         socket=dataclasses.replace(settings.socket, path=_below(folder, settings.socket.path)),
-        recording=dataclasses.replace(settings.recording, directory=_below(folder, settings.recording.directory)),
-        compensation=dataclasses.replace(settings.compensation, model=_below(folder, settings.compensation.model)))
+        recording=dataclasses.replace(
+            settings.recording, directory=_below(folder, settings.recording.directory)
+        ),
+        compensation=dataclasses.replace(
+            settings.compensation, model=_below(folder, settings.compensation.model)
+        ),
+    )
 
 
 def _below(folder: Path, path: str) -> str:
@@ -267,10 +395,16 @@ def _section(name: str, cls: type, node: Node | None, root: Node) -> Any:
     values = {}
     for key, item in given.items():
         if key not in fields:
-            raise item.error(f"unknown option '{name}.{key}'{suggest(key, fields)}; expected one of {', '.join(fields)}")
+            raise item.error(
+                f"unknown option '{name}.{key}'{suggest(key, fields)}; expected one of {', '.join(fields)}"
+            )
         values[key] = _value(f"{name}.{key}", types_[key], fields[key].metadata["option"], item)
     for key, f in fields.items():
-        if key not in values and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+        if (
+            key not in values
+            and f.default is dataclasses.MISSING
+            and f.default_factory is dataclasses.MISSING
+        ):
             raise place.error(f"'{name}.{key}' is missing: {f.metadata['option'].meaning}")
     return cls(**values)
 
@@ -288,8 +422,10 @@ def _value(key: str, kind: Any, row: Option, node: Node) -> Any:
         if not isinstance(node.value, str):
             raise node.error(f"{key}: a text was expected, not {_shown(node)}")
         if row.choices and node.value not in row.choices:
-            raise node.error(f"{key}: '{node.value}'{suggest(node.value, row.choices)}; expected one of "
-                             f"{', '.join(row.choices)}")
+            raise node.error(
+                f"{key}: '{node.value}'{suggest(node.value, row.choices)}; expected one of "
+                f"{', '.join(row.choices)}"
+            )
         return node.value
     if origin is dict:
         return _mapping(key, typing.get_args(kind)[1], row, node)
@@ -301,7 +437,7 @@ def _value(key: str, kind: Any, row: Option, node: Node) -> Any:
         for item in node.value:
             _channel(key, item.value, item)
         return tuple(item.value for item in node.value)
-    if origin in (types.UnionType, typing.Union):          # Node | None: the reader of that part checks it
+    if origin in (types.UnionType, typing.Union):  # Node | None: the reader of that part checks it
         return node
     raise TypeError(f"{key}: no rule for {kind}")
 
@@ -316,22 +452,26 @@ def _number(key: str, kind: Any, row: Option, node: Node) -> Any:
     if kind is int and value != int(value if math.isfinite(value) else 0):
         raise node.error(f"{key}: a whole number was expected, not {value}")
     if not row.low <= value <= row.high:
-        raise node.error(f"{key}: {value:g} is out of range; expected {row.low:g} to {row.high:g} {row.unit}".rstrip())
+        raise node.error(
+            f"{key}: {value:g} is out of range; expected {row.low:g} to {row.high:g} {row.unit}".rstrip()
+        )
     return kind(value)
 
 
 def _with_unit(key: str, text: str, row: Option, node: Node) -> float:
     """'5 ms' in the option's own unit."""
     import pint  # slow to import, and rarely needed
+
     registry: Any = pint.UnitRegistry()
     number, _, unit = text.strip().partition(" ")
     try:
         return float(registry.Quantity(float(number), unit).to(row.unit if row.unit != "1" else "").magnitude)
     except ValueError:
         raise node.error(f"{key}: a number in {row.unit or 'no unit'} was expected, not '{text}'") from None
-    except Exception as e:                                 # pint's errors have no common base but Exception
-        raise node.error(f"{key}: '{text}': the unit does not fit ({str(e).splitlines()[0]}); expected {row.unit}"
-                         ) from None
+    except Exception as e:  # pint's errors have no common base but Exception
+        raise node.error(
+            f"{key}: '{text}': the unit does not fit ({str(e).splitlines()[0]}); expected {row.unit}"
+        ) from None
 
 
 def _mapping(key: str, kind: Any, row: Option, node: Node) -> dict[str, Any]:
@@ -340,7 +480,9 @@ def _mapping(key: str, kind: Any, row: Option, node: Node) -> dict[str, Any]:
     if kind is str:
         return {name: _value(f"{key}.{name}", str, row, item) for name, item in node.value.items()}
     numbers = {}
-    for name, item in sorted(node.value.items(), key=lambda pair: pair[0] != TEMPERATURES):       # single channels after all
+    for name, item in sorted(
+        node.value.items(), key=lambda pair: pair[0] != TEMPERATURES
+    ):  # single channels after all
         for channel in _TWELVE if name == TEMPERATURES else (name,):
             _channel(key, channel, item)
             numbers[channel] = _number(f"{key}.{name}", float, row, item)
@@ -349,7 +491,9 @@ def _mapping(key: str, kind: Any, row: Option, node: Node) -> dict[str, Any]:
 
 def _channel(key: str, name: Any, node: Node) -> None:
     if name not in CHANNELS:
-        raise node.error(f"{key}: no channel '{name}'{suggest(str(name), CHANNELS)}; expected one of {', '.join(CHANNELS)}")
+        raise node.error(
+            f"{key}: no channel '{name}'{suggest(str(name), CHANNELS)}; expected one of {', '.join(CHANNELS)}"
+        )
 
 
 def _shown(node: Node) -> str:
@@ -360,21 +504,28 @@ def _shown(node: Node) -> str:
 
 def _together(settings: Settings, root: Node) -> None:
     """What options must be towards each other."""
+
     def place(section: str, key: str) -> Node:
         node = root.value.get(section)
         return node.value.get(key, node) if node is not None and isinstance(node.value, dict) else root
 
     control, hal, protection = settings.control, settings.hal, settings.protection
     if control.setpoint_low_um >= control.setpoint_high_um:
-        raise place("control", "setpoint_high_um").error("control.setpoint_high_um must be above setpoint_low_um")
+        raise place("control", "setpoint_high_um").error(
+            "control.setpoint_high_um must be above setpoint_low_um"
+        )
     for name in set(protection.low) & set(protection.high):
         if protection.low[name] >= protection.high[name]:
-            raise place("protection", "high").error(f"protection.high.{name} must be above protection.low.{name}")
+            raise place("protection", "high").error(
+                f"protection.high.{name} must be above protection.low.{name}"
+            )
     needed = {"simulated": "plant", "devices": "devices", "replay": "recording"}[hal.backend]
     if not getattr(hal, needed):
         raise place("hal", "backend").error(f"hal.{needed} is missing: the back end '{hal.backend}' needs it")
     if settings.loop.pace == "device" and hal.backend != "devices":
-        raise place("loop", "pace").error(f"loop.pace: device needs hal.backend: devices, found '{hal.backend}'; set pace: clock")
+        raise place("loop", "pace").error(
+            f"loop.pace: device needs hal.backend: devices, found '{hal.backend}'; set pace: clock"
+        )
 
 
 __all__ = ["CHANNELS", "InputError", "Option", "Settings", "changed", "load_settings", "options"]

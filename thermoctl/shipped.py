@@ -1,4 +1,5 @@
 """Where the files lie that come with the program: beside the package in a checkout, under share/thermoctl where a wheel put them."""
+
 from __future__ import annotations
 
 import sys

@@ -5,19 +5,33 @@ dashboard and the reference page derive from this table.
 
 Rows replay: the signals `dt_s` to `status_bits` are everything the law was given, those from `state` on what it gave.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
 
-POINTS = ("coil", "bobbin", "inner_magnet", "outer_magnet", "inner_stator", "outer_stator", "stator_connector",
-          "bobbin_connector", "shaft_1", "shaft_2", "bracket_1", "bracket_2")
+POINTS = (
+    "coil",
+    "bobbin",
+    "inner_magnet",
+    "outer_magnet",
+    "inner_stator",
+    "outer_stator",
+    "stator_connector",
+    "bobbin_connector",
+    "shaft_1",
+    "shaft_2",
+    "bracket_1",
+    "bracket_2",
+)
 """The twelve temperature points, in the paper's order."""
 
 
 @dataclass(frozen=True)
 class Signal:
     """One column of the record: `unit` as pint reads it ('1' for a number), `low`..`high` what is plausible."""
+
     name: str
     unit: str
     meaning: str
@@ -26,7 +40,9 @@ class Signal:
 
 
 def _points(suffix: str, meaning: str) -> tuple[Signal, ...]:
-    return tuple(Signal(f"{p}{suffix}", "degC", f"{p.replace('_', ' ')}: {meaning}", -40.0, 200.0) for p in POINTS)
+    return tuple(
+        Signal(f"{p}{suffix}", "degC", f"{p.replace('_', ' ')}: {meaning}", -40.0, 200.0) for p in POINTS
+    )
 
 
 SIGNALS: tuple[Signal, ...] = (
@@ -43,7 +59,11 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("command_value", "1", "the command's value: the setpoint in um"),
     Signal("external_bits", "1", "fault bits raised outside the law", 0.0),
     Signal("position_raw_um", "um", "position encoder"),
-    Signal("output_reference_um", "um", "second encoder at the output, for proof only; the controller does not use it"),
+    Signal(
+        "output_reference_um",
+        "um",
+        "second encoder at the output, for proof only; the controller does not use it",
+    ),
     Signal("voltage_v", "V", "coil voltage"),
     Signal("current_a", "A", "coil current"),
     Signal("air_c", "degC", "chamber air", -40.0, 80.0),
@@ -55,12 +75,16 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("status_bits", "1", "two bits a channel: 0 OK, 1 stale, 2 error, 3 absent", 0.0),
     # What the law gave.
     Signal("state", "1", "0 OFF, 1 SAFE, 2 READY, 3 ARMED, 4 FAULT", 0.0, 4.0),
-    Signal("fault_bits", "1", "standing faults, and those that led to FAULT; bits as in control/faults.py", 0.0),
+    Signal(
+        "fault_bits", "1", "standing faults, and those that led to FAULT; bits as in control/faults.py", 0.0
+    ),
     Signal("setpoint_um", "um", "where the output shall be"),
     Signal("reference_um", "um", "the setpoint after its rate limiter"),
     Signal("position_um", "um", "position encoder after the moving average"),
     Signal("compensated_um", "um", "position plus compensation: what the controller holds at the reference"),
-    Signal("compensation_um", "um", "the thermal error that is compensated: bounded, slewed, frozen on a fault"),
+    Signal(
+        "compensation_um", "um", "the thermal error that is compensated: bounded, slewed, frozen on a fault"
+    ),
     Signal("expansion_um", "um", "the thermal error as the expansion model gives it"),
     Signal("control_v", "V", "output of the controller"),
     Signal("drive", "1", "what the amplifier was given, in its own unit"),

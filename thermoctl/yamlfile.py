@@ -2,6 +2,7 @@
 
 The one reader of YAML in the program (configuration, plants, effects, profiles, models). PyYAML's safe constructors only.
 """
+
 from __future__ import annotations
 
 import difflib
@@ -13,7 +14,7 @@ from typing import Any
 
 import yaml
 
-MAX_BYTES = 4_000_000      # a larger file is not one a person wrote
+MAX_BYTES = 4_000_000  # a larger file is not one a person wrote
 MAX_DEPTH = 60
 
 
@@ -28,17 +29,21 @@ class _Loader(yaml.SafeLoader):
 _Loader.yaml_implicit_resolvers = {}
 _NUMBER = r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
 for _tag, _regex, _first in (
-        ("tag:yaml.org,2002:bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
-        ("tag:yaml.org,2002:null", r"~|null|Null|NULL|", "~nN"),
-        ("tag:yaml.org,2002:int", r"[-+]?[0-9][0-9_]*", "-+0123456789"),
-        ("tag:yaml.org,2002:float", _NUMBER + r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+0123456789.")):
-    _Loader.add_implicit_resolver(_tag, re.compile(f"^(?:{_regex})$"), [*_first, *([""] if _tag.endswith("null") else [])])
+    ("tag:yaml.org,2002:bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("tag:yaml.org,2002:null", r"~|null|Null|NULL|", "~nN"),
+    ("tag:yaml.org,2002:int", r"[-+]?[0-9][0-9_]*", "-+0123456789"),
+    ("tag:yaml.org,2002:float", _NUMBER + r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+0123456789."),
+):
+    _Loader.add_implicit_resolver(
+        _tag, re.compile(f"^(?:{_regex})$"), [*_first, *([""] if _tag.endswith("null") else [])]
+    )
 
 
 @dataclass(frozen=True)
 class Node:
     """A YAML value with its place. `value` is a dict of str to Node, a list of Node, or a scalar
     (str, int, float, bool, None); `line` and `column` count from 1."""
+
     value: Any
     file: str
     line: int
@@ -59,7 +64,7 @@ class Node:
 
     def error(self, message: str) -> InputError:
         """An InputError that begins with the place; to be raised by the caller."""
-        return InputError(f"{self.place}: {message}".replace("\n", "\\n"))      # a name may hold anything
+        return InputError(f"{self.place}: {message}".replace("\n", "\\n"))  # a name may hold anything
 
 
 def suggest(name: str, allowed: Iterable[str]) -> str:
@@ -115,13 +120,21 @@ def _convert(node: yaml.Node, loader: _Loader, file: str, depth: int) -> Node:
             if not isinstance(key, yaml.ScalarNode):
                 raise InputError(f"{place}: a key must be a plain word")
             if key.value in out:
-                raise InputError(f"{file}:{key.start_mark.line + 1}:{key.start_mark.column + 1}: '{key.value}' stands "
-                                 f"twice (first at line {out[key.value].line}); keep one of them")
+                raise InputError(
+                    f"{file}:{key.start_mark.line + 1}:{key.start_mark.column + 1}: '{key.value}' stands "
+                    f"twice (first at line {out[key.value].line}); keep one of them"
+                )
             out[key.value] = _convert(value, loader, file, depth + 1)
         return Node(out, file, line, column)
     if isinstance(node, yaml.SequenceNode):
         return Node([_convert(v, loader, file, depth + 1) for v in node.value], file, line, column)
-    if node.tag.startswith("tag:yaml.org,2002:") and node.tag.rsplit(":", 1)[1] in ("str", "int", "float", "bool", "null"):
+    if node.tag.startswith("tag:yaml.org,2002:") and node.tag.rsplit(":", 1)[1] in (
+        "str",
+        "int",
+        "float",
+        "bool",
+        "null",
+    ):
         kind = node.tag.rsplit(":", 1)[1]
         try:
             if kind == "int":

@@ -4,6 +4,7 @@ The drive has its own object dictionary, SDO server (expedited), NMT slave, hear
 PDOs whose mapping the master writes, and the CiA-402 state machine. When the master's heartbeat (0x1016) is missing it
 stops by itself: error 0x8130, fault state, pre-operational.
 """
+
 from __future__ import annotations
 
 import math
@@ -14,30 +15,57 @@ NOT_READY, DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x00, 0x40
 BOOT, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 HEARTBEAT_LOST = 0x8130
 ABORT_NO_OBJECT, ABORT_NO_SUB, ABORT_READ_ONLY, ABORT_LENGTH, ABORT_COMMAND, ABORT_VALUE = (
-    0x06020000, 0x06090011, 0x06010002, 0x06070010, 0x05040001, 0x06090030)
+    0x06020000,
+    0x06090011,
+    0x06010002,
+    0x06070010,
+    0x05040001,
+    0x06090030,
+)
 Frame = tuple[int, bytes]
 
 
 @dataclass
 class Entry:
     """An object: struct letter, value, and whether the master may write it."""
+
     type: str
     value: int = 0
     writable: bool = False
 
 
 def _dictionary(node: int) -> dict[tuple[int, int], Entry]:
-    od = {(0x1000, 0): Entry("I", 0x00020192), (0x1001, 0): Entry("B"), (0x1016, 0): Entry("B", 1),
-          (0x1016, 1): Entry("I", 0, True), (0x1017, 0): Entry("H", 0, True), (0x1018, 0): Entry("B", 4),
-          (0x1018, 1): Entry("I", 0), (0x1018, 2): Entry("I", 0x74), (0x1018, 3): Entry("I", 1),
-          (0x1018, 4): Entry("I", 1),
-          (0x603F, 0): Entry("H"), (0x6040, 0): Entry("H", 0, True), (0x6041, 0): Entry("H", DISABLED),
-          (0x6060, 0): Entry("b", 0, True), (0x6061, 0): Entry("b", 0), (0x6071, 0): Entry("h", 0, True),
-          (0x6075, 0): Entry("I", 2000, True), (0x6077, 0): Entry("h"), (0x6078, 0): Entry("h"),
-          (0x6079, 0): Entry("I", 24000), (0x2071, 0): Entry("i", 0, True), (0x2078, 0): Entry("i")}
+    od = {
+        (0x1000, 0): Entry("I", 0x00020192),
+        (0x1001, 0): Entry("B"),
+        (0x1016, 0): Entry("B", 1),
+        (0x1016, 1): Entry("I", 0, True),
+        (0x1017, 0): Entry("H", 0, True),
+        (0x1018, 0): Entry("B", 4),
+        (0x1018, 1): Entry("I", 0),
+        (0x1018, 2): Entry("I", 0x74),
+        (0x1018, 3): Entry("I", 1),
+        (0x1018, 4): Entry("I", 1),
+        (0x603F, 0): Entry("H"),
+        (0x6040, 0): Entry("H", 0, True),
+        (0x6041, 0): Entry("H", DISABLED),
+        (0x6060, 0): Entry("b", 0, True),
+        (0x6061, 0): Entry("b", 0),
+        (0x6071, 0): Entry("h", 0, True),
+        (0x6075, 0): Entry("I", 2000, True),
+        (0x6077, 0): Entry("h"),
+        (0x6078, 0): Entry("h"),
+        (0x6079, 0): Entry("I", 24000),
+        (0x2071, 0): Entry("i", 0, True),
+        (0x2078, 0): Entry("i"),
+    }
     for communication, mapping, cob in ((0x1400, 0x1600, 0x200), (0x1800, 0x1A00, 0x180)):
-        od |= {(communication, 0): Entry("B", 2), (communication, 1): Entry("I", 0x8000_0000 | cob + node, True),
-               (communication, 2): Entry("B", 1, True), (mapping, 0): Entry("B", 0, True)}
+        od |= {
+            (communication, 0): Entry("B", 2),
+            (communication, 1): Entry("I", 0x8000_0000 | cob + node, True),
+            (communication, 2): Entry("B", 1, True),
+            (mapping, 0): Entry("B", 0, True),
+        }
         od |= {(mapping, i): Entry("I", 0, True) for i in range(1, 9)}
     return od
 
@@ -48,6 +76,7 @@ class Cia402Drive:
 
     `command_object` is the target that drives (0x2071, 0x6071); `alive` False: unpowered, mute;
     `heartbeat` False: its own heartbeat is off."""
+
     node: int
     command_object: int = 0x2071
     alive: bool = True
@@ -137,14 +166,14 @@ class Cia402Drive:
                 self.state = DISABLED
                 self.od[0x603F, 0].value = self.od[0x1001, 0].value = 0
                 self._emergency(0)
-        elif not word & 0x02:                               # disable voltage
+        elif not word & 0x02:  # disable voltage
             self.state = DISABLED
-        elif not word & 0x04:                               # quick stop
+        elif not word & 0x04:  # quick stop
             self.state = QUICK_STOP if self.state == ENABLED else DISABLED
-        elif word & 0x07 == 0x06:                           # shutdown
+        elif word & 0x07 == 0x06:  # shutdown
             if self.state in (DISABLED, READY, SWITCHED_ON, ENABLED):
                 self.state = READY
-        elif word & 0x0F == 0x07:                           # switch on / disable operation
+        elif word & 0x0F == 0x07:  # switch on / disable operation
             if self.state in (READY, ENABLED, SWITCHED_ON):
                 self.state = SWITCHED_ON
         elif word & 0x0F == 0x0F and self.state in (SWITCHED_ON, ENABLED):
@@ -161,7 +190,7 @@ class Cia402Drive:
         keys = self._mapped(0x1600)
         layout = struct.Struct("<" + "".join(self.od[k].type for k in keys))
         if layout.size > len(data):
-            self._emergency(0x8210)                         # PDO not processed: length
+            self._emergency(0x8210)  # PDO not processed: length
             return
         for key, value in zip(keys, layout.unpack_from(data), strict=True):
             self.od[key].value = value
@@ -179,7 +208,7 @@ class Cia402Drive:
     def _status_word(self) -> int:
         quick = 0x20 if self.state in (READY, SWITCHED_ON, ENABLED) else 0
         voltage = 0x10 if self.od[0x6079, 0].value > 0 else 0
-        return self.state | quick | voltage | 0x200         # remote
+        return self.state | quick | voltage | 0x200  # remote
 
     def _sdo(self, data: bytes) -> bytes:
         command, index, sub = struct.unpack_from("<BHB", data)
@@ -187,15 +216,17 @@ class Cia402Drive:
 
         def abort(code: int) -> bytes:
             return struct.pack("<BHBI", 0x80, index, sub, code)
+
         if entry is None:
             return abort(ABORT_NO_SUB if (index, 0) in self.od else ABORT_NO_OBJECT)
         size = struct.calcsize(entry.type)
-        if command == 0x40:                                 # upload
+        if command == 0x40:  # upload
             if index == 0x6041:
                 entry.value = self._status_word()
             return struct.pack("<BHB", 0x43 | (4 - size) << 2, index, sub) + struct.pack(
-                "<" + entry.type, entry.value).ljust(4, b"\0")
-        if command & 0xE0 == 0x20 and command & 0x02:       # expedited download
+                "<" + entry.type, entry.value
+            ).ljust(4, b"\0")
+        if command & 0xE0 == 0x20 and command & 0x02:  # expedited download
             given = 4 - (command >> 2 & 3) if command & 1 else size
             if not entry.writable:
                 return abort(ABORT_READ_ONLY)
@@ -241,7 +272,11 @@ class SlcanAdapter:
             elif c == b"C" or c == b"":
                 self.open = self.open and c == b""
                 answer += b"\r"
-            elif kind == b"S" and c[1:] in (b"0", b"1", b"2", b"3", b"4", b"5", b"6", b"7", b"8") and not self.open:
+            elif (
+                kind == b"S"
+                and c[1:] in (b"0", b"1", b"2", b"3", b"4", b"5", b"6", b"7", b"8")
+                and not self.open
+            ):
                 self.bitrate = int(c[1:])
                 answer += b"\r"
             elif c == b"V":
@@ -256,9 +291,9 @@ class SlcanAdapter:
     def _frame(c: bytes) -> Frame | None:
         digits = 3 if c[:1] == b"t" else 8
         try:
-            size = int(c[1 + digits:2 + digits])
-            data = bytes.fromhex(c[2 + digits:].decode("ascii"))
-            return (int(c[1:1 + digits], 16), data) if len(data) == size <= 8 else None
+            size = int(c[1 + digits : 2 + digits])
+            data = bytes.fromhex(c[2 + digits :].decode("ascii"))
+            return (int(c[1 : 1 + digits], 16), data) if len(data) == size <= 8 else None
         except ValueError:
             return None
 

@@ -1,4 +1,5 @@
 """A Modbus device as bytes on a wire: TCP and RTU framing, functions 3 and 4, exceptions. Pure: bytes in, bytes out."""
+
 from __future__ import annotations
 
 import struct
@@ -27,6 +28,7 @@ def encode(value: float, register: Register) -> list[int]:
 class ModbusUnit:
     """One unit: `registers[kind]` maps address to word. What can be wrong with it: `exception` (code that answers every
     request), `silent`, `half` (the answer stops in the middle), `corrupt` (RTU: a wrong CRC)."""
+
     unit_id: int
     registers: dict[str, dict[int, int]] = field(default_factory=lambda: {"input": {}, "holding": {}})
     exception: int = 0
@@ -64,17 +66,17 @@ class ModbusUnit:
         while len(buffer) >= 8:
             transaction, protocol, length, unit = struct.unpack_from(">HHHB", buffer)
             if protocol != 0 or not 2 <= length <= 254:
-                buffer.clear()                              # not Modbus
+                buffer.clear()  # not Modbus
                 break
             if len(buffer) < 6 + length:
                 break
-            pdu = bytes(buffer[7:6 + length])
-            del buffer[:6 + length]
+            pdu = bytes(buffer[7 : 6 + length])
+            del buffer[: 6 + length]
             if self.silent or unit != self.unit_id:
                 continue
             answer = self.answer(pdu)
             frame = struct.pack(">HHHB", transaction, 0, len(answer) + 1, unit) + answer
-            out += frame[:len(frame) // 2] if self.half else frame
+            out += frame[: len(frame) // 2] if self.half else frame
         return bytes(out)
 
     def feed_rtu(self, buffer: bytearray) -> bytes:
@@ -91,5 +93,5 @@ class ModbusUnit:
             body = bytes((unit,)) + self.answer(pdu)
             crc = crc16("modbus", body) ^ (0x5A5A if self.corrupt else 0)
             frame = body + crc.to_bytes(2, "little")
-            out += frame[:len(frame) // 2] if self.half else frame
+            out += frame[: len(frame) // 2] if self.half else frame
         return bytes(out)

@@ -8,6 +8,7 @@ it, Modbus TCP servers and RTU units. One plant feeds them all; the drive's curr
                     `t` on the machine's monotonic clock
     control.sock    a line in, a line out: pull cables and break things (`help` lists what each device knows)
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -33,10 +34,10 @@ from hal.virtual.modbus import ModbusUnit
 from hal.wire import Framer, encode_slcan
 from thermoctl.yamlfile import InputError, suggest
 
-MAX_STEPS = 50              # periods caught up at once; a longer stop of this program shifts the plant's time
+MAX_STEPS = 50  # periods caught up at once; a longer stop of this program shifts the plant's time
 REFERENCE_HZ = 100
 SUPPLY_V = 24.0
-PRIORITY = 70               # below the daemon's loop
+PRIORITY = 70  # below the daemon's loop
 _REFERENCE = ("output_reference_um", "position_um", "coil_c", "air_c")
 
 
@@ -52,7 +53,7 @@ class Pty:
         if self.master >= 0:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.master, self._slave = os.openpty()     # the slave stays open: the master lives while nobody listens
+        self.master, self._slave = os.openpty()  # the slave stays open: the master lives while nobody listens
         tty.setraw(self._slave)
         os.set_blocking(self.master, False)
         if self.path.is_symlink():
@@ -110,10 +111,12 @@ class VirtualDevice:
 
     def flag(self, owner: Any, attribute: str) -> Callable[[str], None]:
         """A verb `<attribute> on|off`."""
+
         def switch(argument: str) -> None:
             if argument not in ("on", "off"):
                 raise InputError(f"{attribute}: on or off was expected, found '{argument}'")
             setattr(owner, attribute, argument == "on")
+
         return switch
 
     def raw(self, bound: Bound, value: float) -> float:
@@ -206,7 +209,7 @@ class TextMeter(VirtualDevice):
         for _ in self._lines.feed(self.pty.receive()):
             if not self.mute:
                 line = self._line()
-                self.pty.send(line[:len(line) // 2] if self.half else line)
+                self.pty.send(line[: len(line) // 2] if self.half else line)
 
     def _line(self) -> bytes:
         values = {b.channel.source: self.reading(b) or 0.0 for b in self.binding.bounds}
@@ -244,7 +247,11 @@ class DriveOnSlcan(SlcanDevice):
     def __init__(self, binding: Binding, rig: PlantRig) -> None:
         super().__init__(binding, rig)
         self.drive = Cia402Drive(binding.address, binding.profile.bus_spec.command)
-        self.verbs = {"heartbeat": self.flag(self.drive, "heartbeat"), "power": self._power, "fault": self._fault}
+        self.verbs = {
+            "heartbeat": self.flag(self.drive, "heartbeat"),
+            "power": self._power,
+            "fault": self._fault,
+        }
 
     def _power(self, argument: str) -> None:
         if argument not in ("on", "off"):
@@ -307,8 +314,13 @@ class DbcSender(SlcanDevice):
         for name in {b.channel.source.message for b in self.binding.bounds}:
             message = database.get_message_by_name(name)
             values = dict.fromkeys((s.name for s in message.signals), 0.0)
-            values.update({b.channel.source.signal: self.reading(b) or 0.0 for b in self.binding.bounds
-                           if b.channel.source.message == name})
+            values.update(
+                {
+                    b.channel.source.signal: self.reading(b) or 0.0
+                    for b in self.binding.bounds
+                    if b.channel.source.message == name
+                }
+            )
             self.pty.send(encode_slcan(message.frame_id, bytes(message.encode(values, strict=False))))
 
 
@@ -327,7 +339,9 @@ class ModbusOnWire(VirtualDevice):
         self._open: set[str] = set()
         self._sums = [0.0] * len(binding.bounds)
         self._summed = 0
-        self._every = max(1, round(1 / (max(b.channel.rate_hz for b in binding.bounds) * rig.stepper.period_s)))
+        self._every = max(
+            1, round(1 / (max(b.channel.rate_hz for b in binding.bounds) * rig.stepper.period_s))
+        )
         self.verbs = {v: self.flag(self.unit, v) for v in ("silent", "half", "corrupt")}
         self.verbs |= {"exception": self._exception, "open": self._open_sensor, "close": self._close_sensor}
         self._refresh()
@@ -356,8 +370,9 @@ class ModbusOnWire(VirtualDevice):
         if self._address is None:
             self.pty.plug()
         elif self._server is None:
-            self._server = socket.create_server(self._address, family=socket.AF_INET6 if ":" in self._address[0]
-                                                else socket.AF_INET)
+            self._server = socket.create_server(
+                self._address, family=socket.AF_INET6 if ":" in self._address[0] else socket.AF_INET
+            )
             self._server.setblocking(False)
 
     def unplug(self) -> None:
@@ -426,15 +441,21 @@ class ModbusOnWire(VirtualDevice):
         self._summed = 0
 
 
-_KINDS: dict[str, type[VirtualDevice]] = {"serial-binary": EncoderStream, "serial-lines": TextMeter,
-                                          "can-cia402": DriveOnSlcan, "can-dbc": DbcSender, "modbus": ModbusOnWire}
+_KINDS: dict[str, type[VirtualDevice]] = {
+    "serial-binary": EncoderStream,
+    "serial-lines": TextMeter,
+    "can-cia402": DriveOnSlcan,
+    "can-dbc": DbcSender,
+    "modbus": ModbusOnWire,
+}
 
 
 def virtual_device(binding: Binding, rig: PlantRig) -> VirtualDevice:
     """The device that plays `binding`. Raises InputError for a CAN port that is not slcan."""
     if binding.profile.bus.startswith("can") and not binding.port.startswith("slcan:"):
-        raise InputError(f"{binding.place}: the virtual rig plays CAN devices on slcan ports only, "
-                         f"found '{binding.port}'")
+        raise InputError(
+            f"{binding.place}: the virtual rig plays CAN devices on slcan ports only, found '{binding.port}'"
+        )
     return _KINDS[binding.profile.bus](binding, rig)
 
 
@@ -452,7 +473,7 @@ class VirtualRig:
         self.period_s = settings.loop.period_s
         self.stopping = False
         self.tick = self.slips = 0
-        self.latest_s = 0.0         # the longest that a tick came late
+        self.latest_s = 0.0  # the longest that a tick came late
 
     def run(self, announce: Callable[[str], None]) -> None:
         """Plug everything in and live in real time until `stopping`; everything is unplugged afterwards."""
@@ -462,8 +483,10 @@ class VirtualRig:
             for device in self.devices.values():
                 device.plug()
             with open(self.run_dir / "reference.csv", "w", buffering=1) as reference:
-                reference.write("# the virtual rig's own truth; t is CLOCK_MONOTONIC\n"
-                                f"t,{','.join(_REFERENCE)},drive,enabled\n")
+                reference.write(
+                    "# the virtual rig's own truth; t is CLOCK_MONOTONIC\n"
+                    f"t,{','.join(_REFERENCE)},drive,enabled\n"
+                )
                 for device in self.devices.values():
                     announce(f"{device.name}: {device.binding.port}")
                 announce(f"control: {self.run_dir / 'control.sock'}; reference: {reference.name}; ready")
@@ -526,7 +549,9 @@ class VirtualRig:
         with client:
             client.settimeout(0.02)
             try:
-                client.sendall((self.obey(client.recv(400).decode("utf-8", "replace").strip()) + "\n").encode())
+                client.sendall(
+                    (self.obey(client.recv(400).decode("utf-8", "replace").strip()) + "\n").encode()
+                )
             except OSError:
                 return
 
@@ -562,7 +587,7 @@ def _listen(path: Path) -> socket.socket:
         server.close()
         raise InputError(f"{path}: another virtual rig is running; stop it first")
     if path.exists():
-        path.unlink()                  # left over from one that was killed
+        path.unlink()  # left over from one that was killed
     server.bind(str(path))
     server.listen(4)
     server.setblocking(False)
@@ -588,20 +613,25 @@ def main(settings: Any, command: str = "") -> int:
         try:
             answer = tell(path, command)
         except FileNotFoundError:
-            raise InputError(f"{path}: no virtual rig is running; start `thermoctl virtual-rig` first") from None
+            raise InputError(
+                f"{path}: no virtual rig is running; start `thermoctl virtual-rig` first"
+            ) from None
         print(answer)
         return 1 if answer.startswith("error") else 0
     rig = VirtualRig(settings)
 
     def stop(*_: Any) -> None:
         rig.stopping = True
+
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError:
-        print("no real-time priority (CAP_SYS_NICE): frames may come late when the machine is busy", flush=True)
-    ctypes.CDLL(None).mlockall(3)               # current and future pages; may be refused
+        print(
+            "no real-time priority (CAP_SYS_NICE): frames may come late when the machine is busy", flush=True
+        )
+    ctypes.CDLL(None).mlockall(3)  # current and future pages; may be refused
     gc.freeze()
     rig.run(lambda line: print(line, flush=True))
     return 0

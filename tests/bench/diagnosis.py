@@ -19,6 +19,7 @@ All but sindy and latent get their candidates as a short list of the SHORT best 
 starting values: fitting every candidate in full, as they would without it, takes them hours. Every method's findings
 are refitted and judged on held-out data by the same code, so `gain` compares what was found and nothing else.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -51,6 +52,7 @@ SHORT, MOST, LEVEL = 8, 3, 0.05
 
 # ------------------------------------------------------------------------------------------------------- common parts
 
+
 def prepared(job: prove.Job) -> tuple[Case, Explanation, Mapping[str, Any]]:
     """The case, its plant refitted, the catalogue."""
     case = Case(load(job.plant), [read_table(r) for r in job.recordings])
@@ -63,22 +65,41 @@ def prepared(job: prove.Job) -> tuple[Case, Explanation, Mapping[str, Any]]:
 def rms(case: Case, errors: Sequence[np.ndarray]) -> dict[str, float]:
     """Root mean square per output over all folds."""
     stacked = np.concatenate(list(errors))
-    return {o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2))) for j, o in enumerate(case.plant.outputs)
-            if np.isfinite(stacked[:, j]).any()}
+    return {
+        o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2)))
+        for j, o in enumerate(case.plant.outputs)
+        if np.isfinite(stacked[:, j]).any()
+    }
 
 
 def told(case: Case, base: Explanation, final: Explanation, suspect: str | None = None) -> dict[str, Any]:
     """A peer's result in the form of diagnosis.json. Peers give no probabilities: each finding counts as certain."""
     drives = [final.fit.model.drive(t) for t in case.tables]
     estimates = {e.name: e for e in report(final.fit, drives)} if final.effects else {}
-    findings = [{"effect": c.effect.name, "where": c.place.where, "probability": 1.0, "when": None,
-                 "parameters": {p: {"value": estimates[n].value, "sd": estimates[n].sd} for p, n in own.items() if n in estimates}}
-                for c, own in zip(final.effects, final.own, strict=True)]
+    findings = [
+        {
+            "effect": c.effect.name,
+            "where": c.place.where,
+            "probability": 1.0,
+            "when": None,
+            "parameters": {
+                p: {"value": estimates[n].value, "sd": estimates[n].sd}
+                for p, n in own.items()
+                if n in estimates
+            },
+        }
+        for c, own in zip(final.effects, final.own, strict=True)
+    ]
     verdict = "explained" if findings else "unexplained" if suspect else "consistent"
     before = rms(case, unseen_errors(case, base.plant))
     after = rms(case, unseen_errors(case, final.plant)) if findings else before
-    return {"verdict": verdict, "findings": findings, "alternatives": [], "suspect": suspect,
-            "fit": {"held_out_refit_only": before, "held_out_after": after}}
+    return {
+        "verdict": verdict,
+        "findings": findings,
+        "alternatives": [],
+        "suspect": suspect,
+        "fit": {"held_out_refit_only": before, "held_out_after": after},
+    }
 
 
 def white(e: Explanation) -> tuple[float, int]:
@@ -88,12 +109,14 @@ def white(e: Explanation) -> tuple[float, int]:
     for column in stacked.T:
         known = column[np.isfinite(column)]
         if len(known):
-            total += len(known) * float(np.log(np.mean(known ** 2)))
+            total += len(known) * float(np.log(np.mean(known**2)))
             n += len(known)
     return total, n
 
 
-def forward(case: Case, start: Explanation, entries: Mapping[str, Any], price: Callable[[int, int], float]) -> Explanation:
+def forward(
+    case: Case, start: Explanation, entries: Mapping[str, Any], price: Callable[[int, int], float]
+) -> Explanation:
     """Add the candidate whose likelihood gains most beyond its price (parameters, samples) until none does."""
     current = start
     for _ in range(MOST):
@@ -101,7 +124,10 @@ def forward(case: Case, start: Explanation, entries: Mapping[str, Any], price: C
         best, margin = None, 0.0
         now, samples = white(current)
         for rival in search.compete(case, seen, search.finalists(seen.directions, SHORT)[:SHORT]):
-            added = sum(len(case.tables) if rival.plant.parameters[n].per_recording else 1 for n in rival.own[-1].values())
+            added = sum(
+                len(case.tables) if rival.plant.parameters[n].per_recording else 1
+                for n in rival.own[-1].values()
+            )
             gain = now - white(rival)[0] - price(added, samples)
             if gain > margin:
                 best, margin = rival, gain
@@ -112,6 +138,7 @@ def forward(case: Case, start: Explanation, entries: Mapping[str, Any], price: C
 
 
 # ----------------------------------------------------------------------------------------------------------- the methods
+
 
 def thermoctl(job: prove.Job) -> dict[str, Any]:
     """The product."""
@@ -128,7 +155,10 @@ def ctsm(job: prove.Job) -> dict[str, Any]:
         if held is None:
             break
         # held readings: what is compared at a sample has seen the readings before it only
-        inputs = {k: dataclasses.replace(i, linear=i.linear and not k.startswith(observer.SEEN)) for k, i in held.inputs.items()}
+        inputs = {
+            k: dataclasses.replace(i, linear=i.linear and not k.startswith(observer.SEEN))
+            for k, i in held.inputs.items()
+        }
         try:
             found = case.explain(dataclasses.replace(held, inputs=inputs), [], [])
         except (SimulationError, InputError, np.linalg.LinAlgError):
@@ -137,7 +167,9 @@ def ctsm(job: prove.Job) -> dict[str, Any]:
             best, likelihood = found, white(found)[0]
     final = forward(case, best, entries, lambda added, n: float(chi2.isf(LEVEL, added)))
     if best is not base:
-        final = case.explain(observer.without(final.plant), final.effects, final.own) if final.effects else base
+        final = (
+            case.explain(observer.without(final.plant), final.effects, final.own) if final.effects else base
+        )
     return told(case, base, final)
 
 
@@ -153,8 +185,12 @@ def latent(job: prove.Job) -> dict[str, Any]:
     drives = [base.fit.model.drive(t) for t in case.tables]
     for r, d in enumerate(drives):
         base.fit.model.prepare(d, base.fit.values[r])
-    model = base.fit.model      # where a slope is another state alone (dx/dt = v) no physics can be missing
-    kinematic = {x for x, slope in zip(model.states, model.code.slopes, strict=True) if slope in [ex.name(v) for v in model.states]}
+    model = base.fit.model  # where a slope is another state alone (dx/dt = v) no physics can be missing
+    kinematic = {
+        x
+        for x, slope in zip(model.states, model.code.slopes, strict=True)
+        if slope in [ex.name(v) for v in model.states]
+    }
     found = [s for s in locate.suspects(screen.Metric(base.fit, drives)) if s.name not in kinematic]
     alarm = bool(found) and found[0].log_p + np.log10(len(found)) < np.log10(LEVEL)
     return told(case, base, base, found[0].name if alarm else None)
@@ -167,7 +203,7 @@ def sindy(job: prove.Job) -> dict[str, Any]:
     drives = [model.drive(t) for t in case.tables]
     rig = Rig(base.plant, drives, [t.columns for t in case.tables])
     metric = screen.Metric(base.fit, drives)
-    known: list[dict[str, np.ndarray]] = []         # per recording: the derivatives of the states that are measured
+    known: list[dict[str, np.ndarray]] = []  # per recording: the derivatives of the states that are measured
     at = []
     for r in range(len(drives)):
         trajectory = screen.Trajectory(metric, rig, r)
@@ -181,8 +217,10 @@ def sindy(job: prove.Job) -> dict[str, Any]:
         if not all(state in rates for rates in known):
             continue
         slope = model.code.slopes[i]
-        target = [rates[state] - np.broadcast_to(np.asarray(ex.evaluate(slope, a.values), float), a.drive.t.shape)
-                  for rates, a in zip(known, at, strict=True)]
+        target = [
+            rates[state] - np.broadcast_to(np.asarray(ex.evaluate(slope, a.values), float), a.drive.t.shape)
+            for rates, a in zip(known, at, strict=True)
+        ]
         usable = [c for c in columns if all(i in f and np.isfinite(f[i]).all() for f in c.forces)]
         for column, coefficient, share in _sparse(target, [[f[i] for f in c.forces] for c in usable], usable):
             c, _, (shape, dim), _ = column.item
@@ -192,8 +230,13 @@ def sindy(job: prove.Job) -> dict[str, Any]:
     current = base
     for _, c, kept in sorted(chosen.values(), key=lambda item: -item[0])[:MOST]:
         start = {k[1:]: v for k, v in kept.items() if k.startswith("=")}
-        direction = screen.Direction(dataclasses.replace(c, rig=Rig(current.plant, drives, rig.columns)),
-                                     {k: v for k, v in kept.items() if k and not k.startswith("=")}, 0.0, 1, start)
+        direction = screen.Direction(
+            dataclasses.replace(c, rig=Rig(current.plant, drives, rig.columns)),
+            {k: v for k, v in kept.items() if k and not k.startswith("=")},
+            0.0,
+            1,
+            start,
+        )
         try:
             plant, own = search.extend(current.plant, direction, drives)
             current = case.explain(plant, [*current.effects, c], [*current.own, own])
@@ -215,6 +258,7 @@ def _measured(plant: Any, model: Any, at: screen.Trajectory) -> dict[str, np.nda
     def take(state: str, z: np.ndarray) -> None:
         rates[state] = np.asarray(derive._differentiate(z[:, None], at.drive.t))[:, 0]
         at.values[state] = np.asarray(derive.smoothed_x_)[:, 0]
+
     for j, o in enumerate(plant.outputs.values()):
         used = ex.names(o.value)
         (state,) = used if len(used) == 1 else ("",)
@@ -225,14 +269,21 @@ def _measured(plant: Any, model: Any, at: screen.Trajectory) -> dict[str, np.nda
         gain = float(ex.evaluate(o.value, {state: 1.0})) - offset
         good = np.isfinite(y)
         take(state, (np.interp(at.drive.t, at.drive.t[good], y[good]) - offset) / gain)
-    for i, slope in enumerate(model.code.slopes):       # dx/dt = v: the position's derivative measures the speed
+    for i, slope in enumerate(model.code.slopes):  # dx/dt = v: the position's derivative measures the speed
         used = ex.names(slope)
-        if model.states[i] in rates and len(used) == 1 and (v := next(iter(used))) in model.states and v not in rates:
+        if (
+            model.states[i] in rates
+            and len(used) == 1
+            and (v := next(iter(used))) in model.states
+            and v not in rates
+        ):
             take(v, rates[model.states[i]])
     return rates
 
 
-def _sparse(target: list[np.ndarray], features: list[list[np.ndarray]], usable: list) -> list[tuple[Any, float, float]]:
+def _sparse(
+    target: list[np.ndarray], features: list[list[np.ndarray]], usable: list
+) -> list[tuple[Any, float, float]]:
     """(column, coefficient, share of the target's energy) that STLSQ keeps; the threshold whose error on the recording that was
     not fitted is least wins, and none where the error falls by less than a hundredth."""
     from pysindy import STLSQ
@@ -240,7 +291,7 @@ def _sparse(target: list[np.ndarray], features: list[list[np.ndarray]], usable: 
     if not features:
         return []
     y = np.concatenate(target)
-    best: dict[tuple[str, str], tuple[float, int]] = {}     # of each candidate the shape that correlates best
+    best: dict[tuple[str, str], tuple[float, int]] = {}  # of each candidate the shape that correlates best
     for k, column in enumerate(features):
         x = np.concatenate(column)
         size = float(np.linalg.norm(x))
@@ -254,13 +305,17 @@ def _sparse(target: list[np.ndarray], features: list[list[np.ndarray]], usable: 
     theta = [np.stack([features[k][r] for k in take], axis=1) for r in range(len(target))]
     scale = np.linalg.norm(np.concatenate(theta), axis=0) / np.sqrt(len(y))
     theta = [x / scale for x in theta]
-    folds = [(theta[0], target[0], theta[1], target[1]), (theta[1], target[1], theta[0], target[0])] if len(target) > 1 else \
-        [(theta[0][::2], target[0][::2], theta[0][1::2], target[0][1::2])]
+    folds = (
+        [(theta[0], target[0], theta[1], target[1]), (theta[1], target[1], theta[0], target[0])]
+        if len(target) > 1
+        else [(theta[0][::2], target[0][::2], theta[0][1::2], target[0][1::2])]
+    )
     spread = float(np.std(y))
 
     def fitted(x: np.ndarray, z: np.ndarray, threshold: float) -> np.ndarray:
         return np.asarray(STLSQ(threshold=threshold, alpha=1e-3, unbias=True).fit(x, z[:, None]).coef_)[0]
-    least = sum(float(np.sum(z ** 2)) for *_, z in folds)
+
+    least = sum(float(np.sum(z**2)) for *_, z in folds)
     chosen, limit = None, 0.99 * least
     for threshold in spread * np.geomspace(0.03, 1.0, 12):
         error = sum(float(np.sum((z1 - x1 @ fitted(x0, z0, threshold)) ** 2)) for x0, z0, x1, z1 in folds)
@@ -269,15 +324,24 @@ def _sparse(target: list[np.ndarray], features: list[list[np.ndarray]], usable: 
     if chosen is None:
         return []
     coefficients = fitted(np.concatenate(theta), y, chosen)
-    return [(usable[k], float(w / s), float(w * w) / spread ** 2)
-            for k, w, s in zip(take, coefficients, scale, strict=True) if w]
+    return [
+        (usable[k], float(w / s), float(w * w) / spread**2)
+        for k, w, s in zip(take, coefficients, scale, strict=True)
+        if w
+    ]
 
 
-METHODS: dict[str, Callable[[prove.Job], dict[str, Any]]] = {"thermoctl": thermoctl, "ctsm": ctsm, "sindy": sindy,
-                                                             "latent": latent, "bic": bic}
+METHODS: dict[str, Callable[[prove.Job], dict[str, Any]]] = {
+    "thermoctl": thermoctl,
+    "ctsm": ctsm,
+    "sindy": sindy,
+    "latent": latent,
+    "bic": bic,
+}
 
 
 # ---------------------------------------------------------------------------------------------------------- the bench
+
 
 def placed(job: prove.Job, answer: Mapping[str, Any], row: scoring.Row, suspect: str | None) -> bool:
     """Whether a true place was pointed at: by a finding of any name, or by the suspected node or output itself."""
@@ -295,8 +359,11 @@ def placed(job: prove.Job, answer: Mapping[str, Any], row: scoring.Row, suspect:
 
 def noise_of(job: prove.Job) -> dict[str, float]:
     """What the truth would leave, for answers that do not tell: the sensors' noise as the plant file has it."""
-    return {o.name: float(np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12))) for o in load(job.plant).outputs.values()
-            if o.noise}
+    return {
+        o.name: float(np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12)))
+        for o in load(job.plant).outputs.values()
+        if o.noise
+    }
 
 
 def one(method: str, job: prove.Job, out: Path) -> dict[str, Any]:
@@ -309,14 +376,23 @@ def one(method: str, job: prove.Job, out: Path) -> dict[str, Any]:
         result, error = METHODS[method](job), None
     except (InputError, SimulationError, np.linalg.LinAlgError, ValueError) as e:
         result, error = None, f"{type(e).__name__}: {e}"
-    content = {"fingerprint": job.fingerprint(), "seconds": time.monotonic() - begun, "cpu_s": time.process_time() - cpu,
-               "result": result, "error": error}
+    content = {
+        "fingerprint": job.fingerprint(),
+        "seconds": time.monotonic() - begun,
+        "cpu_s": time.process_time() - cpu,
+        "result": result,
+        "error": error,
+    }
     kept.parent.mkdir(parents=True, exist_ok=True)
     kept.write_text(json.dumps(content) + "\n")
     return content
 
 
-def figures(jobs: Sequence[prove.Job], answers: Mapping[str, Mapping[str, Any]], results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def figures(
+    jobs: Sequence[prove.Job],
+    answers: Mapping[str, Mapping[str, Any]],
+    results: Mapping[str, Mapping[str, Any]],
+) -> dict[str, Any]:
     """One method's figures over all cases; each share as [k, n]."""
     rows, spots = [], []
     for job in jobs:
@@ -328,16 +404,24 @@ def figures(jobs: Sequence[prove.Job], answers: Mapping[str, Mapping[str, Any]],
     null = [r for r in rows if r.kind == "none"]
     there = [r for r in rows if r.kind not in ("none", "unknown")]
     unknown = [r for r in rows if r.kind == "unknown"]
-    gains = [min(max(r.gain, -1.0), 1.2) if r.gain is not None else 0.0 for r in there
-             if r.gain is not None or not (results[r.case]["result"] or {}).get("fit", {}).get("held_out_after")]
-    return {"cases": len(rows), "detected": [sum(r.detected for r in there), len(there)],
-            "right_name": [sum(r.alike for r in there), len(there)], "exact_name": [sum(r.exact for r in there), len(there)],
-            "right_place": [sum(spots), len(spots)], "false_alarms": [sum(r.detected for r in null), len(null)],
-            "unknown_misnamed": [sum(r.verdict == "explained" for r in unknown), len(unknown)],
-            "gain_median": float(np.median(gains)) if gains else None,
-            "cpu_s_median": float(np.median([x["cpu_s"] for x in results.values()])),
-            "cpu_s_longest": max(x["cpu_s"] for x in results.values()),
-            "failed": sum(x["error"] is not None for x in results.values())}
+    gains = [
+        min(max(r.gain, -1.0), 1.2) if r.gain is not None else 0.0
+        for r in there
+        if r.gain is not None or not (results[r.case]["result"] or {}).get("fit", {}).get("held_out_after")
+    ]
+    return {
+        "cases": len(rows),
+        "detected": [sum(r.detected for r in there), len(there)],
+        "right_name": [sum(r.alike for r in there), len(there)],
+        "exact_name": [sum(r.exact for r in there), len(there)],
+        "right_place": [sum(spots), len(spots)],
+        "false_alarms": [sum(r.detected for r in null), len(null)],
+        "unknown_misnamed": [sum(r.verdict == "explained" for r in unknown), len(unknown)],
+        "gain_median": float(np.median(gains)) if gains else None,
+        "cpu_s_median": float(np.median([x["cpu_s"] for x in results.values()])),
+        "cpu_s_longest": max(x["cpu_s"] for x in results.values()),
+        "failed": sum(x["error"] is not None for x in results.values()),
+    }
 
 
 def table(found: Mapping[str, Mapping[str, Any]]) -> Any:
@@ -345,16 +429,43 @@ def table(found: Mapping[str, Mapping[str, Any]]) -> Any:
     from rich.table import Table
 
     t = Table(title=f"{next(iter(found.values()))['cases']} cases")
-    for title in ("method", "detected", "right name*", "exact name", "right place", "false alarms", "unknown named",
-                  "gain** (median)", "CPU s (median)", "longest", "failed"):
+    for title in (
+        "method",
+        "detected",
+        "right name*",
+        "exact name",
+        "right place",
+        "false alarms",
+        "unknown named",
+        "gain** (median)",
+        "CPU s (median)",
+        "longest",
+        "failed",
+    ):
         t.add_column(title, justify="left" if title == "method" else "right")
     for name, f in found.items():
-        t.add_row(name, *(f"{f[k][0]}/{f[k][1]}" for k in ("detected", "right_name", "exact_name", "right_place", "false_alarms",
-                                                           "unknown_misnamed")),
-                  "–" if f["gain_median"] is None else f"{f['gain_median']:.2f}", f"{f['cpu_s_median']:.1f}",
-                  f"{f['cpu_s_longest']:.1f}", str(f["failed"]))
-    t.caption = ("* or a name that the data cannot tell from it; an ambiguous verdict counts by its first finding. ** share of the held-out "
-                 "gain that the truth itself would bring, over cases with something missing; nothing found counts 0")
+        t.add_row(
+            name,
+            *(
+                f"{f[k][0]}/{f[k][1]}"
+                for k in (
+                    "detected",
+                    "right_name",
+                    "exact_name",
+                    "right_place",
+                    "false_alarms",
+                    "unknown_misnamed",
+                )
+            ),
+            "–" if f["gain_median"] is None else f"{f['gain_median']:.2f}",
+            f"{f['cpu_s_median']:.1f}",
+            f"{f['cpu_s_longest']:.1f}",
+            str(f["failed"]),
+        )
+    t.caption = (
+        "* or a name that the data cannot tell from it; an ambiguous verdict counts by its first finding. ** share of the held-out "
+        "gain that the truth itself would bring, over cases with something missing; nothing found counts 0"
+    )
     return t
 
 
@@ -365,7 +476,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("cases", nargs="*", type=Path, help="folders of cases; none: a few are generated")
     p.add_argument("--answers", type=Path, help="folder of answers (default: answer.yaml inside each case)")
-    p.add_argument("--number", type=int, help="only the first N cases of each folder (generated: how many, default 10)")
+    p.add_argument(
+        "--number", type=int, help="only the first N cases of each folder (generated: how many, default 10)"
+    )
     p.add_argument("--methods", default=",".join(METHODS))
     p.add_argument("--seed", type=int, default=31, help="of generated cases")
     p.add_argument("--families", default="heater,stage,drive,flexure,tanks", help="of generated cases")
@@ -380,8 +493,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         from tests.concealed import generate
 
         made = a.out / f"cases-{a.seed}"
-        generate.main(["--out", str(made), "--number", str(a.number or 10), "--seed", str(a.seed), "--smoke", "--answers", "inside",
-                       "--families", a.families])
+        generate.main(
+            [
+                "--out",
+                str(made),
+                "--number",
+                str(a.number or 10),
+                "--seed",
+                str(a.seed),
+                "--smoke",
+                "--answers",
+                "inside",
+                "--families",
+                a.families,
+            ]
+        )
         folders = [made]
     jobs, answers = [], {}
     for folder in folders:
@@ -394,11 +520,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         results = {}
         for count, job in enumerate(jobs, 1):
             results[job.name] = x = one(method, job, a.out)
-            said = x["error"] or ", ".join(f"{f['effect']} at {f['where']}" for f in x["result"]["findings"]) or \
-                x["result"].get("suspect") or "nothing"
+            said = (
+                x["error"]
+                or ", ".join(f"{f['effect']} at {f['where']}" for f in x["result"]["findings"])
+                or x["result"].get("suspect")
+                or "nothing"
+            )
             verdict = (x["result"] or {}).get("verdict", "failed")
-            print(f"{method} [{count}/{len(jobs)}] {job.name} {x['cpu_s']:.1f} s: {verdict}: {said}"
-                  f"   (true: {answers[job.name]['effects']})", file=sys.stderr, flush=True)
+            print(
+                f"{method} [{count}/{len(jobs)}] {job.name} {x['cpu_s']:.1f} s: {verdict}: {said}"
+                f"   (true: {answers[job.name]['effects']})",
+                file=sys.stderr,
+                flush=True,
+            )
         found[method] = figures(jobs, answers, results)
     Console(width=150).print(table(found))
     (a.out / "figures.json").write_text(json.dumps(found, indent=1) + "\n")

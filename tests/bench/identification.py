@@ -3,6 +3,7 @@
 python tests/bench/identification.py [--scale]      (--scale: the 18 million samples too; 4 GB of memory for the peer)
 Data: a 12-node heat network with time constants from 15 s to 4000 s, three pulses and rest, 0.1 K of noise.
 """
+
 from __future__ import annotations
 
 import os
@@ -34,9 +35,22 @@ MISSED: list[str] = []
 def network() -> tuple[np.ndarray, np.ndarray]:
     """Continuous A (12, 12), B (12, 1) of coil, bobbin, magnets, stators, connectors, shafts, brackets."""
     c = np.array([38, 26, 58, 90, 140, 340, 90, 12, 12, 12, 130, 300.0])
-    links = [(0, 1, 1.3), (1, 2, .13), (0, 3, .12), (2, 4, 2.0), (3, 5, 2.2), (4, 5, 2.4), (4, 6, 1.1), (1, 7, .3), (7, 8, .35), (8, 9, .17),
-             (6, 10, .6), (10, 11, .45), (9, 11, .027)]
-    loss = np.array([.02, 0, 0, 0, 0, .2, 0, .02, .02, .03, .08, .05])
+    links = [
+        (0, 1, 1.3),
+        (1, 2, 0.13),
+        (0, 3, 0.12),
+        (2, 4, 2.0),
+        (3, 5, 2.2),
+        (4, 5, 2.4),
+        (4, 6, 1.1),
+        (1, 7, 0.3),
+        (7, 8, 0.35),
+        (8, 9, 0.17),
+        (6, 10, 0.6),
+        (10, 11, 0.45),
+        (9, 11, 0.027),
+    ]
+    loss = np.array([0.02, 0, 0, 0, 0, 0.2, 0, 0.02, 0.02, 0.03, 0.08, 0.05])
     a = -np.diag(loss / c)
     for i, j, g in links:
         a[i, i] -= g / c[i]
@@ -80,7 +94,11 @@ def cpu(work, repeat: int = 1):
 
 def memory(key: str) -> float:
     """MB of this process: VmRSS now, VmHWM at most."""
-    return next(float(line.split()[1]) / 1024 for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(key))
+    return next(
+        float(line.split()[1]) / 1024
+        for line in Path("/proc/self/status").read_text().splitlines()
+        if line.startswith(key)
+    )
 
 
 def goal(what: str, value: float, limit: float, detail: str = "") -> None:
@@ -93,18 +111,33 @@ def goal(what: str, value: float, limit: float, detail: str = "") -> None:
 def slicot(u: np.ndarray, y: np.ndarray, n: int = 12, i: int = 20, refine: bool = True):
     """ctrlsys: ib01ad + ib01bd (N4SID, fast QR), then ib01cd: (a, b, c)."""
     import ctrlsys
+
     u, y = np.asfortranarray(u), np.asfortranarray(y)
     _, r, _, _, info = ctrlsys.ib01ad("N", "F", "N", "O", "N", "N", i, 1, y.shape[1], u, y, 0.0, -1.0)[:5]
     a, c, b, d, *_ = ctrlsys.ib01bd("N", "A", "N", i, n, 1, y.shape[1], len(u), r, 0.0)
     if refine:
-        out = ctrlsys.ib01cd("X", "C", "B", n, 1, y.shape[1], np.asfortranarray(a), np.asfortranarray(b), np.asfortranarray(c),
-                             np.asfortranarray(np.zeros_like(d)), u, y, 0.0)
+        out = ctrlsys.ib01cd(
+            "X",
+            "C",
+            "B",
+            n,
+            1,
+            y.shape[1],
+            np.asfortranarray(a),
+            np.asfortranarray(b),
+            np.asfortranarray(c),
+            np.asfortranarray(np.zeros_like(d)),
+            u,
+            y,
+            0.0,
+        )
         b = out[1]
     return np.array(a), np.array(b), np.array(c)
 
 
 def sippy(u: np.ndarray, y: np.ndarray):
     from sippy_unipi import system_identification
+
     with contextlib.redirect_stdout(io.StringIO()):
         m = system_identification(y.T, u.T, "N4SID", SS_fixed_order=12, SS_f=20, SS_p=20, SS_D_required=False)
     return m.A, m.B, m.C
@@ -112,6 +145,7 @@ def sippy(u: np.ndarray, y: np.ndarray):
 
 def ipsid(u: np.ndarray, y: np.ndarray):
     import PSID
+
     with contextlib.redirect_stdout(io.StringIO()):
         m = PSID.IPSID(y, U=u, nx=12, n1=0, i=20)
     return m.A, m.B, m.C
@@ -120,8 +154,14 @@ def ipsid(u: np.ndarray, y: np.ndarray):
 def nfoursid(u: np.ndarray, y: np.ndarray):
     import pandas
     from nfoursid.nfoursid import NFourSID
+
     names = [f"y{j}" for j in range(y.shape[1])]
-    m = NFourSID(pandas.DataFrame(np.hstack([u, y]), columns=["u", *names]), output_columns=names, input_columns=["u"], num_block_rows=13)
+    m = NFourSID(
+        pandas.DataFrame(np.hstack([u, y]), columns=["u", *names]),
+        output_columns=names,
+        input_columns=["u"],
+        num_block_rows=13,
+    )
     m.subspace_identification()
     s, _ = m.system_identification(rank=12)
     return s.a, s.b, s.c
@@ -130,9 +170,11 @@ def nfoursid(u: np.ndarray, y: np.ndarray):
 def error(model, u: np.ndarray, truth: np.ndarray) -> float:
     """Free-run rmse of (a, b, c) or a StateSpace."""
     a, b, c = (model.a, model.b, model.c) if hasattr(model, "a") else model
-    y = kernels.simulate(*(np.ascontiguousarray(v, dtype=float) for v in (a, b, c)), np.zeros(len(a)), np.ascontiguousarray(u))
+    y = kernels.simulate(
+        *(np.ascontiguousarray(v, dtype=float) for v in (a, b, c)), np.zeros(len(a)), np.ascontiguousarray(u)
+    )
     with np.errstate(over="ignore", invalid="ignore"):
-        e = float(np.sqrt(np.mean((y - truth)**2)))
+        e = float(np.sqrt(np.mean((y - truth) ** 2)))
     return e if np.isfinite(e) else np.inf
 
 
@@ -149,16 +191,26 @@ def models() -> None:
     noisy = [y + 0.1 * np.random.default_rng(s).standard_normal(y.shape) for s in range(8)]
     ours, _ = cpu(lambda: subspace.identify(u, noisy[0], 1.0, 12, 20, "cva"), 7)
     theirs, _ = cpu(lambda: slicot(u, noisy[0]), 7)
-    goal("subspace CPU / ctrlsys N4SID + ib01cd (n 12, i 20, 15 000 x 13)", ours / theirs, 0.6, f"{1e3 * ours:.0f} / {1e3 * theirs:.0f} ms")
-    peers = {"ctrlsys + ib01cd, i 20": slicot, "ctrlsys + ib01cd, i 30": lambda u, y: slicot(u, y, 12, 30),
-             "ctrlsys + ib01cd, n 8": lambda u, y: slicot(u, y, 8, 20)}
+    goal(
+        "subspace CPU / ctrlsys N4SID + ib01cd (n 12, i 20, 15 000 x 13)",
+        ours / theirs,
+        0.6,
+        f"{1e3 * ours:.0f} / {1e3 * theirs:.0f} ms",
+    )
+    peers = {
+        "ctrlsys + ib01cd, i 20": slicot,
+        "ctrlsys + ib01cd, i 30": lambda u, y: slicot(u, y, 12, 30),
+        "ctrlsys + ib01cd, n 8": lambda u, y: slicot(u, y, 8, 20),
+    }
     for name, run in (("sippy N4SID", sippy), ("PSID", ipsid)):
         try:
             t, m = cpu(lambda run=run: run(u, noisy[0]))
-        except Exception as e:                                   # noqa: BLE001  a peer that does not run is reported, not hidden
+        except Exception as e:  # noqa: BLE001  a peer that does not run is reported, not hidden
             print(f"    {name}: does not run here: {type(e).__name__}: {str(e)[:90]}")
             continue
-        goal(f"subspace CPU / {name}", ours / t, 0.05, f"{1e3 * t:.0f} ms, its error {error(m, uv, yv):.4f} K")
+        goal(
+            f"subspace CPU / {name}", ours / t, 0.05, f"{1e3 * t:.0f} ms, its error {error(m, uv, yv):.4f} K"
+        )
         if name == "PSID":
             peers[name] = run
     # nfoursid forms an N x N matrix (3.5 GB and 51 s for 15 000 samples): the same hours at 5 s a sample instead
@@ -171,16 +223,27 @@ def models() -> None:
         its = f"{error(resampled.resample(1.0), uv, yv):.4f} K"
     except InputError:
         its = "not told: no real logarithm"
-    goal("subspace CPU / nfoursid (3000 x 13)", ours / t, 0.05, f"{1e3 * ours:.0f} / {1e3 * t:.0f} ms, its error {its}")
+    goal(
+        "subspace CPU / nfoursid (3000 x 13)",
+        ours / t,
+        0.05,
+        f"{1e3 * ours:.0f} / {1e3 * t:.0f} ms, its error {its}",
+    )
     found = {k: [run(u, v) for v in noisy] for k, run in peers.items()}
     found["ours, real poles"] = [modal.identify(modal.reduce((u, v), 1.0), 8) for v in noisy]
     found["ours, CVA"] = [subspace.identify(u, v, 1.0, 12, 20, "cva") for v in noisy]
     found["the paper's (26)"] = [subspace.identify(u, v, 1.0, 12, 20, "paper") for v in noisy]
     e = {k: [error(m, uv, yv) for m in v] for k, v in found.items()}
     for k, v in e.items():
-        print(f"    {k:26s} median {np.median(v):.4f} K, worst {np.max(v):.4f} K, unstable {sum(radius(m) >= 1 for m in found[k])} of 8")
+        print(
+            f"    {k:26s} median {np.median(v):.4f} K, worst {np.max(v):.4f} K, unstable {sum(radius(m) >= 1 for m in found[k])} of 8"
+        )
     best = min((k for k in peers), key=lambda k: np.median(e[k]))
-    goal(f"free-run error over 8 seeds / best peer ({best})", np.median(e["ours, real poles"]) / np.median(e[best]), 0.6)
+    goal(
+        f"free-run error over 8 seeds / best peer ({best})",
+        np.median(e["ours, real poles"]) / np.median(e[best]),
+        0.6,
+    )
     goal("unstable models of 8", sum(radius(m) >= 1 for m in found["ours, real poles"]), 0)
     t, _ = cpu(lambda: modal.identify(modal.reduce((u, noisy[0]), 1.0), 8), 3)
     print(f"    real poles from 15 000 samples: {1e3 * t:.0f} ms CPU")
@@ -199,10 +262,13 @@ def scale() -> None:
         rng = np.random.default_rng(0)
         u_all = test_2(0.001, n)
         for k in range(0, n, 500_000):
-            u = u_all[k:k + 500_000]
+            u = u_all[k : k + 500_000]
             y = kernels.simulate(a, b, np.eye(12), x, u)
             x = a @ y[-1] + b @ u[-1]
-            data[k:k + len(u), 0], data[k:k + len(u), 1:] = u[:, 0], y + 0.1 * rng.standard_normal(y.shape)
+            data[k : k + len(u), 0], data[k : k + len(u), 1:] = (
+                u[:, 0],
+                y + 0.1 * rng.standard_normal(y.shape),
+            )
         del data, u_all
 
         def chunks():
@@ -213,7 +279,7 @@ def scale() -> None:
                     yield z[:, :1], z[:, 1:]
 
         reading, _ = cpu(lambda: sum(len(u) for u, _ in chunks()))
-        Path("/proc/self/clear_refs").write_text("5")              # the peak counts from here
+        Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
         before = memory("VmRSS")
         t, m = cpu(lambda: modal.identify(modal.reduce(chunks(), 0.001), 8))
         grown = memory("VmHWM") - before
@@ -224,13 +290,22 @@ def scale() -> None:
             y = free_run(1.0, u) + 0.1 * np.random.default_rng(s).standard_normal((18000, 12))
             coarse.append(error(modal.identify(modal.reduce((u, y), 1.0), 8), uv, yv))
         goal("18 M x 13: memory beside the reading, MB (peak growth)", grown, 64)
-        goal("18 M x 13: error from 1 ms data / from 1 s data", fine / np.median(coarse), 1.0, f"{1e3 * fine:.2f} mK, stable {m.stable}")
+        goal(
+            "18 M x 13: error from 1 ms data / from 1 s data",
+            fine / np.median(coarse),
+            1.0,
+            f"{1e3 * fine:.2f} mK, stable {m.stable}",
+        )
         z = np.load(path)
         try:
             theirs, p = cpu(lambda: slicot(z[:, :1], z[:, 1:], refine=False))
-            goal("18 M x 13: CPU after reading / ctrlsys", (t - reading) / theirs, 0.06,
-                 f"{t - reading:.2f} / {theirs:.1f} s, its radius {radius(p):.6f}")
-        except Exception as e:                                   # noqa: BLE001
+            goal(
+                "18 M x 13: CPU after reading / ctrlsys",
+                (t - reading) / theirs,
+                0.06,
+                f"{t - reading:.2f} / {theirs:.1f} s, its radius {radius(p):.6f}",
+            )
+        except Exception as e:  # noqa: BLE001
             print(f"    ctrlsys does not run at 18 M: {type(e).__name__}: {str(e)[:90]}")
 
 
@@ -243,7 +318,7 @@ def output_error() -> None:
         t = np.arange(n)
         u = (6.0 * ((t % 700) < 350 + 200 * np.sin(t / 2300)) * ((t % 7200) < 4500)).astype(float)[:, None]
         rises = free_run(1.0, u)
-        gains = np.array([.05, .5, 0, 0, .1, 0, -.2, .3, .4, .4, -.9, .1])
+        gains = np.array([0.05, 0.5, 0, 0, 0.1, 0, -0.2, 0.3, 0.4, 0.4, -0.9, 0.1])
         f = np.exp(-1 / 180)
         y = np.zeros(n)
         for k in range(1, n):
@@ -260,13 +335,23 @@ def output_error() -> None:
             e = (y - m.predict(measured))[7200:]
             held[name].append(float(np.sqrt(np.mean(e**2))))
         if seed == 0:
-            print(f"    time constant, truth 180 s: recursion (5) {m5.time_constant_s:.1f} s (bias of the equation error), "
-                  f"output error {mo.time_constant_s:.0f} s, bank {bank.model().time_constant_s:.0f} s")
+            print(
+                f"    time constant, truth 180 s: recursion (5) {m5.time_constant_s:.1f} s (bias of the equation error), "
+                f"output error {mo.time_constant_s:.0f} s, bank {bank.model().time_constant_s:.0f} s"
+            )
     r = {k: np.median(v) for k, v in held.items()}
-    goal("output error, held-out rms / recursion (5)", r["output error"] / r["recursion (5)"], 0.15,
-         f"{1e3 * r['output error']:.1f} / {1e3 * r['recursion (5)']:.1f} nm, {1e3 * spent['output error']:.0f} ms")
-    goal("online bank, held-out rms / recursion (5)", r["bank"] / r["recursion (5)"], 0.15,
-         f"{1e3 * r['bank']:.1f} nm, {1e6 * spent['bank'] / 7200:.1f} us a sample")
+    goal(
+        "output error, held-out rms / recursion (5)",
+        r["output error"] / r["recursion (5)"],
+        0.15,
+        f"{1e3 * r['output error']:.1f} / {1e3 * r['recursion (5)']:.1f} nm, {1e3 * spent['output error']:.0f} ms",
+    )
+    goal(
+        "online bank, held-out rms / recursion (5)",
+        r["bank"] / r["recursion (5)"],
+        0.15,
+        f"{1e3 * r['bank']:.1f} nm, {1e6 * spent['bank'] / 7200:.1f} us a sample",
+    )
 
 
 C_SOURCE = r"""
@@ -291,14 +376,26 @@ def steps() -> None:
 
         def plain() -> None:
             th, q, g = np.zeros(p), 1e3 * np.eye(p), np.zeros(p)
-            lib.rls_all(*(v.ctypes.data_as(d) for v in (th, q, f, y)), ctypes.c_double(0.9999), g.ctypes.data_as(d), p, n)
+            lib.rls_all(
+                *(v.ctypes.data_as(d) for v in (th, q, f, y)),
+                ctypes.c_double(0.9999),
+                g.ctypes.data_as(d),
+                p,
+                n,
+            )
 
         c, _ = cpu(plain, 5)
     import padasip
+
     theirs, _ = cpu(lambda: padasip.filters.FilterRLS(n=p, mu=0.9999).run(y[:4000], f[:4000]))
-    goal("RLS step, 25 parameters / padasip in a loop", (ours / n) / (theirs / 4000), 0.03,
-         f"{1e6 * ours / n:.2f} / {1e6 * theirs / 4000:.1f} us; plain C {1e6 * c / n:.2f} us")
+    goal(
+        "RLS step, 25 parameters / padasip in a loop",
+        (ours / n) / (theirs / 4000),
+        0.03,
+        f"{1e6 * ours / n:.2f} / {1e6 * theirs / 4000:.1f} us; plain C {1e6 * c / n:.2f} us",
+    )
     from filterpy.kalman import KalmanFilter
+
     a, b = plant(1.0)
     k = KalmanFilter(dim_x=12, dim_z=1, dim_u=1)
     k.F, k.B, k.H = a, b, np.eye(1, 12)
@@ -312,10 +409,24 @@ def steps() -> None:
     theirs, _ = cpu(peer)
     poles = np.exp(-1 / np.geomspace(15, 4000, 12))
     u, big = np.ones((200_000, 1)), rng.standard_normal(200_000)
-    ours, _ = cpu(lambda: kernels.steady_filter_modal(poles, np.ones((12, 1)), np.ones(12), 0.01 * np.ones(12), np.zeros(12), u, big), 3)
-    dense, _ = cpu(lambda: kernels.steady_filter(a, b, np.eye(1, 12), 0.01 * np.ones((12, 1)), np.zeros(12), u, big[:, None]), 3)
-    goal("steady-state filter, 12 states, modal / filterpy", (ours / 2e5) / (theirs / 2000), 0.005,
-         f"{1e6 * ours / 2e5:.3f} / {1e6 * theirs / 2000:.0f} us; dense {1e6 * dense / 2e5:.3f} us")
+    ours, _ = cpu(
+        lambda: kernels.steady_filter_modal(
+            poles, np.ones((12, 1)), np.ones(12), 0.01 * np.ones(12), np.zeros(12), u, big
+        ),
+        3,
+    )
+    dense, _ = cpu(
+        lambda: kernels.steady_filter(
+            a, b, np.eye(1, 12), 0.01 * np.ones((12, 1)), np.zeros(12), u, big[:, None]
+        ),
+        3,
+    )
+    goal(
+        "steady-state filter, 12 states, modal / filterpy",
+        (ours / 2e5) / (theirs / 2000),
+        0.005,
+        f"{1e6 * ours / 2e5:.3f} / {1e6 * theirs / 2000:.0f} us; dense {1e6 * dense / 2e5:.3f} us",
+    )
 
 
 def measured_data() -> None:
@@ -327,12 +438,15 @@ def measured_data() -> None:
     For information also the best order of each peer with the held-out part looked at, ours from the one record alone, and what the ratio
     would be over other stretches of the same length (moving-block bootstrap of the held-out part, 5 to 95 %)."""
     from thermoctl.recording.table import read_table
+
     folder = Path(os.environ.get("THERMOCTL_RECORDINGS", "../shared/recordings"))
     if not folder.is_dir():
         print(f"    measured data: no folder {folder}; set THERMOCTL_RECORDINGS")
         return
 
-    def block(name: str, inputs: list[str], outputs: list[str], less: str | None, square: bool, period: float):
+    def block(
+        name: str, inputs: list[str], outputs: list[str], less: str | None, square: bool, period: float
+    ):
         table = read_table(folder / name)
         t = np.arange(table.t[0], table.t[-1], period)
         u = np.column_stack([np.interp(t, table.t, table.columns[c]) for c in inputs])
@@ -342,10 +456,20 @@ def measured_data() -> None:
         return (u**2 if square else u), y, period
 
     tclab = (["Q1", "Q2"], ["T1", "T2"], "air", False, 1.0)
-    motor = {k: block(f"tmotor_ak109/run_{k}.csv", ["current"], ["temperature"], "air", True, 1.0) for k in (1, 2, 3)}
-    sets = {"tclab run 1": (block("tclab/run_1.csv", *tclab), []), "tclab run 3": (block("tclab/run_3.csv", *tclab), []),
-            "tmotor run 1": (motor[1], [motor[2], motor[3]]), "tmotor run 3": (motor[3], [motor[1], motor[2]]),
-            "building": (block("building_prbs/run_1.csv", ["outdoor", "solar", "heating"], ["indoor"], None, False, 300.0), [])}
+    motor = {
+        k: block(f"tmotor_ak109/run_{k}.csv", ["current"], ["temperature"], "air", True, 1.0)
+        for k in (1, 2, 3)
+    }
+    sets = {
+        "tclab run 1": (block("tclab/run_1.csv", *tclab), []),
+        "tclab run 3": (block("tclab/run_3.csv", *tclab), []),
+        "tmotor run 1": (motor[1], [motor[2], motor[3]]),
+        "tmotor run 3": (motor[3], [motor[1], motor[2]]),
+        "building": (
+            block("building_prbs/run_1.csv", ["outdoor", "solar", "heating"], ["indoor"], None, False, 300.0),
+            [],
+        ),
+    }
     peers = {"ctrlsys": slicot_mimo, "sippy": sippy_mimo, "PSID": ipsid_mimo}
     for name, ((u, y, period), others) in sets.items():
         cut = int(0.6 * len(u))
@@ -360,7 +484,9 @@ def measured_data() -> None:
                 v = float(np.sqrt(np.mean(e**2)))
             return v if np.isfinite(v) else np.inf
 
-        def mine(given: list, u=u, y=y, cut=cut, period=period, left=left, rms=rms) -> tuple[StateSpace, np.ndarray]:
+        def mine(
+            given: list, u=u, y=y, cut=cut, period=period, left=left, rms=rms
+        ) -> tuple[StateSpace, np.ndarray]:
             m = modal.identify_validated(u[:cut], y[:cut], period, others=given)
             return m, left(m, cut, len(u), m.x0 if m.info["rest"] else None)
 
@@ -372,18 +498,33 @@ def measured_data() -> None:
             looked[peer] = np.inf
             chosen: dict[bool, tuple[float, np.ndarray]] = {}
             for order, i, joined in product(range(1, 6), (8, 15), {False, bool(others)}):
-                def fit(stop: int, run=run, order=order, i=i, before=others if joined else [], u=u, y=y, period=period):
+
+                def fit(
+                    stop: int,
+                    run=run,
+                    order=order,
+                    i=i,
+                    before=others if joined else [],
+                    u=u,
+                    y=y,
+                    period=period,
+                ):
                     data = (np.vstack([*(o[k] for o in before), v[:stop]]) for k, v in enumerate((u, y)))
-                    return StateSpace(*(np.asarray(v, float) for v in run(*data, order, i)), period, np.zeros(order))
+                    return StateSpace(
+                        *(np.asarray(v, float) for v in run(*data, order, i)), period, np.zeros(order)
+                    )
+
                 try:
                     held = left(fit(cut), cut, len(u))
-                except Exception:                            # noqa: BLE001, S112  an order the peer cannot do
+                except Exception:  # noqa: BLE001, S112  an order the peer cannot do
                     continue
                 looked[peer] = min(looked[peer], rms(held))
                 parts = []
                 for part in (0.4, 0.6, 0.8):
-                    with contextlib.suppress(Exception):     # a part that is too short for the peer's window
-                        parts.append(rms(left(fit(int(part * cut)), int(part * cut), int((part + 0.2) * cut))))
+                    with contextlib.suppress(Exception):  # a part that is too short for the peer's window
+                        parts.append(
+                            rms(left(fit(int(part * cut)), int(part * cut), int((part + 0.2) * cut)))
+                        )
                 score = float(np.sqrt(np.mean(np.square(parts)))) if parts else np.inf
                 before = chosen.get(joined)
                 if before is None or (score, rms(held)) < (before[0], rms(before[1])):
@@ -391,9 +532,15 @@ def measured_data() -> None:
             fair[peer] = min((v[1] for v in chosen.values()), key=rms)
         best = min(fair, key=lambda k: rms(fair[k]))
         low, high = spread(e, fair[best])
-        goal(f"{name}: held-out error / best peer ({best})", ours / rms(fair[best]), 1.0,
-             f"{ours:.3f} K, order {model.info['order']}; " + ", ".join(f"{k} {rms(v):.3f} (looked at: {looked[k]:.3f})" for k, v in fair.items())
-             + (f"; ours from this record alone {alone:.3f}" if others else "") + f"; other stretches {low:.2f} to {high:.2f}")
+        goal(
+            f"{name}: held-out error / best peer ({best})",
+            ours / rms(fair[best]),
+            1.0,
+            f"{ours:.3f} K, order {model.info['order']}; "
+            + ", ".join(f"{k} {rms(v):.3f} (looked at: {looked[k]:.3f})" for k, v in fair.items())
+            + (f"; ours from this record alone {alone:.3f}" if others else "")
+            + f"; other stretches {low:.2f} to {high:.2f}",
+        )
 
 
 def spread(ours: np.ndarray, theirs: np.ndarray, blocks: int = 8, draws: int = 2000) -> tuple[float, float]:
@@ -408,6 +555,7 @@ def spread(ours: np.ndarray, theirs: np.ndarray, blocks: int = 8, draws: int = 2
 
 def sippy_mimo(u: np.ndarray, y: np.ndarray, n: int, i: int):
     from sippy_unipi import system_identification
+
     with contextlib.redirect_stdout(io.StringIO()):
         m = system_identification(y.T, u.T, "N4SID", SS_fixed_order=n, SS_f=i, SS_p=i, SS_D_required=False)
     return m.A, m.B, m.C
@@ -415,6 +563,7 @@ def sippy_mimo(u: np.ndarray, y: np.ndarray, n: int, i: int):
 
 def ipsid_mimo(u: np.ndarray, y: np.ndarray, n: int, i: int):
     import PSID
+
     with contextlib.redirect_stdout(io.StringIO()):
         m = PSID.IPSID(y, U=u, nx=n, n1=0, i=i)
     return m.A, m.B, m.C
@@ -422,10 +571,13 @@ def ipsid_mimo(u: np.ndarray, y: np.ndarray, n: int, i: int):
 
 def slicot_mimo(u: np.ndarray, y: np.ndarray, n: int, i: int):
     import ctrlsys
+
     u, y, m = np.asfortranarray(u), np.asfortranarray(y), u.shape[1]
     r = ctrlsys.ib01ad("N", "F", "N", "O", "N", "N", i, m, y.shape[1], u, y, 0.0, -1.0)[1]
     a, c, b, d, *_ = ctrlsys.ib01bd("N", "A", "N", i, n, m, y.shape[1], len(u), r, 0.0)
-    b = ctrlsys.ib01cd("X", "C", "B", n, m, y.shape[1], *(np.asfortranarray(v) for v in (a, b, c, 0 * d)), u, y, 0.0)[1]
+    b = ctrlsys.ib01cd(
+        "X", "C", "B", n, m, y.shape[1], *(np.asfortranarray(v) for v in (a, b, c, 0 * d)), u, y, 0.0
+    )[1]
     return np.array(a), np.array(b), np.array(c)
 
 

@@ -8,6 +8,7 @@ Each candidate runs in a process of its own: start-up is import and first call, 
 column is the same start with memory that is never both writable and executable (prctl PR_SET_MDWE, Linux 6.3; what
 systemd's MemoryDenyWriteExecute asks for).
 """
+
 from __future__ import annotations
 
 import ctypes
@@ -60,9 +61,16 @@ cdef class Law:
 
 def arrays():
     import numpy as np
+
     rng = np.random.default_rng(1)
     A = -np.eye(N) * 1e-5 + rng.normal(size=(N, N)) * 1e-7
-    return np.ascontiguousarray(A), np.full(N, 1e-6), np.linspace(1, 0.1, N), np.zeros(N), np.array([1.0, 0.0, 0.0, 0.0])
+    return (
+        np.ascontiguousarray(A),
+        np.full(N, 1e-6),
+        np.linspace(1, 0.1, N),
+        np.zeros(N),
+        np.array([1.0, 0.0, 0.0, 0.0]),
+    )
 
 
 def make_law(work):
@@ -71,9 +79,22 @@ def make_law(work):
 
     from thermoctl.control.law import Law
     from thermoctl.control.model import CompensatorModel, Parameters
+
     A, B, zeta, _, _ = arrays()
-    model = CompensatorModel("mkf", 1e-3, A, np.column_stack([B, B]), np.eye(N), zeta, 1e-4, 0.04, 0.9, np.ones(12),
-                             np.ones(12), 1.0)
+    model = CompensatorModel(
+        "mkf",
+        1e-3,
+        A,
+        np.column_stack([B, B]),
+        np.eye(N),
+        zeta,
+        1e-4,
+        0.04,
+        0.9,
+        np.ones(12),
+        np.ones(12),
+        1.0,
+    )
     law = Law(model, Parameters(kp=0.01, ti_s=0.004, td_s=0.001, output_limit=2.0), 1e-3)
     law.bind(np.full(20, 22.0), np.ones(20, np.uint8), np.zeros(20, np.uint8))
     return lambda k: law.step(1e-3)
@@ -82,14 +103,18 @@ def make_law(work):
 def make_cython(work):
     sys.path.insert(0, str(work))
     from bench_law import Law
+
     step = Law(*(a.ravel() for a in arrays())).step
     return lambda k: step(1.0, 0.1, 1.0, 2.0)
 
 
 def make_cffi(work):
     import cffi
+
     ffi = cffi.FFI()
-    ffi.cdef("void law_step(const double*, const double*, const double*, double*, double*, double, double, double, double);")
+    ffi.cdef(
+        "void law_step(const double*, const double*, const double*, double*, double*, double, double, double, double);"
+    )
     library = ffi.dlopen(str(work / "step.so"))
     kept = arrays()
     A, B, z, x, s = (ffi.cast("double *", a.ctypes.data) for a in kept)
@@ -133,12 +158,14 @@ def make_numba(work):
                 a += A[i, j] * x[j]
             out[i] = a
         return out
+
     given = arrays()
     return lambda k: step(*given, 1.0, 0.1, 1.0, 2.0)
 
 
 def make_numpy(work):
     import numpy as np
+
     A, B, z, x, s = arrays()
 
     def step(k):
@@ -153,11 +180,18 @@ def make_numpy(work):
         d = change / 1e-3
         s[1] = np.clip(s[1] + 0.01 * (change + 0.25 * eps + 0.001 * (d - s[3])), -2.0, 2.0)
         s[2], s[3] = eps, d
+
     return step
 
 
-CANDIDATES = {"cython": make_cython, "cffi": make_cffi, "ctypes": make_ctypes, "numba": make_numba, "numpy": make_numpy,
-              "law (Cython, whole)": make_law}
+CANDIDATES = {
+    "cython": make_cython,
+    "cffi": make_cffi,
+    "ctypes": make_ctypes,
+    "numba": make_numba,
+    "numpy": make_numpy,
+    "law (Cython, whole)": make_law,
+}
 
 
 def child(name: str, work: Path, deny: bool) -> None:
@@ -166,6 +200,7 @@ def child(name: str, work: Path, deny: bool) -> None:
         print(json.dumps({"unsupported": True}))
         return
     import numpy as np
+
     begin = time.perf_counter()
     call = CANDIDATES[name](work)
     call(0)
@@ -180,9 +215,18 @@ def child(name: str, work: Path, deny: bool) -> None:
 
 
 def run(name: str, work: Path, cache: Path, deny: bool = False) -> dict:
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, __file__, "--child", name, str(work), str(int(deny))], capture_output=True,
-                          text=True, env=environment)
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(cache),
+        "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONPATH": str(ROOT),
+    }
+    done = subprocess.run(
+        [sys.executable, __file__, "--child", name, str(work), str(int(deny))],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
     if done.returncode:
         return {"failed": (done.stderr.strip().splitlines() or [f"signal {-done.returncode}"])[-1][:60]}
     return json.loads(done.stdout)
@@ -195,20 +239,34 @@ def main() -> None:
         flags = ["-O2", "-ffp-contract=off", "-shared", "-fPIC"]
         subprocess.run(["cc", *flags, "-o", str(work / "step.so"), str(work / "step.c")], check=True)
         (work / "bench_law.pyx").write_text(PYX_SOURCE)
-        subprocess.run([sys.executable, "-m", "Cython.Build.Cythonize", "-i", "-q", str(work / "bench_law.pyx")], check=True,
-                       cwd=work)
-        print(f"{'candidate':22}{'a call':>10}{'over ctypes':>13}{'first start':>13}{'again':>9}   under MDWE")
+        subprocess.run(
+            [sys.executable, "-m", "Cython.Build.Cythonize", "-i", "-q", str(work / "bench_law.pyx")],
+            check=True,
+            cwd=work,
+        )
+        print(
+            f"{'candidate':22}{'a call':>10}{'over ctypes':>13}{'first start':>13}{'again':>9}   under MDWE"
+        )
         reference = None
         for name in ("ctypes", *(n for n in CANDIDATES if n != "ctypes")):
-            first, again, denied = run(name, work, cache), run(name, work, cache), run(name, work, cache / "denied", True)
+            first, again, denied = (
+                run(name, work, cache),
+                run(name, work, cache),
+                run(name, work, cache / "denied", True),
+            )
             if "failed" in first:
                 print(f"{name:22}  not here: {first['failed']}")
                 continue
             reference = reference or again["median_ns"]
-            life = "fails: " + denied["failed"] if "failed" in denied else (
-                "kernel has no PR_SET_MDWE" if "unsupported" in denied else "runs")
-            print(f"{name:22}{again['median_ns']:7.0f} ns{again['median_ns'] / reference:12.2f}x{first['start_s']:11.3f} s"
-                  f"{again['start_s']:7.3f} s   {life}")
+            life = (
+                "fails: " + denied["failed"]
+                if "failed" in denied
+                else ("kernel has no PR_SET_MDWE" if "unsupported" in denied else "runs")
+            )
+            print(
+                f"{name:22}{again['median_ns']:7.0f} ns{again['median_ns'] / reference:12.2f}x{first['start_s']:11.3f} s"
+                f"{again['start_s']:7.3f} s   {life}"
+            )
 
 
 if __name__ == "__main__":

@@ -47,7 +47,10 @@ REFIT = 4  # steps of Gauss and Newton that an honest refit may take
 STRIDES = (1.0, 0.6, 0.3, 0.1)  # lengths of a step that are tried
 RESIZED = 3  # times a size is chosen again because a refit from the truth's model leaves another signal than a straight one
 ROOM = 20e6  # numbers that the rivals measured at a time may fill: a large rig's signals are hundreds of megabytes
-FIXED = ("copper_resistance", "resistance_temperature")  # copper's coefficient: the drive's strength decides how visible
+FIXED = (
+    "copper_resistance",
+    "resistance_temperature",
+)  # copper's coefficient: the drive's strength decides how visible
 
 
 class NotVisible(Exception):
@@ -77,11 +80,17 @@ def holders() -> dict[str, tuple[str, ...]]:
     return {e: tuple(f for f in FAMILIES if f in found[e]) for e in sorted(found)}
 
 
-def plan(seed: int, number: int, families: Sequence[str] = tuple(FAMILIES), kind: str | None = None) -> list[Slot]:
+def plan(
+    seed: int, number: int, families: Sequence[str] = tuple(FAMILIES), kind: str | None = None
+) -> list[Slot]:
     """The first `number` slots of a set. Each kind goes round the families and schedules by itself; single effects go
     round all pairs of an effect and a size in an order that the seed shuffles, so that no pair is forgotten. `kind` asks
     for one kind instead of the set's turn."""
-    effects = {e: [f for f in held if f in families] for e, held in holders().items()} if kind in (None, "one") else {}
+    effects = (
+        {e: [f for f in held if f in families] for e, held in holders().items()}
+        if kind in (None, "one")
+        else {}
+    )
     cells = [(e, b) for e, held in effects.items() if held for b in BANDS]
     order = np.random.default_rng([seed, len(cells)]).permutation(len(cells))
     count: dict[str, int] = {}
@@ -95,7 +104,9 @@ def plan(seed: int, number: int, families: Sequence[str] = tuple(FAMILIES), kind
             held = effects[effect]
             # another family and schedule for each size of an effect, and in each turn
             shift = turn + list(BANDS).index(band) + seed
-            slots.append(Slot(n, what, held[shift % len(held)], SCHEDULES[(k + turn) % len(SCHEDULES)], effect, band))
+            slots.append(
+                Slot(n, what, held[shift % len(held)], SCHEDULES[(k + turn) % len(SCHEDULES)], effect, band)
+            )
         else:
             family = families[(k + seed) % len(families)]
             slots.append(Slot(n, what, family, SCHEDULES[(k // len(families) + k) % len(SCHEDULES)]))
@@ -114,7 +125,10 @@ class Bench:
         for run in scene.runs:
             n = len(run["t"])
             spectra.append(
-                np.stack([x.spectrum(n) + r**2 / 12 for x, r in zip(self.noise, scene.resolution, strict=True)], axis=1)
+                np.stack(
+                    [x.spectrum(n) + r**2 / 12 for x, r in zip(self.noise, scene.resolution, strict=True)],
+                    axis=1,
+                )
             )
         self.judge = Judge(spectra)
 
@@ -124,7 +138,10 @@ class Bench:
         moved = zip(scene.ranges.items(), x, strict=False)
         theta = {p: scene.theta[p] + v * (high - low) / 4 for (p, (low, high)), v in moved}
         starts = x[n:].reshape(len(scene.runs), -1)
-        return [Variant(theta, {p: v * s for (p, s), v in zip(scene.starts.items(), row, strict=True)}) for row in starts]
+        return [
+            Variant(theta, {p: v * s for (p, s), v in zip(scene.starts.items(), row, strict=True)})
+            for row in starts
+        ]
 
     def _at(self, points: list[np.ndarray]) -> list[np.ndarray]:
         """Noiseless readings (m, N, ny) by run at these parameters and starts."""
@@ -146,7 +163,9 @@ class Bench:
             moved.append((y[1:] - y[:1]) / h[:, None, None])
         whole = [self.judge.whiten([d[:n] for d in moved])]
         for k in runs:  # each run has its own start
-            whole.append(self.judge.whiten([d[n:] if j == k else np.zeros_like(d[n:]) for j, d in enumerate(moved)]))
+            whole.append(
+                self.judge.whiten([d[n:] if j == k else np.zeros_like(d[n:]) for j, d in enumerate(moved)])
+            )
         return base, np.concatenate(whole)
 
     def _whitened(self, readings: list[np.ndarray], models: list[np.ndarray]) -> np.ndarray:
@@ -156,11 +175,16 @@ class Bench:
     def measure(self, pool: list[Suspect]) -> None:
         """What a straight refit leaves of each of `pool` at SIZES (`curve`: suspect, sizes, rows)."""
         scene = self.scene
-        self.base, self.derivatives = self.tangents(np.zeros(len(scene.ranges) + len(scene.runs) * len(scene.starts)))
+        self.base, self.derivatives = self.tangents(
+            np.zeros(len(scene.ranges) + len(scene.runs) * len(scene.starts))
+        )
         self.judge.set_parameters(self.derivatives)
         sized = [(s, np.array([z for z in SIZES if z <= s.top])) for s in pool]
         rows = [Variant(effects=[(s.effect, s.where, s.make(z))]) for s, sizes in sized for z in sizes]
-        d = [scene.outputs_of(k, rows) - base if rows else np.zeros((0, *base.shape)) for k, base in enumerate(self.base)]
+        d = [
+            scene.outputs_of(k, rows) - base if rows else np.zeros((0, *base.shape))
+            for k, base in enumerate(self.base)
+        ]
         left = self.judge.left_over(self.judge.whiten(d))
         ends = np.cumsum([len(sizes) for _, sizes in sized])
         self.curve = [(s, z, left[end - len(z) : end]) for (s, z), end in zip(sized, ends, strict=True)]
@@ -171,19 +195,27 @@ class Bench:
         scene, free = self.scene, len(self.derivatives)
         walls = np.full((2, free), [[-np.inf], [np.inf]])
         for j, (p, (low, high)) in enumerate(scene.ranges.items()):
-            walls[:, j] = np.array([min(low - scene.theta[p], 0), max(high - scene.theta[p], 0)]) * 4 / (high - low)
+            walls[:, j] = (
+                np.array([min(low - scene.theta[p], 0), max(high - scene.theta[p], 0)]) * 4 / (high - low)
+            )
         x, slope = np.zeros(free), self.derivatives
         left = self._whitened(readings, [b[None] for b in self.base])[0]
         cost = float(snr(left))
         for _ in range(REFIT):
             # least squares of  left - slope' step  and of the ridge  x + step,  on the triangle of a QR decomposition
-            wide = np.concatenate([np.concatenate([slope, -np.eye(free)], axis=1).T, np.append(left, x)[:, None]], axis=1)
+            wide = np.concatenate(
+                [np.concatenate([slope, -np.eye(free)], axis=1).T, np.append(left, x)[:, None]], axis=1
+            )
             triangle = np.linalg.qr(wide, mode="r")
-            step = lsq_linear(triangle[:-1, :-1], triangle[:-1, -1], (walls[0] - x - 1e-9, walls[1] - x + 1e-9)).x
+            step = lsq_linear(
+                triangle[:-1, :-1], triangle[:-1, -1], (walls[0] - x - 1e-9, walls[1] - x + 1e-9)
+            ).x
             hoped = float(np.linalg.norm(triangle[:, -1] - triangle[:, :-1] @ step))
             trial = [x + a * step for a in STRIDES]
             rows = self._whitened(readings, self._at(trial))
-            costs = np.nan_to_num(np.hypot(snr(rows), snr(np.array(trial))), nan=np.inf)  # a step may run away
+            costs = np.nan_to_num(
+                np.hypot(snr(rows), snr(np.array(trial))), nan=np.inf
+            )  # a step may run away
             best = int(np.argmin(costs))
             if not costs[best] < cost:
                 break
@@ -205,7 +237,11 @@ class Bench:
         chunk = max(8, int(ROOM / sum(2 * y.size for y in self.base)))
         for begin in range(0, len(rivals), chunk):
             part = rivals[begin : begin + chunk]
-            rows = [Variant(effects=[(s.effect, s.where, s.make(z * min(1, s.top)))]) for s in part for z in (0.1, 1)]
+            rows = [
+                Variant(effects=[(s.effect, s.where, s.make(z * min(1, s.top)))])
+                for s in part
+                for z in (0.1, 1)
+            ]
             d = [self.scene.outputs_of(k, rows) - self.base[k] for k in range(len(self.scene.runs))]
             left = self.judge.left_over(self.judge.whiten(d))
             for i, s in enumerate(part):
@@ -231,7 +267,11 @@ def _begun(s: Suspect, at: float) -> Suspect:
 
 def _alike(rivals: list[tuple[Suspect, float]], truth: Suspect) -> list[tuple[str, str]]:
     """Rivals after which too little of the signal is left to tell them from the truth."""
-    return [(s.effect, s.where) for s, stays in rivals if (s.effect, s.where) != (truth.effect, truth.where) and stays < TELL_APART]
+    return [
+        (s.effect, s.where)
+        for s, stays in rivals
+        if (s.effect, s.where) != (truth.effect, truth.where) and stays < TELL_APART
+    ]
 
 
 def _size_for(curve: tuple, target: float) -> float | None:
@@ -248,7 +288,11 @@ def _size_for(curve: tuple, target: float) -> float | None:
 
 
 def make_case(
-    seed: int, number: int, families: Sequence[str] = tuple(FAMILIES), short: bool = False, kind: str | None = None
+    seed: int,
+    number: int,
+    families: Sequence[str] = tuple(FAMILIES),
+    short: bool = False,
+    kind: str | None = None,
 ) -> tuple[dict, list[list[tuple[str, np.ndarray]]], dict]:
     """Case `number` of a set: (plant, columns of each run, answer)."""
     slot = plan(seed, number + 1, families, kind)[number]
@@ -256,11 +300,18 @@ def make_case(
     at = held.index(slot.family)
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([seed, number, attempt])
-        late = attempt // 6  # not visible on this rig: another one; where no such rig shows it, another family, schedule
-        family, schedule = held[(at + late) % len(held)], SCHEDULES[(SCHEDULES.index(slot.schedule) + late) % len(SCHEDULES)]
+        late = (
+            attempt // 6
+        )  # not visible on this rig: another one; where no such rig shows it, another family, schedule
+        family, schedule = (
+            held[(at + late) % len(held)],
+            SCHEDULES[(SCHEDULES.index(slot.schedule) + late) % len(SCHEDULES)],
+        )
         vigour = 1.0
         for _ in range(4 if slot.effect in FIXED else 1):
-            scene = FAMILIES[family].scene(np.random.default_rng([seed, number, attempt, 1]), schedule, short, vigour)
+            scene = FAMILIES[family].scene(
+                np.random.default_rng([seed, number, attempt, 1]), schedule, short, vigour
+            )
             case, seen = _conceal(scene, slot, np.random.default_rng([seed, number, attempt, 2]))
             if case is not None or not seen:
                 break
@@ -270,7 +321,9 @@ def make_case(
             effects, runs, told, bench = case
             break
     else:
-        raise NotVisible(f"case {number + 1:04d}: {slot.effect or slot.kind} not visible as asked in {ATTEMPTS} draws")
+        raise NotVisible(
+            f"case {number + 1:04d}: {slot.effect or slot.kind} not visible as asked in {ATTEMPTS} draws"
+        )
     kind = slot.kind
     answer = {
         "verdict": "consistent" if kind == "none" else "unexplained" if kind == "unknown" else "explained",
@@ -297,7 +350,13 @@ def make_case(
         columns = [("t", run["t"])]
         columns += [(c, run[key]) for c, key in scene.columns.items()]
         for j, c in enumerate(scene.output_columns):
-            dirt = {"outliers": 0.0015} if dirt_kind == "outliers" else {"gaps": 1} if dirt_kind == "gaps" else {}
+            dirt = (
+                {"outliers": 0.0015}
+                if dirt_kind == "outliers"
+                else {"gaps": 1}
+                if dirt_kind == "gaps"
+                else {}
+            )
             if j == slow:
                 dirt = {"every": 5}
             y = sensors.record(runs[k][:, j], bench.noise[j], scene.sd[j], scene.resolution[j], dirt, rng)
@@ -305,13 +364,17 @@ def make_case(
             oracle.append((scene.outputs[j], np.sqrt(np.nanmean((y - runs[k][:, j]) ** 2))))
         tables.append(columns)
     answer["dirt"] = str(dirt_kind)
-    answer["oracle_rms"] = {o: float(f"{np.mean([r for n, r in oracle if n == o]):.5g}") for o in scene.outputs}
+    answer["oracle_rms"] = {
+        o: float(f"{np.mean([r for n, r in oracle if n == o]):.5g}") for o in scene.outputs
+    }
     return scene.plant, tables, answer
 
 
 def published(effect: str, p: dict) -> dict:
     """An effect's parameters by the names that the catalogue publishes."""
-    if effect == "directional_friction":  # F either way, D and H|v| what differs; the mean damping goes to the damper
+    if (
+        effect == "directional_friction"
+    ):  # F either way, D and H|v| what differs; the mean damping goes to the damper
         plus, minus = p["FP"], p["FM"]
         return {"F": (plus + minus) / 2, "D": (plus - minus) / 2, "H": (p["BP"] - p["BM"]) / 2}
     names = {"A": "ALPHA"} if effect in FIXED else {"X": "X0"} if effect == "backlash_hysteresis" else {}
@@ -331,7 +394,9 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
     pool = scene.unknowns if kind == "unknown" else scene.suspects
     names = sorted({s.effect for s in pool})  # every effect alike, whatever its number of places
     picks = [slot.effect] if slot.effect else list(rng.permutation(names))[: 4 if kind == "unknown" else 8]
-    chosen = [options[rng.integers(len(options))] for options in ([s for s in pool if s.effect == e] for e in picks)]
+    chosen = [
+        options[rng.integers(len(options))] for options in ([s for s in pool if s.effect == e] for e in picks)
+    ]
     bench.measure(chosen)
     if kind in ("pair", "cancel"):
         return _two(bench, kind, rng, told), None
@@ -381,7 +446,10 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
             sizes = [_size_for(c, rng.uniform(18, 50)) for c in (first, second)]
             if None in sizes:
                 continue
-            a, b = (c[2][int(np.argmin(abs(np.log(c[1] / z))))] for c, z in zip((first, second), sizes, strict=True))
+            a, b = (
+                c[2][int(np.argmin(abs(np.log(c[1] / z))))]
+                for c, z in zip((first, second), sizes, strict=True)
+            )
             cos = float(a @ b / (snr(a) * snr(b) + 1e-12))
             score = cos if kind == "cancel" else abs(cos)
             if best is None or score < best[0]:
@@ -402,7 +470,11 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
         "band": "large",
         "snr": [snr(left), *(snr(a) for a in alone)],
         "onset": onset,
-        "alike": [x for s, rivals in zip((one, two), bench.beyond_rivals(alone), strict=True) for x in _alike(rivals, s)],
+        "alike": [
+            x
+            for s, rivals in zip((one, two), bench.beyond_rivals(alone), strict=True)
+            for x in _alike(rivals, s)
+        ],
     }
     return effects, runs, told, bench
 
@@ -444,16 +516,27 @@ def listing(slots: Sequence[Slot], answers: Sequence[dict]) -> str:
     size = Counter((s.effect, s.band) for s in slots if s.kind == "one")
     place = Counter((s.kind, s.family, s.schedule) for s in slots)
     kinds, families, schedules = (sorted({p[i] for p in place | made["place"]}) for i in range(3))
-    lines = [f"{len(slots)} cases planned, {len(answers)} made (planned/made)", "", f"{'effect':36s}" + "".join(f"{b:>9s}" for b in BANDS)]
+    lines = [
+        f"{len(slots)} cases planned, {len(answers)} made (planned/made)",
+        "",
+        f"{'effect':36s}" + "".join(f"{b:>9s}" for b in BANDS),
+    ]
     for e, held in holders().items():
         cells = "".join(f"{size[e, b]:>6d}/{made['size'][e, b]:<2d}" for b in BANDS)
         lines.append(f"{e:36s}{cells}  {', '.join(held)}")
     lines += ["", f"{'family, schedule':36s}" + "".join(f"{k:>9s}" for k in kinds)]
     for f in families:
         for s in schedules:
-            lines.append(f"{f + ', ' + s:36s}" + "".join(f"{place[k, f, s]:>6d}/{made['place'][k, f, s]:<2d}" for k in kinds))
-    total = [sum(x[k, f, s] for f in families for s in schedules) for k in kinds for x in (place, made["place"])]
-    lines.append(f"{'all':36s}" + "".join(f"{a:>6d}/{b:<2d}" for a, b in zip(total[::2], total[1::2], strict=True)))
+            lines.append(
+                f"{f + ', ' + s:36s}"
+                + "".join(f"{place[k, f, s]:>6d}/{made['place'][k, f, s]:<2d}" for k in kinds)
+            )
+    total = [
+        sum(x[k, f, s] for f in families for s in schedules) for k in kinds for x in (place, made["place"])
+    ]
+    lines.append(
+        f"{'all':36s}" + "".join(f"{a:>6d}/{b:<2d}" for a, b in zip(total[::2], total[1::2], strict=True))
+    )
     for what in ("colour", "dirt"):
         lines.append(f"{what} made: " + ", ".join(f"{k} {n}" for k, n in sorted(made[what].items())))
     return "\n".join(lines)
@@ -463,7 +546,9 @@ def main(argv: list[str] | None = None) -> int:
     """The command."""
     p = argparse.ArgumentParser(prog="tests.concealed.generate", description=__doc__)
     p.add_argument("--out", required=True, type=Path)
-    p.add_argument("--list", action="store_true", help="count what the set covers, planned and made so far; make nothing")
+    p.add_argument(
+        "--list", action="store_true", help="count what the set covers, planned and made so far; make nothing"
+    )
     p.add_argument("--number", type=int, default=600)
     p.add_argument("--first", type=int, default=0, help="number of the first case (to make a part of a set)")
     p.add_argument("--seed", type=int, default=1)

@@ -51,9 +51,13 @@ def main(argv: list[str]) -> int:
         if answer["colour"] == "white" and answer["dirt"] != "outliers":
             fit = json.loads((result / "cases" / name / "diagnosis.json").read_text())["fit"]["refit_only"]
             told = "detected" if row["detected"] else "missed"
-            print(f"{name} {row['band']:6s} {told:8s} {answer['snr'][0]:6.1f} {left(cases / name, answer, fit):6.1f}")
+            print(
+                f"{name} {row['band']:6s} {told:8s} {answer['snr'][0]:6.1f} {left(cases / name, answer, fit):6.1f}"
+            )
     if small:
-        print(f"an ideal test finds {np.mean(norm.sf(THRESHOLD - np.array(small))):.0%} of the {len(small)} small effects")
+        print(
+            f"an ideal test finds {np.mean(norm.sf(THRESHOLD - np.array(small))):.0%} of the {len(small)} small effects"
+        )
     return 0
 
 

@@ -74,7 +74,10 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
     ohm, heat_c, heat_g = par("R"), par("C_coil", 1.0), par("G_coil")
     e = columns(rows)
     copper = np.array(
-        [any(x == "copper_resistance" for x, _, _ in row.effects) or theta.get("knows_copper", 0) for row in rows]
+        [
+            any(x == "copper_resistance" for x, _, _ in row.effects) or theta.get("knows_copper", 0)
+            for row in rows
+        ]
     )
     on = {k: bool(np.any(v != _NEUTRAL[k])) for k, v in e.items()}
     dry = any(
@@ -91,7 +94,11 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
     x = np.array([row.start.get("position", 0.0) for row in rows]) + run.get("start", 0.0)
     v = np.zeros(m)
     air = run["air"]
-    coil = np.full(m, air[0]) + np.array([row.start.get("coil", 0.0) for row in rows]) + run.get("start_coil", 0.0)
+    coil = (
+        np.full(m, air[0])
+        + np.array([row.start.get("coil", 0.0) for row in rows])
+        + run.get("start_coil", 0.0)
+    )
     rest = x.copy()  # creep: position of the damper in series
     bouc = np.zeros(m)
     x2, v2 = x.copy(), np.zeros(m)
@@ -133,16 +140,20 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
             if on["quadratic_drag.B"]:
                 force = force - e["quadratic_drag.B"] * v * np.abs(v)
             if on["backlash_hysteresis.F"]:  # Bouc-Wen, n = 1: dz = (v - |v| z sign(v z)...) / X, midpoint
-                half = bouc + (v - 0.5 * (np.abs(v) * bouc + v * np.abs(bouc))) / e["backlash_hysteresis.X"] * (h / 2)
-                bouc = bouc + (v - 0.5 * (np.abs(v) * half + v * np.abs(half))) / e["backlash_hysteresis.X"] * h
+                half = bouc + (v - 0.5 * (np.abs(v) * bouc + v * np.abs(bouc))) / e[
+                    "backlash_hysteresis.X"
+                ] * (h / 2)
+                bouc = (
+                    bouc + (v - 0.5 * (np.abs(v) * half + v * np.abs(half))) / e["backlash_hysteresis.X"] * h
+                )
                 force = force - e["backlash_hysteresis.F"] * bouc
             if on["creep.K"]:
                 rest = x + (rest - x) * np.exp(-h / e["creep.TAU"])
                 force = force - e["creep.K"] * (x - rest)
             if on["?second_mass.K"]:
-                pull = e["?second_mass.K"] * (x2 - x) + 0.02 * np.sqrt(e["?second_mass.K"] * e["?second_mass.M"]) * (
-                    v2 - v
-                )
+                pull = e["?second_mass.K"] * (x2 - x) + 0.02 * np.sqrt(
+                    e["?second_mass.K"] * e["?second_mass.M"]
+                ) * (v2 - v)
                 v2 = v2 - pull / e["?second_mass.M"] * h
                 x2 = x2 + v2 * h
                 force = force + pull
@@ -182,7 +193,12 @@ def friction_suspects(force: float, pace: float, travel: float) -> list[Suspect]
     f = 0.12 * force
     return [
         Suspect("coulomb_friction", "velocity", lambda s: {"F": f * s}, top=4),
-        Suspect("stribeck_friction", "velocity", lambda s: {"FC": f * s, "FS": 0.6 * f * s, "VS": 0.15 * pace}, top=4),
+        Suspect(
+            "stribeck_friction",
+            "velocity",
+            lambda s: {"FC": f * s, "FS": 0.6 * f * s, "VS": 0.15 * pace},
+            top=4,
+        ),
         Suspect(
             "directional_friction",
             "velocity",
@@ -215,7 +231,10 @@ class FreeStage:
     def scene(self, rng: np.random.Generator, schedule: str, short: bool, vigour: float = 1.0) -> Scene:
         size = float(np.round(rng.uniform(0.3, 1.5), 2))
         damped = rng.random() < 0.8
-        belief: dict[str, tuple] = {"gain": (32.0 * size, "N/V"), "mass": (90.0 * size, "kg", 40 * size, 160 * size)}
+        belief: dict[str, tuple] = {
+            "gain": (32.0 * size, "N/V"),
+            "mass": (90.0 * size, "kg", 40 * size, 160 * size),
+        }
         if damped:
             belief["damping"] = (200.0 * size, "N*s/m", 20 * size, 800 * size)
         theta, ranges = _draw(belief, rng)
@@ -270,7 +289,9 @@ class FreeStage:
         }
 
         def outputs_of(k: int, rows: list[Variant]) -> np.ndarray:
-            with np.errstate(over="ignore", invalid="ignore"):  # a rival too large for the rig: its row is not finite
+            with np.errstate(
+                over="ignore", invalid="ignore"
+            ):  # a rival too large for the rig: its row is not finite
                 states = simulate(theta, runs[k], rows)
             out = np.empty((len(rows), n, 1))
             for r in range(len(rows)):
@@ -285,12 +306,16 @@ class FreeStage:
             suspects.append(Suspect("viscous_friction", "velocity", lambda s: {"B": 60 * size * s}))
         faults = sensor_suspects("encoder", period, runs[0]["t"][-1], 100.0, False, rng)
         suspects += [
-            s for s in faults if s.effect in ("sensor_lag", "sensor_delay", "sensor_offset_step", "sensor_drift")
+            s
+            for s in faults
+            if s.effect in ("sensor_lag", "sensor_delay", "sensor_offset_step", "sensor_drift")
         ]
         suspects.append(Suspect("cyclic_error", "encoder", lambda s: {"A": 0.05 * s, "P": 0.02, "PHI": 0.4}))
         unknowns = [
             Suspect("?sticky_zone", "velocity", lambda s: {"F": 0.2 * force * s, "X": 0.02}, top=4),
-            Suspect("?second_mass", "velocity", lambda s: {"M": 12 * size * s, "K": 12 * size * s * 900}, top=3),
+            Suspect(
+                "?second_mass", "velocity", lambda s: {"M": 12 * size * s, "K": 12 * size * s * 900}, top=3
+            ),
             Suspect("?one_way_gain", "motor", lambda s: {"A": 0.12 * s}, top=4, aliases=("velocity",)),
         ]
         return Scene(
@@ -342,10 +367,13 @@ class Flexure:
             t = clock(n, period, rng)
             hold = levels(t, rng, schedule, 1.6, 4.0) * (1 if schedule == "warm-up" else 1)
             tones = sum(
-                rng.uniform(0.2, 0.5) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in rng.uniform(0.3, 6.0, 5)
+                rng.uniform(0.2, 0.5) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6))
+                for f in rng.uniform(0.3, 6.0, 5)
             )
             current = vigour * np.convolve(
-                hold * rng.choice([-1, 1]) + 0.5 * tones * (hold > 0), np.hanning(41) / np.hanning(41).sum(), "same"
+                hold * rng.choice([-1, 1]) + 0.5 * tones * (hold > 0),
+                np.hanning(41) / np.hanning(41).sum(),
+                "same",
             )
             runs.append(
                 {
@@ -439,16 +467,22 @@ class Flexure:
         for effect, suspect in {
             "back_emf": Suspect("back_emf", "voltage", lambda s: {"K": 9.0 * s}, top=3),
             "inductance": Suspect("inductance", "voltage", lambda s: {"L": 4e-3 * s}, top=4),
-            "resistance_temperature": Suspect("resistance_temperature", "voltage", lambda s: {"A": 0.00393}, top=1),
+            "resistance_temperature": Suspect(
+                "resistance_temperature", "voltage", lambda s: {"A": 0.00393}, top=1
+            ),
             "copper_resistance": Suspect("copper_resistance", "joule", lambda s: {"A": 0.00393}, top=1),
         }.items():
             if not knows[effect]:
                 suspects.append(suspect)
         for output, swing, air in zip(outputs, (8.0, 5.0, 15.0), (False, False, True), strict=True):
             suspects += [
-                s for s in sensor_suspects(output, period, span, swing, air, rng) if s.effect != "sensor_gain" or air
+                s
+                for s in sensor_suspects(output, period, span, swing, air, rng)
+                if s.effect != "sensor_gain" or air
             ]
-        suspects.append(Suspect("cyclic_error", "position_read", lambda s: {"A": 0.004 * s, "P": 5e-4, "PHI": 0.4}))
+        suspects.append(
+            Suspect("cyclic_error", "position_read", lambda s: {"A": 0.004 * s, "P": 5e-4, "PHI": 0.4})
+        )
         unknowns = [
             Suspect("?sticky_zone", "velocity", lambda s: {"F": 0.1 * force * s, "X": 0.002}, top=6),
             Suspect("?one_way_gain", "motor", lambda s: {"A": 0.05 * s}, top=4, aliases=("velocity",)),

@@ -33,7 +33,8 @@ class Tanks:
             pump = np.round(pump + 0.25 * top, 4)
             start = {k: float(np.round(rng.uniform(1.5, 4.0), 3)) for k in names}
             runs.append(
-                {"t": t, "pump": pump, "air": np.full(n, 22.0)} | {f"{k}_start": np.full(n, start[k]) for k in names}
+                {"t": t, "pump": pump, "air": np.full(n, 22.0)}
+                | {f"{k}_start": np.full(n, start[k]) for k in names}
             )
         flows: dict = {"pumped": {"into": "upper", "rate": "k_pump * pump", "unit": "V/s"}}
         for k, name in enumerate(names):
@@ -44,9 +45,13 @@ class Tanks:
             "title": f"{len(names)} tanks in cascade",
             "inputs": {"pump": {"unit": "V"}} | {f"{k}_start": {"unit": "V"} for k in names},
             "parameters": _parameter_block(belief),
-            "nodes": {k: {"unit": "V", "storage": 1, "initial": f"{k}_start", "initial_sigma": 0.03} for k in names},
+            "nodes": {
+                k: {"unit": "V", "storage": 1, "initial": f"{k}_start", "initial_sigma": 0.03} for k in names
+            },
             "flows": flows,
-            "outputs": {f"level_{k}": {"value": k, "unit": "V", "noise": 0.02, "resolution": 0.005} for k in seen},
+            "outputs": {
+                f"level_{k}": {"value": k, "unit": "V", "noise": 0.02, "resolution": 0.005} for k in seen
+            },
         }
 
         def outputs_of(k: int, rows: list[Variant]) -> np.ndarray:
@@ -54,30 +59,44 @@ class Tanks:
             for r, row in enumerate(rows):
                 states = _integrate(names, {**theta, **row.theta}, row, runs[k])
                 for j, name in enumerate(seen):
-                    out[r, :, j] = _fault(rows, r, f"level_{name}", runs[k], states[:, names.index(name)], False)
+                    out[r, :, j] = _fault(
+                        rows, r, f"level_{name}", runs[k], states[:, names.index(name)], False
+                    )
             return out
 
         calm = [outputs_of(k, [Variant()])[0] for k in range(2)]
         high = float(max(np.quantile(y, 0.97) for y in calm))
         peak = {
-            x: float(max(_integrate(names, theta, Variant(), r)[:, names.index(x)].max() for r in runs)) for x in names
+            x: float(max(_integrate(names, theta, Variant(), r)[:, names.index(x)].max() for r in runs))
+            for x in names
         }
         span = runs[0]["t"][-1]
         suspects = [
-            Suspect("overflow", x, lambda s, x=x: {"HMAX": peak[x] * max(1.0 - 0.12 * s, 0.4), "A": 0.7}, top=5)
+            Suspect(
+                "overflow", x, lambda s, x=x: {"HMAX": peak[x] * max(1.0 - 0.12 * s, 0.4), "A": 0.7}, top=5
+            )
             for x in names
         ]
-        suspects += [Suspect("orifice_exponent", f"{x}_outflow", lambda s: {"N": 0.5 + 0.04 * s}, top=6) for x in names]
+        suspects += [
+            Suspect("orifice_exponent", f"{x}_outflow", lambda s: {"N": 0.5 + 0.04 * s}, top=6) for x in names
+        ]
         for x in seen:
-            suspects += [s for s in sensor_suspects(f"level_{x}", period, span, 4.0, False, rng, top_value=high)]
+            suspects += [
+                s for s in sensor_suspects(f"level_{x}", period, span, 4.0, False, rng, top_value=high)
+            ]
         suspects.append(
             Suspect("actuator_saturation", "pumped", lambda s: {"U": top * max(1.3 - 0.15 * s, 0.5)}, top=4)
         )
-        suspects.append(Suspect("actuator_dead_zone", "pumped", lambda s: {"U": 0.25 * top * (1 + 0.05 * s)}, top=4))
+        suspects.append(
+            Suspect("actuator_dead_zone", "pumped", lambda s: {"U": 0.25 * top * (1 + 0.05 * s)}, top=4)
+        )
         suspects.append(Suspect("actuator_delay", "pumped", lambda s: {"TD": 4 * period * s}, top=6))
-        unknowns = [Suspect("?siphon", x, lambda s: {"A": 0.25 * s}, top=4, aliases=(f"{x}_outflow",)) for x in names]
+        unknowns = [
+            Suspect("?siphon", x, lambda s: {"A": 0.25 * s}, top=4, aliases=(f"{x}_outflow",)) for x in names
+        ]
         unknowns += [
-            Suspect("?clogging", f"{x}_outflow", lambda s: {"A": 0.12 * s}, top=4, aliases=(x,)) for x in names
+            Suspect("?clogging", f"{x}_outflow", lambda s: {"A": 0.12 * s}, top=4, aliases=(x,))
+            for x in names
         ]
         scene = Scene(
             plant,
@@ -134,7 +153,9 @@ def _integrate(names: list[str], theta: dict, row: Variant, run: dict) -> np.nda
         x = np.maximum(x, 0.0)
         flow = k * x**power
         if special:  # a siphon that starts above 5 V; a filter that clogs in cycles
-            flow = flow * (1 + siphon / (1 + np.exp(-(x - 4.0) / 0.05))) * (1 - clog * ((now % 700.0) / 700.0))
+            flow = (
+                flow * (1 + siphon / (1 + np.exp(-(x - 4.0) / 0.05))) * (1 - clog * ((now % 700.0) / 700.0))
+            )
         spill = np.maximum(x - rim, 0.0) * 5.0
         d = -flow - spill
         d[0] += theta["k_pump"] * u

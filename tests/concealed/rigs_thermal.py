@@ -19,13 +19,19 @@ def _draw(belief: dict[str, tuple], rng: np.random.Generator) -> tuple[dict, dic
 
 def _parameter_block(belief: dict[str, tuple]) -> dict:
     return {
-        n: {"value": b[0], "unit": b[1], **({"range": [b[2], b[3]]} if len(b) == 4 else {})} for n, b in belief.items()
+        n: {"value": b[0], "unit": b[1], **({"range": [b[2], b[3]]} if len(b) == 4 else {})}
+        for n, b in belief.items()
     }
 
 
-def _network_block(net: Network, belief: dict[str, tuple], sigma: float, rates: dict[str, str]) -> tuple[dict, dict]:
+def _network_block(
+    net: Network, belief: dict[str, tuple], sigma: float, rates: dict[str, str]
+) -> tuple[dict, dict]:
     """The `nodes` and `flows` of the plant file."""
-    nodes = {n: {"unit": "degC", "storage": c, "initial": "air", "initial_sigma": sigma} for n, c in net.bodies.items()}
+    nodes = {
+        n: {"unit": "degC", "storage": c, "initial": "air", "initial_sigma": sigma}
+        for n, c in net.bodies.items()
+    }
     flows = {q: {"into": body, "rate": rates[q], "unit": "W"} for q, (body, _) in net.joule.items()}
     for name, (g, a, b) in net.edges.items():
         if g in belief:
@@ -63,7 +69,9 @@ def sensor_suspects(
     if air:
         found.append(Suspect("cold_junction_drift", output, lambda s: {"A": sign * 0.3 * s}, top=4))
     if top_value is not None:
-        found.append(Suspect("sensor_saturation", output, lambda s: {"YMAX": top_value - swing * 0.08 * s}, top=4))
+        found.append(
+            Suspect("sensor_saturation", output, lambda s: {"YMAX": top_value - swing * 0.08 * s}, top=4)
+        )
     return found
 
 
@@ -93,7 +101,9 @@ def thermal_suspects(
         found += [
             Suspect("radiation", n, lambda s, g=g: {"E": 0.4 * g / (4 * 295.0**3) * s}, top=20),
             Suspect("natural_convection", n, lambda s, g=g: {"G": 0.3 * g / rise**0.25 * s}, top=15),
-            Suspect("external_heat_source", n, lambda s: {"Q": 0.15 * heat * s, "T0": t0, "T1": t1}, onset="T0"),
+            Suspect(
+                "external_heat_source", n, lambda s: {"Q": 0.15 * heat * s, "T0": t0, "T1": t1}, onset="T0"
+            ),
             Suspect("second_ambient", n, lambda s, g=g: {"G": 0.3 * g * s}, top=6),
             Suspect("hidden_thermal_mass", n, lambda s, g=g, c=c: {"C": 0.5 * c * s, "G": 1.2 * g}, top=8),
             Suspect("variable_heat_capacity", n, lambda s: {"A": 0.006 * s}, top=6),
@@ -116,14 +126,20 @@ def thermal_suspects(
         if pace:
             found.append(Suspect("forced_convection", f, lambda s: {"A": 0.4 / pace**0.5 * s}, top=8))
         if stroke:
-            found.append(Suspect("position_dependent_conductance", f, lambda s: {"A": 0.17 / stroke * s}, top=5))
+            found.append(
+                Suspect("position_dependent_conductance", f, lambda s: {"A": 0.17 / stroke * s}, top=5)
+            )
     for a, b in absent:
-        g = 0.3 * min(max((theta[p[0]] for p in net.edges.values() if n in p[1:]), default=1.0) for n in (a, b))
+        g = 0.3 * min(
+            max((theta[p[0]] for p in net.edges.values() if n in p[1:]), default=1.0) for n in (a, b)
+        )
         found.append(Suspect("missing_link", f"{a}-{b}", lambda s, g=g: {"G": g * s}))
     return found
 
 
-def thermal_unknowns(surfaces: list[str], films: list[str], net: Network, rng: np.random.Generator) -> list[Suspect]:
+def thermal_unknowns(
+    surfaces: list[str], films: list[str], net: Network, rng: np.random.Generator
+) -> list[Suspect]:
     """Heat effects that the catalogue lacks. Where: the node."""
     found = [Suspect("?melting", n, lambda s: {"A": 1.5 * s}, top=6) for n in surfaces]
     found += [Suspect("?boiling", n, lambda s: {"A": 0.15 * s}) for n in surfaces]
@@ -210,7 +226,9 @@ class Actuator:
                 "melt_at": 26.0,
             }
             run["heat:joule"] = run["voltage"] * run["current"]
-            run["base"] = run["air"] + 3 * np.sin(2 * np.pi * t / t[-1] * rng.uniform(0.6, 1.6) + rng.uniform(0, 6))
+            run["base"] = run["air"] + 3 * np.sin(
+                2 * np.pi * t / t[-1] * rng.uniform(0.6, 1.6) + rng.uniform(0, 6)
+            )
             run["start"] = rng.normal(0, 0.08, 12)
             runs.append(run)
         full = rng.random() < 0.5
@@ -220,7 +238,9 @@ class Actuator:
             else ["coil", "bobbin", "outer_stator", "bracket_2"]
             + list(
                 rng.choice(
-                    ["outer_magnet", "inner_stator", "stator_connector", "shaft_1", "bracket_1"], 2, replace=False
+                    ["outer_magnet", "inner_stator", "stator_connector", "shaft_1", "bracket_1"],
+                    2,
+                    replace=False,
                 )
             )
         )
@@ -272,7 +292,9 @@ class Actuator:
                         y = y + q["A"] * (node[one] - node[other])
                     elif effect == "expansion_lag":
                         y = sensors.lag(run["t"], y, q["TAU"])
-                    elif effect == "?output_memory":  # a joint that slips when the growth passes a limit and stays
+                    elif (
+                        effect == "?output_memory"
+                    ):  # a joint that slips when the growth passes a limit and stays
                         y = y + q["A"] * np.maximum.accumulate(np.floor(np.maximum(y - y[0], 0) / 2.0))
                 out[r, :, -1] = _fault(rows, r, "position_error", run, y, False)
             return out
@@ -318,7 +340,11 @@ class Actuator:
         ]
         suspects += [
             Suspect("bending", f"{a}-{b}", lambda s: {"A": 0.15 * s})
-            for a, b in (("outer_stator", "bracket_2"), ("inner_stator", "outer_magnet"), ("bracket_1", "bracket_2"))
+            for a, b in (
+                ("outer_stator", "bracket_2"),
+                ("inner_stator", "outer_magnet"),
+                ("bracket_1", "bracket_2"),
+            )
         ]
         suspects += [
             Suspect("quadratic_expansion", "position_error", lambda s: {"A": 0.006 * s}),
@@ -326,7 +352,9 @@ class Actuator:
         ]
         if schedule != "warm-up":
             suspects.append(Suspect("scale_expansion", "position_error", lambda s: {"A": 0.03 * s}))
-        unknowns = thermal_unknowns(["bobbin", "outer_stator"], ["outer_stator_to_air", "bracket_1_to_air"], net, rng)
+        unknowns = thermal_unknowns(
+            ["bobbin", "outer_stator"], ["outer_stator_to_air", "bracket_1_to_air"], net, rng
+        )
         unknowns.append(Suspect("?output_memory", "position_error", lambda s: {"A": 0.1 * s}))
         return Scene(
             plant,
@@ -362,7 +390,9 @@ class Heater:
         count = 3 if three else 2
         scale = rng.uniform(0.7, 1.5)
         ids = range(1, count + 1)
-        belief: dict[str, tuple] = {f"C_{i}": (round(6.0 * scale, 2), "J/K", 2.0 * scale, 14 * scale) for i in ids}
+        belief: dict[str, tuple] = {
+            f"C_{i}": (round(6.0 * scale, 2), "J/K", 2.0 * scale, 14 * scale) for i in ids
+        }
         belief |= {f"G_{i}": (0.05, "W/K", 0.015, 0.15) for i in ids}
         linked = rng.random() < 0.75
         edges = {f"loss_{i}": (f"G_{i}", f"block_{i}", "air") for i in ids}
@@ -387,7 +417,9 @@ class Heater:
             for i in heated:
                 run[f"heat_{i}"] = np.round(levels(t, rng, schedule, 2.2 * scale, 320.0, 0.15), 4)
                 run[f"heat:power_{i}"] = run[f"heat_{i}"]
-            run["base"] = run["air"] + 6 * np.sin(2 * np.pi * t / t[-1] * rng.uniform(0.6, 1.6) + rng.uniform(0, 6))
+            run["base"] = run["air"] + 6 * np.sin(
+                2 * np.pi * t / t[-1] * rng.uniform(0.6, 1.6) + rng.uniform(0, 6)
+            )
             run["start"] = rng.normal(0, 0.2, count)
             runs.append(run)
         coarse = rng.random() < 0.3
@@ -423,7 +455,18 @@ class Heater:
         if three:
             absent.append(("block_1", "block_3"))
         suspects = thermal_suspects(
-            net, theta, blocks, [f"loss_{i}" for i in ids], joints, absent, span, 20.0, 0.0, 0.0, 2.2 * scale, rng
+            net,
+            theta,
+            blocks,
+            [f"loss_{i}" for i in ids],
+            joints,
+            absent,
+            span,
+            20.0,
+            0.0,
+            0.0,
+            2.2 * scale,
+            rng,
         )
         suspects.append(Suspect("heat_split", "block_1-block_2", lambda s: {"A": min(0.08 * s, 0.7)}))
         suspects.append(Suspect("heat_split", "block_2-block_1", lambda s: {"A": min(0.08 * s, 0.7)}))
@@ -478,7 +521,10 @@ class Drive:
             "flange_to_air": ("H_flange", "flange", "air"),
         }
         net = Network(
-            {b: f"C_{b}" for b in ("winding", "housing", "flange")}, edges, {"joule": ("winding", "i2r")}, cells=12
+            {b: f"C_{b}" for b in ("winding", "housing", "flange")},
+            edges,
+            {"joule": ("winding", "i2r")},
+            cells=12,
         )
         runs = []
         for _ in range(2):
@@ -486,9 +532,9 @@ class Drive:
             hold = vigour * levels(t, rng, schedule, 5.0, 500.0)
             wave = 1 + (0.25 * np.sin(2 * np.pi * t / rng.uniform(30, 90)) if schedule != "warm-up" else 0)
             current = np.round(hold * wave, 5)
-            pace = np.interp(t, np.linspace(0, t[-1], 25), rng.choice([0.0, 20.0, 60.0, 100.0], 25)) * rng.choice(
-                [-1, 1]
-            )
+            pace = np.interp(
+                t, np.linspace(0, t[-1], 25), rng.choice([0.0, 20.0, 60.0, 100.0], 25)
+            ) * rng.choice([-1, 1])
             speed = np.round((pace if schedule != "warm-up" else np.full(len(t), 40.0)) * (hold > 0), 5)
             runs.append(
                 {
@@ -499,7 +545,8 @@ class Drive:
                     "speed": speed,
                     "melt_at": 45.0,
                     "start": rng.normal(0, 0.1, 3),
-                    "base": 24 + 5 * np.sin(2 * np.pi * t / t[-1] * rng.uniform(0.6, 1.6) + rng.uniform(0, 6)),
+                    "base": 24
+                    + 5 * np.sin(2 * np.pi * t / t[-1] * rng.uniform(0.6, 1.6) + rng.uniform(0, 6)),
                 }
             )
         grow = " * (1 + 0.00393 * (winding - 20))"
@@ -512,7 +559,9 @@ class Drive:
             + (" + K_e * speed" if knows["back_emf"] else "")
         )
         housing_seen = rng.random() < 0.8
-        outputs = ["winding_temperature"] + (["housing_temperature"] if housing_seen else []) + ["winding_voltage"]
+        outputs = (
+            ["winding_temperature"] + (["housing_temperature"] if housing_seen else []) + ["winding_voltage"]
+        )
         spec = {
             "winding_temperature": {"value": "winding", "unit": "degC", "noise": 0.15},
             "housing_temperature": {"value": "housing", "unit": "degC", "noise": 0.1},
@@ -536,7 +585,8 @@ class Drive:
                 Variant(
                     {**row.theta, "scale:joule": row.theta.get("R_w", theta["R_w"])},
                     row.start,
-                    row.effects + ([("copper_resistance", "joule", {})] if knows["copper_resistance"] else []),
+                    row.effects
+                    + ([("copper_resistance", "joule", {})] if knows["copper_resistance"] else []),
                 )
                 for row in rows
             ]
@@ -549,7 +599,10 @@ class Drive:
                 ohm = p["R_w"] * np.ones(len(run["t"]))
                 if knows["resistance_temperature"] or "resistance_temperature" in present:
                     ohm = ohm * (
-                        1 + 0.00393 * (temps[r, :, 0] - 20) * present.get("resistance_temperature", {}).get("share", 1)
+                        1
+                        + 0.00393
+                        * (temps[r, :, 0] - 20)
+                        * present.get("resistance_temperature", {}).get("share", 1)
                     )
                 y = {
                     "winding_temperature": temps[r, :, 0],
@@ -588,7 +641,9 @@ class Drive:
         if not knows["copper_resistance"]:
             suspects.append(Suspect("copper_resistance", "joule", lambda s: {"A": 0.00393}, top=1))
         if not knows["resistance_temperature"]:
-            suspects.append(Suspect("resistance_temperature", "winding_voltage", lambda s: {"A": 0.00393}, top=1))
+            suspects.append(
+                Suspect("resistance_temperature", "winding_voltage", lambda s: {"A": 0.00393}, top=1)
+            )
         if not knows["back_emf"]:
             suspects.append(Suspect("back_emf", "winding_voltage", lambda s: {"K": 0.01 * s}))
         for output in outputs:

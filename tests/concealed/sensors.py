@@ -24,7 +24,9 @@ class Noise:
     def spectrum(self, n: int) -> np.ndarray:
         """Variance in each of n DCT bins (n,), in the square of the channel's unit."""
         w = np.pi * np.arange(n) / n
-        density = self.white**2 + self.ar**2 * (1 - self.rho**2) / (1 - 2 * self.rho * np.cos(w) + self.rho**2)
+        density = self.white**2 + self.ar**2 * (1 - self.rho**2) / (
+            1 - 2 * self.rho * np.cos(w) + self.rho**2
+        )
         return density + self.flicker**2 * _flicker_shape(n)
 
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -79,7 +81,13 @@ def lag(t: np.ndarray, y: np.ndarray, tau: float) -> np.ndarray:
 
 
 def apply_fault(
-    effect: str, p: dict, t: np.ndarray, y: np.ndarray, air: np.ndarray | None, x: np.ndarray | None, thermal: bool
+    effect: str,
+    p: dict,
+    t: np.ndarray,
+    y: np.ndarray,
+    air: np.ndarray | None,
+    x: np.ndarray | None,
+    thermal: bool,
 ) -> np.ndarray:
     """The reading (N,) that a sensor with the named fault gives for the true value y (N,)."""
     s = t - t[0]

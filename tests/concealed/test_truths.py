@@ -102,7 +102,9 @@ def test_nothing_missing_is_nothing(family, monkeypatch):
     bench = generate.Bench(scene, rng)
     bench.measure([])
     lumped = thermal.simulate
-    monkeypatch.setattr(rigs_thermal, "simulate", lambda net, *rest: lumped(dataclasses.replace(net, cells=1), *rest))
+    monkeypatch.setattr(
+        rigs_thermal, "simulate", lambda net, *rest: lumped(dataclasses.replace(net, cells=1), *rest)
+    )
     one_cell = [scene.outputs_of(k, [Variant()])[0] for k in range(2)]
     d = bench.judge.whiten([(a - b)[None] for a, b in zip(bench.base, one_cell, strict=True)])
     assert np.linalg.norm(d) > 1.0  # the models do differ
@@ -154,7 +156,10 @@ def test_an_honest_refit_leaves_what_scipy_leaves(family):
         return np.append(bench._whitened(readings, bench._at([x]))[0], x)
 
     walls = [
-        np.array([(r[i] - scene.theta[p]) * 4 / (r[1] - r[0]) for p, r in scene.ranges.items()] + [e * np.inf] * (free - n))
+        np.array(
+            [(r[i] - scene.theta[p]) * 4 / (r[1] - r[0]) for p, r in scene.ranges.items()]
+            + [e * np.inf] * (free - n)
+        )
         for i, e in ((0, -1), (1, 1))
     ]
     peer = least_squares(residual, np.zeros(free), bounds=walls, diff_step=1e-4, xtol=1e-6)
@@ -251,9 +256,15 @@ def test_a_fixed_effect_gets_its_size_from_the_drive():
     rng = np.random.default_rng
     full, weak = (rigs.scene(rng(4), "designed", True, v) for v in (1.0, 0.25))
     assert weak.runs[0]["current"].max() == pytest.approx(0.25 * full.runs[0]["current"].max(), rel=1e-3)
-    slot = next(s for s in generate.plan(3, 144, ["drive"], "one") if s.effect == "resistance_temperature" and s.band == "middle")
+    slot = next(
+        s
+        for s in generate.plan(3, 144, ["drive"], "one")
+        if s.effect == "resistance_temperature" and s.band == "middle"
+    )
     answer = generate.make_case(3, slot.number, ["drive"], True, "one")[2]
-    assert answer["effects"] == [["resistance_temperature", "winding_voltage"]] and 6 <= answer["snr"][0] <= 15
+    assert (
+        answer["effects"] == [["resistance_temperature", "winding_voltage"]] and 6 <= answer["snr"][0] <= 15
+    )
     assert answer["parameters"] == [{"ALPHA": 0.00393}]
 
 
@@ -273,7 +284,17 @@ def test_a_set_of_600_holds_every_effect_in_every_size_and_150_of_nothing():
 
 
 def test_the_listing_counts_what_was_planned_and_made(tmp_path, capsys):
-    argv = ["--out", str(tmp_path / "c"), "--seed", "3", "--smoke", "--kind", "none", "--families", "tanks,heater"]
+    argv = [
+        "--out",
+        str(tmp_path / "c"),
+        "--seed",
+        "3",
+        "--smoke",
+        "--kind",
+        "none",
+        "--families",
+        "tanks,heater",
+    ]
     generate.main([*argv, "--number", "2"])
     capsys.readouterr()
     generate.main([*argv, "--number", "4", "--list"])
@@ -289,5 +310,7 @@ def test_parameters_are_told_by_the_names_that_the_catalogue_publishes():
     """What a diagnosis reports can be compared with the truth: each name of an answer is one of the catalogue's."""
     for family in generate.FAMILIES.values():
         for s in family.scene(np.random.default_rng(1), "designed", True).suspects:
-            entry = yaml.safe_load((Path(__file__).parents[2] / f"config/effects/{s.effect}.yaml").read_text())
+            entry = yaml.safe_load(
+                (Path(__file__).parents[2] / f"config/effects/{s.effect}.yaml").read_text()
+            )
             assert set(generate.published(s.effect, s.make(1.0))) <= set(entry["parameters"]), s.effect

@@ -42,7 +42,9 @@ class Network:
     stiffness: float = 150.0
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a rival too large for the rig runs away: its row is not finite
+@np.errstate(
+    over="ignore", invalid="ignore"
+)  # a rival too large for the rig runs away: its row is not finite
 def simulate(net: Network, theta: dict, run: dict, rows: list[Variant]) -> np.ndarray:
     """Mean temperatures (m, N, bodies), degC, of every variant; `run`: t (s), air, heats (W), velocity, position."""
     names, flows = list(net.bodies), list(net.edges)
@@ -95,7 +97,9 @@ def simulate(net: Network, theta: dict, run: dict, rows: list[Variant]) -> np.nd
     out = np.empty((m, len(t), nb))
     heat_total = [np.asarray(run[name], float) for name in v.heat_columns]
 
-    def force(z: np.ndarray, hidden: np.ndarray, k: int, air_now: float, now: float) -> tuple[np.ndarray, np.ndarray]:
+    def force(
+        z: np.ndarray, hidden: np.ndarray, k: int, air_now: float, now: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         temps = z @ read
         ts, tm = temps[:, :nb], temps[:, nb:]
         other = np.concatenate([ts, np.full((m, 1), air_now)], axis=1)[:, b]
@@ -131,7 +135,9 @@ def simulate(net: Network, theta: dict, run: dict, rows: list[Variant]) -> np.nd
 class _Arrays:
     """The variants of a batch as arrays (m, bodies) and (m, flows)."""
 
-    def __init__(self, net: Network, theta: dict, rows: list[Variant], names: list[str], flows: list[str], run: dict):
+    def __init__(
+        self, net: Network, theta: dict, rows: list[Variant], names: list[str], flows: list[str], run: dict
+    ):
         m, nb, ne = len(rows), len(names), len(flows)
         self.names, self.run = names, run
         at = {n: i for i, n in enumerate(names)}
@@ -170,7 +176,11 @@ class _Arrays:
                 elif effect == "second_ambient":
                     body["base"][r, i] = p["G"]
                 elif effect == "hidden_thermal_mass":
-                    body["hid_g"][r, i], self.hid_c[r, i], body["hid_air"][r, i] = p["G"], p["C"], p.get("G_air", 0.0)
+                    body["hid_g"][r, i], self.hid_c[r, i], body["hid_air"][r, i] = (
+                        p["G"],
+                        p["C"],
+                        p.get("G_air", 0.0),
+                    )
                 elif effect == "missing_link":
                     self.links.append((r, *(at[n] for n in where.split("-")), p["G"]))
                 elif effect == "heat_split":

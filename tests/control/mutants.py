@@ -10,6 +10,7 @@ too: the tick would not return. Every processor takes its share, and a mutant me
 the whole takes minutes. Our own mutator because law.py runs here as a module of its own
 beside the compiled one, in one process: mutmut and cosmic-ray start pytest anew for each of the mutants.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -28,19 +29,32 @@ from pathlib import Path
 from tests.control import protection
 from tests.control.test_protection import CONTROL, PROTECTION
 
-LIMIT_S = 10.0              # all scenarios take about 2 s on the source as it is
+LIMIT_S = 10.0  # all scenarios take about 2 s on the source as it is
 
 SWAPS: dict[type, list[type]] = {
-    ast.Lt: [ast.LtE, ast.Gt], ast.LtE: [ast.Lt, ast.Gt], ast.Gt: [ast.GtE, ast.Lt], ast.GtE: [ast.Gt, ast.Lt],
-    ast.Eq: [ast.NotEq], ast.NotEq: [ast.Eq], ast.In: [ast.NotIn], ast.And: [ast.Or], ast.Or: [ast.And],
-    ast.Add: [ast.Sub], ast.Sub: [ast.Add], ast.Mult: [ast.Div], ast.Div: [ast.Mult], ast.BitOr: [ast.BitAnd],
-    ast.BitAnd: [ast.BitOr], ast.LShift: [ast.RShift], ast.RShift: [ast.LShift]}
+    ast.Lt: [ast.LtE, ast.Gt],
+    ast.LtE: [ast.Lt, ast.Gt],
+    ast.Gt: [ast.GtE, ast.Lt],
+    ast.GtE: [ast.Gt, ast.Lt],
+    ast.Eq: [ast.NotEq],
+    ast.NotEq: [ast.Eq],
+    ast.In: [ast.NotIn],
+    ast.And: [ast.Or],
+    ast.Or: [ast.And],
+    ast.Add: [ast.Sub],
+    ast.Sub: [ast.Add],
+    ast.Mult: [ast.Div],
+    ast.Div: [ast.Mult],
+    ast.BitOr: [ast.BitAnd],
+    ast.BitAnd: [ast.BitOr],
+    ast.LShift: [ast.RShift],
+    ast.RShift: [ast.LShift],
+}
 
 _FLAG = "a flag: only ever looked at as zero or not"
 _NO_DRIVE = "v is 0 wherever enable is 0: control() and _arm() empty it; a second lock on the same door"
 WHY: dict[str, str] = {
-    "law.py:_agree: `if self.fresh[_COIL]: self._compare_order()` condition True in `if self.fresh[_COIL]:`":
-        "means and estimates move over seconds: looked at in every tick the same is found, up to 0.1 s earlier, at a cost",
+    "law.py:_agree: `if self.fresh[_COIL]: self._compare_order()` condition True in `if self.fresh[_COIL]:`": "means and estimates move over seconds: looked at in every tick the same is found, up to 0.1 s earlier, at a cost",
     "law.py:protect: `clip(self.v, -self.output_limit, self.output_limit) if self.` condition True in "
     "`self.drive = clip(self.v, -self.output_limit, self.output_limit) if self.enable > 0.0 else`": _NO_DRIVE,
     "law.py:protect: `self.enable > 0.0` Gt -> GtE in "
@@ -49,27 +63,24 @@ WHY: dict[str, str] = {
     "`amperes = self.last[_CURRENT] if current else 0.0`": "amperes is looked at only where `current` holds",
     "law.py:_judge_readings: `1.0 + _K_ERROR` Add -> Sub in `self.verdict[c] = 1.0 + _K_ERROR`": "_K_ERROR is 0",
     "law.py:_judge_readings: `1.0 + _K_ERROR` Add -> Sub in `self.verdict[c] = 1.0 + _K_ERROR` (2)": "_K_ERROR is 0",
-    "law.py:_judge_readings: `1.0` + 1 in `self.verdict[c] = 1.0 + _K_ERROR`":
-        "of a channel that no device has and nobody requires: its verdict is only looked at as zero or not",
+    "law.py:_judge_readings: `1.0` + 1 in `self.verdict[c] = 1.0 + _K_ERROR`": "of a channel that no device has and nobody requires: its verdict is only looked at as zero or not",
     "law.py:_judge_readings: `1.0` + 1 in `self.seen[c] = 1.0`": _FLAG,
     "law.py:_judge_readings: `1` + 1 in `self.hold = 1`": _FLAG,
     "law.py:_compare_order: `1.0` + 1 in `self.exchanged = 1.0`": _FLAG,
     "law.py:_agree: `1.0` + 1 in `self.reference_zeroed = 1.0 if self.state != _OFF else 0.0`": _FLAG,
     "law.py:_agree: `1.0` + 1 in `self.zeroed = 1.0 if self.state != _OFF else 0.0`": _FLAG,
-    "law.py:_arm: `0 <= command < _COMMANDS` LtE -> Lt in `before, known = self.state, command if 0 <= command < _COMMANDS else _NONE`":
-        "command 0 is _NONE itself",
+    "law.py:_arm: `0 <= command < _COMMANDS` LtE -> Lt in `before, known = self.state, command if 0 <= command < _COMMANDS else _NONE`": "command 0 is _NONE itself",
     "law.py:_arm: `0` + 1 in `before, known = self.state, command if 0 <= command < _COMMANDS else _NONE`": "command 0 is _NONE itself",
     "law.py:_arm: `(((before * _COMMANDS + known) * 2 + started) * 2 + tripped)` Add -> Sub in "
-    "`self.state = _NEXT[(((before * _COMMANDS + known) * 2 + started) * 2 + tripped) * 2 + crit`":
-        "the place before, critical and not tripped: next_state asks for critical first, and has the same there",
-    "law.py:_agree: `0.0` + 1 in `amperes = self.last[_CURRENT] if current else 0.0`":
-        "amperes is looked at only where `current` holds",
+    "`self.state = _NEXT[(((before * _COMMANDS + known) * 2 + started) * 2 + tripped) * 2 + crit`": "the place before, critical and not tripped: next_state asks for critical first, and has the same there",
+    "law.py:_agree: `0.0` + 1 in `amperes = self.last[_CURRENT] if current else 0.0`": "amperes is looked at only where `current` holds",
 }
 """'file:function: what' of a mutant that survives -> why it means the same."""
 
 
 def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
     """(what, replacement) for each small change of this one node."""
+
     def changed(field: str, value: object) -> ast.AST:
         other = copy.deepcopy(node)
         setattr(other, field, value)
@@ -81,18 +92,25 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
     if isinstance(node, ast.Compare):
         for k, op in enumerate(node.ops):
             for new in SWAPS.get(type(op), []):
-                yield f"{type(op).__name__} -> {new.__name__}", changed("ops", [*node.ops[:k], new(), *node.ops[k + 1:]])
+                yield (
+                    f"{type(op).__name__} -> {new.__name__}",
+                    changed("ops", [*node.ops[:k], new(), *node.ops[k + 1 :]]),
+                )
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.USub):
         yield f"{type(node.op).__name__} gone", node.operand
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
         yield "+ 1", changed("value", node.value + 1)
     if isinstance(node, ast.If | ast.While | ast.IfExp):
         for value in (True, False):
-            if not (isinstance(node, ast.While) and value):          # would not end
+            if not (isinstance(node, ast.While) and value):  # would not end
                 yield f"condition {value}", changed("test", ast.Constant(value))
     if isinstance(node, ast.AugAssign):
         yield "set, not added", ast.Assign([node.target], node.value)
-    if isinstance(node, ast.Assign | ast.AugAssign) or isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+    if (
+        isinstance(node, ast.Assign | ast.AugAssign)
+        or isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Call)
+    ):
         yield "gone", ast.Pass()
 
 
@@ -103,8 +121,13 @@ def mutants(path: Path, functions: tuple[str, ...] | None) -> Iterator[tuple[str
     source, seen = path.read_text(), dict[str, int]()
     lines, tree = source.splitlines(), ast.parse(source)
     owners = [(f.lineno, f.end_lineno or 0, f.name) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef)]
-    places = [(parent, field, k, node) for parent in ast.walk(tree) for field, value in ast.iter_fields(parent)
-              for k, node in enumerate(value if isinstance(value, list) else [value]) if isinstance(node, ast.AST)]
+    places = [
+        (parent, field, k, node)
+        for parent in ast.walk(tree)
+        for field, value in ast.iter_fields(parent)
+        for k, node in enumerate(value if isinstance(value, list) else [value])
+        if isinstance(node, ast.AST)
+    ]
     for parent, field, k, node in places:
         line = getattr(node, "lineno", 0)
         owner = next((name for first, last, name in owners if first <= line <= last), "module")
@@ -132,6 +155,7 @@ def _put(parent: ast.AST, field: str, k: int, node: ast.AST) -> None:
 def build(trees: dict[str, ast.Module]) -> types.ModuleType:
     """law.py as a module of its own, with `arming` and `faults` of its own; `trees` replaces the source of some of them."""
     import thermoctl.control as package
+
     kept = {n: sys.modules.get(f"thermoctl.control.{n}") for n in ("arming", "faults")}
     made = {}
     try:
@@ -139,7 +163,7 @@ def build(trees: dict[str, ast.Module]) -> types.ModuleType:
             tree = trees.get(name) or ast.parse((CONTROL / f"{name}.py").read_text())
             module = types.ModuleType(f"mutant_{name}")
             module.__file__ = str(CONTROL / f"{name}.py")
-            sys.modules[module.__name__] = module                    # dataclass looks it up
+            sys.modules[module.__name__] = module  # dataclass looks it up
             exec(compile(tree, module.__file__, "exec"), vars(module))
             made[name] = module
             if name != "law":
@@ -150,7 +174,7 @@ def build(trees: dict[str, ast.Module]) -> types.ModuleType:
             if module is not None:
                 sys.modules[f"thermoctl.control.{name}"] = module
                 setattr(package, name, module)
-    made["law"].WARM_UP_TICKS = made["law"]._WARM_UP = 6             # interpreted ticks are slow
+    made["law"].WARM_UP_TICKS = made["law"]._WARM_UP = 6  # interpreted ticks are slow
     made["law"].arming, made["law"].faults = made["arming"], made["faults"]
     return made["law"]
 
@@ -180,7 +204,7 @@ def _endless(*_: object) -> None:
 
 def share(which: int, of: int, only: str) -> tuple[int, list[str]]:
     """(mutants tried, those that survive) of every of-th mutant, beginning with number `which`."""
-    warnings.simplefilter("ignore")                      # numbers that are not finite are meant
+    warnings.simplefilter("ignore")  # numbers that are not finite are meant
     signal.signal(signal.SIGPROF, _endless)
     order, number, tried, left = list(protection.SCENARIOS), 0, 0, []
     for name, functions in (("arming", None), ("faults", None), ("law", PROTECTION)):
@@ -215,14 +239,18 @@ def main() -> int:
         found = pool.starmap(share, [(which, count, args.only) for which in range(count)], chunksize=1)
     total, left = sum(tried for tried, _ in found), sorted(m for _, survivors in found for m in survivors)
     unexplained = [m for m in left if m not in WHY]
-    text = (f"{total} mutants of the protection (arming.py, faults.py, {', '.join(PROTECTION)} of law.py), {total - len(left)} broken by "
-            f"{len(order)} scenarios, {len(left)} survive, {len(unexplained)} of them unexplained.\n")
+    text = (
+        f"{total} mutants of the protection (arming.py, faults.py, {', '.join(PROTECTION)} of law.py), {total - len(left)} broken by "
+        f"{len(order)} scenarios, {len(left)} survive, {len(unexplained)} of them unexplained.\n"
+    )
     print(f"{text}{time.perf_counter() - begun:.0f} s on {count} processors")
     if args.page:
         rows = "".join(f"| {m.replace('|', chr(92) + '|')} | {WHY.get(m, 'not explained')} |\n" for m in left)
-        Path(args.page).write_text("<!-- Written by `make mutants`. -->\n# Mutants\n\nEvery small change of the source that protects must "
-                                   f"break a test (tests/control/mutants.py says which changes).\n\n{text}\n| survivor | why |\n"
-                                   f"| --- | --- |\n{rows}")
+        Path(args.page).write_text(
+            "<!-- Written by `make mutants`. -->\n# Mutants\n\nEvery small change of the source that protects must "
+            f"break a test (tests/control/mutants.py says which changes).\n\n{text}\n| survivor | why |\n"
+            f"| --- | --- |\n{rows}"
+        )
     return 1 if unexplained else 0
 
 

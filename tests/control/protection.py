@@ -4,6 +4,7 @@ A scenario is a function of a law module: compiled or interpreted it must hold (
 branch, and it must fail for every mutant of the source (`make mutants`, tests/control/mutants.py). Time steps are powers of two,
 so that sums of them are exact and a limit can be met exactly: at the limit nothing trips, one bit or one tick beyond it does.
 """
+
 from __future__ import annotations
 
 import math
@@ -16,7 +17,7 @@ import numpy as np
 from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel, Parameters
 
-P = 2.0 ** -10                                              # period, s
+P = 2.0**-10  # period, s
 AIR = 22.0
 AT = {name: i for i, name in enumerate(faults.CHANNELS)}
 REQUIRED = ("position_um", "voltage_v", "current_a", "air_c", "coil_c")
@@ -39,8 +40,21 @@ def model(gain=0.0, slow=0.0):
     """Two bodies that keep their heat, coil and bobbin; no expansion; corrections by `gain`."""
     C = np.zeros((12, 2))
     C[0, 0] = C[1, 1] = 1.0
-    return CompensatorModel("kalman", P, -np.eye(2) * slow, np.zeros((2, 2)), C, np.array([gain, 0.0]), 0.0, 1.0, 0.0,
-                            np.zeros(12), np.zeros(12), 1.0, air_filter_s=1.0)
+    return CompensatorModel(
+        "kalman",
+        P,
+        -np.eye(2) * slow,
+        np.zeros((2, 2)),
+        C,
+        np.array([gain, 0.0]),
+        0.0,
+        1.0,
+        0.0,
+        np.zeros(12),
+        np.zeros(12),
+        1.0,
+        air_filter_s=1.0,
+    )
 
 
 class Bench:
@@ -48,7 +62,9 @@ class Bench:
 
     def __init__(self, module, model_=None, **changes):
         required = channels(0, **dict.fromkeys(REQUIRED, 1))
-        self.parameters = replace(Parameters(kp=0.0, ti_s=1.0, td_s=0.0, output_limit=4.0, required=required), **changes)
+        self.parameters = replace(
+            Parameters(kp=0.0, ti_s=1.0, td_s=0.0, output_limit=4.0, required=required), **changes
+        )
         self.module, self.law = module, module.Law(model_ or model(), self.parameters, P)
         self.value = channels(np.nan, position_um=8.0, voltage_v=0.0, current_a=0.0, air_c=AIR, coil_c=AIR)
         self.status = np.where(np.isnan(self.value), 3, 0).astype(np.uint8)
@@ -99,7 +115,10 @@ class Bench:
 
     def well(self, *names):
         """ARMED and driving, with these warnings and no others."""
-        assert self.state == arming.ARMED and self.shown == set(names) and self.law.enable == 1.0, (self.state, self.shown)
+        assert self.state == arming.ARMED and self.shown == set(names) and self.law.enable == 1.0, (
+            self.state,
+            self.shown,
+        )
         return self
 
 
@@ -144,16 +163,18 @@ def rate_to_the_bit(module):
     """The first reading may be anything; then the change counts over the time since the last one, up and down."""
     for sign in (1.0, -1.0):
         bench = Bench(module, rate=channels(math.inf, position_um=1024.0)).armed()
-        bench.set(position_um=8.0 + sign).tick().well()                              # 1 um in one period
+        bench.set(position_um=8.0 + sign).tick().well()  # 1 um in one period
         bench.set(position_um=math.nextafter(8.0 + 2 * sign, sign * math.inf)).tick().safe("position_rate")
         bench = Bench(module, rate=channels(math.inf, position_um=1024.0)).armed()
         bench.silent("position_um").tick(3).well()
-        bench.set(position_um=8.0 + sign * 4.0).tick().well()                        # 4 um in four periods
+        bench.set(position_um=8.0 + sign * 4.0).tick().well()  # 4 um in four periods
         bench.silent("position_um").tick(3)
         bench.set(position_um=8.0 + sign * 8.25).tick().safe("position_rate")
-        bench.tick().tick(command=arming.DISARM)                                     # the new level is believed
+        bench.tick().tick(command=arming.DISARM)  # the new level is believed
         assert bench.state == arming.SAFE and bench.shown == set()
-    bench = Bench(module, rate=channels(math.inf, position_um=1024.0)).armed()       # a tick without time: one period
+    bench = Bench(
+        module, rate=channels(math.inf, position_um=1024.0)
+    ).armed()  # a tick without time: one period
     bench.set(position_um=9.0).tick(dt=0.0).well()
     bench.set(position_um=10.5).tick(dt=0.0).safe("position_rate")
 
@@ -164,9 +185,11 @@ def stale_to_the_tick(module):
     bench.silent("position_um").tick(4).well()
     bench.tick().safe("position_stale")
     bench.set(position_um=8.0).tick()
-    assert bench.shown == {"position_stale"} and bench.state == arming.FAULT           # latched, the cause is gone
+    assert bench.shown == {"position_stale"} and bench.state == arming.FAULT  # latched, the cause is gone
     bench.tick(command=arming.DISARM).tick(2).tick(command=arming.ARM).well()
-    bench.silent("position_um").tick(4).well().set(position_um=8.0).tick().silent("position_um").tick(4).well()
+    bench.silent("position_um").tick(4).well().set(position_um=8.0).tick().silent("position_um").tick(
+        4
+    ).well()
 
 
 @scenario
@@ -201,14 +224,14 @@ def a_reading_that_was_refused_is_not_seen(module):
 def frozen_to_the_tick(module):
     bench = Bench(module, frozen_s=channels(math.inf, voltage_v=4 * P)).warm()
     assert bench.state == arming.SAFE and bench.shown == {"voltage_frozen"}
-    bench.set(voltage_v=0.25).tick(3).tick(command=arming.ARM).well()                  # three times the same since
+    bench.set(voltage_v=0.25).tick(3).tick(command=arming.ARM).well()  # three times the same since
     bench.tick().well().tick().safe("voltage_frozen")
     bench.set(voltage_v=0.5).tick(command=arming.DISARM)
     assert bench.shown == set()
     bench.tick(3).silent("voltage_v").tick(9)
-    assert bench.shown == set()                                                       # nothing new is not the same again
+    assert bench.shown == set()  # nothing new is not the same again
     bench.set(voltage_v=0.5).tick()
-    assert bench.shown == {"voltage_frozen"}                                          # ten periods later, still the same
+    assert bench.shown == {"voltage_frozen"}  # ten periods later, still the same
 
 
 @scenario
@@ -234,11 +257,15 @@ def the_compensation_waits_for_what_it_needs(module):
     bench = Bench(module, replace(warm, gain=np.array([1.0, 0.0]))).set(coil_c=AIR + 1).warm()
     bench.law.x[1] = 3.0
     bench.say(2, "air_c").tick(3).set(air_c=AIR).tick(3)
-    assert bench.law.compensation_um != 1.0                                           # and goes on when it is back
-    bench = Bench(module, replace(warm, gain=np.array([1.0, 0.0])), required=channels(0)).set(coil_c=AIR + 1).warm()
+    assert bench.law.compensation_um != 1.0  # and goes on when it is back
+    bench = (
+        Bench(module, replace(warm, gain=np.array([1.0, 0.0])), required=channels(0))
+        .set(coil_c=AIR + 1)
+        .warm()
+    )
     bench.law.x[1] = 3.0
     bench.say(2, "air_c").tick(3)
-    assert bench.law.compensation_um != 1.0                                           # not required: used without it
+    assert bench.law.compensation_um != 1.0  # not required: used without it
 
 
 @scenario
@@ -257,16 +284,17 @@ def following_to_the_tick(module):
     def away(distance, **changes):
         bench = Bench(module, following_um=2.0, following_s=4 * P, **changes).armed()
         return bench.set(position_um=8.0 + distance)
+
     for sign in (1.0, -1.0):
         away(sign * 2.0).tick(20).well()
         away(sign * 2.25).tick(4).well().tick().safe("following_error")
         away(sign * 4.0).tick(4).well()
-        away(sign * 4.25).tick().safe("following_error")                              # twice the limit: at once
+        away(sign * 4.25).tick().safe("following_error")  # twice the limit: at once
     bench = away(2.25).tick(4).set(position_um=8.0).tick().set(position_um=10.25).tick(3).well()
     bench.tick(command=arming.DISARM)
     assert bench.state == arming.SAFE
     bench.tick(20)
-    assert bench.shown == set() and bench.state == arming.READY                       # not armed: nothing to follow
+    assert bench.shown == set() and bench.state == arming.READY  # not armed: nothing to follow
     bench.tick(command=arming.ARM).tick(3).well()
 
 
@@ -286,45 +314,84 @@ def saturation_to_the_tick(module):
 @scenario
 def amplifier_to_the_tick(module):
     bench = Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=1.0).tick(4).well()
-    bench.set(amplifier_state=2.0).tick().set(amplifier_state=0.0).tick(4).well().tick().safe("amplifier_not_following")
+    bench.set(amplifier_state=2.0).tick().set(amplifier_state=0.0).tick(4).well().tick().safe(
+        "amplifier_not_following"
+    )
     bench = Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=2.0).tick(9).well()
     bench.set(amplifier_state=1.0).say(1, "amplifier_state").tick(9).well("amplifier_stale")
     bench = Bench(module, amplifier_s=4 * P).set(amplifier_state=1.0).armed().tick(4, command=arming.DISARM)
     assert bench.shown == set()
     Bench(module).armed().set(amplifier_state=3.0).tick().safe("amplifier_fault")
     Bench(module).warm().set(amplifier_state=3.0).tick().safe("amplifier_fault")
-    bench = Bench(module).armed().set(amplifier_state=3.0).say(1, "amplifier_state").tick().well("amplifier_stale")
+    bench = (
+        Bench(module)
+        .armed()
+        .set(amplifier_state=3.0)
+        .say(1, "amplifier_state")
+        .tick()
+        .well("amplifier_stale")
+    )
 
 
 @scenario
 def idle_to_the_tick(module):
-    for readings, trips in (({"current_a": 0.5}, False), ({"current_a": 0.75}, True), ({"current_a": -0.75}, True),
-                            ({"voltage_v": 4.0, "current_a": 0.5}, False), ({"voltage_v": 5.0, "current_a": 0.5}, True),
-                            ({"voltage_v": -5.0, "current_a": 0.5}, True)):
-        bench = Bench(module, idle_current_a=0.5, idle_power_w=2.0, idle_s=4 * P).warm().set(**readings).tick(4)
+    for readings, trips in (
+        ({"current_a": 0.5}, False),
+        ({"current_a": 0.75}, True),
+        ({"current_a": -0.75}, True),
+        ({"voltage_v": 4.0, "current_a": 0.5}, False),
+        ({"voltage_v": 5.0, "current_a": 0.5}, True),
+        ({"voltage_v": -5.0, "current_a": 0.5}, True),
+    ):
+        bench = (
+            Bench(module, idle_current_a=0.5, idle_power_w=2.0, idle_s=4 * P).warm().set(**readings).tick(4)
+        )
         assert bench.state == arming.READY and bench.shown == set()
         bench.tick()
-        assert (bench.state == arming.FAULT) == trips and bench.shown == ({"coil_stuck_on"} if trips else set())
-        bench = Bench(module, idle_current_a=0.5, idle_power_w=2.0, idle_s=4 * P).armed().set(**readings).tick(20).well()
+        assert (bench.state == arming.FAULT) == trips and bench.shown == (
+            {"coil_stuck_on"} if trips else set()
+        )
+        bench = (
+            Bench(module, idle_current_a=0.5, idle_power_w=2.0, idle_s=4 * P)
+            .armed()
+            .set(**readings)
+            .tick(20)
+            .well()
+        )
         bench.tick(command=arming.DISARM).tick(3)
-        assert bench.shown == set()                                                   # the time counts from disarming
-        bench = Bench(module, idle_current_a=0.5, idle_power_w=2.0, idle_s=4 * P).warm().set(**readings).tick(2)
+        assert bench.shown == set()  # the time counts from disarming
+        bench = (
+            Bench(module, idle_current_a=0.5, idle_power_w=2.0, idle_s=4 * P).warm().set(**readings).tick(2)
+        )
         bench.tick(command=arming.ARM).tick().tick(command=arming.DISARM).tick(3)
         assert bench.shown == set()
-    bench = Bench(module, idle_current_a=0.5, idle_s=4 * P).warm().set(current_a=0.75).tick(3).set(current_a=0.5).tick()
+    bench = (
+        Bench(module, idle_current_a=0.5, idle_s=4 * P)
+        .warm()
+        .set(current_a=0.75)
+        .tick(3)
+        .set(current_a=0.5)
+        .tick()
+    )
     bench.set(current_a=0.75).tick(4)
     assert bench.shown == set()
-    bench = Bench(module, required=channels(0), idle_current_a=0.5, idle_s=4 * P, high=channels(math.inf, current_a=9.0)).warm()
+    bench = Bench(
+        module, required=channels(0), idle_current_a=0.5, idle_s=4 * P, high=channels(math.inf, current_a=9.0)
+    ).warm()
     bench.set(current_a=10.0).tick(9)
-    assert bench.shown == {"current_range"}                                           # a reading at fault proves nothing
+    assert bench.shown == {"current_range"}  # a reading at fault proves nothing
 
 
 @scenario
 def times_count_from_arming(module):
     """What lasted for a while before DISARM does not count after the next ARM."""
+
     def again(bench):
         return bench.tick(3).well().tick(command=arming.DISARM).tick(2).tick(command=arming.ARM)
-    again(Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=1.0)).tick(4).well().tick().safe("amplifier_not_following")
+
+    again(Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=1.0)).tick(4).well().tick().safe(
+        "amplifier_not_following"
+    )
     bench = again(Bench(module, following_um=2.5, following_s=4 * P).armed().set(position_um=11.0))
     bench.set(position_um=14.0).tick(4).well().tick().safe("following_error")
     bench = Bench(module, saturation_s=4 * P).armed()
@@ -337,20 +404,55 @@ def times_count_from_arming(module):
 @scenario
 def all_at_once(module):
     """Faults add up: none hides another."""
-    bench = Bench(module, following_um=1.0, following_s=0.0, saturation_s=0.0, amplifier_s=0.0, coil_limit_c=30.0,
-                  coil_rate_k_s=0.5, coil_rate_time_s=1.0, innovation_limit_c=2.0, innovation_time_s=P, power_limit_w=1.0,
-                  power_time_s=P, late_s=P / 2, bound_um=1.0, resistance_ohm=4.0, agree_time_s=P, current_per_drive=1.0,
-                  current_tolerance_a=0.5, flexure_um_per_a=1.0, position_tolerance_um=1.0, monitored_limit_c=2.0)
+    bench = Bench(
+        module,
+        following_um=1.0,
+        following_s=0.0,
+        saturation_s=0.0,
+        amplifier_s=0.0,
+        coil_limit_c=30.0,
+        coil_rate_k_s=0.5,
+        coil_rate_time_s=1.0,
+        innovation_limit_c=2.0,
+        innovation_time_s=P,
+        power_limit_w=1.0,
+        power_time_s=P,
+        late_s=P / 2,
+        bound_um=1.0,
+        resistance_ohm=4.0,
+        agree_time_s=P,
+        current_per_drive=1.0,
+        current_tolerance_a=0.5,
+        flexure_um_per_a=1.0,
+        position_tolerance_um=1.0,
+        monitored_limit_c=2.0,
+    )
     bench.set(bobbin_c=AIR)
     bench.law.configure(replace(bench.parameters, late_s=1.0))
     bench.armed()
     bench.law.configure(bench.parameters)
     bench.law.v, bench.law.x[0] = 4.0, 99.0
-    bench.set(position_um=20.0, voltage_v=9.0, current_a=1.0, coil_c=40.0, bobbin_c=60.0, amplifier_state=3.0).say(2, "shaft_1_c")
+    bench.set(
+        position_um=20.0, voltage_v=9.0, current_a=1.0, coil_c=40.0, bobbin_c=60.0, amplifier_state=3.0
+    ).say(2, "shaft_1_c")
     bench.tick(external=1 << faults.BIT["amplifier_write"])
-    bench.safe("amplifier_write", "following_error", "drive_saturated", "amplifier_not_following", "amplifier_fault",
-               "coil_overtemperature", "coil_overtemperature_model", "coil_heating_rate", "coil_disagrees", "power_limit",
-               "loop_late", "electrical_disagrees", "position_disagrees", "monitored_disagrees", "monitored_error")
+    bench.safe(
+        "amplifier_write",
+        "following_error",
+        "drive_saturated",
+        "amplifier_not_following",
+        "amplifier_fault",
+        "coil_overtemperature",
+        "coil_overtemperature_model",
+        "coil_heating_rate",
+        "coil_disagrees",
+        "power_limit",
+        "loop_late",
+        "electrical_disagrees",
+        "position_disagrees",
+        "monitored_disagrees",
+        "monitored_error",
+    )
     bench = Bench(module, idle_current_a=0.5, idle_s=0.0, power_limit_w=1.0, power_time_s=P).warm()
     bench.law.x[0] = math.nan
     bench.set(voltage_v=9.0, current_a=1.0).tick(external=1 << faults.BIT["amplifier_write"])
@@ -374,9 +476,13 @@ def coil_to_the_bit(module):
 def heating_rate(module):
     """A ramp of r K/s reads as r (1 - exp(-t/tau)): far below its temperature limit it trips."""
     bench = Bench(module, coil_rate_k_s=1.0, coil_rate_time_s=64 * P).armed()
-    exact = Bench(module, coil_rate_k_s=1.0, coil_rate_time_s=0.25).armed().set(coil_c=AIR + 0.25).tick().well()
+    exact = (
+        Bench(module, coil_rate_k_s=1.0, coil_rate_time_s=0.25).armed().set(coil_c=AIR + 0.25).tick().well()
+    )
     assert exact.law.coil_rate_k_s == 1.0
-    Bench(module, coil_rate_k_s=1.0, coil_rate_time_s=0.25).armed().set(coil_c=AIR + 0.28125).tick().safe("coil_heating_rate")
+    Bench(module, coil_rate_k_s=1.0, coil_rate_time_s=0.25).armed().set(coil_c=AIR + 0.28125).tick().safe(
+        "coil_heating_rate"
+    )
     for k in range(1, 800):
         bench.set(coil_c=AIR + k * P).tick()
     bench.well()
@@ -403,29 +509,50 @@ def the_coil_and_the_model(module):
             bench.set(coil_c=AIR + sign * k / 16).tick()
         assert bench.state == arming.ARMED and abs(bench.law.model_error_c - sign * 4.0) < 1e-6
         bench.set(coil_c=AIR + sign * 4.25).tick().safe("coil_disagrees")
-    for row, trips in ((0, True), (1, False)):                                         # a model of the coil alone, of the bobbin alone
+    for row, trips in ((0, True), (1, False)):  # a model of the coil alone, of the bobbin alone
         C = np.zeros((12, 2))
         C[row, row] = 1.0
-        bench = Bench(module, replace(model(), C=C), innovation_limit_c=2.0, innovation_time_s=P).armed().set(coil_c=AIR + 9).tick(2)
+        bench = (
+            Bench(module, replace(model(), C=C), innovation_limit_c=2.0, innovation_time_s=P)
+            .armed()
+            .set(coil_c=AIR + 9)
+            .tick(2)
+        )
         (bench.safe if trips else bench.well)(*["coil_disagrees"] * trips)
     mute = replace(model(), C=np.zeros((12, 2)))
-    bench = Bench(module, mute, innovation_limit_c=2.0, innovation_time_s=P, drift_limit_c=2.0).armed().set(coil_c=AIR + 9)
+    bench = (
+        Bench(module, mute, innovation_limit_c=2.0, innovation_time_s=P, drift_limit_c=2.0)
+        .armed()
+        .set(coil_c=AIR + 9)
+    )
     bench.tick(3).well()
 
 
 @scenario
 def power_limit(module):
-    bench = Bench(module, power_limit_w=8.0, power_time_s=P).armed().set(voltage_v=4.0, current_a=2.0).tick(3).well()
+    bench = (
+        Bench(module, power_limit_w=8.0, power_time_s=P)
+        .armed()
+        .set(voltage_v=4.0, current_a=2.0)
+        .tick(3)
+        .well()
+    )
     bench.set(voltage_v=math.nextafter(4.0, 5.0)).tick().safe("power_limit")
-    bench = Bench(module, power_limit_w=8.0, power_time_s=4 * P).armed().set(voltage_v=8.0, current_a=2.0).tick(2).well()
+    bench = (
+        Bench(module, power_limit_w=8.0, power_time_s=4 * P)
+        .armed()
+        .set(voltage_v=8.0, current_a=2.0)
+        .tick(2)
+        .well()
+    )
     assert bench.law.outputs[11] == 16.0
-    bench.tick().safe("power_limit")                                                  # 4, 7, 9.25 W in the mean
+    bench.tick().safe("power_limit")  # 4, 7, 9.25 W in the mean
 
 
 @scenario
 def nothing_that_is_not_finite_is_driven(module):
     for name in ("v", "expansion_before_um", "air_c", "eps1"):
-        for value in (math.nan, math.inf)[:1 if name == "v" else 2]:                     # an infinite v is clipped
+        for value in (math.nan, math.inf)[: 1 if name == "v" else 2]:  # an infinite v is clipped
             bench = Bench(module).armed()
             setattr(bench.law, name, value)
             bench.tick()
@@ -443,11 +570,16 @@ def nothing_that_is_not_finite_is_driven(module):
     bench.law.compensation_um = math.nan
     bench.set(position_um=9.0).say(1, "voltage_v").tick()
     assert "not_finite" in bench.shown and bench.law.enable == 0.0
-    bench = Bench(module, low=channels(-math.inf), high=channels(math.inf)).armed().set(voltage_v=1e200, current_a=1e200).tick()
+    bench = (
+        Bench(module, low=channels(-math.inf), high=channels(math.inf))
+        .armed()
+        .set(voltage_v=1e200, current_a=1e200)
+        .tick()
+    )
     assert "not_finite" in bench.shown and bench.law.enable == 0.0
     C = np.zeros((12, 2))
     C[0, 0], C[1, 1] = 1e300, 1.0
-    bench = Bench(module, replace(model(), C=C)).armed()                              # the coil's estimate alone overflows
+    bench = Bench(module, replace(model(), C=C)).armed()  # the coil's estimate alone overflows
     bench.law.x[0] = 1e10
     bench.silent("coil_c").tick().safe("not_finite")
 
@@ -466,58 +598,116 @@ def outside_faults(module):
 @scenario
 def voltage_and_current(module):
     def bench(**changes):
-        return Bench(module, **{"resistance_ohm": 4.0, "resistance_tolerance": 0.25, "resistance_v": 0.5, "agree_time_s": P,
-                                **changes}).set(air_c=20.0, coil_c=20.0).armed()
+        return (
+            Bench(
+                module,
+                **{
+                    "resistance_ohm": 4.0,
+                    "resistance_tolerance": 0.25,
+                    "resistance_v": 0.5,
+                    "agree_time_s": P,
+                    **changes,
+                },
+            )
+            .set(air_c=20.0, coil_c=20.0)
+            .armed()
+        )
+
     for sign in (1.0, -1.0):
         bench().set(current_a=sign, voltage_v=sign * 4.0).tick(2).well()
-        bench().set(current_a=sign, voltage_v=sign * 6.0).tick(2).well()               # 2 = 0.25 x 6 + 0.5
+        bench().set(current_a=sign, voltage_v=sign * 6.0).tick(2).well()  # 2 = 0.25 x 6 + 0.5
         bench().set(current_a=sign, voltage_v=sign * 6.25).tick().safe("electrical_disagrees")
-        bench().set(current_a=sign, voltage_v=sign * 2.5).tick(2).well()               # 1.5 = 0.25 x 4 + 0.5
+        bench().set(current_a=sign, voltage_v=sign * 2.5).tick(2).well()  # 1.5 = 0.25 x 4 + 0.5
         bench().set(current_a=sign, voltage_v=sign * 2.25).tick().safe("electrical_disagrees")
-    bench().set(current_a=1.0, voltage_v=6.0).tick(dt=2 * P).well()                    # a longer tick: the reading itself
+    bench().set(current_a=1.0, voltage_v=6.0).tick(dt=2 * P).well()  # a longer tick: the reading itself
     bench(agree_time_s=4 * P).set(current_a=1.0, voltage_v=20.0).tick().safe("electrical_disagrees")
-    bench(agree_time_s=4 * P, resistance_tolerance=1.0, resistance_v=3.0).set(current_a=0.0, voltage_v=16.0).tick(9).well()
-    b = bench(agree_time_s=4 * P, resistance_tolerance=0.0, resistance_v=6.0).set(voltage_v=8.0).tick(4).well()    # 2, 3.5, 4.6, 5.5
+    bench(agree_time_s=4 * P, resistance_tolerance=1.0, resistance_v=3.0).set(
+        current_a=0.0, voltage_v=16.0
+    ).tick(9).well()
+    b = (
+        bench(agree_time_s=4 * P, resistance_tolerance=0.0, resistance_v=6.0)
+        .set(voltage_v=8.0)
+        .tick(4)
+        .well()
+    )  # 2, 3.5, 4.6, 5.5
     b.tick().safe("electrical_disagrees")
     bench(resistance_ohm=0.0).set(current_a=1.0, voltage_v=20.0).tick(3).well()
     bench(resistance_ohm=0.5).set(current_a=1.0, voltage_v=20.0).tick().safe("electrical_disagrees")
-    b = bench().set(current_a=1.0, voltage_v=4.0).tick(9).well()                       # the scale settles, it does not add up
+    b = bench().set(current_a=1.0, voltage_v=4.0).tick(9).well()  # the scale settles, it does not add up
     b.set(voltage_v=7.0).tick().safe("electrical_disagrees")
     # The coil's own temperature counts: 100 K more are 39.3 %.
-    hot = Bench(module, resistance_ohm=4.0, resistance_tolerance=0.0, resistance_v=0.5, agree_time_s=P).set(air_c=20.0, coil_c=120.0)
+    hot = Bench(module, resistance_ohm=4.0, resistance_tolerance=0.0, resistance_v=0.5, agree_time_s=P).set(
+        air_c=20.0, coil_c=120.0
+    )
     hot.law.x[0] = 0.0
     hot = replace_gain(module, hot).warm()
     hot.tick(command=arming.ARM).set(current_a=1.0, voltage_v=4.0 * 1.393).tick(2).well()
     hot.set(voltage_v=4.0).tick().safe("electrical_disagrees")
-    b = bench(resistance_tolerance=0.0)                                               # the estimate's temperature, not the reading's
+    b = bench(resistance_tolerance=0.0)  # the estimate's temperature, not the reading's
     b.law.x[0] = 100.0
     b.set(current_a=1.0, voltage_v=4.0 * 1.393).tick(2).well()
     b.set(voltage_v=4.0).tick().safe("electrical_disagrees")
     # A model that says nothing of the coil: its own reading counts; one at fault does not.
     C = np.zeros((12, 2))
     C[1, 1] = 1.0
-    mute = Bench(module, replace(model(), C=C), resistance_ohm=4.0, resistance_tolerance=0.0, resistance_v=0.5, agree_time_s=P,
-                 required=channels(0)).set(air_c=20.0, coil_c=120.0).armed()
+    mute = (
+        Bench(
+            module,
+            replace(model(), C=C),
+            resistance_ohm=4.0,
+            resistance_tolerance=0.0,
+            resistance_v=0.5,
+            agree_time_s=P,
+            required=channels(0),
+        )
+        .set(air_c=20.0, coil_c=120.0)
+        .armed()
+    )
     mute.set(current_a=1.0, voltage_v=4.0 * 1.393).tick(2).well()
     mute.set(voltage_v=4.0).tick().safe("electrical_disagrees")
-    mute = Bench(module, replace(model(), C=C), resistance_ohm=4.0, resistance_tolerance=0.0, resistance_v=0.5, agree_time_s=P,
-                 required=channels(0)).set(air_c=20.0).say(2, "coil_c").armed()
-    mute.set(current_a=1.0, voltage_v=9.0).tick(9).well("coil_error")                  # no temperature at all: not compared
+    mute = (
+        Bench(
+            module,
+            replace(model(), C=C),
+            resistance_ohm=4.0,
+            resistance_tolerance=0.0,
+            resistance_v=0.5,
+            agree_time_s=P,
+            required=channels(0),
+        )
+        .set(air_c=20.0)
+        .say(2, "coil_c")
+        .armed()
+    )
+    mute.set(current_a=1.0, voltage_v=9.0).tick(9).well("coil_error")  # no temperature at all: not compared
     # No comparison with a reading at fault, here of channels that need not be there.
     for name in ("voltage_v", "current_a"):
         b = bench(required=channels(0)).set(current_a=1.0, voltage_v=4.0).tick()
         b.say(2, name).set(**{"voltage_v" if name == "current_a" else "current_a": 20.0}).tick(3)
         assert "electrical_disagrees" not in b.shown
-    b = Bench(module, required=channels(0), resistance_ohm=4.0, agree_time_s=P, resistance_tolerance=0.0, resistance_v=0.5)
+    b = Bench(
+        module,
+        required=channels(0),
+        resistance_ohm=4.0,
+        agree_time_s=P,
+        resistance_tolerance=0.0,
+        resistance_v=0.5,
+    )
     b.law.configure(replace(b.parameters, resistance_v=0.25))
     b.say(2, "air_c", "coil_c").set(current_a=1.0, voltage_v=4.0).tick(5)
-    assert b.shown == {"air_error", "coil_error"}                                     # no temperature: R at 20 degC
+    assert b.shown == {"air_error", "coil_error"}  # no temperature: R at 20 degC
 
 
 def replace_gain(module, bench):
     """The same bench with a filter that starts on the coil's first reading."""
-    other = Bench(module, model(gain=0.5), **{f: getattr(bench.parameters, f) for f in (
-        "resistance_ohm", "resistance_tolerance", "resistance_v", "agree_time_s")})
+    other = Bench(
+        module,
+        model(gain=0.5),
+        **{
+            f: getattr(bench.parameters, f)
+            for f in ("resistance_ohm", "resistance_tolerance", "resistance_v", "agree_time_s")
+        },
+    )
     other.value[:], other.status[:], other.fresh[:] = bench.value, bench.status, bench.fresh
     return other
 
@@ -525,22 +715,43 @@ def replace_gain(module, bench):
 @scenario
 def current_and_drive(module):
     def bench(**changes):
-        b = Bench(module, **{"current_per_drive": 0.5, "current_tolerance_a": 0.25, "agree_time_s": P, **changes}).armed()
+        b = Bench(
+            module, **{"current_per_drive": 0.5, "current_tolerance_a": 0.25, "agree_time_s": P, **changes}
+        ).armed()
         b.law.v = 2.0
         return b.set(current_a=1.0).tick()
+
     for off in (0.25, -0.25):
         bench(current_tolerance_a=1.0).set(current_a=1.0 + off).tick(3).well()
         b = bench(current_tolerance_a=1.0)
         b.law.configure(replace(b.parameters, current_tolerance_a=0.25))
         b.tick(2).well().set(current_a=1.0 + off).tick(3).well().set(current_a=1.0 + 1.25 * off).tick().safe(
-            "amplifier_not_following")
-    b = Bench(module, current_per_drive=0.5, current_tolerance_a=0.25, agree_time_s=P).warm().set(current_a=9.0).tick(3)
-    assert b.shown == set()                                                           # idle: another fault's business
-    b = Bench(module, current_per_drive=0.5, current_tolerance_a=0.25, agree_time_s=4 * P).armed().set(current_a=0.5).tick(2).well()
-    b.tick().safe("amplifier_not_following")                                          # 0.125, 0.219, 0.289 A
-    b.set(current_a=0.0).tick(command=arming.DISARM).tick(2).tick(command=arming.ARM).set(current_a=0.5).tick(2).well()
-    Bench(module, current_per_drive=0.0, current_tolerance_a=0.25, agree_time_s=P).armed().set(current_a=9.0).tick(3).well()
-    b = Bench(module, required=channels(0), current_per_drive=0.5, current_tolerance_a=0.25, agree_time_s=P).armed()
+            "amplifier_not_following"
+        )
+    b = (
+        Bench(module, current_per_drive=0.5, current_tolerance_a=0.25, agree_time_s=P)
+        .warm()
+        .set(current_a=9.0)
+        .tick(3)
+    )
+    assert b.shown == set()  # idle: another fault's business
+    b = (
+        Bench(module, current_per_drive=0.5, current_tolerance_a=0.25, agree_time_s=4 * P)
+        .armed()
+        .set(current_a=0.5)
+        .tick(2)
+        .well()
+    )
+    b.tick().safe("amplifier_not_following")  # 0.125, 0.219, 0.289 A
+    b.set(current_a=0.0).tick(command=arming.DISARM).tick(2).tick(command=arming.ARM).set(current_a=0.5).tick(
+        2
+    ).well()
+    Bench(module, current_per_drive=0.0, current_tolerance_a=0.25, agree_time_s=P).armed().set(
+        current_a=9.0
+    ).tick(3).well()
+    b = Bench(
+        module, required=channels(0), current_per_drive=0.5, current_tolerance_a=0.25, agree_time_s=P
+    ).armed()
     b.say(2, "current_a")
     b.value[AT["current_a"]] = 9.0
     b.tick(3).well("current_error")
@@ -549,17 +760,27 @@ def current_and_drive(module):
 @scenario
 def position_and_current(module):
     def bench(**changes):
-        return Bench(module, **{"flexure_um_per_a": 8.0, "position_tolerance_um": 4.0, "agree_time_s": P, **changes}).armed()
+        return Bench(
+            module, **{"flexure_um_per_a": 8.0, "position_tolerance_um": 4.0, "agree_time_s": P, **changes}
+        ).armed()
+
     for sign in (1.0, -1.0):
         bench().set(position_um=8.0 + sign * 8.0, current_a=sign).tick(2).well()
         bench().set(position_um=8.0 + sign * 4.0).tick(2).well()
         bench().set(position_um=8.0 + sign * 4.25).tick().safe("position_disagrees")
         bench().set(current_a=sign).tick().safe("position_disagrees")
-    b = bench(agree_time_s=4 * P).set(position_um=16.0).tick(2).well()                 # 2, 3.5, 4.6 um
+    b = bench(agree_time_s=4 * P).set(position_um=16.0).tick(2).well()  # 2, 3.5, 4.6 um
     b.tick().safe("position_disagrees")
     bench(flexure_um_per_a=0.0).set(position_um=99.0).tick(3).well()
     # The zero is where the stage stands, with the current that holds it there, until OFF is left; not later.
-    b = Bench(module, flexure_um_per_a=8.0, position_tolerance_um=4.0, agree_time_s=P, idle_current_a=9.0, idle_power_w=99.0)
+    b = Bench(
+        module,
+        flexure_um_per_a=8.0,
+        position_tolerance_um=4.0,
+        agree_time_s=P,
+        idle_current_a=9.0,
+        idle_power_w=99.0,
+    )
     b.set(position_um=40.0, current_a=3.0).tick(module.WARM_UP_TICKS // 2).set(position_um=60.0).warm()
     assert b.law.position_zero_um == 60.0 - 24.0 and b.shown == set()
     b.set(position_um=65.0).tick(2)
@@ -573,33 +794,56 @@ def position_and_current(module):
 @scenario
 def watched_temperatures(module):
     def bench(**changes):
-        return Bench(module, **{"monitored_limit_c": 4.0, "innovation_time_s": P, **changes}).set(bobbin_c=AIR, shaft_1_c=AIR).armed()
+        return (
+            Bench(module, **{"monitored_limit_c": 4.0, "innovation_time_s": P, **changes})
+            .set(bobbin_c=AIR, shaft_1_c=AIR)
+            .armed()
+        )
+
     for sign in (1.0, -1.0):
         bench().set(bobbin_c=AIR + sign * 4.0).tick(2).well()
         bench().set(bobbin_c=AIR + sign * 4.0).tick(dt=2 * P).well()
         bench().set(bobbin_c=AIR + sign * 4.25).tick().well("monitored_disagrees")
-    bench().set(shaft_1_c=AIR + 50).tick(3).well()                                    # of which the model says nothing
-    bench(innovation_time_s=4 * P).set(bobbin_c=AIR + 8).tick(2).well().tick().well("monitored_disagrees")     # 2, 3.5, 4.6 K
+    bench().set(shaft_1_c=AIR + 50).tick(3).well()  # of which the model says nothing
+    bench(innovation_time_s=4 * P).set(bobbin_c=AIR + 8).tick(2).well().tick().well(
+        "monitored_disagrees"
+    )  # 2, 3.5, 4.6 K
     bench().set(bobbin_c=AIR + 8).say(2, "bobbin_c").tick(3).well("monitored_error")
-    b = Bench(module, required=channels(0), monitored_limit_c=4.0, innovation_time_s=P).say(1, "coil_c").set(bobbin_c=99.0).warm()
-    assert b.shown == {"coil_stale"}                                                  # before the first reading of the coil
-    b = bench(innovation_limit_c=99.0).set(coil_c=AIR + 9.0).tick(3).well()           # the coil's own has its own limits
+    b = (
+        Bench(module, required=channels(0), monitored_limit_c=4.0, innovation_time_s=P)
+        .say(1, "coil_c")
+        .set(bobbin_c=99.0)
+        .warm()
+    )
+    assert b.shown == {"coil_stale"}  # before the first reading of the coil
+    b = (
+        bench(innovation_limit_c=99.0).set(coil_c=AIR + 9.0).tick(3).well()
+    )  # the coil's own has its own limits
 
 
 @scenario
 def exchanged_sensors(module):
     def bench(coil, bobbin, estimates=(4.0, 0.0), **changes):
-        b = Bench(module, **{"order_limit_c": 2.0, "innovation_time_s": P, **changes}).set(bobbin_c=AIR).armed()
+        b = (
+            Bench(module, **{"order_limit_c": 2.0, "innovation_time_s": P, **changes})
+            .set(bobbin_c=AIR)
+            .armed()
+        )
         b.law.x[0], b.law.x[1] = estimates
         return b.set(coil_c=AIR + coil, bobbin_c=AIR + bobbin).tick(2)
+
     bench(4.0, 0.0).well()
-    bench(0.0, 4.0).well("monitored_disagrees").say(2, "shaft_1_c").tick().well("monitored_disagrees", "monitored_error")
-    bench(0.0, 1.0).well()                                                            # 4 x -1 = -4: at the limit
+    bench(0.0, 4.0).well("monitored_disagrees").say(2, "shaft_1_c").tick().well(
+        "monitored_disagrees", "monitored_error"
+    )
+    bench(0.0, 1.0).well()  # 4 x -1 = -4: at the limit
     bench(0.0, 1.25).well("monitored_disagrees")
     bench(4.0, 0.0, (0.0, 4.0)).well("monitored_disagrees")
     b = bench(0.0, 4.0)
-    b.set(coil_c=AIR + 4.0, bobbin_c=AIR).tick(2).well()                               # exchanged back
-    b = bench(0.0, 4.0).silent("coil_c").tick(3).well("monitored_disagrees")           # between two readings of the coil
+    b.set(coil_c=AIR + 4.0, bobbin_c=AIR).tick(2).well()  # exchanged back
+    b = (
+        bench(0.0, 4.0).silent("coil_c").tick(3).well("monitored_disagrees")
+    )  # between two readings of the coil
     b = bench(0.0, 4.0).say(2, "bobbin_c").tick(2).well("monitored_error")
     b = bench(0.0, 4.0, required=channels(0)).say(2, "coil_c").tick(2)
     assert "coil_error" in b.shown
@@ -607,13 +851,17 @@ def exchanged_sensors(module):
     C[0, 0] = 1.0
     b = Bench(module, replace(model(), C=C), order_limit_c=2.0, innovation_time_s=P).set(bobbin_c=AIR).armed()
     b.law.x[0] = 4.0
-    b.set(bobbin_c=AIR + 9.0).tick(2).well()                                           # no estimate of the bobbin
+    b.set(bobbin_c=AIR + 9.0).tick(2).well()  # no estimate of the bobbin
     C[:, :] = 0.0
     C[1, 1] = C[3, 0] = 1.0
-    b = Bench(module, replace(model(), C=C), order_limit_c=2.0, innovation_time_s=P).set(bobbin_c=AIR, outer_magnet_c=AIR).armed()
+    b = (
+        Bench(module, replace(model(), C=C), order_limit_c=2.0, innovation_time_s=P)
+        .set(bobbin_c=AIR, outer_magnet_c=AIR)
+        .armed()
+    )
     b.law.x[0], b.law.x[1] = 4.0, 0.0
     b.set(bobbin_c=AIR + 4.0, outer_magnet_c=AIR).tick(2).well("monitored_disagrees")
-    b.say(2, "bobbin_c").tick(2).well("monitored_error")                               # the other one's own fault counts
+    b.say(2, "bobbin_c").tick(2).well("monitored_error")  # the other one's own fault counts
 
 
 @scenario
@@ -621,25 +869,39 @@ def reference_and_estimate(module):
     growing = replace(model(), b2=np.r_[np.ones(2), np.zeros(10)], expansion_period_s=P)
 
     def bench(**changes):
-        return Bench(module, changes.pop("model_", growing), **{"reference_tolerance_um": 4.0, "agree_time_s": P, **changes}).set(
-            output_reference_um=108.0).armed()
+        return (
+            Bench(
+                module,
+                changes.pop("model_", growing),
+                **{"reference_tolerance_um": 4.0, "agree_time_s": P, **changes},
+            )
+            .set(output_reference_um=108.0)
+            .armed()
+        )
+
     for sign in (1.0, -1.0):
         bench().set(position_um=8.0 + sign * 50, output_reference_um=108.0 + sign * 50).tick(2).well()
         bench().set(output_reference_um=108.0 + sign * 4.0).tick(2).well()
         bench().set(output_reference_um=108.0 + sign * 4.0).tick(dt=2 * P).well()
         bench().set(output_reference_um=108.0 + sign * 4.25).tick().well("monitored_disagrees")
-        bench().set(output_reference_um=108.0 + sign * 4.25).say(2, "shaft_1_c").tick().well("monitored_disagrees", "monitored_error")
+        bench().set(output_reference_um=108.0 + sign * 4.25).say(2, "shaft_1_c").tick().well(
+            "monitored_disagrees", "monitored_error"
+        )
         b = bench()
         b.law.x[0] = sign * 9.0
-        b.tick(3).well("monitored_disagrees")                                         # the expansion that was estimated is not there
+        b.tick(3).well("monitored_disagrees")  # the expansion that was estimated is not there
         b.set(output_reference_um=108.0 + sign * 9.0).tick(2).well()
     bench(agree_time_s=4 * P).set(output_reference_um=116.0).tick(2).well().tick().well("monitored_disagrees")
-    bench(model_=model()).set(output_reference_um=999.0).tick(3).well()               # a model without expansion
+    bench(model_=model()).set(output_reference_um=999.0).tick(3).well()  # a model without expansion
     for say in ((2, "output_reference_um"), (2, "position_um")):
         b = bench(required=channels(0))
         b.set(output_reference_um=999.0 if say[1] == "position_um" else 108.0).say(*say).tick(3)
         assert "monitored_disagrees" not in b.shown
-    b = Bench(module, growing, reference_tolerance_um=4.0, agree_time_s=P).set(output_reference_um=1.0).tick(module.WARM_UP_TICKS // 2)
+    b = (
+        Bench(module, growing, reference_tolerance_um=4.0, agree_time_s=P)
+        .set(output_reference_um=1.0)
+        .tick(module.WARM_UP_TICKS // 2)
+    )
     b.set(output_reference_um=50.0).warm()
     assert b.law.reference_zero_um == 42.0 and b.shown == set()
 
@@ -647,7 +909,11 @@ def reference_and_estimate(module):
 @scenario
 def each_way_a_model_expands(module):
     for change in ({"b1": np.ones(12)}, {"b2": np.ones(12)}, {"b_air": 1.0}):
-        b = Bench(module, replace(model(), **change), reference_tolerance_um=4.0, agree_time_s=P).set(output_reference_um=0.0).armed()
+        b = (
+            Bench(module, replace(model(), **change), reference_tolerance_um=4.0, agree_time_s=P)
+            .set(output_reference_um=0.0)
+            .armed()
+        )
         b.set(output_reference_um=9.0).tick(2).well("monitored_disagrees")
 
 
@@ -659,7 +925,7 @@ def the_way_up(module):
     bench.tick(command=arming.ARM)
     assert bench.state == arming.SAFE
     bench.tick(command=arming.ARM)
-    assert bench.state == arming.READY                                                # a command given earlier is not remembered
+    assert bench.state == arming.READY  # a command given earlier is not remembered
     bench.tick()
     assert bench.state == arming.READY
     bench.tick(command=arming.SETPOINT, value=99.0)
@@ -676,16 +942,16 @@ def no_state_but_ready_arms(module):
     bench.tick(command=arming.DISARM)
     assert bench.state == arming.SAFE and bench.shown == set()
     bench = Bench(module).warm().say(2, "coil_c").tick(command=arming.ARM)
-    assert bench.state == arming.SAFE and bench.shown == {"coil_error"}               # a fault, not critical: SAFE
+    assert bench.state == arming.SAFE and bench.shown == {"coil_error"}  # a fault, not critical: SAFE
     bench.tick(command=arming.ARM)
     assert bench.state == arming.SAFE
     bench = Bench(module).armed().say(2, "coil_c").tick().tick(command=arming.DISARM)
-    bench.safe("coil_error")                                                          # its cause stands: not acknowledged
+    bench.safe("coil_error")  # its cause stands: not acknowledged
 
 
 @scenario
 def a_command_that_is_none_does_nothing(module):
-    for command in (-1, -3, 4, 5, 6, 7, 8, 99, 2 ** 31 - 1, -2 ** 31):
+    for command in (-1, -3, 4, 5, 6, 7, 8, 99, 2**31 - 1, -(2**31)):
         bench = Bench(module).tick(command=command)
         assert bench.state == arming.OFF
         bench.warm().tick(command=command)
@@ -696,19 +962,48 @@ def a_command_that_is_none_does_nothing(module):
 
 @scenario
 def what_led_to_the_fault_stays_shown(module):
-    bench = Bench(module).armed().say(2, "coil_c").tick().set(coil_c=AIR).say(2, "air_c").tick().safe("coil_error", "air_error")
+    bench = (
+        Bench(module)
+        .armed()
+        .say(2, "coil_c")
+        .tick()
+        .set(coil_c=AIR)
+        .say(2, "air_c")
+        .tick()
+        .safe("coil_error", "air_error")
+    )
     bench.set(air_c=AIR).tick(9).safe("coil_error", "air_error")
     assert bench.law.fault_bits == int(bench.law.outputs[1])
     bench.tick(command=arming.DISARM)
     assert bench.shown == set() and bench.law.latched == 0
-    bench = Bench(module).armed().say(2, "shaft_1_c", "coil_c").tick().set(shaft_1_c=AIR, coil_c=AIR).tick().safe("coil_error")
-    bench = Bench(module).armed().say(2, "coil_c", "air_c").tick().set(coil_c=AIR, air_c=AIR).tick().safe("coil_error", "air_error")
+    bench = (
+        Bench(module)
+        .armed()
+        .say(2, "shaft_1_c", "coil_c")
+        .tick()
+        .set(shaft_1_c=AIR, coil_c=AIR)
+        .tick()
+        .safe("coil_error")
+    )
+    bench = (
+        Bench(module)
+        .armed()
+        .say(2, "coil_c", "air_c")
+        .tick()
+        .set(coil_c=AIR, air_c=AIR)
+        .tick()
+        .safe("coil_error", "air_error")
+    )
 
 
 @scenario
 def a_critical_fault_latches_from_every_state(module):
     for critical in (f.name for f in faults.FAULTS if f.severity == "critical"):
-        for bench in (Bench(module).warm(), Bench(module).armed(), Bench(module).tick(module.WARM_UP_TICKS + 1)):
+        for bench in (
+            Bench(module).warm(),
+            Bench(module).armed(),
+            Bench(module).tick(module.WARM_UP_TICKS + 1),
+        ):
             bench.tick(external=1 << faults.BIT[critical]).safe(critical).tick(3).safe(critical)
     bench = Bench(module).tick(external=1 << faults.BIT["power_limit"])
     assert bench.state == arming.OFF
@@ -723,21 +1018,56 @@ def leaving_armed_empties_the_controller(module):
         drive = bench.law.drive
         assert drive == bench.law.v and abs(drive) <= 4.0
         bench.set(position_um=7.5).tick(**leave)
-        assert (bench.law.v, bench.law.eps1, bench.law.d1, bench.law.drive, bench.law.control_v) == (0.0, 0.0, 0.0, 0.0, 0.0)
+        assert (bench.law.v, bench.law.eps1, bench.law.d1, bench.law.drive, bench.law.control_v) == (
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+        )
 
 
 @scenario
 def outputs_say_what_is(module):
     growing = replace(model(0.5), b2=np.ones(12), expansion_period_s=P)
     bench = Bench(module, growing, kp=0.125, slew_um_s=1.0).set(bobbin_c=AIR).armed()
-    bench.set(position_um=7.0, voltage_v=3.0, current_a=0.5, coil_c=AIR + 2, air_c=AIR + 1).tick(2, command=arming.SETPOINT, value=20.0)
+    bench.set(position_um=7.0, voltage_v=3.0, current_a=0.5, coil_c=AIR + 2, air_c=AIR + 1).tick(
+        2, command=arming.SETPOINT, value=20.0
+    )
     bench.silent("position_um", "coil_c").tick(2)
     law, out = bench.law, dict(zip(module.OUTPUTS, bench.law.outputs, strict=True))
-    for name in ("setpoint_um", "reference_um", "position_um", "compensated_um", "compensation_um", "expansion_um",
-                 "control_v", "drive", "enable", "power_w", "air_rate_k_s", "innovation_c", "kalman_gain"):
+    for name in (
+        "setpoint_um",
+        "reference_um",
+        "position_um",
+        "compensated_um",
+        "compensation_um",
+        "expansion_um",
+        "control_v",
+        "drive",
+        "enable",
+        "power_w",
+        "air_rate_k_s",
+        "innovation_c",
+        "kalman_gain",
+    ):
         assert out[name] == getattr(law, name), name
-    assert all(out[n] != 0.0 for n in ("compensation_um", "expansion_um", "air_rate_k_s", "innovation_c", "position_age_s", "coil_age_s"))
-    assert out["state"] == arming.ARMED and out["fault_bits"] == 1 << faults.BIT["compensation_slewing"] and out["power_w"] == 1.5
+    assert all(
+        out[n] != 0.0
+        for n in (
+            "compensation_um",
+            "expansion_um",
+            "air_rate_k_s",
+            "innovation_c",
+            "position_age_s",
+            "coil_age_s",
+        )
+    )
+    assert (
+        out["state"] == arming.ARMED
+        and out["fault_bits"] == 1 << faults.BIT["compensation_slewing"]
+        and out["power_w"] == 1.5
+    )
     assert out["position_age_s"] == law.age[0] and out["coil_age_s"] == law.age[AT["coil_c"]]
     assert [out[n[:-2] + "_est_c"] for n in faults.TEMPERATURES] == [law.T[m] + law.air_c for m in range(12)]
     law.v = 9.0
@@ -779,18 +1109,42 @@ def the_state_machine(module):
 def the_fault_table(module):
     table = module.faults
     assert [f.bit for f in table.FAULTS] == list(range(len(table.FAULTS))) and len(table.FAULTS) <= 53
-    assert table.FAULTS[0].name == "position_error" and len({f.name for f in table.FAULTS}) == len(table.FAULTS)
-    assert all(f.meaning and f.remedy and f.severity in ("warning", "fault", "critical") for f in table.FAULTS)
-    assert [table.FAULTS[5 * g + k].name for g in range(7) for k in range(5)] == [f"{g}_{k}" for g in table.GROUPS
-                                                                                  for k in table.KINDS]
+    assert table.FAULTS[0].name == "position_error" and len({f.name for f in table.FAULTS}) == len(
+        table.FAULTS
+    )
+    assert all(
+        f.meaning and f.remedy and f.severity in ("warning", "fault", "critical") for f in table.FAULTS
+    )
+    assert [table.FAULTS[5 * g + k].name for g in range(7) for k in range(5)] == [
+        f"{g}_{k}" for g in table.GROUPS for k in table.KINDS
+    ]
     severity = {f.name: f.severity for f in table.FAULTS}
     assert {n for n, s in severity.items() if s == "critical"} == {
-        "coil_overtemperature", "coil_overtemperature_model", "coil_heating_rate", "power_limit", "coil_stuck_on", "amplifier_fault",
-        "amplifier_write", "not_finite"}
-    assert {n for n, s in severity.items() if s == "warning"} == {"compensation_slewing", "monitored_disagrees"}
+        "coil_overtemperature",
+        "coil_overtemperature_model",
+        "coil_heating_rate",
+        "power_limit",
+        "coil_stuck_on",
+        "amplifier_fault",
+        "amplifier_write",
+        "not_finite",
+    }
+    assert {n for n, s in severity.items() if s == "warning"} == {
+        "compensation_slewing",
+        "monitored_disagrees",
+    }
     assert table.mask("critical") == sum(1 << table.BIT[n] for n, s in severity.items() if s == "critical")
-    assert table.mask("critical", "warning") == table.mask("critical") + table.mask("warning") and table.mask() == 0
-    assert [f.name for f in table.decode(5.0)] == ["position_error", "position_range"] and table.decode(0) == ()
-    assert table.decode(float(2 ** 52))[0].bit == 52 and table.BY_NAME["not_finite"].bit == table.BIT["not_finite"]
-    assert list(table.GROUP_OF_CHANNEL) == [0, 1, 2, 3, 4, 5, *[1] * 11, 6, 6, 6] and len(table.CHANNELS) == 20
+    assert (
+        table.mask("critical", "warning") == table.mask("critical") + table.mask("warning")
+        and table.mask() == 0
+    )
+    assert [f.name for f in table.decode(5.0)] == ["position_error", "position_range"] and table.decode(
+        0
+    ) == ()
+    assert (
+        table.decode(float(2**52))[0].bit == 52 and table.BY_NAME["not_finite"].bit == table.BIT["not_finite"]
+    )
+    assert (
+        list(table.GROUP_OF_CHANNEL) == [0, 1, 2, 3, 4, 5, *[1] * 11, 6, 6, 6] and len(table.CHANNELS) == 20
+    )
     assert table.CHANNELS[5:17] == table.TEMPERATURES and table.TEMPERATURES[0] == "coil_c"

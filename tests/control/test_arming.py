@@ -1,4 +1,5 @@
 """The arming machine as a whole: every state, command and condition, and long sequences of them."""
+
 import itertools
 
 from hypothesis import given

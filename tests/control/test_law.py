@@ -1,4 +1,5 @@
 """The law against closed forms and an independent numpy reference; every limit, from outside, in simulated ticks."""
+
 import importlib.util
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +28,9 @@ def channels(default, **given):
 
 def parameters(**changes):
     required = channels(0, **dict.fromkeys(REQUIRED, 1))
-    return replace(Parameters(kp=0.02, ti_s=0.004, td_s=0.001, output_limit=5.0, required=required), **changes)
+    return replace(
+        Parameters(kp=0.02, ti_s=0.004, td_s=0.001, output_limit=5.0, required=required), **changes
+    )
 
 
 def thermal_model(kind="mkf", n=12, seed=1):
@@ -38,8 +41,20 @@ def thermal_model(kind="mkf", n=12, seed=1):
     B = np.abs(rng.normal(size=(n, 2))) * 1e-6
     C = np.eye(12, n) if kind == "mkf" else rng.normal(size=(12, n))
     gain = np.linspace(1.0, 0.2, n) if kind == "mkf" else rng.normal(size=n) * 0.05 + np.linalg.pinv(C)[:, 0]
-    return CompensatorModel(kind, 1e-3, A, B, C, gain, R_w=1e-4, R_v=0.04, f1=0.99, b1=rng.normal(size=12) * 0.01,
-                            b2=rng.normal(size=12) * 0.01, expansion_period_s=0.05)
+    return CompensatorModel(
+        kind,
+        1e-3,
+        A,
+        B,
+        C,
+        gain,
+        R_w=1e-4,
+        R_v=0.04,
+        f1=0.99,
+        b1=rng.normal(size=12) * 0.01,
+        b2=rng.normal(size=12) * 0.01,
+        expansion_period_s=0.05,
+    )
 
 
 class Rig:
@@ -47,7 +62,9 @@ class Rig:
 
     def __init__(self, model=None, parameters_=None, law_class=Law):
         self.law = law_class(model or zero_model(), parameters_ or parameters(), 1e-3)
-        self.value = channels(np.nan, position_um=10.0, voltage_v=0.0, current_a=0.0, air_c=AMBIENT, coil_c=AMBIENT)
+        self.value = channels(
+            np.nan, position_um=10.0, voltage_v=0.0, current_a=0.0, air_c=AMBIENT, coil_c=AMBIENT
+        )
         self.status = np.where(np.isnan(self.value), 3, 0).astype(np.uint8)
         self.fresh = (self.status == 0).astype(np.uint8)
         self.law.bind(self.value, self.fresh, self.status)
@@ -94,7 +111,9 @@ def test_compiled():
 def test_velocity_pid_is_equation_41():
     """Against the positional closed form of (41): with constant Ts the sum telescopes to P + I + D of the error."""
     Kp, Ti, Td, Ts = 0.03, 0.02, 0.002, 1e-3
-    rig = Rig(parameters_=parameters(kp=Kp, ti_s=Ti, td_s=Td, output_limit=1e9, setpoint_rate_um_s=1e12)).armed()
+    rig = Rig(
+        parameters_=parameters(kp=Kp, ti_s=Ti, td_s=Td, output_limit=1e9, setpoint_rate_um_s=1e12)
+    ).armed()
     rng = np.random.default_rng(2)
     eps, v = [0.0, 0.0], []
     for _ in range(200):
@@ -141,7 +160,7 @@ def test_moving_average_is_the_mean_of_the_last_frames():
         rig.set(position_um=frame)
         rig.tick()
         if k >= 4:
-            assert rig.position_um == pytest.approx(frames[k - 4:k + 1].mean(), abs=1e-12)
+            assert rig.position_um == pytest.approx(frames[k - 4 : k + 1].mean(), abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["mkf", "kalman"])
@@ -213,7 +232,9 @@ def test_two_sensors_are_corrected_together():
     rig.set(coil_c=AMBIENT + 1, inner_stator_c=AMBIENT - 2)
     rig.tick()
     x = x + model.A_minus_I @ x
-    np.testing.assert_allclose(rig.law.x, x + gain @ (np.array([1.0, -2.0]) - model.C[[0, 4]] @ x), rtol=1e-12)
+    np.testing.assert_allclose(
+        rig.law.x, x + gain @ (np.array([1.0, -2.0]) - model.C[[0, 4]] @ x), rtol=1e-12
+    )
 
 
 def test_interpreted_source_gives_the_same_bits():
@@ -221,15 +242,22 @@ def test_interpreted_source_gives_the_same_bits():
     rigs = [Rig(thermal_model(), parameters(moving_average=4), cls) for cls in (Law, interpreted())]
     rng = np.random.default_rng(6)
     for k in range(900):
-        readings = dict(position_um=10 + rng.normal(), voltage_v=rng.normal(), current_a=rng.normal(),
-                        coil_c=25 + rng.normal(), air_c=22 + rng.normal())
+        readings = dict(
+            position_um=10 + rng.normal(),
+            voltage_v=rng.normal(),
+            current_a=rng.normal(),
+            coil_c=25 + rng.normal(),
+            air_c=22 + rng.normal(),
+        )
         dt = 1e-3 + abs(rng.normal()) * 1e-4
         for rig in rigs:
             rig.set(**readings)
             rig.status[INDEX["coil_c"]] = 2 if 500 < k < 520 else 0
             if k == 300:
                 rig.law.configure(parameters(kp=0.05, moving_average=7))
-            command = {150: arming.ARM, 200: arming.SETPOINT, 600: arming.DISARM, 650: arming.ARM}.get(k, arming.NONE)
+            command = {150: arming.ARM, 200: arming.SETPOINT, 600: arming.DISARM, 650: arming.ARM}.get(
+                k, arming.NONE
+            )
             rig.tick(command=command, argument=30.0, dt=dt)
         assert rigs[0].law.outputs.tobytes() == rigs[1].law.outputs.tobytes(), k
     assert rigs[0].law.snapshot().tobytes() == rigs[1].law.snapshot().tobytes()
@@ -268,7 +296,7 @@ def test_reload_moves_nothing():
 
 def test_arming_takes_the_measured_position():
     rig = Rig().tick(50)
-    rig.tick(command=arming.ARM)              # too early: not remembered
+    rig.tick(command=arming.ARM)  # too early: not remembered
     rig.tick(command=arming.SETPOINT, argument=99.0)
     rig.tick(200)
     assert rig.state == "READY"
@@ -293,15 +321,26 @@ def test_rearming_after_a_fault_does_not_jump():
     assert rig.control_v == 0.0
 
 
-LIMITED = dict(low=channels(-np.inf, coil_c=-20, position_um=-500, voltage_v=-30, current_a=-5),
-               high=channels(np.inf, coil_c=120, position_um=500, voltage_v=30, current_a=5),
-               rate=channels(np.inf, coil_c=100.0, position_um=1e5),
-               stale_s=channels(np.inf, coil_c=0.5, position_um=0.005, voltage_v=0.01, current_a=0.01),
-               frozen_s=channels(np.inf, voltage_v=0.2),
-               coil_limit_c=60.0, coil_rate_k_s=0.5, power_limit_w=20.0, power_time_s=1.0,
-               following_um=50.0, following_s=0.01,
-               idle_current_a=0.2, idle_power_w=1.0, idle_s=0.01, saturation_s=0.05, innovation_limit_c=5.0,
-               innovation_time_s=1.0, late_s=0.05)
+LIMITED = dict(
+    low=channels(-np.inf, coil_c=-20, position_um=-500, voltage_v=-30, current_a=-5),
+    high=channels(np.inf, coil_c=120, position_um=500, voltage_v=30, current_a=5),
+    rate=channels(np.inf, coil_c=100.0, position_um=1e5),
+    stale_s=channels(np.inf, coil_c=0.5, position_um=0.005, voltage_v=0.01, current_a=0.01),
+    frozen_s=channels(np.inf, voltage_v=0.2),
+    coil_limit_c=60.0,
+    coil_rate_k_s=0.5,
+    power_limit_w=20.0,
+    power_time_s=1.0,
+    following_um=50.0,
+    following_s=0.01,
+    idle_current_a=0.2,
+    idle_power_w=1.0,
+    idle_s=0.01,
+    saturation_s=0.05,
+    innovation_limit_c=5.0,
+    innovation_time_s=1.0,
+    late_s=0.05,
+)
 
 
 def break_reading(rig, name, kind):
@@ -318,10 +357,15 @@ def break_reading(rig, name, kind):
         rig.value[i] += {"position_um": 200.0, "coil_c": 3.0}[name]
 
 
-@pytest.mark.parametrize("name,kind,fault", [
-    (name, kind, f"{group}_{'range' if kind == 'nan' else kind}")
-    for name, group in zip(REQUIRED, ("position", "voltage", "current", "coil"), strict=True)
-    for kind in ("error", "stale", "nan", "range", "rate") if kind != "rate" or name in ("position_um", "coil_c")])
+@pytest.mark.parametrize(
+    "name,kind,fault",
+    [
+        (name, kind, f"{group}_{'range' if kind == 'nan' else kind}")
+        for name, group in zip(REQUIRED, ("position", "voltage", "current", "coil"), strict=True)
+        for kind in ("error", "stale", "nan", "range", "rate")
+        if kind != "rate" or name in ("position_um", "coil_c")
+    ],
+)
 def test_a_bad_reading_disables_the_amplifier_at_once_and_freezes_the_compensation(name, kind, fault):
     rig = Rig(thermal_model(), parameters(**LIMITED))
     rig.set(voltage_v=0.01)
@@ -338,7 +382,7 @@ def test_a_bad_reading_disables_the_amplifier_at_once_and_freezes_the_compensati
     rig.tick()
     assert rig.state == "FAULT" and rig.enable == 0.0 and rig.drive == 0.0 and fault in rig.faults
     if name != "position_um":
-        if kind != "rate":          # after one jump the new level is believed again
+        if kind != "rate":  # after one jump the new level is believed again
             rig.tick(500)
         assert rig.compensation_um == compensation
 
@@ -347,7 +391,7 @@ def test_a_silent_sensor_is_stale_after_its_time():
     rig = Rig(parameters_=parameters(**LIMITED)).armed()
     rig.fresh[INDEX["position_um"]] = 0
     rig.tick(5)
-    assert rig.state == "ARMED"              # the encoder's frame may miss a few ticks
+    assert rig.state == "ARMED"  # the encoder's frame may miss a few ticks
     rig.tick(2)
     assert rig.state == "FAULT" and "position_stale" in rig.faults
 
@@ -370,19 +414,24 @@ def test_monitored_sensors_only_warn():
 def wiggle(rig, ticks, **values):
     """Ticks with a voltage that is not frozen."""
     for k in range(ticks):
-        rig.set(**{"voltage_v": 0.001 * (k % 2), **{n: (f(k) if callable(f) else f) for n, f in values.items()}})
+        rig.set(
+            **{"voltage_v": 0.001 * (k % 2), **{n: (f(k) if callable(f) else f) for n, f in values.items()}}
+        )
         rig.tick()
         if rig.state == "FAULT":
             return k + 1
     return None
 
 
-@pytest.mark.parametrize("fault,changes,ticks", [
-    ("coil_overtemperature", dict(coil_c=61.0), 2),
-    ("power_limit", dict(voltage_v=lambda k: 24 + k % 2, current_a=2.0), 1500),
-    ("following_error", dict(position_um=61.0), 12),
-    ("drive_saturated", dict(position_um=58.0), 80),
-])
+@pytest.mark.parametrize(
+    "fault,changes,ticks",
+    [
+        ("coil_overtemperature", dict(coil_c=61.0), 2),
+        ("power_limit", dict(voltage_v=lambda k: 24 + k % 2, current_a=2.0), 1500),
+        ("following_error", dict(position_um=61.0), 12),
+        ("drive_saturated", dict(position_um=58.0), 80),
+    ],
+)
 def test_limits_trip_when_armed(fault, changes, ticks):
     rate = channels(np.inf)
     rig = Rig(parameters_=parameters(**{**LIMITED, "rate": rate})).armed()
@@ -391,15 +440,19 @@ def test_limits_trip_when_armed(fault, changes, ticks):
 
 
 def test_model_temperature_trips_without_the_sensor_seeing_it():
-    model = replace(thermal_model(n=12), A_minus_I=-np.eye(12) * 1e-7, B=np.full((12, 2), 1e-2),
-                    gain=np.r_[1e-6, np.zeros(11)])
+    model = replace(
+        thermal_model(n=12),
+        A_minus_I=-np.eye(12) * 1e-7,
+        B=np.full((12, 2), 1e-2),
+        gain=np.r_[1e-6, np.zeros(11)],
+    )
     rig = Rig(model, parameters(coil_limit_c=60.0)).armed()
     assert wiggle(rig, 2000, voltage_v=10.0, current_a=1.0) is not None
     assert "coil_overtemperature_model" in rig.faults and "coil_overtemperature" not in rig.faults
 
 
 def test_fast_heating_trips_before_the_temperature_is_reached():
-    model = replace(thermal_model(), R_w=1.0, R_v=1e-6)               # an estimate that follows the reading
+    model = replace(thermal_model(), R_w=1.0, R_v=1e-6)  # an estimate that follows the reading
     rig = Rig(model, parameters(coil_rate_k_s=0.5)).armed()
     assert wiggle(rig, 20000, coil_c=lambda k: AMBIENT + k * 2e-3) is not None
     assert rig.faults >= {"coil_heating_rate"} and rig.value[INDEX["coil_c"]] < AMBIENT + 30
@@ -466,9 +519,19 @@ def test_outside_faults_trip():
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from(faults.CHANNELS), st.floats(allow_nan=True, allow_infinity=True),
-                          st.sampled_from([0, 0, 0, 1, 2, 3]), st.sampled_from(range(4)),
-                          st.floats(allow_nan=True, allow_infinity=True), st.floats(-1, 2)), max_size=80))
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(faults.CHANNELS),
+            st.floats(allow_nan=True, allow_infinity=True),
+            st.sampled_from([0, 0, 0, 1, 2, 3]),
+            st.sampled_from(range(4)),
+            st.floats(allow_nan=True, allow_infinity=True),
+            st.floats(-1, 2),
+        ),
+        max_size=80,
+    )
+)
 def test_whatever_is_read_the_drive_is_finite_and_off_unless_armed(events):
     """No reading, command or time step, however absurd, gives a drive that is not finite, beyond its limit, or on in
     another state than ARMED."""
@@ -491,10 +554,18 @@ def test_outputs_are_the_attributes_of_their_names():
         assert rig.law.outputs[OUT[name]] == (getattr(rig.law, name) if expected is None else expected), name
 
 
-@pytest.mark.parametrize("change,message", [
-    (dict(kind="lqr"), "kind"), (dict(C=np.zeros((3, 12))), "C has shape"), (dict(f1=1.0), "f1"),
-    (dict(sensors=(3,)), "sensors"),
-    (dict(R_v=0.0), "R_v"), (dict(B=np.full((12, 2), np.nan)), "not finite"), (dict(R_w=-1.0), "R_w")])
+@pytest.mark.parametrize(
+    "change,message",
+    [
+        (dict(kind="lqr"), "kind"),
+        (dict(C=np.zeros((3, 12))), "C has shape"),
+        (dict(f1=1.0), "f1"),
+        (dict(sensors=(3,)), "sensors"),
+        (dict(R_v=0.0), "R_v"),
+        (dict(B=np.full((12, 2), np.nan)), "not finite"),
+        (dict(R_w=-1.0), "R_w"),
+    ],
+)
 def test_a_model_that_does_not_fit_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         replace(thermal_model(), **change)
@@ -505,7 +576,10 @@ def test_fault_table():
     assert len(faults.BIT) == len(faults.FAULTS)
     assert {f.severity for f in faults.FAULTS} == {"warning", "fault", "critical"}
     assert all(f.meaning and f.remedy for f in faults.FAULTS)
-    assert [f.name for f in faults.decode(float(1 << 3 | 1 << 41))] == [faults.FAULTS[3].name, faults.FAULTS[41].name]
+    assert [f.name for f in faults.decode(float(1 << 3 | 1 << 41))] == [
+        faults.FAULTS[3].name,
+        faults.FAULTS[41].name,
+    ]
 
 
 def test_a_reading_that_was_never_good_keeps_its_first_fault():

@@ -1,4 +1,5 @@
 """The protection's scenarios on the compiled law and on its source, and what of the source they reach."""
+
 import importlib.util
 import sys
 from pathlib import Path
@@ -37,7 +38,9 @@ def test_every_branch_is_reached(tmp_path):
     """`make mutants`: arming.py, faults.py and the protection's part of law.py, branch by branch."""
     coverage = pytest.importorskip("coverage")
     files = [str(CONTROL / f"{name}.py") for name in ("law", "arming", "faults")]
-    measure = coverage.Coverage(data_file=str(tmp_path / "coverage"), branch=True, include=files, config_file=False)
+    measure = coverage.Coverage(
+        data_file=str(tmp_path / "coverage"), branch=True, include=files, config_file=False
+    )
     for name in [n for n in sys.modules if n in ("thermoctl.control.arming", "thermoctl.control.faults")]:
         del sys.modules[name]
     measure.start()
@@ -45,6 +48,7 @@ def test_every_branch_is_reached(tmp_path):
         module = interpreted()
         import thermoctl.control.arming as arming
         import thermoctl.control.faults as faults
+
         module.arming, module.faults = arming, faults
         for scenario in protection.SCENARIOS:
             scenario(module)
@@ -54,8 +58,11 @@ def test_every_branch_is_reached(tmp_path):
     for file in files:
         analysis = measure._analyze(file)
         lines = own_lines(file) if file.endswith("law.py") else None
-        missed = [a for a in [*analysis.missing, *(b[0] for b in analysis.missing_branch_arcs().items())]
-                  if lines is None or a in lines]
+        missed = [
+            a
+            for a in [*analysis.missing, *(b[0] for b in analysis.missing_branch_arcs().items())]
+            if lines is None or a in lines
+        ]
         if missed:
             missing[Path(file).name] = sorted(set(missed))
     assert not missing
@@ -64,6 +71,11 @@ def test_every_branch_is_reached(tmp_path):
 def own_lines(file):
     """The lines of the protection's functions in law.py."""
     import ast
+
     tree = ast.parse(Path(file).read_text())
-    return {line for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name in PROTECTION
-            for line in range(node.lineno, node.end_lineno + 1)}
+    return {
+        line
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef) and node.name in PROTECTION
+        for line in range(node.lineno, node.end_lineno + 1)
+    }

@@ -1,4 +1,5 @@
 """A configuration of its own for each test: the simulated rig with a model, its files in the test's directory."""
+
 import dataclasses
 from pathlib import Path
 
@@ -16,8 +17,12 @@ ROOT = Path(__file__).resolve().parents[2]
 def config(tmp_path):
     """Path of a configuration like config/simulated.yaml, socket and recordings in tmp_path, no real-time priority."""
     text = patient((ROOT / "config/simulated.yaml").read_text())
-    for old, new in (("plants/", f"{ROOT}/config/plants/"), ("../run/", f"{tmp_path}/"),
-                     ("../recordings", f"{tmp_path}/recordings"), ("models/", f"{ROOT}/config/models/")):
+    for old, new in (
+        ("plants/", f"{ROOT}/config/plants/"),
+        ("../run/", f"{tmp_path}/"),
+        ("../recordings", f"{tmp_path}/recordings"),
+        ("models/", f"{ROOT}/config/models/"),
+    ):
         text = text.replace(old, new)
     path = tmp_path / "rig.yaml"
     path.write_text(text)

@@ -1,4 +1,5 @@
 """The daemon as a process of its own, `thermoctl run` on a configuration, as tests drive it."""
+
 import contextlib
 import os
 import re
@@ -25,13 +26,16 @@ def wait(condition, what, limit_s=LIMIT_S):
         with contextlib.suppress(InputError, psutil.Error):
             if found := condition():
                 return found, time.monotonic() - begin
-        time.sleep(0.01)                                   # how often we look, not a wait
+        time.sleep(0.01)  # how often we look, not a wait
     raise AssertionError(f"{what}: not within {limit_s} s")
 
 
 def patient(text):
     """config/simulated.yaml's text for a machine that runs tests: it stalls for longer than a rig's may, and is forgiven."""
-    for strict, instead in ((r"stale_s: \{.*", "stale_s: {position_um: 5}"), (r"frozen_s: \{.*", "frozen_s: {coil_c: 900}\n  late_s: 10")):
+    for strict, instead in (
+        (r"stale_s: \{.*", "stale_s: {position_um: 5}"),
+        (r"frozen_s: \{.*", "frozen_s: {coil_c: 900}\n  late_s: 10"),
+    ):
         text, replaced = re.subn(strict, instead, text)
         assert replaced == 1, strict
     return text
@@ -44,14 +48,20 @@ class Daemon:
         self.config, self.settings = Path(config), load_settings(config)
         self.log_path = self.config.with_suffix(".log")
         with self.log_path.open("a") as log:
-            self.process = subprocess.Popen([sys.executable, "-m", "thermoctl.cli", "run", "--config", str(config)], stdout=log,
-                                            stderr=log, env={**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"})
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "thermoctl.cli", "run", "--config", str(config)],
+                stdout=log,
+                stderr=log,
+                env={**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"},
+            )
         try:
             wait(lambda: self.process.poll() is not None or self.ask("status")["state"] == "READY", "READY")
         except AssertionError:
             self.kill()
             raise
-        self.family = psutil.Process(self.process.pid).children(recursive=True) if self.process.poll() is None else []
+        self.family = (
+            psutil.Process(self.process.pid).children(recursive=True) if self.process.poll() is None else []
+        )
 
     def ask(self, command, **more):
         return ask(self.settings.socket.path, {"command": command, **more}, 10.0)
@@ -82,4 +92,4 @@ class Daemon:
             with contextlib.suppress(psutil.Error, OSError):
                 process.kill()
         self.process.wait()
-        Path("/dev/shm", shared_name(self.settings)).unlink(missing_ok=True)       # nobody is left to remove it
+        Path("/dev/shm", shared_name(self.settings)).unlink(missing_ok=True)  # nobody is left to remove it

@@ -1,4 +1,5 @@
 """The daemon as a whole, its real processes on the simulated rig: commands, reload, and every way of dying."""
+
 import contextlib
 import json
 import os
@@ -39,10 +40,21 @@ def test_a_session(daemon, capsys, monkeypatch):
     assert main(["arm"]) == 0 and capsys.readouterr().out.startswith("ARMED, setpoint ")
     assert main(["setpoint", "4"]) == 0
     wait(lambda: abs(daemon.ask("status")["compensated_um"] - 4.0) < 0.2, "the stage at 4 um")
-    assert main(["setpoint", "4000"]) == 1 and "control.setpoint_low_um..setpoint_high_um" in capsys.readouterr().err
+    assert (
+        main(["setpoint", "4000"]) == 1
+        and "control.setpoint_low_um..setpoint_high_um" in capsys.readouterr().err
+    )
     assert main(["status", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert {"state", "ticks", "slips", "setpoint_um", "position_um", "compensation_um", "faults"} <= found.keys()
+    assert {
+        "state",
+        "ticks",
+        "slips",
+        "setpoint_um",
+        "position_um",
+        "compensation_um",
+        "faults",
+    } <= found.keys()
     assert found["state"] == "ARMED" and found["setpoint_um"] == 4.0 and found["faults"] == []
     assert main(["latency", "--json"]) == 0
     latency = json.loads(capsys.readouterr().out)
@@ -64,7 +76,9 @@ def test_reload_applies_whole_files_only(daemon):
     before = daemon.ask("status")["ticks"]
     daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.008").replace("priority: 80", "priority: 70"))
     answer = daemon.ask("reload")
-    assert answer["ok"] and answer["applied"] == ["control.kp"] and answer["needs_restart"] == ["loop.priority"]
+    assert (
+        answer["ok"] and answer["applied"] == ["control.kp"] and answer["needs_restart"] == ["loop.priority"]
+    )
     daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.005").replace("ti_s: 0.004", "ti_s: never"))
     answer = daemon.ask("reload")
     assert not answer["ok"] and "control.ti_s" in answer["error"] and ":12:9:" in answer["error"]
@@ -79,8 +93,15 @@ def test_bad_clients_cost_nothing(daemon):
     """Garbage, an endless line, a client that never reads, a flood: answered or dropped, and the loop ticks on."""
     path = daemon.settings.socket.path
     ticks = daemon.ask("status")["ticks"]
-    for data in (b"\xff\xfe\n", b"[]\n", b'{"command": 3}\n', b'{"command": "fly"}\n', b"[" * 5000 + b"\n",
-                 b'{"command": "setpoint", "value": "NaN"}\n', b'{"command": "setpoint", "value": NaN}\n'):
+    for data in (
+        b"\xff\xfe\n",
+        b"[]\n",
+        b'{"command": 3}\n',
+        b'{"command": "fly"}\n',
+        b"[" * 5000 + b"\n",
+        b'{"command": "setpoint", "value": "NaN"}\n',
+        b'{"command": "setpoint", "value": NaN}\n',
+    ):
         with socket.socket(socket.AF_UNIX) as s:
             s.connect(path)
             s.settimeout(5)
@@ -117,7 +138,10 @@ def test_a_helper_that_is_killed_comes_back_and_the_loop_runs_on(daemon, name):
     daemon.ask("arm")
     pid, ticks = daemon.child(name), daemon.ask("status")["ticks"]
     os.kill(pid, signal.SIGKILL)
-    wait(lambda: not psutil.pid_exists(pid) and f"{name} ended, started again" in daemon.log, "its end is noticed")
+    wait(
+        lambda: not psutil.pid_exists(pid) and f"{name} ended, started again" in daemon.log,
+        "its end is noticed",
+    )
     now, _ = wait(lambda: daemon.ask("status"), "an answer")
     assert now["state"] == "ARMED" and now["ticks"] > ticks and daemon.process.poll() is None
 
@@ -138,7 +162,7 @@ def test_a_supervisor_that_is_killed_takes_all_with_it(daemon):
     wait(lambda: not any(p.is_running() for p in daemon.family), "all children gone", 10.0)
     again = Daemon(daemon.config)
     try:
-        assert again.ask("status")["state"] == "READY"           # never ARMED by itself
+        assert again.ask("status")["state"] == "READY"  # never ARMED by itself
     finally:
         again.kill()
 
@@ -147,8 +171,12 @@ def test_the_first_fault_is_logged_with_its_remedy(unrecorded):
     text = unrecorded.read_text().replace("air_c: 45", "air_c: 10")
     unrecorded.write_text(text.replace("air_c: 5,", "air_c: 4,"))
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, "-m", "thermoctl.cli", "run", "--config", str(unrecorded)], text=True,
-                          stderr=subprocess.PIPE, env=environment) as process:
+    with subprocess.Popen(
+        [sys.executable, "-m", "thermoctl.cli", "run", "--config", str(unrecorded)],
+        text=True,
+        stderr=subprocess.PIPE,
+        env=environment,
+    ) as process:
         line = next(line for line in process.stderr if "air_range" in line)
         assert "remedy=" in line and "protection.low..high" in line
         path = load_settings(unrecorded).socket.path
@@ -182,22 +210,25 @@ def test_start_tells_why_it_failed(unrecorded, capsys, monkeypatch):
     assert "plant.yaml" in error and "Traceback" not in error
 
 
-@pytest.mark.parametrize("old,new,message", [
-    ("kp: 0.01", "kpp: 0.01", r"unknown option 'control.kpp' (did you mean 'kp'?)"),
-    ("kp: 0.01", "kp: -1", "control.kp: -1 is out of range; expected 0 to 1000"),
-    ("period_s: 1 ms", "period_s: 1 kg", "the unit does not fit"),
-    ("period_s: 1 ms", "period_s: soon", "a number in s was expected"),
-    ("control:", "controll:", "(did you mean 'control'?)"),
-    ("backend: simulated", "backend: simulatd", "(did you mean 'simulated'?)"),
-    ("kp: 0.01", "kp: 0.01\n  kp: 0.02", "stands twice"),
-    ("moving_average: 4", "moving_average: 4.5", "a whole number was expected"),
-    ("enable: true", "enable: maybe", "true or false was expected"),
-    ("required: [position_um", "required: [postion_um", "(did you mean 'position_um'?)"),
-    ("setpoint_high_um: 250", "setpoint_high_um: -300", "must be above"),
-    ("  kp: 0.01\n", "", "'control.kp' is missing"),
-    ("  plant:", "  roles: 7\n  plant:", "a mapping of names was expected"),
-    ("rig: {name: simulated}", "rig: 3", "a mapping was expected"),
-])
+@pytest.mark.parametrize(
+    "old,new,message",
+    [
+        ("kp: 0.01", "kpp: 0.01", r"unknown option 'control.kpp' (did you mean 'kp'?)"),
+        ("kp: 0.01", "kp: -1", "control.kp: -1 is out of range; expected 0 to 1000"),
+        ("period_s: 1 ms", "period_s: 1 kg", "the unit does not fit"),
+        ("period_s: 1 ms", "period_s: soon", "a number in s was expected"),
+        ("control:", "controll:", "(did you mean 'control'?)"),
+        ("backend: simulated", "backend: simulatd", "(did you mean 'simulated'?)"),
+        ("kp: 0.01", "kp: 0.01\n  kp: 0.02", "stands twice"),
+        ("moving_average: 4", "moving_average: 4.5", "a whole number was expected"),
+        ("enable: true", "enable: maybe", "true or false was expected"),
+        ("required: [position_um", "required: [postion_um", "(did you mean 'position_um'?)"),
+        ("setpoint_high_um: 250", "setpoint_high_um: -300", "must be above"),
+        ("  kp: 0.01\n", "", "'control.kp' is missing"),
+        ("  plant:", "  roles: 7\n  plant:", "a mapping of names was expected"),
+        ("rig: {name: simulated}", "rig: 3", "a mapping was expected"),
+    ],
+)
 def test_a_bad_configuration_is_one_good_line(config, old, new, message, capsys):
     assert old in config.read_text()
     config.write_text(config.read_text().replace(old, new, 1))
@@ -216,7 +247,9 @@ def test_check_and_doctor_find_the_example_good(config, capsys):
 
 def full_rate(daemon):
     """The full-rate recordings, oldest first."""
-    return sorted(p for p in Path(daemon.settings.recording.directory).glob("*.arrows") if ".10hz" not in p.name)
+    return sorted(
+        p for p in Path(daemon.settings.recording.directory).glob("*.arrows") if ".10hz" not in p.name
+    )
 
 
 def on_disk(daemon, count):
@@ -246,12 +279,12 @@ def test_what_a_session_recorded_replays_to_the_bit(config, capsys):
     finally:
         daemon.kill()
     files = full_rate(daemon)
-    assert len(files) == 3                          # the start, after the reload, after the kill
+    assert len(files) == 3  # the start, after the reload, after the kill
     ticks = 0
     for path in files:
         assert main(["replay", str(path)]) == 0
         out = capsys.readouterr().out
         assert "bit for bit" in out
         ticks += int(out.split(": ")[1].split()[0])
-    assert ticks > 2000         # what was seen on the disk of the last two
+    assert ticks > 2000  # what was seen on the disk of the last two
     assert main(["replay", str(config)]) == 2 and "rig.yaml" in capsys.readouterr().err

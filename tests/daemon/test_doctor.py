@@ -1,4 +1,5 @@
 """`thermoctl doctor`: each property of the machine that makes ticks late is found where it is, with its remedy."""
+
 from types import SimpleNamespace
 
 import pytest
@@ -6,19 +7,33 @@ import pytest
 from thermoctl.daemon import doctor
 from thermoctl.daemon.doctor import cpu_list, real_time_checks
 
-GOOD = {"sys/kernel/realtime": "1", "proc/version": "Linux 6.1-rt SMP PREEMPT_RT", "sys/devices/system/cpu/isolated": "2-3",
-        "sys/devices/system/cpu/nohz_full": "3", "proc/sys/kernel/sched_rt_runtime_us": "-1",
-        "proc/sys/kernel/sched_rt_period_us": "1000000", "dev/cpu_dma_latency": "",
-        "sys/devices/system/cpu/cpu3/cpufreq/scaling_governor": "performance", "proc/irq/17/smp_affinity_list": "0-2",
-        "proc/irq/17/eth0/x": "", "proc/irq/0/smp_affinity_list": "0-3",
-        "sys/bus/usb-serial/devices/ttyUSB7/latency_timer": "1"}
+GOOD = {
+    "sys/kernel/realtime": "1",
+    "proc/version": "Linux 6.1-rt SMP PREEMPT_RT",
+    "sys/devices/system/cpu/isolated": "2-3",
+    "sys/devices/system/cpu/nohz_full": "3",
+    "proc/sys/kernel/sched_rt_runtime_us": "-1",
+    "proc/sys/kernel/sched_rt_period_us": "1000000",
+    "dev/cpu_dma_latency": "",
+    "sys/devices/system/cpu/cpu3/cpufreq/scaling_governor": "performance",
+    "proc/irq/17/smp_affinity_list": "0-2",
+    "proc/irq/17/eth0/x": "",
+    "proc/irq/0/smp_affinity_list": "0-3",
+    "sys/bus/usb-serial/devices/ttyUSB7/latency_timer": "1",
+}
 
 
 def settings(cpu=3, spin_s=0.0):
-    device = SimpleNamespace(name="encoder", binding=SimpleNamespace(
-        port="/dev/ttyUSB7", profile=SimpleNamespace(line=SimpleNamespace(latency_timer_ms=1))))
-    return SimpleNamespace(loop=SimpleNamespace(cpu=cpu, period_s=1e-3, spin_s=spin_s),
-                           hal=SimpleNamespace(backend="devices", device=device))
+    device = SimpleNamespace(
+        name="encoder",
+        binding=SimpleNamespace(
+            port="/dev/ttyUSB7", profile=SimpleNamespace(line=SimpleNamespace(latency_timer_ms=1))
+        ),
+    )
+    return SimpleNamespace(
+        loop=SimpleNamespace(cpu=cpu, period_s=1e-3, spin_s=spin_s),
+        hal=SimpleNamespace(backend="devices", device=device),
+    )
 
 
 @pytest.fixture
@@ -35,6 +50,7 @@ def machine(tmp_path, monkeypatch):
             else:
                 path.write_text(text + "\n")
         return {c.name: c for c in real_time_checks(s or settings(), str(tmp_path))}
+
     return checks
 
 
@@ -44,13 +60,25 @@ def test_a_tuned_machine_has_nothing_to_tune(machine):
     assert len(found) == 8
 
 
-@pytest.mark.parametrize("changed,name,word", [
-    ({"sys/kernel/realtime": None, "proc/version": "Linux 6.1 SMP PREEMPT_DYNAMIC"}, "PREEMPT_RT", "linux-image-rt"),
-    ({"sys/devices/system/cpu/isolated": "0-2"}, "isolated processor", "isolcpus"),
-    ({"sys/devices/system/cpu/nohz_full": "(null)"}, "no tick on it", "nohz_full=3"),
-    ({"proc/irq/17/smp_affinity_list": "0-3"}, "interrupts elsewhere", "smp_affinity_list"),
-    ({"sys/devices/system/cpu/cpu3/cpufreq/scaling_governor": "powersave"}, "frequency governor", "cpupower"),
-    ({"sys/bus/usb-serial/devices/ttyUSB7/latency_timer": "16"}, "latency_timer of encoder", "echo 1 >")])
+@pytest.mark.parametrize(
+    "changed,name,word",
+    [
+        (
+            {"sys/kernel/realtime": None, "proc/version": "Linux 6.1 SMP PREEMPT_DYNAMIC"},
+            "PREEMPT_RT",
+            "linux-image-rt",
+        ),
+        ({"sys/devices/system/cpu/isolated": "0-2"}, "isolated processor", "isolcpus"),
+        ({"sys/devices/system/cpu/nohz_full": "(null)"}, "no tick on it", "nohz_full=3"),
+        ({"proc/irq/17/smp_affinity_list": "0-3"}, "interrupts elsewhere", "smp_affinity_list"),
+        (
+            {"sys/devices/system/cpu/cpu3/cpufreq/scaling_governor": "powersave"},
+            "frequency governor",
+            "cpupower",
+        ),
+        ({"sys/bus/usb-serial/devices/ttyUSB7/latency_timer": "16"}, "latency_timer of encoder", "echo 1 >"),
+    ],
+)
 def test_what_is_not_tuned_is_named_with_its_remedy(machine, changed, name, word):
     found = machine(changed)
     assert [c.name for c in found.values() if not c.good] == [name]

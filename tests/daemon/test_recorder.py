@@ -1,4 +1,5 @@
 """The recorder's watch of the model: innovations in, an alarm out, and never a row lost for it."""
+
 import dataclasses
 import os
 
@@ -20,8 +21,8 @@ SIGMA = np.sqrt(make_model().R_v)
 def innovations(shift, seconds=2000.0, held=10, seed=1):
     """t, innovation and gain of 100 Hz rows that hold each of the sensor's samples `held` rows; `shift` sigma on the last third."""
     t = np.arange(0.0, seconds, 0.01)
-    e = np.repeat(np.random.default_rng(seed).normal(0.0, SIGMA, len(t) // held + 1), held)[:len(t)]
-    e[:5] = np.nan                                                    # no sample yet
+    e = np.repeat(np.random.default_rng(seed).normal(0.0, SIGMA, len(t) // held + 1), held)[: len(t)]
+    e[:5] = np.nan  # no sample yet
     return t, e + shift * SIGMA * (t > 2 * seconds / 3), np.full(len(t), 0.1)
 
 
@@ -41,11 +42,17 @@ def test_rows_one_by_one_and_a_clock_that_begins_again():
     t, e, k = innovations(2.0, seconds=600.0)
     whole, each = Misfit(make_model()), Misfit(make_model())
     found = whole.add(t, e, k)
-    assert [a for a in (each.add(t[n:n + 1], e[n:n + 1], k[n:n + 1]) for n in range(len(t))) if a is not None] == [found]
+    assert [
+        a
+        for a in (each.add(t[n : n + 1], e[n : n + 1], k[n : n + 1]) for n in range(len(t)))
+        if a is not None
+    ] == [found]
     assert found.begin_s == pytest.approx(400.0, abs=2 * BLOCK_S)
     fresh = Misfit(make_model())
     fresh.add(t, e, k)
-    whole.add(np.concatenate((t, t)), np.concatenate((e, e)), np.concatenate((k, k)))       # twice the same: begun anew each time
+    whole.add(
+        np.concatenate((t, t)), np.concatenate((e, e)), np.concatenate((k, k))
+    )  # twice the same: begun anew each time
     assert whole.sums == fresh.sums and whole.alarmed
 
 
@@ -71,6 +78,7 @@ def test_only_nan_and_no_rows():
 
 class Kept:
     """A writer that keeps the rows."""
+
     full = False
 
     def __init__(self):
@@ -87,11 +95,18 @@ class Kept:
 def test_a_watch_that_fails_loses_no_row():
     shared, writer, told = Shared.create(f"thermoctl-recorder-{os.getpid()}"), Kept(), []
     try:
-        recorder = Recorder(shared, make_model(), Parameters(kp=0.0, ti_s=1.0, td_s=0.0, output_limit=1.0), 1e-3,
-                            lambda law: writer, lambda event, **more: told.append(event))
+        recorder = Recorder(
+            shared,
+            make_model(),
+            Parameters(kp=0.0, ti_s=1.0, td_s=0.0, output_limit=1.0),
+            1e-3,
+            lambda law: writer,
+            lambda event, **more: told.append(event),
+        )
 
         def fails(*_):
             raise ZeroDivisionError
+
         recorder.misfit.add = fails
         row = np.zeros(len(SIGNALS))
         for tick in range(1, 501):

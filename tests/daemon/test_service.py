@@ -1,4 +1,5 @@
 """The systemd unit: installed below a directory, complete, and hardened as far as a real-time device driver can be."""
+
 import re
 import shutil
 import subprocess
@@ -30,7 +31,11 @@ def test_install_and_uninstall_leave_nothing(installed, config):
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze (package systemd)")
 def test_exposure_is_at_most_two(installed):
     unit: Path = installed / "etc/systemd/system/thermoctl.service"
-    done = subprocess.run(["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)], text=True,
-                          capture_output=True, check=False)
+    done = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)],
+        text=True,
+        capture_output=True,
+        check=False,
+    )
     exposure = re.search(r"Overall exposure level for thermoctl.service: ([\d.]+)", done.stdout)
     assert exposure and float(exposure[1]) <= 2.0, done.stdout + done.stderr

@@ -1,4 +1,5 @@
 """Shared memory between the loop and its readers: order, loss, torn rows, leftovers, other versions."""
+
 import multiprocessing
 import os
 
@@ -6,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from thermoctl.daemon.clock import now_ns, sleep_until
 from thermoctl.daemon.ring import Box, Histogram, Mailbox, Record, Ring, unpack_readings
-
 from thermoctl.daemon.shared import Shared, percentiles
 from thermoctl.daemon.socket import latency
 from thermoctl.yamlfile import InputError
@@ -138,7 +139,7 @@ def test_histogram_and_percentiles():
     for v in values:
         h.add(v)
     assert counts.sum() == 5000 and counts[100] == (values >= 100).sum() and largest[0] == values.max()
-    p50, = percentiles(counts, (0.5,))
+    (p50,) = percentiles(counts, (0.5,))
     assert abs(p50 - np.percentile(values, 50)) < 1.5
     assert np.isnan(percentiles(np.zeros(4, np.uint64))).all()
 

@@ -1,4 +1,5 @@
 """The tick in simulated time: determinism, replay to the bit, faults, arming and reload as a whole."""
+
 import dataclasses
 from pathlib import Path
 
@@ -27,15 +28,24 @@ def test_one_list_of_names():
     """Signals, law, back ends and settings name the same things in the same order."""
     first, state = INDEX["position_raw_um"], INDEX["state"]
     assert faults.CHANNELS == ROLES == CHANNELS
-    assert NAMES[first + 1:first + len(ROLES)] == ROLES[1:]
+    assert NAMES[first + 1 : first + len(ROLES)] == ROLES[1:]
     assert NAMES[state:] == OUTPUTS
 
 
 def test_the_tick_is_the_block_diagram():
-    source = (Path(thermoctl.__file__).parent / "daemon/loop.py").read_text()         # the module that runs is compiled
-    lines = [line.strip() for line in source[source.index("    def tick("):source.index("    def sample(")].splitlines()]
-    stages = [stage for line in lines for stage in ("sample", "estimate", "compensate", "control", "protect", "actuate",
-                                                    "publish") if f".{stage}(" in line]
+    source = (
+        Path(thermoctl.__file__).parent / "daemon/loop.py"
+    ).read_text()  # the module that runs is compiled
+    lines = [
+        line.strip()
+        for line in source[source.index("    def tick(") : source.index("    def sample(")].splitlines()
+    ]
+    stages = [
+        stage
+        for line in lines
+        for stage in ("sample", "estimate", "compensate", "control", "protect", "actuate", "publish")
+        if f".{stage}(" in line
+    ]
     assert stages == ["sample", "estimate", "compensate", "control", "protect", "actuate", "publish"]
 
 
@@ -100,8 +110,9 @@ def test_the_loop_closes_and_holds_the_compensated_position(session):
     rows = session.rows[-1000:]
     assert session.state == "ARMED" and not session.faults
     assert abs(column(rows, "compensated_um") - 8.0).max() < 0.2
-    np.testing.assert_allclose(column(rows, "compensated_um"),
-                               column(rows, "position_um") + column(rows, "compensation_um"))
+    np.testing.assert_allclose(
+        column(rows, "compensated_um"), column(rows, "position_um") + column(rows, "compensation_um")
+    )
     speed = np.diff(column(session.rows, "reference_um")) / session.period_s
     assert abs(speed[200:]).max() <= 1000 / 60 * (1 + 1e-9)
 
@@ -144,7 +155,7 @@ def test_replay_gives_the_recorded_bits(session):
     before = replay(rows[:reload_at], session.metadata)
     assert before.ticks == reload_at and not before.differences
     with_old_gains = replay(rows, session.metadata)
-    assert "control_v" in with_old_gains.differences          # the comparison can fail
+    assert "control_v" in with_old_gains.differences  # the comparison can fail
 
 
 def test_replay_from_a_kept_state(quiet):
@@ -184,12 +195,21 @@ def test_law_metadata_comes_back_exact(session):
     assert found["model"].A_minus_I.tobytes() == make_model().A_minus_I.tobytes() and found["state"] is None
 
 
-@pytest.mark.parametrize("role,how,fault", [
-    ("position_um", STALE, "position_stale"), ("position_um", ERROR, "position_error"),
-    ("position_um", float("nan"), "position_range"), ("position_um", 380.0, "position_rate"),
-    ("coil_c", ERROR, "coil_error"), ("coil_c", 900.0, "coil_range"), ("voltage_v", ERROR, "voltage_error"),
-    ("current_a", float("inf"), "current_range"), ("air_c", ERROR, "air_error"),
-    ("amplifier_state", 3.0, "amplifier_fault")])
+@pytest.mark.parametrize(
+    "role,how,fault",
+    [
+        ("position_um", STALE, "position_stale"),
+        ("position_um", ERROR, "position_error"),
+        ("position_um", float("nan"), "position_range"),
+        ("position_um", 380.0, "position_rate"),
+        ("coil_c", ERROR, "coil_error"),
+        ("coil_c", 900.0, "coil_range"),
+        ("voltage_v", ERROR, "voltage_error"),
+        ("current_a", float("inf"), "current_range"),
+        ("air_c", ERROR, "air_error"),
+        ("amplifier_state", 3.0, "amplifier_fault"),
+    ],
+)
 def test_a_pulled_sensor_disables_the_amplifier_within_two_ticks(session, role, how, fault):
     session.arm()
     session.command("setpoint", 2.0)
@@ -209,7 +229,7 @@ def test_a_pulled_sensor_disables_the_amplifier_within_two_ticks(session, role, 
     session.tick(150)
     session.command("arm")
     session.tick(2)
-    assert session.state == "FAULT"                  # latched: arming does not acknowledge
+    assert session.state == "FAULT"  # latched: arming does not acknowledge
     session.command("disarm")
     session.tick(3)
     before = session.row[INDEX["compensated_um"]]
@@ -223,6 +243,7 @@ def test_a_write_that_fails_is_a_fault_of_the_next_tick(session):
 
     def refuse(drive, enable):
         raise OSError("bus off")
+
     session.broken.write = refuse
     session.tick(2)
     assert session.state == "FAULT" and "amplifier_write" in session.faults
@@ -240,8 +261,16 @@ def test_rows_are_complete(session):
     assert int(row[INDEX["status_bits"]]) >> (2 * k) & 3 == 3 and int(row[INDEX["status_bits"]]) & 3 == OK
 
 
-@pytest.mark.parametrize("name,value", [("command", np.nan), ("command", 1e300), ("external_bits", 0.5), ("fresh_bits", np.inf),
-                                        ("status_bits", -1e99)])
+@pytest.mark.parametrize(
+    "name,value",
+    [
+        ("command", np.nan),
+        ("command", 1e300),
+        ("external_bits", 0.5),
+        ("fresh_bits", np.inf),
+        ("status_bits", -1e99),
+    ],
+)
 def test_a_damaged_row_is_not_replayed(session, name, value):
     session.arm()
     rows = session.rows

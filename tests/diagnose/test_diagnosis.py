@@ -1,4 +1,5 @@
 """Diagnoses of rigs whose truth this file simulates itself (scipy, no plant code), judged from outside by what is written."""
+
 import json
 import re
 from dataclasses import replace
@@ -43,7 +44,14 @@ outputs:
 LEVELS = (0.0, 2.5, 0.8, 0.0, 1.6, 3.0, 0.0, 2.0)
 
 
-def heater(folder, extra=lambda t, x, air: (0.0, 0.0), seeds=(1, 2), sensor=lambda t, y: y, start=0.0, heavier=lambda x: 1.0):
+def heater(
+    folder,
+    extra=lambda t, x, air: (0.0, 0.0),
+    seeds=(1, 2),
+    sensor=lambda t, y: y,
+    start=0.0,
+    heavier=lambda x: 1.0,
+):
     """Two recordings of a two-block heater that has `extra` watts into its blocks, begins `start` above the air and whose first
     block's capacity is multiplied by `heavier(temperature)`; returns the plant's and their paths."""
     (folder / "plant.yaml").write_text(HEATER)
@@ -57,16 +65,27 @@ def heater(folder, extra=lambda t, x, air: (0.0, 0.0), seeds=(1, 2), sensor=lamb
         x = np.empty((len(t), 2))
         x[0] = air[0] + start
         for k in range(len(t) - 1):
+
             def slope(s, q, k=k, heat=heat, air=air):
                 a = np.interp(s, t, air)
                 e = extra(s, q, a)
                 flow = g12 * (q[0] - q[1])
-                return [(heat[k] - flow - g[0] * (q[0] - a) + e[0]) / c[0] / heavier(q[0]), (flow - g[1] * (q[1] - a) + e[1]) / c[1]]
+                return [
+                    (heat[k] - flow - g[0] * (q[0] - a) + e[0]) / c[0] / heavier(q[0]),
+                    (flow - g[1] * (q[1] - a) + e[1]) / c[1],
+                ]
+
             x[k + 1] = solve_ivp(slope, (t[k], t[k + 1]), x[k], rtol=1e-6, atol=1e-8).y[:, -1]
         y = sensor(t, x) + rng.normal(0, 0.1, x.shape)
         path = folder / f"run_{seed}.csv"
-        np.savetxt(path, np.column_stack([t, heat, air, y]), delimiter=",", comments="", fmt="%.7g",
-                   header="t,heat,air_temperature,temperature_1,temperature_2")
+        np.savetxt(
+            path,
+            np.column_stack([t, heat, air, y]),
+            delimiter=",",
+            comments="",
+            fmt="%.7g",
+            header="t,heat,air_temperature,temperature_1,temperature_2",
+        )
         paths.append(path)
     return paths
 
@@ -85,18 +104,34 @@ def test_nothing_missing_is_said_with_what_would_have_been_seen(tmp_path):
 
 
 def test_natural_convection_is_named_placed_and_worth_it_on_unseen_data(tmp_path):
-    r = diagnosed(heater(tmp_path, lambda t, x, a: (-0.02 * (x[0] - a) * abs(x[0] - a) ** 0.25, 0.0)), tmp_path / "out")
-    named = {(f["effect"], f["where"]) for f in r["findings"]} | {(a["effect"], a["where"]) for a in r["alternatives"]}
+    r = diagnosed(
+        heater(tmp_path, lambda t, x, a: (-0.02 * (x[0] - a) * abs(x[0] - a) ** 0.25, 0.0)), tmp_path / "out"
+    )
+    named = {(f["effect"], f["where"]) for f in r["findings"]} | {
+        (a["effect"], a["where"]) for a in r["alternatives"]
+    }
     assert ("natural_convection", "one") in named and r["verdict"] in ("explained", "ambiguous")
     fit = r["fit"]
     assert fit["held_out_after"]["temperature_1"] < 0.115 < fit["held_out_refit_only"]["temperature_1"]
-    assert set(r["fit"]) == {"before", "refit_only", "after", "held_out_before", "held_out_refit_only", "held_out_after"}
+    assert set(r["fit"]) == {
+        "before",
+        "refit_only",
+        "after",
+        "held_out_before",
+        "held_out_refit_only",
+        "held_out_after",
+    }
     # The extended plant runs in the simulator and gives the error that was reported.
     plant = load(tmp_path / "out" / "plant.yaml")
     model = plant.compile()
-    errors = np.concatenate([read_table(tmp_path / f"run_{s}.csv").columns["temperature_1"]
-                             - model.simulate(read_table(tmp_path / f"run_{s}.csv")).y[:, 0] for s in (1, 2)])
-    assert np.sqrt(np.mean(errors ** 2)) == pytest.approx(fit["after"]["temperature_1"], rel=0.1)
+    errors = np.concatenate(
+        [
+            read_table(tmp_path / f"run_{s}.csv").columns["temperature_1"]
+            - model.simulate(read_table(tmp_path / f"run_{s}.csv")).y[:, 0]
+            for s in (1, 2)
+        ]
+    )
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(fit["after"]["temperature_1"], rel=0.1)
     page = (tmp_path / "out" / "report.html").read_text()
     assert "natural" in page.lower() and not re.search(r"(src|href)=.?https?://", page)
 
@@ -113,23 +148,30 @@ def test_heat_from_outside_is_found_with_its_interval(tmp_path):
 def test_an_offset_begins_at_its_sample_and_says_how_surely(tmp_path):
     def sensor(t, y):
         return y + np.column_stack([0 * t, 0.3 * (t >= 777.0)])
+
     r = diagnosed(heater(tmp_path, sensor=sensor), tmp_path / "out")
     (finding,) = r["findings"]
-    assert (finding["effect"], finding["where"], r["verdict"]) == ("sensor_offset_step", "temperature_2", "explained")
+    assert (finding["effect"], finding["where"], r["verdict"]) == (
+        "sensor_offset_step",
+        "temperature_2",
+        "explained",
+    )
     found = {n.split("_")[0]: p for n, p in finding["parameters"].items()}
-    assert found["T0"]["value"] == pytest.approx(777.0, abs=6.0)                # three samples: steps of 3 sigma in noise
+    assert found["T0"]["value"] == pytest.approx(777.0, abs=6.0)  # three samples: steps of 3 sigma in noise
     assert 0.3 < found["T0"]["sd"] < 6.0 and abs(found["T0"]["value"] - 777.0) < 3 * found["T0"]["sd"]
     assert abs(found["A"]["value"] - 0.3) < 3 * found["A"]["sd"]
 
 
 def test_a_lag_begins_where_what_it_follows_begins(tmp_path):
     """The blocks begin 0.7 K off the air: what is read of them late begins there, too, and is no delay instead."""
+
     def sensor(t, y):
         late, keep = y.copy(), np.exp(-2.0 / 6.0)
-        for k in range(1, len(t)):          # exact for straight lines between samples
+        for k in range(1, len(t)):  # exact for straight lines between samples
             slope = (y[k, 0] - y[k - 1, 0]) / 2.0
             late[k, 0] = y[k, 0] - slope * 6.0 + (late[k - 1, 0] - y[k - 1, 0] + slope * 6.0) * keep
         return late
+
     r = diagnosed(heater(tmp_path, sensor=sensor, start=0.7), tmp_path / "out")
     assert (r["findings"][0]["effect"], r["findings"][0]["where"]) == ("sensor_lag", "temperature_1")
     (tau,) = r["findings"][0]["parameters"].values()
@@ -138,32 +180,59 @@ def test_a_lag_begins_where_what_it_follows_begins(tmp_path):
 
 def test_a_delay_of_very_many_samples_is_found(tmp_path):
     """The screening sees a short one: parameters of the plant take up most of it, and stand far off until it is there."""
+
     def late(t, x):
         return np.column_stack([x[:, 0], np.interp(t - 70.0, t, x[:, 1])])
+
     r = diagnosed(heater(tmp_path, sensor=late), tmp_path / "out")
     assert [(f["effect"], f["where"]) for f in r["findings"]] == [("sensor_delay", "temperature_2")]
-    assert r["findings"][0]["parameters"]["TD_sensor_delay_temperature_2"]["value"] == pytest.approx(70, rel=0.05)
+    assert r["findings"][0]["parameters"]["TD_sensor_delay_temperature_2"]["value"] == pytest.approx(
+        70, rel=0.05
+    )
 
 
 def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
     """A voltage over a resistance, read 0.2 s late, sampled every 2 s: held, the reading would be a whole sample late."""
     _, run, _ = heater(tmp_path)
-    (tmp_path / "plant.yaml").write_text(HEATER.replace("outputs:", "outputs:\n  voltage: {value: 3 * heat, unit: V, noise: 0.02}"))
+    (tmp_path / "plant.yaml").write_text(
+        HEATER.replace("outputs:", "outputs:\n  voltage: {value: 3 * heat, unit: V, noise: 0.02}")
+    )
     rows = np.loadtxt(run, delimiter=",", skiprows=1)
-    np.savetxt(run, np.column_stack([rows, 3 * rows[:, 1]]), delimiter=",", comments="",
-               header="t,heat,air_temperature,temperature_1,temperature_2,voltage")
+    np.savetxt(
+        run,
+        np.column_stack([rows, 3 * rows[:, 1]]),
+        delimiter=",",
+        comments="",
+        header="t,heat,air_temperature,temperature_1,temperature_2,voltage",
+    )
     plant, table = load(tmp_path / "plant.yaml"), read_table(run)
     drive = plant.compile().drive(table)
-    lags = [c for c in candidates(Rig(plant, [drive], [table.columns]), {"sensor_lag": catalogue()["sensor_lag"]}) if c.place.where == "voltage"]
+    lags = [
+        c
+        for c in candidates(Rig(plant, [drive], [table.columns]), {"sensor_lag": catalogue()["sensor_lag"]})
+        if c.place.where == "voltage"
+    ]
     held, straight = (c.extend({"TAU": 0.2}).compile().simulate(table).y[:, 0] for c in lags)
     u, t = 3 * rows[:, 1], rows[:, 0]
     line = lsim(([1.0], [0.2, 1.0]), u, t, interp=True)[1] + u[0] * np.exp(-t / 0.2)
     stair = lsim(([1.0], [0.2, 1.0]), u, t, interp=False)[1] + u[0] * np.exp(-t / 0.2)
-    assert np.allclose(straight, line, atol=1e-4 * np.ptp(u)) and np.allclose(held, stair, atol=1e-4 * np.ptp(u))
+    assert np.allclose(straight, line, atol=1e-4 * np.ptp(u)) and np.allclose(
+        held, stair, atol=1e-4 * np.ptp(u)
+    )
     assert np.abs(straight - held).max() > 0.5 * np.abs(np.diff(u)).max()
     # Where what is read is a node, there is one form.
-    assert len([c for c in candidates(Rig(plant, [drive], [table.columns]), {"sensor_lag": catalogue()["sensor_lag"]})
-                if c.place.where == "temperature_1"]) == 1
+    assert (
+        len(
+            [
+                c
+                for c in candidates(
+                    Rig(plant, [drive], [table.columns]), {"sensor_lag": catalogue()["sensor_lag"]}
+                )
+                if c.place.where == "temperature_1"
+            ]
+        )
+        == 1
+    )
 
 
 STAGE = """
@@ -194,15 +263,31 @@ def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path):
     for seed in (1, 2):
         rng = np.random.default_rng(seed)
         force = np.interp(t, np.arange(0, 21, 1.0), rng.uniform(-10, 10, 21))
-        A, B, C, D, _ = cont2discrete((np.array([[-33 / 1.3, -640 / 1.3], [1, 0]]), np.array([[1 / 1.3], [0]]),
-                                       np.array([[0, 1]]), np.zeros((1, 1))), 0.005)
+        A, B, C, D, _ = cont2discrete(
+            (
+                np.array([[-33 / 1.3, -640 / 1.3], [1, 0]]),
+                np.array([[1 / 1.3], [0]]),
+                np.array([[0, 1]]),
+                np.zeros((1, 1)),
+            ),
+            0.005,
+        )
         x = dlsim((A, B, C, D, 0.005), force)[1][:, 0]
         y = x + 3e-6 * np.sin(2 * np.pi * x / period + 0.7) + rng.normal(0, 2e-6, len(t))
         assert np.ptp(x) > 70 * period
         paths.append(tmp_path / f"run_{seed}.csv")
-        np.savetxt(paths[-1], np.column_stack([t, force, y]), delimiter=",", comments="", fmt="%.9g", header="t,force,encoder")
+        np.savetxt(
+            paths[-1],
+            np.column_stack([t, force, y]),
+            delimiter=",",
+            comments="",
+            fmt="%.9g",
+            header="t,force,encoder",
+        )
     r = diagnosed(paths, tmp_path / "out")
-    assert r["verdict"] == "explained" and [(f["effect"], f["where"]) for f in r["findings"]] == [("cyclic_error", "encoder")]
+    assert r["verdict"] == "explained" and [(f["effect"], f["where"]) for f in r["findings"]] == [
+        ("cyclic_error", "encoder")
+    ]
     found = {k.split("_")[0]: v["value"] for k, v in r["findings"][0]["parameters"].items()}
     assert found["P"] == pytest.approx(period, rel=1e-3) and abs(found["A"]) == pytest.approx(3e-6, rel=0.1)
 
@@ -216,7 +301,7 @@ def test_dry_friction_that_sticks_is_no_load(tmp_path):
         step = np.arange(300_000)
         force = np.where(step % 30_000 < 10_000, rng.uniform(2, 8, 10)[step // 30_000], 0.0)
         x, v, seen = 0.0, 0.0, np.empty(len(step))
-        for i, f in enumerate(force):       # Strang splitting, friction as the set-valued law that it is
+        for i, f in enumerate(force):  # Strang splitting, friction as the set-valued law that it is
             seen[i] = x
             x += h / 2 * v
             v = (v * (1 - h * b / m / 2) + h * (f - k * x) / m) / (1 + h * b / m / 2)
@@ -227,9 +312,11 @@ def test_dry_friction_that_sticks_is_no_load(tmp_path):
         paths.append(tmp_path / f"run_{seed}.csv")
         np.savetxt(paths[-1], rows, delimiter=",", comments="", fmt="%.9g", header="t,force,encoder")
     r = diagnosed(paths, tmp_path / "out")
-    assert [(f["effect"], f["where"]) for f in r["findings"]] == [("coulomb_friction", "velocity")] and r["verdict"] != "unexplained"
+    assert [(f["effect"], f["where"]) for f in r["findings"]] == [("coulomb_friction", "velocity")] and r[
+        "verdict"
+    ] != "unexplained"
     found = {k.split("_")[0]: v["value"] for k, v in r["findings"][0]["parameters"].items()}
-    assert found["F"] == pytest.approx(dry, rel=0.15) and found["W"] < 2e-6         # m/s, of 0.3: it does not creep
+    assert found["F"] == pytest.approx(dry, rel=0.15) and found["W"] < 2e-6  # m/s, of 0.3: it does not creep
 
 
 TANK = """
@@ -263,11 +350,22 @@ def test_a_pump_that_is_clipped_is_the_actuators_entry(tmp_path):
         x[0] = 2.0
         for k in range(len(t) - 1):
             given = min(pump[k], 3.1)
-            x[k + 1] = solve_ivp(lambda s, q, given=given: 0.047 * given - 0.066 * np.sqrt(max(q[0], 0.0)), (t[k], t[k + 1]), [x[k]],
-                                 rtol=1e-7, atol=1e-9).y[0, -1]
+            x[k + 1] = solve_ivp(
+                lambda s, q, given=given: 0.047 * given - 0.066 * np.sqrt(max(q[0], 0.0)),
+                (t[k], t[k + 1]),
+                [x[k]],
+                rtol=1e-7,
+                atol=1e-9,
+            ).y[0, -1]
         path = tmp_path / f"run_{seed}.csv"
-        np.savetxt(path, np.column_stack([t, pump, np.full(len(t), 2.0), x + rng.normal(0, 0.02, len(t))]), delimiter=",", comments="",
-                   fmt="%.7g", header="t,pump,level_start,level")
+        np.savetxt(
+            path,
+            np.column_stack([t, pump, np.full(len(t), 2.0), x + rng.normal(0, 0.02, len(t))]),
+            delimiter=",",
+            comments="",
+            fmt="%.7g",
+            header="t,pump,level_start,level",
+        )
         paths.append(path)
     r = diagnosed(paths, tmp_path / "out")
     (f,) = r["findings"]
@@ -278,32 +376,47 @@ def test_a_pump_that_is_clipped_is_the_actuators_entry(tmp_path):
 
 def test_what_one_recording_does_not_determine_is_proved_on_blocks_of_all(tmp_path):
     """Two heaters that go together in one recording and against each other in the other: neither tells their shares, both do."""
-    text = HEATER.replace("  heat: {unit: W}", "  heat: {unit: W}\n  more: {unit: W}").replace(
-        "  G_12:", "  A: {value: 1, unit: '1', range: [0, 2]}\n  B: {unit: '1', BELIEF}\n  G_12:").replace(
-        "rate: heat,", "rate: A * heat + B * more,")
+    text = (
+        HEATER.replace("  heat: {unit: W}", "  heat: {unit: W}\n  more: {unit: W}")
+        .replace("  G_12:", "  A: {value: 1, unit: '1', range: [0, 2]}\n  B: {unit: '1', BELIEF}\n  G_12:")
+        .replace("rate: heat,", "rate: A * heat + B * more,")
+    )
     for name, belief in (("before", "value: 0"), ("after", "value: -1, range: [-2, 2]")):
-        (tmp_path / f"{name}.yaml").write_text(text.replace("BELIEF", belief).replace("C_1: {value: 6, unit: J/K, range: [2, 14]}",
-                                                                                     "C_1: {value: 5.2, unit: J/K}"))
+        (tmp_path / f"{name}.yaml").write_text(
+            text.replace("BELIEF", belief).replace(
+                "C_1: {value: 6, unit: J/K, range: [2, 14]}", "C_1: {value: 5.2, unit: J/K}"
+            )
+        )
     _, *runs = heater(tmp_path)
     tables = []
     for sign, path in zip((1.0, -1.0), runs, strict=True):
         heat = np.loadtxt(path, delimiter=",", skiprows=1)
         heat = np.column_stack([heat[:, :2], sign * heat[:, 1], heat[:, 2:]])
-        heat[:, 1] /= 1.0 + sign * 0.3                  # what heated the block is 1 * heat + 0.3 * more
+        heat[:, 1] /= 1.0 + sign * 0.3  # what heated the block is 1 * heat + 0.3 * more
         heat[:, 2] = sign * heat[:, 1]
-        np.savetxt(path, heat, delimiter=",", comments="", fmt="%.7g", header="t,heat,more,air_temperature,temperature_1,temperature_2")
+        np.savetxt(
+            path,
+            heat,
+            delimiter=",",
+            comments="",
+            fmt="%.7g",
+            header="t,heat,more,air_temperature,temperature_1,temperature_2",
+        )
         tables.append(read_table(str(path)))
     plants = [load(tmp_path / f"{name}.yaml") for name in ("before", "after")]
     case = Case(plants[0], tables)
-    before, after = (replace(case.explain(p, [], []), plant=p) for p in plants)       # as believed, not as fitted to all of the data
+    before, after = (
+        replace(case.explain(p, [], []), plant=p) for p in plants
+    )  # as believed, not as fitted to all of the data
     ratio, _, high, blocks = prediction(case, before, after)
     assert blocks and ratio < high < 0.9
-    assert not prediction(case, before, before)[3]      # nothing gained, nothing proved
+    assert not prediction(case, before, before)[3]  # nothing gained, nothing proved
 
 
 def test_physics_outside_the_catalogue_is_not_given_a_confident_name(tmp_path):
     def boiling(t, x, a):
         return (-1.2 * np.sin(t / 9.0) ** 2 * (x[0] > 45), 0.0)
+
     r = diagnosed(heater(tmp_path, boiling), tmp_path / "out")
     assert r["verdict"] == "unexplained" or max((f["probability"] for f in r["findings"]), default=0) < 0.9
     assert r["mismatch"] and {"channel", "rms", "expected_rms", "node"} <= set(r["mismatch"][0])
@@ -311,7 +424,9 @@ def test_physics_outside_the_catalogue_is_not_given_a_confident_name(tmp_path):
 
 def test_a_change_of_phase_is_unknown_and_sits_in_the_storage(tmp_path):
     """The first block melts round 40 degC, in 0.8 K: no entry says that."""
-    r = diagnosed(heater(tmp_path, heavier=lambda x: 1 + 1.0 * np.exp(-0.5 * ((x - 40.0) / 0.8) ** 2)), tmp_path / "out")
+    r = diagnosed(
+        heater(tmp_path, heavier=lambda x: 1 + 1.0 * np.exp(-0.5 * ((x - 40.0) / 0.8) ** 2)), tmp_path / "out"
+    )
     assert r["verdict"] == "unexplained"
     assert any("the storage of one" in n for n in r["notes"]), r["notes"]
 
@@ -347,25 +462,39 @@ outputs:
 """)
     t, paths = np.arange(0.0, 20.0, 0.005), [tmp_path / "plant.yaml"]
     m, m2, k, d, b = 10.0, 1.0, 900.0, 1.2, 35.0
-    A = np.array([[-(b + d) / m, -k / m, d / m, k / m], [1, 0, 0, 0], [d / m2, k / m2, -d / m2, -k / m2], [0, 0, 1, 0]])
-    A, B, C, D, _ = cont2discrete((A, np.array([[1 / m], [0], [0], [0]]), np.array([[0, 1, 0, 0]]), np.zeros((1, 1))), 0.005)
+    A = np.array(
+        [[-(b + d) / m, -k / m, d / m, k / m], [1, 0, 0, 0], [d / m2, k / m2, -d / m2, -k / m2], [0, 0, 1, 0]]
+    )
+    A, B, C, D, _ = cont2discrete(
+        (A, np.array([[1 / m], [0], [0], [0]]), np.array([[0, 1, 0, 0]]), np.zeros((1, 1))), 0.005
+    )
     for seed in (1, 2):
         rng = np.random.default_rng(seed)
         force = rng.choice([-6.0, 0.0, 6.0], 40)[(t // 0.5).astype(int)]
         y = dlsim((A, B, C, D, 0.005), force)[1][:, 0] + rng.normal(0, 2e-5, len(t))
         paths.append(tmp_path / f"run_{seed}.csv")
-        np.savetxt(paths[-1], np.column_stack([t, force, y]), delimiter=",", comments="", fmt="%.9g", header="t,force,encoder")
+        np.savetxt(
+            paths[-1],
+            np.column_stack([t, force, y]),
+            delimiter=",",
+            comments="",
+            fmt="%.9g",
+            header="t,force,encoder",
+        )
     r = diagnosed(paths, tmp_path / "out")
     assert r["verdict"] == "unexplained"
     assert any("dynamics between motor" in n for n in r["notes"]), r["notes"]
 
 
-@pytest.mark.parametrize(("spoil", "words"), [
-    (lambda p: p[1].write_text(p[1].read_text().replace("heat,", "warmth,", 1)), "no column 'heat'"),
-    (lambda p: p[1].write_text("\n".join(p[1].read_text().splitlines()[:12])), "too little data"),
-    (lambda p: p[1].write_text(p[1].read_text().replace("\n2,", "\nx,", 1)), "run_1.csv"),
-    (lambda p: p[0].write_text(HEATER.replace("G_12 *", "G_13 *")), "G_13"),
-])
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda p: p[1].write_text(p[1].read_text().replace("heat,", "warmth,", 1)), "no column 'heat'"),
+        (lambda p: p[1].write_text("\n".join(p[1].read_text().splitlines()[:12])), "too little data"),
+        (lambda p: p[1].write_text(p[1].read_text().replace("\n2,", "\nx,", 1)), "run_1.csv"),
+        (lambda p: p[0].write_text(HEATER.replace("G_12 *", "G_13 *")), "G_13"),
+    ],
+)
 def test_unusable_input_is_one_line_and_leaves_nothing(tmp_path, capsys, spoil, words):
     paths = heater(tmp_path, seeds=(1,))
     spoil(paths)
@@ -377,19 +506,33 @@ def test_unusable_input_is_one_line_and_leaves_nothing(tmp_path, capsys, spoil, 
 
 def test_every_entry_of_the_catalogue_reads_and_a_users_own_replaces_it(tmp_path):
     entries = catalogue()
-    assert {"radiation", "coulomb_friction", "sensor_lag", "missing_member", "overflow"} <= set(entries) and len(entries) >= 48
-    (tmp_path / "mine.yaml").write_text("effect: mine\ntitle: T\nwhere: temperature_node\nsource: me\n"
-                                        "change: [{flow: {from: T, rate: 'K * (T - air)**3'}}]\nparameters: {K: {low: 0}}\n")
+    assert {"radiation", "coulomb_friction", "sensor_lag", "missing_member", "overflow"} <= set(
+        entries
+    ) and len(entries) >= 48
+    (tmp_path / "mine.yaml").write_text(
+        "effect: mine\ntitle: T\nwhere: temperature_node\nsource: me\n"
+        "change: [{flow: {from: T, rate: 'K * (T - air)**3'}}]\nparameters: {K: {low: 0}}\n"
+    )
     from thermoctl.diagnose.effects import CATALOGUE
+
     assert "mine" in catalogue((CATALOGUE, tmp_path))
 
 
-@pytest.mark.parametrize(("text", "words"), [
-    ("effect: mine\n", "needs 'title'"),
-    ("effect: m\ntitle: T\nwhere: temperature_nod\nsource: s\nchange: []\nparameters: {}\n", "did you mean 'temperature_node'"),
-    ("effect: m\ntitle: T\nwhere: sensor\nsource: s\nchange: [{vlaue: y}]\nparameters: {}\n", "a change must be one of"),
-    ("effect: m\ncolour: red\n", "unknown key 'colour'"),
-])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("effect: mine\n", "needs 'title'"),
+        (
+            "effect: m\ntitle: T\nwhere: temperature_nod\nsource: s\nchange: []\nparameters: {}\n",
+            "did you mean 'temperature_node'",
+        ),
+        (
+            "effect: m\ntitle: T\nwhere: sensor\nsource: s\nchange: [{vlaue: y}]\nparameters: {}\n",
+            "a change must be one of",
+        ),
+        ("effect: m\ncolour: red\n", "unknown key 'colour'"),
+    ],
+)
 def test_a_bad_effect_file_gives_its_one_error(tmp_path, text, words):
     (tmp_path / "bad.yaml").write_text(text)
     with pytest.raises(InputError, match="bad.yaml:") as e:
@@ -409,14 +552,17 @@ def test_a_channel_whose_clock_runs_ahead_is_said_so_and_nothing_is_named(tmp_pa
 
     def ahead(names, rows):
         k = names.index("temperature_2")
-        rows[:-20, k] = rows[20:, k]        # 20 samples of 2 s
+        rows[:-20, k] = rows[20:, k]  # 20 samples of 2 s
         return rows[:-20]
+
     for p in paths[1:]:
         _rewritten(p, ahead)
     r = diagnosed(paths, tmp_path / "out")
     assert r["verdict"] == "unexplained" and r["findings"] == []
     said = next(n for n in r["notes"] if "clock" in n)
-    assert said.startswith("temperature_2") and float(re.search(r"about ([\d.]+) s ahead", said).group(1)) == pytest.approx(40, abs=6)
+    assert said.startswith("temperature_2") and float(
+        re.search(r"about ([\d.]+) s ahead", said).group(1)
+    ) == pytest.approx(40, abs=6)
 
 
 def test_a_recording_of_another_rig_gets_no_name(tmp_path):
@@ -424,9 +570,12 @@ def test_a_recording_of_another_rig_gets_no_name(tmp_path):
 
     def other(names, rows):
         rng = np.random.default_rng(5)
-        for name in ("temperature_1", "temperature_2"):        # a machine that works to its own timetable
-            rows[:, names.index(name)] = 40 + 15 * np.sin(rows[:, 0] / 90 + rng.uniform(0, 6)) + rng.normal(0, 0.1, len(rows))
+        for name in ("temperature_1", "temperature_2"):  # a machine that works to its own timetable
+            rows[:, names.index(name)] = (
+                40 + 15 * np.sin(rows[:, 0] / 90 + rng.uniform(0, 6)) + rng.normal(0, 0.1, len(rows))
+            )
         return rows
+
     for p in paths[1:]:
         _rewritten(p, other)
     r = diagnosed(paths, tmp_path / "out")
@@ -439,9 +588,15 @@ def test_a_recording_in_which_nothing_moves_shows_nothing(tmp_path):
 
     def rest(names, rows):
         rng = np.random.default_rng(6)
-        for name, value, noise in (("heat", 0, 0), ("air_temperature", 21.5, 0), ("temperature_1", 21.5, 0.1), ("temperature_2", 21.5, 0.1)):
+        for name, value, noise in (
+            ("heat", 0, 0),
+            ("air_temperature", 21.5, 0),
+            ("temperature_1", 21.5, 0.1),
+            ("temperature_2", 21.5, 0.1),
+        ):
             rows[:, names.index(name)] = value + noise * rng.normal(size=len(rows))
         return rows
+
     _rewritten(paths[1], rest)
     r = diagnosed(paths, tmp_path / "out")
     assert r["verdict"] == "consistent" and r["findings"] == []

@@ -1,4 +1,5 @@
 """Effects of a speed fit whatever unit the speed has: the extended plant passes the unit check when it is read again."""
+
 import numpy as np
 import pytest
 
@@ -21,7 +22,12 @@ def test_heat_of_a_speed_is_offered_and_keeps_its_units(unit, tmp_path):
     (tmp_path / "plant.yaml").write_text(PLANT.format(unit=unit))
     plant = load(tmp_path / "plant.yaml")
     t = np.arange(100.0)
-    table = Table("run", "run", t, {"heat": 1 + np.sin(t), "speed": np.cos(t), "air": np.full(100, 20.0), "housing_c": 20 + 0 * t})
+    table = Table(
+        "run",
+        "run",
+        t,
+        {"heat": 1 + np.sin(t), "speed": np.cos(t), "air": np.full(100, 20.0), "housing_c": 20 + 0 * t},
+    )
     rig = Rig(plant, [plant.compile().drive(table)], [table.columns])
     names = {"eddy_heating", "hysteresis_heating", "forced_convection"}
     found = [c for c in candidates(rig, catalogue()) if c.effect.name in names]
@@ -71,10 +77,17 @@ def test_every_entry_keeps_the_units_of_a_rig_that_moves_and_heats(tmp_path):
     plant = load(tmp_path / "plant.yaml")
     t = np.arange(0.0, 2.0, 0.002)
     moving = {"current": np.sin(9 * t), "current_rate": 9 * np.cos(9 * t), "air": 20 + 0.1 * t}
-    table = Table("run", "run", t, moving | {"position_read": 0 * t, "voltage": 0 * t, "coil_temperature": 20 + 0 * t})
+    table = Table(
+        "run", "run", t, moving | {"position_read": 0 * t, "voltage": 0 * t, "coil_temperature": 20 + 0 * t}
+    )
     rig = Rig(plant, [plant.compile().drive(table)], [table.columns])
     found = candidates(rig, catalogue())
-    assert {"position_dependent_conductance", "cogging", "cubic_stiffness", "back_emf"} < {c.effect.name for c in found}
+    assert {"position_dependent_conductance", "cogging", "cubic_stiffness", "back_emf"} < {
+        c.effect.name for c in found
+    }
     for c in found:
-        save(c.extend({p.name: p.null if p.typical is None else p.typical for p in c.effect.parameters}), tmp_path / "extended.yaml")
+        save(
+            c.extend({p.name: p.null if p.typical is None else p.typical for p in c.effect.parameters}),
+            tmp_path / "extended.yaml",
+        )
         load(tmp_path / "extended.yaml")

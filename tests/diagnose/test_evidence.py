@@ -1,4 +1,5 @@
 """The likelihood of coloured residuals against spectra and draws made here."""
+
 import numpy as np
 import pytest
 from scipy.fft import idct
@@ -18,9 +19,11 @@ def test_a_flicker_filter_has_the_spectrum_of_its_parts(beside, large):
     ar, ma = flicker(0.01, 1.0, beside, large)
     z = np.exp(-1j * np.linspace(1e-3, np.pi, 200))
     made = np.abs(np.polyval(ma[::-1], z) / np.polyval(ar[::-1], z)) ** 2
-    parts = 1 + sum(0.01 * (1 - p ** 2) / np.abs(1 - p * z) ** 2 for p in np.exp(-1 / (2.0 * 8.0 ** np.arange(5))))
+    parts = 1 + sum(
+        0.01 * (1 - p**2) / np.abs(1 - p * z) ** 2 for p in np.exp(-1 / (2.0 * 8.0 ** np.arange(5)))
+    )
     if beside:
-        parts = parts + large * (1 - beside ** 2) / np.abs(1 - beside * z) ** 2
+        parts = parts + large * (1 - beside**2) / np.abs(1 - beside * z) ** 2
     assert np.ptp(made / parts) < 1e-3 * np.mean(made / parts)
     assert np.abs(np.roots(ma)).max() < 1 and np.abs(np.roots(ar)).max() < 1
 
@@ -29,8 +32,11 @@ def mixed(n, rng):
     """White noise, a first-order part and a 1/f part, standard deviation about 1."""
     slow = np.zeros(n)
     slow[1:] = 1 / np.arange(1, n)
-    return (0.88 * rng.standard_normal(n) + lfilter([0.45 * np.sqrt(1 - 0.5 ** 2)], [1, -0.5], rng.standard_normal(n))
-            + 0.15 * idct(rng.standard_normal(n) * np.sqrt(slow * n / slow.sum()), norm="ortho"))
+    return (
+        0.88 * rng.standard_normal(n)
+        + lfilter([0.45 * np.sqrt(1 - 0.5**2)], [1, -0.5], rng.standard_normal(n))
+        + 0.15 * idct(rng.standard_normal(n) * np.sqrt(slow * n / slow.sum()), norm="ortho")
+    )
 
 
 KINDS = ("white", "first order", "flicker")
@@ -39,7 +45,13 @@ KINDS = ("white", "first order", "flicker")
 def noise_of(kind, n, rng):
     """Noise of one of KINDS, its white part of standard deviation about 1."""
     white = rng.standard_normal(n)
-    return white if kind == "white" else white + lfilter([0.2], [1, -0.97], rng.standard_normal(n)) if kind == "first order" else mixed(n, rng)
+    return (
+        white
+        if kind == "white"
+        else white + lfilter([0.2], [1, -0.97], rng.standard_normal(n))
+        if kind == "first order"
+        else mixed(n, rng)
+    )
 
 
 def test_a_slow_wave_is_not_paid_for_in_noise_that_has_a_fast_and_a_slow_part():
@@ -73,21 +85,31 @@ def test_what_leaves_white_noise_behind_is_paid_in_full():
 def block(tmp_path):
     """A heated block whose two recordings are the plant's own simulation, and what is added to its temperature."""
     path = tmp_path / "plant.yaml"
-    path.write_text("format: thermoctl-plant/1\ninputs: {P: {unit: W}, air: {unit: degC}}\n"
-                    "parameters: {C: {value: 30, unit: J/K, range: [10, 90]}, G: {value: 0.5, unit: W/K, range: [0.1, 1]}}\n"
-                    "nodes: {T: {unit: degC, storage: C, initial: air}}\n"
-                    "flows: {heat: {into: T, rate: P, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}\n"
-                    "outputs: {y: {value: T, unit: degC, noise: 0.1}}\n")
+    path.write_text(
+        "format: thermoctl-plant/1\ninputs: {P: {unit: W}, air: {unit: degC}}\n"
+        "parameters: {C: {value: 30, unit: J/K, range: [10, 90]}, G: {value: 0.5, unit: W/K, range: [0.1, 1]}}\n"
+        "nodes: {T: {unit: degC, storage: C, initial: air}}\n"
+        "flows: {heat: {into: T, rate: P, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}\n"
+        "outputs: {y: {value: T, unit: degC, noise: 0.1}}\n"
+    )
 
     def refitted(added):
         plant, tables = load(path), []
         for k in range(2):
             t = np.arange(3000.0)
-            table = Table(f"r{k}", f"r{k}", t, {"P": 6.0 * np.random.default_rng(k).integers(0, 2, 60).repeat(50), "air": 21 + 0 * t})
-            table.columns["y"] = plant.compile(()).simulate(table).y[:, 0] + added(t, np.random.default_rng(100 + k))
+            table = Table(
+                f"r{k}",
+                f"r{k}",
+                t,
+                {"P": 6.0 * np.random.default_rng(k).integers(0, 2, 60).repeat(50), "air": 21 + 0 * t},
+            )
+            table.columns["y"] = plant.compile(()).simulate(table).y[:, 0] + added(
+                t, np.random.default_rng(100 + k)
+            )
             tables.append(table)
         case = Case(plant, tables)
         return case, case.explain(plant, [], [])
+
     return refitted
 
 
@@ -99,15 +121,22 @@ def rhythm(case, e):
 def test_a_rhythm_is_found_with_its_period_though_its_phase_changes(block):
     def bursts(t, rng):
         return 0.1 * rng.standard_normal(len(t)) - 0.12 * ((t + rng.uniform(0, 240)) % 240 < 40)
+
     found = rhythm(*block(bursts))
-    assert found.log_p < -8 and found.period == pytest.approx(240, rel=0.02) and "rhythm of 2" in found.sentence()
+    assert (
+        found.log_p < -8
+        and found.period == pytest.approx(240, rel=0.02)
+        and "rhythm of 2" in found.sentence()
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_noise_of_any_colour_has_no_rhythm(block, kind):
     """Of twenty draws a colour the smallest p is what twenty of pure chance would show."""
+
     def noise(t, rng, seed):
         return 0.1 * noise_of(kind, len(t), np.random.default_rng([seed, *rng.integers(0, 9, 2)]))
+
     least = sorted(rhythm(*block(lambda t, rng, seed=seed: noise(t, rng, seed))).log_p for seed in range(20))
     assert least[0] > -3.5 and np.median(least) > -1
 
@@ -116,7 +145,11 @@ def test_what_white_noise_leaves_has_the_chance_that_is_told(block):
     """An unknown flow into the block, a function of time: uniform; and of all looks the one that remains is none."""
     told, left = [], []
     for seed in range(80):
-        case, e = block(lambda t, rng, seed=seed: 0.1 * np.random.default_rng([seed, *rng.integers(0, 9, 2)]).standard_normal(len(t)))
+        case, e = block(
+            lambda t, rng, seed=seed: (
+                0.1 * np.random.default_rng([seed, *rng.integers(0, 9, 2)]).standard_normal(len(t))
+            )
+        )
         told.append(10 ** next(s for s in suspects(metric_of(case, e, e.colours)) if s.kind == "node").log_p)
         left.append(e.white and remains(case, e))
     assert kstest(told, "uniform").pvalue > 0.01
@@ -134,9 +167,11 @@ def test_little_that_remains_in_white_noise_is_seen(block):
 def three(tmp_path):
     """A plant with three outputs, two of them of one sensor."""
     path = tmp_path / "plant.yaml"
-    path.write_text("format: thermoctl-plant/1\ninputs: {P: {unit: W}}\nparameters: {C: {value: 30, unit: J/K}}\n"
-                    "nodes: {T: {unit: degC, storage: C, initial: 20}}\nflows: {heat: {into: T, rate: P, unit: W}}\n"
-                    "outputs: {a: {value: T, unit: degC}, b: {value: 2 * T, unit: degC}, c: {value: T, unit: degC, column: a}}\n")
+    path.write_text(
+        "format: thermoctl-plant/1\ninputs: {P: {unit: W}}\nparameters: {C: {value: 30, unit: J/K}}\n"
+        "nodes: {T: {unit: degC, storage: C, initial: 20}}\nflows: {heat: {into: T, rate: P, unit: W}}\n"
+        "outputs: {a: {value: T, unit: degC}, b: {value: 2 * T, unit: degC}, c: {value: T, unit: degC, column: a}}\n"
+    )
     return load(path)
 
 
@@ -145,10 +180,12 @@ def test_sensors_of_any_colour_share_nothing(three):
     told = []
     for seed in range(120):
         rng = np.random.default_rng(seed)
-        residuals = [np.stack([noise_of(rng.choice(KINDS), n, rng) for _ in range(3)], axis=1) for n in (3000, 2000)]
+        residuals = [
+            np.stack([noise_of(rng.choice(KINDS), n, rng) for _ in range(3)], axis=1) for n in (3000, 2000)
+        ]
         residuals[0][500:700, 0] = np.nan
         found = {s.name: s for s in together(residuals, channels(residuals, [1.0] * 3), three)}
-        assert set(found) == {"a and b", "b and c"}         # a and c are of one sensor
+        assert set(found) == {"a and b", "b and c"}  # a and c are of one sensor
         told.append(10 ** found["a and b"].log_p / found["a and b"].looks)
     assert kstest(told, "uniform").pvalue > 0.01
 
@@ -157,7 +194,9 @@ def test_what_two_sensors_share_is_no_noise_of_theirs(three):
     """A disturbance of 0.4 sigmas in one and, later and slower, in the other: each takes it for a sensor's colour."""
     rng = np.random.default_rng(0)
     wave = lfilter([0.1], [1, -0.95], rng.standard_normal(6000))
-    r = rng.standard_normal((6000, 3)) + np.stack([1.25 * wave, lfilter([0.05], [1, -0.95], np.roll(wave, 8)), 0 * wave], axis=1)
+    r = rng.standard_normal((6000, 3)) + np.stack(
+        [1.25 * wave, lfilter([0.05], [1, -0.95], np.roll(wave, 8)), 0 * wave], axis=1
+    )
     colours = channels([r], [1.0] * 3)
     assert len(colours[0].ar) > 1
     best = together([r], colours, three)[0]

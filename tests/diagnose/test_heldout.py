@@ -1,4 +1,5 @@
 """What data that took no part say of an explanation, where it shows only once."""
+
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +20,9 @@ def errors(colour, rng):
         if colour == "slow":
             e += lfilter([0.15], [1, -0.98], rng.standard_normal(SAMPLES))
         if colour == "flicker":
-            spectrum = np.fft.rfft(rng.standard_normal(SAMPLES)) / np.sqrt(np.maximum(np.arange(SAMPLES // 2 + 1), 1))
+            spectrum = np.fft.rfft(rng.standard_normal(SAMPLES)) / np.sqrt(
+                np.maximum(np.arange(SAMPLES // 2 + 1), 1)
+            )
             e += 6 * np.fft.irfft(spectrum, SAMPLES)
         out.append(SIGMA * e[:, None])
     return out
@@ -36,7 +39,11 @@ def test_noise_follows_no_prediction_more_than_by_chance(colour):
     z = []
     for k in range(200):
         before = errors(colour, rng)
-        shift = (np.sin(2 * np.pi * (k % 9 + 0.5) * t), (t > 0.7) * 1.0, np.exp(-t / 0.1))[k % 3] * SIGMA * rng.uniform(0.05, 1)
+        shift = (
+            (np.sin(2 * np.pi * (k % 9 + 0.5) * t), (t > 0.7) * 1.0, np.exp(-t / 0.1))[k % 3]
+            * SIGMA
+            * rng.uniform(0.05, 1)
+        )
         z.append(foretold(before, [e - shift[:, None] for e in before]))
     assert np.sqrt(np.mean(np.square(z))) < 1.6
     assert np.max(np.abs(z)) < FORETOLD
@@ -51,6 +58,6 @@ def test_what_happens_once_is_proved_by_one_block(colour):
     before = [after[0], after[1] + once]
     ratio, _, high = judged(before, after)
     assert high == ratio < 1
-    assert judged(after, before)[2] > 1             # the other way round nothing is gained
+    assert judged(after, before)[2] > 1  # the other way round nothing is gained
     faint = [after[0], after[1] + 0.015 * once]
-    assert judged(faint, after)[2] >= 1             # nor by what noise does as well
+    assert judged(faint, after)[2] >= 1  # nor by what noise does as well

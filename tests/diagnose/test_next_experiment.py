@@ -1,4 +1,5 @@
 """The experiment that tells explanations apart: proposed inside the rig's limits, written, run, and decisive."""
+
 import json
 from types import SimpleNamespace
 
@@ -23,8 +24,14 @@ nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.05}}
 flows: {power: {into: T, rate: heat, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}
 outputs: {T_block: {value: T, unit: degC, noise: 0.05}}
 """
-TRUTH = BELIEF.replace("flows: {", "flows: {missing: {from: T, rate: 2.5e-9 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, ") \
-    .replace("value: 40,", "value: 46,").replace("value: 0.25,", "value: 0.2,")
+TRUTH = (
+    BELIEF.replace(
+        "flows: {",
+        "flows: {missing: {from: T, rate: 2.5e-9 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, ",
+    )
+    .replace("value: 40,", "value: 46,")
+    .replace("value: 0.25,", "value: 0.2,")
+)
 LIMITS = {"T_block": (15.0, 110.0)}
 
 
@@ -41,7 +48,11 @@ def undecided():
     table = loads(TRUTH).compile(()).measure(short_pulses(), seed=1)
     case = Case(loads(BELIEF), [table])
     base = case.explain(case.plant, [], [], iterations=40)
-    entries = {k: e for k, e in catalogue((CATALOGUE,)).items() if k in ("radiation", "temperature_dependent_conductance")}
+    entries = {
+        k: e
+        for k, e in catalogue((CATALOGUE,)).items()
+        if k in ("radiation", "temperature_dependent_conductance")
+    }
     seen = search.look(case, base, entries, draws=0)
     found = search.compete(case, seen, search.finalists(seen.directions))
     assert {e.last.effect.name for e in found} == set(entries)
@@ -59,7 +70,9 @@ def test_proposal_stays_inside_the_limits_and_is_the_best_per_hour(undecided):
     assert ahead.min() > 15 and ahead.max() < 110
     assert entry["separates"][0]["sigmas"] > 3 and entry["bits"] > 0.6
     assert entry["bits_per_hour"] == pytest.approx(entry["bits"] / (entry["duration_s"] / 3600))
-    near, _ = experiment.propose(case, found)               # no limits told: about what was recorded, and there they look alike
+    near, _ = experiment.propose(
+        case, found
+    )  # no limits told: about what was recorded, and there they look alike
     assert near["bits"] < 0.5 * entry["bits"] and near["also_helpful"]
 
 
@@ -69,7 +82,7 @@ def test_distance_is_what_dense_algebra_says():
     sigma = np.array([0.3, 0.7])
     stacked = [np.concatenate([q[0][:, 0], q[0][:, 1]]) for q in (a, b)]
     J = [np.concatenate([q[1][:, 0], q[1][:, 1]]) for q in (a, b)]
-    covariance = np.diag(np.repeat(sigma ** 2, 30)) + J[0] @ J[0].T + J[1] @ J[1].T
+    covariance = np.diag(np.repeat(sigma**2, 30)) + J[0] @ J[0].T + J[1] @ J[1].T
     difference = stacked[0] - stacked[1]
     dense = difference @ np.linalg.solve(covariance, difference)
     assert experiment.distance(a, b, [(0, 0), (1, 1)], sigma) == pytest.approx(dense, rel=1e-9)
@@ -83,8 +96,13 @@ def test_bits_are_none_for_equals_and_one_for_two_that_differ():
 
 def test_decided_diagnoses_ask_for_nothing(undecided):
     case, found = undecided
-    assert experiment.propose(case, SimpleNamespace(verdict="explained", final=found.final, rivals=found.rivals)) is None
-    assert experiment.propose(case, SimpleNamespace(verdict="ambiguous", final=found.final, rivals=[])) is None
+    assert (
+        experiment.propose(case, SimpleNamespace(verdict="explained", final=found.final, rivals=found.rivals))
+        is None
+    )
+    assert (
+        experiment.propose(case, SimpleNamespace(verdict="ambiguous", final=found.final, rivals=[])) is None
+    )
     with pytest.raises(InputError, match="no such input or output"):
         experiment.propose(case, found, limits={"T_blok": (0, 1)})
 
@@ -92,7 +110,10 @@ def test_decided_diagnoses_ask_for_nothing(undecided):
 def test_what_is_written_is_read_by_the_experiment_command(undecided, tmp_path):
     case, found = undecided
     entry, chosen = experiment.propose(case, found, limits=LIMITS)
-    assert set(experiment.write(tmp_path, case, entry, chosen)) == {"next_experiment.yaml", "next_experiment.csv"}
+    assert set(experiment.write(tmp_path, case, entry, chosen)) == {
+        "next_experiment.yaml",
+        "next_experiment.csv",
+    }
     (read,) = load_inputs(tmp_path / "next_experiment.yaml").values()
     assert read.corners["heat"] == pytest.approx(chosen.corners["heat"]) and read.assumed == {"air": 22.0}
     by_hand = read_table(tmp_path / "next_experiment.csv")
@@ -109,14 +130,18 @@ flows: {p: {into: T, rate: v * i + A * still * i + B * sun}}
 outputs: {y: {value: T}}""")
     t = np.arange(100.0)
     i = np.abs(np.sin(t / 9))
-    table = Table("r", "r", t, {"v": 5 * i + 0.1, "i": i, "air": 20 + t / 50, "sun": i ** 2, "still": np.ones(100)})
+    table = Table(
+        "r", "r", t, {"v": 5 * i + 0.1, "i": i, "air": 20 + t / 50, "sun": i**2, "still": np.ones(100)}
+    )
     (lever,) = experiment.levers(plant, [table])
     assert set(lever.moves) == {"v", "i"} and lever.moves["i"] == pytest.approx((0.2, -0.02))
     assert [q.name for q in experiment.levers(plant, [table], only=["sun"])] == ["sun"]
     with pytest.raises(InputError, match="not an input"):
         experiment.levers(plant, [table], only=["moon"])
     for word, corners in experiment.courses(lever, 60.0, 1.0).items():
-        assert corners[0, 0] == 0 and corners[-1, 0] == pytest.approx(60) and np.all(np.diff(corners[:, 0]) > 0), word
+        assert (
+            corners[0, 0] == 0 and corners[-1, 0] == pytest.approx(60) and np.all(np.diff(corners[:, 0]) > 0)
+        ), word
         assert corners[:, 1].min() >= lever.low - 1e-9 and corners[:, 1].max() <= lever.high + 1e-9, word
         speed = np.abs(np.diff(corners[:, 1]) / np.diff(corners[:, 0]))
         assert speed.max() <= lever.rate * (1 + 1e-9) + 1e-9, word
@@ -126,24 +151,50 @@ def test_on_the_programs_own_rig_the_setpoint_is_driven(tmp_path):
     plant = loads(BELIEF.replace("heat: {unit: W}", "heat: {unit: W, column: power_w}"))
     t = np.arange(300.0)
     setpoint = 100 * (t // 50 % 3)
-    table = Table("r", "r", t, {"power_w": 0.01 * setpoint, "setpoint_um": setpoint, "air": np.full(300, 20.0), "T_block": 20 + t / 300})
+    table = Table(
+        "r",
+        "r",
+        t,
+        {
+            "power_w": 0.01 * setpoint,
+            "setpoint_um": setpoint,
+            "air": np.full(300, 20.0),
+            "T_block": 20 + t / 300,
+        },
+    )
     case = Case(plant, [table])
-    chosen = experiment.Excitation("hold", 60.0, {"heat": np.array([[0, 0.0], [10, 1.5], [60, 1.5]])}, {"air": 20.0})
+    chosen = experiment.Excitation(
+        "hold", 60.0, {"heat": np.array([[0, 0.0], [10, 1.5], [60, 1.5]])}, {"air": 20.0}
+    )
     experiment.write(tmp_path, case, {"why": "", "sample_s": 1.0}, chosen)
     schedule = load_experiments(tmp_path / "next_experiment.yaml")["next_experiment"]
-    assert schedule.setpoint_um == pytest.approx([0, 150, 150]) and schedule.commands() == [(0.0, "setpoint", pytest.approx(150.0))]
+    assert schedule.setpoint_um == pytest.approx([0, 150, 150]) and schedule.commands() == [
+        (0.0, "setpoint", pytest.approx(150.0))
+    ]
 
 
 def test_rounds_end_when_nothing_is_left_to_ask(tmp_path):
-    results = iter([{"verdict": "ambiguous", "findings": [], "next_experiment": {"profile": "a"}},
-                    {"verdict": "ambiguous", "findings": [], "next_experiment": {"profile": "b"}},
-                    {"verdict": "explained", "findings": [], "next_experiment": None}])
+    results = iter(
+        [
+            {"verdict": "ambiguous", "findings": [], "next_experiment": {"profile": "a"}},
+            {"verdict": "ambiguous", "findings": [], "next_experiment": {"profile": "b"}},
+            {"verdict": "explained", "findings": [], "next_experiment": None},
+        ]
+    )
     asked, ran = [], []
-    end = experiment.resolve(lambda paths: asked.append(list(paths)) or next(results), ["run_1.csv"], tmp_path,
-                             lambda file, out: ran.append((file.name, out.name)), rounds=3)
+    end = experiment.resolve(
+        lambda paths: asked.append(list(paths)) or next(results),
+        ["run_1.csv"],
+        tmp_path,
+        lambda file, out: ran.append((file.name, out.name)),
+        rounds=3,
+    )
     assert ran == [("next_experiment.yaml", "round_1.csv"), ("next_experiment.yaml", "round_2.csv")]
     assert [len(p) for p in asked] == [1, 2, 3] and end["verdict"] == "explained"
-    assert [r["experiment"] for r in json.loads((tmp_path / "diagnosis.json").read_text())["resolved"]] == ["a", "b"]
+    assert [r["experiment"] for r in json.loads((tmp_path / "diagnosis.json").read_text())["resolved"]] == [
+        "a",
+        "b",
+    ]
 
 
 @pytest.mark.slow
@@ -152,8 +203,17 @@ def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment
     (tmp_path / "plant.yaml").write_text(BELIEF)
     (tmp_path / "truth.yaml").write_text(TRUTH)
     write_table(tmp_path / "run_1.csv", loads(TRUTH).compile(()).measure(short_pulses(), seed=1))
-    common = ["diagnose", "--plant", str(tmp_path / "plant.yaml"), str(tmp_path / "run_1.csv"), "--out", str(tmp_path / "out"),
-              "--limit", "T_block=15:110", "--json"]
+    common = [
+        "diagnose",
+        "--plant",
+        str(tmp_path / "plant.yaml"),
+        str(tmp_path / "run_1.csv"),
+        "--out",
+        str(tmp_path / "out"),
+        "--limit",
+        "T_block=15:110",
+        "--json",
+    ]
     assert main([*common, "--quiet"]) == 0
     alone = json.loads(capsys.readouterr().out)
     names = {f["effect"] for f in alone["findings"]} | {a["effect"] for a in alone["alternatives"]}
@@ -162,7 +222,9 @@ def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment
     assert yaml.safe_load((tmp_path / "out/next_experiment.yaml").read_text())["experiments"]
     assert main([*common, "--resolve", "--rig", str(tmp_path / "truth.yaml")]) == 0
     told = json.loads((tmp_path / "out/diagnosis.json").read_text())
-    assert told["verdict"] == "explained" and told["next_experiment"] is None and 1 <= len(told["resolved"]) <= 3
+    assert (
+        told["verdict"] == "explained" and told["next_experiment"] is None and 1 <= len(told["resolved"]) <= 3
+    )
     (finding,) = told["findings"]
     assert (finding["effect"], finding["where"]) == ("radiation", "T") and finding["probability"] > 0.9
     (size,) = finding["parameters"].values()

@@ -5,6 +5,7 @@ THERMOCTL_RECORDINGS (default ../shared/recordings). The reference figures are o
 tmotor_ak109 is of one joint fit of its three runs (0.95/0.39/0.64 K to 0.19/0.20/0.25 K, here their mean square), which is easier.
 tclab's run 1 alone is too short: 72 s to 389 s of heat from outside fits it better than the link between the heaters does.
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -31,6 +32,7 @@ class Real:
     """One diagnosis. `runs`: diagnosed; `unseen`: recordings that took no part (none: the figures held out inside `runs`);
     `share`: of a single run, the first part that is diagnosed, the rest unseen. `effects`: any of these sets is right;
     `reference`: held-out rms per output, of the naive plant and with the right physics. `short`: where it is known to fall short."""
+
     name: str
     folder: str
     runs: Sequence[int]
@@ -45,16 +47,57 @@ FRICTION = [{"directional_friction"}, {"coulomb_friction", "constant_load"}]
 LAG = [{"expansion_lag"}, {"sensor_lag"}, {"missing_member", "sensor_lag"}]
 CASES = [
     Real("emps", "emps", [1], FRICTION, {"drive_voltage": (0.29, 0.09)}),
-    Real("cascaded_tanks", "cascaded_tanks", [1], [{"overflow"}, {"overflow", "orifice_exponent"}], {"level": (0.67, 0.29)}, unseen=[2]),
-    Real("tclab, runs 1 and 2, each from the other", "tclab", [1, 2], [{"missing_link", "sensor_lag"}], {"T1": (1.88, 1.06), "T2": (2.86, 0.70)},
-         short="beside the lag, heat from outside in the same minutes of both runs fits a little better (13 in score of 1190) than the link"),
-    Real("tclab, run 4's last 40 %", "tclab", [4], [{"missing_link", "sensor_lag"}], {"T1": (1.22, 0.66), "T2": (11.6, 0.85)}, share=0.6),
-    Real("tmotor_ak109, each run from the others", "tmotor_ak109", [1, 2, 3], [{"hidden_thermal_mass"}], {"temperature": (0.70, 0.21)}),
-    Real("building_prbs, last 40 %", "building_prbs", [1], [{"hidden_thermal_mass"}], {"indoor": (1.28, 0.67)}, share=0.6),
+    Real(
+        "cascaded_tanks",
+        "cascaded_tanks",
+        [1],
+        [{"overflow"}, {"overflow", "orifice_exponent"}],
+        {"level": (0.67, 0.29)},
+        unseen=[2],
+    ),
+    Real(
+        "tclab, runs 1 and 2, each from the other",
+        "tclab",
+        [1, 2],
+        [{"missing_link", "sensor_lag"}],
+        {"T1": (1.88, 1.06), "T2": (2.86, 0.70)},
+        short="beside the lag, heat from outside in the same minutes of both runs fits a little better (13 in score of 1190) than the link",
+    ),
+    Real(
+        "tclab, run 4's last 40 %",
+        "tclab",
+        [4],
+        [{"missing_link", "sensor_lag"}],
+        {"T1": (1.22, 0.66), "T2": (11.6, 0.85)},
+        share=0.6,
+    ),
+    Real(
+        "tmotor_ak109, each run from the others",
+        "tmotor_ak109",
+        [1, 2, 3],
+        [{"hidden_thermal_mass"}],
+        {"temperature": (0.70, 0.21)},
+    ),
+    Real(
+        "building_prbs, last 40 %",
+        "building_prbs",
+        [1],
+        [{"hidden_thermal_mass"}],
+        {"indoor": (1.28, 0.67)},
+        share=0.6,
+    ),
     *(Real(f"zprobe_drift, probe {k}", "zprobe_drift", [k], LAG, {}) for k in (1, 2)),
-    *(Real(f"zprobe_drift, probe {k}", "zprobe_drift", [k], LAG, {},
-           short="a probe that compensates itself: the lag does not predict its held-out blocks")
-      for k in (3, 4)),
+    *(
+        Real(
+            f"zprobe_drift, probe {k}",
+            "zprobe_drift",
+            [k],
+            LAG,
+            {},
+            short="a probe that compensates itself: the lag does not predict its held-out blocks",
+        )
+        for k in (3, 4)
+    ),
 ]
 
 
@@ -75,13 +118,15 @@ def _held_out(case: Real, out: Path, first: Path | None) -> tuple[dict[str, floa
         errors = []
         for r in case.unseen or case.runs:
             table = read_table(folder / f"run_{r}.csv")
-            if first is not None:       # the parameters of one recording hold for its rest, too
+            if first is not None:  # the parameters of one recording hold for its rest, too
                 table = dataclasses.replace(table, name=first.stem)
             drive = model.drive(table)
             e = drive.y - model.run(drive).y
             errors.append(e[drive.t >= case.share * drive.t[-1]] if first is not None else e)
         stacked = np.concatenate(errors)
-        figures.append({o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2))) for j, o in enumerate(model.outputs)})
+        figures.append(
+            {o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2))) for j, o in enumerate(model.outputs)}
+        )
     return figures[0], figures[1]
 
 
@@ -98,22 +143,40 @@ def test_a_real_rig_is_given_its_missing_physics(case):
         table = read_table(runs[0])
         part = table.t <= table.t[0] + case.share * (table.t[-1] - table.t[0])
         first = out.parent / f"{case.folder}_first.csv"
-        write_table(first, dataclasses.replace(table, t=table.t[part], columns={k: v[part] for k, v in table.columns.items()}))
+        write_table(
+            first,
+            dataclasses.replace(
+                table, t=table.t[part], columns={k: v[part] for k, v in table.columns.items()}
+            ),
+        )
         runs = [first]
     assert main(["diagnose", "--plant", str(folder / "plant.yaml"), *map(str, runs), "--out", str(out)]) == 0
     result = json.loads((out / "diagnosis.json").read_text())
     named = [(f["effect"], f["where"], f["probability"]) for f in result["findings"]]
     before, after = _held_out(case, out, first)
-    print(f"\n{case.name}: {result['verdict']}, {result['seconds']:.0f} s: " + (", ".join(f"{e} at {w} {p:.2f}" for e, w, p in named) or "-"))
+    print(
+        f"\n{case.name}: {result['verdict']}, {result['seconds']:.0f} s: "
+        + (", ".join(f"{e} at {w} {p:.2f}" for e, w, p in named) or "-")
+    )
     for o in before:
-        wanted = f"; reference {case.reference[o][0]} -> {case.reference[o][1]}" if o in case.reference else ""
+        wanted = (
+            f"; reference {case.reference[o][0]} -> {case.reference[o][1]}" if o in case.reference else ""
+        )
         gain = result["held_out_gain"].get(o)
-        print(f"    {o}: {before[o]:.3g} -> {after[o]:.3g} on unseen data{wanted}"
-              + (f"; in its own held-out blocks x {gain['ratio']:.2f} ({gain['interval'][0]:.2f} .. {gain['interval'][1]:.2f})" if gain else ""))
+        print(
+            f"    {o}: {before[o]:.3g} -> {after[o]:.3g} on unseen data{wanted}"
+            + (
+                f"; in its own held-out blocks x {gain['ratio']:.2f} ({gain['interval'][0]:.2f} .. {gain['interval'][1]:.2f})"
+                if gain
+                else ""
+            )
+        )
     found = {e for e, _, _ in named}
     if case.short and not any(wanted <= found for wanted in case.effects):
         pytest.xfail(case.short)
-    assert any(wanted <= found for wanted in case.effects), f"named {found or 'nothing'}, expected one of {case.effects}"
+    assert any(wanted <= found for wanted in case.effects), (
+        f"named {found or 'nothing'}, expected one of {case.effects}"
+    )
     # half as good again as the reference would be a miss; better or a little worse is as the quick refit was
     for o, (_, best) in case.reference.items():
         assert after[o] < 1.5 * best and after[o] < before[o]

@@ -1,4 +1,5 @@
 """How the search goes on from a first choice that another missing effect led astray, and which rivals are kept."""
+
 import dataclasses
 
 import numpy as np
@@ -76,9 +77,10 @@ def test_a_wrong_first_choice_is_mended_by_the_second_effects_of_those_that_came
     wrong = next(e for e in seen.finalists if names(e) == {"sensor_offset_step"})
     found = search.otherwise(case, seen, search.look(case, wrong, seen.entries, draws=0))
     assert names(found[0]) == {"cogging", "backlash_hysteresis"}
-    assert {q: found[0].plant.parameters[q].value for q in found[0].plant.parameters if q[:2] in ("P_", "A_")} == pytest.approx(
-        {"P_cogging_velocity": 0.039, "A_cogging_velocity": 0.02}, rel=0.02)
-    case.begun -= 2 * search.PATIENCE_S         # later than it has patience for
+    assert {
+        q: found[0].plant.parameters[q].value for q in found[0].plant.parameters if q[:2] in ("P_", "A_")
+    } == pytest.approx({"P_cogging_velocity": 0.039, "A_cogging_velocity": 0.02}, rel=0.02)
+    case.begun -= 2 * search.PATIENCE_S  # later than it has patience for
     assert search.otherwise(case, seen, search.look(case, wrong, seen.entries, draws=0)) == []
     case.begun += 2 * search.PATIENCE_S
 
@@ -87,10 +89,13 @@ def test_an_effect_that_is_left_by_itself_keeps_those_that_competed_with_it(look
     case, base, seen = looked
     best, *others = seen.finalists
     second = next(e for e in others if names(e) != names(best))
-    beside = search.compete(case, search.look(case, best, entries(*names(second)), draws=0),
-                            search.look(case, best, entries(*names(second)), draws=0).directions[:1])[0]
+    beside = search.compete(
+        case,
+        search.look(case, best, entries(*names(second)), draws=0),
+        search.look(case, best, entries(*names(second)), draws=0).directions[:1],
+    )[0]
     monkeypatch.setattr(search, "leave_out", lambda case, base, current, k: best)
-    beside.score = best.score               # no better than without
+    beside.score = best.score  # no better than without
     kept, rivals = search._backward(case, base, beside, [], seen.entries, seen.finalists)
     assert kept is best and rivals and all(r in others and names(r) != names(best) for r in rivals)
 
@@ -131,7 +136,9 @@ def test_three_effects_at_once_are_not_said_to_explain(looked, monkeypatch):
     monkeypatch.setattr(run, "remains", lambda case, e: None)
     monkeypatch.setattr(run, "CLEAN", 1e9)
     said = run.examine(Case(case.plant, case.tables), entries("cogging"))
-    assert said.verdict == "unexplained" and any(n.startswith("3 entries of the catalogue") for n in said.notes)
+    assert said.verdict == "unexplained" and any(
+        n.startswith("3 entries of the catalogue") for n in said.notes
+    )
 
 
 def test_what_leaves_something_gives_way_to_what_fits_alike_and_leaves_nothing(monkeypatch):
@@ -139,25 +146,29 @@ def test_what_leaves_something_gives_way_to_what_fits_alike_and_leaves_nothing(m
     case = heated()
     left = {}
     for spoilt in ("natural_convection", "radiation"):
+
         def remains(case, e, spoilt=spoilt):
             return Suspect("node", "block", 60.0, 3) if spoilt in names(e) else None
+
         monkeypatch.setattr(run, "remains", remains)
         left[spoilt] = names(run.examine(case, entries("natural_convection", "radiation")).final)
     assert left == {"natural_convection": {"radiation"}, "radiation": {"natural_convection"}}
 
 
-def test_an_unknown_function_of_time_that_leaves_much_gives_way_to_constant_physics_that_fits_alike(monkeypatch):
+def test_an_unknown_function_of_time_that_leaves_much_gives_way_to_constant_physics_that_fits_alike(
+    monkeypatch,
+):
     case = heated()
     base = case.explain(case.plant, [], [])
     seen = search.look(case, base, entries("natural_convection", "radiation", "second_ambient"), draws=0)
     done = {next(iter(names(e))): e for e in search.compete(case, seen, search.finalists(seen.directions))}
     soaking, constant = done["second_ambient"], done["radiation"]
     soaking.score = min(e.score for e in done.values()) - 50
-    assert search._ordered(case, [constant, soaking])[0] is soaking             # nothing remains beside it
+    assert search._ordered(case, [constant, soaking])[0] is soaking  # nothing remains beside it
     monkeypatch.setattr(case, "excess", lambda e: {"temperature": 9.0})
     assert search._ordered(case, [constant, soaking]) == [constant, soaking]
     constant.fit.cost = 2 * soaking.fit.cost
-    assert search._ordered(case, [constant, soaking])[0] is soaking             # it fits much better
+    assert search._ordered(case, [constant, soaking])[0] is soaking  # it fits much better
     assert search._ordered(case, []) == []
 
 
@@ -168,9 +179,11 @@ def test_other_missing_physics_is_no_inflated_noise(monkeypatch):
     seen = search.look(case, base, entries("natural_convection"))
     found = search.compete(case, seen, search.finalists(seen.directions))[0]
     seen.inflation[1] = 1e9
-    monkeypatch.setattr(search, "MARGINAL", 1e9)        # both ways by which a gain as large as this one counts anyway
+    monkeypatch.setattr(
+        search, "MARGINAL", 1e9
+    )  # both ways by which a gain as large as this one counts anyway
     monkeypatch.setattr(search, "NO_COLOUR", ())
-    assert found.white and search.counts(case, seen, found, seen.entries)       # what is left has its own chance
+    assert found.white and search.counts(case, seen, found, seen.entries)  # what is left has its own chance
     monkeypatch.setattr(type(found), "white", False)
     assert not search.counts(case, seen, found, seen.entries)
     monkeypatch.setattr(case, "excess", lambda e: {"temperature": 9.0})
@@ -204,22 +217,37 @@ def heated():
         heat = rng.permutation([0.0, 2.5, 0.8, 0.0, 1.6, 3.0, 0.0, 2.0])[(t // 200).astype(int)]
         air, x = 21.5 + 0.4 * np.sin(t / 700 + seed), np.empty(len(t))
         x[0] = air[0]
-        for k in range(len(t) - 1):         # a hundredth of the time constant a step
+        for k in range(len(t) - 1):  # a hundredth of the time constant a step
             over = x[k] - air[k]
             x[k + 1] = x[k] + 2.0 * (heat[k] - 0.04 * over - 0.0008 * over * abs(over) ** 0.25) / 5.2
-        tables.append(Table(f"run_{seed}", f"run_{seed}", t, {"heat": heat, "air": air, "temperature": x + rng.normal(0, 0.1, len(t))}))
+        tables.append(
+            Table(
+                f"run_{seed}",
+                f"run_{seed}",
+                t,
+                {"heat": heat, "air": air, "temperature": x + rng.normal(0, 0.1, len(t))},
+            )
+        )
     return Case(loads(HEATER), tables)
 
 
 def test_an_error_faster_than_a_block_of_rows_is_seen(monkeypatch):
     """A reading with an error of a fifth of its noise every half millimetre, which the stage passes in three samples."""
-    truth = loads(STAGE.replace("value: 59", "value: 44").replace("value: 132", "value: 82")
-                  .replace("{value: position,", "{value: position + 1e-6 * sin(2 * pi * position / 0.0005),")).compile(())
+    truth = loads(
+        STAGE.replace("value: 59", "value: 44")
+        .replace("value: 132", "value: 82")
+        .replace("{value: position,", "{value: position + 1e-6 * sin(2 * pi * position / 0.0005),")
+    ).compile(())
     tables = []
     for seed in (1, 2):
         t = np.arange(12000) * 0.002
         force = np.interp(t, np.arange(0, 25, 0.4), np.random.default_rng(seed).uniform(-8, 8, 63))
-        tables.append(truth.measure(Table(f"run_{seed}", f"run_{seed}", t, {"force": force, "encoder": np.zeros(len(t))}), seed=seed))
+        tables.append(
+            truth.measure(
+                Table(f"run_{seed}", f"run_{seed}", t, {"force": force, "encoder": np.zeros(len(t))}),
+                seed=seed,
+            )
+        )
     case = Case(loads(STAGE), tables)
     base = case.explain(case.plant, [], [])
     fine = search.look(case, base, entries("cyclic_error"))
@@ -228,7 +256,9 @@ def test_an_error_faster_than_a_block_of_rows_is_seen(monkeypatch):
     assert best.gain == pytest.approx(24000 * (1e-6) ** 2 / 2 / variance, rel=0.3)
     assert best.start["P"] == pytest.approx(0.0005, rel=0.01)
     monkeypatch.setattr(search, "FINE_ROWS", 1000)
-    assert not any(d.gain > 0.3 * best.gain for d in search.look(case, base, entries("cyclic_error")).directions)
+    assert not any(
+        d.gain > 0.3 * best.gain for d in search.look(case, base, entries("cyclic_error")).directions
+    )
 
 
 def test_a_sketch_keeps_what_directions_have_in_common():
@@ -268,7 +298,16 @@ outputs:
 def motor():
     t = np.arange(0.0, 3000.0, 10.0)
     plant = loads(MOTOR)
-    table = Table("run", "run", t, {"current": 3.0 * (np.sin(t / 200) > 0), "speed": 50 + 50 * np.cos(t / 150), "air": 21 + np.sin(t / 700)})
+    table = Table(
+        "run",
+        "run",
+        t,
+        {
+            "current": 3.0 * (np.sin(t / 200) > 0),
+            "speed": 50 + 50 * np.cos(t / 150),
+            "air": 21 + np.sin(t / 700),
+        },
+    )
     return Case(plant, [plant.compile().measure(table)])
 
 
@@ -287,10 +326,22 @@ def test_a_reading_of_growth_may_follow_the_air_as_a_temperature_does(motor):
 
 def test_what_was_left_out_is_not_looked_for_in_what_another_effect_assumed(motor):
     mass = offered(motor, motor.plant, "hidden_thermal_mass")["housing"]
-    plant = mass.extend({"G": 0.5, "C": 100.0, **{p.name: p.null for p in mass.effect.parameters if p.name not in "GC"}})
+    plant = mass.extend(
+        {"G": 0.5, "C": 100.0, **{p.name: p.null for p in mass.effect.parameters if p.name not in "GC"}}
+    )
     hidden = set(plant.nodes) - set(motor.plant.nodes)
-    assert len(hidden) == 1 and any(hidden & c.place.parts() for c in offered(motor, plant, "missing_link").values())
-    e = motor.explain(plant, [mass], [{p.name: mass.own(p.name) for p in mass.effect.parameters}], iterations=2)
-    seen = search.look(motor, e, entries("missing_link", "natural_convection", "conductance_step", "sensor_gain"), draws=0)
-    assert {d.candidate.effect.name for d in seen.directions} >= {"natural_convection", "conductance_step", "sensor_gain"}
+    assert len(hidden) == 1 and any(
+        hidden & c.place.parts() for c in offered(motor, plant, "missing_link").values()
+    )
+    e = motor.explain(
+        plant, [mass], [{p.name: mass.own(p.name) for p in mass.effect.parameters}], iterations=2
+    )
+    seen = search.look(
+        motor, e, entries("missing_link", "natural_convection", "conductance_step", "sensor_gain"), draws=0
+    )
+    assert {d.candidate.effect.name for d in seen.directions} >= {
+        "natural_convection",
+        "conductance_step",
+        "sensor_gain",
+    }
     assert not any("hidden" in d.candidate.place.where for d in seen.directions)

@@ -1,4 +1,5 @@
 """ISO 230-2, experiments as data, and the chain on a rig."""
+
 import dataclasses
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def test_schedules_of_the_paper():
     rate = np.abs(np.diff(b.setpoint_um) / np.diff(b.t_s))
     assert rate.max() <= 1000 / 60 * 1.001
     t = np.arange(0, tests["test_2"].duration_s)
-    assert experiments.share_below(t, tests["test_2"].at(t)**2, 4.3e-4) > 0.8
+    assert experiments.share_below(t, tests["test_2"].at(t) ** 2, 4.3e-4) > 0.8
 
 
 def test_designed_pulses_beat_equal_ones():
@@ -55,10 +56,20 @@ def test_designed_pulses_beat_equal_ones():
     assert share(widths, gaps) > share([600, 600, 600], [2200, 2200, 2200])
 
 
-@pytest.mark.parametrize("text, message", [
-    ("format: x", "missing|expected"),
-    ("format: thermoctl-experiments/1\nrate_um_s: 1\nexperiments:\n  a: {title: t, parts: [{hold: [[1]]}]}", ":4:.*seconds"),
-    ("format: thermoctl-experiments/1\nrate_um_s: 1\nexperiments:\n  a: {title: t, parts: [{hald: [[1, 2]]}]}", ":4:.*one of")])
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("format: x", "missing|expected"),
+        (
+            "format: thermoctl-experiments/1\nrate_um_s: 1\nexperiments:\n  a: {title: t, parts: [{hold: [[1]]}]}",
+            ":4:.*seconds",
+        ),
+        (
+            "format: thermoctl-experiments/1\nrate_um_s: 1\nexperiments:\n  a: {title: t, parts: [{hald: [[1, 2]]}]}",
+            ":4:.*one of",
+        ),
+    ],
+)
 def test_bad_experiments(tmp_path, text, message):
     path = tmp_path / "e.yaml"
     path.write_text(text)
@@ -99,7 +110,7 @@ def test_compensators_for_the_daemon_follow_the_estimators(proof):
                 out[k] = m.C @ x
             x = x + m.A_minus_I @ x + m.B @ [r4.power_w[k], rate[k]]
     wanted = chain.run_kalman(c.kalman, r4)[:n]
-    assert np.sqrt(np.mean((out - wanted)**2)) < 0.15
+    assert np.sqrt(np.mean((out - wanted) ** 2)) < 0.15
     assert chain.compensator(c, "paper").kind == "mkf"
 
 
@@ -107,12 +118,23 @@ def test_the_full_runs_truth_is_found_from_any_folder(tmp_path, monkeypatch):
     """Settings read a relative path from their own folder; the truth is written beside the report."""
     monkeypatch.chdir(tmp_path)
     Path("out").mkdir()
-    written = full.scaled_truth(ROOT / "config" / "plants" / "actuator_truth.yaml", Path("out") / "truth.yaml")
+    written = full.scaled_truth(
+        ROOT / "config" / "plants" / "actuator_truth.yaml", Path("out") / "truth.yaml"
+    )
     assert written.is_absolute() and written.is_file()
-    was, now = (plant.load(p).parameters["a_bracket_1"].value for p in (ROOT / "config" / "plants" / "actuator_truth.yaml", written))
+    was, now = (
+        plant.load(p).parameters["a_bracket_1"].value
+        for p in (ROOT / "config" / "plants" / "actuator_truth.yaml", written)
+    )
     assert now == pytest.approx(rigs.PAPER_SCALE["a_bracket_1"] * was)
 
 
 def test_page_is_self_contained():
     text = page("A <b>", [("One", table(["x", "y"], [["<i>", 1.23456], [None, 2]]))], "note")
-    assert "<b>" not in text and "&lt;i&gt;" in text and "1.235" in text and "src=" not in text and "http" not in text
+    assert (
+        "<b>" not in text
+        and "&lt;i&gt;" in text
+        and "1.235" in text
+        and "src=" not in text
+        and "http" not in text
+    )

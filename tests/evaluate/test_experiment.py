@@ -1,4 +1,5 @@
 """From experiment to compensation: tests run and recorded, identified, installed, loaded by the daemon, refused elsewhere, rolled back."""
+
 import dataclasses
 import re
 from pathlib import Path
@@ -19,7 +20,7 @@ from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
-QUICK = 50              # heat capacities are divided by it: an hour passes in 72 s
+QUICK = 50  # heat capacities are divided by it: an hour passes in 72 s
 SHORT = """\
 format: thermoctl-experiments/1
 rate_um_s: 16.6667
@@ -34,12 +35,24 @@ experiments:
 def quick(tmp_path, monkeypatch):
     """A folder with a rig whose heat is QUICK times faster, its experiments, no model."""
     text = (ROOT / "config/plants/actuator.yaml").read_text()
-    (tmp_path / "plant.yaml").write_text(re.sub(r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
-                                                lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}", text))
+    (tmp_path / "plant.yaml").write_text(
+        re.sub(
+            r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
+            lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}",
+            text,
+        )
+    )
     text = (ROOT / "config/simulated.yaml").read_text()
-    for old, new in (("plants/actuator.yaml", "plant.yaml"), ("model: models/simulated.yaml", 'model: ""'), ("slew_um_s: 1", "slew_um_s: 50"),
-                     ("temperatures_c: 900", "temperatures_c: 18"), ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25"),
-                     ("period_s: 7200", "period_s: 144"), ("../run/", f"{tmp_path}/"), ("../recordings", f"{tmp_path}/recordings")):
+    for old, new in (
+        ("plants/actuator.yaml", "plant.yaml"),
+        ("model: models/simulated.yaml", 'model: ""'),
+        ("slew_um_s: 1", "slew_um_s: 50"),
+        ("temperatures_c: 900", "temperatures_c: 18"),
+        ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25"),
+        ("period_s: 7200", "period_s: 144"),
+        ("../run/", f"{tmp_path}/"),
+        ("../recordings", f"{tmp_path}/recordings"),
+    ):
         assert old in text, old
         text = text.replace(old, new)
     (tmp_path / "rig.yaml").write_text(text)
@@ -48,27 +61,47 @@ def quick(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.slow       # 12 minutes of rig time: make test-identification
+@pytest.mark.slow  # 12 minutes of rig time: make test-identification
 def test_from_experiment_to_a_model_in_the_daemon_and_back(quick, capsys):
-    (quick / "plant.yaml").write_text((ROOT / "config/plants/actuator.yaml").read_text())          # heat at its own pace
+    (quick / "plant.yaml").write_text(
+        (ROOT / "config/plants/actuator.yaml").read_text()
+    )  # heat at its own pace
     for name in ("test_2", "test_3", "test_4a"):
         assert cli.main(["experiment", name, "--config", "rig.yaml"]) == 0
     said = capsys.readouterr().out
     assert "faster than real time" in said and "mHz" in said and "<- f_c" in said
     table = read_table("test_2.parquet")
-    assert len(table) == pytest.approx(2200, abs=2) and np.ptp(table.columns["output_reference_um"] - table.columns["position_raw_um"]) > 0.5
+    assert (
+        len(table) == pytest.approx(2200, abs=2)
+        and np.ptp(table.columns["output_reference_um"] - table.columns["position_raw_um"]) > 0.5
+    )
 
-    identify = ["identify", "test_2.parquet", "test_3.parquet", "test_4a.parquet", "--config", "rig.yaml", "--order", "2"]
+    identify = [
+        "identify",
+        "test_2.parquet",
+        "test_3.parquet",
+        "test_4a.parquet",
+        "--config",
+        "rig.yaml",
+        "--order",
+        "2",
+    ]
     assert cli.main(identify) == 0
     one = modelfile.current("models")
     found = modelfile.load_calibration(one)
-    assert found.rig == "simulated" and set(found.fingerprints) == {"test_2.parquet", "test_3.parquet", "test_4a.parquet"}
+    assert found.rig == "simulated" and set(found.fingerprints) == {
+        "test_2.parquet",
+        "test_3.parquet",
+        "test_4a.parquet",
+    }
     assert found.figures["expansion_rms_um"] < 0.5
 
     # The daemon's own loader takes it by the folder, and refuses it for a rig of another name.
     (quick / "rig.yaml").write_text((quick / "rig.yaml").read_text().replace('model: ""', "model: models"))
     settings = load_settings("rig.yaml")
-    assert np.array_equal(compensator(settings).A_minus_I, found.model.A_minus_I) and found.figures["refinement"]
+    assert (
+        np.array_equal(compensator(settings).A_minus_I, found.model.A_minus_I) and found.figures["refinement"]
+    )
     other = dataclasses.replace(settings, rig=dataclasses.replace(settings.rig, name="another"))
     with pytest.raises(InputError, match="of rig 'simulated', this one is 'another'"):
         compensator(other)
@@ -76,7 +109,11 @@ def test_from_experiment_to_a_model_in_the_daemon_and_back(quick, capsys):
         Simulation(other)
 
     # It compensates: test 4A again, with the model.
-    simulation = Simulation(dataclasses.replace(settings, protection=dataclasses.replace(settings.protection, innovation_limit_c=1e3)))
+    simulation = Simulation(
+        dataclasses.replace(
+            settings, protection=dataclasses.replace(settings.protection, innovation_limit_c=1e3)
+        )
+    )
     simulation.arm()
     first = simulation.tick()[INDEX["output_reference_um"]]
     left, grown = [], []
@@ -98,7 +135,10 @@ def test_experiment_refuses_what_the_rig_may_not_do(quick, capsys):
     (quick / "experiments.yaml").write_text(SHORT.replace("[70, 250]", "[70, 300]"))
     assert cli.main(["experiment", "test_2", "--config", "rig.yaml"]) == 2
     assert "setpoint_high_um" in capsys.readouterr().err and not (quick / "test_2.parquet").exists()
-    assert cli.main(["experiment", "test_3", "--config", "rig.yaml", "--dry-run"]) == 0 and not (quick / "test_3.parquet").exists()
+    assert (
+        cli.main(["experiment", "test_3", "--config", "rig.yaml", "--dry-run"]) == 0
+        and not (quick / "test_3.parquet").exists()
+    )
 
 
 def test_relay_oscillates_at_the_loops_own_limit(quick):
@@ -116,16 +156,30 @@ def test_a_wrong_expansion_is_tuned_while_the_reference_is_there(quick, monkeypa
     """In simulated time: the tuner takes the daemon's rows, waits for excitation, and installs a better calibration, which can be undone."""
     from thermoctl.plant import load
     from thermoctl.plant.linearise import linearise
+
     right = linearise(load(_thermal(quick)), 0.001, 0.1, expansion_period_s=0.05)
-    wrong = dataclasses.replace(right, b1=0.75 * right.b1, b2=0.75 * right.b2, b_air=0.75 * right.b_air, air_filter_s=right.air_filter_s / QUICK)
+    wrong = dataclasses.replace(
+        right,
+        b1=0.75 * right.b1,
+        b2=0.75 * right.b2,
+        b_air=0.75 * right.b_air,
+        air_filter_s=right.air_filter_s / QUICK,
+    )
     monkeypatch.setattr(tuner, "PROPOSE_S", 10.0)
     settings = load_settings("rig.yaml")
     folder = quick / "models"
     first = modelfile.install(folder, wrong, "simulated")
     said: list[str] = []
-    learning = tuner.Tuning(wrong, "simulated", folder, said.append, Tuner(wrong, (0.5, 2.0, 4.0), 100, 0.4, hold_s=60.0))
+    learning = tuner.Tuning(
+        wrong, "simulated", folder, said.append, Tuner(wrong, (0.5, 2.0, 4.0), 100, 0.4, hold_s=60.0)
+    )
     rows: list[np.ndarray] = []
-    simulation = Simulation(dataclasses.replace(settings, protection=dataclasses.replace(settings.protection, innovation_limit_c=1e3)), wrong)
+    simulation = Simulation(
+        dataclasses.replace(
+            settings, protection=dataclasses.replace(settings.protection, innovation_limit_c=1e3)
+        ),
+        wrong,
+    )
     simulation.arm()
     progress = []
     for k in range(260):
@@ -155,27 +209,37 @@ def test_a_wrong_expansion_is_tuned_while_the_reference_is_there(quick, monkeypa
 def _thermal(folder: Path) -> Path:
     text = (ROOT / "config/plants/actuator_thermal.yaml").read_text()
     path = folder / "thermal.yaml"
-    path.write_text(re.sub(r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
-                           lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}", text))
+    path.write_text(
+        re.sub(
+            r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
+            lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}",
+            text,
+        )
+    )
     return path
 
 
 def test_tuning_needs_a_folder_of_calibrations(quick):
     settings = load_settings("rig.yaml")
-    settings = dataclasses.replace(settings, compensation=dataclasses.replace(settings.compensation, tune=True))
+    settings = dataclasses.replace(
+        settings, compensation=dataclasses.replace(settings.compensation, tune=True)
+    )
     with pytest.raises(InputError, match="folder of calibrations"):
         tuner.check(settings)
 
 
-@pytest.mark.slow       # two programs and wires in real time: make test-identification
+@pytest.mark.slow  # two programs and wires in real time: make test-identification
 def test_an_experiment_at_the_wire_is_ended_and_goes_on(tmp_path):
     """`thermoctl experiment` on the daemon that holds the virtual rig over serial, CAN and Modbus: nothing is lost when it is ended."""
     import signal
     import subprocess
 
     from tests.hal.test_wire_daemon import CLI, Chain
-    (tmp_path / "experiments.yaml").write_text("format: thermoctl-experiments/1\nrate_um_s: 16.6667\nexperiments:\n"
-                                               "  short: {title: Up and down, parts: [{hold: [[1, 0], [6, 20], [3, 0]]}]}\n")
+
+    (tmp_path / "experiments.yaml").write_text(
+        "format: thermoctl-experiments/1\nrate_um_s: 16.6667\nexperiments:\n"
+        "  short: {title: Up and down, parts: [{hold: [[1, 0], [6, 20], [3, 0]]}]}\n"
+    )
     chain = Chain(tmp_path)
     try:
         out = tmp_path / "short.parquet"
@@ -188,14 +252,19 @@ def test_an_experiment_at_the_wire_is_ended_and_goes_on(tmp_path):
         kept = read_table(out)
         assert len(kept) > 5 and chain.status()["state"] != "ARMED"
         goes_on, again = "", []
-        while len(again) < 6 and (not again or again[-1].returncode):       # a busy machine's wires may trip it: acknowledged, it goes on too
+        while len(again) < 6 and (
+            not again or again[-1].returncode
+        ):  # a busy machine's wires may trip it: acknowledged, it goes on too
             chain.ask("disarm")
             again.append(subprocess.run(command, capture_output=True, text=True, timeout=120, check=False))
             goes_on += again[-1].stdout
         assert again[-1].returncode == 0, [(r.stdout, r.stderr) for r in again]
         assert re.search(r"goes on at \d+ s|begins anew", goes_on)
         whole = read_table(out)
-        assert np.nanmax(whole.columns["position_um"]) == pytest.approx(20, abs=1) and (np.diff(whole.t) > 0).all()
+        assert (
+            np.nanmax(whole.columns["position_um"]) == pytest.approx(20, abs=1)
+            and (np.diff(whole.t) > 0).all()
+        )
         assert not out.with_name("short.parquet.progress").exists() and chain.status()["state"] != "ARMED"
     finally:
         chain.stop()

@@ -6,6 +6,7 @@ A target gets bytes that are damaged seeds (atheris, which sees which branches t
 damage). An exception that is not meant, an input that takes over LIMIT_S or more than LIMIT_MB of memory ends the run, with the
 input kept in build/fuzz. `make fuzz` runs all.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -45,10 +46,13 @@ def _file(data: bytes, suffix: str) -> Path:
 def plant() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """A plant file: read, checked, its units counted."""
     from thermoctl.plant import load
+
     seeds = [p.read_bytes() for p in sorted((ROOT / "config/plants").glob("*.yaml"))]
-    seeds.append(b"format: thermoctl-plant/1\ntitle: a\ninputs: {u: {unit: W}}\nparameters: {C: {value: 1, unit: J/K}}\n"
-                 b"nodes: {T: {unit: degC, storage: C, initial: 20}}\nflows: {q: {into: T, rate: u * (1 - T / 3), unit: W}}\n"
-                 b"outputs: {y: {value: T, unit: degC}}\n")
+    seeds.append(
+        b"format: thermoctl-plant/1\ntitle: a\ninputs: {u: {unit: W}}\nparameters: {C: {value: 1, unit: J/K}}\n"
+        b"nodes: {T: {unit: degC, storage: C, initial: 20}}\nflows: {q: {into: T, rate: u * (1 - T / 3), unit: W}}\n"
+        b"outputs: {y: {value: T, unit: degC}}\n"
+    )
     return (lambda data: load(_file(data, ".yaml"))), seeds
 
 
@@ -72,6 +76,7 @@ def config() -> tuple[Callable[[bytes], Any], list[bytes]]:
             load_profile(_file(data[1:], ".yaml"))
         else:
             one(data)
+
     seeds = [p.read_bytes() for p in (ROOT / "config").glob("*.yaml") if p.name != "experiments.yaml"]
     return either, seeds + [b"p" + p.read_bytes() for p in (ROOT / "config/devices").glob("*.yaml")]
 
@@ -85,8 +90,14 @@ def expression() -> tuple[Callable[[bytes], Any], list[bytes]]:
             tree = parse(data.decode("utf-8", "replace"))
             for name in sorted(names(tree))[:2]:
                 str(derivative(tree, name))
-    return one, [b"k*(a-b)", b"min(max(u, -U), U) * exp(-x**2/2)", b"table(x, [0, 1, 2], [3, 4, 5]) + delay(u, 3) - first(T)",
-                 b"sign(v)*F*tanh(v/1e-3) + step(x - 2)*(x > 3) + 1.5e-3 + pi*t", b"((((a))))**-2**b"]
+
+    return one, [
+        b"k*(a-b)",
+        b"min(max(u, -U), U) * exp(-x**2/2)",
+        b"table(x, [0, 1, 2], [3, 4, 5]) + delay(u, 3) - first(T)",
+        b"sign(v)*F*tanh(v/1e-3) + step(x - 2)*(x > 3) + 1.5e-3 + pi*t",
+        b"((((a))))**-2**b",
+    ]
 
 
 def _cut(data: bytes) -> list[bytes]:
@@ -102,13 +113,18 @@ def _cut(data: bytes) -> list[bytes]:
 
 def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """Encoder frames and text lines in any pieces; what the framer keeps stays small."""
-    from hal.wire import Framer
-
     from hal.profile import BinaryFrame
     from hal.serial_port import LineReader
+    from hal.wire import Framer
+
     fields = (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8"))
-    specs = [BinaryFrame(b"\xaa\x55", fields, sequence="sequence"), BinaryFrame(b"\xaa", fields, has_length=False, crc="modbus"),
-             BinaryFrame(b"\0\0\0\0\0\0\0\0", (("a", "float64"), ("b", "int64")), endian=">", crc="xmodem", crc_endian=">")]
+    specs = [
+        BinaryFrame(b"\xaa\x55", fields, sequence="sequence"),
+        BinaryFrame(b"\xaa", fields, has_length=False, crc="modbus"),
+        BinaryFrame(
+            b"\0\0\0\0\0\0\0\0", (("a", "float64"), ("b", "int64")), endian=">", crc="xmodem", crc_endian=">"
+        ),
+    ]
 
     def one(data: bytes) -> None:
         for spec in specs:
@@ -119,15 +135,19 @@ def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
         reader = LineReader()
         for piece in _cut(data):
             assert all(len(line) <= 1024 for line in reader.feed(piece))
+
     frames = b"".join(Framer(specs[0]).encode(k, k * 1000, 0) for k in range(5))
-    return one, [b"\x05\x09\x01\x40" + frames, b"\x20\x20\x20\x20V=+3.1250 A=+0.6250\r\nV=1e9 A=\n", b"\xff" * 4 + b"\xaa\x55\x07" * 300]
+    return one, [
+        b"\x05\x09\x01\x40" + frames,
+        b"\x20\x20\x20\x20V=+3.1250 A=+0.6250\r\nV=1e9 A=\n",
+        b"\xff" * 4 + b"\xaa\x55\x07" * 300,
+    ]
 
 
 def slcan() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """An adapter's answers, and a drive's frames behind them."""
-    from hal.wire import SlcanParser, encode_slcan
-
     from hal.can_bus import drive_state, next_control_word
+    from hal.wire import SlcanParser, encode_slcan
 
     def one(data: bytes) -> None:
         parser = SlcanParser()
@@ -135,9 +155,18 @@ def slcan() -> tuple[Callable[[bytes], Any], list[bytes]]:
             for can_id, body in parser.feed(piece):
                 assert 0 <= can_id < 1 << 32 and len(body) <= 8
                 word = int.from_bytes(body[:2], "little")
-                assert drive_state(word) in (0.0, 1.0, 2.0, 3.0) and 0 <= next_control_word(word, bool(word & 1)) <= 0xFF
-    frames = b"".join(encode_slcan(i, bytes(range(n))) for i, n in ((0x185, 6), (0x705, 1), (0x1FFFFFFF, 8), (0, 0)))
-    return one, [b"\x07\x01\x20\x03" + frames + b"z\r\aZ\rV1013\rF00\r", b"\x40" * 4 + b"t1238" + b"00" * 8 + b"A5F3\r"]
+                assert (
+                    drive_state(word) in (0.0, 1.0, 2.0, 3.0)
+                    and 0 <= next_control_word(word, bool(word & 1)) <= 0xFF
+                )
+
+    frames = b"".join(
+        encode_slcan(i, bytes(range(n))) for i, n in ((0x185, 6), (0x705, 1), (0x1FFFFFFF, 8), (0, 0))
+    )
+    return one, [
+        b"\x07\x01\x20\x03" + frames + b"z\r\aZ\rV1013\rF00\r",
+        b"\x40" * 4 + b"t1238" + b"00" * 8 + b"A5F3\r",
+    ]
 
 
 def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
@@ -149,6 +178,7 @@ def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
     from hal.modbus import ModbusDevice
     from hal.profile import bind
     from thermoctl import yamlfile
+
     listener = socket.create_server(("127.0.0.1", 0))
     answer = [b""]
 
@@ -158,9 +188,12 @@ def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
             with connection, contextlib.suppress(OSError):
                 request = connection.recv(260)
                 connection.sendall(answer[0].replace(b"\xf0\x0d", request[:2]))
+
     threading.Thread(target=serve, daemon=True).start()
-    text = (f"{{profile: devices/thermocouples-modbus-8.yaml, port: 'tcp:127.0.0.1:{listener.getsockname()[1]}', "
-            "roles: {thermocouple_1: coil_c, thermocouple_2: bobbin_c}}")
+    text = (
+        f"{{profile: devices/thermocouples-modbus-8.yaml, port: 'tcp:127.0.0.1:{listener.getsockname()[1]}', "
+        "roles: {thermocouple_1: coil_c, thermocouple_2: bobbin_c}}"
+    )
     device = ModbusDevice(bind(yamlfile.loads(text), ROOT / "config"))
 
     def one(data: bytes) -> None:
@@ -174,9 +207,15 @@ def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
         finally:
             device.disconnect()
         assert ((sample.value != sample.value) | (abs(sample.value) < 1e4)).all()
+
     good = b"\xf0\x0d\0\0\0\x07\x01\x04\x04\x08\xb1\x08\xa0"
-    return one, [good, b"\xf0\x0d\0\0\0\x03\x01\x84\x02", good[:9],
-                 b"\xf0\x0d\0\0\xff\xff\x01\x04\xff", b"\xf0\x0d\0\0\0\x07\x01\x04\x04\x7f\xff\x80\x00"]
+    return one, [
+        good,
+        b"\xf0\x0d\0\0\0\x03\x01\x84\x02",
+        good[:9],
+        b"\xf0\x0d\0\0\xff\xff\x01\x04\xff",
+        b"\xf0\x0d\0\0\0\x07\x01\x04\x04\x7f\xff\x80\x00",
+    ]
 
 
 def _recording(suffix: str) -> tuple[Callable[[bytes], Any], list[bytes]]:
@@ -185,6 +224,7 @@ def _recording(suffix: str) -> tuple[Callable[[bytes], Any], list[bytes]]:
 
     from thermoctl.recording.reader import info
     from thermoctl.recording.table import Table, read_table, write_table
+
     table = Table("a", "a", np.arange(40.0), {"x": np.sin(np.arange(40.0)), "y": np.full(40, np.nan)})
     path = FOLDER / f"seed{suffix if suffix != '.arrows' else '.arrow'}"
     write_table(str(path), table)
@@ -194,17 +234,21 @@ def _recording(suffix: str) -> tuple[Callable[[bytes], Any], list[bytes]]:
     if suffix == ".arrows":
         sink = io.BytesIO()
         columns = pa.table({"t_s": np.arange(50.0), "wall_s": np.arange(50.0), "x": np.zeros(50)})
-        with pa.ipc.new_stream(sink, columns.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as stream:
+        with pa.ipc.new_stream(
+            sink, columns.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")
+        ) as stream:
             stream.write_table(columns, max_chunksize=20)
         seeds.append(sink.getvalue())
 
     def one(data: bytes) -> None:
         from thermoctl.yamlfile import InputError
+
         read = _file(data, suffix)
         with contextlib.suppress(InputError):
             read_table(str(read))
         if suffix == ".arrows":
             info(read)
+
     return one, seeds
 
 
@@ -216,14 +260,16 @@ def commands() -> tuple[Callable[[bytes], Any], list[bytes]]:
     from thermoctl.daemon.shared import Shared
     from thermoctl.settings import load_settings
     from thermoctl.signals import SIGNALS
+
     settings = load_settings(ROOT / "config/simulated.yaml")
     shared = Shared.create(f"thermoctl-fuzz-{os.getpid()}")
     shared.remove()
     shared.ring.write(np.zeros(len(SIGNALS)))
-    room.ANSWER_S = 0.001                                  # nobody takes the commands
+    room.ANSWER_S = 0.001  # nobody takes the commands
 
     def refuse(*_: Any) -> Any:
         raise room.InputError("no file")
+
     obey = room.Commands(shared, settings, refuse, lambda *a, **k: None)
 
     def one(data: bytes) -> None:
@@ -231,9 +277,12 @@ def commands() -> tuple[Callable[[bytes], Any], list[bytes]]:
         for line in data.split(b"\n"):
             found = obey.answer(line, "uid 0 pid 0")
             assert isinstance(found["ok"], bool) and len(json.dumps(found)) < 1_000_000
-    return one, [b'{"command": "status"}\n{"command": "setpoint", "value": 1e3}\n{"command": "arm"}\n{"command": "latency"}',
-                 b'{"command": "setpoint", "value": NaN}\n{"command": ["x"]}\n[[[[1]]]]\n{"command": "reload"}\n'
-                 b'{"command": "disarm", "value": "\\ud800"}']
+
+    return one, [
+        b'{"command": "status"}\n{"command": "setpoint", "value": 1e3}\n{"command": "arm"}\n{"command": "latency"}',
+        b'{"command": "setpoint", "value": NaN}\n{"command": ["x"]}\n[[[[1]]]]\n{"command": "reload"}\n'
+        b'{"command": "disarm", "value": "\\ud800"}',
+    ]
 
 
 def metadata() -> tuple[Callable[[bytes], Any], list[bytes]]:
@@ -247,6 +296,7 @@ def metadata() -> tuple[Callable[[bytes], Any], list[bytes]]:
     from thermoctl.daemon.replay import replay
     from thermoctl.signals import SIGNALS
     from thermoctl.yamlfile import InputError
+
     model, parameters = zero_model(), Parameters(kp=0.1, ti_s=1.0, td_s=0.0, output_limit=1.0)
     state = Law(model, parameters, 1e-3).snapshot()
     keep.save(FOLDER / "seed.state", model, state)
@@ -260,13 +310,27 @@ def metadata() -> tuple[Callable[[bytes], Any], list[bytes]]:
         else:
             with contextlib.suppress(InputError):
                 replay(np.zeros((3, len(SIGNALS))), data.decode("utf-8", "replace"))
-    return one, [law_metadata(model, parameters, 1e-3, 0, 0, state).encode(), b"k" + (FOLDER / "seed.state").read_bytes()]
+
+    return one, [
+        law_metadata(model, parameters, 1e-3, 0, 0, state).encode(),
+        b"k" + (FOLDER / "seed.state").read_bytes(),
+    ]
 
 
 TARGETS: dict[str, Callable[[], tuple[Callable[[bytes], Any], list[bytes]]]] = {
-    "plant": plant, "config": config, "expression": expression, "serial": serial, "slcan": slcan, "modbus": modbus,
-    "csv": lambda: _recording(".csv"), "parquet": lambda: _recording(".parquet"), "arrow": lambda: _recording(".arrow"),
-    "arrows": lambda: _recording(".arrows"), "commands": commands, "metadata": metadata}
+    "plant": plant,
+    "config": config,
+    "expression": expression,
+    "serial": serial,
+    "slcan": slcan,
+    "modbus": modbus,
+    "csv": lambda: _recording(".csv"),
+    "parquet": lambda: _recording(".parquet"),
+    "arrow": lambda: _recording(".arrow"),
+    "arrows": lambda: _recording(".arrows"),
+    "commands": commands,
+    "metadata": metadata,
+}
 
 
 def damaged(seed: bytes, others: list[bytes], random_: random.Random) -> bytes:
@@ -279,16 +343,35 @@ def damaged(seed: bytes, others: list[bytes], random_: random.Random) -> bytes:
         if how == 0 and data:
             data[at % len(data)] ^= 1 << random_.randrange(8)
         elif how == 1:
-            del data[at:at + size]
+            del data[at : at + size]
         elif how == 2:
-            data[at:at] = data[max(0, at - size):at] * random_.choice((1, 2, 50))
+            data[at:at] = data[max(0, at - size) : at] * random_.choice((1, 2, 50))
         elif how == 3:
             other = random_.choice(others)
             begin = random_.randrange(len(other) + 1)
-            data[at:at + size] = other[begin:begin + size]
+            data[at : at + size] = other[begin : begin + size]
         elif how == 4:
-            data[at:at + size] = random_.choice((b"\xff" * 8, b"\0" * 8, b"\xff\xff\xff\x7f", b"1e999", b"-1", b"nan", b"{", b"[" * 90, b"&a *a ",
-                                                 b"\n", b"\r", b"'", b"\"", b"!!python/object:os.system ", b"9" * 400, b"<<: ", b"\xf0\x9f\x92\xa9"))
+            data[at : at + size] = random_.choice(
+                (
+                    b"\xff" * 8,
+                    b"\0" * 8,
+                    b"\xff\xff\xff\x7f",
+                    b"1e999",
+                    b"-1",
+                    b"nan",
+                    b"{",
+                    b"[" * 90,
+                    b"&a *a ",
+                    b"\n",
+                    b"\r",
+                    b"'",
+                    b'"',
+                    b"!!python/object:os.system ",
+                    b"9" * 400,
+                    b"<<: ",
+                    b"\xf0\x9f\x92\xa9",
+                )
+            )
         elif how == 5:
             del data[at:]
         else:
@@ -313,6 +396,7 @@ def guarded(one: Callable[[bytes], Any], name: str) -> Callable[[bytes], None]:
             one(data)
         except InputError as e:
             assert "\n" not in str(e) and len(str(e)) < 5000, "a message is one line"
+
     return run
 
 
@@ -331,17 +415,36 @@ def guided(args: argparse.Namespace) -> int:
         corpus.mkdir()
         for k, seed in enumerate(seeds):
             (corpus / str(k)).write_bytes(seed[:MAX_INPUT])
-        atheris.Setup([sys.argv[0], f"-max_total_time={args.seconds:.0f}", "-timeout=30", f"-rss_limit_mb={LIMIT_MB}", f"-seed={args.seed}",
-                       f"-max_len={MAX_INPUT}", f"-artifact_prefix={KEPT}/{args.name}-", "-print_final_stats=1", str(corpus)],
-                      guarded(one, args.name))
+        atheris.Setup(
+            [
+                sys.argv[0],
+                f"-max_total_time={args.seconds:.0f}",
+                "-timeout=30",
+                f"-rss_limit_mb={LIMIT_MB}",
+                f"-seed={args.seed}",
+                f"-max_len={MAX_INPUT}",
+                f"-artifact_prefix={KEPT}/{args.name}-",
+                "-print_final_stats=1",
+                str(corpus),
+            ],
+            guarded(one, args.name),
+        )
         atheris.Fuzz()
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     shutil.rmtree(FOLDER, ignore_errors=True)
     words = log.read_text(errors="replace")
-    said = {name: (re.findall(pattern, words) or ["-"])[-1] for name, pattern in
-            (("inputs", r"Done (\d+) runs"), ("branches", r" cov: (\d+)"), ("MB", r"peak_rss_mb: +(\d+)"))}
-    print(f"{args.name:10} {said['inputs']:>7} inputs in {args.seconds:5.1f} s, {said['branches']:>4} branches seen by atheris, at most "
-          f"{said['MB']} MB, " + ("no find" if code == 0 else f"FIND, see {log}"))
+    said = {
+        name: (re.findall(pattern, words) or ["-"])[-1]
+        for name, pattern in (
+            ("inputs", r"Done (\d+) runs"),
+            ("branches", r" cov: (\d+)"),
+            ("MB", r"peak_rss_mb: +(\d+)"),
+        )
+    }
+    print(
+        f"{args.name:10} {said['inputs']:>7} inputs in {args.seconds:5.1f} s, {said['branches']:>4} branches seen by atheris, at most "
+        f"{said['MB']} MB, " + ("no find" if code == 0 else f"FIND, see {log}")
+    )
     return code
 
 
@@ -363,7 +466,7 @@ def main() -> int:
     for seed in seeds:
         run(seed)
     KEPT.mkdir(parents=True, exist_ok=True)
-    signal.signal(signal.SIGPROF, _alarm)                  # processor time: a busy machine is no find
+    signal.signal(signal.SIGPROF, _alarm)  # processor time: a busy machine is no find
     random_, begun, count, grown = random.Random(args.seed), time.monotonic(), 0, 0.0
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     while time.monotonic() - begun < args.seconds:
@@ -376,7 +479,9 @@ def main() -> int:
             signal.setitimer(signal.ITIMER_PROF, 0)
             path = KEPT / f"{args.name}-{count}"
             path.write_bytes(data)
-            print(f"{args.name}: {type(e).__name__}: {e} after {count} inputs; kept in {path}", file=sys.stderr)
+            print(
+                f"{args.name}: {type(e).__name__}: {e} after {count} inputs; kept in {path}", file=sys.stderr
+            )
             raise
         signal.setitimer(signal.ITIMER_PROF, 0)
         grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - before
@@ -384,7 +489,9 @@ def main() -> int:
             (KEPT / f"{args.name}-{count}").write_bytes(data)
             print(f"{args.name}: {grown:.0f} MB more after {count} inputs", file=sys.stderr)
             return 1
-    print(f"{args.name:10} {count:7} inputs in {time.monotonic() - begun:5.1f} s, {grown:4.0f} MB more, no find")
+    print(
+        f"{args.name:10} {count:7} inputs in {time.monotonic() - begun:5.1f} s, {grown:4.0f} MB more, no find"
+    )
     shutil.rmtree(FOLDER, ignore_errors=True)
     return 0
 

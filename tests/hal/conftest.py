@@ -1,4 +1,5 @@
 """A rig at the wire for the tests of hal: virtual devices in this process, drivers unmodified, no daemon."""
+
 from __future__ import annotations
 
 import socket
@@ -42,12 +43,25 @@ AIR = "{air: {mean: 22, swing: 0.5, period_s: 7200, noise: 0.02, resolution: 0.0
 
 def make_settings(directory: Path, **hal: object) -> SimpleNamespace:
     """Settings as settings.py makes them, of the part that hal reads."""
-    values = {"backend": "simulated", "plant": str(CONFIG / "plants/actuator.yaml"), "truth": "",
-              "drive_input": "drive", "inputs": yamlfile.loads(AIR), "roles": {},
-              "seed": 1, "sensor_period_s": 0.1, "recording": "",
-              "run_dir": str(directory), "devices": (), "faults": ()}
-    return SimpleNamespace(path=str(CONFIG / "devices/rig.yaml"), loop=SimpleNamespace(period_s=0.001),
-                           hal=SimpleNamespace(**{**values, **hal}))
+    values = {
+        "backend": "simulated",
+        "plant": str(CONFIG / "plants/actuator.yaml"),
+        "truth": "",
+        "drive_input": "drive",
+        "inputs": yamlfile.loads(AIR),
+        "roles": {},
+        "seed": 1,
+        "sensor_period_s": 0.1,
+        "recording": "",
+        "run_dir": str(directory),
+        "devices": (),
+        "faults": (),
+    }
+    return SimpleNamespace(
+        path=str(CONFIG / "devices/rig.yaml"),
+        loop=SimpleNamespace(period_s=0.001),
+        hal=SimpleNamespace(**{**values, **hal}),
+    )
 
 
 def free_port() -> int:
@@ -67,7 +81,13 @@ class Wire:
         self.drive, self.enable = 0.0, False
         self.until(lambda _: (self.rig.run_dir / "reference.csv").exists(), tick=False)
 
-    def until(self, condition: Callable[[Sample | None], bool], limit_s: float = 10.0, backend=None, tick: bool = True):
+    def until(
+        self,
+        condition: Callable[[Sample | None], bool],
+        limit_s: float = 10.0,
+        backend=None,
+        tick: bool = True,
+    ):
         """Tick (read, write) every millisecond until `condition(sample)`; returns the seconds it took."""
         begin = time.monotonic()
         sample = None
@@ -79,8 +99,9 @@ class Wire:
             if condition(sample):
                 return now - begin
             assert now - begin < limit_s, f"not within {limit_s} s: " + str(
-                {r: STATUS_NAMES[sample.status[i]] for r, i in ROLE.items()} if sample is not None else "")
-            time.sleep(0.001)              # the pace of the loop, not a wait
+                {r: STATUS_NAMES[sample.status[i]] for r, i in ROLE.items()} if sample is not None else ""
+            )
+            time.sleep(0.001)  # the pace of the loop, not a wait
 
     def stop(self) -> None:
         self.rig.stopping = True
@@ -92,7 +113,9 @@ class Wire:
 def wired(tmp_path):
     """Settings of the four wired devices, not running."""
     text = WIRING.format(dir=tmp_path, port=free_port())
-    return make_settings(tmp_path, backend="devices", devices=tuple(yamlfile.loads(text, "wiring.yaml").value))
+    return make_settings(
+        tmp_path, backend="devices", devices=tuple(yamlfile.loads(text, "wiring.yaml").value)
+    )
 
 
 @pytest.fixture

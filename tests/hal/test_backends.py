@@ -1,4 +1,5 @@
 """The simulated, the replayed and the spoiled rig."""
+
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -61,7 +62,7 @@ def test_sensors_have_their_steps_noise_and_rates(tmp_path):
     assert len(coil) == 50 and np.all(coil % 0.25 == 0) and fresh[:, POSITION].all()
     assert status[-1, COIL] == OK and status[-1, ROLE["supply_v"]] == ABSENT
     settled = values[2000:, POSITION]
-    assert 0.005 < settled.std() < 0.02                           # 0.01 um of noise in the plant file
+    assert 0.005 < settled.std() < 0.02  # 0.01 um of noise in the plant file
 
 
 def test_a_clock_that_jumps_moves_the_plants_time_not_its_state(tmp_path):
@@ -70,7 +71,7 @@ def test_a_clock_that_jumps_moves_the_plants_time_not_its_state(tmp_path):
     before = backend.rig.stepper.t
     backend.read(1e6)
     assert backend.rig.stepper.t - before < 0.01
-    backend.read(50.0)                                            # and backwards
+    backend.read(50.0)  # and backwards
     assert backend.rig.stepper.t - before < 0.01
 
 
@@ -94,15 +95,21 @@ def test_not_finite_or_not_enabled_is_no_drive(tmp_path):
     assert backend.read(0.002).value[STATE] == AMP_DISABLED
 
 
-@pytest.mark.parametrize("hal,message", [
-    ({"drive_input": "drivee"}, "no input 'drivee'.*did you mean 'drive'"),
-    ({"inputs": None}, "hal.inputs must say what air is"),
-    ({"inputs": yamlfile.loads("{aire: {mean: 1}}")}, "no free input 'aire'.*did you mean 'air'"),
-    ({"inputs": yamlfile.loads("{air: {meen: 1}}")}, "1:7: air: 'mean' is missing"),
-    ({"inputs": yamlfile.loads("{air: {mean: 1, swinge: 2}}")}, "unknown key 'swinge' \\(did you mean 'swing'"),
-    ({"roles": {"coil_c": "coill_c"}}, "'coill_c' is no role.*did you mean 'coil_c'"),
-    ({"roles": {"koil": "coil_c"}}, "no output 'koil'"),
-])
+@pytest.mark.parametrize(
+    "hal,message",
+    [
+        ({"drive_input": "drivee"}, "no input 'drivee'.*did you mean 'drive'"),
+        ({"inputs": None}, "hal.inputs must say what air is"),
+        ({"inputs": yamlfile.loads("{aire: {mean: 1}}")}, "no free input 'aire'.*did you mean 'air'"),
+        ({"inputs": yamlfile.loads("{air: {meen: 1}}")}, "1:7: air: 'mean' is missing"),
+        (
+            {"inputs": yamlfile.loads("{air: {mean: 1, swinge: 2}}")},
+            "unknown key 'swinge' \\(did you mean 'swing'",
+        ),
+        ({"roles": {"coil_c": "coill_c"}}, "'coill_c' is no role.*did you mean 'coil_c'"),
+        ({"roles": {"koil": "coil_c"}}, "no output 'koil'"),
+    ],
+)
 def test_mistakes_in_the_simulated_rig_are_named(tmp_path, hal, message):
     with pytest.raises(InputError, match=message):
         make_backend(make_settings(tmp_path, **hal))
@@ -110,15 +117,19 @@ def test_mistakes_in_the_simulated_rig_are_named(tmp_path, hal, message):
 
 def recording(**columns):
     n = len(next(iter(columns.values())))
-    return Table("r", "r.csv", 100.0 + np.arange(n) * 0.01, {k: np.array(v, float) for k, v in columns.items()})
+    return Table(
+        "r", "r.csv", 100.0 + np.arange(n) * 0.01, {k: np.array(v, float) for k, v in columns.items()}
+    )
 
 
 def test_replay_gives_the_recorded_samples_at_their_times():
-    backend = ReplayBackend(recording(q=[1e-6, 2e-6, 3e-6, 4e-6], coil_c=[20, math.nan, 21, math.nan], x=[0, 0, 0, 0]),
-                            {"q": "position_um [m]"})
+    backend = ReplayBackend(
+        recording(q=[1e-6, 2e-6, 3e-6, 4e-6], coil_c=[20, math.nan, 21, math.nan], x=[0, 0, 0, 0]),
+        {"q": "position_um [m]"},
+    )
     backend.open()
     seen = []
-    for k in range(8):                                            # two reads for each row
+    for k in range(8):  # two reads for each row
         s = backend.read(5.0 + k * 0.005)
         seen.append((s.value[POSITION], s.fresh[POSITION], s.value[COIL], s.fresh[COIL]))
     assert seen[::2] == [(1, True, 20, True), (2, True, 20, False), (3, True, 21, True), (4, True, 21, False)]
@@ -135,11 +146,16 @@ def test_replay_skips_to_the_newest_when_the_reader_is_slow():
     assert backend.read(0.505).value[POSITION] == 50
 
 
-@pytest.mark.parametrize("columns,roles,message", [
-    ({"x": [1, 2]}, {}, "no column plays a role"), ({"x": [1, 2]}, {"y": "coil_c"}, "no column 'y'"),
-    ({"x": [1, 2]}, {"x": "coil"}, "'coil' is no role.*did you mean 'coil_c'"),
-    ({"x": [1, 2]}, {"x": "coil_c [furlong]"}, "takes degC or K"),
-    ({"x": [1, 2], "coil_c": [1, 2]}, {"x": "coil_c"}, "coil_c to two columns")])
+@pytest.mark.parametrize(
+    "columns,roles,message",
+    [
+        ({"x": [1, 2]}, {}, "no column plays a role"),
+        ({"x": [1, 2]}, {"y": "coil_c"}, "no column 'y'"),
+        ({"x": [1, 2]}, {"x": "coil"}, "'coil' is no role.*did you mean 'coil_c'"),
+        ({"x": [1, 2]}, {"x": "coil_c [furlong]"}, "takes degC or K"),
+        ({"x": [1, 2], "coil_c": [1, 2]}, {"x": "coil_c"}, "coil_c to two columns"),
+    ],
+)
 def test_mistakes_in_a_replay_are_named(columns, roles, message):
     with pytest.raises(InputError, match=message):
         ReplayBackend(recording(**columns), roles)
@@ -246,12 +262,19 @@ def test_a_stuck_amplifier_drives_whatever_it_is_told():
     assert source.told[49] == (0.2, True) and source.told[50:] == [(0.7, True)] * 50
 
 
-@pytest.mark.parametrize("text,message", [
-    ("{kind: drp, role: coil_c}", "'drp' is not one of.*did you mean 'drop'"),
-    ("{kind: drop}", "'role' is missing"), ("{kind: drop, role: coil}", "'coil' is no role"),
-    ("{kind: step, role: coil_c}", "'by' is missing"), ("{kind: delay, role: coil_c, by: -1}", "above 0"),
-    ("{kind: swap, role: coil_c}", "two roles"), ("{kind: drop, role: coil_c, probability: 2}", "outside 0 .. 1"),
-    ("{kind: drop, role: coil_c, at: 1}", "unknown key 'at' \\(did you mean 'at_s'")])
+@pytest.mark.parametrize(
+    "text,message",
+    [
+        ("{kind: drp, role: coil_c}", "'drp' is not one of.*did you mean 'drop'"),
+        ("{kind: drop}", "'role' is missing"),
+        ("{kind: drop, role: coil}", "'coil' is no role"),
+        ("{kind: step, role: coil_c}", "'by' is missing"),
+        ("{kind: delay, role: coil_c, by: -1}", "above 0"),
+        ("{kind: swap, role: coil_c}", "two roles"),
+        ("{kind: drop, role: coil_c, probability: 2}", "outside 0 .. 1"),
+        ("{kind: drop, role: coil_c, at: 1}", "unknown key 'at' \\(did you mean 'at_s'"),
+    ],
+)
 def test_mistakes_in_a_schedule_are_named(text, message):
     with pytest.raises(InputError, match=message):
         schedule([yamlfile.loads(text)])

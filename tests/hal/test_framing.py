@@ -1,15 +1,18 @@
 """Bytes on serial lines: known check values, damage, and recovery after it."""
+
 import re
 
 import pytest
-from hal.wire import Framer, crc16
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.profile import BinaryFrame
 from hal.serial_port import MAX_LINE, LineReader, latency_timer_ms, set_latency_timer
+from hal.wire import Framer, crc16
 
-SPEC = BinaryFrame(b"\xaa\x55", (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8")), sequence="sequence")
+SPEC = BinaryFrame(
+    b"\xaa\x55", (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8")), sequence="sequence"
+)
 
 
 @pytest.mark.parametrize("name,check", [("ccitt-false", 0x29B1), ("xmodem", 0x31C3), ("modbus", 0x4B37)])
@@ -40,7 +43,7 @@ def test_each_damaged_byte_is_noticed_and_the_next_frame_is_read():
             framer.feed(bytes(damaged))
             assert framer.newest == ()
             framer.feed(Framer(SPEC).encode(2, 78, 0))
-            framer.feed(Framer(SPEC).encode(3, 79, 0))       # where the length byte was hit, one frame may be lost
+            framer.feed(Framer(SPEC).encode(3, 79, 0))  # where the length byte was hit, one frame may be lost
             assert framer.newest == (3, 79, 0)
 
 
@@ -51,7 +54,7 @@ def test_gaps_of_the_sequence_are_counted_also_over_its_end():
     assert (framer.frames, framer.lost) == (4, 2)
 
 
-frames = st.tuples(st.integers(0, 65535), st.integers(-2**31, 2**31 - 1), st.integers(0, 255))
+frames = st.tuples(st.integers(0, 65535), st.integers(-(2**31), 2**31 - 1), st.integers(0, 255))
 
 
 @settings(max_examples=200, deadline=None)
@@ -66,7 +69,7 @@ def test_true_frames_are_found_between_garbage_however_the_bytes_are_cut(pieces,
         garbage_bytes += len(garbage)
         stream += garbage + encoder.encode(*values)
     for at in range(0, len(stream), size):
-        for byte in stream[at:at + size]:
+        for byte in stream[at : at + size]:
             if framer.feed(bytes([byte])):
                 seen.append(framer.newest)
     assert seen == [values for _, values in pieces]
@@ -80,19 +83,22 @@ def test_any_bytes_leave_the_framer_small_and_able(chunks):
     for chunk in chunks:
         framer.feed(chunk)
         assert framer.pending < framer.size
-    framer.feed(b"\x00" * 300)                             # whatever half frame was pending is judged
+    framer.feed(b"\x00" * 300)  # whatever half frame was pending is judged
     framer.feed(framer.encode(5, 55, 0))
     assert framer.newest == (5, 55, 0)
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.from_regex(r"[ -~]{1,60}", fullmatch=True), max_size=10), st.integers(1, 9),
-       st.sampled_from([b"\r\n", b"\n", b"\r"]))
+@given(
+    st.lists(st.from_regex(r"[ -~]{1,60}", fullmatch=True), max_size=10),
+    st.integers(1, 9),
+    st.sampled_from([b"\r\n", b"\n", b"\r"]),
+)
 def test_lines_come_out_whole(lines, size, end):
     reader, out = LineReader(), []
     stream = b"".join(line.encode() + end for line in lines)
     for at in range(0, len(stream), size):
-        out += reader.feed(stream[at:at + size])
+        out += reader.feed(stream[at : at + size])
     assert out == [line.encode() for line in lines]
 
 

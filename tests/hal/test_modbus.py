@@ -1,14 +1,15 @@
 """Modbus: request and answer bytes, blocks, types, and what a sick device answers."""
+
 import struct
 
 import pytest
-from hal.wire import crc16
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.modbus import decode, plan_blocks
 from hal.profile import Modbus, Register
 from hal.virtual.modbus import ModbusUnit, encode
+from hal.wire import crc16
 
 
 def register(address, type="int16", kind="input", order="big"):
@@ -23,7 +24,7 @@ def test_read_input_registers_bytes():
     unit = ModbusUnit(1)
     unit.store(register(8), 2225)
     request = bytes.fromhex("01 04 0008 0001".replace(" ", ""))
-    assert rtu(request).hex() == "010400080001b008"              # the CRC as every Modbus tool has it
+    assert rtu(request).hex() == "010400080001b008"  # the CRC as every Modbus tool has it
     assert unit.feed_rtu(bytearray(rtu(request))) == rtu(bytes.fromhex("01040208b1"))
     tcp = bytearray.fromhex("0007 0000 0006 01 04 0008 0001".replace(" ", ""))
     assert unit.feed_tcp(tcp).hex() == "00070000000501040208b1"
@@ -32,9 +33,9 @@ def test_read_input_registers_bytes():
 def test_exceptions():
     unit = ModbusUnit(1)
     unit.store(register(0), 1)
-    assert unit.answer(b"\x06\x00\x00\x00\x01").hex() == "8601"   # function not known
-    assert unit.answer(b"\x04\x03\xe7\x00\x01").hex() == "8402"   # no such register
-    assert unit.answer(b"\x04\x00\x00\x00\x7e").hex() == "8403"   # more than 125
+    assert unit.answer(b"\x06\x00\x00\x00\x01").hex() == "8601"  # function not known
+    assert unit.answer(b"\x04\x03\xe7\x00\x01").hex() == "8402"  # no such register
+    assert unit.answer(b"\x04\x00\x00\x00\x7e").hex() == "8403"  # more than 125
     unit.exception = 6
     assert unit.answer(b"\x04\x00\x00\x00\x01").hex() == "8406"
 
@@ -47,7 +48,7 @@ def test_rtu_finds_the_request_behind_garbage(garbage):
     request = rtu(b"\x01\x04\x00\x00\x00\x01")
     buffer = bytearray(garbage)
     unit.feed_rtu(buffer)
-    buffer += bytes(8)                                            # ends whatever frame the garbage began
+    buffer += bytes(8)  # ends whatever frame the garbage began
     unit.feed_rtu(buffer)
     buffer += request
     assert unit.feed_rtu(buffer).endswith(rtu(b"\x01\x04\x02\x00\x05"))
@@ -63,8 +64,11 @@ def test_any_tcp_bytes_are_survived(chunks):
         assert len(buffer) < 400
 
 
-@given(st.sampled_from(["int16", "uint16", "int32", "uint32", "int64", "float32", "float64"]),
-       st.sampled_from(["big", "little"]), st.integers(0, 30000))
+@given(
+    st.sampled_from(["int16", "uint16", "int32", "uint32", "int64", "float32", "float64"]),
+    st.sampled_from(["big", "little"]),
+    st.integers(0, 30000),
+)
 def test_types_and_word_orders_round_trip(type, order, value):
     r = register(0, type, order=order)
     assert decode(encode(value, r), r) == value
@@ -77,16 +81,30 @@ def test_float_words_are_these():
 
 
 def test_neighbours_share_a_block_over_small_gaps_only():
-    registers = [register(a) for a in range(12)] + [register(16, "int32"), register(40), register(3, kind="holding")]
+    registers = [register(a) for a in range(12)] + [
+        register(16, "int32"),
+        register(40),
+        register(3, kind="holding"),
+    ]
     blocks = plan_blocks(registers, Modbus(1))
-    assert [(b.kind, b.address, b.count) for b in blocks] == [("holding", 3, 1), ("input", 0, 18), ("input", 40, 1)]
+    assert [(b.kind, b.address, b.count) for b in blocks] == [
+        ("holding", 3, 1),
+        ("input", 0, 18),
+        ("input", 40, 1),
+    ]
     assert sorted(i for b in blocks for i, _ in b.members) == list(range(15))
     assert [b.count for b in plan_blocks(registers[:12], Modbus(1, max_block=5))] == [5, 5, 2]
 
 
-@given(st.lists(st.tuples(st.integers(0, 300), st.sampled_from(["int16", "float32", "int64"])), min_size=1,
-                max_size=20),
-       st.integers(0, 20), st.integers(4, 125))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 300), st.sampled_from(["int16", "float32", "int64"])),
+        min_size=1,
+        max_size=20,
+    ),
+    st.integers(0, 20),
+    st.integers(4, 125),
+)
 def test_blocks_cover_every_register_and_keep_the_limit(items, gap, limit):
     registers = [register(a, t) for a, t in items]
     blocks = plan_blocks(registers, Modbus(1, max_gap=gap, max_block=limit))

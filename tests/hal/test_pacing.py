@@ -1,4 +1,5 @@
 """loop.pace: device. The encoder's frame starts the tick; the clock does where no frame comes."""
+
 from __future__ import annotations
 
 import os
@@ -9,15 +10,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hal.wire import Framer
-from thermoctl.daemon.clock import now_ns
 
 from hal.backend import ROLE
 from hal.devices import DevicesBackend, _driver
 from hal.profile import bind
+from hal.wire import Framer
 from tests.hal.conftest import CONFIG
 from thermoctl import yamlfile
 from thermoctl.control.model import Parameters, zero_model
+from thermoctl.daemon.clock import now_ns
 from thermoctl.daemon.loop import Rig, run_loop
 from thermoctl.daemon.shared import Shared
 from thermoctl.settings import load_settings
@@ -64,10 +65,10 @@ def test_half_a_frame_is_no_frame(encoder):
     assert wait(encoder) >= 2 * PERIOD_S
     assert not encoder.backend.read(time.monotonic()).fresh[0]
     threading.Timer(PERIOD_S, os.write, (encoder.master, frame[7:])).start()
-    assert wait(encoder, 400) < 300 * PERIOD_S                 # woken by the rest of it
+    assert wait(encoder, 400) < 300 * PERIOD_S  # woken by the rest of it
     sample = encoder.backend.read(time.monotonic())
     assert sample.fresh[ROLE["position_um"]] and sample.value[0] == pytest.approx(1001 * 0.005)
-    assert not encoder.backend.read(time.monotonic()).fresh[0]     # a frame is shown once
+    assert not encoder.backend.read(time.monotonic()).fresh[0]  # a frame is shown once
 
 
 def test_an_encoder_that_is_gone_leaves_the_clock(encoder):
@@ -85,8 +86,9 @@ def test_ticks_follow_the_frames_and_go_on_without_them(encoder):
     muted, done = threading.Event(), threading.Event()
 
     def feed():
-        while not muted.wait(0.8 * PERIOD_S):                  # the encoder's clock is not ours
+        while not muted.wait(0.8 * PERIOD_S):  # the encoder's clock is not ours
             os.write(encoder.master, encoder.frame())
+
     feeder = threading.Thread(target=feed)
     feeder.start()
 
@@ -94,6 +96,7 @@ def test_ticks_follow_the_frames_and_go_on_without_them(encoder):
         if rig.law.tick == 150:
             muted.set()
         return done.is_set() or rig.law.tick >= 200
+
     try:
         run_loop(settings, shared, rig, stopping)
         rows, _, _ = shared.ring.read(0)
@@ -103,7 +106,7 @@ def test_ticks_follow_the_frames_and_go_on_without_them(encoder):
         shared.remove()
     fresh = rows[:, INDEX["fresh_bits"]].astype(int) & 1
     dt = rows[:, INDEX["dt_s"]]
-    by_frame = dt[5:150] < 1.9 * PERIOD_S                      # the others: the feeder itself came too late, the clock ticked
+    by_frame = dt[5:150] < 1.9 * PERIOD_S  # the others: the feeder itself came too late, the clock ticked
     assert fresh[5:150][by_frame].all() and by_frame.mean() > 0.5
     assert 0.5 * PERIOD_S < np.median(dt[5:150]) < 1.5 * PERIOD_S
     assert not fresh[160:].any() and np.median(dt[160:]) >= 1.99 * PERIOD_S

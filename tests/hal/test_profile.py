@@ -32,7 +32,12 @@ def test_shipped_rigs_bind(name):
 
 
 CASES = [
-    (ENCODER, "format: thermoctl-device/1", "format: thermoctl-device/9", "'thermoctl-device/1' was expected"),
+    (
+        ENCODER,
+        "format: thermoctl-device/1",
+        "format: thermoctl-device/9",
+        "'thermoctl-device/1' was expected",
+    ),
     (ENCODER, "bus: serial-binary", "bus: serial-bynary", "did you mean 'serial-binary'"),
     (ENCODER, "vendor: thermoctl\n", "", "'vendor' is missing"),
     (ENCODER, "rate_hz: 1000", "rate: 1000", "'rate_hz' is missing"),
@@ -54,7 +59,12 @@ CASES = [
     (DRIVE, "object: 0x6078", "object: 0x6077", "is not sent by the drive"),
     (MODULE, "register: 0,", "register: 70000,", "is outside 0 .. 65535"),
     (MODULE, "modbus: {unit_id: 1", "modbus: {unit_id: 300", "is outside 0 .. 247"),
-    (MODULE, "channels:\n", "drive: {unit: A, scale: 1, limits: [-1, 1]}\nchannels:\n", "cannot take the command"),
+    (
+        MODULE,
+        "channels:\n",
+        "drive: {unit: A, scale: 1, limits: [-1, 1]}\nchannels:\n",
+        "cannot take the command",
+    ),
 ]
 
 
@@ -74,21 +84,35 @@ def test_each_mistake_has_its_place_and_a_word(tmp_path, good, old, new, message
 @given(st.integers(0, len(ENCODER) - 1), st.sampled_from(["", " ", ":", "{", "[", "x", "-", "\t", "0", "'"]))
 def test_a_damaged_profile_is_read_or_refused_never_a_traceback(tmp_path_factory, at, put):
     from hal.profile import FORMAT
+
     path = tmp_path_factory.getbasetemp() / "damaged-profile.yaml"
-    path.write_text(ENCODER[:at] + put + ENCODER[at + 1:])
+    path.write_text(ENCODER[:at] + put + ENCODER[at + 1 :])
     try:
         assert load_profile(path).bus and FORMAT
     except InputError as e:
         assert str(path) in str(e)
 
 
-@pytest.mark.parametrize("text,message", [
-    ("{profile: none.yaml, port: x, roles: {}}", "none.yaml cannot be read"),
-    ("{profile: encoder-serial.yaml, roles: {position: position_um}}", "'port' is missing"),
-    ("{profile: encoder-serial.yaml, port: x, roles: {positon: position_um}}", "did you mean 'position'"),
-    ("{profile: encoder-serial.yaml, port: x, roles: {position: position}}", "did you mean 'position_um'"),
-    ("{profile: encoder-serial.yaml, port: x, roles: {position: coil_c}}", "the role coil_c takes degC or K"),
-    ("{profile: encoder-serial.yaml, prot: x, port: x, roles: {position: position_um}}", "unknown key 'prot'")])
+@pytest.mark.parametrize(
+    "text,message",
+    [
+        ("{profile: none.yaml, port: x, roles: {}}", "none.yaml cannot be read"),
+        ("{profile: encoder-serial.yaml, roles: {position: position_um}}", "'port' is missing"),
+        ("{profile: encoder-serial.yaml, port: x, roles: {positon: position_um}}", "did you mean 'position'"),
+        (
+            "{profile: encoder-serial.yaml, port: x, roles: {position: position}}",
+            "did you mean 'position_um'",
+        ),
+        (
+            "{profile: encoder-serial.yaml, port: x, roles: {position: coil_c}}",
+            "the role coil_c takes degC or K",
+        ),
+        (
+            "{profile: encoder-serial.yaml, prot: x, port: x, roles: {position: position_um}}",
+            "unknown key 'prot'",
+        ),
+    ],
+)
 def test_mistakes_in_a_binding_are_named(text, message):
     with pytest.raises(InputError, match=message):
         bind(yamlfile.loads(text), CONFIG / "devices")
@@ -96,16 +120,25 @@ def test_mistakes_in_a_binding_are_named(text, message):
 
 def test_a_binding_may_loosen_the_limits_of_its_profile():
     drive = "profile: drive-cia402.yaml, port: 'slcan:x', roles: {state: amplifier_state}"
-    tight, loose = (bind(yamlfile.loads(f"{{{drive}{more}}}"), CONFIG / "devices")
-                    for more in ("", ", stale_after_s: 0.1, watchdog_s: 0.2"))
+    tight, loose = (
+        bind(yamlfile.loads(f"{{{drive}{more}}}"), CONFIG / "devices")
+        for more in ("", ", stale_after_s: 0.1, watchdog_s: 0.2")
+    )
     assert tight.profile.bus_spec.watchdog_s == 0.1 and loose.profile.bus_spec.watchdog_s == 0.2
     assert tight.bounds[0].channel.stale_after_s == 0.02 and loose.bounds[0].channel.stale_after_s == 0.1
-    for more, message in ((", watchdog_s: 0.03", "watchdog_s: 0.03 is outside 0.04"), (", stale_after_s: 0", "stale_after_s")):
+    for more, message in (
+        (", watchdog_s: 0.03", "watchdog_s: 0.03 is outside 0.04"),
+        (", stale_after_s: 0", "stale_after_s"),
+    ):
         with pytest.raises(InputError, match=message):
             bind(yamlfile.loads(f"{{{drive}{more}}}"), CONFIG / "devices")
     with pytest.raises(InputError, match="has none"):
-        bind(yamlfile.loads("{profile: encoder-serial.yaml, port: x, watchdog_s: 1, roles: {position: position_um}}"),
-             CONFIG / "devices")
+        bind(
+            yamlfile.loads(
+                "{profile: encoder-serial.yaml, port: x, watchdog_s: 1, roles: {position: position_um}}"
+            ),
+            CONFIG / "devices",
+        )
 
 
 def test_two_devices_in_one_role_are_refused():
@@ -117,8 +150,12 @@ def test_two_devices_in_one_role_are_refused():
 
 def test_units_convert_into_the_role(tmp_path):
     path = tmp_path / "e.yaml"
-    path.write_text(ENCODER.replace("unit: um, scale: 0.005, range: [-5000, 5000]",
-                                    "unit: nm, scale: 5, offset: 100, range: [-5000000, 5000000]"))
+    path.write_text(
+        ENCODER.replace(
+            "unit: um, scale: 0.005, range: [-5000, 5000]",
+            "unit: nm, scale: 5, offset: 100, range: [-5000000, 5000000]",
+        )
+    )
     node = yamlfile.loads("{profile: e.yaml, port: x, roles: {position: position_um}}")
     bound = bind(node, tmp_path).bounds[0]
     assert bound.scale == pytest.approx(0.005) and bound.offset == pytest.approx(0.1)
@@ -127,13 +164,15 @@ def test_units_convert_into_the_role(tmp_path):
 
 def test_relative_ports_count_from_the_configuration(tmp_path):
     (tmp_path / "link").symlink_to("/dev/null")
-    assert resolve_port("./link", tmp_path) == f"{tmp_path}/link"               # the link itself, not its target
+    assert resolve_port("./link", tmp_path) == f"{tmp_path}/link"  # the link itself, not its target
     assert resolve_port("slcan:../can@500000", tmp_path / "config") == f"slcan:{tmp_path}/can@500000"
     for port in ("/dev/ttyUSB0", "tcp:127.0.0.1:502", "socketcan:can0", "rtu:/dev/x"):
         assert resolve_port(port, tmp_path) == port
 
 
 def test_the_virtual_rig_refuses_a_bus_it_cannot_play():
-    node = yamlfile.loads("{profile: drive-cia402.yaml, port: 'socketcan:can0', roles: {state: amplifier_state}}")
+    node = yamlfile.loads(
+        "{profile: drive-cia402.yaml, port: 'socketcan:can0', roles: {state: amplifier_state}}"
+    )
     with pytest.raises(InputError, match="slcan ports only"):
         virtual_device(bind(node, CONFIG / "devices"), None)

@@ -1,5 +1,6 @@
 """Drivers against virtual devices over ptys and TCP: readings agree with the plant, and every pulled cable ends in the
 right channel status, quickly, and comes back (issue 2, 'Must show' 5)."""
+
 import math
 import os
 import re
@@ -26,10 +27,24 @@ from hal.devices import make_devices
 from hal.virtual.drive import HEARTBEAT_LOST
 from hal.virtual.rig import tell
 
-POSITION, COIL, AIR, VOLTAGE, CURRENT = (ROLE[r] for r in ("position_um", "coil_c", "air_c", "voltage_v", "current_a"))
+POSITION, COIL, AIR, VOLTAGE, CURRENT = (
+    ROLE[r] for r in ("position_um", "coil_c", "air_c", "voltage_v", "current_a")
+)
 STATE, FAULT_CODE = ROLE["amplifier_state"], ROLE["amplifier_fault"]
-BOUND = [ROLE[r] for r in ("position_um", "amplifier_state", "amplifier_fault", "supply_v", "coil_c", "shaft_1_c",
-                           "air_c", "voltage_v", "current_a")]
+BOUND = [
+    ROLE[r]
+    for r in (
+        "position_um",
+        "amplifier_state",
+        "amplifier_fault",
+        "supply_v",
+        "coil_c",
+        "shaft_1_c",
+        "air_c",
+        "voltage_v",
+        "current_a",
+    )
+]
 
 
 @pytest.fixture
@@ -47,8 +62,14 @@ def obey(wire, line):
 
 def test_readings_agree_with_the_plant_while_driven(wire, backend):
     wire.drive, wire.enable = 0.25, True
-    wire.until(lambda s: s.value[STATE] == AMP_ENABLED and abs(s.value[POSITION] - 0.25 * 8 / 26000 * 1e6) < 0.1
-               and abs(s.value[CURRENT] - 0.25) < 0.005, backend=backend)         # k_T i / k_flexure
+    wire.until(
+        lambda s: (
+            s.value[STATE] == AMP_ENABLED
+            and abs(s.value[POSITION] - 0.25 * 8 / 26000 * 1e6) < 0.1
+            and abs(s.value[CURRENT] - 0.25) < 0.005
+        ),
+        backend=backend,
+    )  # k_T i / k_flexure
     s = backend.sample
     true = wire.rig.plant.true
     assert s.value[POSITION] == pytest.approx(true("position_um"), abs=0.06)
@@ -64,7 +85,7 @@ def test_readings_agree_with_the_plant_while_driven(wire, backend):
 def test_a_drive_that_is_not_finite_or_too_large_is_held(wire, backend):
     drive = wire.rig.devices["drive"].drive
     wire.drive, wire.enable = 99.0, True
-    wire.until(lambda s: drive.command == 2_500_000, backend=backend)              # the profile's limit
+    wire.until(lambda s: drive.command == 2_500_000, backend=backend)  # the profile's limit
     wire.drive = math.nan
     wire.until(lambda s: s.value[STATE] == AMP_DISABLED and drive.command == 0, backend=backend)
 
@@ -95,7 +116,7 @@ def test_a_pulled_cable_shows_and_comes_back(wire, backend, pull, plug, role, st
     name = next(n for n, i in ROLE.items() if i == role)
     assert pull.split()[0] in backend.problem(name)
     healthy = [i for i in BOUND if i not in backend._owner[role].roles]
-    assert all(backend.sample.status[healthy] == OK)               # the other devices are not drawn in
+    assert all(backend.sample.status[healthy] == OK)  # the other devices are not drawn in
     obey(wire, plug)
     wire.until(lambda s: s.status[role] == OK and s.fresh[role], limit_s=5.0, backend=backend)
 
@@ -122,12 +143,14 @@ def test_the_drive_stops_by_itself_when_the_daemon_dies_and_can_be_enabled_again
     wire.drive, wire.enable = 0.1, True
     wire.until(lambda s: drive.command == 100_000, backend=backend)
     begin = time.monotonic()
-    wire.until(lambda _: drive.command == 0, tick=False)              # nobody ticks: no heartbeat
+    wire.until(lambda _: drive.command == 0, tick=False)  # nobody ticks: no heartbeat
     assert time.monotonic() - begin < 1.0 and drive.od[0x603F, 0].value == HEARTBEAT_LOST
     wire.until(lambda s: s.value[FAULT_CODE] == HEARTBEAT_LOST, limit_s=5.0, backend=backend)
-    assert drive.command == 0                                         # the wish to drive alone does not restart it
+    assert drive.command == 0  # the wish to drive alone does not restart it
     wire.enable = False
-    wire.until(lambda s: s.value[STATE] == AMP_DISABLED and s.value[FAULT_CODE] == 0, limit_s=5.0, backend=backend)
+    wire.until(
+        lambda s: s.value[STATE] == AMP_DISABLED and s.value[FAULT_CODE] == 0, limit_s=5.0, backend=backend
+    )
     wire.enable = True
     wire.until(lambda s: drive.command == 100_000, limit_s=5.0, backend=backend)
 
@@ -136,7 +159,9 @@ def test_a_fault_of_the_drive_is_told_with_its_code_and_not_driven_over(wire, ba
     wire.drive, wire.enable = 0.1, True
     wire.until(lambda s: s.value[STATE] == AMP_ENABLED, backend=backend)
     obey(wire, "drive fault 0x2310")
-    wire.until(lambda s: s.value[STATE] == AMP_FAULT and s.value[FAULT_CODE] == 0x2310, limit_s=2.0, backend=backend)
+    wire.until(
+        lambda s: s.value[STATE] == AMP_FAULT and s.value[FAULT_CODE] == 0x2310, limit_s=2.0, backend=backend
+    )
     for _ in range(200):
         backend.read(time.monotonic())
         backend.write(0.1, True)
@@ -151,9 +176,11 @@ def test_a_reconnected_drive_is_set_up_anew_and_stays_off(wire, backend):
     wire.until(lambda s: s.status[STATE] == ERROR and drive.command == 0, limit_s=2.0, backend=backend)
     wire.enable = False
     obey(wire, "drive plug")
-    wire.until(lambda s: s.status[STATE] == OK and s.value[STATE] == AMP_DISABLED, limit_s=5.0, backend=backend)
+    wire.until(
+        lambda s: s.status[STATE] == OK and s.value[STATE] == AMP_DISABLED, limit_s=5.0, backend=backend
+    )
     assert backend.counters()["drive.reconnections"] == 1
-    assert drive.od[0x1016, 1].value & 0xFFFF == 200                  # its watchdog is set again
+    assert drive.od[0x1016, 1].value & 0xFFFF == 200  # its watchdog is set again
 
 
 def test_close_disables_the_drive(wire):
@@ -190,8 +217,11 @@ def test_poller_through_a_board_in_shared_memory(wire):
     board = Board.create(f"thermoctl-test-{os.getpid()}")
     attached = Board.attach(board.name)
     stop = threading.Event()
-    pollers = [threading.Thread(target=poll_until, args=(d, attached, stop))
-               for d in make_devices(wire.settings) if d.slow]
+    pollers = [
+        threading.Thread(target=poll_until, args=(d, attached, stop))
+        for d in make_devices(wire.settings)
+        if d.slow
+    ]
     for p in pollers:
         p.start()
     backend = make_backend(wire.settings, board)
@@ -224,10 +254,10 @@ def test_a_board_survives_a_writer_killed_while_writing(wired):
     board.post(sample, device)
     seen = board.merge(shown, device.roles, 0)
     assert shown.value[COIL] == 22.25 and shown.fresh[COIL]
-    board.rows["sequence"][device.roles[0]] += 1                      # killed here
+    board.rows["sequence"][device.roles[0]] += 1  # killed here
     device.put(sample, 0, 2250, 2.0)
     assert board.merge(shown, device.roles, seen) == seen and shown.value[COIL] == 22.25
-    board.post(sample, device)                                        # its successor
+    board.post(sample, device)  # its successor
     assert board.merge(shown, device.roles, seen) > seen and shown.value[COIL] == 22.5
 
 
@@ -242,6 +272,7 @@ def test_control_socket_answers_nonsense_plainly(wire):
 
 def test_the_reference_is_recorded_with_a_time_that_the_daemon_shares(wire):
     from thermoctl.recording.table import read_table
+
     path = wire.rig.run_dir / "reference.csv"
     begin = time.monotonic()
     wire.until(lambda _: wire.rig.tick > 1000, tick=False)

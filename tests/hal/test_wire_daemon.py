@@ -2,6 +2,7 @@
 
 Slow: `python -m pytest -m slow tests/hal/test_wire_daemon.py`. Limits are for a busy machine; what was measured is printed.
 """
+
 import os
 import re
 import signal
@@ -27,7 +28,9 @@ class Chain:
     """Both programs on a private copy of config/wire.yaml."""
 
     def __init__(self, tmp_path):
-        text = (CONFIG / "wire.yaml").read_text().replace("15020", str(free_port())).replace("../run/", "./run/")
+        text = (
+            (CONFIG / "wire.yaml").read_text().replace("15020", str(free_port())).replace("../run/", "./run/")
+        )
         text = text.replace("../recordings", str(tmp_path / "recordings"))
         text = re.sub(r"(profile: |plant: |model: )(\w+/)", rf"\g<1>{CONFIG}/\g<2>", text)
         self.config, self.run_dir = tmp_path / "wire.yaml", tmp_path / "run/wire"
@@ -38,7 +41,9 @@ class Chain:
         self.until(lambda s: s.get("state") == "READY", 30)
 
     def start_rig(self):
-        rig = subprocess.Popen([*CLI, "virtual-rig", "--config", str(self.config)], stdout=subprocess.PIPE, text=True)
+        rig = subprocess.Popen(
+            [*CLI, "virtual-rig", "--config", str(self.config)], stdout=subprocess.PIPE, text=True
+        )
         for line in rig.stdout:
             if "ready" in line:
                 return rig
@@ -57,7 +62,7 @@ class Chain:
         begin = time.monotonic()
         while not condition(s := self.status()):
             assert time.monotonic() - begin < limit_s, (s.get("state"), s.get("faults"), s.get("slips"))
-            time.sleep(0.01)                                          # how often we ask, not a wait
+            time.sleep(0.01)  # how often we ask, not a wait
         return s
 
     def tell(self, line):
@@ -89,10 +94,17 @@ def chain(tmp_path):
     c.stop()
 
 
-@pytest.mark.parametrize("pull,plug,fault", [
-    ("encoder unplug", "encoder plug", "position"), ("encoder mute on", "encoder mute off", "position"),
-    ("drive unplug", "drive plug", "amplifier"), ("drive heartbeat off", "drive heartbeat on", "amplifier"),
-    ("thermocouples unplug", "thermocouples plug", "coil"), ("meter unplug", "meter plug", "voltage")])
+@pytest.mark.parametrize(
+    "pull,plug,fault",
+    [
+        ("encoder unplug", "encoder plug", "position"),
+        ("encoder mute on", "encoder mute off", "position"),
+        ("drive unplug", "drive plug", "amplifier"),
+        ("drive heartbeat off", "drive heartbeat on", "amplifier"),
+        ("thermocouples unplug", "thermocouples plug", "coil"),
+        ("meter unplug", "meter plug", "voltage"),
+    ],
+)
 def test_pulled_cable_ends_in_its_fault_and_rearms_without_a_jump(chain, pull, plug, fault):
     chain.arm()
     assert chain.ask("setpoint", 20.0)["ok"]
@@ -100,13 +112,15 @@ def test_pulled_cable_ends_in_its_fault_and_rearms_without_a_jump(chain, pull, p
     pulled = time.monotonic()
     chain.tell(pull)
     chain.until(lambda s: any(fault in str(f) for f in s["faults"]), 10)
-    stopped = fault in ("position", "amplifier", "voltage")           # a lost thermocouple freezes the compensation
+    stopped = fault in ("position", "amplifier", "voltage")  # a lost thermocouple freezes the compensation
     if stopped:
         chain.until(lambda s: s["state"] == "FAULT", 5)
     chain.tell(plug)
     armed = chain.arm()
     assert abs(armed["setpoint_um"] - armed["position_um"]) < 0.5
-    driven = chain.until(lambda s: s["ticks"] > armed["ticks"] + 1500, 10)     # the drive has been driving for a while
+    driven = chain.until(
+        lambda s: s["ticks"] > armed["ticks"] + 1500, 10
+    )  # the drive has been driving for a while
     assert driven["state"] == "ARMED", driven
     chain.stop()
     r = chain.reference()
@@ -115,8 +129,10 @@ def test_pulled_cable_ends_in_its_fault_and_rearms_without_a_jump(chain, pull, p
     if stopped:
         print(f"{pull}: amplifier off {(r.t[off][0] - pulled) * 1e3:.0f} ms after the command was typed")
     on = r.columns["enabled"] > 0
-    held = after[1:] & on[1:] & on[:-1]                               # both rows driven: what the controller did
-    assert held.any() and np.abs(np.diff(r.columns["position_um"]))[held].max() < 2.0      # re-armed without a jump
+    held = after[1:] & on[1:] & on[:-1]  # both rows driven: what the controller did
+    assert (
+        held.any() and np.abs(np.diff(r.columns["position_um"]))[held].max() < 2.0
+    )  # re-armed without a jump
 
 
 def test_killed_rig_is_a_fault_and_comes_back(chain):
@@ -131,15 +147,16 @@ def test_killed_rig_is_a_fault_and_comes_back(chain):
 
 def test_killed_daemon_leaves_the_amplifier_off(chain):
     chain.arm()
-    for process in subprocess.run(["ps", "-o", "pid=", "--ppid", str(chain.daemon.pid)], capture_output=True,
-                                  text=True).stdout.split():
-        os.kill(int(process), signal.SIGKILL)                         # our own children: loop, pollers, recorder
+    for process in subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(chain.daemon.pid)], capture_output=True, text=True
+    ).stdout.split():
+        os.kill(int(process), signal.SIGKILL)  # our own children: loop, pollers, recorder
     chain.daemon.kill()
     killed = time.monotonic()
     while time.monotonic() < killed + 1.0:
-        assert "encoder" in tell(chain.run_dir / "control.sock", "help")     # the rig itself lives on
+        assert "encoder" in tell(chain.run_dir / "control.sock", "help")  # the rig itself lives on
     chain.rig.terminate()
     chain.rig.wait(10)
     r = chain.reference()
-    late = r.t > killed + 0.5                                         # watchdog 0.2 s
+    late = r.t > killed + 0.5  # watchdog 0.2 s
     assert late.any() and not r.columns["enabled"][late].any() and not r.columns["drive"][late].any()

@@ -1,4 +1,5 @@
 """The quick rig for all scenarios, and the table at the end where THERMOCTL_HAZARDS names a file."""
+
 import os
 import platform
 import time
@@ -24,8 +25,16 @@ def rig(quick):
 
 def pytest_sessionfinish(session, exitstatus):
     path = os.environ.get("THERMOCTL_HAZARDS")
-    if path and harness.ROWS:                   # a row is there only where its scenario was kept
-        model = next((line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
-                      if line.startswith("model name")), platform.machine())
-        machine = f"{os.cpu_count()} x {model}, Linux {platform.release()}, Python {platform.python_version()}"
+    if path and harness.ROWS:  # a row is there only where its scenario was kept
+        model = next(
+            (
+                line.split(":", 1)[1].strip()
+                for line in Path("/proc/cpuinfo").read_text().splitlines()
+                if line.startswith("model name")
+            ),
+            platform.machine(),
+        )
+        machine = (
+            f"{os.cpu_count()} x {model}, Linux {platform.release()}, Python {platform.python_version()}"
+        )
         Path(path).write_text(harness.page(harness.ROWS, machine, time.strftime("%Y-%m-%d")))

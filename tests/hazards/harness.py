@@ -4,6 +4,7 @@ Every scenario is measured the same way: from the tick in which the hazard begin
 where it has to be, the amplifier disabled; how far the stage's output moved meanwhile; and that after mending and
 acknowledging the rig is armed again without a jump. The rows become docs/proof/hazards.md (`make hazards`).
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -21,13 +22,14 @@ from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX
 
 ROOT = Path(__file__).resolve().parents[2]
-QUICK = 50.0                    # the quick rig's heat capacities are so many times smaller
-JUMP_UM = 0.5                   # arming may not move the stage more than this
+QUICK = 50.0  # the quick rig's heat capacities are so many times smaller
+JUMP_UM = 0.5  # arming may not move the stage more than this
 
 
 @dataclass(frozen=True)
 class Row:
     """One line of the table. `limit`, `measured`: what was allowed and what came, in words with units."""
+
     section: str
     hazard: str
     limit: str
@@ -45,19 +47,29 @@ def quick_settings(folder: Path):
     thermal hour passes in 72 s of simulated time. Limits on thermal rates and slews follow."""
     from thermoctl.identify.modelfile import save_model
     from thermoctl.plant.linearise import linearise
+
     for name in ("actuator", "actuator_thermal"):
         text = (ROOT / f"config/plants/{name}.yaml").read_text()
-        text = re.sub(r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
-                      lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}", text)
+        text = re.sub(
+            r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
+            lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}",
+            text,
+        )
         (folder / f"{name}.yaml").write_text(text)
     model = linearise(load(folder / "actuator_thermal.yaml"), 0.001, 0.1, expansion_period_s=0.02)
     model = dataclasses.replace(model, air_filter_s=model.air_filter_s / QUICK)
     save_model(folder / "model.yaml", model, "simulated", [folder / "actuator_thermal.yaml"])
     text = (ROOT / "config/simulated.yaml").read_text()
-    for old, new in (("plants/", ""), ("models/simulated.yaml", "model.yaml"), ("slew_um_s: 1", "slew_um_s: 50"),
-                     ("temperatures_c: 900", "temperatures_c: 18"),
-                     ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25\n  innovation_time_s: 0.6"),
-                     ("period_s: 7200", "period_s: 144"), ("../run/", f"{folder}/"), ("../recordings", f"{folder}/recordings")):
+    for old, new in (
+        ("plants/", ""),
+        ("models/simulated.yaml", "model.yaml"),
+        ("slew_um_s: 1", "slew_um_s: 50"),
+        ("temperatures_c: 900", "temperatures_c: 18"),
+        ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25\n  innovation_time_s: 0.6"),
+        ("period_s: 7200", "period_s: 144"),
+        ("../run/", f"{folder}/"),
+        ("../recordings", f"{folder}/recordings"),
+    ):
         assert old in text, old
         text = text.replace(old, new)
     (folder / "rig.yaml").write_text(text)
@@ -73,9 +85,18 @@ class HazardRig(Simulation):
         self.rig.backend = self.injector
 
     def inject(self, kind: str, *roles: str, by: float = 0.0) -> None:
-        self.injector.faults.append(Fault(kind, tuple(ROLE[r] for r in roles), max(self.injector._t, 0.0), math.inf, by,
-                                          stale_after_s=0.01 if "_um" in roles[0] else 0.05) if roles
-                                    else Fault(kind, (), 0.0, math.inf, by))
+        self.injector.faults.append(
+            Fault(
+                kind,
+                tuple(ROLE[r] for r in roles),
+                max(self.injector._t, 0.0),
+                math.inf,
+                by,
+                stale_after_s=0.01 if "_um" in roles[0] else 0.05,
+            )
+            if roles
+            else Fault(kind, (), 0.0, math.inf, by)
+        )
 
     def mend(self) -> None:
         self.injector.faults.clear()
@@ -111,21 +132,30 @@ class HazardRig(Simulation):
         way, begun, wanted = 0.0, self.output_um, self["reference_um"]
         for k in range(1, limit_ticks + 1):
             self.tick()
-            way = max(way, abs((self.output_um - begun) - (self["reference_um"] - wanted)) if self.state == "ARMED" else 0.0)
+            way = max(
+                way,
+                abs((self.output_um - begun) - (self["reference_um"] - wanted))
+                if self.state == "ARMED"
+                else 0.0,
+            )
             found = self.faults & names
             if found:
-                if any(faults.BY_NAME[n].severity != "warning" and not n.startswith("monitored") for n in found):
+                if any(
+                    faults.BY_NAME[n].severity != "warning" and not n.startswith("monitored") for n in found
+                ):
                     assert self.state == "FAULT" and self["enable"] == 0.0 and self["drive"] == 0.0
                 return k, found, way
-        raise AssertionError(f"none of {sorted(names)} within {limit_ticks} ticks: state {self.state}, {sorted(self.faults)}, "
-                             f"the output moved {way:.2f} um")
+        raise AssertionError(
+            f"none of {sorted(names)} within {limit_ticks} ticks: state {self.state}, {sorted(self.faults)}, "
+            f"the output moved {way:.2f} um"
+        )
 
     def comes_back(self, limit_s: float = 20.0) -> float:
         """Mended: acknowledge, arm, and hold for 0.3 s; the largest step of the output from where it stood, um."""
         self.mend()
         self.tick(50)
-        assert self["enable"] == 0.0 and self.state != "ARMED"             # nothing arms by itself
-        if self.state == "FAULT":                                          # latched: arming does not acknowledge
+        assert self["enable"] == 0.0 and self.state != "ARMED"  # nothing arms by itself
+        if self.state == "FAULT":  # latched: arming does not acknowledge
             self.command("arm")
             self.tick(3)
             assert self.state == "FAULT"
@@ -139,32 +169,52 @@ class HazardRig(Simulation):
         assert calm == 4, (self.state, self.faults)
         stood, worst = self.output_um + self["compensation_um"], 0.0
         self.command("arm")
-        for _ in range(300):                    # what the compensation adds at its limited slew is no jump
+        for _ in range(300):  # what the compensation adds at its limited slew is no jump
             self.tick()
             worst = max(worst, abs(self.output_um + self["compensation_um"] - stood))
         assert self.state == "ARMED" and worst < JUMP_UM, (self.state, self.faults, worst)
         return worst
 
 
-def say(section: str, hazard: str, limit_ticks: int, ticks: int, found: set[str], way_um: float, jump_um: float | None) -> None:
+def say(
+    section: str,
+    hazard: str,
+    limit_ticks: int,
+    ticks: int,
+    found: set[str],
+    way_um: float,
+    jump_um: float | None,
+) -> None:
     """Keep the scenario's row."""
     name = sorted(found, key=lambda n: faults.BIT[n])[0]
     fault = faults.BY_NAME[name]
     trips = fault.severity != "warning" and not name.startswith("monitored")
     back = "" if jump_um is None else f"; re-armed, moved {jump_um:.2f} um"
-    ROWS.append(Row(section, hazard, f"{limit_ticks} ticks", f"{ticks} ticks, output off by {way_um:.2f} um",
-                    ("amplifier off" if trips else "warning") + back, f"`{name}`: {fault.remedy}"))
+    ROWS.append(
+        Row(
+            section,
+            hazard,
+            f"{limit_ticks} ticks",
+            f"{ticks} ticks, output off by {way_um:.2f} um",
+            ("amplifier off" if trips else "warning") + back,
+            f"`{name}`: {fault.remedy}",
+        )
+    )
 
 
 def page(rows: list[Row], machine: str, date: str) -> str:
     """The table as Markdown."""
-    text = ("<!-- Written by `make hazards`; a figure here was measured by the tests in tests/hazards. -->\n# Hazards\n\n"
-            f"Measured {date} on {machine}. A tick is 1 ms. Each row is a test in `tests/hazards`; it fails when the limit is not "
-            "kept, when the amplifier is not safe, when nothing names the cause, or when the rig does not come back, or with a "
-            "jump.\n")
+    text = (
+        "<!-- Written by `make hazards`; a figure here was measured by the tests in tests/hazards. -->\n# Hazards\n\n"
+        f"Measured {date} on {machine}. A tick is 1 ms. Each row is a test in `tests/hazards`; it fails when the limit is not "
+        "kept, when the amplifier is not safe, when nothing names the cause, or when the rig does not come back, or with a "
+        "jump.\n"
+    )
     for section in dict.fromkeys(r.section for r in rows):
         text += f"\n## {section}\n\n| hazard | limit | measured | outcome | message |\n| --- | --- | --- | --- | --- |\n"
         for r in rows:
             if r.section == section:
-                text += "| " + " | ".join(str(c).replace("|", "\\|") for c in dataclasses.astuple(r)[1:]) + " |\n"
+                text += (
+                    "| " + " | ".join(str(c).replace("|", "\\|") for c in dataclasses.astuple(r)[1:]) + " |\n"
+                )
     return text

@@ -1,5 +1,6 @@
 """The daemon's real processes on the simulated rig: each one killed, stopped and gone on, on a full and on a read-only disk, over
 leftovers of shared memory. Real time: limits are generous, what was measured is in the table."""
+
 import contextlib
 import os
 import re
@@ -24,8 +25,13 @@ pytestmark = pytest.mark.slow
 def start(folder, directory):
     """The simulated rig's daemon, recording into `directory`, its files in `folder`."""
     text = (ROOT / "config/simulated.yaml").read_text()
-    for old, new in (("plants/", f"{ROOT}/config/plants/"), ("models/", f"{ROOT}/config/models/"), ("../run/", f"{folder}/"),
-                     ("../recordings", str(directory)), ("reference: true", "reference: false")):
+    for old, new in (
+        ("plants/", f"{ROOT}/config/plants/"),
+        ("models/", f"{ROOT}/config/models/"),
+        ("../run/", f"{folder}/"),
+        ("../recordings", str(directory)),
+        ("reference: true", "reference: false"),
+    ):
         text = text.replace(old, new)
     (folder / "rig.yaml").write_text(text)
     found = Daemon(folder / "rig.yaml")
@@ -70,8 +76,13 @@ def test_kill_9_of_a_helper(daemon, name):
     assert daemon.stop() == 0
     count, missing = ticks(Path(daemon.settings.recording.directory))
     assert count > 1000 and missing <= 1500
-    say(f"kill -9: {name}", "1.5 s of record", f"noticed in {seconds:.1f} s; {missing} ticks not recorded", "drives on",
-        f"`{name} ended, started again`")
+    say(
+        f"kill -9: {name}",
+        "1.5 s of record",
+        f"noticed in {seconds:.1f} s; {missing} ticks not recorded",
+        "drives on",
+        f"`{name} ended, started again`",
+    )
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
@@ -82,8 +93,13 @@ def test_the_loop_killed_or_stopped_for_good(daemon, how):
     assert daemon.process.wait(LIMIT_S) == 1
     seconds = time.monotonic() - begin
     assert "the loop" in daemon.log and "could not be disabled" not in daemon.log
-    say(f"{'kill -9' if how == signal.SIGKILL else 'SIGSTOP for good'}: loop", "ends, exit 1", f"{seconds:.1f} s",
-        "amplifier off by the supervisor; systemd starts it into SAFE", "`the loop ended` or `stands still`")
+    say(
+        f"{'kill -9' if how == signal.SIGKILL else 'SIGSTOP for good'}: loop",
+        "ends, exit 1",
+        f"{seconds:.1f} s",
+        "amplifier off by the supervisor; systemd starts it into SAFE",
+        "`the loop ended` or `stands still`",
+    )
 
 
 def test_the_loop_stopped_for_a_while(daemon):
@@ -98,7 +114,13 @@ def test_the_loop_stopped_for_a_while(daemon):
     daemon.armed()
     now = daemon.ask("status")
     assert abs(now["setpoint_um"] - now["compensated_um"]) < 0.5
-    say("SIGSTOP, SIGCONT after 0.3 s: loop", "first tick", "first tick after it", "amplifier off; re-armed without a jump", "`loop_late`")
+    say(
+        "SIGSTOP, SIGCONT after 0.3 s: loop",
+        "first tick",
+        "first tick after it",
+        "amplifier off; re-armed without a jump",
+        "`loop_late`",
+    )
 
 
 def test_the_whole_machine_stands_for_a_while(daemon):
@@ -110,7 +132,7 @@ def test_the_whole_machine_stands_for_a_while(daemon):
         os.kill(pid, signal.SIGSTOP)
     begin = time.monotonic()
     wait(lambda: time.monotonic() - begin > 3.0, "3 s")
-    os.kill(everyone[0], signal.SIGCONT)                    # the supervisor first: it looks, and sees no tick since
+    os.kill(everyone[0], signal.SIGCONT)  # the supervisor first: it looks, and sees no tick since
     begin = time.monotonic()
     wait(lambda: time.monotonic() - begin > 0.2, "0.2 s")
     for pid in everyone[1:]:
@@ -119,7 +141,13 @@ def test_the_whole_machine_stands_for_a_while(daemon):
     assert "loop_late" in [f["name"] for f in now["faults"]] and now["enable"] == 0.0
     daemon.armed()
     assert daemon.process.poll() is None and "stands still" not in daemon.log
-    say("SIGSTOP, SIGCONT after 3 s: every process", "first tick", "first tick after it", "amplifier off; re-armed without a jump", "`loop_late`")
+    say(
+        "SIGSTOP, SIGCONT after 3 s: every process",
+        "first tick",
+        "first tick after it",
+        "amplifier off; re-armed without a jump",
+        "`loop_late`",
+    )
 
 
 def test_the_recorder_stopped_for_a_while_loses_nothing(daemon):
@@ -134,19 +162,31 @@ def test_the_recorder_stopped_for_a_while_loses_nothing(daemon):
     assert daemon.stop() == 0
     count, missing = ticks(Path(daemon.settings.recording.directory))
     assert missing == 0 and count > 3000
-    say("SIGSTOP, SIGCONT after 3 s: recorder", "nothing lost", f"{missing} of {count} ticks", "drives on", "")
+    say(
+        "SIGSTOP, SIGCONT after 3 s: recorder", "nothing lost", f"{missing} of {count} ticks", "drives on", ""
+    )
 
 
 @pytest.mark.parametrize("name", ["commands", "recorder"])
 def test_a_helper_stopped_for_good_is_replaced(daemon, name):
     from thermoctl.daemon.supervisor import HANG_S
+
     daemon.armed()
     os.kill(daemon.child(name), signal.SIGSTOP)
-    _, seconds = wait(lambda: f"{name} hangs: killed" in daemon.log and f"{name} ended, started again" in daemon.log, "replaced")
-    assert seconds > HANG_S / 2                             # a busy machine may have held it up before
+    _, seconds = wait(
+        lambda: f"{name} hangs: killed" in daemon.log and f"{name} ended, started again" in daemon.log,
+        "replaced",
+    )
+    assert seconds > HANG_S / 2  # a busy machine may have held it up before
     now, _ = wait(lambda: daemon.ask("status"), "an answer")
     assert now["state"] == "ARMED"
-    say(f"SIGSTOP for good: {name}", f"{HANG_S:g} s and a start", f"replaced in {seconds:.1f} s", "drives on", f"`{name} hangs: killed`")
+    say(
+        f"SIGSTOP for good: {name}",
+        f"{HANG_S:g} s and a start",
+        f"replaced in {seconds:.1f} s",
+        "drives on",
+        f"`{name} hangs: killed`",
+    )
 
 
 def test_the_supervisor_stopped_and_killed(daemon, tmp_path):
@@ -163,7 +203,7 @@ def test_the_supervisor_stopped_and_killed(daemon, tmp_path):
     daemon.process.kill()
     daemon.process.wait()
     _, seconds = wait(lambda: not any(p.is_running() for p in daemon.family), "all children gone", 20)
-    left = Path("/dev/shm", shared_name(daemon.settings)).stat().st_ino      # nobody is left who could remove it
+    left = Path("/dev/shm", shared_name(daemon.settings)).stat().st_ino  # nobody is left who could remove it
     again = Daemon(daemon.config)
     try:
         assert again.ask("status")["state"] == "READY" and "kept=True" in again.log
@@ -171,14 +211,20 @@ def test_the_supervisor_stopped_and_killed(daemon, tmp_path):
         assert again.stop() == 0 and not Path("/dev/shm", shared_name(daemon.settings)).exists()
     finally:
         again.kill()
-    say("kill -9: supervisor", "20 s", f"children gone in {seconds:.1f} s", "amplifier off by the loop; the next daemon starts into SAFE",
-        "`estimates kept=True`")
+    say(
+        "kill -9: supervisor",
+        "20 s",
+        f"children gone in {seconds:.1f} s",
+        "amplifier off by the loop; the next daemon starts into SAFE",
+        "`estimates kept=True`",
+    )
 
 
 @pytest.mark.parametrize("left", [b"", b"x" * 8, b"\0" * 4096, b"\xff" * 20_000_000])
 def test_leftovers_in_shared_memory(tmp_path, left):
     """Whatever stands under the segment's name is replaced, and told where it is attached to."""
     from thermoctl.daemon.shared import Shared
+
     name = f"thermoctl-hazard-{os.getpid()}"
     Path("/dev/shm", name).write_bytes(left)
     with pytest.raises(InputError, match="not there|another version"):
@@ -188,14 +234,25 @@ def test_leftovers_in_shared_memory(tmp_path, left):
         assert Shared.attach(name).ring.head == 0 and shared.mailbox.take() is None
     finally:
         shared.remove()
-    say(f"shared memory left over: {len(left)} bytes", "replaced", "replaced", "starts", "`of another version; restart the daemon`")
+    say(
+        f"shared memory left over: {len(left)} bytes",
+        "replaced",
+        "replaced",
+        "starts",
+        "`of another version; restart the daemon`",
+    )
 
 
 @pytest.fixture
 def small_disk(tmp_path):
     place = tmp_path / "disk"
     place.mkdir()
-    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(place)], capture_output=True).returncode:
+    if (
+        os.geteuid()
+        or subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(place)], capture_output=True
+        ).returncode
+    ):
         pytest.skip("a small file system cannot be mounted here (root is needed)")
     yield place
     subprocess.run(["mount", "-o", "remount,rw", str(place)], capture_output=True)
@@ -211,20 +268,36 @@ def test_disk_full_and_read_only(tmp_path, small_disk):
         with contextlib.suppress(OSError), filler.open("wb", buffering=0) as f:
             while f.write(b"x" * 4096):
                 pass
-        _, seconds = wait(lambda: re.search("nothing is recorded.*[Nn]o space", daemon.log), "told that the disk is full")
+        _, seconds = wait(
+            lambda: re.search("nothing is recorded.*[Nn]o space", daemon.log), "told that the disk is full"
+        )
         lost, _ = wait(lambda: daemon.ask("status")["recorder"]["lost"], "counted as lost")
         slips = daemon.ask("status")["slips"]
         assert daemon.ask("status")["state"] == "ARMED"
         filler.unlink()
         rows = daemon.ask("status")["recorder"]["rows"]
         wait(lambda: daemon.ask("status")["recorder"]["rows"] > rows + 3000, "records again")
-        say("disk full", "told; the loop never waits", f"told in {seconds:.1f} s, {lost} ticks lost at first, {slips} slips", "drives on",
-            "`nothing is recorded: No space left on device`")
+        say(
+            "disk full",
+            "told; the loop never waits",
+            f"told in {seconds:.1f} s, {lost} ticks lost at first, {slips} slips",
+            "drives on",
+            "`nothing is recorded: No space left on device`",
+        )
         subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=False)
-        if "read-only" in daemon.log.lower() or subprocess.run(["touch", str(small_disk / "x")], capture_output=True).returncode:
+        if (
+            "read-only" in daemon.log.lower()
+            or subprocess.run(["touch", str(small_disk / "x")], capture_output=True).returncode
+        ):
             _, seconds = wait(lambda: "ead-only" in daemon.log, "told that the disk is read-only")
             assert daemon.ask("status")["state"] == "ARMED"
-            say("disk becomes read-only", "told; the loop never waits", f"told in {seconds:.1f} s", "drives on", "`Read-only file system`")
+            say(
+                "disk becomes read-only",
+                "told; the loop never waits",
+                f"told in {seconds:.1f} s",
+                "drives on",
+                "`Read-only file system`",
+            )
     finally:
         daemon.kill()
 
@@ -232,6 +305,7 @@ def test_disk_full_and_read_only(tmp_path, small_disk):
 def test_setpoint_flood_by_the_socket(daemon):
     """Four clients ask for setpoints as fast as they can; another one's disarm is obeyed at once."""
     import threading
+
     daemon.armed()
     done, count = threading.Event(), [0]
 
@@ -240,6 +314,7 @@ def test_setpoint_flood_by_the_socket(daemon):
             with contextlib.suppress(InputError):
                 daemon.ask("setpoint", value=sign * 200.0)
                 count[0] += 1
+
     clients = [threading.Thread(target=flood, args=((-1) ** k,)) for k in range(4)]
     for c in clients:
         c.start()
@@ -257,7 +332,18 @@ def test_setpoint_flood_by_the_socket(daemon):
 
 
 def test_two_daemons(daemon, tmp_path):
-    second = subprocess.run([sys.executable, "-m", "thermoctl.cli", "run", "--config", str(daemon.config)], capture_output=True, text=True,
-                            env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=LIMIT_S)
+    second = subprocess.run(
+        [sys.executable, "-m", "thermoctl.cli", "run", "--config", str(daemon.config)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        timeout=LIMIT_S,
+    )
     assert second.returncode == 2 and "another daemon runs" in second.stderr and daemon.ask("status")["ok"]
-    say("two daemons on one rig", "refused", "refused, exit 2", "the first runs on", "`another daemon runs on this socket`")
+    say(
+        "two daemons on one rig",
+        "refused",
+        "refused, exit 2",
+        "the first runs on",
+        "`another daemon runs on this socket`",
+    )

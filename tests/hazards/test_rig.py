@@ -1,15 +1,16 @@
 """The amplifier, the stage, the coil, the clock and the people, in simulated time."""
+
 import dataclasses
 
 import numpy as np
 import pytest
-from thermoctl.daemon.ring import Histogram
 
 from tests.hazards.harness import ROWS, HazardRig, Row, say
 from thermoctl.control import arming
 from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import law_parameters
 from thermoctl.daemon.reload import reload_settings
+from thermoctl.daemon.ring import Histogram
 from thermoctl.yamlfile import InputError
 
 
@@ -50,6 +51,7 @@ def test_encoder_counts_backwards(rig):
         sample = inner(now_s)
         sample.value[0] = -sample.value[0]
         return sample
+
     rig.backend.read = backwards
     rig.arm()
     rig.command("setpoint", 5.0)
@@ -77,6 +79,7 @@ def test_blocked_stage(rig):
         k[0] += 1
         sample.value[0] = held + 0.005 * (k[0] % 3)
         return sample
+
     rig.backend.read = blocked
     ticks, found, way = rig.detect({"following_error", "position_disagrees", "drive_saturated"}, 400)
     del rig.backend.read
@@ -96,7 +99,13 @@ def test_over_temperature_by_rate(quick):
 
 
 def test_over_temperature(quick):
-    p = dataclasses.replace(law_parameters(quick), coil_limit_c=30.0, innovation_limit_c=99.0, drift_limit_c=99.0, coil_rate_k_s=99.0)
+    p = dataclasses.replace(
+        law_parameters(quick),
+        coil_limit_c=30.0,
+        innovation_limit_c=99.0,
+        drift_limit_c=99.0,
+        coil_rate_k_s=99.0,
+    )
     rig = HazardRig(quick, parameters=p)
     rig.ready_to_be_spoiled(5.0)
     rig.inject("drift", "coil_c", by=5.0)
@@ -127,26 +136,46 @@ def test_setpoint_flood(rig):
         behind = max(behind, abs(rig["compensated_um"] - rig["reference_um"]))
         assert rig.state == "ARMED" and not rig.faults
     assert speed <= 1000 / 60 * (1 + 1e-9) and behind < 1.0
-    ROWS.append(Row("Rig", "setpoint flood: one a tick, to and fro, NaN and infinite", "16.67 um/s, 1 um behind",
-                    f"{speed:.2f} um/s, {behind:.2f} um behind", "drives on", "refused outside the limits by the command socket"))
+    ROWS.append(
+        Row(
+            "Rig",
+            "setpoint flood: one a tick, to and fro, NaN and infinite",
+            "16.67 um/s, 1 um behind",
+            f"{speed:.2f} um/s, {behind:.2f} um behind",
+            "drives on",
+            "refused outside the limits by the command socket",
+        )
+    )
 
 
 def test_reload_to_nonsense(quick, rig):
     """Each damaged configuration is refused whole, with its place; what is in force stays, and the stage stays."""
     from pathlib import Path
+
     path, good = Path(quick.path), Path(quick.path).read_text()
     rig.ready_to_be_spoiled(5.0)
     generation, refused = rig["generation"], 0
     try:
-        for old, new in (("kp: 0.01", "kp: -1"), ("kp: 0.01", "kp: .nan"), ("kp: 0.01", "kp: [1]"), ("control:", "contrl:"),
-                         ("ti_s: 0.004", "ti_s: 0"), ("output_limit: 1.5", "output_limit: 1e99"), ("\nrig:", "\n{{{"),
-                         ("setpoint_low_um: -250", "setpoint_low_um: 999"), ("required: [", "required: [nothing, "), ("\nrig:", "\n\0")):
+        for old, new in (
+            ("kp: 0.01", "kp: -1"),
+            ("kp: 0.01", "kp: .nan"),
+            ("kp: 0.01", "kp: [1]"),
+            ("control:", "contrl:"),
+            ("ti_s: 0.004", "ti_s: 0"),
+            ("output_limit: 1.5", "output_limit: 1e99"),
+            ("\nrig:", "\n{{{"),
+            ("setpoint_low_um: -250", "setpoint_low_um: 999"),
+            ("required: [", "required: [nothing, "),
+            ("\nrig:", "\n\0"),
+        ):
             path.write_text(good.replace(old, new, 1))
             with pytest.raises(InputError, match="rig.yaml"):
                 reload_settings(quick, quick)
             refused += 1
             rig.tick(20)
-        path.write_text(good.replace("kp: 0.01", "kp: 0.008").replace("moving_average: 4", "moving_average: 9"))
+        path.write_text(
+            good.replace("kp: 0.01", "kp: 0.008").replace("moving_average: 4", "moving_average: 9")
+        )
         stood = rig["reference_um"] - rig["compensated_um"]
         rig.reload(reload_settings(quick, quick)[1])
         worst = 0.0
@@ -156,8 +185,16 @@ def test_reload_to_nonsense(quick, rig):
     finally:
         path.write_text(good)
     assert rig.state == "ARMED" and not rig.faults and rig["generation"] == generation + 1 and worst < 0.5
-    ROWS.append(Row("Rig", "reload: ten damaged configurations, then a good one", "all refused; 0.5 um",
-                    f"{refused} refused; {worst:.2f} um", "drives on", "file:line:column, what was expected"))
+    ROWS.append(
+        Row(
+            "Rig",
+            "reload: ten damaged configurations, then a good one",
+            "all refused; 0.5 um",
+            f"{refused} refused; {worst:.2f} um",
+            "drives on",
+            "file:line:column, what was expected",
+        )
+    )
 
 
 def test_clock_step(rig):
@@ -172,11 +209,21 @@ def test_clock_step(rig):
         assert rig.state == "ARMED" and not rig.faults and rig["t_s"] > t_s
         t_s = rig["t_s"]
     assert worst < 0.5
-    ROWS.append(Row("Clock", "wall clock set by an hour, to and fro", "no fault, 0.5 um", f"no fault, {worst:.2f} um", "drives on",
-                    "recorded in `wall_s`; `t_s` goes on"))
+    ROWS.append(
+        Row(
+            "Clock",
+            "wall clock set by an hour, to and fro",
+            "no fault, 0.5 um",
+            f"no fault, {worst:.2f} um",
+            "drives on",
+            "recorded in `wall_s`; `t_s` goes on",
+        )
+    )
 
 
-@pytest.mark.parametrize("name,gap_s", [("starved for 0.3 s", 0.3), ("stopped for 2 s", 2.0), ("suspended for an hour", 3600.0)])
+@pytest.mark.parametrize(
+    "name,gap_s", [("starved for 0.3 s", 0.3), ("stopped for 2 s", 2.0), ("suspended for an hour", 3600.0)]
+)
 def test_gap(rig, name, gap_s):
     """The loop did not run: the first tick after it trips; after a long gap the estimate starts anew on the coil's reading."""
     rig.ready_to_be_spoiled(5.0)
@@ -203,8 +250,9 @@ def test_a_suspend_shows_in_the_loops_own_clock(quick):
 
     def stopping():
         if len(rows) == 40:
-            slept[0] = 3600 * 10 ** 9
+            slept[0] = 3600 * 10**9
         return len(rows) >= 80
+
     loops.run_loop(quick, shared, rig.rig, stopping)
     dt = np.array(rows)[:, loops.INDEX["dt_s"]]
     late = np.flatnonzero(dt > 3000)
@@ -216,6 +264,7 @@ def test_a_restart_keeps_the_estimates(quick, tmp_path):
     """Warm rig, daemon started again 30 s (of the quick rig) later: the estimate and the expansion's origin are kept; not
     where the kept ones do not fit the coil any more, are old, of another model, or damaged."""
     from thermoctl.daemon import keep
+
     rig = HazardRig(quick)
     rig.arm()
     rig.command("setpoint", 250.0)
@@ -235,17 +284,33 @@ def test_a_restart_keeps_the_estimates(quick, tmp_path):
     cold.tick(400)
     without = cold["expansion_um"] - (rig.output_um - rig.backend.rig.true("position_um"))
     assert after.state == "READY" and abs(kept) < 0.5 < abs(without)
-    other = HazardRig(quick)                                # a rig that is cold: the kept estimates do not fit
+    other = HazardRig(quick)  # a rig that is cold: the kept estimates do not fit
     other.law.resume(state, 0.05)
     other.tick(300)
     assert abs(other["coil_est_c"] - other["coil_c"]) < 0.6 and abs(other["expansion_um"]) < 1.0
     text = path.read_text()
-    for damaged in ("", "{}", "[1]", text[:-9], text.replace('"version": 1', '"version": 2'), "x" * 99999, text.replace('"boot": "', '"boot": "0')):
+    for damaged in (
+        "",
+        "{}",
+        "[1]",
+        text[:-9],
+        text.replace('"version": 1', '"version": 2'),
+        "x" * 99999,
+        text.replace('"boot": "', '"boot": "0'),
+    ):
         path.write_text(damaged)
         assert keep.load(path, model)[0] is None
     path.write_text(text)
     assert keep.load(path, dataclasses.replace(model, R_v=model.R_v, f1=0.5))[2] == "of another model"
-    ROWS.append(Row("Clock", "restart on a warm rig", "expansion within 0.5 um", f"{abs(kept):.2f} um (without what was kept "
-                    f"{abs(without):.2f} um)", "SAFE, not armed", "`estimates kept=True age_s=...` in the log"))
+    ROWS.append(
+        Row(
+            "Clock",
+            "restart on a warm rig",
+            "expansion within 0.5 um",
+            f"{abs(kept):.2f} um (without what was kept {abs(without):.2f} um)",
+            "SAFE, not armed",
+            "`estimates kept=True age_s=...` in the log",
+        )
+    )
     for r in (rig, other):
         r.close()

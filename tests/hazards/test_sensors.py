@@ -1,4 +1,5 @@
 """Every sensor x (open, short, frozen, jump, drift, NaN, stale, swapped, late, duplicated), armed and driving."""
+
 import math
 
 import pytest
@@ -8,12 +9,23 @@ from thermoctl.control.faults import TEMPERATURES
 
 OTHERS = TEMPERATURES[1:]
 SENSORS = ("position_um", "output_reference_um", "voltage_v", "current_a", "air_c", *TEMPERATURES)
-SHOWS = {"position_um": "position", "output_reference_um": "monitored", "voltage_v": "voltage", "current_a": "current",
-         "air_c": "air", "coil_c": "coil"}
+SHOWS = {
+    "position_um": "position",
+    "output_reference_um": "monitored",
+    "voltage_v": "voltage",
+    "current_a": "current",
+    "air_c": "air",
+    "coil_c": "coil",
+}
 
 
-THERMAL = (*SENSORS[:7], *(pytest.param(r, marks=() if r in ("shaft_1_c", "bracket_2_c") else pytest.mark.slow)
-                           for r in OTHERS[1:]))
+THERMAL = (
+    *SENSORS[:7],
+    *(
+        pytest.param(r, marks=() if r in ("shaft_1_c", "bracket_2_c") else pytest.mark.slow)
+        for r in OTHERS[1:]
+    ),
+)
 """For hazards that take seconds of simulated time: of the eleven watched temperatures three in `make test`, all in
 `make hazards`."""
 
@@ -64,18 +76,23 @@ def test_late(rig, role):
 
 
 # What a reading shows that is shorted, and in how many ticks that is found.
-SHORT = {"position_um": (0.0, 102, {"position_frozen", "position_disagrees", "following_error"}),
-         "output_reference_um": (0.0, 102, {"monitored_frozen", "monitored_disagrees"}),
-         "voltage_v": (0.0, 102, {"voltage_frozen", "electrical_disagrees"}),
-         "current_a": (0.0, 102, {"current_frozen", "electrical_disagrees", "amplifier_not_following"}),
-         "air_c": (-242.0, 100, {"air_range"}), "coil_c": (22.0, 13000, {"electrical_disagrees", "coil_disagrees"})}
+SHORT = {
+    "position_um": (0.0, 102, {"position_frozen", "position_disagrees", "following_error"}),
+    "output_reference_um": (0.0, 102, {"monitored_frozen", "monitored_disagrees"}),
+    "voltage_v": (0.0, 102, {"voltage_frozen", "electrical_disagrees"}),
+    "current_a": (0.0, 102, {"current_frozen", "electrical_disagrees", "amplifier_not_following"}),
+    "air_c": (-242.0, 100, {"air_range"}),
+    "coil_c": (22.0, 13000, {"electrical_disagrees", "coil_disagrees"}),
+}
 
 
 @pytest.mark.parametrize("role", THERMAL)
 def test_short(rig, role):
     """Encoder and meters read 0, the Pt100 its lower end, a thermocouple the temperature of its terminals, which is the
     chamber's: a believable number."""
-    value, limit, expected = SHORT.get(role, (22.0, 19000, {"monitored_frozen", "monitored_disagrees", "monitored_rate"}))
+    value, limit, expected = SHORT.get(
+        role, (22.0, 19000, {"monitored_frozen", "monitored_disagrees", "monitored_rate"})
+    )
     rig.ready_to_be_spoiled(250.0 if role.endswith("_c") else 20.0)
     rig.inject("set", role, by=value)
     ticks, found, way = rig.detect(expected, limit)
@@ -90,7 +107,10 @@ FROZEN = {"position_um": 103, "output_reference_um": 103, "voltage_v": 103, "cur
 def test_frozen_and_duplicated(rig, role, kind):
     """The converter hangs and goes on sending; or a gateway gives its last reading as new in every tick."""
     limit = FROZEN.get(role, 18500)
-    expected = {f"{group(role)}_frozen", *(("coil_disagrees", "electrical_disagrees") if role == "coil_c" else ("monitored_disagrees",))}
+    expected = {
+        f"{group(role)}_frozen",
+        *(("coil_disagrees", "electrical_disagrees") if role == "coil_c" else ("monitored_disagrees",)),
+    }
     rig.ready_to_be_spoiled(250.0 if role.endswith("_c") else 20.0)
     rig.inject("freeze", role)
     if kind == "duplicated":
@@ -99,10 +119,14 @@ def test_frozen_and_duplicated(rig, role, kind):
     finish(rig, role, kind, limit, ticks, found, way)
 
 
-JUMP = {"position_um": (100.0, 1, {"position_rate"}), "output_reference_um": (100.0, 1, {"monitored_rate"}),
-        "voltage_v": (2.0, 50, {"electrical_disagrees"}),
-        "current_a": (0.5, 50, {"amplifier_not_following", "electrical_disagrees"}), "air_c": (5.0, 100, {"air_rate"}),
-        "coil_c": (5.0, 100, {"coil_rate"})}
+JUMP = {
+    "position_um": (100.0, 1, {"position_rate"}),
+    "output_reference_um": (100.0, 1, {"monitored_rate"}),
+    "voltage_v": (2.0, 50, {"electrical_disagrees"}),
+    "current_a": (0.5, 50, {"amplifier_not_following", "electrical_disagrees"}),
+    "air_c": (5.0, 100, {"air_rate"}),
+    "coil_c": (5.0, 100, {"coil_rate"}),
+}
 
 
 @pytest.mark.parametrize("role", SENSORS)
@@ -116,11 +140,14 @@ def test_jump(rig, role):
 
 
 # Drift a second, and by how much the reading may be wrong when it is found: the limit in ticks follows.
-DRIFT = {"position_um": (1.0, 4.5, {"position_disagrees"}), "output_reference_um": (1.0, 3.0, {"monitored_disagrees"}),
-         "voltage_v": (0.05, 0.05, {"electrical_disagrees"}),
-         "current_a": (0.01, 0.01, {"amplifier_not_following", "electrical_disagrees"}),
-         "air_c": (0.5, 8.0, {"monitored_disagrees", "coil_disagrees", "electrical_disagrees"}),
-         "coil_c": (0.5, 4.5, {"coil_disagrees", "electrical_disagrees"})}
+DRIFT = {
+    "position_um": (1.0, 4.5, {"position_disagrees"}),
+    "output_reference_um": (1.0, 3.0, {"monitored_disagrees"}),
+    "voltage_v": (0.05, 0.05, {"electrical_disagrees"}),
+    "current_a": (0.01, 0.01, {"amplifier_not_following", "electrical_disagrees"}),
+    "air_c": (0.5, 8.0, {"monitored_disagrees", "coil_disagrees", "electrical_disagrees"}),
+    "coil_c": (0.5, 4.5, {"coil_disagrees", "electrical_disagrees"}),
+}
 
 
 @pytest.mark.parametrize("role", THERMAL)
@@ -135,12 +162,22 @@ def test_drift(rig, role):
 
 
 # Plugs exchanged before the rig is switched on, then a move that heats the coil by 10 K.
-SWAPS = [("position_um", "output_reference_um", 10000, {"monitored_disagrees"}), ("voltage_v", "current_a", 200, {"electrical_disagrees"}),
-         ("air_c", "coil_c", 18000, {"monitored_disagrees", "coil_disagrees", "electrical_disagrees"}),
-         ("shaft_1_c", "outer_magnet_c", 18000, {"monitored_disagrees"}),
-         *(pytest.param("coil_c", m, 18000, {"monitored_disagrees", "coil_disagrees", "electrical_disagrees"},
-                        marks=() if m in ("bobbin_c", "bobbin_connector_c", "bracket_1_c") else pytest.mark.slow)
-           for m in OTHERS)]
+SWAPS = [
+    ("position_um", "output_reference_um", 10000, {"monitored_disagrees"}),
+    ("voltage_v", "current_a", 200, {"electrical_disagrees"}),
+    ("air_c", "coil_c", 18000, {"monitored_disagrees", "coil_disagrees", "electrical_disagrees"}),
+    ("shaft_1_c", "outer_magnet_c", 18000, {"monitored_disagrees"}),
+    *(
+        pytest.param(
+            "coil_c",
+            m,
+            18000,
+            {"monitored_disagrees", "coil_disagrees", "electrical_disagrees"},
+            marks=() if m in ("bobbin_c", "bobbin_connector_c", "bracket_1_c") else pytest.mark.slow,
+        )
+        for m in OTHERS
+    ),
+]
 
 
 @pytest.mark.parametrize("one,other,limit,expected", SWAPS)

@@ -1,5 +1,6 @@
 """The wires of the encoder and of the drive, in simulated time: the real drivers on pseudo-terminals, whose other ends are
 played between two ticks by a frame generator and a CiA-402 drive; plant, loop and law are those of the simulated rig."""
+
 from __future__ import annotations
 
 import contextlib
@@ -13,20 +14,20 @@ import types
 
 import numpy as np
 import pytest
-from hal.wire import Framer
 
 from hal.backend import ROLE, Sample
 from hal.devices import DevicesBackend, make_devices
 from hal.virtual import drive as drives
 from hal.virtual.rig import Pty
+from hal.wire import Framer
 from tests.hazards.harness import ROOT, HazardRig, say
 from thermoctl import yamlfile
 
 ENCODER, DRIVE = ("position_um",), ("amplifier_state", "amplifier_fault", "supply_v")
 
 
-FRAME = struct.Struct("=IB3x8s")                             # struct can_frame of the kernel
-ERROR_FRAME = FRAME.pack(0x2000_0040, 8, bytes(8))           # CAN_ERR_FLAG | CAN_ERR_BUSOFF
+FRAME = struct.Struct("=IB3x8s")  # struct can_frame of the kernel
+ERROR_FRAME = FRAME.pack(0x2000_0040, 8, bytes(8))  # CAN_ERR_FLAG | CAN_ERR_BUSOFF
 
 
 class KernelBus:
@@ -58,7 +59,7 @@ class KernelBus:
 
     def send(self, data):
         for at in range(0, len(data), 16):
-            self.ours.send(data[at:at + 16])
+            self.ours.send(data[at : at + 16])
 
     def feed(self, data):
         return b"", [(i, d[:n]) for i, n, d in FRAME.iter_unpack(data)]
@@ -77,16 +78,20 @@ class Wires:
         self.encoder.plug()
         self.adapter_port.plug()
         devices = ROOT / "config/devices"
-        text = (f"[{{name: encoder, profile: {devices}/encoder-serial.yaml, port: {folder}/encoder, "
-                f"roles: {{position: position_um}}}}, {{name: drive, profile: {devices}/drive-cia402.yaml, "
-                f"port: '{'socketcan:can0' if bus else f'slcan:{folder}/can'}', "
-                f"roles: {{state: amplifier_state, fault: amplifier_fault, supply: supply_v}}}}]")
-        bound = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, devices=tuple(yamlfile.loads(text).value)))
+        text = (
+            f"[{{name: encoder, profile: {devices}/encoder-serial.yaml, port: {folder}/encoder, "
+            f"roles: {{position: position_um}}}}, {{name: drive, profile: {devices}/drive-cia402.yaml, "
+            f"port: '{'socketcan:can0' if bus else f'slcan:{folder}/can'}', "
+            f"roles: {{state: amplifier_state, fault: amplifier_fault, supply: supply_v}}}}]"
+        )
+        bound = dataclasses.replace(
+            settings, hal=dataclasses.replace(settings.hal, devices=tuple(yamlfile.loads(text).value))
+        )
         self.devices = DevicesBackend(make_devices(bound), [])
         self.framer = Framer(self.devices.fast[0].binding.profile.bus_spec)
         self.drive, self.adapter, self.sequence = drives.Cia402Drive(5), bus or drives.SlcanAdapter(), 0
-        self.spoil_frame = lambda frame: frame               # what becomes of an encoder frame on its way
-        self.spoil_can = lambda data: data                   # and of the adapter's bytes
+        self.spoil_frame = lambda frame: frame  # what becomes of an encoder frame on its way
+        self.spoil_can = lambda data: data  # and of the adapter's bytes
         self.status = 0
         self.connecting = threading.Event()
 
@@ -95,10 +100,12 @@ class Wires:
 
     def connect(self, action):
         """Run `action` (which blocks on the drive's answers) with the drive played by a thread."""
+
         def play():
             while not self.connecting.is_set():
                 self.play_drive()
                 select.select([self.adapter_port.master], [], [], 0.002)
+
         self.connecting.clear()
         player = threading.Thread(target=play)
         player.start()
@@ -125,13 +132,22 @@ class Wires:
         if self.adapter_port.master >= 0:
             self.play_drive()
         for port in (self.encoder, self.adapter_port):
-            if port.master >= 0:                             # until the terminal has passed on what was written
+            if port.master >= 0:  # until the terminal has passed on what was written
                 select.select([port._slave], [], [], 0.02)
         wired, out = self.devices.read(now_s), self.sample
-        out.value[:], out.time_s[:], out.fresh[:], out.status[:] = inner.value, inner.time_s, inner.fresh, inner.status
+        out.value[:], out.time_s[:], out.fresh[:], out.status[:] = (
+            inner.value,
+            inner.time_s,
+            inner.fresh,
+            inner.status,
+        )
         for k in (ROLE[r] for r in (*ENCODER, *DRIVE)):
-            out.value[k], out.time_s[k], out.fresh[k], out.status[k] = (wired.value[k], wired.time_s[k], wired.fresh[k],
-                                                                        wired.status[k])
+            out.value[k], out.time_s[k], out.fresh[k], out.status[k] = (
+                wired.value[k],
+                wired.time_s[k],
+                wired.fresh[k],
+                wired.status[k],
+            )
         return out
 
     def write(self, drive, enable):
@@ -168,7 +184,7 @@ class WiredRig(HazardRig):
             self.tick()
             if not all(d.up for d in self.wires.devices.fast):
                 self.wires.play_drive()
-                select.select([], [], [], 1e-4)              # the reconnecting thread's turn
+                select.select([], [], [], 1e-4)  # the reconnecting thread's turn
         raise AssertionError((self.state, self.faults))
 
     def comes_back(self, limit_s=20.0):
@@ -195,13 +211,13 @@ def happens(rig, hazard, expected, limit, begin, cause):
     rig.ready_to_be_spoiled(5.0)
     begin(rig.wires)
     ticks, found, way = rig.detect(expected, limit)
-    for _ in range(1000):                                    # a link notices that it is gone at its next heartbeat
+    for _ in range(1000):  # a link notices that it is gone at its next heartbeat
         text = rig.wires.problem("position_um") + rig.wires.problem("amplifier_state")
         if not cause or cause in text:
             break
         rig.tick()
     assert cause in text, text
-    rig.settle(lambda: rig.wires.drive.command == 0, 200)     # the real end of the wire is off
+    rig.settle(lambda: rig.wires.drive.command == 0, 200)  # the real end of the wire is off
     jump = rig.comes_back(60.0)
     say("Wires", hazard, limit, ticks, found, way, jump)
 
@@ -225,25 +241,73 @@ def set_(name, value):
     return lambda wires: setattr(wires, name, value)
 
 
-@pytest.mark.parametrize("hazard,expected,limit,begin,cause", [
-    ("encoder: every frame fails its CRC", {"position_stale"}, 12, set_("spoil_frame", flip), "no new reading"),
-    ("encoder: noise instead of frames", {"position_stale"}, 12, set_("spoil_frame", garbage), "no new reading"),
-    ("encoder: half of each frame", {"position_stale"}, 12, set_("spoil_frame", lambda f: f[:6]), "no new reading"),
-    ("encoder: says that its signal is too weak", {"position_error"}, 1, set_("status", 1), "reports an error"),
-    ("encoder: silent", {"position_stale"}, 12, set_("spoil_frame", lambda f: b""), "no new reading"),
-    ("encoder: cable out", {"position_error"}, 2, lambda w: w.encoder.unplug(), "lost on"),
-    ("drive: its heartbeat is missing", {"amplifier_error"}, 103, lambda w: setattr(w.drive, "heartbeat", False),
-     "no heartbeat"),
-    ("drive: supply off", {"amplifier_stale", "amplifier_error"}, 25, no_supply, ""),
-    ("drive: restarts by itself", {"amplifier_error", "amplifier_not_following"}, 5, lambda w: w.drive.power_up(), ""),
-    ("drive: over-current (0x2310)", {"amplifier_fault"}, 2, lambda w: w.drive.fault(0x2310), ""),
-    ("drive: over-temperature (0x4210)", {"amplifier_fault"}, 2, lambda w: w.drive.fault(0x4210), ""),
-    ("CAN: adapter's cable out", {"amplifier_error"}, 2, lambda w: w.adapter_port.unplug(), "lost on"),
-    ("CAN: half of each message", {"amplifier_stale", "amplifier_error"}, 25,
-     set_("spoil_can", lambda d: d[:len(d) // 2]), ""),
-    ("CAN: the adapter refuses everything (BEL)", {"amplifier_stale", "amplifier_error"}, 25,
-     set_("spoil_can", lambda d: b"\a" * bool(d)), ""),
-])
+@pytest.mark.parametrize(
+    "hazard,expected,limit,begin,cause",
+    [
+        (
+            "encoder: every frame fails its CRC",
+            {"position_stale"},
+            12,
+            set_("spoil_frame", flip),
+            "no new reading",
+        ),
+        (
+            "encoder: noise instead of frames",
+            {"position_stale"},
+            12,
+            set_("spoil_frame", garbage),
+            "no new reading",
+        ),
+        (
+            "encoder: half of each frame",
+            {"position_stale"},
+            12,
+            set_("spoil_frame", lambda f: f[:6]),
+            "no new reading",
+        ),
+        (
+            "encoder: says that its signal is too weak",
+            {"position_error"},
+            1,
+            set_("status", 1),
+            "reports an error",
+        ),
+        ("encoder: silent", {"position_stale"}, 12, set_("spoil_frame", lambda f: b""), "no new reading"),
+        ("encoder: cable out", {"position_error"}, 2, lambda w: w.encoder.unplug(), "lost on"),
+        (
+            "drive: its heartbeat is missing",
+            {"amplifier_error"},
+            103,
+            lambda w: setattr(w.drive, "heartbeat", False),
+            "no heartbeat",
+        ),
+        ("drive: supply off", {"amplifier_stale", "amplifier_error"}, 25, no_supply, ""),
+        (
+            "drive: restarts by itself",
+            {"amplifier_error", "amplifier_not_following"},
+            5,
+            lambda w: w.drive.power_up(),
+            "",
+        ),
+        ("drive: over-current (0x2310)", {"amplifier_fault"}, 2, lambda w: w.drive.fault(0x2310), ""),
+        ("drive: over-temperature (0x4210)", {"amplifier_fault"}, 2, lambda w: w.drive.fault(0x4210), ""),
+        ("CAN: adapter's cable out", {"amplifier_error"}, 2, lambda w: w.adapter_port.unplug(), "lost on"),
+        (
+            "CAN: half of each message",
+            {"amplifier_stale", "amplifier_error"},
+            25,
+            set_("spoil_can", lambda d: d[: len(d) // 2]),
+            "",
+        ),
+        (
+            "CAN: the adapter refuses everything (BEL)",
+            {"amplifier_stale", "amplifier_error"},
+            25,
+            set_("spoil_can", lambda d: b"\a" * bool(d)),
+            "",
+        ),
+    ],
+)
 def test_wire(wired, hazard, expected, limit, begin, cause):
     if "cable out" in hazard:
         port = wired.wires.encoder if "encoder" in hazard else wired.wires.adapter_port
@@ -253,11 +317,14 @@ def test_wire(wired, hazard, expected, limit, begin, cause):
             if port is wired.wires.adapter_port:
                 wired.wires.adapter = drives.SlcanAdapter()
             return again(limit_s)
+
         wired.comes_back = comes_back
     happens(wired, hazard, expected, limit, begin, cause)
 
 
-@pytest.mark.parametrize("state", ["NOT_READY", "DISABLED", "READY", "SWITCHED_ON", "QUICK_STOP", "FAULT_REACTION"])
+@pytest.mark.parametrize(
+    "state", ["NOT_READY", "DISABLED", "READY", "SWITCHED_ON", "QUICK_STOP", "FAULT_REACTION"]
+)
 def test_the_drive_leaves_operation_by_itself(wired, state):
     """Each other state of CiA-402, held by a drive that does not go back to work."""
     code = {"FAULT_REACTION": 0x0F}.get(state) if state == "FAULT_REACTION" else getattr(drives, state)
@@ -267,6 +334,7 @@ def test_the_drive_leaves_operation_by_itself(wired, state):
         step = wires.drive._step_state
         wires.drive.state = code
         wires.drive._step_state = lambda word: step(word) if word == 0 else None
+
     try:
         happens(wired, f"drive: {state.lower().replace('_', ' ')} while armed", expected, 100, stays, "")
     finally:
@@ -284,8 +352,12 @@ def test_single_errors_are_survived(wired):
         if k % 100:
             return frame
         spoiled += 1
-        return (flip(frame), frame[:random.integers(1, len(frame))],
-                random.integers(0, 256, 200, dtype=np.uint8).tobytes() + b"\xaa\x55" + frame)[spoiled % 3]
+        return (
+            flip(frame),
+            frame[: random.integers(1, len(frame))],
+            random.integers(0, 256, 200, dtype=np.uint8).tobytes() + b"\xaa\x55" + frame,
+        )[spoiled % 3]
+
     wired.wires.spoil_frame = spoil
     before, worst = dict(wired.wires.devices.counters()), 0.0
     for _ in range(3000):
@@ -294,10 +366,24 @@ def test_single_errors_are_survived(wired):
         assert wired.state == "ARMED" and not wired.faults, wired.faults
     after = wired.wires.devices.counters()
     lost = 3000 - (after["encoder.frames"] - before["encoder.frames"])
-    assert spoiled == 30 and after["encoder.errors"] > before["encoder.errors"] and lost <= 2 * spoiled and worst < 0.5
+    assert (
+        spoiled == 30
+        and after["encoder.errors"] > before["encoder.errors"]
+        and lost <= 2 * spoiled
+        and worst < 0.5
+    )
     from tests.hazards.harness import ROWS, Row
-    ROWS.append(Row("Wires", "encoder: one frame in a hundred damaged", f"{2 * spoiled} of 3000 frames lost",
-                    f"{lost} lost, error of the loop {worst:.2f} um", "drives on", "counted in `encoder.errors`"))
+
+    ROWS.append(
+        Row(
+            "Wires",
+            "encoder: one frame in a hundred damaged",
+            f"{2 * spoiled} of 3000 frames lost",
+            f"{lost} lost, error of the loop {worst:.2f} um",
+            "drives on",
+            "counted in `encoder.errors`",
+        )
+    )
 
 
 def test_usb_renumbering(wired, tmp_path):
@@ -305,7 +391,7 @@ def test_usb_renumbering(wired, tmp_path):
     numbers must never be taken for a position."""
     wired.ready_to_be_spoiled(5.0)
     old = os.readlink(tmp_path / "encoder")
-    held = os.openpty()                                      # the old number is taken by something else
+    held = os.openpty()  # the old number is taken by something else
     wired.wires.encoder.unplug()
     ticks, found, way = wired.detect({"position_error"}, 2)
     keeper = os.openpty()
@@ -332,7 +418,7 @@ def test_the_adapter_takes_no_more_data(wired):
     wires = wired.wires
     wires.play_drive = lambda: wires.drive.tick(wires.now_s) and None
     ticks, found, way = wired.detect({"amplifier_stale", "amplifier_error"}, 25)
-    wired.settle(lambda: wires.drive.command == 0, 150)       # by its own watchdog, 0.1 s
+    wired.settle(lambda: wires.drive.command == 0, 150)  # by its own watchdog, 0.1 s
     del wires.play_drive
     jump = wired.comes_back(60.0)
     say("Wires", "CAN: the adapter hangs", 25, ticks, found, way, jump)
@@ -353,8 +439,16 @@ def test_bus_off(quick, tmp_path, monkeypatch):
         def comes_back(limit_s=20.0, again=rig.comes_back):
             bus.off = False
             return again(limit_s)
+
         rig.comes_back = comes_back
-        happens(rig, "CAN: bus-off", {"amplifier_error"}, 2, begin, "CAN bus-off: check wiring, termination and bitrate")
+        happens(
+            rig,
+            "CAN: bus-off",
+            {"amplifier_error"},
+            2,
+            begin,
+            "CAN bus-off: check wiring, termination and bitrate",
+        )
     finally:
         rig.close()
 

@@ -1,4 +1,5 @@
 """Expansion models, filters, tuning and calibration files."""
+
 import numpy as np
 import pytest
 from scipy import linalg, signal
@@ -14,7 +15,9 @@ def motion(n=9000, seed=0):
     rng = np.random.default_rng(seed)
     t = np.arange(n)
     heat = ((t % 1500) < 700 + 300 * np.sin(t / 1900)).astype(float)
-    rises = np.column_stack([signal.lfilter([1 - p], [1, -p], 8 * heat) for p in np.exp(-1 / np.array([250.0, 1400.0]))])
+    rises = np.column_stack(
+        [signal.lfilter([1 - p], [1, -p], 8 * heat) for p in np.exp(-1 / np.array([250.0, 1400.0]))]
+    )
     f = np.exp(-1 / 120)
     y = signal.lfilter([0, 1 - f], [1, -f], rises @ [1.2, -0.8])
     return rises, y, rng
@@ -41,15 +44,22 @@ def test_the_air_enters_with_the_sum_of_the_gains():
     rises, _, rng = motion()
     air = 22 + 0.5 * np.sin(np.arange(len(rises)) / 3000)
     y = (rises + (air - air[0])[:, None]) @ [0.7, 0.5] + 0.3
-    m = expansion.output_error(rises, y + 0.01 * rng.standard_normal(len(y)), 1.0, air=air, lags=1, tau_range_s=(0.5, 60))
+    m = expansion.output_error(
+        rises, y + 0.01 * rng.standard_normal(len(y)), 1.0, air=air, lags=1, tau_range_s=(0.5, 60)
+    )
     assert m.b_air == pytest.approx((m.b1 + m.b2).sum())
     assert np.std((y - m.predict(rises, air, m.info["start_um"]))[100:]) < 0.02
 
 
 def test_noisy_inputs_shrink_the_gains():
     rises, y, _ = motion(4000)
-    free, careful = expansion.output_error(rises, y, 1.0), expansion.output_error(rises, y, 1.0, input_sigma_k=5.0)
-    assert np.abs(careful.b1 + careful.b2).sum() / (1 - careful.f1) < np.abs(free.b1 + free.b2).sum() / (1 - free.f1)
+    free, careful = (
+        expansion.output_error(rises, y, 1.0),
+        expansion.output_error(rises, y, 1.0, input_sigma_k=5.0),
+    )
+    assert np.abs(careful.b1 + careful.b2).sum() / (1 - careful.f1) < np.abs(free.b1 + free.b2).sum() / (
+        1 - free.f1
+    )
 
 
 def test_bank_online_comes_near_the_block_fit_and_misses_samples():
@@ -58,7 +68,7 @@ def test_bank_online_comes_near_the_block_fit_and_misses_samples():
     read[::7] = np.nan
     bank = expansion.Bank(2, 1.0)
     for k in range(0, len(y), 500):
-        bank.update(rises[k:k + 500], read[k:k + 500])
+        bank.update(rises[k : k + 500], read[k : k + 500])
     m = bank.model()
     assert 60 < m.time_constant_s < 240
     assert np.std((y - m.predict(rises))[2000:]) < 0.1
@@ -82,14 +92,20 @@ def test_rls_step_equals_run_and_forgets():
     for k in range(300):
         kernels.rls_step(b, qb, f[k], y[k], 0.98, w)
     assert np.array_equal(a, b)
-    weight = 0.98**np.arange(299, -1, -1.0)
+    weight = 0.98 ** np.arange(299, -1, -1.0)
     normal = (f * weight[:, None]).T @ f
     assert np.allclose(a, np.linalg.solve(normal, (f * weight[:, None]).T @ y), atol=1e-3)
 
 
 def thermal():
     p = np.exp(-1 / np.array([30.0, 300.0, 2000.0]))
-    return StateSpace(np.diag(p), (1 - p)[:, None], np.array([[1.0, 1.0, 0.6], [0.2, 1.2, 0.8], [0.1, 0.3, 1.0]]), 1.0, np.zeros(3))
+    return StateSpace(
+        np.diag(p),
+        (1 - p)[:, None],
+        np.array([[1.0, 1.0, 0.6], [0.2, 1.2, 0.8], [0.1, 0.3, 1.0]]),
+        1.0,
+        np.zeros(3),
+    )
 
 
 def test_mkf_is_the_printed_recursion():
@@ -100,7 +116,7 @@ def test_mkf_is_the_printed_recursion():
     f = filter.mkf(m, u, y, 0.01, 1.0)
     e = y - m.simulate(u)
     z = e - e.mean(0)
-    assert np.allclose(f.zeta, (z[:, :1] * z).mean(0) / (z[:, 0]**2).mean())
+    assert np.allclose(f.zeta, (z[:, :1] * z).mean(0) / (z[:, 0] ** 2).mean())
     coil = y[:, 0].copy()
     coil[5:9] = np.nan
     got, gains = f.run(u[:, 0], coil)
@@ -141,14 +157,22 @@ def test_filter_follows_an_unmodelled_disturbance_better_than_the_model_alone():
     u = ((np.arange(7200) % 1500) < 700).astype(float) * 4
     wrong = m.simulate((u * 1.08)[:, None])
     measured = np.round((wrong + 0.06 * rng.standard_normal(wrong.shape)) / 0.25) * 0.25
-    f, _ = filter.tune(filter.disturbed(filter.with_air(m)), [filter.Record(u, 0 * u, measured)], filter.sensor_variance(0.25, 0.06))
-    left = [np.sqrt(np.mean((e - wrong)**2)) for e in (m.simulate(u[:, None]), f.run(u, 0 * u, measured[:, 0]))]
+    f, _ = filter.tune(
+        filter.disturbed(filter.with_air(m)),
+        [filter.Record(u, 0 * u, measured)],
+        filter.sensor_variance(0.25, 0.06),
+    )
+    left = [
+        np.sqrt(np.mean((e - wrong) ** 2)) for e in (m.simulate(u[:, None]), f.run(u, 0 * u, measured[:, 0]))
+    ]
     assert left[1] < 0.5 * left[0]
 
 
 def test_more_sensors_never_cost_accuracy():
     m = filter.disturbed(filter.with_air(thermal()))
-    choice = filter.choose_sensors(m, np.array([1e-2, 1e-9, 1e-5, 1e-12]), 0.01, np.array([0.5, 1.0, -0.7]), 3)
+    choice = filter.choose_sensors(
+        m, np.array([1e-2, 1e-9, 1e-5, 1e-12]), 0.01, np.array([0.5, 1.0, -0.7]), 3
+    )
     assert [len(s) for s, _ in choice] == [1, 2, 3]
     errors = [e for _, e in choice]
     assert errors[0] >= errors[1] >= errors[2] > 0
@@ -183,11 +207,14 @@ def test_margins_predict_where_the_loop_becomes_unstable():
         ts, kp, ti, td = 0.001, g.kp * factor, g.ti_s, g.td_s
         e, v, y = np.zeros(n + 2), np.zeros(n), np.zeros(n)
         for k in range(n):
-            past = v[max(0, k - 399):k][::-1]
-            y[k] = past @ impulse[:len(past)]
+            past = v[max(0, k - 399) : k][::-1]
+            y[k] = past @ impulse[: len(past)]
             e[k] = 1 - y[k]
-            v[k] = (v[k - 1] if k else 0) + kp * ((1 + ts / ti + td / ts) * e[k] - (1 + 2 * td / ts) * (e[k - 1] if k else 0)
-                                                   + td / ts * (e[k - 2] if k > 1 else 0))
+            v[k] = (v[k - 1] if k else 0) + kp * (
+                (1 + ts / ti + td / ts) * e[k]
+                - (1 + 2 * td / ts) * (e[k - 1] if k else 0)
+                + td / ts * (e[k - 2] if k > 1 else 0)
+            )
             if abs(y[k]) > 1e6:
                 return True
         return np.abs(y[-500:] - 1).max() > 0.5
@@ -202,7 +229,9 @@ def test_robust_tuning_has_the_margins_and_the_relay_finds_the_limit():
     t = np.arange(0, 1, 0.001)
     w = 2 * np.pi / 0.02
     r = tuning.relay(t, 5 * np.sin(w * t), 0.1)
-    assert r.ti_s == pytest.approx(0.01, rel=0.01) and r.kp == pytest.approx(0.6 * 4 * 0.1 / (np.pi * 5), rel=0.02)
+    assert r.ti_s == pytest.approx(0.01, rel=0.01) and r.kp == pytest.approx(
+        0.6 * 4 * 0.1 / (np.pi * 5), rel=0.02
+    )
     with pytest.raises(InputError, match="oscillations"):
         tuning.relay(t, t, 0.1)
 
@@ -218,7 +247,9 @@ def test_a_proposal_changes_only_the_three_lines(tmp_path):
     text = "rig: {name: a}\ncontrol:            # gains\n  kp: 0.01          # um\n  ti_s: 4 ms\n  td_s: 0.001\n  moving_average: 4\nloop:\n  kp: 7\n"
     path.write_text(text)
     tuning.write(path, tuning.Gains(0.02, 0.005, 0.002, "test"))
-    assert path.read_text() == text.replace("kp: 0.01 ", "kp: 0.02 ").replace("ti_s: 4 ms", "ti_s: 0.005").replace("td_s: 0.001", "td_s: 0.002")
+    assert path.read_text() == text.replace("kp: 0.01 ", "kp: 0.02 ").replace(
+        "ti_s: 4 ms", "ti_s: 0.005"
+    ).replace("td_s: 0.001", "td_s: 0.002")
     path.write_text("control: {kp: 1}\n")
     with pytest.raises(InputError):
         tuning.write(path, tuning.Gains(0.02, 0.005, 0.002, "test"))
@@ -232,9 +263,14 @@ def test_calibration_round_trip_and_roll_back(tmp_path):
     two = modelfile.install(tmp_path / "m", zero_model(0.002), "bench")
     c = modelfile.load_calibration(one, "bench")
     assert c.fingerprints == {"r.csv": modelfile.fingerprint(recording)} and c.figures == {"rms_um": 0.1}
-    assert all(np.array_equal(getattr(c.model, k), getattr(zero_model(), k)) for k in ("A_minus_I", "B", "C", "gain", "b1"))
+    assert all(
+        np.array_equal(getattr(c.model, k), getattr(zero_model(), k))
+        for k in ("A_minus_I", "B", "C", "gain", "b1")
+    )
     assert modelfile.load_model(tmp_path / "m").period_s == 0.002 and modelfile.current(tmp_path / "m") == two
-    assert modelfile.roll_back(tmp_path / "m") == one and modelfile.load_model(tmp_path / "m").period_s == 0.001
+    assert (
+        modelfile.roll_back(tmp_path / "m") == one and modelfile.load_model(tmp_path / "m").period_s == 0.001
+    )
     with pytest.raises(InputError, match="oldest"):
         modelfile.roll_back(tmp_path / "m")
     with pytest.raises(InputError, match="never overwritten"):
@@ -261,8 +297,20 @@ def compensator(gain):
     b = np.zeros(12)
     b[:2] = gain
     f = np.exp(-1 / 120)
-    return CompensatorModel("kalman", 0.001, -np.eye(2) * 1e-6, np.zeros((2, 2)), np.zeros((12, 2)), np.zeros(2), 0.0, 1.0, f, np.zeros(12),
-                            (1 - f) * b, 1.0)
+    return CompensatorModel(
+        "kalman",
+        0.001,
+        -np.eye(2) * 1e-6,
+        np.zeros((2, 2)),
+        np.zeros((12, 2)),
+        np.zeros(2),
+        0.0,
+        1.0,
+        f,
+        np.zeros(12),
+        (1 - f) * b,
+        1.0,
+    )
 
 
 def test_online_tuning_waits_for_excitation_and_is_clipped():

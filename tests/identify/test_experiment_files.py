@@ -1,4 +1,5 @@
 """Experiment files that list inputs: read, refused, run."""
+
 import numpy as np
 import pytest
 
@@ -37,18 +38,36 @@ def test_inputs_follow_straight_lines_between_their_corners(folder):
     (x,) = load_inputs(folder / "next.yaml").values()
     t, columns = x.columns()
     assert t[-1] == x.duration_s == 600 and len(t) == 121
-    assert columns["heat"] == pytest.approx(np.interp(t, [0, 10, 300, 310, 600], [0, 8, 8, 0, 0])) and np.all(columns["air"] == 22)
+    assert columns["heat"] == pytest.approx(np.interp(t, [0, 10, 300, 310, 600], [0, 8, 8, 0, 0])) and np.all(
+        columns["air"] == 22
+    )
 
 
 def test_a_plant_file_in_the_rigs_place_gives_a_recording(folder):
     out = folder / "r.csv"
-    assert main(["experiment", str(folder / "next.yaml"), "--plant", str(folder / "plant.yaml"), "--out", str(out)]) == 0
+    assert (
+        main(
+            [
+                "experiment",
+                str(folder / "next.yaml"),
+                "--plant",
+                str(folder / "plant.yaml"),
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     made = read_table(out)
     assert set(made.columns) == {"heat", "air", "T_block"} and len(made.t) == 121
-    k = np.arange(3, 60)                # 8 W into 40 J/K that lose 0.25 W/K, closed form; each sample's power is held to the next
-    rise = 8 / 0.25 * (1 - np.exp(-(made.t[k] - 10) * 0.25 / 40)) + 4 / 0.25 * (1 - np.exp(-5 * 0.25 / 40)) * np.exp(-(made.t[k] - 10) * 0.25 / 40)
+    k = np.arange(
+        3, 60
+    )  # 8 W into 40 J/K that lose 0.25 W/K, closed form; each sample's power is held to the next
+    rise = 8 / 0.25 * (1 - np.exp(-(made.t[k] - 10) * 0.25 / 40)) + 4 / 0.25 * (
+        1 - np.exp(-5 * 0.25 / 40)
+    ) * np.exp(-(made.t[k] - 10) * 0.25 / 40)
     error = made.columns["T_block"][k] - 22 - rise
-    assert np.sqrt(np.mean(error ** 2)) == pytest.approx(0.05, rel=0.35)
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(0.05, rel=0.35)
     assert made.columns["T_block"] * 100 == pytest.approx(np.round(made.columns["T_block"] * 100), abs=1e-6)
 
 
@@ -61,19 +80,26 @@ def test_the_daemon_is_not_asked_for_inputs_that_it_does_not_command(folder, cap
 def test_a_setpoint_among_inputs_is_a_schedule(folder):
     (folder / "s.yaml").write_text(GOOD.replace("heat: {unit: W, ", "setpoint_um: {"))
     schedule = load_experiments(folder / "s.yaml")["next_experiment"]
-    assert schedule.commands() == [(0.0, "setpoint", 8.0), (300.0, "setpoint", 0.0)] and schedule.duration_s == 600
+    assert (
+        schedule.commands() == [(0.0, "setpoint", 8.0), (300.0, "setpoint", 0.0)]
+        and schedule.duration_s == 600
+    )
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    (("[10, 8], [300, 8]", "[300, 8], [10, 8]"), "must begin at 0 and increase"),
-    (("[[0, 0], [10", "[[1, 0], [10"), "must begin at 0"),
-    (("[10, 8],", "[10, hot],"), "a number from"),
-    (("corners: [[0, 0], [10, 8], [300, 8], [310, 0], [600, 0]]", "corners: 5"), "two or more corners"),
-    (("sample_s: 5", "sample_s: -5"), "a number from"),
-    (("    title: Warm-up and cool-down\n", ""), "'title' is missing"),
-    (("    inputs:\n", "    inptus:\n"), "is not known"),
-    (("      heat:", "      other: {corners: [[0, 0], [9, 1]]}\n      heat:"), "end at the same time"),
-    (("/1", "/2"), "was expected")])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("[10, 8], [300, 8]", "[300, 8], [10, 8]"), "must begin at 0 and increase"),
+        (("[[0, 0], [10", "[[1, 0], [10"), "must begin at 0"),
+        (("[10, 8],", "[10, hot],"), "a number from"),
+        (("corners: [[0, 0], [10, 8], [300, 8], [310, 0], [600, 0]]", "corners: 5"), "two or more corners"),
+        (("sample_s: 5", "sample_s: -5"), "a number from"),
+        (("    title: Warm-up and cool-down\n", ""), "'title' is missing"),
+        (("    inputs:\n", "    inptus:\n"), "is not known"),
+        (("      heat:", "      other: {corners: [[0, 0], [9, 1]]}\n      heat:"), "end at the same time"),
+        (("/1", "/2"), "was expected"),
+    ],
+)
 def test_a_wrong_file_gives_one_error_with_its_line(folder, capsys, change, words):
     text = GOOD.replace(*change)
     assert text != GOOD
@@ -83,13 +109,19 @@ def test_a_wrong_file_gives_one_error_with_its_line(folder, capsys, change, word
     assert "bad.yaml:" in str(e.value)
 
 
-def test_on_the_simulated_back_end_it_runs_under_the_daemons_protections(folder, capsys, monkeypatch, request):
+def test_on_the_simulated_back_end_it_runs_under_the_daemons_protections(
+    folder, capsys, monkeypatch, request
+):
     monkeypatch.chdir(request.config.rootpath)
-    text = GOOD.replace("[[0, 0], [10, 8], [300, 8], [310, 0], [600, 0]]", "[[0, 0], [2, 20], [6, 20]]").replace("heat: {unit: W, ", "setpoint_um: {")
+    text = GOOD.replace(
+        "[[0, 0], [10, 8], [300, 8], [310, 0], [600, 0]]", "[[0, 0], [2, 20], [6, 20]]"
+    ).replace("heat: {unit: W, ", "setpoint_um: {")
     (folder / "s.yaml").write_text(text.replace("sample_s: 5", "sample_s: 0.1"))
     record(folder / "s.yaml", folder / "r.csv", "config/simulated.yaml", None)
     made = read_table(folder / "r.csv")
-    assert made.columns["setpoint_um"][-1] == 20 and made.columns["position_um"][-1] == pytest.approx(20, abs=5)
+    assert made.columns["setpoint_um"][-1] == 20 and made.columns["position_um"][-1] == pytest.approx(
+        20, abs=5
+    )
     assert np.all(made.columns["fault_bits"] == 0) and made.columns["state"][-1] == 3
     (folder / "far.yaml").write_text(text.replace("sample_s: 5", "sample_s: 0.1").replace("20]", "90000]"))
     with pytest.raises(InputError, match="setpoints leave"):

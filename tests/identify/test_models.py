@@ -1,4 +1,5 @@
 """Thermal models: subspace, real poles, resampling, against closed forms and a simulator of known truth."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -41,7 +42,11 @@ def test_gram_is_the_hankel_matrix_squared_whatever_the_pieces(data):
     u, _, y = data
     u, y, i = u[:700], y[:700], 4
     z = np.hstack([u, y])
-    hankel = np.lib.stride_tricks.sliding_window_view(z, 2 * i, axis=0).transpose(0, 2, 1).reshape(700 - 2 * i + 1, -1)
+    hankel = (
+        np.lib.stride_tricks.sliding_window_view(z, 2 * i, axis=0)
+        .transpose(0, 2, 1)
+        .reshape(700 - 2 * i + 1, -1)
+    )
     whole = subspace.correlate((u, y), 1.0, i).gram
     cuts = [0, 3, 5, 40, 333, 700]
     pieces = subspace.correlate([(u[a:b], y[a:b]) for a, b in zip(cuts, cuts[1:], strict=False)], 1.0, i).gram
@@ -67,7 +72,10 @@ def test_the_papers_input_matrix_is_exact_without_noise_and_worse_with_it():
     u = pulses()
     y = truth().simulate(u)
     noisy = y + 0.05 * rng.standard_normal(y.shape)
-    error = {w: np.sqrt(np.mean((subspace.identify(u, noisy, 1.0, 6, 20, w).simulate(u) - y)**2)) for w in ("paper", "n4sid")}
+    error = {
+        w: np.sqrt(np.mean((subspace.identify(u, noisy, 1.0, 6, 20, w).simulate(u) - y) ** 2))
+        for w in ("paper", "n4sid")
+    }
     assert error["n4sid"] < 0.3 * error["paper"]
 
 
@@ -91,7 +99,13 @@ def test_slow_disturbances_bend_plain_least_squares_more():
     """Three tests of a rig whose outputs drift; the model runs free over a fourth: what is left varies less when the drift's colour is
     known, though only to a factor of three."""
     t = np.arange(7200)
-    inputs = [pulses(9000), *(5.0 * ((t % period < on) & (t < 3600)).astype(float)[:, None] for period, on in ((900, 400), (500, 200)))]
+    inputs = [
+        pulses(9000),
+        *(
+            5.0 * ((t % period < on) & (t < 3600)).astype(float)[:, None]
+            for period, on in ((900, 400), (500, 200))
+        ),
+    ]
     t = np.arange(9000)
     other = 4.0 * ((t % 75 < 35) & (t % 3600 < 2400)).astype(float)[:, None]
     wanted = truth().simulate(other)
@@ -110,7 +124,13 @@ def test_slow_disturbances_bend_plain_least_squares_more():
 def test_other_recordings_of_a_rig_help_where_one_is_short():
     """A hundred seconds of one record, with and without two other records of the rig: error of the free run that goes on."""
     rng = np.random.default_rng(5)
-    m = StateSpace(np.diag(np.exp(-1 / np.array([15.0, 200.0]))), np.array([[0.3], [0.05]]), np.array([[1.0, 1.0]]), 1.0, np.zeros(2))
+    m = StateSpace(
+        np.diag(np.exp(-1 / np.array([15.0, 200.0]))),
+        np.array([[0.3], [0.05]]),
+        np.array([[1.0, 1.0]]),
+        1.0,
+        np.zeros(2),
+    )
 
     def record(on, n=180):
         u = ((np.arange(n) % (2 * on)) < on).astype(float)[:, None]
@@ -122,7 +142,7 @@ def test_other_recordings_of_a_rig_help_where_one_is_short():
     for more in ((), others):
         found = modal.identify_validated(u[:100], read[:100], 1.0, others=more)
         x0 = found.x0 if found.info["rest"] else found.initial_state(u[:100], read[:100])
-        errors.append(np.sqrt(np.mean((found.simulate(u, x0)[100:] - y[100:])**2)))
+        errors.append(np.sqrt(np.mean((found.simulate(u, x0)[100:] - y[100:]) ** 2)))
     assert found.info["rest"] and errors[1] < 0.7 * errors[0]
 
 
@@ -156,7 +176,7 @@ def test_real_poles_beat_subspace_and_are_stable(data):
     m = modal.identify(modal.reduce((u, noisy), 1.0), 3)
     assert m.stable and np.isreal(m.poles).all()
     assert np.allclose(np.sort(m.time_constants_s), TAU, rtol=0.1)
-    assert np.sqrt(np.mean((m.simulate(u) - y)**2)) < 0.01
+    assert np.sqrt(np.mean((m.simulate(u) - y) ** 2)) < 0.01
 
 
 def test_blocks_lose_nothing_of_the_slow_dynamics():
@@ -174,15 +194,15 @@ def test_blocks_lose_nothing_of_the_slow_dynamics():
 def test_pieces_gaps_and_a_late_start(data):
     u, y, noisy = data
     whole = modal.reduce((u, noisy), 1.0)
-    pieces = modal.reduce(((u[k:k + 77], noisy[k:k + 77]) for k in range(0, len(u), 77)), 1.0)
+    pieces = modal.reduce(((u[k : k + 77], noisy[k : k + 77]) for k in range(0, len(u), 77)), 1.0)
     assert np.allclose(whole.u, pieces.u) and np.allclose(whole.y, pieces.y)
     holes = noisy.copy()
     holes[np.random.default_rng(0).random(holes.shape) < 0.4] = np.nan
     holes[2000:2300, 1] = np.nan
     m = modal.identify(modal.reduce((u, holes), 1.0), 3)
-    assert np.sqrt(np.mean((m.simulate(u) - y)**2)) < 0.03
+    assert np.sqrt(np.mean((m.simulate(u) - y) ** 2)) < 0.03
     late = modal.identify(modal.reduce((u[600:], noisy[600:]), 1.0), 3, rest=False)
-    assert np.sqrt(np.mean((late.simulate(u[600:], late.x0) - y[600:])**2)) < 0.02
+    assert np.sqrt(np.mean((late.simulate(u[600:], late.x0) - y[600:]) ** 2)) < 0.02
 
 
 def test_order_by_bic(data):
@@ -225,19 +245,25 @@ def test_prediction_error_refinement_lowers_the_prediction_error(data):
     u, y = modal.reduce((u, noisy), 1.0).u[:, :, 0] / np.sqrt(10), modal.reduce((u, noisy), 1.0).y
     start = modal.identify(modal.reduce((u, y), 10.0, 10.0), 3)
     gain = subspace.prediction_gain(start, u, y)
-    before = np.sum(subspace.innovations(start, u, y, gain)**2)
+    before = np.sum(subspace.innovations(start, u, y, gain) ** 2)
     m, gain = subspace.refine_prediction_error(start, u, y, 3)
-    assert m.stable and np.sum(subspace.innovations(m, u, y, gain)**2) <= before
+    assert m.stable and np.sum(subspace.innovations(m, u, y, gain) ** 2) <= before
 
 
-@pytest.mark.parametrize("work, message", [
-    (lambda u, y: subspace.identify(u[:50], y[:50], 1.0), "needs at least"),
-    (lambda u, y: subspace.identify(u, y, 1.0, weighting="cva2"), "cva2"),
-    (lambda u, y: subspace.identify(u, np.where(np.arange(len(u))[:, None] == 9, np.nan, y), 1.0), "sample 9 is missing"),
-    (lambda u, y: modal.reduce((u[:30], y[:30]), 1.0), "at least 20"),
-    (lambda u, y: modal.identify(modal.reduce((u, 0 * y + np.nan), 1.0), 3), "has no sample"),
-    (lambda u, y: subspace.identify(0 * u, 0 * y, 1.0), "singular"),
-])
+@pytest.mark.parametrize(
+    "work, message",
+    [
+        (lambda u, y: subspace.identify(u[:50], y[:50], 1.0), "needs at least"),
+        (lambda u, y: subspace.identify(u, y, 1.0, weighting="cva2"), "cva2"),
+        (
+            lambda u, y: subspace.identify(u, np.where(np.arange(len(u))[:, None] == 9, np.nan, y), 1.0),
+            "sample 9 is missing",
+        ),
+        (lambda u, y: modal.reduce((u[:30], y[:30]), 1.0), "at least 20"),
+        (lambda u, y: modal.identify(modal.reduce((u, 0 * y + np.nan), 1.0), 3), "has no sample"),
+        (lambda u, y: subspace.identify(0 * u, 0 * y, 1.0), "singular"),
+    ],
+)
 def test_bad_data_are_refused_in_one_line(data, work, message):
     with pytest.raises(InputError, match=message):
         work(data[0], data[2])
@@ -247,7 +273,9 @@ def test_agrees_with_slicot(data):
     """ctrlsys (SLICOT's IB01AD, IB01BD): the same singular values and poles for W1 = W2 = I."""
     ctrlsys = pytest.importorskip("ctrlsys")
     u, _, noisy = data
-    out = ctrlsys.ib01ad("N", "F", "N", "O", "N", "N", 10, 1, 4, np.asfortranarray(u), np.asfortranarray(noisy), 0.0, -1.0)
+    out = ctrlsys.ib01ad(
+        "N", "F", "N", "O", "N", "N", 10, 1, 4, np.asfortranarray(u), np.asfortranarray(noisy), 0.0, -1.0
+    )
     a = np.asarray(ctrlsys.ib01bd("N", "A", "N", 10, 3, 1, 4, len(u), out[1], 0.0)[0])
     ours, _ = subspace.shift(subspace.project(subspace.correlate((u, noisy), 1.0, 10), "n4sid"), 3)
     assert np.allclose(np.sort(np.linalg.eigvals(a).real), np.sort(np.linalg.eigvals(ours).real), atol=2e-3)

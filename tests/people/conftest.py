@@ -1,4 +1,5 @@
 """A configuration of its own for each test, and a rig that runs on it."""
+
 import tempfile
 from pathlib import Path
 
@@ -14,8 +15,12 @@ ROOT = Path(__file__).resolve().parents[2]
 def settings():
     with tempfile.TemporaryDirectory(prefix="thermoctl") as folder:
         text = (ROOT / "config/simulated.yaml").read_text()
-        for old, new in (("plants/", f"{ROOT}/config/plants/"), ("models/", f"{ROOT}/config/models/"), ("../run/", f"{folder}/"),
-                         ("../recordings", f"{folder}/rec")):
+        for old, new in (
+            ("plants/", f"{ROOT}/config/plants/"),
+            ("models/", f"{ROOT}/config/models/"),
+            ("../run/", f"{folder}/"),
+            ("../recordings", f"{folder}/rec"),
+        ):
             text = text.replace(old, new)
         path = Path(folder) / "rig.yaml"
         path.write_text(text)
@@ -25,6 +30,7 @@ def settings():
 @pytest.fixture
 def running(settings):
     from running import Running  # the daemon's rooms are loaded where they are used
+
     r = Running(settings)
     yield r
     r.close()

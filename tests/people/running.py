@@ -1,4 +1,5 @@
 """A simulated rig that ticks into a daemon's shared memory, in this process, with the daemon's command socket."""
+
 import threading
 import time
 from pathlib import Path
@@ -42,15 +43,31 @@ class Running:
         backend = make_backend(settings)
         backend.open()
         self.backend = Spoilt(backend)
-        self.rig = Rig(self.backend, compensator(settings), law_parameters(settings), settings.loop.period_s,
-                       self._publish, self.shared.mailbox, self.shared.parameters, self.shared.state)
+        self.rig = Rig(
+            self.backend,
+            compensator(settings),
+            law_parameters(settings),
+            settings.loop.period_s,
+            self._publish,
+            self.shared.mailbox,
+            self.shared.parameters,
+            self.shared.state,
+        )
         self.rig.wall_s = lambda: self.base_s + self.now_s
         self.base_s, self.now_s, self.record = time.time(), 0.0, None
         self.lateness = np.random.default_rng(1)
         self.lock, self.stopping = threading.Lock(), threading.Event()
-        self.threads = [threading.Thread(target=serve, daemon=True, args=(
-            listen(Path(settings.socket.path), None), Commands(self.shared, settings, None, lambda *a, **k: None),
-            self.stopping.is_set))]
+        self.threads = [
+            threading.Thread(
+                target=serve,
+                daemon=True,
+                args=(
+                    listen(Path(settings.socket.path), None),
+                    Commands(self.shared, settings, None, lambda *a, **k: None),
+                    self.stopping.is_set,
+                ),
+            )
+        ]
 
     def _publish(self, row):
         self.shared.ring.write(row)
@@ -69,9 +86,11 @@ class Running:
 
     def run(self, ticks=20, pause_s=0.02):
         """From now on, tick beside the test."""
+
         def pace():
             while not self.stopping.wait(pause_s):
                 self.tick(ticks)
+
         self.threads.append(threading.Thread(target=pace, daemon=True))
         for thread in self.threads:
             thread.start()

@@ -1,4 +1,5 @@
 """The calibration wizard: the whole way on the simulated rig with shortened tests, and a test by the socket of a daemon."""
+
 import os
 import re
 import signal
@@ -34,7 +35,7 @@ experiments:
 """
 
 
-@pytest.mark.slow       # 14 minutes of rig time: make test-wizard
+@pytest.mark.slow  # 14 minutes of rig time: make test-wizard
 def test_from_doctor_to_proof_with_an_end_in_between(settings, capsys, monkeypatch):
     config = Path(settings.path)
     folder, before = config.parent, config.read_bytes()
@@ -43,8 +44,14 @@ def test_from_doctor_to_proof_with_an_end_in_between(settings, capsys, monkeypat
 
     # Ended by a signal in test 2.
     with (folder / "err").open("wb") as err:
-        process = subprocess.Popen([sys.executable, "-m", "thermoctl.cli", *command], cwd=folder, stderr=err, stdin=subprocess.DEVNULL,
-                                   stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "thermoctl.cli", *command],
+            cwd=folder,
+            stderr=err,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
     said = ""
     for line in process.stdout:
         said += line
@@ -62,9 +69,16 @@ def test_from_doctor_to_proof_with_an_end_in_between(settings, capsys, monkeypat
     monkeypatch.chdir(folder)
     assert cli.main(command) == 0
     said = capsys.readouterr().out
-    assert re.search(r"test_1: done before", said) and "test_2: done before" not in said and "nothing was changed" in said
+    assert (
+        re.search(r"test_1: done before", said)
+        and "test_2: done before" not in said
+        and "nothing was changed" in said
+    )
     assert not (folder / "models").exists() and config.read_bytes() == before
-    assert len(read_table(out / "test_2.parquet")) == pytest.approx(2400, abs=2) and not (out / "test_2.part.parquet").exists()
+    assert (
+        len(read_table(out / "test_2.parquet")) == pytest.approx(2400, abs=2)
+        and not (out / "test_2.part.parquet").exists()
+    )
     report = (out / "report.html").read_text()
     if PICTURES and find():
         browser = Browser(find(), folder / "browser", 1100, 900)
@@ -72,7 +86,9 @@ def test_from_doctor_to_proof_with_an_end_in_between(settings, capsys, monkeypat
         browser.until("document.readyState === 'complete'")
         browser.keep("report-calibration", height=1250)
         browser.close()
-    assert "Proof: before and after" in report and report.count("<svg") >= 3 and "without compensation" in report
+    assert (
+        "Proof: before and after" in report and report.count("<svg") >= 3 and "without compensation" in report
+    )
 
     # Only now: accepted.
     assert cli.main([*command, "--accept", "--gains"]) == 0
@@ -88,8 +104,10 @@ def test_from_doctor_to_proof_with_an_end_in_between(settings, capsys, monkeypat
 
 def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, monkeypatch):
     """The heat does not wait: what happened in between comes from the daemon's own recording, or the test begins anew."""
-    (tmp_path / "experiments.yaml").write_text("format: thermoctl-experiments/1\nrate_um_s: 16.6667\nexperiments:\n"
-                                               "  short: {title: A short one, parts: [{hold: [[0.3, 0], [1.5, 5]]}]}\n")
+    (tmp_path / "experiments.yaml").write_text(
+        "format: thermoctl-experiments/1\nrate_um_s: 16.6667\nexperiments:\n"
+        "  short: {title: A short one, parts: [{hold: [[0.3, 0], [1.5, 5]]}]}\n"
+    )
     schedule = load_experiments(tmp_path / "experiments.yaml")["short"]
     recorded = []
     running.rig.wall_s = time.time
@@ -100,6 +118,7 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
 
     def end_late(p):
         control.ended = p.done_s > 0.8
+
     with pytest.raises(Aborted, match="on request") as ended:
         for block in rig.run(schedule, None, 0.0, end_late, control):
             rows.append(block)
@@ -109,13 +128,17 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
         m.setattr(calibrate, "GAP_S", 0.0)
         assert rig.meanwhile(part) is None, "nothing was recorded since, and now is later"
     Path(settings.recording.directory).mkdir()
-    monkeypatch.setattr(calibrate, "GAP_S", 60.0)      # this machine may be slow to write
+    monkeypatch.setattr(calibrate, "GAP_S", 60.0)  # this machine may be slow to write
     with running.lock:
-        writer = RecordingWriter(settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: recorded[0][INDEX["wall_s"]])
+        writer = RecordingWriter(
+            settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: recorded[0][INDEX["wall_s"]]
+        )
         writer.write(np.array(recorded))
         writer.close()
         whole = rig.meanwhile(part)
-    assert whole is not None and len(whole) >= len(part) and np.diff(whole.t).max() < 0.5, "ten rows a second of rig time"
+    assert whole is not None and len(whole) >= len(part) and np.diff(whole.t).max() < 0.5, (
+        "ten rows a second of rig time"
+    )
     control.ended = False
     rows = np.vstack(list(rig.run(schedule, whole, 0.8, lambda p: None, control)))
     assert (np.diff(rows[:, INDEX["t_s"]]) > 0).all() and np.nanmax(rows[:, INDEX["setpoint_um"]]) == 5.0
@@ -124,12 +147,16 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
 
 def test_a_rig_is_at_rest_when_its_points_are_alike_or_none_moves():
     alike, warm, offsets = np.full(12, 22.0), np.linspace(22, 27, 12), np.linspace(21, 23, 12)
-    assert calibrate.at_rest([(0.0, alike + np.linspace(0, 0.25, 12))]) and not calibrate.at_rest([(0.0, warm)])
+    assert calibrate.at_rest([(0.0, alike + np.linspace(0, 0.25, 12))]) and not calibrate.at_rest(
+        [(0.0, warm)]
+    )
     cooling = [(60.0 * k, alike + 5.0 * np.exp(-k / 15) * np.linspace(0, 1, 12)) for k in range(40)]
-    rested = [calibrate.at_rest(cooling[:k + 1]) for k in range(40)]
+    rested = [calibrate.at_rest(cooling[: k + 1]) for k in range(40)]
     assert not any(rested[:30]) and rested[-1], "5 K with a time constant of a quarter of an hour"
     steady = [(60.0 * k, offsets) for k in range(12)]
-    assert not calibrate.at_rest(steady[:9]) and calibrate.at_rest(steady), "thermocouples that differ, all still"
+    assert not calibrate.at_rest(steady[:9]) and calibrate.at_rest(steady), (
+        "thermocouples that differ, all still"
+    )
     missing = np.where(np.arange(12) == 3, np.nan, alike)
     assert calibrate.at_rest([(0.0, missing)])
 
@@ -139,8 +166,13 @@ def test_a_rig_that_cannot_be_calibrated_is_told_so(settings, capsys):
     (config.parent / "experiments.yaml").write_text(SHORT)
     text = config.read_text()
     out = ["--out", str(config.parent / "cal")]
-    config.write_text(text.replace("backend: simulated", f"backend: devices\n  devices: [{{name: encoder, port: /dev/null, "
-                                   f"profile: {ROOT}/config/devices/encoder-serial.yaml, roles: {{position: position_um}}}}]"))
+    config.write_text(
+        text.replace(
+            "backend: simulated",
+            f"backend: devices\n  devices: [{{name: encoder, port: /dev/null, "
+            f"profile: {ROOT}/config/devices/encoder-serial.yaml, roles: {{position: position_um}}}}]",
+        )
+    )
     assert cli.main(["calibrate", "--config", str(config), *out]) == 2
     assert "no daemon answers" in capsys.readouterr().err
     config.write_text(text)

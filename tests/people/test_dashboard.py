@@ -1,4 +1,5 @@
 """Dashboard, metrics and monitor on a simulated rig that ticks into a daemon's shared memory, in this process."""
+
 import contextlib
 import http.client
 import io
@@ -28,7 +29,7 @@ from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 20.0
-HEATING_S = 240.0                                         # of rig time before the page's test
+HEATING_S = 240.0  # of rig time before the page's test
 TOKEN = "a-token-of-tests-0123456789"
 
 
@@ -100,12 +101,20 @@ def seen_in_the_terminal(browser, running, settings):
     for _ in range(40):
         running.tick(100)
         monitor.remember(trails, status(running.shared))
-    latency = Commands(running.shared, settings, None, lambda *a, **k: None).answer(b'{"command": "latency"}', "")
+    latency = Commands(running.shared, settings, None, lambda *a, **k: None).answer(
+        b'{"command": "latency"}', ""
+    )
     console.print(monitor.screen(status(running.shared), latency, trails, 80))
     page = Path(settings.path).with_name("monitor.html")
-    page.write_text(console.export_html(theme=DIMMED_MONOKAI, code_format=(
-        '<!doctype html><meta charset="utf-8"><style>{stylesheet} body {{ margin: 0; padding: 14px; color: #d9d9d9; background: #191919; '
-        'font: 15px/1.25 "DejaVu Sans Mono", monospace }} pre {{ margin: 0; font: inherit }}</style><pre>{code}</pre>')))
+    page.write_text(
+        console.export_html(
+            theme=DIMMED_MONOKAI,
+            code_format=(
+                '<!doctype html><meta charset="utf-8"><style>{stylesheet} body {{ margin: 0; padding: 14px; color: #d9d9d9; background: #191919; '
+                'font: 15px/1.25 "DejaVu Sans Mono", monospace }} pre {{ margin: 0; font: inherit }}</style><pre>{code}</pre>'
+            ),
+        )
+    )
     browser.size(760, 300)
     browser.open(f"file://{page}")
     browser.until("document.readyState === 'complete' && document.body.textContent.includes('lateness')")
@@ -119,21 +128,25 @@ def choose_when_there(browser, select, value):
 
 
 def choose(browser, select, value):
-    browser.js(f"(s => {{ s.value = '{value}'; s.dispatchEvent(new Event('change')); }})(document.getElementById('{select}'))")
+    browser.js(
+        f"(s => {{ s.value = '{value}'; s.dispatchEvent(new Event('change')); }})(document.getElementById('{select}'))"
+    )
 
 
-@pytest.mark.slow       # its capture needs a machine that is not shared with the rest of the suite: make test-browser
+@pytest.mark.slow  # its capture needs a machine that is not shared with the rest of the suite: make test-browser
 def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
     """From a look at the armed rig to a pulled sensor: numbers, drawing, fault with remedy, capture, history, themes."""
     Path(settings.recording.directory).mkdir(exist_ok=True)
-    writer = RecordingWriter(settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: running.base_s)
+    writer = RecordingWriter(
+        settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: running.base_s
+    )
     waiting = []
     running.record = lambda row: waiting.append(row.copy())
     running.base_s -= HEATING_S + 60.0
-    recorded(settings, 23.5, running.base_s)           # and a day before
+    recorded(settings, 23.5, running.base_s)  # and a day before
     running.arm()
     running.send(3, 240.0)
-    while running.now_s < HEATING_S:                  # 2.9 W: the coil goes to 28 degC, the shaft grows by 10 um
+    while running.now_s < HEATING_S:  # 2.9 W: the coil goes to 28 degC, the shaft grows by 10 um
         running.tick(10000)
         writer.write(np.array(waiting))
         waiting.clear()
@@ -148,23 +161,38 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         browser.dark(False)
         browser.open(dashboard.url(server))
         browser.until("document.getElementById('state').textContent === 'ARMED'")
-        shown = browser.until("(t => t.startsWith('12.5') && t)(document.querySelector('[data-v=setpoint_um]').textContent)")
+        shown = browser.until(
+            "(t => t.startsWith('12.5') && t)(document.querySelector('[data-v=setpoint_um]').textContent)"
+        )
         assert shown == "12.500 µm"
         coil = status(running.shared)["temperatures_c"]["coil"]
-        assert abs(float(browser.until("(t => t !== '–' && t)(document.getElementById('m-coil').textContent)")) - coil) < 2.0
+        assert (
+            abs(
+                float(browser.until("(t => t !== '–' && t)(document.getElementById('m-coil').textContent)"))
+                - coil
+            )
+            < 2.0
+        )
         browser.until("/[0-9] µm/.test(document.getElementById('err-on').textContent)")
         assert browser.js("document.querySelectorAll('#labels .num').length") == 12
         assert browser.js("[...document.querySelectorAll('[data-p]')].every(p => p.style.fill)")
-        off, on = (float(browser.js(f"document.getElementById('err-{k}').textContent").replace("−", "-").split()[0]) for k in ("off", "on"))
+        off, on = (
+            float(browser.js(f"document.getElementById('err-{k}').textContent").replace("−", "-").split()[0])
+            for k in ("off", "on")
+        )
         assert abs(on) < 0.3 and off > 3.0, "what the compensation takes away, in um"
         assert "none" in browser.js("document.getElementById('fault-list').textContent")
         assert browser.js("document.getElementById('commands').hidden")
         browser.until("document.getElementById('n-late').textContent.includes('p99.9')")
         choose(browser, "span", "600")
-        browser.until("/ [1-9]\\d* points from [12] files? of 10 Hz/.test(document.getElementById('n-history').textContent)")
+        browser.until(
+            "/ [1-9]\\d* points from [12] files? of 10 Hz/.test(document.getElementById('n-history').textContent)"
+        )
         # Frames come as often as they are made, and the page keeps up.
         browser.until("points.length > 30")
-        assert browser.js("points[points.length - 1].t - points[0].t") > 30.0, "the last minute is there at once"
+        assert browser.js("points[points.length - 1].t - points[0].t") > 30.0, (
+            "the last minute is there at once"
+        )
         # Smooth at 50 Hz while a day of history is drawn, again and again: the page takes nearly every frame that is made.
         watch.rate_hz = 50.0
         browser.js("window.taken = 0; { const was = take; take = f => { window.taken++; was(f); }; }")
@@ -172,7 +200,9 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         for signal in ("air_c", "compensation_um", "air_c", "compensation_um"):
             choose(browser, "signal", signal)
             choose(browser, "span", "86400")
-            browser.until("/ [1-9]\\d{2,} points from 2 files of 10 Hz/.test(document.getElementById('n-history').textContent)")
+            browser.until(
+                "/ [1-9]\\d{2,} points from 2 files of 10 Hz/.test(document.getElementById('n-history').textContent)"
+            )
         browser.until("taken > 100")
         assert browser.js("taken") > 0.8 * (watch.number - made)
         watch.rate_hz = 20.0
@@ -202,7 +232,9 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         # A pulled sensor.
         running.backend.broken.add("coil_c")
         browser.until("document.getElementById('state').textContent === 'FAULT'")
-        fault = browser.until("(t => t.includes('coil error') && t)(document.getElementById('fault-list').textContent)")
+        fault = browser.until(
+            "(t => t.includes('coil error') && t)(document.getElementById('fault-list').textContent)"
+        )
         assert "→ look at `thermoctl status`" in fault
         assert browser.js("document.getElementById('faults').className") == "w12 alarm"
         assert browser.js("document.getElementById('fault-list').getAttribute('role')") == "alert"
@@ -230,13 +262,17 @@ def test_commands_from_the_page(settings, running, browser):
     running.run()
     with served(settings, commands=True) as (server, watch):
         browser.open(dashboard.url(server))
-        assert TOKEN not in browser.until("document.getElementById('state').textContent === 'READY' && location.href")
+        assert TOKEN not in browser.until(
+            "document.getElementById('state').textContent === 'READY' && location.href"
+        )
         browser.js("window.confirm = () => true; document.getElementById('arm').focus()")
         browser.key("Enter")
         browser.until("document.getElementById('state').textContent === 'ARMED'")
         browser.js("document.getElementById('setpoint').value = '900'; document.getElementById('go').click()")
         browser.until("document.getElementById('said').textContent.includes('setpoint_low_um')")
-        browser.js("document.getElementById('setpoint').value = '-3.5'; document.getElementById('go').click()")
+        browser.js(
+            "document.getElementById('setpoint').value = '-3.5'; document.getElementById('go').click()"
+        )
         browser.until("document.querySelector('[data-v=setpoint_um]').textContent === '−3.500 µm'")
         browser.js("document.getElementById('disarm').click()")
         browser.until("document.getElementById('state').textContent === 'READY'")
@@ -258,15 +294,21 @@ def test_who_may_look_and_command(settings, running):
         status, headers, page = fetch(server, "/")
         assert status == 200 and b"<title>thermoctl" in page
         policy = headers["Content-Security-Policy"]
-        assert "default-src 'none'" in policy and "unsafe" not in policy and headers["X-Content-Type-Options"] == "nosniff"
-        assert fetch(server, "/api/info")[0] == 200                       # loopback: everyone here may look
+        assert (
+            "default-src 'none'" in policy
+            and "unsafe" not in policy
+            and headers["X-Content-Type-Options"] == "nosniff"
+        )
+        assert fetch(server, "/api/info")[0] == 200  # loopback: everyone here may look
         assert fetch(server, "/api/command", "POST", body, Authorization=f"Bearer {TOKEN}", **kind)[0] == 405
         assert fetch(server, "/metrics")[0] == 404
         for method in ("PUT", "DELETE", "PATCH", "OPTIONS", "BREW"):
             assert fetch(server, "/", method)[0] == 405
     with served(settings, commands=True) as (server, watch):
+
         def post(**headers):
             return fetch(server, "/api/command", "POST", body, **{**kind, **headers})[0]
+
         assert post() == post(Authorization="Bearer wrong") == post(Authorization=TOKEN) == 401
         good = {"Authorization": f"Bearer {TOKEN}"}
         assert post(**good, Origin="http://evil.example") == post(**good, Sec_Fetch_Site="cross-site") == 403
@@ -275,7 +317,10 @@ def test_who_may_look_and_command(settings, running):
         assert running.rig.row[INDEX["state"]] == 2, "not one of them armed the rig"
         assert fetch(server, "/api/command", "POST", '{"command": "reload"}', **kind, **good)[0] == 400
         assert fetch(server, "/api/command", "POST", "[" * 1000, **kind, **good)[0] == 400
-        assert fetch(server, "/api/command", "POST", '{"command": "setpoint", "value": 1}', **kind, **good)[0] == 409
+        assert (
+            fetch(server, "/api/command", "POST", '{"command": "setpoint", "value": 1}', **kind, **good)[0]
+            == 409
+        )
         assert post(**good) == 200 and running.rig.row[INDEX["state"]] == 3
 
 
@@ -291,7 +336,9 @@ def test_beyond_this_machine_the_token_is_needed(settings, running):
             assert status == 401 and headers["WWW-Authenticate"] == "Bearer" and TOKEN.encode() not in body
             assert fetch(server, f"{path}?token={TOKEN}")[0] == 401, "never in an address"
         assert fetch(server, "/api/info", Authorization=f"Bearer {TOKEN}")[0] == 200
-        assert fetch(server, "/api/info", Authorization=f"Bearer {TOKEN}", Host=socket.gethostname())[0] == 200
+        assert (
+            fetch(server, "/api/info", Authorization=f"Bearer {TOKEN}", Host=socket.gethostname())[0] == 200
+        )
         assert fetch(server, "/api/info", Authorization=f"Bearer {TOKEN}", Host="rebound.example")[0] == 421
         assert f"#token={TOKEN}" in dashboard.url(server)
     finally:
@@ -304,30 +351,50 @@ def test_beyond_this_machine_the_token_is_needed(settings, running):
 def test_limits_of_a_request(settings, monkeypatch):
     monkeypatch.setattr(dashboard, "REQUEST_S", 0.3)
     with served(settings, follow=False, commands=True) as (server, watch):
+
         def code(data, **more):
             answer = raw(server, data, **more)
             return int(answer.split()[1]) if answer else None
+
         assert code(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * 20000 + b"\r\n\r\n") in (431, None)
         assert code(b"GET /" + b"a" * 9000) in (431, None)
-        assert code(b"GET / HTTP/1.1\r\nHost: localhost\r\n") == 408       # and then nothing more
+        assert code(b"GET / HTTP/1.1\r\nHost: localhost\r\n") == 408  # and then nothing more
         assert code(b"GET / HTTP/1.1\r\n\r\n") == 421
         assert code(b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n\r\n") == 421
         assert code(b"nonsense\r\n\r\n") == 400 and code(b"GET / HTTP/9.9\r\nHost: localhost\r\n\r\n") == 505
         assert code(b"", close=True) is None
-        head = (b"POST /api/command HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer " + TOKEN.encode()
-                + b"\r\nContent-Type: application/json\r\n")
+        head = (
+            b"POST /api/command HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer "
+            + TOKEN.encode()
+            + b"\r\nContent-Type: application/json\r\n"
+        )
         assert code(head + b"Content-Length: 2000\r\n\r\n") == 413
-        assert code(head + b"Content-Length: -1\r\n\r\n") == code(head + b"Transfer-Encoding: chunked\r\n\r\n") == 411
+        assert (
+            code(head + b"Content-Length: -1\r\n\r\n")
+            == code(head + b"Transfer-Encoding: chunked\r\n\r\n")
+            == 411
+        )
         assert code(head + b"Content-Length: 20\r\n\r\n{") == 408
-        for path in ("/api/history?signal=nothing", "/api/history?begin=x", "/api/history?points=1e9",
-                     "/api/history?points=0", "/api/history?begin=5&end=4", "/api/history?end=inf", "/api/capture?number=nan",
-                     "/api/history?" + "&".join(f"a{k}=1" for k in range(20)), "/api/history?signal=%ff"):
+        for path in (
+            "/api/history?signal=nothing",
+            "/api/history?begin=x",
+            "/api/history?points=1e9",
+            "/api/history?points=0",
+            "/api/history?begin=5&end=4",
+            "/api/history?end=inf",
+            "/api/capture?number=nan",
+            "/api/history?" + "&".join(f"a{k}=1" for k in range(20)),
+            "/api/history?signal=%ff",
+        ):
             status, _, body = fetch(server, path)
             assert status == 400 and json.loads(body)["error"], path
         assert fetch(server, "/api/capture?number=7")[0] == fetch(server, "/../../etc/passwd")[0] == 404
         # More connections than there are places: the last are closed at once, those that say nothing a little later.
         monkeypatch.setattr(dashboard, "REQUEST_S", 2.0)
-        crowd = [socket.create_connection(("127.0.0.1", server.server_address[1])) for _ in range(dashboard.MAX_CONNECTIONS + 8)]
+        crowd = [
+            socket.create_connection(("127.0.0.1", server.server_address[1]))
+            for _ in range(dashboard.MAX_CONNECTIONS + 8)
+        ]
         answers = [s.recv(12) for s in crowd]
         for s in crowd:
             s.close()
@@ -407,7 +474,11 @@ def test_a_fault_before_the_first_look_is_captured_whole_and_the_last_seconds_ar
     assert t[0] == pytest.approx(first - 2.0, abs=2e-3) and t[-1] == pytest.approx(first + 2.0, abs=2e-3)
     past = list(watch.past)
     seconds = past[-1]["wall_s"] - past[0]["wall_s"]
-    assert seconds > 4.0 and len(past) == pytest.approx(10 * seconds, rel=0.05) and {p["state"] for p in past} >= {"ARMED", "FAULT"}
+    assert (
+        seconds > 4.0
+        and len(past) == pytest.approx(10 * seconds, rel=0.05)
+        and {p["state"] for p in past} >= {"ARMED", "FAULT"}
+    )
     running.tick(500)
     watch.look()
     assert watch.past[-1]["wall_s"] - past[-1]["wall_s"] == pytest.approx(0.5, abs=0.1)
@@ -437,8 +508,10 @@ def recorded(settings, hours, wall_s, hertz=1.0):
     rows[:, INDEX["wall_s"]] = wall_s - hours * 3600 + rows[:, INDEX["t_s"]]
     rows[:, INDEX["compensation_um"]] = np.linspace(0.0, 10.0, n)
     rows[n // 2, INDEX["compensation_um"]] = 77.0
-    rows[n // 3:n // 3 + 900, INDEX["air_c"]] = np.nan
-    writer = RecordingWriter(settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: float(rows[0, INDEX["wall_s"]]))
+    rows[n // 3 : n // 3 + 900, INDEX["air_c"]] = np.nan
+    writer = RecordingWriter(
+        settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: float(rows[0, INDEX["wall_s"]])
+    )
     writer.write(rows)
     writer.close()
     return rows
@@ -451,11 +524,15 @@ def test_a_day_of_history_is_decimated_without_losing_a_spike(settings):
         os.utime(path, (end, end))
     found = history(settings.recording.directory, "compensation_um", end - 86400.0, end, 500)
     assert 400 <= len(found.t) <= 500 and found.source == "tier" and found.files == 1
-    assert found.high.max() == 77.0 and (found.low <= found.mean + 1e-12).all() and (found.mean <= found.high + 1e-12).all()
+    assert (
+        found.high.max() == 77.0
+        and (found.low <= found.mean + 1e-12).all()
+        and (found.mean <= found.high + 1e-12).all()
+    )
     assert (np.diff(found.t) > 0).all() and found.t[0] >= end - 86400.0 and found.t[-1] <= end
     edges = end - 86400.0 + np.arange(501) / 500 * 86400.0
     wall = rows[:, INDEX["wall_s"]]
-    for k in (0, 123, 250, 499):                       # against the rows themselves
+    for k in (0, 123, 250, 499):  # against the rows themselves
         inside = rows[(wall >= edges[k]) & (wall < edges[k + 1]), INDEX["compensation_um"]]
         assert found.mean[k] == pytest.approx(inside.mean(), rel=0.02, abs=0.02)
     zoom = history(settings.recording.directory, "compensation_um", end - 43210.0, end - 43190.0, 500)
@@ -477,13 +554,18 @@ def test_metrics_are_understood_by_prometheus(settings, running):
     row = running.rig.row
 
     def value(name, /, **labels):
-        found = [s.value for f in families.values() for s in f.samples if s.name == name and s.labels == labels]
+        found = [
+            s.value for f in families.values() for s in f.samples if s.name == name and s.labels == labels
+        ]
         assert len(found) == 1, (name, labels, found)
         return found[0]
 
     assert value("thermoctl_up") == 1.0 and value("thermoctl_state", state="ARMED") == 1.0
     assert value("thermoctl_compensated_um") == row[INDEX["compensated_um"]]
-    assert value("thermoctl_temperature_celsius", point="shaft_2", kind="estimated") == row[INDEX["shaft_2_est_c"]]
+    assert (
+        value("thermoctl_temperature_celsius", point="shaft_2", kind="estimated")
+        == row[INDEX["shaft_2_est_c"]]
+    )
     assert value("thermoctl_ticks_total") == row[INDEX["tick"]]
     assert value("thermoctl_lateness_seconds_count") == running.shared.areas["lateness"].sum()
     buckets = [s for s in families["thermoctl_lateness_seconds"].samples if s.name.endswith("_bucket")]
@@ -506,14 +588,21 @@ def test_metrics_are_understood_by_prometheus(settings, running):
     with served(settings, follow=True, with_metrics=True) as (server, watch):
         watch.wait(watch.number, LIMIT_S)
         status, headers, body = fetch(server, "/metrics")
-        assert status == 200 and headers["Content-Type"].startswith("text/plain; version=0.0.4") and b"thermoctl_up 1.0" in body
+        assert (
+            status == 200
+            and headers["Content-Type"].startswith("text/plain; version=0.0.4")
+            and b"thermoctl_up 1.0" in body
+        )
 
 
 # ---------------------------------------------------------------------------------------------------------- monitor
 def test_sparkline():
     assert monitor.sparkline([0, 1, 2, 3, 4, 5, 6, 7], 8) == "▁▂▃▄▅▆▇█"
     assert monitor.sparkline([5, 5, 5], 8) == "▅▅▅" and monitor.sparkline([], 8) == ""
-    assert monitor.sparkline([float("nan"), 1, 2], 2) == "▁█" and monitor.sparkline([float("nan")] * 3, 8) == "   "
+    assert (
+        monitor.sparkline([float("nan"), 1, 2], 2) == "▁█"
+        and monitor.sparkline([float("nan")] * 3, 8) == "   "
+    )
     assert monitor.sparkline(range(100), 4, monitor.ASCII) == "_-*@"
 
 
@@ -528,7 +617,9 @@ def test_the_monitor_on_a_recorded_status(settings, running):
     running.backend.broken.add("coil_c")
     running.tick(3)
     recorded_status = json.loads(json.dumps(status(running.shared)))
-    answer = Commands(running.shared, settings, None, lambda *a, **k: None).answer(b'{"command": "latency"}', "")
+    answer = Commands(running.shared, settings, None, lambda *a, **k: None).answer(
+        b'{"command": "latency"}', ""
+    )
     console = Console(file=io.StringIO(), width=80, record=True, force_terminal=True)
     console.print(monitor.screen(recorded_status, answer, trails, 80))
     text = console.export_text(clear=False)

@@ -1,4 +1,5 @@
 """Fleet: three rigs over five months, made by a plant: one well, one that drifts, one with a body more."""
+
 import json
 import math
 
@@ -46,8 +47,13 @@ def folder(tmp_path_factory):
             y = model.simulate(given, {"H": H}).y[:, 0] + 0.05 * random.standard_normal(len(t))
             if rig == "changed" and month == 4:
                 y += 1.5 * np.sin(t / 90.0)
-            columns = {**given.columns, "body_c": y, "wall_s": 1.8e9 + month * MONTH_S + t,
-                       "state": np.full(len(t), 3.0), "fault_bits": np.zeros(len(t))}
+            columns = {
+                **given.columns,
+                "body_c": y,
+                "wall_s": 1.8e9 + month * MONTH_S + t,
+                "state": np.full(len(t), 3.0),
+                "fault_bits": np.zeros(len(t)),
+            }
             write_table(root / "data" / rig / f"{month}.parquet", Table("x", "x", t, columns))
     return root
 
@@ -59,12 +65,19 @@ def test_what_is_said_of_three_rigs(folder, capsys):
     assert rigs["well"]["advice"] == []
     assert [s["misfit"] < 1.2 for s in rigs["well"]["summaries"]] == [True] * 5
     H = rigs["drifting"]["drifts"]["H"]
-    assert H["drifts"] and H["per_month"] == pytest.approx(-0.04, rel=0.1) and not rigs["drifting"]["drifts"]["C"]["drifts"]
+    assert (
+        H["drifts"]
+        and H["per_month"] == pytest.approx(-0.04, rel=0.1)
+        and not rigs["drifting"]["drifts"]["C"]["drifts"]
+    )
     said = " ".join(rigs["drifting"]["advice"])
     assert "H drifts by -0.0" in said and "identify again" in said
     said = " ".join(rigs["changed"]["advice"])
     assert "thermoctl diagnose" in said and "4.parquet" in said
-    assert main(["fleet", str(folder / "data"), "--plant", plant]) == 1 and "no longer fits" in capsys.readouterr().out
+    assert (
+        main(["fleet", str(folder / "data"), "--plant", plant]) == 1
+        and "no longer fits" in capsys.readouterr().out
+    )
 
 
 def test_files_that_are_bad_do_not_stop_the_others(folder, capsys, tmp_path):
@@ -76,7 +89,9 @@ def test_files_that_are_bad_do_not_stop_the_others(folder, capsys, tmp_path):
     assert "stands twice" in out and "67 %" in out
     for words in ([str(tmp_path / "none")], [str(folder / "data"), "--parameters", "H"]):
         assert main(["fleet", *words]) == 2
-    assert main(["fleet", str(folder / "data"), "--plant", str(folder / "plant.yaml"), "--parameters", "G"]) == 2
+    assert (
+        main(["fleet", str(folder / "data"), "--plant", str(folder / "plant.yaml"), "--parameters", "G"]) == 2
+    )
     assert "no parameter 'G' with a range" in capsys.readouterr().err
     lost = summarise(str(tmp_path / "none.csv"), None, ())
     assert lost.error and "none.csv" in judge([lost])[0].advice[0]
@@ -100,7 +115,7 @@ def test_an_object_store(folder, capsys):
     assert main(["fleet", "nonsense://x"]) == 2 and "nonsense" in capsys.readouterr().err
 
 
-@pytest.mark.slow       # Dask's processes take seconds to start: make test-fleet
+@pytest.mark.slow  # Dask's processes take seconds to start: make test-fleet
 def test_dask_gives_the_same(folder, capsys):
     plant = ["--plant", str(folder / "plant.yaml"), "--parameters", "C,H", "--json"]
     assert main(["fleet", f"file://{folder}/data", *plant, "--workers", "2"]) == 1
@@ -113,7 +128,9 @@ def test_drift_needs_evidence():
     times = [k * MONTH_S for k in range(4)]
     assert drift(times, [(1.0, 0.01), (0.9, 0.01), (0.8, 0.01), (0.7, 0.01)]).drifts
     assert drift(times, [(1.0, 0.01), (0.9, 0.01), (0.8, 0.01), (0.7, 0.01)]).per_month == pytest.approx(-0.1)
-    assert not drift(times, [(1.0, 0.5), (0.9, 0.5), (0.8, 0.5), (0.7, 0.5)]).drifts, "inside the estimates' errors"
+    assert not drift(times, [(1.0, 0.5), (0.9, 0.5), (0.8, 0.5), (0.7, 0.5)]).drifts, (
+        "inside the estimates' errors"
+    )
     assert not drift(times, [(1.0, 1e-4), (0.7, 1e-4), (1.1, 1e-4), (0.8, 1e-4)]).drifts, "scatter is no line"
     assert not drift(times[:2], [(1.0, 0.01), (0.5, 0.01)]).drifts
     assert math.isinf(drift([], []).sigma)

@@ -1,4 +1,5 @@
 """A recording that another program's own library wrote is diagnosed as the CSV is: the same plant, the same numbers."""
+
 import re
 from pathlib import Path
 
@@ -19,12 +20,16 @@ def write(path, t, columns):
     if path.suffix == ".parquet":
         pa.parquet.write_table(pa.table({"t": t, **columns}), path)
     elif path.suffix == ".mf4":
-        asammdf = pytest.importorskip("asammdf", reason="asammdf is not installed: pip install 'thermoctl[formats]'")
+        asammdf = pytest.importorskip(
+            "asammdf", reason="asammdf is not installed: pip install 'thermoctl[formats]'"
+        )
         with asammdf.MDF() as mdf:
             mdf.append([asammdf.Signal(v, t, name=n) for n, v in columns.items()])
             mdf.save(path)
     else:
-        nptdms = pytest.importorskip("nptdms", reason="npTDMS is not installed: pip install 'thermoctl[formats]'")
+        nptdms = pytest.importorskip(
+            "nptdms", reason="npTDMS is not installed: pip install 'thermoctl[formats]'"
+        )
         step = {"wf_increment": float(t[1] - t[0]), "wf_start_offset": float(t[0])}
         with nptdms.TdmsWriter(path) as writer:
             writer.write_segment([nptdms.ChannelObject("rig", n, v, step) for n, v in columns.items()])
@@ -47,5 +52,17 @@ def test_a_foreign_recording_is_held_against_the_plant_as_a_csv_is(suffix, tmp_p
     # and it is refused as a CSV is
     spoilt = {n: v for n, v in csv.columns.items() if n != "heat"}
     write(tmp_path / f"spoilt{suffix}", csv.t, spoilt)
-    assert main(["diagnose", "--plant", str(EXAMPLE / "plant.yaml"), str(tmp_path / f"spoilt{suffix}"), "--out", str(tmp_path / "out")]) == 2
+    assert (
+        main(
+            [
+                "diagnose",
+                "--plant",
+                str(EXAMPLE / "plant.yaml"),
+                str(tmp_path / f"spoilt{suffix}"),
+                "--out",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 2
+    )
     assert "no column 'heat'" in capsys.readouterr().err and not (tmp_path / "out").exists()

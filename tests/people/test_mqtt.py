@@ -1,4 +1,5 @@
 """MQTT on a real broker (Debian: apt-get install mosquitto)."""
+
 import json
 import os
 import queue
@@ -43,7 +44,9 @@ class Reader:
     """A client that collects what comes below thermoctl/."""
 
     def __init__(self, port):
-        client = pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed: pip install 'thermoctl[mqtt]'")
+        client = pytest.importorskip(
+            "paho.mqtt.client", reason="paho-mqtt is not installed: pip install 'thermoctl[mqtt]'"
+        )
         self.got = queue.Queue()
         self.client = client.Client(client.CallbackAPIVersion.VERSION2)
         self.client.on_message = lambda c, u, m: self.got.put((m.topic, m.payload.decode(), m.retain))
@@ -66,6 +69,7 @@ class Reader:
 
 def test_state_faults_and_availability(settings, running, broker):
     from thermoctl.daemon.mqtt import Bridge
+
     running.arm()
     running.run()
     reader = Reader(broker)
@@ -104,10 +108,16 @@ def test_state_faults_and_availability(settings, running, broker):
 
 
 def test_what_is_refused(settings, capsys):
-    pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed: pip install 'thermoctl[mqtt]'")
+    pytest.importorskip(
+        "paho.mqtt.client", reason="paho-mqtt is not installed: pip install 'thermoctl[mqtt]'"
+    )
     from thermoctl.daemon.mqtt import Bridge
-    for arguments, message in (({"broker": "host:port"}, "HOST:PORT"), ({"broker": ":1883"}, "HOST:PORT"),
-                               ({"broker": "localhost", "topic": "a/#"}, "topic")):
+
+    for arguments, message in (
+        ({"broker": "host:port"}, "HOST:PORT"),
+        ({"broker": ":1883"}, "HOST:PORT"),
+        ({"broker": "localhost", "topic": "a/#"}, "topic"),
+    ):
         with pytest.raises(InputError, match=message):
             Bridge(settings, **arguments)
     with socket.socket() as s:

@@ -3,6 +3,7 @@
 Prints one line `RESULT {...}` for every scenario: name, ok, seconds or figures, and what went wrong. vcan0 is the kernel's
 virtual bus; can0 and can1 are two emulated Kvaser PCI cards (SJA1000 chips) on one emulated wire.
 """
+
 from __future__ import annotations
 
 import json
@@ -68,7 +69,7 @@ class DriveOn:
                     pass
                 for can_id, data in self.drive.tick(time.monotonic()):
                     send(s, can_id, data)
-            except OSError:                      # the interface is down: the wire is dead, the drive lives on
+            except OSError:  # the interface is down: the wire is dead, the drive lives on
                 self.drive.tick(time.monotonic())
                 if s is not None:
                     s.close()
@@ -96,9 +97,11 @@ class Loop:
             self.backend.write(self.drive_a, self.enable)
             if condition(sample):
                 return now - begin
-            assert now - begin < limit_s, f"not within {limit_s} s: status {sample.status[STATE]}, value " \
-                                          f"{sample.value[STATE]}, {self.backend.problem('amplifier_state')}"
-            time.sleep(0.001)                    # the pace of the loop
+            assert now - begin < limit_s, (
+                f"not within {limit_s} s: status {sample.status[STATE]}, value "
+                f"{sample.value[STATE]}, {self.backend.problem('amplifier_state')}"
+            )
+            time.sleep(0.001)  # the pace of the loop
 
 
 def ip(*arguments: str) -> None:
@@ -110,7 +113,10 @@ def filters_are_in_the_kernel() -> dict:
     port = open_can("socketcan:vcan0", (0x085, 0x185, 0x585, 0x705))
     assert isinstance(port, LibraryPort)
     listed = Path("/proc/net/can/rcvlist_sff").read_text() + Path("/proc/net/can/rcvlist_fil").read_text()
-    assert all(f" {i:x} " in listed.lower().replace("0000", " ") or f"{i:03x}" in listed.lower() for i in (0x185, 0x705)), listed
+    assert all(
+        f" {i:x} " in listed.lower().replace("0000", " ") or f"{i:03x}" in listed.lower()
+        for i in (0x185, 0x705)
+    ), listed
     other = raw_socket("vcan0")
     for k in range(2000):
         send(other, 0x300 + k % 64, b"noise")
@@ -144,7 +150,7 @@ def drives_over(channel: str, drive_channel: str) -> dict:
         problem = loop.backend.problem("amplifier_state")
         loop.until(lambda s: peer.drive.state != ENABLED and peer.drive.command == 0, 2.0)
         off_s = time.monotonic() - began
-        loop.enable, loop.drive_a = False, 0.0   # what the law does: FAULT drives nothing
+        loop.enable, loop.drive_a = False, 0.0  # what the law does: FAULT drives nothing
         ip(channel, "up")
         back_s = loop.until(lambda s: s.status[STATE] == OK and s.value[STATE] == AMP_DISABLED, 10.0)
         assert peer.drive.state == DISABLED and peer.drive.command == 0
@@ -156,7 +162,13 @@ def drives_over(channel: str, drive_channel: str) -> dict:
         loop.backend.close()
         peer.stop()
     assert peer.drive.state != ENABLED
-    return {"enabled_s": enabled_s, "down_noticed_s": lost_s, "amplifier_off_s": off_s, "back_after_up_s": back_s, "problem": problem}
+    return {
+        "enabled_s": enabled_s,
+        "down_noticed_s": lost_s,
+        "amplifier_off_s": off_s,
+        "back_after_up_s": back_s,
+        "problem": problem,
+    }
 
 
 def bus_off() -> dict:
@@ -203,6 +215,7 @@ def heartbeat_lost() -> dict:
 def a_missing_interface_is_one_line() -> dict:
     """An interface that is not there, and one that is down: an error that says what to do."""
     from hal.backend import HardwareError
+
     messages = []
     for channel in ("can7", "vcan1"):
         try:
@@ -223,12 +236,19 @@ def main() -> None:
     subprocess.run(["ip", "link", "add", "dev", "vcan0", "type", "vcan"], check=True)
     subprocess.run(["ip", "link", "add", "dev", "vcan1", "type", "vcan"], check=True)
     ip("vcan0", "up")
-    scenarios = [("kernel filters", filters_are_in_the_kernel, ()), ("drive on vcan, down and up", drives_over, ("vcan0", "vcan0")),
-                 ("bus-off", bus_off, ()), ("heartbeat lost", heartbeat_lost, ()),
-                 ("missing and down interfaces", a_missing_interface_is_one_line, ())]
+    scenarios = [
+        ("kernel filters", filters_are_in_the_kernel, ()),
+        ("drive on vcan, down and up", drives_over, ("vcan0", "vcan0")),
+        ("bus-off", bus_off, ()),
+        ("heartbeat lost", heartbeat_lost, ()),
+        ("missing and down interfaces", a_missing_interface_is_one_line, ()),
+    ]
     if Path("/sys/class/net/can1").exists():
         for card in ("can0", "can1"):
-            subprocess.run(["ip", "link", "set", card, "type", "can", "bitrate", "1000000", "restart-ms", "100"], check=True)
+            subprocess.run(
+                ["ip", "link", "set", card, "type", "can", "bitrate", "1000000", "restart-ms", "100"],
+                check=True,
+            )
             ip(card, "up")
         scenarios.append(("drive on the emulated card, down and up", drives_over, ("can0", "can1")))
     for name, scenario, arguments in scenarios:

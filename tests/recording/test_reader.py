@@ -1,4 +1,5 @@
 """Export, recover, list: read back with each format's own library."""
+
 import csv
 import json
 import os
@@ -46,7 +47,7 @@ def test_recover_gives_a_file_that_any_arrow_reader_opens(recording, tmp_path):
     with pa.ipc.open_stream(tmp_path / "mended.arrows") as f:
         arrow = f.read_all()
     assert mended.whole and mended.rows == arrow.num_rows == info(cut).rows > 0
-    np.testing.assert_array_equal(arrow["coil_c"].to_numpy(), rows[:arrow.num_rows, INDEX["coil_c"]])
+    np.testing.assert_array_equal(arrow["coil_c"].to_numpy(), rows[: arrow.num_rows, INDEX["coil_c"]])
     with pytest.raises(InputError, match="exists already"):
         recover(cut, tmp_path / "mended.arrows")
 
@@ -60,7 +61,9 @@ def test_an_export_reads_back_with_the_formats_own_library(recording, tmp_path, 
     if suffix == ".csv":
         with open(out, newline="") as f:
             cells = list(csv.DictReader(f))
-        got = tuple(np.array([float(c[n] or "nan") for c in cells]) for n in ("t_s", "coil_c", "output_reference_um"))
+        got = tuple(
+            np.array([float(c[n] or "nan") for c in cells]) for n in ("t_s", "coil_c", "output_reference_um")
+        )
     elif suffix == ".parquet":
         arrow = pa.parquet.read_table(out)
         got = tuple(arrow[n].to_numpy() for n in ("t_s", "coil_c", "output_reference_um"))
@@ -76,8 +79,11 @@ def test_an_export_reads_back_with_the_formats_own_library(recording, tmp_path, 
         with open(out, "rb") as f:
             messages = [(m.log_time, json.loads(m.data)) for _, _, m in mcap.make_reader(f).iter_messages()]
         assert messages[0][0] == round((1.7e9 + 0.1) * 1e9) and "output_reference_um" not in messages[0][1]
-        got = (np.array([m["t_s"] for _, m in messages]), np.array([m["coil_c"] for _, m in messages]),
-               np.full(800, np.nan))
+        got = (
+            np.array([m["t_s"] for _, m in messages]),
+            np.array([m["coil_c"] for _, m in messages]),
+            np.full(800, np.nan),
+        )
     for have, want in zip(got, (t, coil, np.full(800, np.nan)), strict=True):
         np.testing.assert_array_equal(have, want)
     if suffix != ".mcap":
@@ -90,12 +96,19 @@ def test_tdms_and_mdf_of_several_rates_are_read(tmp_path):
     nptdms, asammdf = pytest.importorskip("nptdms"), pytest.importorskip("asammdf")
     fast, slow = np.arange(10) * 0.1, np.arange(2) * 0.5
     with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:
-        writer.write_segment([
-            nptdms.ChannelObject("g", "x", fast + 1, {"wf_increment": 0.125, "wf_start_offset": 0.0}),
-            nptdms.ChannelObject("g", "y", slow + 7, {"wf_increment": 0.5})])
+        writer.write_segment(
+            [
+                nptdms.ChannelObject("g", "x", fast + 1, {"wf_increment": 0.125, "wf_start_offset": 0.0}),
+                nptdms.ChannelObject("g", "y", slow + 7, {"wf_increment": 0.5}),
+            ]
+        )
     table = read_table(tmp_path / "a.tdms")
     np.testing.assert_array_equal(table.columns["x"], fast + 1)
-    assert table.columns["y"][0] == 7.0 and table.columns["y"][4] == 7.5 and np.isnan(table.columns["y"]).sum() == 8
+    assert (
+        table.columns["y"][0] == 7.0
+        and table.columns["y"][4] == 7.5
+        and np.isnan(table.columns["y"]).sum() == 8
+    )
     with nptdms.TdmsWriter(tmp_path / "b.tdms") as writer:
         writer.write_segment([nptdms.ChannelObject("g", "x", fast)])
     with pytest.raises(InputError, match="'g/x' has no time"):

@@ -1,4 +1,5 @@
 """The recorder's files: whatever happens, what was acknowledged opens."""
+
 import errno
 import os
 import subprocess
@@ -28,22 +29,30 @@ def ticks(n, start=0):
     rows[:, INDEX["position_um"]] = number * 0.01
     rows[:, INDEX["coil_c"]] = RNG.normal(25, 0.1, n)
     rows[:, INDEX["output_reference_um"]] = np.nan
-    rows[:, -1] = RNG.normal(size=n)                                 # coil_age_s: the end of a batch
+    rows[:, -1] = RNG.normal(size=n)  # coil_age_s: the end of a batch
     rows[:, INDEX["fault_bits"]] = np.where(number == 1234, 4.0, 1.0)
     return rows
 
 
 def settings(directory, **changes):
-    return SimpleNamespace(**{"directory": str(directory), "file_mb": 512.0, "file_s": 3600.0, "budget_gb": 1.0,
-                              "tier_budget_gb": 1.0, **changes})
+    return SimpleNamespace(
+        **{
+            "directory": str(directory),
+            "file_mb": 512.0,
+            "file_s": 3600.0,
+            "budget_gb": 1.0,
+            "tier_budget_gb": 1.0,
+            **changes,
+        }
+    )
 
 
 def feed(writer, rows, piece=100):
-    return sum(writer.write(rows[i:i + piece]) for i in range(0, len(rows), piece))
+    return sum(writer.write(rows[i : i + piece]) for i in range(0, len(rows), piece))
 
 
 def only(directory, kind):
-    path, = recording_files(Path(directory), kind)
+    (path,) = recording_files(Path(directory), kind)
     return path
 
 
@@ -80,15 +89,19 @@ def test_the_tier_is_min_mean_and_max_of_each_tenth(tmp_path):
 def test_cut_at_any_byte_everything_before_opens(tmp_path):
     writer = RecordingWriter(settings(tmp_path), {"config": "x"})
     rows = ticks(3000)
-    ends = []                                                        # (bytes on disk, rows acknowledged)
+    ends = []  # (bytes on disk, rows acknowledged)
     for i in range(0, 3000, 500):
-        writer.write(rows[i:i + 500])
+        writer.write(rows[i : i + 500])
         writer.flush()
         ends.append((os.path.getsize(writer.path), i + 500))
     path = writer.path
     writer.close()
     data = path.read_bytes()
-    cuts = RNG.integers(0, len(data), 120).tolist() + [e + d for e, _ in ends for d in (-1, 0, 1)] + [0, 1, len(data)]
+    cuts = (
+        RNG.integers(0, len(data), 120).tolist()
+        + [e + d for e, _ in ends for d in (-1, 0, 1)]
+        + [0, 1, len(data)]
+    )
     for cut in cuts:
         copy = tmp_path / "cut.arrows"
         copy.write_bytes(data[:cut])
@@ -98,12 +111,14 @@ def test_cut_at_any_byte_everything_before_opens(tmp_path):
         else:
             with pytest.raises(InputError, match="cut.arrows"):
                 read_table(copy)
-        copy.write_bytes(data[:cut] + bytes(4096))                   # a file system that had reserved the block
-        if expected:                                                 # zeros are never taken for ticks
+        copy.write_bytes(data[:cut] + bytes(4096))  # a file system that had reserved the block
+        if expected:  # zeros are never taken for ticks
             table = read_table(copy)
             assert len(table) >= expected
-            np.testing.assert_array_equal(table.columns["tick"], rows[:len(table), INDEX["tick"]])
-            np.testing.assert_array_equal(table.columns["coil_age_s"], rows[:len(table), INDEX["coil_age_s"]])
+            np.testing.assert_array_equal(table.columns["tick"], rows[: len(table), INDEX["tick"]])
+            np.testing.assert_array_equal(
+                table.columns["coil_age_s"], rows[: len(table), INDEX["coil_age_s"]]
+            )
 
 
 CHILD = """
@@ -171,8 +186,9 @@ def test_a_full_disk_loses_rows_is_counted_and_comes_back(tmp_path, monkeypatch)
     before, real = writer.path, os.write
 
     def full(fd, data):
-        real(fd, bytes(data)[:50])                                   # half a batch fits, then it is full
+        real(fd, bytes(data)[:50])  # half a batch fits, then it is full
         raise OSError(errno.ENOSPC, "No space left on device")
+
     with monkeypatch.context() as patch:
         patch.setattr(writing.os, "write", full)
         lost = feed(writer, ticks(2004, 1002))

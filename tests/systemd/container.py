@@ -4,6 +4,7 @@ The rootfs is made once by mmdebstrap from Debian's packages and kept under buil
 `make qemu-test` boots). The checkout and the packages of its .venv are mounted read-only; the program itself runs on Debian's
 own python3 from /opt/thermoctl, as an installation would.
 """
+
 from __future__ import annotations
 
 import os
@@ -18,8 +19,10 @@ from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOTFS = ROOT / "build/systemd/rootfs"
-PACKAGES = ("systemd,systemd-sysv,udev,dbus,python3,python3-distutils,libpython3.11,kmod,iproute2,procps,can-utils,gcc,libc6-dev,"
-            "linux-image-amd64")
+PACKAGES = (
+    "systemd,systemd-sysv,udev,dbus,python3,python3-distutils,libpython3.11,kmod,iproute2,procps,can-utils,gcc,libc6-dev,"
+    "linux-image-amd64"
+)
 CHECKOUT = "/srv/thermoctl"
 PROGRAM = """#!/usr/bin/python3
 import sys
@@ -33,7 +36,11 @@ def missing() -> str:
     """Why the test cannot run here, or ''."""
     if os.geteuid() != 0:
         return "needs root"
-    for program, package in (("systemd-nspawn", "systemd-container"), ("mmdebstrap", "mmdebstrap"), ("nsenter", "util-linux")):
+    for program, package in (
+        ("systemd-nspawn", "systemd-container"),
+        ("mmdebstrap", "mmdebstrap"),
+        ("nsenter", "util-linux"),
+    ):
         if shutil.which(program) is None:
             return f"needs {program} (apt-get install {package})"
     if sys.version_info[:2] != (3, 11):
@@ -53,11 +60,15 @@ def make_rootfs() -> Path:
         ROOTFS.parent.mkdir(parents=True, exist_ok=True)
         part = ROOTFS.with_suffix(".part")
         shutil.rmtree(part, ignore_errors=True)
-        subprocess.run(["mmdebstrap", "--variant=minbase", f"--include={PACKAGES}", "bookworm", str(part)], check=True)
+        subprocess.run(
+            ["mmdebstrap", "--variant=minbase", f"--include={PACKAGES}", "bookworm", str(part)], check=True
+        )
         part.rename(ROOTFS)
     program = ROOTFS / "opt/thermoctl/bin/thermoctl"
     program.parent.mkdir(parents=True, exist_ok=True)
-    program.write_text(PROGRAM.format(checkout=CHECKOUT, version=f"{sys.version_info[0]}.{sys.version_info[1]}"))
+    program.write_text(
+        PROGRAM.format(checkout=CHECKOUT, version=f"{sys.version_info[0]}.{sys.version_info[1]}")
+    )
     program.chmod(0o755)
     (ROOTFS / CHECKOUT.lstrip("/")).mkdir(parents=True, exist_ok=True)
     return ROOTFS
@@ -73,17 +84,41 @@ class Container:
         for name in ("upper", "work", "root"):
             (work / name).mkdir()
         self.root = work / "root"
-        subprocess.run(["mount", "-t", "overlay", "overlay", "-o",
-                        f"lowerdir={make_rootfs()},upperdir={work}/upper,workdir={work}/work", str(self.root)], check=True)
+        subprocess.run(
+            [
+                "mount",
+                "-t",
+                "overlay",
+                "overlay",
+                "-o",
+                f"lowerdir={make_rootfs()},upperdir={work}/upper,workdir={work}/work",
+                str(self.root),
+            ],
+            check=True,
+        )
 
     def boot(self, limit_s: float = 90.0) -> float:
         """Boot it; returns the seconds until systemd says that it runs."""
         begin = time.monotonic()
-        log = open(self.work / "boot.log", "ab")      # noqa: SIM115 - nspawn writes to it as long as it lives
+        log = open(self.work / "boot.log", "ab")  # noqa: SIM115 - nspawn writes to it as long as it lives
         self.process = subprocess.Popen(
-            ["systemd-nspawn", "-q", "-D", str(self.root), "-b", "--register=no", "--keep-unit", "--private-network",
-             "--capability=CAP_IPC_LOCK,CAP_SYS_NICE", f"--bind-ro={ROOT}:{CHECKOUT}", "--console=pipe"],
-            stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            [
+                "systemd-nspawn",
+                "-q",
+                "-D",
+                str(self.root),
+                "-b",
+                "--register=no",
+                "--keep-unit",
+                "--private-network",
+                "--capability=CAP_IPC_LOCK,CAP_SYS_NICE",
+                f"--bind-ro={ROOT}:{CHECKOUT}",
+                "--console=pipe",
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+        )
         while time.monotonic() < begin + limit_s:
             if self.process.poll() is not None:
                 raise RuntimeError("systemd-nspawn ended: " + (self.work / "boot.log").read_text()[-2000:])
@@ -91,16 +126,26 @@ class Container:
             for pid in children:
                 if Path(f"/proc/{pid}/comm").read_text().strip() == "systemd":
                     self.pid = int(pid)
-            if self.pid and self.run("systemctl", "is-system-running", check=False).strip() in ("running", "degraded"):
+            if self.pid and self.run("systemctl", "is-system-running", check=False).strip() in (
+                "running",
+                "degraded",
+            ):
                 return time.monotonic() - begin
             time.sleep(0.05)
         raise RuntimeError("systemd did not come up: " + (self.work / "boot.log").read_text()[-2000:])
 
     def run(self, *command: str, check: bool = True) -> str:
         """A command inside; its output (stdout and stderr). Raises AssertionError when it fails and `check`."""
-        done = subprocess.run(["nsenter", "-t", str(self.pid), "-m", "-u", "-i", "-n", "-p", "-r", "-w", "--", *command],
-                              stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-        assert not check or done.returncode == 0, f"{' '.join(command)}: exit {done.returncode}: {done.stdout[-1500:]}"
+        done = subprocess.run(
+            ["nsenter", "-t", str(self.pid), "-m", "-u", "-i", "-n", "-p", "-r", "-w", "--", *command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        )
+        assert not check or done.returncode == 0, (
+            f"{' '.join(command)}: exit {done.returncode}: {done.stdout[-1500:]}"
+        )
         return done.stdout
 
     def thermoctl(self, *arguments: str, check: bool = True) -> str:

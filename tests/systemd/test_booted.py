@@ -4,6 +4,7 @@ amplifier told? (issue 7). Slow: `make systemd-test`.
 The amplifier's own record is the virtual rig's reference.csv (CLOCK_MONOTONIC, shared with the container): `enabled` is the
 drive's state, 100 rows a second. Every scenario's figures are printed in one table at the end.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -43,7 +44,7 @@ CapabilityBoundingSet=CAP_SYS_NICE CAP_IPC_LOCK
 AmbientCapabilities=CAP_SYS_NICE CAP_IPC_LOCK
 PrivateUsers=no
 """
-WATCHDOG_S = 0.2              # the amplifier's own: the limit where nobody is left to tell it anything
+WATCHDOG_S = 0.2  # the amplifier's own: the limit where nobody is left to tell it anything
 TABLE: list[tuple[str, str, str, str]] = []
 
 
@@ -53,8 +54,14 @@ class Booted(Container):
     def install(self) -> None:
         etc = self.root / "etc/thermoctl"
         shutil.copytree(ROOT / "config", etc)
-        text = (etc / "wire.yaml").read_text().replace("../run/wire.sock", "/run/thermoctl/rig.sock\n  group: thermoctl")
-        text = text.replace("../run/wire", "/run/wire").replace("../recordings", "/var/lib/thermoctl/recordings")
+        text = (
+            (etc / "wire.yaml")
+            .read_text()
+            .replace("../run/wire.sock", "/run/thermoctl/rig.sock\n  group: thermoctl")
+        )
+        text = text.replace("../run/wire", "/run/wire").replace(
+            "../recordings", "/var/lib/thermoctl/recordings"
+        )
         (etc / "rig.yaml").write_text(text)
         for path in (etc, *etc.rglob("*")):
             path.chmod(0o755 if path.is_dir() else 0o644)
@@ -63,7 +70,9 @@ class Booted(Container):
             drop_in = self.root / "etc/systemd/system/thermoctl.service.d/rights.conf"
             drop_in.parent.mkdir(parents=True)
             drop_in.write_text(DROP_IN)
-            TABLE.append(("(no CAP_SYS_RESOURCE here: a drop-in gives FIFO", "and locked", "memory;", "not tested:"))
+            TABLE.append(
+                ("(no CAP_SYS_RESOURCE here: a drop-in gives FIFO", "and locked", "memory;", "not tested:")
+            )
             TABLE.append((" LimitRTPRIO=, LimitMEMLOCK=, PrivateUsers=)", "", "", ""))
 
     def amplifier(self):
@@ -76,15 +85,22 @@ class Booted(Container):
         self.run("systemctl", "start", "virtual-rig.service")
         begin = time.monotonic()
         while not self.file("/run/wire/control.sock").exists():
-            assert time.monotonic() - begin < 90, self.run("systemctl", "status", "virtual-rig.service", check=False)
+            assert time.monotonic() - begin < 90, self.run(
+                "systemctl", "status", "virtual-rig.service", check=False
+            )
             time.sleep(0.05)
 
     def until(self, condition, limit_s: float, what: str):
         """Ask `thermoctl status` until condition(status)."""
         begin = time.monotonic()
         while not condition(s := self.status()):
-            assert time.monotonic() - begin < limit_s, (what, s.get("state"), s.get("faults"), self.journal()[-1500:])
-            time.sleep(0.05)                                          # how often we ask, not a wait
+            assert time.monotonic() - begin < limit_s, (
+                what,
+                s.get("state"),
+                s.get("faults"),
+                self.journal()[-1500:],
+            )
+            time.sleep(0.05)  # how often we ask, not a wait
         return s
 
     def ready(self, limit_s: float = 60.0):
@@ -92,7 +108,7 @@ class Booted(Container):
 
     def arm(self) -> None:
         """Arm and drive away from zero, so that there is something to switch off."""
-        if self.unit("ActiveState")[0] != "active":                  # after a test that failed
+        if self.unit("ActiveState")[0] != "active":  # after a test that failed
             self.run("systemctl", "reset-failed", "thermoctl.service", check=False)
             self.start_rig()
             self.run("systemctl", "start", "thermoctl.service")
@@ -114,8 +130,15 @@ class Booted(Container):
         children = self.run("ps", "-o", "pid=,rtprio=", "--ppid", str(main)).split("\n")
         loop = [int(c.split()[0]) for c in children if len(c.split()) == 2 and c.split()[1] == "80"]
         assert main > 1 and loop, children
-        return {"main": main, "loop": loop[0], **{f"child {c.split()[0]}": int(c.split()[0]) for c in children
-                                                  if c.split() and int(c.split()[0]) != loop[0]}}
+        return {
+            "main": main,
+            "loop": loop[0],
+            **{
+                f"child {c.split()[0]}": int(c.split()[0])
+                for c in children
+                if c.split() and int(c.split()[0]) != loop[0]
+            },
+        }
 
     def send(self, number: int, *pids: int) -> float:
         """Signal processes of the container from outside, so that no program's start counts; the time (monotonic s)."""
@@ -128,7 +151,7 @@ class Booted(Container):
         assert len(outside) == len(pids), (outside, pids)
         event = time.monotonic()
         for pid in outside.values():
-            with contextlib.suppress(ProcessLookupError):             # the first one's end has ended it already
+            with contextlib.suppress(ProcessLookupError):  # the first one's end has ended it already
                 os.kill(pid, number)
         return event
 
@@ -139,7 +162,9 @@ class Booted(Container):
         """Wait until systemd has started it again and it is READY; the seconds that took."""
         begin = time.monotonic()
         while int(self.unit("NRestarts")[0]) <= restarts or self.unit("ActiveState")[0] != "active":
-            assert time.monotonic() - begin < 60, self.unit("ActiveState", "Result", "NRestarts") + [self.journal()[-1500:]]
+            assert time.monotonic() - begin < 60, self.unit("ActiveState", "Result", "NRestarts") + [
+                self.journal()[-1500:]
+            ]
             time.sleep(0.05)
         seconds = time.monotonic() - begin
         self.ready()
@@ -149,21 +174,32 @@ class Booted(Container):
 def read_table_text(text: str, work):
     """reference.csv up to its last whole row."""
     path = work / "reference.csv"
-    path.write_text(text[:text.rfind("\n") + 1])
+    path.write_text(text[: text.rfind("\n") + 1])
     return read_table(path)
 
 
 def off_after(rig: Booted, event: float, limit_s: float, name: str, back_s: float | None = None) -> None:
     """The amplifier was off `limit_s` after `event` and was not driven again since; a row of the table."""
     t, enabled, drive = rig.amplifier()
-    assert enabled[t < event].any() and enabled[t < event][-1], "the amplifier was not driven before: the test shows nothing"
+    assert enabled[t < event].any() and enabled[t < event][-1], (
+        "the amplifier was not driven before: the test shows nothing"
+    )
     after = t >= event
     still_on = t[after][enabled[after]]
     took = float(still_on[-1] - event) + 0.01 if len(still_on) else 0.0
     late = after & (t > event + limit_s)
-    TABLE.append((name, f"{took * 1e3:.0f} ms", f"{limit_s * 1e3:.0f} ms", "-" if back_s is None else f"{back_s:.1f} s"))
+    TABLE.append(
+        (
+            name,
+            f"{took * 1e3:.0f} ms",
+            f"{limit_s * 1e3:.0f} ms",
+            "-" if back_s is None else f"{back_s:.1f} s",
+        )
+    )
     assert late.any(), "no row after the limit: the rig stands still"
-    assert not enabled[late].any() and not drive[late].any(), f"driven {took:.3f} s after {name}; limit {limit_s} s"
+    assert not enabled[late].any() and not drive[late].any(), (
+        f"driven {took:.3f} s after {name}; limit {limit_s} s"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -179,33 +215,53 @@ def rig(tmp_path_factory):
         yield booted
     finally:
         booted.remove()
-        print("\n".join(["", f"{'scenario':44}{'amplifier off after':>20}{'limit':>10}{'active again':>14}",
-                         *(f"{a:44}{b:>20}{c:>10}{d:>14}" for a, b, c, d in TABLE)]))
+        print(
+            "\n".join(
+                [
+                    "",
+                    f"{'scenario':44}{'amplifier off after':>20}{'limit':>10}{'active again':>14}",
+                    *(f"{a:44}{b:>20}{c:>10}{d:>14}" for a, b, c, d in TABLE),
+                ]
+            )
+        )
 
 
 def test_install_made_user_directories_and_rules(rig):
-    assert "thermoctl" in rig.run("getent", "passwd", "thermoctl") and "thermoctl" in rig.run("getent", "group", "thermoctl")
-    assert rig.run("stat", "-c", "%U:%G %a", "/var/lib/thermoctl/recordings").strip() == "thermoctl:thermoctl 750"
+    assert "thermoctl" in rig.run("getent", "passwd", "thermoctl") and "thermoctl" in rig.run(
+        "getent", "group", "thermoctl"
+    )
+    assert (
+        rig.run("stat", "-c", "%U:%G %a", "/var/lib/thermoctl/recordings").strip()
+        == "thermoctl:thermoctl 750"
+    )
     rules = rig.run("cat", "/etc/udev/rules.d/99-thermoctl.rules")
     assert "cpu_dma_latency" in rules
-    exposure = re.search(r"Overall exposure level for own.service: ([\d.]+)",
-                         rig.run("sh", "-c", "cp /etc/systemd/system/thermoctl.service /tmp/own.service; "      # without the drop-in
-                                         "systemd-analyze security --offline=true --no-pager /tmp/own.service"))
+    exposure = re.search(
+        r"Overall exposure level for own.service: ([\d.]+)",
+        rig.run(
+            "sh",
+            "-c",
+            "cp /etc/systemd/system/thermoctl.service /tmp/own.service; "  # without the drop-in
+            "systemd-analyze security --offline=true --no-pager /tmp/own.service",
+        ),
+    )
     assert exposure and float(exposure[1]) <= 2.0
     TABLE.append((f"exposure {exposure[1]} (limit 2.0)", "-", "-", "-"))
-    assert "thermoctl.service" not in rig.run("systemd-analyze", "verify", "/etc/systemd/system/thermoctl.service", check=False)
+    assert "thermoctl.service" not in rig.run(
+        "systemd-analyze", "verify", "/etc/systemd/system/thermoctl.service", check=False
+    )
 
 
 def test_start_drives_nothing_and_runs_in_real_time(rig):
     begin = time.monotonic()
-    rig.run("systemctl", "enable", "--now", "thermoctl.service")              # Type=notify: returns when it is ready
+    rig.run("systemctl", "enable", "--now", "thermoctl.service")  # Type=notify: returns when it is ready
     rig.ready()
     t, enabled, drive = rig.amplifier()
     assert not enabled[t > begin].any() and not drive[t > begin].any()
     loop = rig.pids()["loop"]
     assert rig.run("ps", "-o", "cls=", "-p", str(loop)).strip() == "FF"
     locked = re.search(r"VmLck:\s+(\d+)", rig.run("cat", f"/proc/{loop}/status"))
-    assert locked and int(locked[1]) > 10_000                                 # kB
+    assert locked and int(locked[1]) > 10_000  # kB
     assert rig.run("ps", "-o", "user=", "-p", str(loop)).strip() == "thermoctl"
 
 
@@ -213,8 +269,9 @@ def test_stop_switches_off_first(rig):
     rig.arm()
     event = time.monotonic()
     rig.run("systemctl", "stop", "thermoctl.service")
-    assert rig.unit("ActiveState", "Result") == ["inactive", "success"], \
-        rig.run("journalctl", "-u", "thermoctl", "--no-pager", "-n", "20")
+    assert rig.unit("ActiveState", "Result") == ["inactive", "success"], rig.run(
+        "journalctl", "-u", "thermoctl", "--no-pager", "-n", "20"
+    )
     assert rig.main_pid() == 0
     time_row_after(rig, event + 1.0)
     off_after(rig, event, 1.0, "systemctl stop")
@@ -251,12 +308,17 @@ def test_reload_is_taken_without_a_jump_and_nonsense_is_refused(rig):
     assert (r.columns["enabled"][during] > 0).all()
     jump = float(np.abs(np.diff(r.columns["position_um"][during])).max())
     TABLE.append(("systemctl reload, good and nonsense", f"stays on, {jump:.2f} um", "0.5 um", "-"))
-    assert jump < 0.5                                                         # um between two rows, 10 ms
+    assert jump < 0.5  # um between two rows, 10 ms
 
 
-@pytest.mark.parametrize("victim,name,limit_s", [
-    ("loop", "kill -9 of the loop", WATCHDOG_S + 0.1), ("main", "kill -9 of the supervisor", WATCHDOG_S + 0.1),
-    ("all", "kill -9 of every process", WATCHDOG_S + 0.1)])
+@pytest.mark.parametrize(
+    "victim,name,limit_s",
+    [
+        ("loop", "kill -9 of the loop", WATCHDOG_S + 0.1),
+        ("main", "kill -9 of the supervisor", WATCHDOG_S + 0.1),
+        ("all", "kill -9 of every process", WATCHDOG_S + 0.1),
+    ],
+)
 def test_kill_9(rig, victim, name, limit_s):
     rig.run("systemctl", "reset-failed", "thermoctl.service", check=False)
     rig.arm()
@@ -266,12 +328,17 @@ def test_kill_9(rig, victim, name, limit_s):
     back = rig.back(restarts)
     time_row_after(rig, event + limit_s + 1.0)
     off_after(rig, event, limit_s, name, back)
-    assert rig.status()["state"] == "READY"                                   # not armed by itself
+    assert rig.status()["state"] == "READY"  # not armed by itself
 
 
-@pytest.mark.parametrize("victim,name,limit_s", [
-    ("loop", "SIGSTOP of the loop", WATCHDOG_S + 0.1), ("all", "SIGSTOP of every process", WATCHDOG_S + 0.1),
-    ("main", "SIGSTOP of the supervisor", 2.0 + 1.5)])
+@pytest.mark.parametrize(
+    "victim,name,limit_s",
+    [
+        ("loop", "SIGSTOP of the loop", WATCHDOG_S + 0.1),
+        ("all", "SIGSTOP of every process", WATCHDOG_S + 0.1),
+        ("main", "SIGSTOP of the supervisor", 2.0 + 1.5),
+    ],
+)
 def test_stopped_processes_are_ended_and_started_again(rig, victim, name, limit_s):
     """A loop that stands still is ended by the supervisor; a supervisor that stands still by WatchdogSec=2: until then the
     loop goes on controlling."""
@@ -315,7 +382,7 @@ def test_an_unusable_configuration_is_not_tried_again_and_too_many_failures_end(
     assert re.search(r"rig\.yaml:\d+", rig.journal())
     path.write_text(good)
     rig.run("systemctl", "reset-failed", "thermoctl.service")
-    rig.run("systemctl", "stop", "virtual-rig.service")                       # no devices: every start fails with status 3
+    rig.run("systemctl", "stop", "virtual-rig.service")  # no devices: every start fails with status 3
     rig.run("systemctl", "start", "--no-block", "thermoctl.service")
     begin = time.monotonic()
     while rig.unit("ActiveState", "SubState")[0] != "failed":
@@ -331,8 +398,11 @@ def test_an_unusable_configuration_is_not_tried_again_and_too_many_failures_end(
 
 
 def test_the_journal_has_the_daemons_lines(rig):
-    lines = [json.loads(line) for line in
-             rig.run("journalctl", "-u", "thermoctl", "-o", "json", "--no-pager").splitlines() if line.startswith("{")]
+    lines = [
+        json.loads(line)
+        for line in rig.run("journalctl", "-u", "thermoctl", "-o", "json", "--no-pager").splitlines()
+        if line.startswith("{")
+    ]
     own = [x for x in lines if x.get("SYSLOG_IDENTIFIER") == "thermoctl"]
     assert any("ready" in str(x["MESSAGE"]) for x in own) and any("state" in str(x["MESSAGE"]) for x in own)
     assert {x.get("_SYSTEMD_UNIT") for x in own} == {"thermoctl.service"}
@@ -346,7 +416,7 @@ def test_power_cycle_boots_into_ready_and_drives_nothing(rig):
     assert "Failed" not in "".join(line for line in log.splitlines() if "thermoctl" in line.lower())
     seconds = rig.boot()
     rig.ready(90)
-    t, enabled, drive = rig.amplifier()                                       # a new record: the rig came up with the machine
+    t, enabled, drive = rig.amplifier()  # a new record: the rig came up with the machine
     assert t[0] > event and not enabled.any() and not drive.any()
     TABLE.append(("boot: READY by itself, never driven", "-", "-", f"{seconds:.1f} s"))
 
@@ -354,13 +424,21 @@ def test_power_cycle_boots_into_ready_and_drives_nothing(rig):
 def test_uninstall_leaves_nothing_of_ours(rig):
     rig.arm()
     rig.thermoctl("service", "uninstall")
-    stopping = [x for x in map(json.loads, rig.run("journalctl", "-o", "json", "UNIT=thermoctl.service").splitlines())
-                if str(x["MESSAGE"]).startswith("Stopping")]
-    event = int(stopping[-1]["__MONOTONIC_TIMESTAMP"]) * 1e-6                 # not when the program began to start
+    stopping = [
+        x
+        for x in map(json.loads, rig.run("journalctl", "-o", "json", "UNIT=thermoctl.service").splitlines())
+        if str(x["MESSAGE"]).startswith("Stopping")
+    ]
+    event = int(stopping[-1]["__MONOTONIC_TIMESTAMP"]) * 1e-6  # not when the program began to start
     time_row_after(rig, event + 1.5)
     off_after(rig, event, 1.0, "thermoctl service uninstall")
     assert rig.unit("LoadState", "ActiveState") == ["not-found", "inactive"]
-    left = rig.run("sh", "-c", "ls /etc/systemd/system/thermoctl.service /etc/sysusers.d/thermoctl.conf "
-                               "/etc/tmpfiles.d/thermoctl.conf /etc/udev/rules.d/99-thermoctl.rules 2>/dev/null", check=False)
+    left = rig.run(
+        "sh",
+        "-c",
+        "ls /etc/systemd/system/thermoctl.service /etc/sysusers.d/thermoctl.conf "
+        "/etc/tmpfiles.d/thermoctl.conf /etc/udev/rules.d/99-thermoctl.rules 2>/dev/null",
+        check=False,
+    )
     assert not left.strip()
-    assert "rig.yaml" in rig.run("ls", "/etc/thermoctl")                      # configuration and recordings stay
+    assert "rig.yaml" in rig.run("ls", "/etc/thermoctl")  # configuration and recordings stay

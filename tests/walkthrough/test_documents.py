@@ -1,4 +1,5 @@
 """What README and the how-to pages tell a reader to type works, page by page, in a folder as a clone has it."""
+
 import json
 import re
 import shutil
@@ -30,7 +31,9 @@ def folder(tmp_path_factory):
 def test_every_block_of_commands_says_whether_it_is_run():
     for page in pages():
         for block in blocks(page):
-            assert re.fullmatch(r"runs|runs in a clone|runs for \d+ s|not run: .{10,}", block.mark), f"{block.where}: {block.mark!r}"
+            assert re.fullmatch(r"runs|runs in a clone|runs for \d+ s|not run: .{10,}", block.mark), (
+                f"{block.where}: {block.mark!r}"
+            )
 
 
 def test_links_of_the_documents_lead_somewhere():
@@ -39,7 +42,9 @@ def test_links_of_the_documents_lead_somewhere():
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-@pytest.mark.parametrize("page", [p for p in pages() if any(b.mark == "runs" for b in blocks(p))], ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "page", [p for p in pages() if any(b.mark == "runs" for b in blocks(p))], ids=lambda p: p.stem
+)
 def test_a_page(page, folder):
     for block in blocks(page):
         if block.mark == "runs":
@@ -52,5 +57,7 @@ def test_a_page(page, folder):
 def test_the_example_is_what_its_script_writes(tmp_path):
     subprocess.run([sys.executable, ROOT / "examples/heater/make.py", tmp_path], check=True)
     for name in ("run_1.csv", "run_2.csv"):
-        there, here = (np.loadtxt(p / name, delimiter=",", skiprows=1) for p in (ROOT / "examples/heater", tmp_path))
+        there, here = (
+            np.loadtxt(p / name, delimiter=",", skiprows=1) for p in (ROOT / "examples/heater", tmp_path)
+        )
         assert np.allclose(there, here, rtol=2e-4, atol=2e-3)

@@ -2,6 +2,7 @@
 
 `python tests/walkthrough/walk.py [FOLDER]` (make walkthrough); leaves FOLDER (default: a temporary one) as a reader's would be.
 """
+
 import json
 import re
 import subprocess
@@ -25,20 +26,34 @@ def main():
             seconds = re.search(r"for (\d+) s", block.mark)
             print(f"[{number}/{len(steps)}] README.md:{block.line}\n{block.text.rstrip()}", flush=True)
             begun = time.monotonic()
-            if seconds:                              # the time is that of the program; what has to be installed first is installed first
+            if seconds:  # the time is that of the program; what has to be installed first is installed first
                 subprocess.run(["make", "install"], cwd=clone, check=True, capture_output=True)
             try:
                 said = run(block, clone, clone / ".venv/bin", float(seconds[1]) if seconds else None)
-            except AssertionError:                   # nothing of the walk goes on running
-                subprocess.run([clone / ".venv/bin/thermoctl", "stop", "--config", "config/simulated.yaml"], cwd=clone, check=False)
+            except AssertionError:  # nothing of the walk goes on running
+                subprocess.run(
+                    [clone / ".venv/bin/thermoctl", "stop", "--config", "config/simulated.yaml"],
+                    cwd=clone,
+                    check=False,
+                )
                 raise
-            print("".join(f"    {line}\n" for line in said.splitlines()[-12:]) + f"    ({time.monotonic() - begun:.0f} s)", flush=True)
+            print(
+                "".join(f"    {line}\n" for line in said.splitlines()[-12:])
+                + f"    ({time.monotonic() - begun:.0f} s)",
+                flush=True,
+            )
             if seconds:
                 assert "ARMED" in said, "the loop ran"
         found = json.loads((clone / "result/diagnosis.json").read_text())
-        assert found["verdict"] == "explained" and found["findings"][0]["effect"] == "external_heat_source", found["verdict"]
-        assert (clone / "result/report.html").stat().st_size > 10000 and (clone / "result/plant.yaml").exists()
-        print(f"walked: {len(steps)} steps, and the recording has its diagnosis: {found['findings'][0]['effect']} at {found['findings'][0]['where']}")
+        assert found["verdict"] == "explained" and found["findings"][0]["effect"] == "external_heat_source", (
+            found["verdict"]
+        )
+        assert (clone / "result/report.html").stat().st_size > 10000 and (
+            clone / "result/plant.yaml"
+        ).exists()
+        print(
+            f"walked: {len(steps)} steps, and the recording has its diagnosis: {found['findings'][0]['effect']} at {found['findings'][0]['where']}"
+        )
     return 0
 
 

@@ -10,6 +10,7 @@
 A critical fault leads to FAULT from every state but OFF. Only READY can become ARMED, only by a command that arrives in
 READY: a command given earlier is not remembered, so power-up, restart and cleared faults never arm by themselves.
 """
+
 from __future__ import annotations
 
 OFF, SAFE, READY, ARMED, FAULT = range(5)
@@ -43,7 +44,12 @@ def next_state(state: int, command: int, started: bool, tripped: bool, critical:
     return READY
 
 
-TABLE = bytes(next_state(state, command, started, tripped, critical) for state in range(len(STATES))
-              for command in range(len(COMMANDS)) for started in (False, True) for tripped in (False, True)
-              for critical in (False, True))
+TABLE = bytes(
+    next_state(state, command, started, tripped, critical)
+    for state in range(len(STATES))
+    for command in range(len(COMMANDS))
+    for started in (False, True)
+    for tripped in (False, True)
+    for critical in (False, True)
+)
 """`next_state` of every input, the last argument running fastest: how the compiled tick asks it."""

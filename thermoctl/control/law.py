@@ -35,6 +35,7 @@ A reading that is not valid is never used (`last` holds the newest valid one). T
 tick without a new frame (1 to 3 % of the ticks of a polled encoder): the differences then come one tick later and
 nothing is lost.
 """
+
 from __future__ import annotations
 
 from array import array
@@ -44,23 +45,39 @@ import numpy as np
 from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel, Parameters
 
-OUTPUTS = ("state", "fault_bits", "setpoint_um", "reference_um", "position_um", "compensated_um", "compensation_um",
-           "expansion_um", "control_v", "drive", "enable", "power_w", "air_rate_k_s",
-           *(name.removesuffix("_c") + "_est_c" for name in faults.TEMPERATURES), "innovation_c", "kalman_gain",
-           "position_age_s", "coil_age_s")
+OUTPUTS = (
+    "state",
+    "fault_bits",
+    "setpoint_um",
+    "reference_um",
+    "position_um",
+    "compensated_um",
+    "compensation_um",
+    "expansion_um",
+    "control_v",
+    "drive",
+    "enable",
+    "power_w",
+    "air_rate_k_s",
+    *(name.removesuffix("_c") + "_est_c" for name in faults.TEMPERATURES),
+    "innovation_c",
+    "kalman_gain",
+    "position_age_s",
+    "coil_age_s",
+)
 """What a tick gives, in the order of `Law.outputs`; each is an attribute of the law, too (the estimates apart)."""
 
 MAX_AVERAGE = 64
 WARM_UP_TICKS = 100
-MAX_GAP_S = 10.0            # a longer time between two ticks makes the estimate worthless
-RESUME_LIMIT_C = 2.0        # estimates of an earlier run are kept when the coil's first reading is as close as this
-COPPER_1_K = 0.00393        # temperature coefficient of the coil's resistance, from 20 degC
+MAX_GAP_S = 10.0  # a longer time between two ticks makes the estimate worthless
+RESUME_LIMIT_C = 2.0  # estimates of an earlier run are kept when the coil's first reading is as close as this
+COPPER_1_K = 0.00393  # temperature coefficient of the coil's resistance, from 20 degC
 _GAP_S, _RESUME_C, _COPPER, _WARM_UP = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K, WARM_UP_TICKS
 COMPILED = not __file__.endswith(".py")
 """False when this module runs interpreted: right for coverage, a hundred times too slow for a rig."""
 
 # Constants that the compiler turns into C numbers (typed in law.pxd).
-_OK, _STALE, _ERROR, _ABSENT = 0, 1, 2, 3                  # status of a reading, as the back ends give it
+_OK, _STALE, _ERROR, _ABSENT = 0, 1, 2, 3  # status of a reading, as the back ends give it
 _NONE, _SETPOINT, _OFF, _ARMED, _FAULT = arming.NONE, arming.SETPOINT, arming.OFF, arming.ARMED, arming.FAULT
 _NEXT, _COMMANDS = arming.TABLE, len(arming.COMMANDS)
 _N, _M = len(faults.CHANNELS), len(faults.TEMPERATURES)
@@ -77,22 +94,100 @@ _B_NOT_FOLLOWING, _B_LATE = faults.BIT["amplifier_not_following"], faults.BIT["l
 _B_NOT_FINITE = faults.BIT["not_finite"]
 _B_ELECTRICAL, _B_DISPLACED = faults.BIT["electrical_disagrees"], faults.BIT["position_disagrees"]
 _B_MONITORED = faults.BIT["monitored_disagrees"]
-_TRIP_OTHERS = faults.mask("fault", "critical") >> (len(faults.GROUPS) * _KINDS) << (len(faults.GROUPS) * _KINDS)
+_TRIP_OTHERS = (
+    faults.mask("fault", "critical") >> (len(faults.GROUPS) * _KINDS) << (len(faults.GROUPS) * _KINDS)
+)
 _CRITICAL = faults.mask("critical")
 
 _SCALARS = (
-    "state", "tick", "latched", "v", "eps1", "d1", "setpoint_um", "reference_um", "position_um", "compensated_um",
-    "compensation_um", "expansion_um", "power_w", "air_c", "air_start_c", "air_known", "air_rate_k_s", "innovation_c",
-    "innovation_mean_c", "kalman_gain", "P", "corrected", "primed", "expansion_before_um", "expansion_after_um",
-    "phase_s", "coil_slow_c", "coil_rate_k_s", "coil_elapsed_s", "power_mean_w", "following_s", "idle_s",
-    "saturation_s", "amplifier_s", "average_at", "averaged", "enable", "drive", "air_started", "resumed",
-    "model_error_c", "ohm_v", "ohm_scale_v", "current_error_a", "displaced_um", "position_zero_um", "zeroed",
-    "reference_error_um", "reference_zero_um", "reference_zeroed", "exchanged")
+    "state",
+    "tick",
+    "latched",
+    "v",
+    "eps1",
+    "d1",
+    "setpoint_um",
+    "reference_um",
+    "position_um",
+    "compensated_um",
+    "compensation_um",
+    "expansion_um",
+    "power_w",
+    "air_c",
+    "air_start_c",
+    "air_known",
+    "air_rate_k_s",
+    "innovation_c",
+    "innovation_mean_c",
+    "kalman_gain",
+    "P",
+    "corrected",
+    "primed",
+    "expansion_before_um",
+    "expansion_after_um",
+    "phase_s",
+    "coil_slow_c",
+    "coil_rate_k_s",
+    "coil_elapsed_s",
+    "power_mean_w",
+    "following_s",
+    "idle_s",
+    "saturation_s",
+    "amplifier_s",
+    "average_at",
+    "averaged",
+    "enable",
+    "drive",
+    "air_started",
+    "resumed",
+    "model_error_c",
+    "ohm_v",
+    "ohm_scale_v",
+    "current_error_a",
+    "displaced_um",
+    "position_zero_um",
+    "zeroed",
+    "reference_error_um",
+    "reference_zero_um",
+    "reference_zeroed",
+    "exchanged",
+)
 _WHOLE = ("state", "tick", "latched", "average_at", "averaged")
-_VECTORS = ("x", "T", "T_before", "average", "age", "last", "same_s", "seen", "verdict", "corrections", "apart_c")
-_KEPT = ("air_c", "air_start_c", "air_known", "air_started", "corrected", "primed", "P", "expansion_before_um",
-         "expansion_after_um", "phase_s", "compensation_um", "expansion_um", "position_zero_um", "zeroed",
-         "reference_zero_um", "reference_zeroed", "x", "T", "T_before", "corrections")
+_VECTORS = (
+    "x",
+    "T",
+    "T_before",
+    "average",
+    "age",
+    "last",
+    "same_s",
+    "seen",
+    "verdict",
+    "corrections",
+    "apart_c",
+)
+_KEPT = (
+    "air_c",
+    "air_start_c",
+    "air_known",
+    "air_started",
+    "corrected",
+    "primed",
+    "P",
+    "expansion_before_um",
+    "expansion_after_um",
+    "phase_s",
+    "compensation_um",
+    "expansion_um",
+    "position_zero_um",
+    "zeroed",
+    "reference_zero_um",
+    "reference_zeroed",
+    "x",
+    "T",
+    "T_before",
+    "corrections",
+)
 
 
 def finite(value):
@@ -135,7 +230,9 @@ class Law:
         along = float(model.C[0] @ model.gain[:, 0])
         self.first_gain = 1.0 / along if abs(along) > 1e-9 else 0.0
         # c is advanced once a reading, in steps that the fastest mode allows.
-        self.correction_step_s = 0.5 * model.period_s / max(float(np.abs(model.A_minus_I).sum(axis=1).max()), 1e-12)
+        self.correction_step_s = (
+            0.5 * model.period_s / max(float(np.abs(model.A_minus_I).sum(axis=1).max()), 1e-12)
+        )
         self.dx, self.e = np.zeros(self.n), np.zeros(_M)
         self.corrections, self.apart_c = np.zeros(self.n), np.zeros(_M)
         self.group = array("i", faults.GROUP_OF_CHANNEL)
@@ -146,7 +243,9 @@ class Law:
         self.state, self.latched, self.tick, self.average_at, self.averaged = arming.OFF, 0, 0, 0, 0
         self.v = self.eps1 = self.d1 = 0.0
         self.setpoint_um = self.reference_um = self.position_um = self.compensated_um = 0.0
-        self.power_w = self.power_mean_w = self.air_c = self.air_start_c = self.air_known = self.air_rate_k_s = 0.0
+        self.power_w = self.power_mean_w = self.air_c = self.air_start_c = self.air_known = (
+            self.air_rate_k_s
+        ) = 0.0
         self.corrected = self.coil_slow_c = self.coil_rate_k_s = self.coil_elapsed_s = 0.0
         self.innovation_c = self.innovation_mean_c = self.kalman_gain = 0.0
         self.P = 1e3 * model.R_v
@@ -179,7 +278,7 @@ class Law:
         self.setpoint_low_um, self.setpoint_high_um = p.setpoint_low_um, p.setpoint_high_um
         length = int(min(max(p.moving_average, 1), MAX_AVERAGE))
         if self.tick > 0 and length != self.average_length:
-            self.average = np.full(MAX_AVERAGE, self.position_um)      # the filter restarts at its own output
+            self.average = np.full(MAX_AVERAGE, self.position_um)  # the filter restarts at its own output
             self.average_at, self.averaged = 0, length
         self.average_length = length
         self.compensate_on, self.bound_um, self.slew_um_s = p.compensate > 0.0, p.bound_um, p.slew_um_s
@@ -192,35 +291,53 @@ class Law:
         self.power_limit_w, self.power_time_s = p.power_limit_w, p.power_time_s
         self.idle_current_a, self.idle_power_w, self.idle_limit_s = p.idle_current_a, p.idle_power_w, p.idle_s
         self.saturation_limit_s, self.amplifier_limit_s, self.late_s = p.saturation_s, p.amplifier_s, p.late_s
-        self.agree_time_s, self.drift_limit_c, self.monitored_limit_c = p.agree_time_s, p.drift_limit_c, p.monitored_limit_c
-        self.resistance_ohm, self.resistance_tolerance, self.resistance_v = (p.resistance_ohm, p.resistance_tolerance,
-                                                                             p.resistance_v)
+        self.agree_time_s, self.drift_limit_c, self.monitored_limit_c = (
+            p.agree_time_s,
+            p.drift_limit_c,
+            p.monitored_limit_c,
+        )
+        self.resistance_ohm, self.resistance_tolerance, self.resistance_v = (
+            p.resistance_ohm,
+            p.resistance_tolerance,
+            p.resistance_v,
+        )
         self.current_per_drive, self.current_tolerance_a = p.current_per_drive, p.current_tolerance_a
         self.flexure_um_per_a, self.position_tolerance_um = p.flexure_um_per_a, p.position_tolerance_um
         self.reference_tolerance_um, self.order_limit_c = p.reference_tolerance_um, p.order_limit_c
 
     def snapshot(self) -> np.ndarray:
         """The whole state as one float64 vector, for replay and for a warm restart."""
-        return np.concatenate([np.array([float(getattr(self, name)) for name in _SCALARS]),
-                               *(np.asarray(getattr(self, name)) for name in _VECTORS)])
+        return np.concatenate(
+            [
+                np.array([float(getattr(self, name)) for name in _SCALARS]),
+                *(np.asarray(getattr(self, name)) for name in _VECTORS),
+            ]
+        )
 
     def restore(self, vector: np.ndarray):
         """Take a state that `snapshot` gave for a model of the same order. Raises ValueError for another length, and where
         a number that counts is not finite."""
         size = len(self.snapshot())
         if len(vector) != size:
-            raise ValueError(f"law: a state of {len(vector)} numbers, expected {size} (another model or version)")
+            raise ValueError(
+                f"law: a state of {len(vector)} numbers, expected {size} (another model or version)"
+            )
         if not np.isfinite(vector[[_SCALARS.index(name) for name in _WHOLE]]).all():
             raise ValueError("law: a state whose counters are not finite")
-        for name, end in (("state", len(arming.STATES)), ("average_at", MAX_AVERAGE)):      # both are places in a table
+        for name, end in (
+            ("state", len(arming.STATES)),
+            ("average_at", MAX_AVERAGE),
+        ):  # both are places in a table
             if not 0 <= vector[_SCALARS.index(name)] < end:
-                raise ValueError(f"law: a state whose {name} is {vector[_SCALARS.index(name)]:g}, expected 0 to {end - 1}")
+                raise ValueError(
+                    f"law: a state whose {name} is {vector[_SCALARS.index(name)]:g}, expected 0 to {end - 1}"
+                )
         for name, number in zip(_SCALARS, vector, strict=False):
             setattr(self, name, float(number) if name not in _WHOLE else int(number))
         start = len(_SCALARS)
         for name in _VECTORS:
             length = len(np.asarray(getattr(self, name)))
-            setattr(self, name, np.array(vector[start:start + length], dtype=np.float64))
+            setattr(self, name, np.array(vector[start : start + length], dtype=np.float64))
             start += length
 
     def resume(self, vector: np.ndarray, gap_s: float):
@@ -245,8 +362,14 @@ class Law:
             if phase >= self.expansion_period_s:
                 phase -= self.expansion_period_s
                 T = np.asarray(self.C) @ x
-                before, after = after, (self.f1 * after + self.b_air * (self.air_c - self.air_start_c)
-                                        + float(np.asarray(self.b1) @ T_before + np.asarray(self.b2) @ T))
+                before, after = (
+                    after,
+                    (
+                        self.f1 * after
+                        + self.b_air * (self.air_c - self.air_start_c)
+                        + float(np.asarray(self.b1) @ T_before + np.asarray(self.b2) @ T)
+                    ),
+                )
                 T_before = T
         self.x, self.corrections, self.T, self.T_before = x, c, np.asarray(self.C) @ x, T_before
         self.phase_s, self.expansion_before_um, self.expansion_after_um = phase, before, after
@@ -256,7 +379,9 @@ class Law:
         for i in range(self.n):
             self.x[i] = 0.0
             self.corrections[i] = 0.0
-        self.corrected = self.primed = self.air_known = self.resumed = self.model_error_c = self.innovation_mean_c = 0.0
+        self.corrected = self.primed = self.air_known = self.resumed = self.model_error_c = (
+            self.innovation_mean_c
+        ) = 0.0
         self.P = 1e3 * self.R_v
 
     def step(self, dt, command=0, command_value=0.0, external=0):
@@ -367,7 +492,7 @@ class Law:
     def _correct(self):
         """(35): every new valid reading of a correcting sensor moves the state; the coil's first one starts it."""
         coil_new = self.fresh[_COIL] and self.verdict[_COIL] == 0.0
-        if self.resumed > 0.0 and coil_new:                     # do the kept estimates still fit?
+        if self.resumed > 0.0 and coil_new:  # do the kept estimates still fit?
             s = self.value[_COIL] - self.air_c
             for j in range(self.n):
                 s -= self.C[0, j] * self.x[j]
@@ -378,7 +503,7 @@ class Law:
                 self.air_started = 0.0
                 if self.verdict[_AIR] == 0.0:
                     self._start_air(self.last[_AIR])
-        if self.air_known == 0.0 and coil_new:                  # no air sensor: rises above the first coil reading
+        if self.air_known == 0.0 and coil_new:  # no air sensor: rises above the first coil reading
             self._start_air(self.value[_COIL])
         if self.corrected == 0.0 and not coil_new:
             return
@@ -403,7 +528,9 @@ class Law:
                 return
             self._predict_corrections(elapsed)
             self.innovation_c = self.e[0]
-            self.innovation_mean_c += (self.e[0] - self.innovation_mean_c) * min(1.0, elapsed / self.innovation_time_s)
+            self.innovation_mean_c += (self.e[0] - self.innovation_mean_c) * min(
+                1.0, elapsed / self.innovation_time_s
+            )
             self.coil_rate_k_s = (self.value[_COIL] - self.coil_slow_c) / self.coil_rate_time_s
             self.coil_slow_c += self.coil_rate_k_s * min(elapsed, self.coil_rate_time_s)
         gain = 1.0
@@ -443,7 +570,7 @@ class Law:
     def compensate(self):
         """The estimated thermal error, um: expansion model, bound, slew; frozen while a needed reading is at fault."""
         one = 1
-        if self.primed == 0.0:                                        # quasi-steady start at the first temperatures
+        if self.primed == 0.0:  # quasi-steady start at the first temperatures
             s = self.b_air * (self.air_c - self.air_start_c)
             for m in range(_M):
                 s += (self.b1[m] + self.b2[m]) * self.T[m]
@@ -461,10 +588,13 @@ class Law:
             self.expansion_before_um = self.expansion_after_um
             self.expansion_after_um = s
         part = min(1.0, self.phase_s / self.expansion_period_s)
-        self.expansion_um = (self.expansion_before_um + part * (self.expansion_after_um - self.expansion_before_um)
-                             + self.offset_um)
+        self.expansion_um = (
+            self.expansion_before_um
+            + part * (self.expansion_after_um - self.expansion_before_um)
+            + self.offset_um
+        )
         target = self.expansion_um if self.compensate_on else 0.0
-        if not (abs(target) <= self.bound_um):                        # also when it is not a number
+        if not (abs(target) <= self.bound_um):  # also when it is not a number
             self.faults |= one << _B_BOUND
             target = clip(target, -self.bound_um, self.bound_um) if finite(target) else self.compensation_um
         if self.hold:
@@ -504,8 +634,11 @@ class Law:
         eps = self.reference_um - self.compensated_um
         change = eps - self.eps1
         d = change / self.dt if self.dt > 0.0 else 0.0
-        self.v = clip(self.v + self.kp * (change + self.dt / self.ti_s * eps + self.td_s * (d - self.d1)),
-                      -self.output_limit, self.output_limit)
+        self.v = clip(
+            self.v + self.kp * (change + self.dt / self.ti_s * eps + self.td_s * (d - self.d1)),
+            -self.output_limit,
+            self.output_limit,
+        )
         self.eps1, self.d1 = eps, d
 
     # ---- protect ------------------------------------------------------------------------------------------------
@@ -521,15 +654,18 @@ class Law:
             self.saturation_s = self.saturation_s + self.dt if abs(self.v) >= self.output_limit else 0.0
             if self.saturation_s > self.saturation_limit_s:
                 found |= one << _B_SATURATED
-            reports = self.status[_AMPLIFIER_STATE] == _OK and self.value[_AMPLIFIER_STATE] != _AMPLIFIER_ENABLED
+            reports = (
+                self.status[_AMPLIFIER_STATE] == _OK and self.value[_AMPLIFIER_STATE] != _AMPLIFIER_ENABLED
+            )
             self.amplifier_s = self.amplifier_s + self.dt if reports else 0.0
             if self.amplifier_s > self.amplifier_limit_s:
                 found |= one << _B_NOT_FOLLOWING
             self.idle_s = 0.0
         else:
             self.following_s = self.saturation_s = self.amplifier_s = 0.0
-            driven = ((self.verdict[_CURRENT] == 0.0 and abs(self.last[_CURRENT]) > self.idle_current_a)
-                      or abs(self.power_w) > self.idle_power_w)
+            driven = (
+                self.verdict[_CURRENT] == 0.0 and abs(self.last[_CURRENT]) > self.idle_current_a
+            ) or abs(self.power_w) > self.idle_power_w
             self.idle_s = self.idle_s + self.dt if driven else 0.0
             if self.idle_s > self.idle_limit_s:
                 found |= one << _B_STUCK
@@ -541,13 +677,21 @@ class Law:
             found |= one << _B_HOT_MODEL
         if self.coil_rate_k_s > self.coil_rate_limit:
             found |= one << _B_HEATING
-        if self.predicts[0] and (abs(self.innovation_mean_c) > self.innovation_limit_c
-                                 or abs(self.model_error_c) > self.drift_limit_c):
+        if self.predicts[0] and (
+            abs(self.innovation_mean_c) > self.innovation_limit_c
+            or abs(self.model_error_c) > self.drift_limit_c
+        ):
             found |= one << _B_DISAGREES
         if self.power_mean_w > self.power_limit_w:
             found |= one << _B_POWER
-        if not (finite(self.v) and finite(self.reference_um) and finite(self.compensated_um) and finite(self.T[0])
-                and finite(self.expansion_um) and finite(self.power_w)):
+        if not (
+            finite(self.v)
+            and finite(self.reference_um)
+            and finite(self.compensated_um)
+            and finite(self.T[0])
+            and finite(self.expansion_um)
+            and finite(self.power_w)
+        ):
             found |= one << _B_NOT_FINITE
         self._agree()
         self.faults |= found
@@ -564,9 +708,15 @@ class Law:
         part = min(1.0, self.dt / self.agree_time_s)
         current = self.verdict[_CURRENT] == 0.0
         amperes = self.last[_CURRENT] if current else 0.0
-        estimated = self.predicts[0] and self.air_known > 0.0         # the coil's temperature: estimate, or else its own reading
-        if (current and self.verdict[_VOLTAGE] == 0.0 and self.resistance_ohm > 0.0
-                and (estimated or self.verdict[_COIL] == 0.0)):
+        estimated = (
+            self.predicts[0] and self.air_known > 0.0
+        )  # the coil's temperature: estimate, or else its own reading
+        if (
+            current
+            and self.verdict[_VOLTAGE] == 0.0
+            and self.resistance_ohm > 0.0
+            and (estimated or self.verdict[_COIL] == 0.0)
+        ):
             s = self.T[0] + self.air_c if estimated else self.last[_COIL]
             s = self.resistance_ohm * amperes * (1.0 + _COPPER * (s - 20.0))
             self.ohm_v += part * (self.last[_VOLTAGE] - s - self.ohm_v)
@@ -576,7 +726,9 @@ class Law:
         if self.state != _ARMED or not current or self.current_per_drive == 0.0:
             self.current_error_a = 0.0
         else:
-            self.current_error_a += part * (amperes - self.current_per_drive * self.drive - self.current_error_a)
+            self.current_error_a += part * (
+                amperes - self.current_per_drive * self.drive - self.current_error_a
+            )
             if abs(self.current_error_a) > self.current_tolerance_a:
                 self.faults |= one << _B_NOT_FOLLOWING
         if current and self.verdict[_POSITION] == 0.0 and self.flexure_um_per_a != 0.0:
@@ -614,8 +766,12 @@ class Law:
         self.exchanged = 0.0
         for m in range(1, _M):
             for k in range(m):
-                if (self.predicts[m] and self.predicts[k] and self.verdict[_COIL + m] == 0.0
-                        and self.verdict[_COIL + k] == 0.0):
+                if (
+                    self.predicts[m]
+                    and self.predicts[k]
+                    and self.verdict[_COIL + m] == 0.0
+                    and self.verdict[_COIL + k] == 0.0
+                ):
                     s = self.T[m] - self.T[k]
                     if (s + self.apart_c[m] - self.apart_c[k]) * s < -self.order_limit_c * self.order_limit_c:
                         self.exchanged = 1.0
@@ -659,5 +815,3 @@ class Law:
     def fault_bits(self) -> int:
         """Standing faults, and while FAULT those that led there."""
         return self.faults | self.latched
-
-

@@ -3,6 +3,7 @@
 Both are plain arrays and numbers. Neither knows a file; `Parameters.pack` turns the parameters into one flat vector so
 that they cross from the process that validated them to the loop through shared memory, and are stored in recordings.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
@@ -32,6 +33,7 @@ class CompensatorModel:
     air_filter_s: time constant of the low-pass from which the rate of the air is taken.
     Raises ValueError when shapes or numbers do not fit together.
     """
+
     kind: str
     period_s: float
     A_minus_I: np.ndarray
@@ -68,24 +70,50 @@ class CompensatorModel:
         if n > MAX_ORDER:
             raise ValueError(f"compensator model: order {n}, expected at most {MAX_ORDER}")
         if not self.sensors or self.sensors[0] != 0 or not all(0 <= j < M for j in self.sensors):
-            raise ValueError(f"compensator model: sensors {self.sensors}, expected 0 (the coil) first, all below {M}")
+            raise ValueError(
+                f"compensator model: sensors {self.sensors}, expected 0 (the coil) first, all below {M}"
+            )
         if self.kind == "mkf" and s != 1:
             raise ValueError("compensator model: the MKF corrects by the coil alone")
-        positive = {"period_s": self.period_s, "expansion_period_s": self.expansion_period_s, "R_v": self.R_v,
-                    "air_filter_s": self.air_filter_s}
+        positive = {
+            "period_s": self.period_s,
+            "expansion_period_s": self.expansion_period_s,
+            "R_v": self.R_v,
+            "air_filter_s": self.air_filter_s,
+        }
         for name, number in positive.items():
             if not (np.isfinite(number) and number > 0.0):
                 raise ValueError(f"compensator model: {name} is {number}, expected a number above 0")
-        if not (np.isfinite(self.R_w) and self.R_w >= 0.0 and np.isfinite([self.f1, self.b_air, self.offset_um]).all()):
-            raise ValueError("compensator model: R_w, f1, b_air and offset_um must be finite, R_w not negative")
+        if not (
+            np.isfinite(self.R_w)
+            and self.R_w >= 0.0
+            and np.isfinite([self.f1, self.b_air, self.offset_um]).all()
+        ):
+            raise ValueError(
+                "compensator model: R_w, f1, b_air and offset_um must be finite, R_w not negative"
+            )
         if abs(self.f1) >= 1.0:
-            raise ValueError(f"compensator model: f1 is {self.f1}, expected |f1| < 1 (a stable expansion model)")
+            raise ValueError(
+                f"compensator model: f1 is {self.f1}, expected |f1| < 1 (a stable expansion model)"
+            )
 
 
 def zero_model(period_s: float = 0.001) -> CompensatorModel:
     """A model that estimates no rise and no expansion: the loop without compensation."""
-    return CompensatorModel("mkf", period_s, np.full((1, 1), -period_s / 400.0), np.zeros((1, 2)), np.zeros((M, 1)),
-                            np.zeros(1), 0.0, 1.0, 0.0, np.zeros(M), np.zeros(M), 1.0)
+    return CompensatorModel(
+        "mkf",
+        period_s,
+        np.full((1, 1), -period_s / 400.0),
+        np.zeros((1, 2)),
+        np.zeros((M, 1)),
+        np.zeros(1),
+        0.0,
+        1.0,
+        0.0,
+        np.zeros(M),
+        np.zeros(M),
+        1.0,
+    )
 
 
 def _channels(value: float) -> np.ndarray:
@@ -98,6 +126,7 @@ class Parameters:
 
     Defaults switch a limit off (inf), except the ones without which nothing may be driven.
     """
+
     kp: float
     ti_s: float
     td_s: float
@@ -105,16 +134,16 @@ class Parameters:
     setpoint_rate_um_s: float = 1000.0 / 60.0
     setpoint_low_um: float = -np.inf
     setpoint_high_um: float = np.inf
-    moving_average: float = 1.0            # samples, 1..MAX_AVERAGE
-    compensate: float = 1.0                # 1 on, 0 off
+    moving_average: float = 1.0  # samples, 1..MAX_AVERAGE
+    compensate: float = 1.0  # 1 on, 0 off
     bound_um: float = np.inf
     slew_um_s: float = np.inf
     low: np.ndarray = field(default_factory=lambda: _channels(-np.inf))
     high: np.ndarray = field(default_factory=lambda: _channels(np.inf))
-    rate: np.ndarray = field(default_factory=lambda: _channels(np.inf))         # largest change per second
+    rate: np.ndarray = field(default_factory=lambda: _channels(np.inf))  # largest change per second
     stale_s: np.ndarray = field(default_factory=lambda: _channels(np.inf))
     frozen_s: np.ndarray = field(default_factory=lambda: _channels(np.inf))
-    required: np.ndarray = field(default_factory=lambda: _channels(0.0))        # 1: a fault of this reading trips
+    required: np.ndarray = field(default_factory=lambda: _channels(0.0))  # 1: a fault of this reading trips
     following_um: float = np.inf
     following_s: float = 0.0
     coil_limit_c: float = np.inf
@@ -130,22 +159,24 @@ class Parameters:
     saturation_s: float = np.inf
     amplifier_s: float = 1.0
     late_s: float = np.inf
-    agree_time_s: float = 0.5              # readings are compared in their means over this time
-    drift_limit_c: float = np.inf          # coil's reading against the model alone
-    monitored_limit_c: float = np.inf      # a watched temperature against its estimate
-    resistance_ohm: float = 0.0            # of the coil at 20 degC; 0: not compared
+    agree_time_s: float = 0.5  # readings are compared in their means over this time
+    drift_limit_c: float = np.inf  # coil's reading against the model alone
+    monitored_limit_c: float = np.inf  # a watched temperature against its estimate
+    resistance_ohm: float = 0.0  # of the coil at 20 degC; 0: not compared
     resistance_tolerance: float = 0.2
     resistance_v: float = 0.3
-    current_per_drive: float = 0.0         # A per unit of drive of a current amplifier; 0: not compared
+    current_per_drive: float = 0.0  # A per unit of drive of a current amplifier; 0: not compared
     current_tolerance_a: float = np.inf
-    flexure_um_per_a: float = 0.0          # where a current holds the stage; 0: not compared
+    flexure_um_per_a: float = 0.0  # where a current holds the stage; 0: not compared
     position_tolerance_um: float = np.inf
     reference_tolerance_um: float = np.inf
-    order_limit_c: float = np.inf          # how far two temperatures may stand the wrong way round
+    order_limit_c: float = np.inf  # how far two temperatures may stand the wrong way round
 
     def pack(self) -> np.ndarray:
         """All numbers as one flat float64 vector (fields in order, arrays in place)."""
-        return np.concatenate([np.atleast_1d(np.asarray(getattr(self, f.name), dtype=float)) for f in fields(self)])
+        return np.concatenate(
+            [np.atleast_1d(np.asarray(getattr(self, f.name), dtype=float)) for f in fields(self)]
+        )
 
     @classmethod
     def unpack(cls, vector: np.ndarray) -> Parameters:
@@ -156,7 +187,7 @@ class Parameters:
         start = 0
         for f in fields(cls):
             if f.name in _ARRAYS:
-                values[f.name] = np.array(vector[start:start + len(CHANNELS)], dtype=np.float64)
+                values[f.name] = np.array(vector[start : start + len(CHANNELS)], dtype=np.float64)
                 start += len(CHANNELS)
             else:
                 values[f.name] = float(vector[start])
@@ -165,6 +196,9 @@ class Parameters:
 
 
 _ARRAYS = ("low", "high", "rate", "stale_s", "frozen_s", "required")
-NAMES = tuple(name for f in fields(Parameters)
-              for name in ([f"{f.name}[{c}]" for c in CHANNELS] if f.name in _ARRAYS else [f.name]))
+NAMES = tuple(
+    name
+    for f in fields(Parameters)
+    for name in ([f"{f.name}[{c}]" for c in CHANNELS] if f.name in _ARRAYS else [f.name])
+)
 """The names of the numbers of `Parameters.pack`, in order."""

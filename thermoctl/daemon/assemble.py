@@ -1,4 +1,5 @@
 """From the configuration to what the law takes: parameters, the compensator's model, names of shared memory."""
+
 from __future__ import annotations
 
 import zlib
@@ -17,18 +18,38 @@ def law_parameters(settings: Any) -> Parameters:
     """Gains, limits and protection of `settings` as the law takes them. Raises InputError for an unknown channel."""
     control, compensation, protection = settings.control, settings.compensation, settings.protection
     taken = {f.name for f in fields(Parameters)}
-    numbers = {name: getattr(protection, name) for name in vars(protection)
-               if name in taken and isinstance(getattr(protection, name), int | float)}
-    arrays: dict[str, Any] = {name: _by_channel(getattr(protection, name), default, f"protection.{name}")
-              for name, default in (("low", -np.inf), ("high", np.inf), ("rate", np.inf), ("stale_s", np.inf),
-                                    ("frozen_s", np.inf))}
+    numbers = {
+        name: getattr(protection, name)
+        for name in vars(protection)
+        if name in taken and isinstance(getattr(protection, name), int | float)
+    }
+    arrays: dict[str, Any] = {
+        name: _by_channel(getattr(protection, name), default, f"protection.{name}")
+        for name, default in (
+            ("low", -np.inf),
+            ("high", np.inf),
+            ("rate", np.inf),
+            ("stale_s", np.inf),
+            ("frozen_s", np.inf),
+        )
+    }
     required = dict.fromkeys(protection.required, 1.0)
     return Parameters(
-        kp=control.kp, ti_s=control.ti_s, td_s=control.td_s, output_limit=control.output_limit,
-        setpoint_rate_um_s=control.setpoint_rate_um_s, setpoint_low_um=control.setpoint_low_um,
-        setpoint_high_um=control.setpoint_high_um, moving_average=float(control.moving_average),
-        compensate=float(compensation.enable), bound_um=compensation.bound_um, slew_um_s=compensation.slew_um_s,
-        required=_by_channel(required, 0.0, "protection.required"), **arrays, **numbers)
+        kp=control.kp,
+        ti_s=control.ti_s,
+        td_s=control.td_s,
+        output_limit=control.output_limit,
+        setpoint_rate_um_s=control.setpoint_rate_um_s,
+        setpoint_low_um=control.setpoint_low_um,
+        setpoint_high_um=control.setpoint_high_um,
+        moving_average=float(control.moving_average),
+        compensate=float(compensation.enable),
+        bound_um=compensation.bound_um,
+        slew_um_s=compensation.slew_um_s,
+        required=_by_channel(required, 0.0, "protection.required"),
+        **arrays,
+        **numbers,
+    )
 
 
 def _by_channel(given: Any, default: float, where: str) -> np.ndarray:
@@ -45,6 +66,7 @@ def compensator(settings: Any) -> CompensatorModel:
     if not settings.compensation.model:
         return zero_model(settings.loop.period_s)
     from thermoctl.identify.modelfile import load_model
+
     return load_model(settings.compensation.model, settings.rig.name)
 
 

@@ -3,6 +3,7 @@
 Exit status as in cli.py. The configuration is found by --config, else $THERMOCTL_CONFIG, else config/simulated.yaml
 here, else /etc/thermoctl/rig.yaml.
 """
+
 from __future__ import annotations
 
 import json
@@ -19,8 +20,11 @@ from thermoctl.yamlfile import InputError
 
 def find_config(given: str | None) -> str:
     """The configuration's path. Raises InputError when there is none."""
-    candidates = [given] if given else [os.environ.get("THERMOCTL_CONFIG"), "config/simulated.yaml",
-                                        "/etc/thermoctl/rig.yaml"]
+    candidates = (
+        [given]
+        if given
+        else [os.environ.get("THERMOCTL_CONFIG"), "config/simulated.yaml", "/etc/thermoctl/rig.yaml"]
+    )
     for path in candidates:
         if path and (given or Path(path).exists()):
             return path
@@ -35,12 +39,14 @@ def settings_of(config: str | None) -> Any:
 def run(config: str | None) -> int:
     """The daemon in the foreground."""
     from thermoctl.daemon.supervisor import run as supervise
+
     return supervise(settings_of(config))
 
 
 def service(config: str | None, action: str) -> int:
     """start, stop or restart."""
     from thermoctl.daemon import service as services
+
     return getattr(services, action)(settings_of(config))
 
 
@@ -79,14 +85,26 @@ def status(config: str | None, as_json: bool = False) -> int:
     if not answer["ticks"]:
         print("OFF, starting")
         return 1
-    print(f"{answer['state']}   {answer['ticks']} ticks in {answer['uptime_s']:.1f} s, {answer['slips']} slips, "
-          f"busy {answer['busy_us']:.0f} us")
-    print("   ".join(f"{label} {_number(answer[key])} um" for label, key in (
-        ("setpoint", "setpoint_um"), ("position", "position_um"), ("compensation", "compensation_um"),
-        ("output", "output_reference_um"))))
+    print(
+        f"{answer['state']}   {answer['ticks']} ticks in {answer['uptime_s']:.1f} s, {answer['slips']} slips, "
+        f"busy {answer['busy_us']:.0f} us"
+    )
+    print(
+        "   ".join(
+            f"{label} {_number(answer[key])} um"
+            for label, key in (
+                ("setpoint", "setpoint_um"),
+                ("position", "position_um"),
+                ("compensation", "compensation_um"),
+                ("output", "output_reference_um"),
+            )
+        )
+    )
     coil, estimate = answer["temperatures_c"]["coil"], answer["estimates_c"]["coil"]
-    print(f"drive {_number(answer['drive'])}   power {_number(answer['power_w'])} W   air {_number(answer['air_c'], 2)}"
-          f" C   coil {_number(coil, 2)} C, estimated {_number(estimate, 2)} C")
+    print(
+        f"drive {_number(answer['drive'])}   power {_number(answer['power_w'])} W   air {_number(answer['air_c'], 2)}"
+        f" C   coil {_number(coil, 2)} C, estimated {_number(estimate, 2)} C"
+    )
     bad = {role: state for role, state in answer["channels"].items() if state not in ("OK", "ABSENT")}
     if bad:
         print("readings: " + ", ".join(f"{role} {state}" for role, state in bad.items()))
@@ -110,19 +128,31 @@ def latency(config: str | None, as_json: bool = False) -> int:
         print(json.dumps(answer))
         return 0
     period = answer["period_us"]
-    print(f"{answer['ticks']} ticks of {period:g} us, {answer['slips']} slips "
-          f"({1000.0 * answer['slips'] / max(answer['ticks'], 1):.2f} in 1000)")
+    print(
+        f"{answer['ticks']} ticks of {period:g} us, {answer['slips']} slips "
+        f"({1000.0 * answer['slips'] / max(answer['ticks'], 1):.2f} in 1000)"
+    )
     print(f"{'':24}{'p50':>9}{'p99':>9}{'p99.9':>9}{'largest':>10}   us")
-    for name, label in (("lateness", "wake-up lateness"), ("busy", "busy time"), ("reference", "idle loop's lateness")):
+    for name, label in (
+        ("lateness", "wake-up lateness"),
+        ("busy", "busy time"),
+        ("reference", "idle loop's lateness"),
+    ):
         h = answer[name]
         if h["count"]:
             print(f"{label:24}{h['p50_us']:9.0f}{h['p99_us']:9.0f}{h['p999_us']:9.0f}{h['largest_us']:10.0f}")
         else:
-            print(f"{label:24}  none (loop.reference is off)" if name == "reference" else f"{label:24}  none yet")
+            print(
+                f"{label:24}  none (loop.reference is off)"
+                if name == "reference"
+                else f"{label:24}  none yet"
+            )
     busy = answer["busy"]
     if busy["count"]:
-        print(f"{'busy share of the tick':24}" + "".join(f"{100.0 * busy[k] / period:8.1f}%"
-                                                       for k in ("p50_us", "p99_us", "p999_us")))
+        print(
+            f"{'busy share of the tick':24}"
+            + "".join(f"{100.0 * busy[k] / period:8.1f}%" for k in ("p50_us", "p99_us", "p999_us"))
+        )
     for name in ("lateness", "busy"):
         print(f"\n{name}, us")
         print(_bars(answer[name]["bins_us"]))
@@ -132,22 +162,30 @@ def latency(config: str | None, as_json: bool = False) -> int:
 def _bars(bins: list[list[int]], width: int = 50) -> str:
     """A histogram of whole microseconds in bins that double."""
     edges = [0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 1 << 30]
-    counts = [sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)]
+    counts = [
+        sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)
+    ]
     top = max(counts, default=0) or 1
-    return "\n".join(f"{low:6d} .. {high if high < 1 << 30 else '':<5} {count:9d} {'#' * round(width * count / top)}"
-                     for low, high, count in zip(edges, edges[1:], counts, strict=False) if count)
+    return "\n".join(
+        f"{low:6d} .. {high if high < 1 << 30 else '':<5} {count:9d} {'#' * round(width * count / top)}"
+        for low, high, count in zip(edges, edges[1:], counts, strict=False)
+        if count
+    )
 
 
 def check(config: str) -> int:
     """Validate the configuration, the model, the plant and the profiles; no hardware is touched."""
     from hal.backend import make_backend
     from thermoctl.daemon.assemble import compensator, law_parameters
+
     settings = load_settings(config)
     law_parameters(settings)
     model = compensator(settings)
     make_backend(settings)
-    print(f"{config}: good. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, model "
-          f"{settings.compensation.model or 'none'} ({model.kind}, order {len(model.A_minus_I)})")
+    print(
+        f"{config}: good. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, model "
+        f"{settings.compensation.model or 'none'} ({model.kind}, order {len(model.A_minus_I)})"
+    )
     return 0
 
 
@@ -159,6 +197,7 @@ def doctor(config: str, seconds: float = 2.0) -> int:
     from thermoctl.daemon.doctor import real_time_checks
     from thermoctl.daemon.loop import become_real_time
     from thermoctl.signals import SIGNALS
+
     settings = load_settings(config)
     backend = make_backend(settings)
     units = {s.name: s.unit for s in SIGNALS}
@@ -170,7 +209,7 @@ def doctor(config: str, seconds: float = 2.0) -> int:
             sample = backend.read(now)
             for role, fresh in zip(ROLES, sample.fresh, strict=True):
                 counts[role] += int(fresh)
-            backend.write(0.0, False)                      # a drive answers to its SYNC; it stays disabled
+            backend.write(0.0, False)  # a drive answers to its SYNC; it stays disabled
             time.sleep(settings.loop.period_s)
             now = time.monotonic()
         print(f"{'channel':24}{'value':>14} {'unit':8}{'status':8}{'rate':>10}")
@@ -182,7 +221,9 @@ def doctor(config: str, seconds: float = 2.0) -> int:
             bad += sample.status[k] != OK
             unit = units.get("position_raw_um" if role == "position_um" else role, "")
             problem = f"   {backend.problem(role)}" if sample.status[k] != OK else ""
-            print(f"{role:24}{sample.value[k]:14.4f} {unit:8}{state:8}{counts[role] / seconds:7.1f} Hz{problem}")
+            print(
+                f"{role:24}{sample.value[k]:14.4f} {unit:8}{state:8}{counts[role] / seconds:7.1f} Hz{problem}"
+            )
     except HardwareError as e:
         print(f"thermoctl: {e}", file=sys.stderr)
         return 3
@@ -194,14 +235,17 @@ def doctor(config: str, seconds: float = 2.0) -> int:
     for line in refused or ["priority, locked memory, processor and latency request are all granted"]:
         print(f"  {line}")
     for check in real_time_checks(settings):
-        print(f"  {check.name:24}{'good' if check.good else 'tune'}  {check.found}"
-              + ("" if check.good else f"\n{'':30}-> {check.remedy}"))
+        print(
+            f"  {check.name:24}{'good' if check.good else 'tune'}  {check.found}"
+            + ("" if check.good else f"\n{'':30}-> {check.remedy}")
+        )
     return 1 if bad else 0
 
 
 def service_files(action: str, config: str | None, root: str) -> int:
     """service install | uninstall."""
     from thermoctl.daemon import service as services
+
     if action == "uninstall":
         return services.uninstall(Path(root))
     settings = settings_of(config)
@@ -211,12 +255,14 @@ def service_files(action: str, config: str | None, root: str) -> int:
 def demo(config: str | None, seconds: float | None) -> int:
     """The live view of a daemon of its own."""
     from thermoctl.daemon.view import demo as show
+
     return show(settings_of(config), seconds)
 
 
 def run_simulated_time(config: str | None, hours: float, no_compensation: bool, out: str | None) -> int:
     """Hours of rig time without a clock; see simulate.warm_up_proof."""
     from thermoctl.daemon.simulate import trapezoids
+
     return trapezoids(settings_of(config), hours, not no_compensation, out)
 
 
@@ -226,12 +272,15 @@ def replay(recording: str) -> int:
 
     from thermoctl.daemon.replay import replay as run_replay
     from thermoctl.recording.reader import read_rows
+
     rows, metadata = read_rows(recording)
     begin = time.perf_counter()
     result = run_replay(rows, metadata, recording)
     seconds = time.perf_counter() - begin
-    print(f"{recording}: {result.ticks} ticks replayed in {seconds:.2f} s"
-          + (f", {result.skipped} before the stored state skipped" if result.skipped else ""))
+    print(
+        f"{recording}: {result.ticks} ticks replayed in {seconds:.2f} s"
+        + (f", {result.skipped} before the stored state skipped" if result.skipped else "")
+    )
     for name, (count, first, largest) in result.differences.items():
         print(f"  {name}: differs in {count} ticks, first in tick {first}, by at most {largest:g}")
     if result.differences:

@@ -14,6 +14,7 @@ needed ("Authorization: Bearer TOKEN"; the page takes it from the address's #tok
 refused (Host, Origin, Sec-Fetch-Site), so is what is too large, too slow or too many. It speaks plain HTTP: beyond the
 machine, put an ssh tunnel or a TLS proxy in front.
 """
+
 from __future__ import annotations
 
 import base64
@@ -48,9 +49,9 @@ from thermoctl.signals import INDEX, POINTS, SIGNALS
 from thermoctl.yamlfile import InputError
 
 PAGE = Path(__file__).with_name("dashboard.html")
-MAX_HEAD, MAX_BODY = 8192, 1024         # bytes of a request
+MAX_HEAD, MAX_BODY = 8192, 1024  # bytes of a request
 MAX_CONNECTIONS, MAX_STREAMS = 32, 12
-REQUEST_S, SEND_S = 5.0, 5.0            # a request must have come, and an answer have gone, within these
+REQUEST_S, SEND_S = 5.0, 5.0  # a request must have come, and an answer have gone, within these
 MIN_TOKEN = 16
 COMMANDS = ("arm", "disarm", "setpoint")
 TOKEN_VARIABLE = "THERMOCTL_DASHBOARD_TOKEN"
@@ -67,6 +68,7 @@ class Refused(Exception):
 @dataclass(frozen=True)
 class Policy:
     """Who may do what. names: host names, besides addresses and localhost, that the page is asked for by."""
+
     token: str
     token_to_look: bool
     commands: bool = False
@@ -88,8 +90,10 @@ class Policy:
         """Refuse a request without the token."""
         given = headers.get("Authorization", "")
         if not hmac.compare_digest(given.encode(errors="replace"), f"Bearer {self.token}".encode()):
-            raise Refused(HTTPStatus.UNAUTHORIZED, "the token is missing or wrong: open the address that "
-                                                   "`thermoctl dashboard` printed")
+            raise Refused(
+                HTTPStatus.UNAUTHORIZED,
+                "the token is missing or wrong: open the address that `thermoctl dashboard` printed",
+            )
 
     def _ours(self, name: str) -> bool:
         if name == "localhost" or name in self.names:
@@ -110,6 +114,7 @@ def _host_name(host: str) -> str:
 
 class Server(ThreadingHTTPServer):
     """At most MAX_CONNECTIONS at a time; one more is closed at once."""
+
     daemon_threads = True
     allow_reuse_address = True
     request_queue_size = 64
@@ -139,6 +144,7 @@ class Server(ThreadingHTTPServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that went away is no news; a defect of ours is."""
         import sys
+
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
@@ -152,12 +158,15 @@ def _page() -> tuple[bytes, str]:
         digests = (base64.b64encode(hashlib.sha256(part.encode()).digest()).decode() for part in found)
         return " ".join(f"'sha256-{d}'" for d in digests)
 
-    return text.encode(), (f"default-src 'none'; script-src {hashes('script')}; style-src {hashes('style')}; "
-                           "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
+    return text.encode(), (
+        f"default-src 'none'; script-src {hashes('script')}; style-src {hashes('style')}; "
+        "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
 
 
 class Handler(BaseHTTPRequestHandler):
     """One request a connection."""
+
     server: Server
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "thermoctl", ""
@@ -203,7 +212,9 @@ class Handler(BaseHTTPRequestHandler):
             self.connection.settimeout(max(left, 1e-3))
             return self.connection.recv(4096) if left > 0 else b""
         except TimeoutError:
-            raise Refused(HTTPStatus.REQUEST_TIMEOUT, f"the request did not come within {REQUEST_S:g} s") from None
+            raise Refused(
+                HTTPStatus.REQUEST_TIMEOUT, f"the request did not come within {REQUEST_S:g} s"
+            ) from None
 
     def _answer(self, body: bytes) -> None:
         policy = self.server.policy
@@ -213,11 +224,19 @@ class Handler(BaseHTTPRequestHandler):
             self._command(body)
             return
         if self.command not in ("GET", "HEAD"):
-            raise Refused(HTTPStatus.METHOD_NOT_ALLOWED, "this dashboard is read-only; start it with --commands to move the rig"
-                          if self.command == "POST" else "only GET is answered")
+            raise Refused(
+                HTTPStatus.METHOD_NOT_ALLOWED,
+                "this dashboard is read-only; start it with --commands to move the rig"
+                if self.command == "POST"
+                else "only GET is answered",
+            )
         routes: dict[str, Callable[[Query], None]] = {
-            "/api/live": self._live, "/api/info": self._info, "/api/history": self._history,
-            "/api/captures": self._captures, "/api/capture": self._capture}
+            "/api/live": self._live,
+            "/api/info": self._info,
+            "/api/history": self._history,
+            "/api/captures": self._captures,
+            "/api/capture": self._capture,
+        }
         if policy.metrics:
             routes["/metrics"] = self._metrics
         if url.path == "/":
@@ -246,7 +265,10 @@ class Handler(BaseHTTPRequestHandler):
                 now, text = time.monotonic(), f"data: {_dump(frame)}\n\n"
                 if now - told >= 1.0:
                     told = now
-                    slow = {"latency": watch.latency(), "captures": [c.summary() for c in list(watch.captures)]}
+                    slow = {
+                        "latency": watch.latency(),
+                        "captures": [c.summary() for c in list(watch.captures)],
+                    }
                     text += f"event: slow\ndata: {_dump(slow)}\n\n"
                 self.wfile.write(text.encode())
         finally:
@@ -254,21 +276,42 @@ class Handler(BaseHTTPRequestHandler):
 
     def _info(self, query: Query) -> None:
         settings = self.server.settings
-        self._json({
-            "ok": True, "rig": settings.rig.name, "commands": self.server.policy.commands, "points": POINTS,
-            "period_s": settings.loop.period_s, "rate_hz": self.server.watch.rate_hz,
-            "innovation_limit_c": settings.protection.innovation_limit_c,
-            "innovation_time_s": settings.protection.innovation_time_s,
-            "coil_limit_c": settings.protection.coil_limit_c, "power_limit_w": settings.protection.power_limit_w,
-            "setpoint_low_um": settings.control.setpoint_low_um, "setpoint_high_um": settings.control.setpoint_high_um,
-            "signals": [{"name": s.name, "unit": s.unit, "meaning": s.meaning} for s in SIGNALS]})
+        self._json(
+            {
+                "ok": True,
+                "rig": settings.rig.name,
+                "commands": self.server.policy.commands,
+                "points": POINTS,
+                "period_s": settings.loop.period_s,
+                "rate_hz": self.server.watch.rate_hz,
+                "innovation_limit_c": settings.protection.innovation_limit_c,
+                "innovation_time_s": settings.protection.innovation_time_s,
+                "coil_limit_c": settings.protection.coil_limit_c,
+                "power_limit_w": settings.protection.power_limit_w,
+                "setpoint_low_um": settings.control.setpoint_low_um,
+                "setpoint_high_um": settings.control.setpoint_high_um,
+                "signals": [{"name": s.name, "unit": s.unit, "meaning": s.meaning} for s in SIGNALS],
+            }
+        )
 
     def _history(self, query: Query) -> None:
         end = query.number("end", time.time())
-        found = history(self.server.settings.recording.directory, query.text("signal", "compensation_um"),
-                        query.number("begin", end - 3600.0), end, int(query.number("points", 800.0)))
-        self._json({"ok": True, "source": found.source, "files": found.files, "t": _numbers(found.t, 3),
-                    **{k: _numbers(getattr(found, k)) for k in ("low", "mean", "high")}})
+        found = history(
+            self.server.settings.recording.directory,
+            query.text("signal", "compensation_um"),
+            query.number("begin", end - 3600.0),
+            end,
+            int(query.number("points", 800.0)),
+        )
+        self._json(
+            {
+                "ok": True,
+                "source": found.source,
+                "files": found.files,
+                "t": _numbers(found.t, 3),
+                **{k: _numbers(getattr(found, k)) for k in ("low", "mean", "high")},
+            }
+        )
 
     def _captures(self, query: Query) -> None:
         self._json({"ok": True, "captures": [c.summary() for c in list(self.server.watch.captures)]})
@@ -276,18 +319,29 @@ class Handler(BaseHTTPRequestHandler):
     def _capture(self, query: Query) -> None:
         capture = self.server.watch.capture(int(query.number("number", 0.0)))
         if capture is None:
-            raise Refused(HTTPStatus.NOT_FOUND, "no capture of this number (the dashboard keeps the newest ones)")
+            raise Refused(
+                HTTPStatus.NOT_FOUND, "no capture of this number (the dashboard keeps the newest ones)"
+            )
         if query.text("format", "json") == "csv":
             out = io.StringIO()
             np.savetxt(out, capture.rows, "%.17g", ",", header=",".join(INDEX), comments="")
-            self._send(out.getvalue().replace("nan", "").encode(), "text/csv; charset=utf-8",
-                       extra={"Content-Disposition": f'attachment; filename="capture-{capture.number}.csv"'})
+            self._send(
+                out.getvalue().replace("nan", "").encode(),
+                "text/csv; charset=utf-8",
+                extra={"Content-Disposition": f'attachment; filename="capture-{capture.number}.csv"'},
+            )
             return
         signal = query.text("signal", "compensated_um")
         if signal not in INDEX:
             raise InputError(f"capture: no signal '{signal[:60]}'")
-        self._json({"ok": True, **capture.summary(), "t": _numbers(capture.rows[:, INDEX["t_s"]] - capture.t_s, 6),
-                    "values": _numbers(capture.rows[:, INDEX[signal]])})
+        self._json(
+            {
+                "ok": True,
+                **capture.summary(),
+                "t": _numbers(capture.rows[:, INDEX["t_s"]] - capture.t_s, 6),
+                "values": _numbers(capture.rows[:, INDEX[signal]]),
+            }
+        )
 
     def _metrics(self, query: Query) -> None:
         self._send(metrics(self.server.watch.shared).encode(), CONTENT_TYPE)
@@ -308,31 +362,48 @@ class Handler(BaseHTTPRequestHandler):
                 return
             body += more
         try:
-            request = json.loads(body[:int(length)])
+            request = json.loads(body[: int(length)])
             command, value = request["command"], request.get("value")
         except (ValueError, RecursionError, KeyError, TypeError, AttributeError):
             raise Refused(HTTPStatus.BAD_REQUEST, "an object with a 'command' was expected") from None
         if command not in COMMANDS:
             raise Refused(HTTPStatus.BAD_REQUEST, f"the commands are {', '.join(COMMANDS)}")
         answer = ask(self.server.settings.socket.path, {"command": command, "value": value})
-        print(f"command {command} {'' if value is None else value} from {self.client_address[0]}: "
-              f"{'done' if answer['ok'] else answer['error']}", flush=True)
+        print(
+            f"command {command} {'' if value is None else value} from {self.client_address[0]}: "
+            f"{'done' if answer['ok'] else answer['error']}",
+            flush=True,
+        )
         self._json(answer, HTTPStatus.OK if answer["ok"] else HTTPStatus.CONFLICT)
 
     def _json(self, answer: dict[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:
         self._send(_dump(answer).encode(), "application/json", status)
 
-    def _send(self, content: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK,
-              extra: dict[str, str] | None = None) -> None:
+    def _send(
+        self,
+        content: bytes,
+        kind: str,
+        status: HTTPStatus = HTTPStatus.OK,
+        extra: dict[str, str] | None = None,
+    ) -> None:
         self._head(status, kind, len(content), extra)
         if self.command != "HEAD":
             self.wfile.write(content)
 
-    def _head(self, status: HTTPStatus, kind: str, length: int | None, extra: dict[str, str] | None = None) -> None:
+    def _head(
+        self, status: HTTPStatus, kind: str, length: int | None, extra: dict[str, str] | None = None
+    ) -> None:
         self.send_response(status)
-        headers = {"Content-Type": kind, "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff",
-                   "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin",
-                   "Content-Security-Policy": self.server.page_policy, "Connection": "close", **(extra or {})}
+        headers = {
+            "Content-Type": kind,
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Content-Security-Policy": self.server.page_policy,
+            "Connection": "close",
+            **(extra or {}),
+        }
         if status == HTTPStatus.UNAUTHORIZED:
             headers["WWW-Authenticate"] = "Bearer"
         if length is not None:
@@ -380,12 +451,21 @@ def _dump(value: Any) -> str:
 
 def _numbers(array: np.ndarray, digits: int | None = None) -> list[float | None]:
     """For JSON: seven significant digits (or `digits` after the point), null where there is none."""
-    return [None if not math.isfinite(v) else round(v, digits) if digits is not None else float(f"{v:.7g}")
-            for v in array.tolist()]
+    return [
+        None if not math.isfinite(v) else round(v, digits) if digits is not None else float(f"{v:.7g}")
+        for v in array.tolist()
+    ]
 
 
-def make_server(settings: Any, listen: str, watch: Watch, commands: bool = False, with_metrics: bool = False,
-                token: str = "", names: tuple[str, ...] = ()) -> Server:
+def make_server(
+    settings: Any,
+    listen: str,
+    watch: Watch,
+    commands: bool = False,
+    with_metrics: bool = False,
+    token: str = "",
+    names: tuple[str, ...] = (),
+) -> Server:
     """A server on `listen` (ADDRESS:PORT, [V6ADDRESS]:PORT, or PORT on loopback), not yet serving.
 
     Raises InputError for an address that cannot be listened on and a token that can be guessed.
@@ -394,12 +474,19 @@ def make_server(settings: Any, listen: str, watch: Watch, commands: bool = False
     if token and len(token) < MIN_TOKEN:
         raise InputError(f"the token has {len(token)} characters; at least {MIN_TOKEN} were expected")
     loopback = ipaddress.ip_address(address).is_loopback
-    policy = Policy(token or secrets.token_urlsafe(24), not loopback, commands, with_metrics,
-                    frozenset(n.lower() for n in (*names, *(() if loopback else (socket.gethostname(),)))))
+    policy = Policy(
+        token or secrets.token_urlsafe(24),
+        not loopback,
+        commands,
+        with_metrics,
+        frozenset(n.lower() for n in (*names, *(() if loopback else (socket.gethostname(),)))),
+    )
     try:
         return Server((address, port), settings, watch, policy)
     except OSError as e:
-        raise InputError(f"{listen}: cannot listen: {e.strerror or e}; choose another address with --listen") from None
+        raise InputError(
+            f"{listen}: cannot listen: {e.strerror or e}; choose another address with --listen"
+        ) from None
 
 
 def _address(listen: str) -> tuple[str, int]:
@@ -411,7 +498,9 @@ def _address(listen: str) -> tuple[str, int]:
         if not 0 <= int(port) <= 65535:
             raise ValueError
     except ValueError:
-        raise InputError(f"--listen {listen}: ADDRESS:PORT was expected, as 127.0.0.1:8765 or [::]:8765") from None
+        raise InputError(
+            f"--listen {listen}: ADDRESS:PORT was expected, as 127.0.0.1:8765 or [::]:8765"
+        ) from None
     return host, int(port)
 
 
@@ -423,8 +512,15 @@ def url(server: Server) -> str:
     return f"http://{host}:{port}/" + (f"#token={server.policy.token}" if needed else "")
 
 
-def dashboard(settings: Any, listen: str, commands: bool, with_metrics: bool, token_file: str | None, rate_hz: float,
-              names: tuple[str, ...]) -> int:
+def dashboard(
+    settings: Any,
+    listen: str,
+    commands: bool,
+    with_metrics: bool,
+    token_file: str | None,
+    rate_hz: float,
+    names: tuple[str, ...],
+) -> int:
     """Serve until Ctrl-C."""
     if not 1.0 <= rate_hz <= 50.0:
         raise InputError(f"--rate {rate_hz:g}: 1 to 50 frames a second were expected")
@@ -438,8 +534,11 @@ def dashboard(settings: Any, listen: str, commands: bool, with_metrics: bool, to
     server = make_server(settings, listen, watch, commands, with_metrics, token, names)
     follower = threading.Thread(target=watch.run, daemon=True)
     follower.start()
-    print(f"{url(server)}\n{'commands are taken with the token' if commands else 'read-only'}"
-          f"{'; metrics at /metrics' if with_metrics else ''}; Ctrl-C ends it", flush=True)
+    print(
+        f"{url(server)}\n{'commands are taken with the token' if commands else 'read-only'}"
+        f"{'; metrics at /metrics' if with_metrics else ''}; Ctrl-C ends it",
+        flush=True,
+    )
     with contextlib.suppress(KeyboardInterrupt):
         server.serve_forever(poll_interval=0.2)
     watch.stop()

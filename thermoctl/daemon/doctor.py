@@ -2,6 +2,7 @@
 
 Everything is read from /proc and /sys below `root`; nothing is changed. docs/how-to/real-time.md explains each line.
 """
+
 from __future__ import annotations
 
 import os
@@ -18,6 +19,7 @@ from hal.serial_port import latency_timer_ms
 @dataclass(frozen=True)
 class Check:
     """One property: `good` as it is, what was `found`, and the `remedy` where it is not good."""
+
     name: str
     good: bool
     found: str
@@ -29,14 +31,24 @@ def real_time_checks(settings: Any, root: str = "/") -> Iterator[Check]:
     base, cpu = Path(root), settings.loop.cpu
     yield _preemption(base)
     if cpu < 0:
-        yield Check("own processor", False, "loop.cpu is -1: the loop runs where the scheduler puts it",
-                    "isolate one and name it in loop.cpu")
+        yield Check(
+            "own processor",
+            False,
+            "loop.cpu is -1: the loop runs where the scheduler puts it",
+            "isolate one and name it in loop.cpu",
+        )
     else:
-        for name, file, what in (("isolated processor", "isolated", "isolcpus=managed_irq,domain,{0}"),
-                                 ("no tick on it", "nohz_full", "nohz_full={0} rcu_nocbs={0}")):
+        for name, file, what in (
+            ("isolated processor", "isolated", "isolcpus=managed_irq,domain,{0}"),
+            ("no tick on it", "nohz_full", "nohz_full={0} rcu_nocbs={0}"),
+        ):
             text = _text(base / "sys/devices/system/cpu" / file)
-            yield Check(name, cpu in cpu_list(text), f"{file}: {text or 'none'}",
-                        f"add {what.format(cpu)} to the kernel's command line (GRUB_CMDLINE_LINUX), update-grub, reboot")
+            yield Check(
+                name,
+                cpu in cpu_list(text),
+                f"{file}: {text or 'none'}",
+                f"add {what.format(cpu)} to the kernel's command line (GRUB_CMDLINE_LINUX), update-grub, reboot",
+            )
         yield _interrupts(base, cpu)
     yield _throttling(base, settings.loop.spin_s / settings.loop.period_s)
     yield _dma_latency(base)
@@ -63,29 +75,50 @@ def _preemption(base: Path) -> Check:
     if _text(base / "sys/kernel/realtime") == "1":
         return Check("PREEMPT_RT", True, "the kernel is PREEMPT_RT", "")
     model = re.search(r"\bPREEMPT\w*", _text(base / "proc/version"))
-    return Check("PREEMPT_RT", False, f"the kernel is {model[0] if model else 'not preemptible'}",
-                 "apt-get install linux-image-rt-amd64 and boot it: tails of milliseconds become tens of microseconds")
+    return Check(
+        "PREEMPT_RT",
+        False,
+        f"the kernel is {model[0] if model else 'not preemptible'}",
+        "apt-get install linux-image-rt-amd64 and boot it: tails of milliseconds become tens of microseconds",
+    )
 
 
 def _interrupts(base: Path, cpu: int) -> Check:
     mine = []
     for irq in sorted((base / "proc/irq").glob("[0-9]*"), key=lambda p: int(p.name)):
         allowed = _text(irq / "effective_affinity_list") or _text(irq / "smp_affinity_list")
-        if cpu in cpu_list(allowed) and any(p.is_dir() for p in irq.iterdir()):          # a directory names its handler
+        if cpu in cpu_list(allowed) and any(
+            p.is_dir() for p in irq.iterdir()
+        ):  # a directory names its handler
             mine.append(irq.name)
     shown = ", ".join(mine[:8]) + (", .." if len(mine) > 8 else "")
-    return Check("interrupts elsewhere", not mine, f"interrupts on processor {cpu}: {shown or 'none'}",
-                 f"write the other processors to /proc/irq/N/smp_affinity_list (irqbalance: IRQBALANCE_BANNED_CPULIST={cpu})")
+    return Check(
+        "interrupts elsewhere",
+        not mine,
+        f"interrupts on processor {cpu}: {shown or 'none'}",
+        f"write the other processors to /proc/irq/N/smp_affinity_list (irqbalance: IRQBALANCE_BANNED_CPULIST={cpu})",
+    )
 
 
 def _throttling(base: Path, burnt: float) -> Check:
-    runtime, period = _text(base / "proc/sys/kernel/sched_rt_runtime_us"), _text(base / "proc/sys/kernel/sched_rt_period_us")
+    runtime, period = (
+        _text(base / "proc/sys/kernel/sched_rt_runtime_us"),
+        _text(base / "proc/sys/kernel/sched_rt_period_us"),
+    )
     if not runtime or not period:
         return Check("real-time throttling", True, "not there", "")
     share = 1.0 if int(runtime) < 0 else int(runtime) / int(period)
-    found = "off" if int(runtime) < 0 else f"real-time tasks may take {100 * share:.0f} %, loop.spin_s burns {100 * burnt:.0f} %"
-    return Check("real-time throttling", burnt < share - 0.3 or int(runtime) < 0, found,
-                 "sysctl -w kernel.sched_rt_runtime_us=-1 (in /etc/sysctl.d/ to keep it), or spin less (loop.spin_s)")
+    found = (
+        "off"
+        if int(runtime) < 0
+        else f"real-time tasks may take {100 * share:.0f} %, loop.spin_s burns {100 * burnt:.0f} %"
+    )
+    return Check(
+        "real-time throttling",
+        burnt < share - 0.3 or int(runtime) < 0,
+        found,
+        "sysctl -w kernel.sched_rt_runtime_us=-1 (in /etc/sysctl.d/ to keep it), or spin less (loop.spin_s)",
+    )
 
 
 def _dma_latency(base: Path) -> Check:
@@ -93,14 +126,24 @@ def _dma_latency(base: Path) -> Check:
     if not device.exists():
         return Check("cpu_dma_latency", True, "this machine has none", "")
     allowed = os.access(device, os.W_OK)
-    return Check("cpu_dma_latency", allowed, "writable: deep idle states are refused while the loop runs" if allowed
-                 else "not writable for this user", "thermoctl service install (its udev rule gives the group thermoctl access)")
+    return Check(
+        "cpu_dma_latency",
+        allowed,
+        "writable: deep idle states are refused while the loop runs"
+        if allowed
+        else "not writable for this user",
+        "thermoctl service install (its udev rule gives the group thermoctl access)",
+    )
 
 
 def _governor(base: Path, cpu: int) -> Check:
     governor = _text(base / f"sys/devices/system/cpu/cpu{max(cpu, 0)}/cpufreq/scaling_governor")
-    return Check("frequency governor", governor in ("", "performance"), governor or "the clock does not scale here",
-                 "cpupower frequency-set -g performance (or echo performance into scaling_governor at boot)")
+    return Check(
+        "frequency governor",
+        governor in ("", "performance"),
+        governor or "the clock does not scale here",
+        "cpupower frequency-set -g performance (or echo performance into scaling_governor at boot)",
+    )
 
 
 def _latency_timers(settings: Any, sys_root: str) -> Iterator[Check]:
@@ -110,6 +153,10 @@ def _latency_timers(settings: Any, sys_root: str) -> Iterator[Check]:
         port = re.sub(r"^(slcan|rtu):|@\d+$", "", device.binding.port)
         wanted, found = device.binding.profile.line.latency_timer_ms, latency_timer_ms(port, sys_root)
         if found is not None:
-            yield Check(f"latency_timer of {device.name}", found <= max(wanted, 1), f"{found} ms",
-                        f"echo 1 > {sys_root}/bus/usb-serial/devices/{os.path.basename(os.path.realpath(port))}/latency_timer "
-                        "(the udev rule of `thermoctl service install` does it at every plug)")
+            yield Check(
+                f"latency_timer of {device.name}",
+                found <= max(wanted, 1),
+                f"{found} ms",
+                f"echo 1 > {sys_root}/bus/usb-serial/devices/{os.path.basename(os.path.realpath(port))}/latency_timer "
+                "(the udev rule of `thermoctl service install` does it at every plug)",
+            )

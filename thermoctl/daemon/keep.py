@@ -5,6 +5,7 @@ that was started again is as safe as a new one. They are taken up when they are 
 model, not older than KEEP_S, and (law.resume) when the coil's first reading is within RESUME_LIMIT_C of them; else
 the estimate starts anew on the coil's first reading. The time between is advanced without power.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -20,8 +21,8 @@ import numpy as np
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.recorder import decode, encode
 
-KEEP_S = 600.0              # older estimates say little about the rig's slow parts
-EVERY_S = 5.0               # between two times that the supervisor keeps them
+KEEP_S = 600.0  # older estimates say little about the rig's slow parts
+EVERY_S = 5.0  # between two times that the supervisor keeps them
 MAX_BYTES = 65536
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
@@ -37,12 +38,22 @@ def _now_s() -> float:
 
 def _fingerprint(model: CompensatorModel) -> int:
     arrays = (model.A_minus_I, model.B, model.C, model.gain, model.b1, model.b2)
-    return zlib.crc32(b"".join(a.tobytes() for a in arrays) + f"{model.kind} {model.period_s} {model.f1}".encode())
+    return zlib.crc32(
+        b"".join(a.tobytes() for a in arrays) + f"{model.kind} {model.period_s} {model.f1}".encode()
+    )
 
 
 def save(path: Path, model: CompensatorModel, state: np.ndarray) -> bool:
     """Keep a law's snapshot; False where the disk refuses (the next start is then a cold one)."""
-    text = json.dumps({"version": 1, "boot": _boot(), "at_s": _now_s(), "model": _fingerprint(model), "state": encode(state)})
+    text = json.dumps(
+        {
+            "version": 1,
+            "boot": _boot(),
+            "at_s": _now_s(),
+            "model": _fingerprint(model),
+            "state": encode(state),
+        }
+    )
     try:
         with contextlib.suppress(FileNotFoundError):
             path.with_suffix(".new").unlink()

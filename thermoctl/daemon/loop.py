@@ -8,6 +8,7 @@ skipped, counted and published, and the phase is kept (policy `skip`). A tick of
 (loop.pxd types it): Python's objects are cold after a period of sleep, and each costs a cache miss. Real-time measures (priority, locked memory,
 processor, latency request) are asked for one by one; what the system refuses is one warning each, never a crash.
 """
+
 from __future__ import annotations
 
 import ctypes
@@ -30,11 +31,15 @@ from thermoctl.signals import INDEX, SIGNALS
 
 RELOAD = float(len(arming.COMMANDS))
 """The mailbox command that applies the parameter block; the others are arming's."""
-SUSPEND_NS = 1_000_000                 # the two clocks are not read at once; less than this is no suspend
-SUSPEND_EVERY = 16                     # ticks between two looks for one
-STATE_EVERY = 1000                     # ticks between two snapshots of the law's state
-_HEAD = INDEX["position_raw_um"]            # numbers of a row before the channels, in the order of `publish`
-_STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = STATE_EVERY, SUSPEND_EVERY, SUSPEND_NS         # numbers of C, by loop.pxd
+SUSPEND_NS = 1_000_000  # the two clocks are not read at once; less than this is no suspend
+SUSPEND_EVERY = 16  # ticks between two looks for one
+STATE_EVERY = 1000  # ticks between two snapshots of the law's state
+_HEAD = INDEX["position_raw_um"]  # numbers of a row before the channels, in the order of `publish`
+_STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = (
+    STATE_EVERY,
+    SUSPEND_EVERY,
+    SUSPEND_NS,
+)  # numbers of C, by loop.pxd
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
 
 
@@ -45,9 +50,18 @@ class Rig:
     parameters, state: as in shared.Shared, or None where nobody commands. wall_s, suspended_ns: other clocks than the system's.
     """
 
-    def __init__(self, backend: Any, model: CompensatorModel, parameters: Parameters, period_s: float,
-                 publish: Ring | Callable[[np.ndarray], Any], mailbox: Mailbox | None = None, parameter_box: Any = None,
-                 state_box: Any = None, start_s: float = 0.0):
+    def __init__(
+        self,
+        backend: Any,
+        model: CompensatorModel,
+        parameters: Parameters,
+        period_s: float,
+        publish: Ring | Callable[[np.ndarray], Any],
+        mailbox: Mailbox | None = None,
+        parameter_box: Any = None,
+        state_box: Any = None,
+        start_s: float = 0.0,
+    ):
         self.backend, self.publish_row, self.mailbox = backend, publish, mailbox
         self.parameter_box, self.state_box, self.start_s = parameter_box, state_box, start_s
         self.law = Law(model, parameters, period_s)
@@ -59,8 +73,9 @@ class Rig:
         self.wall_s: Callable[[], float] | None = None
         self.suspended_ns: Callable[[], int] | None = None
 
-    def tick(self, now_s: float, dt_s: float, lateness_us: float = 0.0,
-             clock_ns: Callable[[], int] | None = None) -> None:
+    def tick(
+        self, now_s: float, dt_s: float, lateness_us: float = 0.0, clock_ns: Callable[[], int] | None = None
+    ) -> None:
         """One tick that began at `now_s`, `dt_s` after the one before; clock_ns times it, None: the loop's own clock."""
         begin = now_ns() if clock_ns is None else int(clock_ns())
         self.sample(now_s)
@@ -80,7 +95,7 @@ class Rig:
             reading = devices.read(now_s)
         else:
             reading = self.backend.read(now_s)
-        if reading is not self.reading:                       # the same object every time, by contract
+        if reading is not self.reading:  # the same object every time, by contract
             self.reading = reading
             fresh = reading.fresh.view(np.uint8)
             self.law.bind(reading.value, fresh, reading.status)
@@ -136,7 +151,9 @@ class Rig:
             self.state_box.put(np.concatenate(((self.law.tick, self.generation), self.law.snapshot())))
 
 
-def run_loop(settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], bool], warm_up_ticks: int = 100) -> None:
+def run_loop(
+    settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], bool], warm_up_ticks: int = 100
+) -> None:
     """Tick until `stopping()`; the caller has opened the back end and disables the amplifier afterwards."""
     period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
     paced = settings.loop.pace == "device"
@@ -148,18 +165,18 @@ def run_loop(settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], boo
     slept_before = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
     deadline = before + period_ns
     while not stopping():
-        if paced:                                              # a frame is late: so is the tick, but not by two periods
+        if paced:  # a frame is late: so is the tick, but not by two periods
             sleep_until(before + period_ns // 2)
             rig.backend.wait_frame(deadline, deadline + period_ns)
             now = now_ns()
             deadline = min(deadline, now)
         else:
             now = sleep_until(deadline, spin_ns)
-            if now < deadline:                                 # a signal woke us: its handler has run
+            if now < deadline:  # a signal woke us: its handler has run
                 continue
         lateness_us = (now - deadline) * 1e-3
         gap_ns = 0
-        if rig.law.tick % _SUSPEND_EVERY == 0:                 # CLOCK_MONOTONIC stands while the machine sleeps
+        if rig.law.tick % _SUSPEND_EVERY == 0:  # CLOCK_MONOTONIC stands while the machine sleeps
             slept = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
             gap_ns = slept - slept_before if slept - slept_before > _SUSPEND_NS else 0
             slept_before = slept
@@ -170,7 +187,7 @@ def run_loop(settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], boo
         before = now
         deadline = now + period_ns if paced else deadline + period_ns
         late_ns = now_ns() - deadline
-        if late_ns > 0:                                        # skip, and keep the phase
+        if late_ns > 0:  # skip, and keep the phase
             skipped = late_ns // period_ns + (1 if late_ns % period_ns else 0)
             rig.slips += skipped
             deadline += skipped * period_ns
@@ -203,12 +220,17 @@ def become_real_time(settings: Any, warn: Callable[[str], None]) -> list[Any]:
             warn(f"{what} refused ({getattr(e, 'strerror', None) or e}): {advice}")
 
     if loop.cpu is not None and loop.cpu >= 0:
-        attempt(lambda: os.sched_setaffinity(0, {loop.cpu}), f"processor {loop.cpu}",
-                "the loop runs where the scheduler puts it; set loop.cpu to an allowed processor")
+        attempt(
+            lambda: os.sched_setaffinity(0, {loop.cpu}),
+            f"processor {loop.cpu}",
+            "the loop runs where the scheduler puts it; set loop.cpu to an allowed processor",
+        )
     if loop.priority > 0:
-        attempt(lambda: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(loop.priority)),
-                f"real-time priority {loop.priority}",
-                "expect late ticks; run under the systemd unit or allow it (LimitRTPRIO, CAP_SYS_NICE)")
+        attempt(
+            lambda: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(loop.priority)),
+            f"real-time priority {loop.priority}",
+            "expect late ticks; run under the systemd unit or allow it (LimitRTPRIO, CAP_SYS_NICE)",
+        )
     attempt(_lock_memory, "locked memory", "page faults may delay ticks; raise LimitMEMLOCK")
 
     def hold_latency() -> None:
@@ -216,8 +238,11 @@ def become_real_time(settings: Any, warn: Callable[[str], None]) -> list[Any]:
         os.write(file, (0).to_bytes(4, "little"))
         kept.append(file)
 
-    attempt(hold_latency, "/dev/cpu_dma_latency",
-            "deep idle states may double the wake-up latency; give the service's group write access (udev rule)")
+    attempt(
+        hold_latency,
+        "/dev/cpu_dma_latency",
+        "deep idle states may double the wake-up latency; give the service's group write access (udev rule)",
+    )
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -3,6 +3,7 @@
 Every number of the newest row becomes `thermoctl_<signal>` with the signal's own unit as its ending; the temperatures
 carry the point as a label. Lateness and busy time are histograms in seconds, faults are 0 or 1 each.
 """
+
 from __future__ import annotations
 
 import math
@@ -17,8 +18,20 @@ from thermoctl.signals import INDEX, POINTS, SIGNALS
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BUCKETS_US = (10, 20, 50, 100, 200, 500, 1000, 2000, 4096)
 _COUNTERS = {"tick": "thermoctl_ticks_total", "slips": "thermoctl_slips_total"}
-_ELSEWHERE = {"t_s", "wall_s", "lateness_us", "busy_us", "state", "fault_bits", "fresh_bits", "status_bits", "command",
-              "command_value", "external_bits", *(f"{p}{end}" for p in POINTS for end in ("_c", "_est_c"))}
+_ELSEWHERE = {
+    "t_s",
+    "wall_s",
+    "lateness_us",
+    "busy_us",
+    "state",
+    "fault_bits",
+    "fresh_bits",
+    "status_bits",
+    "command",
+    "command_value",
+    "external_bits",
+    *(f"{p}{end}" for p in POINTS for end in ("_c", "_est_c")),
+}
 
 
 def metrics(shared: Shared | None) -> str:
@@ -35,25 +48,56 @@ def metrics(shared: Shared | None) -> str:
     if shared is None or row is None:
         return "\n".join(lines) + "\n"
     state, bits = int(row[INDEX["state"]]), int(row[INDEX["fault_bits"]])
-    family("thermoctl_state", "gauge", "1 for the state the daemon is in",
-           [(f'{{state="{name}"}}', float(k == state)) for k, name in enumerate(arming.STATES)])
-    family("thermoctl_fault", "gauge", "1 while the fault stands",
-           [(f'{{name="{f.name}",severity="{f.severity}"}}', float(bits >> f.bit & 1)) for f in faults.FAULTS])
-    family("thermoctl_temperature_celsius", "gauge", "temperature of a point",
-           [(f'{{point="{p}",kind="{kind}"}}', row[INDEX[f"{p}{end}"]]) for p in POINTS
-            for kind, end in (("measured", "_c"), ("estimated", "_est_c"))])
-    family("thermoctl_start_time_seconds", "gauge", "when the daemon started, seconds since 1970",
-           [("", row[INDEX["wall_s"]] - row[INDEX["t_s"]])])
+    family(
+        "thermoctl_state",
+        "gauge",
+        "1 for the state the daemon is in",
+        [(f'{{state="{name}"}}', float(k == state)) for k, name in enumerate(arming.STATES)],
+    )
+    family(
+        "thermoctl_fault",
+        "gauge",
+        "1 while the fault stands",
+        [(f'{{name="{f.name}",severity="{f.severity}"}}', float(bits >> f.bit & 1)) for f in faults.FAULTS],
+    )
+    family(
+        "thermoctl_temperature_celsius",
+        "gauge",
+        "temperature of a point",
+        [
+            (f'{{point="{p}",kind="{kind}"}}', row[INDEX[f"{p}{end}"]])
+            for p in POINTS
+            for kind, end in (("measured", "_c"), ("estimated", "_est_c"))
+        ],
+    )
+    family(
+        "thermoctl_start_time_seconds",
+        "gauge",
+        "when the daemon started, seconds since 1970",
+        [("", row[INDEX["wall_s"]] - row[INDEX["t_s"]])],
+    )
     for s in SIGNALS:
         if s.name in _COUNTERS:
             family(_COUNTERS[s.name], "counter", s.meaning, [("", row[INDEX[s.name]])])
         elif s.name not in _ELSEWHERE:
             family(f"thermoctl_{s.name}", "gauge", s.meaning, [("", row[INDEX[s.name]])])
-    family("thermoctl_recorder_rows_total", "counter", "ticks written to the recording",
-           [("", shared.counters[RECORDER_ROWS])])
-    family("thermoctl_recorder_lost_total", "counter", "ticks that the recorder lost", [("", shared.counters[RECORDER_LOST])])
-    for name, meaning in (("lateness", "wake-up after the tick's deadline"), ("busy", "wake-up until the amplifier was written"),
-                          ("reference", "lateness of the idle loop beside it")):
+    family(
+        "thermoctl_recorder_rows_total",
+        "counter",
+        "ticks written to the recording",
+        [("", shared.counters[RECORDER_ROWS])],
+    )
+    family(
+        "thermoctl_recorder_lost_total",
+        "counter",
+        "ticks that the recorder lost",
+        [("", shared.counters[RECORDER_LOST])],
+    )
+    for name, meaning in (
+        ("lateness", "wake-up after the tick's deadline"),
+        ("busy", "wake-up until the amplifier was written"),
+        ("reference", "lateness of the idle loop beside it"),
+    ):
         _histogram(lines, f"thermoctl_{name}_seconds", meaning, shared.areas[name])
     return "\n".join(lines) + "\n"
 
@@ -63,9 +107,11 @@ def _histogram(lines: list[str], name: str, help: str, counts: np.ndarray) -> No
     counts = counts.astype(np.float64)
     lines += [f"# HELP {name} {help}", f"# TYPE {name} histogram"]
     lines += [f'{name}_bucket{{le="{us * 1e-6:.6g}"}} {_number(counts[:us].sum())}' for us in BUCKETS_US]
-    lines += [f'{name}_bucket{{le="+Inf"}} {_number(counts.sum())}',
-              f"{name}_sum {_number((np.arange(len(counts)) + 0.5) @ counts * 1e-6)}",
-              f"{name}_count {_number(counts.sum())}"]
+    lines += [
+        f'{name}_bucket{{le="+Inf"}} {_number(counts.sum())}',
+        f"{name}_sum {_number((np.arange(len(counts)) + 0.5) @ counts * 1e-6)}",
+        f"{name}_count {_number(counts.sum())}",
+    ]
 
 
 def _number(value: float) -> str:

@@ -6,6 +6,7 @@
 Where the model holds, z is about standard normal and the sum falls back to zero; where it does not, both the alarm and the
 onset (the sum's last zero) come out. The sum runs on both sides.
 """
+
 from __future__ import annotations
 
 import math
@@ -15,16 +16,17 @@ import numpy as np
 
 from thermoctl.control.model import CompensatorModel
 
-BLOCK_S = 20.0          # of innovations in one value
-DRIFT = 1.0             # a lasting shift of two standard errors of a block is what the sum is tuned to
+BLOCK_S = 20.0  # of innovations in one value
+DRIFT = 1.0  # a lasting shift of two standard errors of a block is what the sum is tuned to
 LIMIT = 15.0
-CLIP = 4.0              # no single block decides
-CORRELATED = 4.0        # quantisation correlates neighbours: so many samples count as one
+CLIP = 4.0  # no single block decides
+CORRELATED = 4.0  # quantisation correlates neighbours: so many samples count as one
 
 
 @dataclass(frozen=True)
 class Alarm:
     """The model does not fit from `begin_s` to `end_s`; `mean_c`: the mean innovation there, K."""
+
     begin_s: float
     end_s: float
     mean_c: float
@@ -41,10 +43,10 @@ class Misfit:
 
     def restart(self) -> None:
         """Forget what was seen: another model, or a clock that began again."""
-        self._rows = np.empty((3, 0))           # of the block that is not complete: t, innovation, gain
+        self._rows = np.empty((3, 0))  # of the block that is not complete: t, innovation, gain
         self._last_t, self._last_c = -math.inf, math.nan
         self.sums = [0.0, 0.0]
-        self._since, self._total, self._blocks = [0.0, 0.0], [0.0, 0.0], [0, 0]      # of a sum since it was zero
+        self._since, self._total, self._blocks = [0.0, 0.0], [0.0, 0.0], [0, 0]  # of a sum since it was zero
         self.alarmed = False
 
     def add(self, t_s: np.ndarray, innovation_c: np.ndarray, kalman_gain: np.ndarray) -> Alarm | None:
@@ -53,7 +55,7 @@ class Misfit:
         found = None
         if not self._watches or not rows.shape[1]:
             return found
-        begins = np.flatnonzero(np.diff(rows[0], prepend=self._last_t) < 0.0)        # the clock began again
+        begins = np.flatnonzero(np.diff(rows[0], prepend=self._last_t) < 0.0)  # the clock began again
         for k, part in enumerate(np.split(rows, begins, axis=1)):
             if k > 0:
                 self.restart()
@@ -64,7 +66,9 @@ class Misfit:
         found = None
         if not rows.shape[1]:
             return found
-        changed = np.diff(rows[1], prepend=self._last_c) != 0.0     # the signal holds between samples of the sensor
+        changed = (
+            np.diff(rows[1], prepend=self._last_c) != 0.0
+        )  # the signal holds between samples of the sensor
         self._last_t, self._last_c = rows[0, -1], rows[1, -1]
         if not changed.any():
             return found
@@ -90,7 +94,7 @@ class Misfit:
             self._blocks[side] += 1
             if self.sums[side] > LIMIT:
                 found = Alarm(self._since[side], float(rows[0, -1]), self._total[side] / self._blocks[side])
-                self.sums[side] = LIMIT         # so that it falls back soon after the model fits again
+                self.sums[side] = LIMIT  # so that it falls back soon after the model fits again
         new = found is not None and not self.alarmed
         if found is not None:
             self.alarmed = True

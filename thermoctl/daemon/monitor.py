@@ -1,4 +1,5 @@
 """`thermoctl monitor`: the rig on one screen of a terminal, as over ssh. It asks the command socket and commands nothing."""
+
 from __future__ import annotations
 
 import contextlib
@@ -17,10 +18,16 @@ from thermoctl.daemon.socket import ask
 from thermoctl.yamlfile import InputError
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
-KEPT = 240                         # samples of a sparkline
+KEPT = 240  # samples of a sparkline
 STYLE = {"ARMED": "bold green", "FAULT": "bold white on red", "READY": "bold yellow"}
-TRAILS = (("compensated", "compensated_um", "um", 3), ("error with", "with", "um", 3), ("error without", "without", "um", 3),
-          ("coil", "coil_c", "C", 2), ("innovation", "innovation_c", "K", 3), ("power", "power_w", "W", 2))
+TRAILS = (
+    ("compensated", "compensated_um", "um", 3),
+    ("error with", "with", "um", 3),
+    ("error without", "without", "um", 3),
+    ("coil", "coil_c", "C", 2),
+    ("innovation", "innovation_c", "K", 3),
+    ("power", "power_w", "W", 2),
+)
 """Sparklines: label, key of the trail, unit, digits."""
 
 
@@ -52,21 +59,36 @@ def sparkline(values: Iterable[float], width: int, ramp: str = BLOCKS) -> str:
     if not finite:
         return " " * len(newest)
     low, span = min(finite), max(finite) - min(finite)
-    return "".join(" " if not math.isfinite(v) else ramp[len(ramp) // 2 if span == 0 else
-                                                         min(len(ramp) - 1, int((v - low) / span * len(ramp)))]
-                   for v in newest)
+    return "".join(
+        " "
+        if not math.isfinite(v)
+        else ramp[len(ramp) // 2 if span == 0 else min(len(ramp) - 1, int((v - low) / span * len(ramp)))]
+        for v in newest
+    )
 
 
-def screen(status: dict[str, Any], latency: dict[str, Any] | None, trails: dict[str, deque[float]], width: int = 80,
-           ramp: str = BLOCKS) -> Group:
+def screen(
+    status: dict[str, Any],
+    latency: dict[str, Any] | None,
+    trails: dict[str, deque[float]],
+    width: int = 80,
+    ramp: str = BLOCKS,
+) -> Group:
     """The view of one moment from what the command socket answers, for a terminal `width` characters wide."""
-    faults = [Text.assemble((f"{f['severity']} {f['name']}: ", "bold red" if f["severity"] != "warning" else "bold yellow"),
-                            f"{f['meaning']}\n   -> {f['remedy']}") for f in status["faults"]]
+    faults = [
+        Text.assemble(
+            (f"{f['severity']} {f['name']}: ", "bold red" if f["severity"] != "warning" else "bold yellow"),
+            f"{f['meaning']}\n   -> {f['remedy']}",
+        )
+        for f in status["faults"]
+    ]
     head = Text.assemble(("thermoctl ", "bold"), (f" {status['state']} ", STYLE.get(status["state"], "bold")))
     if "channels" not in status:
         return Group(head, *faults)
-    head.append(f"   {status['ticks']} ticks   {status['slips']} slips   up {_span(status['uptime_s'])}"
-                f"   recorder lost {status['recorder']['lost']}")
+    head.append(
+        f"   {status['ticks']} ticks   {status['slips']} slips   up {_span(status['uptime_s'])}"
+        f"   recorder lost {status['recorder']['lost']}"
+    )
     both = Table.grid(padding=(0, 4))
     both.add_row(_numbers(status), _temperatures(status))
     bad = [f"{role} {state}" for role, state in status["channels"].items() if state not in ("OK", "ABSENT")]
@@ -84,12 +106,20 @@ def _numbers(status: dict[str, Any]) -> Table:
     table.add_column(style="dim")
     table.add_column(justify="right")
     for label, value, unit in (
-            ("setpoint", status["setpoint_um"], "um"), ("reference", status["reference_um"], "um"),
-            ("position, mean", status["position_um"], "um"), ("compensated", status["compensated_um"], "um"),
-            ("output (proof)", status["output_reference_um"], "um"), ("expansion", status["expansion_um"], "um"),
-            ("compensation", status["compensation_um"], "um"), ("error with it", with_, "um"),
-            ("error without it", without, "um"), ("drive", status["drive"], ""), ("power", status["power_w"], "W"),
-            ("innovation", status["innovation_c"], "K"), ("air", status["air_c"], "C")):
+        ("setpoint", status["setpoint_um"], "um"),
+        ("reference", status["reference_um"], "um"),
+        ("position, mean", status["position_um"], "um"),
+        ("compensated", status["compensated_um"], "um"),
+        ("output (proof)", status["output_reference_um"], "um"),
+        ("expansion", status["expansion_um"], "um"),
+        ("compensation", status["compensation_um"], "um"),
+        ("error with it", with_, "um"),
+        ("error without it", without, "um"),
+        ("drive", status["drive"], ""),
+        ("power", status["power_w"], "W"),
+        ("innovation", status["innovation_c"], "K"),
+        ("air", status["air_c"], "C"),
+    ):
         table.add_row(label, _number(value, 3), unit)
     return table
 
@@ -102,7 +132,9 @@ def _temperatures(status: dict[str, Any]) -> Table:
     for name, measured in status["temperatures_c"].items():
         estimate = status["estimates_c"][name]
         difference = None if measured is None or estimate is None else measured - estimate
-        table.add_row(name.replace("_", " "), _number(measured, 2), _number(estimate, 2), _number(difference, 2))
+        table.add_row(
+            name.replace("_", " "), _number(measured, 2), _number(estimate, 2), _number(difference, 2)
+        )
     return table
 
 
@@ -123,16 +155,21 @@ def _timing(latency: dict[str, Any], ramp: str) -> Text:
     late, busy = latency["lateness"], latency["busy"]
     bins: list[Sequence[float]] = late["bins_us"]
     edges = (0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, math.inf)
-    counts = [sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)]
+    counts = [
+        sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)
+    ]
     shape = sparkline([math.log1p(c) if c else math.nan for c in counts], len(counts), ramp)
-    return Text.assemble(("lateness      ", "dim"), (f"[{shape}]", "cyan"),
-                         f" p50 {_number(late['p50_us'], 0)}, p99 {_number(late['p99_us'], 0)}, max "
-                         f"{_number(late['largest_us'], 0)}; busy p99 {_number(busy['p99_us'], 0)}"
-                         f" of {latency['period_us']:.0f} us")
+    return Text.assemble(
+        ("lateness      ", "dim"),
+        (f"[{shape}]", "cyan"),
+        f" p50 {_number(late['p50_us'], 0)}, p99 {_number(late['p99_us'], 0)}, max "
+        f"{_number(late['largest_us'], 0)}; busy p99 {_number(busy['p99_us'], 0)}"
+        f" of {latency['period_us']:.0f} us",
+    )
 
 
 def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"          # + 0.0: no -0.00
+    return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"  # + 0.0: no -0.00
 
 
 def _span(seconds: float | None) -> str:
@@ -152,8 +189,14 @@ def look(path: str, with_latency: bool = True) -> tuple[dict[str, Any], dict[str
     try:
         return ask(path, {"command": "status"}), ask(path, {"command": "latency"}) if with_latency else None
     except InputError as e:
-        return {"ok": False, "state": "OFF", "ticks": 0, "faults": [
-            {"name": "no daemon", "severity": "warning", "meaning": str(e), "remedy": "it is asked again"}]}, None
+        return {
+            "ok": False,
+            "state": "OFF",
+            "ticks": 0,
+            "faults": [
+                {"name": "no daemon", "severity": "warning", "meaning": str(e), "remedy": "it is asked again"}
+            ],
+        }, None
 
 
 def monitor(settings: Any, interval_s: float = 0.5, once: bool = False) -> int:
@@ -168,7 +211,10 @@ def monitor(settings: Any, interval_s: float = 0.5, once: bool = False) -> int:
         remember(trails, status)
         console.print(screen(status, latency, trails, console.width, ramp))
         return int(not status["ok"] or any(f["severity"] != "warning" for f in status["faults"]))
-    with contextlib.suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False, screen=True) as live:
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        Live(console=console, auto_refresh=False, screen=True) as live,
+    ):
         while True:
             status, latency = look(settings.socket.path)
             remember(trails, status)

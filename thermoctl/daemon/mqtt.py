@@ -8,6 +8,7 @@
 TOPIC is thermoctl/RIG unless told otherwise. What cannot be sent while the broker is away is dropped, not kept: the newest
 state counts, and the recording has the rest.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -37,10 +38,20 @@ class Bridge:
 
     broker: HOST or HOST:PORT (1883, with `tls` 8883); user, password: where the broker asks for them."""
 
-    def __init__(self, settings: Any, broker: str, topic: str = "", user: str = "", password: str = "", tls: bool = False):
+    def __init__(
+        self,
+        settings: Any,
+        broker: str,
+        topic: str = "",
+        user: str = "",
+        password: str = "",
+        tls: bool = False,
+    ):
         self.settings, self.topic = settings, topic or f"thermoctl/{settings.rig.name}"
         if any(c in self.topic for c in "+#\0") or self.topic.startswith("/"):
-            raise InputError(f"--topic {self.topic}: a topic without '+' and '#' that does not begin with '/' was expected")
+            raise InputError(
+                f"--topic {self.topic}: a topic without '+' and '#' that does not begin with '/' was expected"
+            )
         host, _, port = broker.rpartition(":") if ":" in broker else (broker, "", "8883" if tls else "1883")
         if not host or not port.isdigit() or not 0 < int(port) < 65536:
             raise InputError(f"--broker {broker}: HOST or HOST:PORT was expected")
@@ -63,7 +74,7 @@ class Bridge:
         if reason.is_failure:
             self.refused = str(reason)
             return
-        self._online = self._faults = None                # the broker may have forgotten: say it again
+        self._online = self._faults = None  # the broker may have forgotten: say it again
         self.connected.set()
 
     def open(self) -> None:
@@ -72,11 +83,15 @@ class Bridge:
         try:
             self.client.connect(*self.broker, keepalive=15)
         except OSError as e:
-            raise InputError(f"{where}: cannot be reached: {e.strerror or e}; is it running, is the port right?") from None
+            raise InputError(
+                f"{where}: cannot be reached: {e.strerror or e}; is it running, is the port right?"
+            ) from None
         self.client.loop_start()
         if not self.connected.wait(CONNECT_S):
             self.client.loop_stop()
-            raise InputError(f"{where}: {self.refused or f'no answer within {CONNECT_S:g} s'}; check --user and --password-file")
+            raise InputError(
+                f"{where}: {self.refused or f'no answer within {CONNECT_S:g} s'}; check --user and --password-file"
+            )
 
     def look(self) -> None:
         """Ask the daemon once and publish."""
@@ -88,7 +103,9 @@ class Bridge:
             return
         online = bool(status["ok"])
         if online != self._online:
-            self.client.publish(f"{self.topic}/availability", ONLINE if online else OFFLINE, qos=1, retain=True)
+            self.client.publish(
+                f"{self.topic}/availability", ONLINE if online else OFFLINE, qos=1, retain=True
+            )
             self._online = online
         if online:
             self.client.publish(f"{self.topic}/status", json.dumps(status, separators=(",", ":")))
@@ -100,13 +117,19 @@ class Bridge:
     def close(self) -> None:
         """Say `offline` and leave."""
         if self.connected.is_set():
-            with contextlib.suppress(RuntimeError, ValueError):      # the connection went at this moment: the last will says it
-                self.client.publish(f"{self.topic}/availability", OFFLINE, qos=1, retain=True).wait_for_publish(2.0)
+            with contextlib.suppress(
+                RuntimeError, ValueError
+            ):  # the connection went at this moment: the last will says it
+                self.client.publish(
+                    f"{self.topic}/availability", OFFLINE, qos=1, retain=True
+                ).wait_for_publish(2.0)
         self.client.disconnect()
         self.client.loop_stop()
 
 
-def mqtt(settings: Any, broker: str, topic: str, rate_hz: float, user: str, password_file: str | None, tls: bool) -> int:
+def mqtt(
+    settings: Any, broker: str, topic: str, rate_hz: float, user: str, password_file: str | None, tls: bool
+) -> int:
     """The command: publish until Ctrl-C. Raises InputError for a broker that is not there or refuses."""
     if not 0.01 <= rate_hz <= 10.0:
         raise InputError(f"--rate {rate_hz:g}: 0.01 to 10 messages a second were expected")
@@ -116,7 +139,10 @@ def mqtt(settings: Any, broker: str, topic: str, rate_hz: float, user: str, pass
         raise InputError(f"{password_file}: cannot be read: {getattr(e, 'strerror', None) or e}") from None
     bridge = Bridge(settings, broker, topic, user, password, tls)
     bridge.open()
-    print(f"publishing below {bridge.topic} on {bridge.broker[0]}:{bridge.broker[1]}; Ctrl-C ends it", flush=True)
+    print(
+        f"publishing below {bridge.topic} on {bridge.broker[0]}:{bridge.broker[1]}; Ctrl-C ends it",
+        flush=True,
+    )
     pause = threading.Event()
     try:
         while True:

@@ -6,6 +6,7 @@ A recording holds the effective configuration, the model, the law's parameters a
 from; a reload starts a new file, so that one file has one set of parameters.
 What passes is also watched: innovations that the filter does not expect raise "the model no longer fits" in the log.
 """
+
 from __future__ import annotations
 
 import base64
@@ -24,8 +25,18 @@ from thermoctl.signals import INDEX
 INTERVAL_S = 0.1
 _TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
 _ARRAYS = ("A_minus_I", "B", "C", "gain", "b1", "b2")
-_NUMBERS = ("kind", "period_s", "R_w", "R_v", "f1", "expansion_period_s", "sensors", "b_air", "offset_um",
-            "air_filter_s")
+_NUMBERS = (
+    "kind",
+    "period_s",
+    "R_w",
+    "R_v",
+    "f1",
+    "expansion_period_s",
+    "sensors",
+    "b_air",
+    "offset_um",
+    "air_filter_s",
+)
 
 
 def encode(array: np.ndarray) -> str:
@@ -38,15 +49,32 @@ def decode(text: str) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text, validate=True))
 
 
-def law_metadata(model: CompensatorModel, parameters: Parameters, period_s: float, generation: int, tick: int,
-                 state: np.ndarray | None) -> str:
+def law_metadata(
+    model: CompensatorModel,
+    parameters: Parameters,
+    period_s: float,
+    generation: int,
+    tick: int,
+    state: np.ndarray | None,
+) -> str:
     """What a replay needs besides the rows, as JSON: model, parameters, the law's state after `tick` (None: new)."""
-    return json.dumps({
-        "version": 1, "period_s": period_s, "generation": generation, "tick": tick,
-        "state": None if state is None else encode(state), "parameters": encode(parameters.pack()),
-        "model": {**{name: getattr(model, name) for name in _NUMBERS},
-                  **{name: {"shape": getattr(model, name).shape, "values": encode(getattr(model, name))}
-                     for name in _ARRAYS}}})
+    return json.dumps(
+        {
+            "version": 1,
+            "period_s": period_s,
+            "generation": generation,
+            "tick": tick,
+            "state": None if state is None else encode(state),
+            "parameters": encode(parameters.pack()),
+            "model": {
+                **{name: getattr(model, name) for name in _NUMBERS},
+                **{
+                    name: {"shape": getattr(model, name).shape, "values": encode(getattr(model, name))}
+                    for name in _ARRAYS
+                },
+            },
+        }
+    )
 
 
 def read_law_metadata(text: str) -> dict[str, Any]:
@@ -56,8 +84,12 @@ def read_law_metadata(text: str) -> dict[str, Any]:
     values: dict[str, Any] = {name: m[name] for name in _NUMBERS} | {"sensors": tuple(m["sensors"])}
     values |= {name: decode(m[name]["values"]).reshape(m[name]["shape"]) for name in _ARRAYS}
     model = CompensatorModel(**values)
-    return {**found, "model": model, "parameters": Parameters.unpack(decode(found["parameters"])),
-            "state": None if found["state"] is None else decode(found["state"])}
+    return {
+        **found,
+        "model": model,
+        "parameters": Parameters.unpack(decode(found["parameters"])),
+        "state": None if found["state"] is None else decode(found["state"]),
+    }
 
 
 class Recorder:
@@ -66,8 +98,15 @@ class Recorder:
     open_writer(law_metadata) gives a writer with write(rows) and close().
     """
 
-    def __init__(self, shared: Shared, model: CompensatorModel, parameters: Parameters, period_s: float,
-                 open_writer: Callable[[str], Any], log: Callable[..., None] = lambda *a, **k: None):
+    def __init__(
+        self,
+        shared: Shared,
+        model: CompensatorModel,
+        parameters: Parameters,
+        period_s: float,
+        open_writer: Callable[[str], Any],
+        log: Callable[..., None] = lambda *a, **k: None,
+    ):
         self.log = log
         self.misfit: Misfit | None = Misfit(model)
         self.shared, self.model, self.parameters, self.period_s = shared, model, parameters, period_s
@@ -102,15 +141,21 @@ class Recorder:
         if self.misfit is None:
             return
         try:
-            alarm = self.misfit.add(rows[:, INDEX["t_s"]], rows[:, INDEX["innovation_c"]], rows[:, INDEX["kalman_gain"]])
-        except Exception as e:                                 # to record is what we are for: never for the watch's sake not
+            alarm = self.misfit.add(
+                rows[:, INDEX["t_s"]], rows[:, INDEX["innovation_c"]], rows[:, INDEX["kalman_gain"]]
+            )
+        except Exception as e:  # to record is what we are for: never for the watch's sake not
             self.misfit = None
             self.log("the watch of the model failed, the recorder goes on without it", error=repr(e))
             return
         if alarm is not None:
-            self.log("the model no longer fits", begins_s=round(alarm.begin_s, 1), ends_s=round(alarm.end_s, 1),
-                     mean_innovation_c=round(alarm.mean_c, 3),
-                     remedy="`thermoctl diagnose --live --out DIR` says which physics changed")
+            self.log(
+                "the model no longer fits",
+                begins_s=round(alarm.begin_s, 1),
+                ends_s=round(alarm.end_s, 1),
+                mean_innovation_c=round(alarm.mean_c, 3),
+                remedy="`thermoctl diagnose --live --out DIR` says which physics changed",
+            )
 
     def _write(self, rows: np.ndarray) -> None:
         self.shared.counters[RECORDER_LOST] += self.writer.write(rows)
@@ -134,7 +179,8 @@ class Recorder:
         if kept is not None and (first[_TICK] > 1 or self.shared.counters[RESUMED]):
             tick, state = int(kept[0]), kept[2:]
         self.writer = self.open_writer(
-            law_metadata(self.model, self.parameters, self.period_s, self.generation, tick, state))
+            law_metadata(self.model, self.parameters, self.period_s, self.generation, tick, state)
+        )
 
     def close(self) -> None:
         """End the file."""
@@ -148,13 +194,18 @@ def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Re
     from thermoctl.daemon.assemble import compensator, law_parameters
     from thermoctl.recording.writer import RecordingWriter
     from thermoctl.settings import effective
+
     config = effective(settings)
 
     def open_writer(law: str) -> RecordingWriter:
         metadata = {"rig": settings.rig.name, "config": config, "law": law}
-        return RecordingWriter(settings.recording, metadata, settings.rig.name, lambda text: log("recorder", what=text))
+        return RecordingWriter(
+            settings.recording, metadata, settings.rig.name, lambda text: log("recorder", what=text)
+        )
 
-    return Recorder(shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer, log)
+    return Recorder(
+        shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer, log
+    )
 
 
 def record(recorder: Recorder, stopping: Callable[[], bool]) -> None:

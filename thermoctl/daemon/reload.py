@@ -1,4 +1,5 @@
 """Reload: the whole file is validated again; what may change while running is applied between two ticks."""
+
 from __future__ import annotations
 
 from typing import Any

@@ -1,4 +1,5 @@
 """Replay: the recorded inputs through the law again, the outputs compared with the recorded ones bit for bit."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ _DT, _COMMAND, _VALUE, _EXTERNAL = (INDEX[n] for n in ("dt_s", "command", "comma
 class Replay:
     """`ticks` compared, `skipped` before the stored state, `differences` {signal: (ticks that differ, first of them,
     largest difference)}; `outputs` (ticks, len(OUTPUTS)) as the law gave them now."""
+
     ticks: int
     skipped: int
     differences: dict[str, tuple[int, int, float]]
@@ -37,28 +39,38 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
         if found["state"] is not None:
             law.restore(found["state"])
     except (ValueError, KeyError, TypeError, OverflowError) as e:
-        raise InputError(f"{name}: holds no usable law to replay ({e}); it was not recorded by this version") from None
+        raise InputError(
+            f"{name}: holds no usable law to replay ({e}); it was not recorded by this version"
+        ) from None
     ticks = rows[:, INDEX["tick"]]
     skipped = int(np.searchsorted(ticks, tick, side="right"))
     rows = np.ascontiguousarray(rows[skipped:])
     if len(rows) and rows[0, INDEX["tick"]] != tick + 1:
-        raise InputError(f"{name}: the stored state is of tick {tick}, the next row is tick "
-                         f"{rows[0, INDEX['tick']]:.0f}; ticks are missing, so a replay cannot start")
+        raise InputError(
+            f"{name}: the stored state is of tick {tick}, the next row is tick "
+            f"{rows[0, INDEX['tick']]:.0f}; ticks are missing, so a replay cannot start"
+        )
     missing = np.flatnonzero(np.diff(rows[:, INDEX["tick"]]) != 1)
     if len(missing):
-        raise InputError(f"{name}: ticks are missing after tick {rows[missing[0], INDEX['tick']]:.0f} (the recorder "
-                         "fell behind); a replay would not start from the same state")
+        raise InputError(
+            f"{name}: ticks are missing after tick {rows[missing[0], INDEX['tick']]:.0f} (the recorder "
+            "fell behind); a replay would not start from the same state"
+        )
     whole = rows[:, [_COMMAND, _EXTERNAL, _OUTPUTS - 2, _OUTPUTS - 1]]
-    wrong = np.flatnonzero(~((whole == np.floor(whole)) & (np.abs(whole) <= [100, 2.0 ** 53, 2.0 ** 53, 2.0 ** 53])).all(axis=1))
+    wrong = np.flatnonzero(
+        ~((whole == np.floor(whole)) & (np.abs(whole) <= [100, 2.0**53, 2.0**53, 2.0**53])).all(axis=1)
+    )
     if len(wrong):
-        raise InputError(f"{name}: tick {rows[wrong[0], INDEX['tick']]:.0f} has a command, or bits, that are no whole number: "
-                         "damaged")
+        raise InputError(
+            f"{name}: tick {rows[wrong[0], INDEX['tick']]:.0f} has a command, or bits, that are no whole number: "
+            "damaged"
+        )
     n = _OUTPUTS - 2 - _CHANNELS
     value, fresh, status = np.zeros(n), np.zeros(n, dtype=np.uint8), np.zeros(n, dtype=np.uint8)
     law.bind(value, fresh, status)
     given = np.empty((len(rows), len(OUTPUTS)))
     for k, row in enumerate(rows):
-        value[:] = row[_CHANNELS:_OUTPUTS - 2]
+        value[:] = row[_CHANNELS : _OUTPUTS - 2]
         unpack_readings(row[_OUTPUTS - 2], row[_OUTPUTS - 1], fresh, status)
         law.step(row[_DT], int(row[_COMMAND]), row[_VALUE], int(row[_EXTERNAL]))
         given[k] = law.outputs

@@ -1,5 +1,6 @@
 """start, stop, restart: through systemd where the unit is installed, else in the background with a pid file; and the
 unit's installation."""
+
 from __future__ import annotations
 
 import contextlib
@@ -19,7 +20,7 @@ from thermoctl.yamlfile import InputError
 UNIT = "thermoctl.service"
 START_S, STOP_S = 60.0, 10.0
 SOURCE = shipped("systemd")
-FILES = {                            # what `service install` puts where
+FILES = {  # what `service install` puts where
     "thermoctl.service": "/etc/systemd/system/thermoctl.service",
     "thermoctl.sysusers": "/etc/sysusers.d/thermoctl.conf",
     "thermoctl.tmpfiles": "/etc/tmpfiles.d/thermoctl.conf",
@@ -63,7 +64,11 @@ def start(settings: Any) -> int:
         begin = out.tell()
         process = subprocess.Popen(
             [sys.executable, "-m", "thermoctl.cli", "run", "--config", str(Path(settings.path).absolute())],
-            stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True)
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=out,
+            start_new_session=True,
+        )
     pid_file(settings).write_text(f"{process.pid}\n")
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline and process.poll() is None:
@@ -113,7 +118,11 @@ def restart(settings: Any) -> int:
 def _program() -> Path:
     """This installation's program: the one that was called, else the one beside the interpreter."""
     called = Path(sys.argv[0]).absolute()
-    return called if called.name == "thermoctl" and called.is_file() else Path(sys.executable).with_name("thermoctl")
+    return (
+        called
+        if called.name == "thermoctl" and called.is_file()
+        else Path(sys.executable).with_name("thermoctl")
+    )
 
 
 def install(config: Path, root: Path = Path("/"), prefix: Path | None = None) -> int:
@@ -133,8 +142,12 @@ def install(config: Path, root: Path = Path("/"), prefix: Path | None = None) ->
     except OSError as e:
         raise InputError(f"{e.filename}: cannot be written: {e.strerror}; run it as root") from None
     if root == Path("/") and Path("/run/systemd/system").is_dir():
-        for command in (["systemd-sysusers"], ["systemd-tmpfiles", "--create", FILES["thermoctl.tmpfiles"]],
-                        ["udevadm", "control", "--reload"], ["systemctl", "daemon-reload"]):
+        for command in (
+            ["systemd-sysusers"],
+            ["systemd-tmpfiles", "--create", FILES["thermoctl.tmpfiles"]],
+            ["udevadm", "control", "--reload"],
+            ["systemctl", "daemon-reload"],
+        ):
             if shutil.which(command[0]):
                 subprocess.run(command, check=False)
         print("`systemctl enable --now thermoctl` starts it now and at every boot")

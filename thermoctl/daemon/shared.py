@@ -10,6 +10,7 @@ own class starts one more process beside the daemon, which removes what a killed
     lateness, busy, reference   histograms, microseconds
     counters    start time, ticks of the reference loop, process ids
 """
+
 from __future__ import annotations
 
 import json
@@ -26,20 +27,27 @@ from thermoctl.signals import SIGNALS
 from thermoctl.yamlfile import InputError
 
 VERSION = 1
-MAGIC = 0x7468726D6F63746C         # 'thrmoctl'
-ROWS = 8192                        # ticks a reader may lag behind
-BINS = 4096                        # us
+MAGIC = 0x7468726D6F63746C  # 'thrmoctl'
+ROWS = 8192  # ticks a reader may lag behind
+BINS = 4096  # us
 STATE_NUMBERS = 1024
 SHARED_MEMORY = Path("/dev/shm")
 
 _AREAS = (
     ("header", "u8", (4,)),
-    ("ring_head", "u8", (1,)), ("rows", "f8", (ROWS, len(SIGNALS))),
-    ("mail_counters", "u8", (2,)), ("mail", "f8", (64, 2)),
-    ("parameters_sequence", "u8", (1,)), ("parameters", "f8", (len(NAMES) + 1,)),
-    ("state_sequence", "u8", (1,)), ("state", "f8", (STATE_NUMBERS,)),
-    ("lateness", "u8", (BINS + 1,)), ("busy", "u8", (BINS + 1,)), ("reference", "u8", (BINS + 1,)),
-    ("largest", "f8", (3,)), ("counters", "f8", (16,)),
+    ("ring_head", "u8", (1,)),
+    ("rows", "f8", (ROWS, len(SIGNALS))),
+    ("mail_counters", "u8", (2,)),
+    ("mail", "f8", (64, 2)),
+    ("parameters_sequence", "u8", (1,)),
+    ("parameters", "f8", (len(NAMES) + 1,)),
+    ("state_sequence", "u8", (1,)),
+    ("state", "f8", (STATE_NUMBERS,)),
+    ("lateness", "u8", (BINS + 1,)),
+    ("busy", "u8", (BINS + 1,)),
+    ("reference", "u8", (BINS + 1,)),
+    ("largest", "f8", (3,)),
+    ("counters", "f8", (16,)),
 )
 START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED = range(7)
 """Places in `counters`; TUNING is 1 + percent, 0 where nothing is tuned; RESUMED is 1 where the law began with the
@@ -79,8 +87,9 @@ class Shared:
             path.unlink(missing_ok=True)
             file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         except PermissionError:
-            raise InputError(f"shared memory '{name}': left by another user; remove {path}, or take another "
-                             "socket.path") from None
+            raise InputError(
+                f"shared memory '{name}': left by another user; remove {path}, or take another socket.path"
+            ) from None
         try:
             os.ftruncate(file, size)
             shared = cls(mmap.mmap(file, size), path)
@@ -98,11 +107,13 @@ class Shared:
         except FileNotFoundError:
             raise InputError(f"shared memory '{name}': not there: no daemon runs (thermoctl start)") from None
         except PermissionError:
-            raise InputError(f"shared memory '{name}': belongs to another user: run this as the daemon's user") from None
+            raise InputError(
+                f"shared memory '{name}': belongs to another user: run this as the daemon's user"
+            ) from None
         try:
             memory = mmap.mmap(file, 0)
             header = tuple(int(h) for h in np.ndarray((4,), "u8", memory))
-        except (ValueError, TypeError):                        # empty, or shorter than a header
+        except (ValueError, TypeError):  # empty, or shorter than a header
             header = ()
         finally:
             os.close(file)

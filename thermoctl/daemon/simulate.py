@@ -3,6 +3,7 @@
 Used for experiments, for proofs over hours of rig time, and by tests: `run_simulated` runs a whole schedule,
 `Simulation` one tick at a time.
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -30,16 +31,31 @@ class Simulation:
     the settings. `law` is the law, `backend` the (opened) back end.
     """
 
-    def __init__(self, settings: Any, model: CompensatorModel | None = None, parameters: Parameters | None = None,
-                 publish: Any = None):
+    def __init__(
+        self,
+        settings: Any,
+        model: CompensatorModel | None = None,
+        parameters: Parameters | None = None,
+        publish: Any = None,
+    ):
         self.period_s = settings.loop.period_s
         self.ticks, self.now_s = 0, 0.0
         self.backend = make_backend(settings)
         self.backend.open()
-        self.mailbox, self.box = Mailbox(np.zeros(2, np.uint64), np.zeros((64, 2))), Box(np.zeros(1, np.uint64), np.zeros(len(NAMES) + 1))
+        self.mailbox, self.box = (
+            Mailbox(np.zeros(2, np.uint64), np.zeros((64, 2))),
+            Box(np.zeros(1, np.uint64), np.zeros(len(NAMES) + 1)),
+        )
         self.quiet = publish is None
-        self.rig = Rig(self.backend, model or compensator(settings), parameters or law_parameters(settings),
-                       self.period_s, publish or (lambda row: None), self.mailbox, self.box)
+        self.rig = Rig(
+            self.backend,
+            model or compensator(settings),
+            parameters or law_parameters(settings),
+            self.period_s,
+            publish or (lambda row: None),
+            self.mailbox,
+            self.box,
+        )
         self.rig.wall_s = lambda: self.now_s
         self.law, self.row = self.rig.law, self.rig.row
 
@@ -75,8 +91,10 @@ class Simulation:
         """Wait for READY and arm. Raises RuntimeError when it does not get there."""
         state = INDEX["state"]
         if not self.until(lambda row: row[state] == arming.READY, limit_s):
-            raise RuntimeError(f"not READY within {limit_s} s: state {arming.STATES[int(self.row[state])]}, faults "
-                               f"{int(self.row[INDEX['fault_bits']]):#x}")
+            raise RuntimeError(
+                f"not READY within {limit_s} s: state {arming.STATES[int(self.row[state])]}, faults "
+                f"{int(self.row[INDEX['fault_bits']]):#x}"
+            )
         self.command("arm")
         self.tick()
 
@@ -90,8 +108,14 @@ def _no_clock() -> int:
     return 0
 
 
-def run_simulated(settings: Any, schedule: Iterable[tuple], duration_s: float, seed: int | None = None, every: int = 1,
-                  model: CompensatorModel | None = None) -> np.ndarray:
+def run_simulated(
+    settings: Any,
+    schedule: Iterable[tuple],
+    duration_s: float,
+    seed: int | None = None,
+    every: int = 1,
+    model: CompensatorModel | None = None,
+) -> np.ndarray:
     """Run `duration_s` of rig time; returns every `every`-th row, (N, len(SIGNALS)).
 
     schedule: (time_s, command, value) in order of time; command arm, disarm or setpoint (um). seed replaces hal.seed.
@@ -115,7 +139,7 @@ def run_simulated(settings: Any, schedule: Iterable[tuple], duration_s: float, s
     return rows
 
 
-SETTLE_S = 0.5              # after the reference has arrived
+SETTLE_S = 0.5  # after the reference has arrived
 STROKE_UM, CYCLE_S = 200.0, 75.0
 
 
@@ -145,13 +169,18 @@ def trapezoids(settings: Any, hours: float, compensate: bool, out: str | None = 
     simulation.close()
     error = (rows[:, output] - rows[:, setpoint])[settled]
     coil = rows[:, INDEX["coil_est_c"]]
-    print(f"{hours:g} h of rig time, compensation {'on' if compensate else 'off'}: state {state}, coil "
-          f"{coil[0]:.1f} to {coil.max():.1f} C, compensation up to "
-          f"{np.abs(rows[:, INDEX['compensation_um']]).max():.2f} um")
-    print(f"output minus setpoint, {settled.sum()} settled samples: mean {error.mean():+.3f} um, 2 sigma "
-          f"{2 * error.std():.3f} um, largest {np.abs(error).max():.3f} um")
+    print(
+        f"{hours:g} h of rig time, compensation {'on' if compensate else 'off'}: state {state}, coil "
+        f"{coil[0]:.1f} to {coil.max():.1f} C, compensation up to "
+        f"{np.abs(rows[:, INDEX['compensation_um']]).max():.2f} um"
+    )
+    print(
+        f"output minus setpoint, {settled.sum()} settled samples: mean {error.mean():+.3f} um, 2 sigma "
+        f"{2 * error.std():.3f} um, largest {np.abs(error).max():.3f} um"
+    )
     if out:
         from thermoctl.recording.table import Table, write_table
+
         columns = {s.name: np.ascontiguousarray(rows[:, i]) for i, s in enumerate(SIGNALS) if s.name != "t_s"}
         write_table(out, Table(name="simulated", path=out, t=rows[:, INDEX["t_s"]].copy(), columns=columns))
     return 0 if np.abs(error).max() <= 0.5 and state == "ARMED" else 1

@@ -5,6 +5,7 @@ permissions (owner and group) decide who may connect; who gave a command that mo
 kernel's peer credentials. A status query reads shared memory and never costs the loop a tick. Every size from outside
 is limited.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -26,35 +27,73 @@ from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared
 from thermoctl.signals import INDEX, POINTS, SIGNALS
 from thermoctl.yamlfile import InputError
 
-MAX_LINE = 65536            # bytes of one request
+MAX_LINE = 65536  # bytes of one request
 MAX_CLIENTS = 32
-ANSWER_S = 1.0              # how long a command may take to show in the loop
+ANSWER_S = 1.0  # how long a command may take to show in the loop
 
 
 def status(shared: Shared) -> dict[str, Any]:
     """The newest row as `thermoctl status --json` gives it; faults with meaning and remedy."""
     row = shared.ring.newest()
     if row is None:
-        return {"state": "OFF", "ticks": 0, "slips": 0, "faults": [], "setpoint_um": None, "position_um": None,
-                "compensation_um": None}
+        return {
+            "state": "OFF",
+            "ticks": 0,
+            "slips": 0,
+            "faults": [],
+            "setpoint_um": None,
+            "position_um": None,
+            "compensation_um": None,
+        }
     number = {name: (float(row[i]) if math.isfinite(row[i]) else None) for name, i in INDEX.items()}
     busy = percentiles(shared.areas["busy"])
     return {
-        "state": arming.STATES[int(row[INDEX["state"]])], "ticks": int(row[INDEX["tick"]]),
-        "slips": int(row[INDEX["slips"]]), "generation": int(row[INDEX["generation"]]), "uptime_s": number["t_s"],
-        **{name: number[name] for name in (
-            "setpoint_um", "reference_um", "position_um", "compensated_um", "compensation_um", "expansion_um",
-            "output_reference_um", "control_v", "drive", "enable", "voltage_v", "current_a", "power_w", "air_c",
-            "innovation_c", "kalman_gain", "position_age_s", "coil_age_s", "supply_v", "amplifier_state",
-            "amplifier_fault")},
+        "state": arming.STATES[int(row[INDEX["state"]])],
+        "ticks": int(row[INDEX["tick"]]),
+        "slips": int(row[INDEX["slips"]]),
+        "generation": int(row[INDEX["generation"]]),
+        "uptime_s": number["t_s"],
+        **{
+            name: number[name]
+            for name in (
+                "setpoint_um",
+                "reference_um",
+                "position_um",
+                "compensated_um",
+                "compensation_um",
+                "expansion_um",
+                "output_reference_um",
+                "control_v",
+                "drive",
+                "enable",
+                "voltage_v",
+                "current_a",
+                "power_w",
+                "air_c",
+                "innovation_c",
+                "kalman_gain",
+                "position_age_s",
+                "coil_age_s",
+                "supply_v",
+                "amplifier_state",
+                "amplifier_fault",
+            )
+        },
         "channels": channel_states(int(row[INDEX["status_bits"]])),
         "temperatures_c": {p: number[f"{p}_c"] for p in POINTS},
         "estimates_c": {p: number[f"{p}_est_c"] for p in POINTS},
-        "lateness_us": number["lateness_us"], "busy_us": number["busy_us"], "busy_p50_us": _or_none(busy[0]),
+        "lateness_us": number["lateness_us"],
+        "busy_us": number["busy_us"],
+        "busy_p50_us": _or_none(busy[0]),
         "tuning_percent": float(shared.counters[TUNING]) - 1.0 if shared.counters[TUNING] else None,
-        "recorder": {"rows": int(shared.counters[RECORDER_ROWS]), "lost": int(shared.counters[RECORDER_LOST])},
-        "faults": [{"name": f.name, "severity": f.severity, "meaning": f.meaning, "remedy": f.remedy}
-                   for f in faults.decode(row[INDEX["fault_bits"]])],
+        "recorder": {
+            "rows": int(shared.counters[RECORDER_ROWS]),
+            "lost": int(shared.counters[RECORDER_LOST]),
+        },
+        "faults": [
+            {"name": f.name, "severity": f.severity, "meaning": f.meaning, "remedy": f.remedy}
+            for f in faults.decode(row[INDEX["fault_bits"]])
+        ],
     }
 
 
@@ -66,21 +105,31 @@ def settled(now: dict[str, Any]) -> bool:
 
 def channel_states(status_bits: int) -> dict[str, str]:
     """Each channel's reading: OK, STALE, ERROR or ABSENT, from the signal status_bits."""
-    return {name: ("OK", "STALE", "ERROR", "ABSENT")[status_bits >> (2 * c) & 3]
-            for c, name in enumerate(faults.CHANNELS)}
+    return {
+        name: ("OK", "STALE", "ERROR", "ABSENT")[status_bits >> (2 * c) & 3]
+        for c, name in enumerate(faults.CHANNELS)
+    }
 
 
 def latency(shared: Shared, period_s: float) -> dict[str, Any]:
     """Histograms and percentiles of lateness and busy time, slips, and the reference loop's, us."""
     row = shared.ring.newest()
-    answer: dict[str, Any] = {"period_us": period_s * 1e6, "ticks": 0 if row is None else int(row[INDEX["tick"]]),
-                              "slips": 0 if row is None else int(row[INDEX["slips"]])}
+    answer: dict[str, Any] = {
+        "period_us": period_s * 1e6,
+        "ticks": 0 if row is None else int(row[INDEX["tick"]]),
+        "slips": 0 if row is None else int(row[INDEX["slips"]]),
+    }
     for k, name in enumerate(("lateness", "busy", "reference")):
-        counts = shared.areas[name].copy()          # the loop counts on meanwhile
+        counts = shared.areas[name].copy()  # the loop counts on meanwhile
         p50, p99, p999 = percentiles(counts)
-        answer[name] = {"count": int(counts.sum()), "p50_us": _or_none(p50), "p99_us": _or_none(p99),
-                        "p999_us": _or_none(p999), "largest_us": float(shared.areas["largest"][k]),
-                        "bins_us": [[int(i), int(counts[i])] for i in counts.nonzero()[0]]}
+        answer[name] = {
+            "count": int(counts.sum()),
+            "p50_us": _or_none(p50),
+            "p99_us": _or_none(p99),
+            "p999_us": _or_none(p999),
+            "largest_us": float(shared.areas["largest"][k]),
+            "bins_us": [[int(i), int(counts[i])] for i in counts.nonzero()[0]],
+        }
     return answer
 
 
@@ -92,9 +141,13 @@ class Commands:
     """What a request does. `reload_settings(settings in force, settings at the start)` validates the file again and
     returns (settings, parameters, applied keys, keys that need a restart)."""
 
-    def __init__(self, shared: Shared, settings: Any,
-                 reload_settings: Callable[[Any, Any], tuple[Any, Any, list[str], list[str]]],
-                 log: Callable[..., None]):
+    def __init__(
+        self,
+        shared: Shared,
+        settings: Any,
+        reload_settings: Callable[[Any, Any], tuple[Any, Any, list[str], list[str]]],
+        log: Callable[..., None],
+    ):
         self.shared, self.settings, self.started = shared, settings, settings
         self.reload_settings, self.log = reload_settings, log
 
@@ -113,17 +166,31 @@ class Commands:
             return {"ok": True, **latency(self.shared, self.settings.loop.period_s)}
         if name == "signals":
             return {"ok": True, "signals": [[s.name, s.unit, s.meaning] for s in SIGNALS]}
-        actions = {"arm": self._arm, "disarm": self._disarm, "setpoint": self._setpoint, "reload": self._reload}
+        actions = {
+            "arm": self._arm,
+            "disarm": self._disarm,
+            "setpoint": self._setpoint,
+            "reload": self._reload,
+        }
         action = actions.get(name)
         if action is None:
-            return {"ok": False, "error": f"unknown command '{name[:40]}'; "
-                                          "expected status, latency, signals, arm, disarm, setpoint or reload"}
+            return {
+                "ok": False,
+                "error": f"unknown command '{name[:40]}'; "
+                "expected status, latency, signals, arm, disarm, setpoint or reload",
+            }
         try:
             answer = action(request)
         except InputError as e:
             answer = {"ok": False, "error": str(e)}
-        self.log("command", name=name, peer=peer, ok=answer["ok"], value=request.get("value"),
-                 error=answer.get("error"))
+        self.log(
+            "command",
+            name=name,
+            peer=peer,
+            ok=answer["ok"],
+            value=request.get("value"),
+            error=answer.get("error"),
+        )
         return answer
 
     def _state(self) -> str:
@@ -146,18 +213,23 @@ class Commands:
         if now["state"] == wanted:
             return {"ok": True, "state": now["state"], "setpoint_um": now["setpoint_um"]}
         causes = "; ".join(f"{f['name']}: {f['meaning']} ({f['remedy']})" for f in now["faults"])
-        return {"ok": False, "state": now["state"],
-                "error": f"{refusal}: the state is {now['state']}{' because of ' + causes if causes else ''}"}
+        return {
+            "ok": False,
+            "state": now["state"],
+            "error": f"{refusal}: the state is {now['state']}{' because of ' + causes if causes else ''}",
+        }
 
     def _arm(self, request: dict) -> dict[str, Any]:
-        deadline = time.monotonic() + ANSWER_S             # a loop that was just started warms up for 0.1 s
+        deadline = time.monotonic() + ANSWER_S  # a loop that was just started warms up for 0.1 s
         while not settled(status(self.shared)) and time.monotonic() < deadline:
             time.sleep(0.005)
         if self._state() == "ARMED":
             return {"ok": True, "state": "ARMED", "setpoint_um": status(self.shared)["setpoint_um"]}
         if self._state() == "FAULT":
-            return self._result("ARMED", "not armed, a fault is latched: `thermoctl disarm` acknowledges it once its "
-                                         "cause is gone")
+            return self._result(
+                "ARMED",
+                "not armed, a fault is latched: `thermoctl disarm` acknowledges it once its cause is gone",
+            )
         self._send(arming.ARM)
         return self._result("ARMED", "not armed")
 
@@ -174,8 +246,10 @@ class Commands:
             raise InputError("setpoint: expected a finite number of micrometres as 'value'")
         control = self.settings.control
         if not control.setpoint_low_um <= value <= control.setpoint_high_um:
-            raise InputError(f"setpoint {value:g} um: outside control.setpoint_low_um..setpoint_high_um "
-                             f"({control.setpoint_low_um:g}..{control.setpoint_high_um:g})")
+            raise InputError(
+                f"setpoint {value:g} um: outside control.setpoint_low_um..setpoint_high_um "
+                f"({control.setpoint_low_um:g}..{control.setpoint_high_um:g})"
+            )
         if self._state() != "ARMED":
             return self._result("ARMED", "setpoint not taken, it counts only when armed")
         self._send(arming.SETPOINT, float(value))
@@ -186,8 +260,12 @@ class Commands:
         self.shared.parameters.put(parameters.pack())
         self._send(RELOAD)
         self.settings = settings
-        return {"ok": True, "generation": status(self.shared).get("generation"), "applied": applied,
-                "needs_restart": restart}
+        return {
+            "ok": True,
+            "generation": status(self.shared).get("generation"),
+            "applied": applied,
+            "needs_restart": restart,
+        }
 
 
 class _Client:
@@ -261,7 +339,7 @@ def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector
             raise OSError("an endless line")
         if client.unsent:
             with contextlib.suppress(BlockingIOError):
-                client.unsent = client.unsent[client.connection.send(client.unsent):]
+                client.unsent = client.unsent[client.connection.send(client.unsent) :]
         busy = client.unsent or b"\n" in client.received
         selector.modify(client.connection, selectors.EVENT_WRITE if busy else selectors.EVENT_READ, client)
     except OSError:
@@ -285,8 +363,9 @@ def ask(path: Path | str, request: dict[str, Any], timeout_s: float = 3.0) -> di
         except PermissionError:
             raise InputError(f"{path}: not allowed; the socket is for its group (see socket.group)") from None
         except (FileNotFoundError, ConnectionRefusedError):
-            raise InputError(f"{path}: the daemon is not running; `thermoctl start` or `thermoctl run --config FILE`"
-                             ) from None
+            raise InputError(
+                f"{path}: the daemon is not running; `thermoctl start` or `thermoctl run --config FILE`"
+            ) from None
         except ConnectionError:
             raise InputError(f"{path}: the daemon broke the connection off; see its log") from None
         except TimeoutError:

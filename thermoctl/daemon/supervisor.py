@@ -12,6 +12,7 @@ again, the loop runs on. The supervisor
 ends: the kernel tells every child (PDEATHSIG) and the loop disables the amplifier. The loop stands still: it is killed,
 as if it had ended.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -40,14 +41,19 @@ from thermoctl.daemon.shared import BEATS, LOOP_PID, RESUMED, WARNINGS, Shared
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
-HANG_S = 15.0               # a helper that did no round for so long is killed and started again
-READY_S = 60.0              # the first tick comes within this: devices connect before it
-STALL_S = 1.0               # a loop that made no tick for so long (or for protection.late_s, where a rig forgives more) is ended
-LOOK_S, LOOK_LONGEST_S = 0.1, 0.2    # between two looks; a longer one tells of a machine that stood, not of the loop
-LOOP_STOP_S, STOP_S = 3.0, 10.0      # the loop, or a helper, that was asked to stop is killed after this
-RESTART_S = 0.5             # pause before a child is started again, doubled up to
+HANG_S = 15.0  # a helper that did no round for so long is killed and started again
+READY_S = 60.0  # the first tick comes within this: devices connect before it
+STALL_S = (
+    1.0  # a loop that made no tick for so long (or for protection.late_s, where a rig forgives more) is ended
+)
+LOOK_S, LOOK_LONGEST_S = (
+    0.1,
+    0.2,
+)  # between two looks; a longer one tells of a machine that stood, not of the loop
+LOOP_STOP_S, STOP_S = 3.0, 10.0  # the loop, or a helper, that was asked to stop is killed after this
+RESTART_S = 0.5  # pause before a child is started again, doubled up to
 RESTART_LONGEST_S = 30.0
-TELL_AGAIN_S = 10.0         # a fault that comes and goes is logged once in this time
+TELL_AGAIN_S = 10.0  # a fault that comes and goes is logged once in this time
 EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_HARDWARE = 0, 1, 2, 3
 
 RECORDER, COMMANDS, REFERENCE = range(3)
@@ -81,7 +87,7 @@ class _Stop:
 
     def __call__(self) -> bool:
         if self.shared is not None:
-            self.shared.counters[BEATS + self.beat] += 1       # asked once a round: a round done
+            self.shared.counters[BEATS + self.beat] += 1  # asked once a round: a round done
         return self.asked
 
 
@@ -106,8 +112,17 @@ def _loop_process(settings: Any, shared: Shared, board: Any) -> int:
     backend = make_backend(settings, board)
     backend.open()
     try:
-        rig = loops.Rig(backend, compensator(settings), law_parameters(settings), settings.loop.period_s,
-                        shared.ring, shared.mailbox, shared.parameters, shared.state, time.monotonic())
+        rig = loops.Rig(
+            backend,
+            compensator(settings),
+            law_parameters(settings),
+            settings.loop.period_s,
+            shared.ring,
+            shared.mailbox,
+            shared.parameters,
+            shared.state,
+            time.monotonic(),
+        )
         _resume(settings, shared, rig)
 
         def warn(text: str) -> None:
@@ -131,14 +146,20 @@ def _resume(settings: Any, shared: Shared, rig: loops.Rig) -> None:
         try:
             rig.law.resume(state, age_s)
             shared.counters[RESUMED] = 1.0
-            rig.keep_state()                                   # where a replay of this run begins
+            rig.keep_state()  # where a replay of this run begins
         except ValueError as e:
             state, why = None, str(e)
-    console_log("estimates", kept=state is not None, age_s=round(age_s, 1) if state is not None else None, why=why or None)
+    console_log(
+        "estimates",
+        kept=state is not None,
+        age_s=round(age_s, 1) if state is not None else None,
+        why=why or None,
+    )
 
 
 def _recorder_process(settings: Any, shared: Shared, board: Any) -> int:
     from thermoctl.daemon.recorder import make_recorder, record
+
     stop = _Stop(shared, RECORDER)
     loops.die_with_parent()
     record(make_recorder(settings, shared, console_log), stop)
@@ -148,6 +169,7 @@ def _recorder_process(settings: Any, shared: Shared, board: Any) -> int:
 def _command_process(settings: Any, shared: Shared, board: Any) -> int:
     from thermoctl.daemon.reload import reload_settings
     from thermoctl.daemon.socket import Commands, listen, serve
+
     stop = _Stop(shared, COMMANDS)
     loops.die_with_parent()
     path = Path(settings.socket.path)
@@ -163,10 +185,15 @@ def _command_process(settings: Any, shared: Shared, board: Any) -> int:
 
 def _tuner_process(settings: Any, shared: Shared, board: Any) -> int:
     from thermoctl.daemon import tuner
+
     stop = _Stop()
     loops.die_with_parent()
-    tuning = tuner.Tuning(compensator(settings), settings.rig.name, Path(settings.compensation.model),
-                          lambda text: console_log("tuned", what=text))
+    tuning = tuner.Tuning(
+        compensator(settings),
+        settings.rig.name,
+        Path(settings.compensation.model),
+        lambda text: console_log("tuned", what=text),
+    )
     tuner.run(shared, tuning, stop)
     return EXIT_OK
 
@@ -181,6 +208,7 @@ def _reference_process(settings: Any, shared: Shared, board: Any) -> int:
 
 def _poller_process(settings: Any, shared: Shared, board: Any, device: str) -> int:
     from hal.board import run_poller
+
     loops.die_with_parent()
     run_poller(settings, device, board.name)
     return EXIT_OK
@@ -189,14 +217,18 @@ def _poller_process(settings: Any, shared: Shared, board: Any, device: str) -> i
 class _Child:
     """One process: how it is started, and when it may be started again. beats: gives its rounds done, None: unwatched."""
 
-    def __init__(self, name: str, main: Callable[..., int], *arguments: Any, beats: Callable[[], float] | None = None):
+    def __init__(
+        self, name: str, main: Callable[..., int], *arguments: Any, beats: Callable[[], float] | None = None
+    ):
         self.name, self.main, self.arguments, self.beats = name, main, arguments, beats
         self.heard, self.heard_at = -1.0, 0.0
         self.process: Any = None
         self.again_at, self.pause_s = 0.0, RESTART_S
 
     def start(self) -> None:
-        self.process = _fork.Process(target=_run_child, args=(self.name, self.main, self.arguments), name=self.name)
+        self.process = _fork.Process(
+            target=_run_child, args=(self.name, self.main, self.arguments), name=self.name
+        )
         self.process.start()
         self.started = self.heard_at = time.monotonic()
 
@@ -267,45 +299,84 @@ class _Watcher:
             state, bits = pairs[k]
             before_state, before_bits = self.before if k == 0 else pairs[k - 1]
             if state != before_state:
-                self.log("state", tick=int(rows[k, INDEX["tick"]]), was=arming.STATES[int(before_state)],
-                         now=arming.STATES[int(state)])
+                self.log(
+                    "state",
+                    tick=int(rows[k, INDEX["tick"]]),
+                    was=arming.STATES[int(before_state)],
+                    now=arming.STATES[int(state)],
+                )
             for fault in faults.decode(int(bits) & ~int(before_bits)):
-                if rows[k, INDEX["t_s"]] - self.told.get(fault.name, -np.inf) < TELL_AGAIN_S and state == before_state:
+                if (
+                    rows[k, INDEX["t_s"]] - self.told.get(fault.name, -np.inf) < TELL_AGAIN_S
+                    and state == before_state
+                ):
                     continue
                 self.told[fault.name] = rows[k, INDEX["t_s"]]
-                self.log(fault.severity, tick=int(rows[k, INDEX["tick"]]), name=fault.name, meaning=repr(fault.meaning),
-                         remedy=repr(fault.remedy))
+                self.log(
+                    fault.severity,
+                    tick=int(rows[k, INDEX["tick"]]),
+                    name=fault.name,
+                    meaning=repr(fault.meaning),
+                    remedy=repr(fault.remedy),
+                )
         self.before = (pairs[-1, 0], pairs[-1, 1])
 
 
 def run(settings: Any, log: Log = console_log) -> int:
     """Run the daemon until SIGTERM or SIGINT; returns its exit status. Raises InputError when it cannot be started."""
     if not COMPILED:
-        log("warning", what="the law runs interpreted, not compiled: far too slow for a rig; run `make install`")
+        log(
+            "warning",
+            what="the law runs interpreted, not compiled: far too slow for a rig; run `make install`",
+        )
     lock = _only_one(settings)
     compensator(settings)
     law_parameters(settings)
-    if settings.compensation.tune:                            # loaded only then: it brings scipy with it
+    if settings.compensation.tune:  # loaded only then: it brings scipy with it
         from thermoctl.daemon import tuner
+
         tuner.check(settings)
     shared = Shared.create(shared_name(settings))
     board, pollers = None, []
     if settings.hal.backend == "devices":
         from hal.board import Board
+
         slow = slow_devices(settings)
         if slow:
             board = Board.create(shared_name(settings) + "-board")
-            pollers = [_Child(f"poller {d.name}", _poller_process, settings, shared, board, d.name,
-                              beats=partial(board.beat, d.roles)) for d in slow]
+            pollers = [
+                _Child(
+                    f"poller {d.name}",
+                    _poller_process,
+                    settings,
+                    shared,
+                    board,
+                    d.name,
+                    beats=partial(board.beat, d.roles),
+                )
+                for d in slow
+            ]
     loop = _Child("loop", _loop_process, settings, shared, board)
-    others = [*pollers, _Child("recorder", _recorder_process, settings, shared, board, beats=partial(shared.beats, RECORDER)),
-              _Child("commands", _command_process, settings, shared, board, beats=partial(shared.beats, COMMANDS))]
+    others = [
+        *pollers,
+        _Child("recorder", _recorder_process, settings, shared, board, beats=partial(shared.beats, RECORDER)),
+        _Child("commands", _command_process, settings, shared, board, beats=partial(shared.beats, COMMANDS)),
+    ]
     if not settings.recording.enable:
         others = [c for c in others if c.name != "recorder"]
     if settings.compensation.tune:
         others.append(_Child("tuner", _tuner_process, settings, shared, board))
     if settings.loop.reference:
-        others.append(_Child("reference", _reference_process, settings, shared, board, beats=partial(shared.beats, REFERENCE)))
+        others.append(
+            _Child(
+                "reference",
+                _reference_process,
+                settings,
+                shared,
+                board,
+                beats=partial(shared.beats, REFERENCE),
+            )
+        )
     try:
         return _supervise(settings, shared, loop, others, log)
     finally:
@@ -322,7 +393,9 @@ def _only_one(settings: Any) -> int:
         lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise InputError(f"{path}: another daemon runs on this socket; stop it first (thermoctl stop)") from None
+        raise InputError(
+            f"{path}: another daemon runs on this socket; stop it first (thermoctl stop)"
+        ) from None
     except OSError as e:
         raise InputError(f"{path}: cannot be made: {e.strerror}; check socket.path") from None
     return lock
@@ -356,12 +429,20 @@ def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child]
                 ready = True
                 notify(f"READY=1\nMAINPID={os.getpid()}")
                 log("ready", ticks=head, seconds=round(now - started, 2))
-            if not loop.alive and not asked:                  # a signal to the whole group ends both
+            if not loop.alive and not asked:  # a signal to the whole group ends both
                 log("the loop ended", exit=loop.process.exitcode)
-                code = loop.process.exitcode if loop.process.exitcode in (EXIT_INPUT, EXIT_HARDWARE) else EXIT_FAILED
+                code = (
+                    loop.process.exitcode
+                    if loop.process.exitcode in (EXIT_INPUT, EXIT_HARDWARE)
+                    else EXIT_FAILED
+                )
                 break
             if stood_s > (stall_s if head > 0 else READY_S):
-                log("the loop stands still: ended", seconds=round(stood_s, 1), pid=int(shared.counters[LOOP_PID]))
+                log(
+                    "the loop stands still: ended",
+                    seconds=round(stood_s, 1),
+                    pid=int(shared.counters[LOOP_PID]),
+                )
                 loop.process.kill()
                 loop.process.join()
                 code = EXIT_FAILED
@@ -398,7 +479,7 @@ def _restart(children: list[_Child], now: float, log: Log) -> None:
         if child.hangs(now):
             log(f"{child.name} hangs: killed", seconds=round(now - child.heard_at, 1))
             child.process.kill()
-            child.heard_at = now                               # one kill; it is gone at the next look
+            child.heard_at = now  # one kill; it is gone at the next look
         if child.alive:
             continue
         if child.again_at == 0.0:
@@ -414,6 +495,7 @@ def _restart(children: list[_Child], now: float, log: Log) -> None:
 
 def _reload(settings: Any, log: Log) -> None:
     from thermoctl.daemon.socket import ask
+
     try:
         answer = ask(settings.socket.path, {"command": "reload"})
         log("reload", **answer)

@@ -3,6 +3,7 @@
 It never touches the loop. A better model becomes a new calibration in the folder that compensation.model names, in use from the daemon's
 next start on; `thermoctl model rollback` takes it back. `status` shows the progress in percent.
 """
+
 from __future__ import annotations
 
 import time
@@ -21,7 +22,7 @@ from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError
 
 INTERVAL_S = 0.5
-PROPOSE_S = 600.0            # of rig time between two looks at the proposal
+PROPOSE_S = 600.0  # of rig time between two looks at the proposal
 _ESTIMATES = [INDEX[f"{p}_est_c"] for p in POINTS]
 _T, _AIR, _STATUS = INDEX["t_s"], INDEX["air_c"], INDEX["status_bits"]
 _POSITION, _REFERENCE = INDEX["position_raw_um"], INDEX["output_reference_um"]
@@ -33,7 +34,14 @@ class Tuning:
 
     folder: of calibrations, or None to learn without installing; say(text): what happened, for the log."""
 
-    def __init__(self, model: CompensatorModel, rig: str, folder: Path | None, say: Callable[[str], None], tuner: Tuner | None = None):
+    def __init__(
+        self,
+        model: CompensatorModel,
+        rig: str,
+        folder: Path | None,
+        say: Callable[[str], None],
+        tuner: Tuner | None = None,
+    ):
         self.rig, self.folder, self.say = rig, folder, say
         self.tuner = tuner or Tuner(model)
         self.period_s = model.expansion_period_s
@@ -50,11 +58,13 @@ class Tuning:
         ends = np.flatnonzero(np.diff(number)) + 1
         for part in np.split(rows, ends)[:-1]:
             self._sample(part)
-        self._rows = [rows[ends[-1] if len(ends) else 0:]]
+        self._rows = [rows[ends[-1] if len(ends) else 0 :]]
 
     def _sample(self, rows: np.ndarray) -> None:
         good = (rows[:, _STATUS].astype(np.int64) & _BOTH) == 0
-        error = float(np.mean((rows[:, _REFERENCE] - rows[:, _POSITION])[good])) if good.any() else float("nan")
+        error = (
+            float(np.mean((rows[:, _REFERENCE] - rows[:, _POSITION])[good])) if good.any() else float("nan")
+        )
         air = float(np.nanmean(rows[:, _AIR]))
         estimates = rows[:, _ESTIMATES].mean(0)
         if not (np.isfinite(air) and np.isfinite(estimates).all()):
@@ -74,16 +84,24 @@ class Tuning:
         if new is None:
             return
         if self.folder is not None:
-            path = modelfile.install(self.folder, new, self.rig, figures={"tuned_online": why, "samples": self.tuner.bank.samples})
-            self.say(f"{path}: {why}; in use from the next start on, `thermoctl model rollback` takes it back")
-        self.tuner = Tuner(new, tuple(self.tuner.edges), self.tuner.full, self.tuner.clip, self.tuner.hold * self.period_s)
+            path = modelfile.install(
+                self.folder, new, self.rig, figures={"tuned_online": why, "samples": self.tuner.bank.samples}
+            )
+            self.say(
+                f"{path}: {why}; in use from the next start on, `thermoctl model rollback` takes it back"
+            )
+        self.tuner = Tuner(
+            new, tuple(self.tuner.edges), self.tuner.full, self.tuner.clip, self.tuner.hold * self.period_s
+        )
 
 
 def check(settings: Any) -> None:
     """Raises InputError when compensation.tune is asked for and there is no folder of calibrations to put results into."""
     if settings.compensation.tune and not Path(settings.compensation.model or "-").is_dir():
-        raise InputError(f"{settings.path}: compensation.tune needs compensation.model to be a folder of calibrations (as `thermoctl identify` "
-                         f"and `thermoctl calibrate --accept` make it), not '{settings.compensation.model}'")
+        raise InputError(
+            f"{settings.path}: compensation.tune needs compensation.model to be a folder of calibrations (as `thermoctl identify` "
+            f"and `thermoctl calibrate --accept` make it), not '{settings.compensation.model}'"
+        )
 
 
 def run(shared: Shared, tuning: Tuning, stopping: Callable[[], bool]) -> None:

@@ -1,4 +1,5 @@
 """`demo`: a daemon of its own, armed and moving, with the monitor's view in front of it."""
+
 from __future__ import annotations
 
 import contextlib
@@ -18,7 +19,7 @@ from thermoctl.daemon.socket import ask
 from thermoctl.yamlfile import InputError
 
 START_S = 60.0
-STROKE_UM, HALF_CYCLE_S = 40.0, 8.0          # quick enough to watch; the limiter gives the trapezoids
+STROKE_UM, HALF_CYCLE_S = 40.0, 8.0  # quick enough to watch; the limiter gives the trapezoids
 
 
 def demo(settings: Any, seconds: float | None = None) -> int:
@@ -28,8 +29,12 @@ def demo(settings: Any, seconds: float | None = None) -> int:
     log_path = Path(settings.socket.path).with_suffix(".log")
     log_path.parent.mkdir(parents=True, exist_ok=True)
     with log_path.open("wb") as log:
-        daemon = subprocess.Popen([sys.executable, "-m", "thermoctl.cli", "run", "--config", settings.path],
-                                  stdout=log, stderr=log, start_new_session=True)
+        daemon = subprocess.Popen(
+            [sys.executable, "-m", "thermoctl.cli", "run", "--config", settings.path],
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
     signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
     faulty = False
     try:
@@ -73,7 +78,10 @@ def _show(settings: Any, console: Console, daemon: subprocess.Popen, seconds: fl
             status = ask(settings.socket.path, {"command": "status"})
             faulty = any(f["severity"] != "warning" for f in status["faults"])
             if status["state"] == "ARMED" and time.monotonic() - begin >= turn * HALF_CYCLE_S:
-                ask(settings.socket.path, {"command": "setpoint", "value": STROKE_UM if turn % 2 == 0 else -STROKE_UM})
+                ask(
+                    settings.socket.path,
+                    {"command": "setpoint", "value": STROKE_UM if turn % 2 == 0 else -STROKE_UM},
+                )
                 turn += 1
             remember(trails, status)
             if live is not None:
@@ -82,7 +90,10 @@ def _show(settings: Any, console: Console, daemon: subprocess.Popen, seconds: fl
             else:
                 with_, without = errors(status)
                 error = "-" if with_ is None else f"{with_:+.3f} um (without compensation {without:+.3f} um)"
-                print(f"{status['state']} tick {status['ticks']} setpoint {status['setpoint_um']:.1f} um, error {error}"
-                      f", coil {status['temperatures_c']['coil']:.2f} C, {status['slips']} slips", flush=True)
+                print(
+                    f"{status['state']} tick {status['ticks']} setpoint {status['setpoint_um']:.1f} um, error {error}"
+                    f", coil {status['temperatures_c']['coil']:.2f} C, {status['slips']} slips",
+                    flush=True,
+                )
             time.sleep(interval_s)
     return faulty

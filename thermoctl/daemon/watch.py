@@ -5,6 +5,7 @@ again is found. Around each new fault the rows of every tick are kept: the captu
 held when the follower came, so a fault soon after the dashboard's start has its seconds before as well. The last minute
 is kept in few numbers: a page that opens shows it at once.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -25,13 +26,29 @@ from thermoctl.daemon.socket import latency, status
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
-BEFORE_S, AFTER_S = 2.0, 2.0        # of a capture
+BEFORE_S, AFTER_S = 2.0, 2.0  # of a capture
 CAPTURES = 16
-SILENT_S = 2.0                      # no tick for so long: the rows are shown as old
-PAST_S, PAST_STEP_S = 60.0, 0.1     # the last minute that a page gets when it opens
-PAST = ("wall_s", "reference_um", "compensated_um", "position_raw_um", "output_reference_um", "compensation_um", "innovation_c",
-        "power_w")
-RANGED = ("position_raw_um", "compensated_um", "output_reference_um", "lateness_us", "drive", "power_w", "innovation_c")
+SILENT_S = 2.0  # no tick for so long: the rows are shown as old
+PAST_S, PAST_STEP_S = 60.0, 0.1  # the last minute that a page gets when it opens
+PAST = (
+    "wall_s",
+    "reference_um",
+    "compensated_um",
+    "position_raw_um",
+    "output_reference_um",
+    "compensation_um",
+    "innovation_c",
+    "power_w",
+)
+RANGED = (
+    "position_raw_um",
+    "compensated_um",
+    "output_reference_um",
+    "lateness_us",
+    "drive",
+    "power_w",
+    "innovation_c",
+)
 """Signals of which a frame says the least and largest value since the frame before."""
 LATENESS_EDGES_US = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
@@ -42,18 +59,26 @@ _TRIPS = faults.mask("fault", "critical")
 @dataclass
 class Capture:
     """The rows of every tick from BEFORE_S before a fault to AFTER_S after it: rows (n, len(SIGNALS))."""
+
     number: int
     t_s: float
     wall_s: float
     faults: list[str]
     rows: np.ndarray
     whole: bool = False
-    lost: int = 0                   # ticks that were overwritten before they could be read
+    lost: int = 0  # ticks that were overwritten before they could be read
 
     def summary(self) -> dict[str, Any]:
         """What a list of captures shows."""
-        return {"number": self.number, "wall_s": self.wall_s, "t_s": self.t_s, "faults": self.faults,
-                "rows": len(self.rows), "whole": self.whole, "lost": self.lost}
+        return {
+            "number": self.number,
+            "wall_s": self.wall_s,
+            "t_s": self.t_s,
+            "faults": self.faults,
+            "rows": len(self.rows),
+            "whole": self.whole,
+            "lost": self.lost,
+        }
 
 
 class Watch:
@@ -74,7 +99,7 @@ class Watch:
         self._stopping = threading.Event()
         self._recent: deque[np.ndarray] = deque()
         self._position = self._captured = self._inode = 0
-        self._bits: int | None = None               # fault bits of the row before; None before the first
+        self._bits: int | None = None  # fault bits of the row before; None before the first
         self._moved_s = time.monotonic()
         model = compensator(settings)
         self._noise_c2 = model.R_v if settings.compensation.model else math.nan
@@ -123,8 +148,10 @@ class Watch:
         for name in ("lateness", "busy", "reference"):
             bins = answer[name].pop("bins_us")
             edges = (*LATENESS_EDGES_US, math.inf)
-            answer[name]["counts"] = [sum(c for us, c in bins if low <= us < high)
-                                      for low, high in zip(edges[:-1], edges[1:], strict=True)]
+            answer[name]["counts"] = [
+                sum(c for us, c in bins if low <= us < high)
+                for low, high in zip(edges[:-1], edges[1:], strict=True)
+            ]
         return {**answer, "edges_us": list(LATENESS_EDGES_US)}
 
     def _attached(self) -> Shared | None:
@@ -137,7 +164,7 @@ class Watch:
             memory = self.shared._memory
             vars(self.shared).clear()
             self.shared = None
-            with contextlib.suppress(BufferError):      # a request still reads it: it goes with that
+            with contextlib.suppress(BufferError):  # a request still reads it: it goes with that
                 memory.close()
         if self.shared is None and inode:
             try:
@@ -145,7 +172,7 @@ class Watch:
             except InputError:
                 return None
             self.shared, self._inode = shared, inode
-            self._position, self._bits = 0, None        # from the oldest row that the ring still holds
+            self._position, self._bits = 0, None  # from the oldest row that the ring still holds
             self._recent.clear()
             self.past.clear()
         return self.shared
@@ -162,12 +189,20 @@ class Watch:
         frame["stale"] = frame["silent_s"] > SILENT_S
         newest = rows[-1] if len(rows) else shared.ring.newest()
         if newest is not None:
-            frame.update(wall_s=float(newest[_WALL]), position_raw_um=_finite(newest[INDEX["position_raw_um"]]),
-                         innovation_sigma_c=self._sigma(newest))
+            frame.update(
+                wall_s=float(newest[_WALL]),
+                position_raw_um=_finite(newest[INDEX["position_raw_um"]]),
+                innovation_sigma_c=self._sigma(newest),
+            )
         if len(rows):
             with np.errstate(all="ignore"):
-                frame["range"] = {n: [_finite(np.fmin.reduce(rows[:, INDEX[n]])), _finite(np.fmax.reduce(rows[:, INDEX[n]]))]
-                                  for n in RANGED}
+                frame["range"] = {
+                    n: [
+                        _finite(np.fmin.reduce(rows[:, INDEX[n]])),
+                        _finite(np.fmax.reduce(rows[:, INDEX[n]])),
+                    ]
+                    for n in RANGED
+                }
         return frame
 
     def _sigma(self, row: np.ndarray) -> float | None:
@@ -180,10 +215,13 @@ class Watch:
         rows = rows[rows[:, _WALL] > rows[-1, _WALL] - PAST_S]
         step = np.floor(rows[:, _WALL] / PAST_STEP_S)
         for row in rows[np.append(np.diff(step) != 0, True)]:
-            point = {"ok": True, "state": arming.STATES[int(row[INDEX["state"]])],
-                     **{n: _finite(row[INDEX[n]]) for n in PAST}}
+            point = {
+                "ok": True,
+                "state": arming.STATES[int(row[INDEX["state"]])],
+                **{n: _finite(row[INDEX[n]]) for n in PAST},
+            }
             if self.past and row[_WALL] < self.past[-1]["wall_s"]:
-                self.past.clear()                           # the clock was set back
+                self.past.clear()  # the clock was set back
             if self.past and row[_WALL] // PAST_STEP_S == self.past[-1]["wall_s"] // PAST_STEP_S:
                 self.past[-1] = point
             else:
@@ -196,7 +234,9 @@ class Watch:
             self._recent.clear()
         for capture in self.captures:
             if not capture.whole:
-                capture.lost += min(lost, round((capture.t_s + AFTER_S - capture.rows[-1, _T]) / self.settings.loop.period_s))
+                capture.lost += min(
+                    lost, round((capture.t_s + AFTER_S - capture.rows[-1, _T]) / self.settings.loop.period_s)
+                )
                 after = rows[rows[:, _T] <= capture.t_s + AFTER_S]
                 capture.rows = np.concatenate((capture.rows, after))
                 capture.whole = len(after) < len(rows)
@@ -214,17 +254,25 @@ class Watch:
         newest = self.captures[-1] if self.captures else None
         t_s = float(rows[k, _T])
         if newest is not None and newest.t_s <= t_s <= newest.t_s + AFTER_S:
-            newest.faults = [*newest.faults, *(n for n in names if n not in newest.faults)]      # a consequence
+            newest.faults = [*newest.faults, *(n for n in names if n not in newest.faults)]  # a consequence
             return
         known = np.concatenate((*self._recent, rows))
         known = known[(known[:, _T] >= t_s - BEFORE_S) & (known[:, _T] <= t_s + AFTER_S)]
         self._captured += 1
-        self.captures.append(Capture(self._captured, t_s, float(rows[k, _WALL]), names, known,
-                                     bool(rows[-1, _T] > t_s + AFTER_S)))
+        self.captures.append(
+            Capture(
+                self._captured, t_s, float(rows[k, _WALL]), names, known, bool(rows[-1, _T] > t_s + AFTER_S)
+            )
+        )
 
 
 def _down() -> dict[str, Any]:
-    return {"ok": False, "state": "OFF", "faults": [], "error": "the daemon is not running: `thermoctl start`"}
+    return {
+        "ok": False,
+        "state": "OFF",
+        "faults": [],
+        "error": "the daemon is not running: `thermoctl start`",
+    }
 
 
 def _finite(number: float) -> float | None:

@@ -1,4 +1,5 @@
 """The commands `diagnose` and `effects`: progress while they work, a summary for a person, JSON for a program."""
+
 from __future__ import annotations
 
 import argparse
@@ -13,8 +14,14 @@ from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.yamlfile import InputError, suggest
 
 # How far along a diagnosis is when a stage begins (share of its whole time, a rough guess): for the estimate of what is left.
-_STAGES = (("refitting the plant", 0.0), ("screening the catalogue", 0.12), ("looking again", 0.35), ("refitting", 0.25),
-           ("screening again", 0.6), ("one effect is not needed", 0.85))
+_STAGES = (
+    ("refitting the plant", 0.0),
+    ("screening the catalogue", 0.12),
+    ("looking again", 0.35),
+    ("refitting", 0.25),
+    ("screening again", 0.6),
+    ("one effect is not needed", 0.85),
+)
 
 
 class Progress:
@@ -34,7 +41,9 @@ def diagnose(args: argparse.Namespace) -> int:
     """`thermoctl diagnose`: runs the diagnosis and prints its summary. Raises InputError for unusable inputs."""
     if args.live:
         if args.recordings:
-            raise InputError("diagnose --live reads the daemon's own recordings; no recording was expected beside it")
+            raise InputError(
+                "diagnose --live reads the daemon's own recordings; no recording was expected beside it"
+            )
         args.recordings = _live(args)
         if not args.recordings:
             return 0
@@ -46,11 +55,25 @@ def diagnose(args: argparse.Namespace) -> int:
     from thermoctl.diagnose.experiment import resolve
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
-        return run.diagnose(args.plant, recordings, args.out, [Path(e) for e in args.effects or ()],
-                            None if args.quiet else Progress(), args.drive or (), _limits(args.limit or ()))
+        return run.diagnose(
+            args.plant,
+            recordings,
+            args.out,
+            [Path(e) for e in args.effects or ()],
+            None if args.quiet else Progress(),
+            args.drive or (),
+            _limits(args.limit or ()),
+        )
+
     if args.resolve:
-        found = resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds,
-                        lambda text: print(text, file=sys.stderr, flush=True))
+        found = resolve(
+            diagnosed,
+            args.recordings,
+            Path(args.out),
+            args.record,
+            args.rounds,
+            lambda text: print(text, file=sys.stderr, flush=True),
+        )
     else:
         found = diagnosed(args.recordings)
     if args.json:
@@ -65,15 +88,21 @@ def _live(args: argparse.Namespace) -> list[str]:
     from thermoctl.diagnose import live
     from thermoctl.plant import load
     from thermoctl.settings import load_settings
+
     settings = load_settings(args.config)
     table = live.newest(settings.recording.directory, settings.rig.name, args.hours)
     alarms = live.where(settings, table)
     span = f"{table.t[0]:.0f} s to {table.t[-1]:.0f} s of the newest session"
     if not alarms:
-        print(f"The model fits: from {span} its innovations are what the filter expects. Nothing to diagnose.")
+        print(
+            f"The model fits: from {span} its innovations are what the filter expects. Nothing to diagnose."
+        )
         return []
     a = alarms[-1]
-    print(f"The model no longer fits from {a.begin_s:.0f} s on (mean innovation {a.mean_c:+.3f} K; {span}); that is diagnosed.", file=sys.stderr)
+    print(
+        f"The model no longer fits from {a.begin_s:.0f} s on (mean innovation {a.mean_c:+.3f} K; {span}); that is diagnosed.",
+        file=sys.stderr,
+    )
     Path(args.out).mkdir(parents=True, exist_ok=True)
     path = Path(args.out) / "live.csv"
     live.extract(load(args.plant), table, a, path)
@@ -89,7 +118,9 @@ def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
         try:
             out[name] = (float(low), float(high))
         except ValueError:
-            raise InputError(f"--limit {text}: NAME=LOW:HIGH was expected, such as block_temperature=15:90") from None
+            raise InputError(
+                f"--limit {text}: NAME=LOW:HIGH was expected, such as block_temperature=15:90"
+            ) from None
         if not out[name][0] < out[name][1]:
             raise InputError(f"--limit {text}: the first number must be the smaller one")
     return out
@@ -101,11 +132,19 @@ def fleet(args: argparse.Namespace) -> int:
     diagnosed is told and does not stop the others; done rigs are not run again."""
     from thermoctl.diagnose import prove
     from thermoctl.diagnose.fleet import find_recordings, rig_of
+
     rigs: dict[str, list[str]] = {}
     for path in (p for r in args.recordings for p in (find_recordings(r) if Path(r).is_dir() else [r])):
         rigs.setdefault(rig_of(path), []).append(path)
-    jobs = [prove.Job(rig, args.plant, tuple(sorted(paths, key=lambda p: Path(p).name)[-args.last:]), tuple(args.effects or ()))
-            for rig, paths in sorted(rigs.items())]
+    jobs = [
+        prove.Job(
+            rig,
+            args.plant,
+            tuple(sorted(paths, key=lambda p: Path(p).name)[-args.last :]),
+            tuple(args.effects or ()),
+        )
+        for rig, paths in sorted(rigs.items())
+    ]
     if not Path(args.plant).is_file():
         raise InputError(f"{args.plant}: no such file; the plant of the fleet's rigs was expected")
     out = Path(args.out)
@@ -114,18 +153,44 @@ def fleet(args: argparse.Namespace) -> int:
     for job in jobs:
         run = json.loads((out / job.name / "run.json").read_text())
         found = {} if run["error"] else json.loads((out / job.name / "diagnosis.json").read_text())
-        told.append({"rig": job.name, "recordings": list(job.recordings), "error": run["error"], "seconds": run["seconds"],
-                     "verdict": found.get("verdict"), "findings": [{k: f[k] for k in ("effect", "where", "probability")}
-                                                                   for f in found.get("findings", [])]})
+        told.append(
+            {
+                "rig": job.name,
+                "recordings": list(job.recordings),
+                "error": run["error"],
+                "seconds": run["seconds"],
+                "verdict": found.get("verdict"),
+                "findings": [
+                    {k: f[k] for k in ("effect", "where", "probability")} for f in found.get("findings", [])
+                ],
+            }
+        )
     if args.json:
         print(json.dumps(told, indent=1))
     elif not args.quiet:
         from rich.console import Console
         from rich.table import Table
-        table = Table("rig", "recordings", "verdict", "effect at place (probability)", "s", box=None, header_style="bold")
+
+        table = Table(
+            "rig",
+            "recordings",
+            "verdict",
+            "effect at place (probability)",
+            "s",
+            box=None,
+            header_style="bold",
+        )
         for x in told:
-            what = x["error"] or "\n".join(f"{f['effect']} at {f['where']} ({f['probability']:.2f})" for f in x["findings"])
-            table.add_row(x["rig"], str(len(x["recordings"])), x["verdict"] or "not diagnosed", what, f"{x['seconds'] or 0:.0f}")
+            what = x["error"] or "\n".join(
+                f"{f['effect']} at {f['where']} ({f['probability']:.2f})" for f in x["findings"]
+            )
+            table.add_row(
+                x["rig"],
+                str(len(x["recordings"])),
+                x["verdict"] or "not diagnosed",
+                what,
+                f"{x['seconds'] or 0:.0f}",
+            )
         Console(soft_wrap=True).print(table)
         print(f"reports: {out}/RIG/report.html")
     return 0
@@ -135,22 +200,36 @@ def effects(args: argparse.Namespace) -> int:
     """`thermoctl effects [show NAME]`: the catalogue, or one entry in full. Raises InputError for an unknown name."""
     from rich.console import Console
     from rich.table import Table
+
     found = catalogue((CATALOGUE, *map(Path, args.effects or ())))
     console = Console(soft_wrap=True)
     if args.action == "show":
         if args.name not in found:
-            raise InputError(f"'{args.name}' is not an effect of the catalogue{suggest(str(args.name), found)}; "
-                             "`thermoctl effects` lists them")
+            raise InputError(
+                f"'{args.name}' is not an effect of the catalogue{suggest(str(args.name), found)}; "
+                "`thermoctl effects` lists them"
+            )
         e = found[args.name]
-        console.print(f"[bold]{e.name}[/]: {e.title}\nplace       {e.where}\nexcited by  {e.excited_by}\n"
-                      f"mimics      {', '.join(e.mimics) or '-'}\nsource      {e.source}")
+        console.print(
+            f"[bold]{e.name}[/]: {e.title}\nplace       {e.where}\nexcited by  {e.excited_by}\n"
+            f"mimics      {', '.join(e.mimics) or '-'}\nsource      {e.source}"
+        )
         for number, change in enumerate(e.changes):
             for item in change:
                 for kind, value in item.items():
-                    body = ", ".join(f"{k}: {v}" for k, v in value.items()) if isinstance(value, dict) else str(value)
-                    console.print(f"{'change' if not number else f'variant {number}':11} {kind}: {body}", markup=False)
+                    body = (
+                        ", ".join(f"{k}: {v}" for k, v in value.items())
+                        if isinstance(value, dict)
+                        else str(value)
+                    )
+                    console.print(
+                        f"{'change' if not number else f'variant {number}':11} {kind}: {body}", markup=False
+                    )
         for p in e.parameters:
-            console.print(f"parameter   {p.name} [{p.unit or '1'}] {p.low:g} .. {p.high:g}, absent at {p.null:g}", markup=False)
+            console.print(
+                f"parameter   {p.name} [{p.unit or '1'}] {p.low:g} .. {p.high:g}, absent at {p.null:g}",
+                markup=False,
+            )
         return 0
     if args.action:
         raise InputError(f"effects: 'show NAME' or nothing was expected, not '{args.action}'")
@@ -166,31 +245,46 @@ def sentence(found: dict[str, Any]) -> str:
     named = " and ".join(f"{f['effect'].replace('_', ' ')} at {f['where']}" for f in found["findings"])
     sure = f" (probability {found['findings'][0]['probability']:.2f})" if found["findings"] else ""
     if found["verdict"] == "consistent":
-        return ("The recordings agree with the plant, as far as its sensors and its parameters' ranges can tell: "
-                "nothing is missing.")
+        return (
+            "The recordings agree with the plant, as far as its sensors and its parameters' ranges can tell: "
+            "nothing is missing."
+        )
     if found["verdict"] == "explained":
         return f"The plant lacks {named}{sure}; with it the simulation follows the recordings as well as the sensors allow."
     if found["verdict"] == "ambiguous":
-        others = ", ".join(f"{a['effect'].replace('_', ' ')} at {a['where']}" for a in found["alternatives"][:4])
-        return (f"Something is missing that these recordings cannot name for sure: most likely {named}{sure}"
-                + (f", but also {others} would fit." if others else "."))
+        others = ", ".join(
+            f"{a['effect'].replace('_', ' ')} at {a['where']}" for a in found["alternatives"][:4]
+        )
+        return (
+            f"Something is missing that these recordings cannot name for sure: most likely {named}{sure}"
+            + (f", but also {others} would fit." if others else ".")
+        )
     where = found["mismatch"][0]["node"] or found["mismatch"][0]["channel"] if found["mismatch"] else None
-    return ("Something is missing" + (f", most of it at {where}," if where else "") + " that no entry of the catalogue explains"
-            + (f"; {named} explains a part of it{sure}." if named else "."))
+    return (
+        "Something is missing"
+        + (f", most of it at {where}," if where else "")
+        + " that no entry of the catalogue explains"
+        + (f"; {named} explains a part of it{sure}." if named else ".")
+    )
 
 
 def summary(found: dict[str, Any], out: str | Path) -> None:
     """Print a result for a person."""
     from rich.console import Console
     from rich.table import Table
+
     console = Console() if sys.stdout.isatty() else Console(width=160)
     console.print(f"[bold]{found['verdict']}[/]. {sentence(found)}")
     if found["findings"]:
-        table = Table("effect", "where", "equation", "parameter", "value", "95 %", box=None, header_style="bold")
+        table = Table(
+            "effect", "where", "equation", "parameter", "value", "95 %", box=None, header_style="bold"
+        )
         for f in found["findings"]:
             first = [f["effect"], f["where"], f["equation"]]
             for name, p in f["parameters"].items():
-                table.add_row(*first, name, f"{p['value']:.4g} {p['unit'] or ''}", f"± {1.96 * (p['sd'] or 0):.2g}")
+                table.add_row(
+                    *first, name, f"{p['value']:.4g} {p['unit'] or ''}", f"± {1.96 * (p['sd'] or 0):.2g}"
+                )
                 first = ["", "", ""]
         console.print(table)
     if found["alternatives"]:
@@ -199,30 +293,59 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
             table.add_row(a["effect"], a["where"], f"{a['probability']:.3f}")
         console.print(table)
     if found["mismatch"]:
-        table = Table("misfit of", "rms", "sensor allows", "missing flow", "follows", box=None, header_style="bold")
+        table = Table(
+            "misfit of", "rms", "sensor allows", "missing flow", "follows", box=None, header_style="bold"
+        )
         for m in found["mismatch"]:
             size, unit = m.get("missing_flow_rms"), m.get("missing_flow_unit")
             flow = f"{size:.3g} {unit or ''} at {m['node']}" if size else "-"
-            table.add_row(m["channel"], f"{m['rms']:.4g}", f"{m['expected_rms']:.4g}", flow, ", ".join(m.get("follows") or ()))
+            table.add_row(
+                m["channel"],
+                f"{m['rms']:.4g}",
+                f"{m['expected_rms']:.4g}",
+                flow,
+                ", ".join(m.get("follows") or ()),
+            )
         console.print(table)
-    table = Table("rms of", "as it came", "refitted", "with the finding", "held out: refitted", "with the finding",
-                  "ratio (95 %)", box=None, header_style="bold")
+    table = Table(
+        "rms of",
+        "as it came",
+        "refitted",
+        "with the finding",
+        "held out: refitted",
+        "with the finding",
+        "ratio (95 %)",
+        box=None,
+        header_style="bold",
+    )
     fit, gain = found["fit"], found.get("held_out_gain", {})
     for o in fit["refit_only"]:
         g = gain.get(o)
-        table.add_row(o, *(_number(fit.get(k, {}).get(o)) for k in ("before", "refit_only", "after", "held_out_refit_only",
-                                                                    "held_out_after")),
-                      f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else "-")
+        table.add_row(
+            o,
+            *(
+                _number(fit.get(k, {}).get(o))
+                for k in ("before", "refit_only", "after", "held_out_refit_only", "held_out_after")
+            ),
+            f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else "-",
+        )
     console.print(table)
     for note in found["notes"]:
         console.print(f"note: {note}", markup=False)
     if found["next_experiment"]:
         told = found["next_experiment"]
-        console.print(f"next experiment: {told['profile']}. {told['why']} {told['also_helpful'] or ''}", markup=False)
-        console.print(f"run it: thermoctl experiment {Path(out) / told['file']}  (or by hand: next_experiment.csv), "
-                      "or let `thermoctl diagnose --resolve` do it", markup=False)
+        console.print(
+            f"next experiment: {told['profile']}. {told['why']} {told['also_helpful'] or ''}", markup=False
+        )
+        console.print(
+            f"run it: thermoctl experiment {Path(out) / told['file']}  (or by hand: next_experiment.csv), "
+            "or let `thermoctl diagnose --resolve` do it",
+            markup=False,
+        )
     for k, r in enumerate(found.get("resolved", ()), 1):
-        console.print(f"round {k}: was {r['verdict']}; ran {r['experiment']} -> {r['recording']}", markup=False)
+        console.print(
+            f"round {k}: was {r['verdict']}; ran {r['experiment']} -> {r['recording']}", markup=False
+        )
     console.print(f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json", markup=False)
 
 

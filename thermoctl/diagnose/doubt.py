@@ -2,6 +2,7 @@
 
 A recording like that gets no name of a missing physics. What is found is said in words that a report can print.
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -14,9 +15,9 @@ from thermoctl.plant.refit import Fit, Noise
 from thermoctl.plant.simulate import Drive
 from thermoctl.recording.table import Table
 
-STILL = 6.0         # an output whose whole spread is below this many sigmas of its noise does not move
-FOLLOWS = 0.3       # share of an output's variation that a plant of the right rig leaves at most, even one that lacks physics
-BOUNDS = 0.5        # share of the parameters at their bounds from which the rig is doubted
+STILL = 6.0  # an output whose whole spread is below this many sigmas of its noise does not move
+FOLLOWS = 0.3  # share of an output's variation that a plant of the right rig leaves at most, even one that lacks physics
+BOUNDS = 0.5  # share of the parameters at their bounds from which the rig is doubted
 
 
 def still(drives: Sequence[Drive], noise: Sequence[Noise]) -> str | None:
@@ -26,8 +27,10 @@ def still(drives: Sequence[Drive], noise: Sequence[Noise]) -> str | None:
     for j, n in enumerate(noise):
         if any(np.isfinite(d.y[:, j]).any() and _spread(d.y[:, j]) > STILL * n.sigma for d in drives):
             return None
-    return ("no input of the plant changes in these recordings and no output moves: next to nothing is excited, so next to nothing "
-            "could be seen missing; record a run with the inputs moved")
+    return (
+        "no input of the plant changes in these recordings and no output moves: next to nothing is excited, so next to nothing "
+        "could be seen missing; record a run with the inputs moved"
+    )
 
 
 def _spread(y: np.ndarray) -> float:
@@ -35,7 +38,9 @@ def _spread(y: np.ndarray) -> float:
     return float(high - low)
 
 
-def other_rig(fitted: Fit, recorded: Sequence[np.ndarray], excess: dict[str, float], large: float, own: Sequence[str]) -> str | None:
+def other_rig(
+    fitted: Fit, recorded: Sequence[np.ndarray], excess: dict[str, float], large: float, own: Sequence[str]
+) -> str | None:
     """A plant that does not follow even roughly, or whose parameters (`own`) end at their bounds. `recorded`: per recording
     (N, outputs); `excess`: residual over noise; `large`: excess up to which the fit is good whatever the rest says."""
     if max(excess.values(), default=0.0) <= large:
@@ -53,13 +58,17 @@ def other_rig(fitted: Fit, recorded: Sequence[np.ndarray], excess: dict[str, flo
         reasons.append(f"{len(ends)} of {len(free)} parameters end at their bounds ({', '.join(ends[:5])})")
     if not reasons:
         return None
-    return ("the plant does not follow these recordings even roughly: " + "; ".join(reasons)
-            + ". Are they of this rig, with these columns and units? No name is given to what is missing")
+    return (
+        "the plant does not follow these recordings even roughly: "
+        + "; ".join(reasons)
+        + ". Are they of this rig, with these columns and units? No name is given to what is missing"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class Early:
     """A channel that runs ahead of the others by `seconds`, and the score that shifting it back would gain at first order."""
+
     output: str
     index: int
     seconds: float
@@ -93,6 +102,6 @@ def later(table: Table, column: str, seconds: float) -> Table:
     step = float(np.median(np.diff(table.t)))
     count = min(max(round(seconds / step), 0), len(table.t))
     values = np.full(len(table.t), np.nan)
-    values[count:] = table.columns[column][:len(table.t) - count]
-    values[count:][np.abs(table.t[count:] - table.t[:len(table.t) - count] - seconds) > 1.5 * step] = np.nan
+    values[count:] = table.columns[column][: len(table.t) - count]
+    values[count:][np.abs(table.t[count:] - table.t[: len(table.t) - count] - seconds) > 1.5 * step] = np.nan
     return dataclasses.replace(table, columns={**table.columns, column: values})

@@ -3,6 +3,7 @@
 An entry (config/effects/*.yaml, and a user's own folder) names the kind of place, the change it makes in the plant language
 and its parameters. `candidates` lists every entry at every place of a plant; `Candidate.extend` gives the plant with it.
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -25,11 +26,39 @@ from thermoctl.plant.units import dimension
 from thermoctl.shipped import shipped
 
 CATALOGUE = shipped("config/effects")
-_KEYS = ("effect", "title", "where", "needs", "change", "variants", "shapes", "parameters", "dims", "prior",
-         "caution", "excited_by", "mimics", "source")
-_SHAPES = ("onsets", "windows", "times", "lags", "delays", "periods", "phases", "end_levels", "high_levels", "drive_levels",
-           "small_levels", "speeds", "creep_speeds", "distances")
-STRAIGHT = "_straight"      # what an input that holds is called where it goes on straight lines
+_KEYS = (
+    "effect",
+    "title",
+    "where",
+    "needs",
+    "change",
+    "variants",
+    "shapes",
+    "parameters",
+    "dims",
+    "prior",
+    "caution",
+    "excited_by",
+    "mimics",
+    "source",
+)
+_SHAPES = (
+    "onsets",
+    "windows",
+    "times",
+    "lags",
+    "delays",
+    "periods",
+    "phases",
+    "end_levels",
+    "high_levels",
+    "drive_levels",
+    "small_levels",
+    "speeds",
+    "creep_speeds",
+    "distances",
+)
+STRAIGHT = "_straight"  # what an input that holds is called where it goes on straight lines
 TEMPERATURE = {"degC", "K", "kelvin", "celsius", "degree_Celsius", "delta_degC", "°C"}
 
 
@@ -37,6 +66,7 @@ TEMPERATURE = {"degC", "K", "kelvin", "celsius", "degree_Celsius", "delta_degC",
 class EffectParameter:
     """One parameter of an effect. `trial`: its value in screening as an expression of the amplitudes s, s2, s3 and of
     shapes; `shape`: the shape that it is; `null`: where the effect is absent."""
+
     name: str
     unit: str | None
     low: float
@@ -46,7 +76,7 @@ class EffectParameter:
     shape: str | None
     per_recording: bool
     typical: float | None
-    origin: str | None          # 'first_air': low and high are counted from the ambient at the start
+    origin: str | None  # 'first_air': low and high are counted from the ambient at the start
 
     @property
     def amplitude(self) -> bool:
@@ -57,19 +87,20 @@ class EffectParameter:
 @dataclass(frozen=True)
 class Effect:
     """One entry of the catalogue."""
+
     name: str
     title: str
     where: str
     needs: tuple[str, ...]
-    changes: tuple[tuple[Mapping[str, Any], ...], ...]        # the change and its variants
+    changes: tuple[tuple[Mapping[str, Any], ...], ...]  # the change and its variants
     shapes: Mapping[str, str]
     parameters: tuple[EffectParameter, ...]
     dims: tuple[tuple[float, ...], ...]
     excited_by: str
     mimics: tuple[str, ...]
     source: str
-    caution: str | None = None      # what a finding of it cannot tell, in words
-    prior: Expr | None = None       # -2 log of how likely its parameters' values are, beyond their bounds
+    caution: str | None = None  # what a finding of it cannot tell, in words
+    prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
 
 
 def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
@@ -91,12 +122,16 @@ def _read(root: yamlfile.Node) -> Effect:
         raise root.error("an effect file must be a mapping")
     for key, node in top.items():
         if key not in _KEYS:
-            raise node.error(f"unknown key '{key}'; allowed are {', '.join(_KEYS)}{yamlfile.suggest(key, _KEYS)}")
+            raise node.error(
+                f"unknown key '{key}'; allowed are {', '.join(_KEYS)}{yamlfile.suggest(key, _KEYS)}"
+            )
     for key in ("effect", "title", "where", "change", "parameters", "source"):
         if key not in top:
             raise root.error(f"an effect needs '{key}'")
     if top["where"].value not in PLACES:
-        raise top["where"].error(f"where must be one of {', '.join(PLACES)}{yamlfile.suggest(str(top['where'].value), PLACES)}")
+        raise top["where"].error(
+            f"where must be one of {', '.join(PLACES)}{yamlfile.suggest(str(top['where'].value), PLACES)}"
+        )
     shapes = top["shapes"].plain() if "shapes" in top else {}
     for key, kind in shapes.items():
         if kind not in _SHAPES:
@@ -112,30 +147,73 @@ def _read(root: yamlfile.Node) -> Effect:
         except ex.ExpressionError as e:
             raise node.error(str(e)) from None
         if trial is not None:
-            amplitudes = max([amplitudes, *(int(n[1:] or 1) for n in ex.names(trial) if re.fullmatch(r"s\d?", n))])
-        parameters.append(EffectParameter(key, p.get("unit"), float(p.get("low", -np.inf)), float(p.get("high", np.inf)),
-                                          float(p.get("null", 0.0)), trial, p.get("shape"), bool(p.get("per_recording")),
-                                          p.get("typical"), p.get("origin")))
+            amplitudes = max(
+                [amplitudes, *(int(n[1:] or 1) for n in ex.names(trial) if re.fullmatch(r"s\d?", n))]
+            )
+        parameters.append(
+            EffectParameter(
+                key,
+                p.get("unit"),
+                float(p.get("low", -np.inf)),
+                float(p.get("high", np.inf)),
+                float(p.get("null", 0.0)),
+                trial,
+                p.get("shape"),
+                bool(p.get("per_recording")),
+                p.get("typical"),
+                p.get("origin"),
+            )
+        )
     try:
         prior = ex.parse(str(top["prior"].value)) if "prior" in top else None
     except ex.ExpressionError as e:
         raise top["prior"].error(str(e)) from None
-    dims = tuple(map(tuple, top["dims"].plain())) if "dims" in top else tuple(
-        tuple(1.0 if i == k else 0.0 for i in range(amplitudes)) for k in range(amplitudes)) or ((1.0,),)
+    dims = (
+        tuple(map(tuple, top["dims"].plain()))
+        if "dims" in top
+        else tuple(tuple(1.0 if i == k else 0.0 for i in range(amplitudes)) for k in range(amplitudes))
+        or ((1.0,),)
+    )
     for node in [top["change"], *(top["variants"].value if "variants" in top else [])]:
         for item in node.value if isinstance(node.value, list) else []:
-            if not isinstance(item.value, dict) or len(item.value) != 1 or next(iter(item.value)) not in _CHANGES:
+            if (
+                not isinstance(item.value, dict)
+                or len(item.value) != 1
+                or next(iter(item.value)) not in _CHANGES
+            ):
                 raise item.error(f"a change must be one of {', '.join(_CHANGES)}")
-    changes = (tuple(top["change"].plain()), *(tuple(v) for v in (top["variants"].plain() if "variants" in top else [])))
-    return Effect(top["effect"].value, top["title"].value, top["where"].value, tuple(top["needs"].plain()) if "needs" in top else (),
-                  changes, shapes, tuple(parameters), dims, top["excited_by"].value if "excited_by" in top else "",
-                  tuple(top["mimics"].plain()) if "mimics" in top else (), top["source"].value,
-                  top["caution"].value if "caution" in top else None, prior)
+    changes = (
+        tuple(top["change"].plain()),
+        *(tuple(v) for v in (top["variants"].plain() if "variants" in top else [])),
+    )
+    return Effect(
+        top["effect"].value,
+        top["title"].value,
+        top["where"].value,
+        tuple(top["needs"].plain()) if "needs" in top else (),
+        changes,
+        shapes,
+        tuple(parameters),
+        dims,
+        top["excited_by"].value if "excited_by" in top else "",
+        tuple(top["mimics"].plain()) if "mimics" in top else (),
+        top["source"].value,
+        top["caution"].value if "caution" in top else None,
+        prior,
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------- the rig
 
-_KINDS = {"temperature": "K", "length": "m", "velocity": "m/s", "current": "A", "time": "s", "rotation": "1/s", "voltage": "V"}
+_KINDS = {
+    "temperature": "K",
+    "length": "m",
+    "velocity": "m/s",
+    "current": "A",
+    "time": "s",
+    "rotation": "1/s",
+    "voltage": "V",
+}
 
 
 @cache
@@ -152,7 +230,9 @@ def _dimension(unit: str | None) -> str:
 
 
 # Nodes that an effect brought to model a reading (lag, memory of the start): no body, so no physics can sit there.
-_READINGS = re.compile(r"(lagged|memory|grown)_(sensor_lag|cold_junction_drift|missing_member|expansion_lag)_")
+_READINGS = re.compile(
+    r"(lagged|memory|grown)_(sensor_lag|cold_junction_drift|missing_member|expansion_lag)_"
+)
 
 
 class Rig:
@@ -161,12 +241,27 @@ class Rig:
     def __init__(self, plant: Plant, drives: Sequence[Drive], columns: Sequence[Mapping[str, np.ndarray]]):
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
         # What an observer (observer.py) added is no physics that an effect could sit in.
-        p = dataclasses.replace(plant, inputs={k: v for k, v in plant.inputs.items() if not k.startswith("seen_") and not k.endswith(STRAIGHT)},
-                                flows={k: v for k, v in plant.flows.items() if not k.startswith("correct_")})
+        p = dataclasses.replace(
+            plant,
+            inputs={
+                k: v
+                for k, v in plant.inputs.items()
+                if not k.startswith("seen_") and not k.endswith(STRAIGHT)
+            },
+            flows={k: v for k, v in plant.flows.items() if not k.startswith("correct_")},
+        )
         self.physics = p
-        self.temperatures = [n.name for n in p.nodes.values() if _dimension(n.unit) == "temperature" and not _READINGS.match(n.name)]
-        self.velocities = [n.name for n in p.nodes.values() if _dimension(n.unit) in ("velocity", "rotation")
-                           and any(f.target == n.name or f.source == n.name for f in p.flows.values())]
+        self.temperatures = [
+            n.name
+            for n in p.nodes.values()
+            if _dimension(n.unit) == "temperature" and not _READINGS.match(n.name)
+        ]
+        self.velocities = [
+            n.name
+            for n in p.nodes.values()
+            if _dimension(n.unit) in ("velocity", "rotation")
+            and any(f.target == n.name or f.source == n.name for f in p.flows.values())
+        ]
         self.position_of: dict[str, str] = {}
         for f in p.flows.values():
             for v in self.velocities:
@@ -174,15 +269,31 @@ class Rig:
                     self.position_of.setdefault(v, f.target)
         common = set.intersection(*(set(c) for c in columns)) if columns else set()
         taken = {i.column for i in p.inputs.values()} | {o.column for o in p.outputs.values()}
-        self.spare = sorted(c for c in common - taken if re.fullmatch(r"[A-Za-z_]\w*", c) and c not in p.nodes
-                            and c not in p.parameters and c not in p.outputs and c not in p.inputs and c not in p.flows
-                            and all(np.ptp(t[c][np.isfinite(t[c])]) > 0 for t in columns if np.isfinite(t[c]).any())
-                            and all(np.isfinite(t[c]).any() for t in columns))
-        moving = {i for j, i in enumerate(plant.inputs) if i in p.inputs and any(np.ptp(d.u[:, j]) > 0 for d in drives)}
+        self.spare = sorted(
+            c
+            for c in common - taken
+            if re.fullmatch(r"[A-Za-z_]\w*", c)
+            and c not in p.nodes
+            and c not in p.parameters
+            and c not in p.outputs
+            and c not in p.inputs
+            and c not in p.flows
+            and all(np.ptp(t[c][np.isfinite(t[c])]) > 0 for t in columns if np.isfinite(t[c]).any())
+            and all(np.isfinite(t[c]).any() for t in columns)
+        )
+        moving = {
+            i
+            for j, i in enumerate(plant.inputs)
+            if i in p.inputs and any(np.ptp(d.u[:, j]) > 0 for d in drives)
+        }
         self.moving_inputs = moving
         self.heat_inputs = [i for i in p.inputs if _dimension(p.inputs[i].unit) == "temperature"]
-        named = [i for i in self.heat_inputs if re.search(r"air|amb|room|outdoor|chamber|base|environment", i, re.I)
-                 and not re.search(r"start|initial", i, re.I)]
+        named = [
+            i
+            for i in self.heat_inputs
+            if re.search(r"air|amb|room|outdoor|chamber|base|environment", i, re.I)
+            and not re.search(r"start|initial", i, re.I)
+        ]
         self.air = next(iter(named), None) or self._coolest()
 
     def _coolest(self) -> str | None:
@@ -199,15 +310,20 @@ class Rig:
         p = self.physics
         if kind == "v":
             if near in self.velocities:
-                return [near]       # type: ignore[list-item]
-            found = [*self.velocities, *(i for i in p.inputs if _dimension(p.inputs[i].unit) in ("velocity", "rotation"))]
+                return [near]  # type: ignore[list-item]
+            found = [
+                *self.velocities,
+                *(i for i in p.inputs if _dimension(p.inputs[i].unit) in ("velocity", "rotation")),
+            ]
             return (found or [c for c in self.spare if re.search(r"veloc|speed|^v$", c, re.I)])[:3]
         if kind == "x":
             if near in self.position_of:
-                return [self.position_of[near]]     # type: ignore[index]
+                return [self.position_of[near]]  # type: ignore[index]
             if self.position_of:
                 return list(self.position_of.values())
-            found = [i for i in p.inputs if _dimension(p.inputs[i].unit) == "length" and i in self.moving_inputs]
+            found = [
+                i for i in p.inputs if _dimension(p.inputs[i].unit) == "length" and i in self.moving_inputs
+            ]
             found += [n.name for n in p.nodes.values() if _dimension(n.unit) == "length"]
             return (found or [c for c in self.spare if re.search(r"posit|stroke|travel|^x$", c, re.I)])[:3]
         if kind == "i":
@@ -219,7 +335,10 @@ class Rig:
 
     def is_motor(self, f: Flow) -> bool:
         """A flow of force that an input drives."""
-        return bool((f.target in self.velocities or f.source in self.velocities) and ex.names(f.rate) & self.moving_inputs)
+        return bool(
+            (f.target in self.velocities or f.source in self.velocities)
+            and ex.names(f.rate) & self.moving_inputs
+        )
 
     def is_pump(self, f: Flow) -> bool:
         """A flow from outside, of something else than heat or force, that an input drives."""
@@ -227,18 +346,26 @@ class Rig:
 
     def drives_of(self, f: Flow) -> list[str]:
         """The inputs that drive a flow (temperatures, positions and references aside)."""
-        return [i for i in self.physics.inputs if i in ex.names(f.rate) and i in self.moving_inputs
-                and _dimension(self.physics.inputs[i].unit) not in ("temperature", "length", "velocity", "rotation")]
+        return [
+            i
+            for i in self.physics.inputs
+            if i in ex.names(f.rate)
+            and i in self.moving_inputs
+            and _dimension(self.physics.inputs[i].unit)
+            not in ("temperature", "length", "velocity", "rotation")
+        ]
 
 
 # ---------------------------------------------------------------------------------------------------------- places
 
+
 @dataclass(frozen=True)
 class Place:
     """Where an effect sits, by the name that a result gives, and what its symbols stand for there."""
+
     where: str
     symbols: Mapping[str, Expr] = field(default_factory=dict)
-    nodes: Mapping[str, str] = field(default_factory=dict)       # T, v, a, b ... as ends of flows
+    nodes: Mapping[str, str] = field(default_factory=dict)  # T, v, a, b ... as ends of flows
     flow: str | None = None
     output: str | None = None
     input: str | None = None
@@ -275,7 +402,7 @@ def _conductances(rig: Rig) -> Iterator[Place]:
 def _pairs(rig: Rig) -> Iterator[Place]:
     linked = {frozenset((f.source, f.target)) for f in rig.physics.flows.values()}
     for k, a in enumerate(rig.temperatures):
-        for b in rig.temperatures[k + 1:]:
+        for b in rig.temperatures[k + 1 :]:
             if frozenset((a, b)) not in linked:
                 yield Place(f"{a}-{b}", {"TA": name(a), "TB": name(b)}, {"TA": a, "TB": b})
 
@@ -292,22 +419,37 @@ def _heated_pairs(rig: Rig) -> Iterator[Place]:
 def _heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
     """Flows of heat from outside into a node that follow inputs, not temperatures of the network: where these change it (copper's
     resistance), there is none of it while the inputs rest."""
-    return [f for f in plant.flows.values() if f.target == node and f.source is None and ex.names(f.rate) & rig.moving_inputs
-            and not ex.names(f.rate) & set(rig.heat_inputs) and (node not in ex.names(f.rate) or _rests(plant, f))]
+    return [
+        f
+        for f in plant.flows.values()
+        if f.target == node
+        and f.source is None
+        and ex.names(f.rate) & rig.moving_inputs
+        and not ex.names(f.rate) & set(rig.heat_inputs)
+        and (node not in ex.names(f.rate) or _rests(plant, f))
+    ]
 
 
 def _rests(plant: Plant, f: Flow) -> bool:
     """Is a flow nothing while all inputs are zero, whatever the temperatures?"""
     if any(e.op == "delay" for e in ex.walk(f.rate)):
         return False
-    at = {**{p.name: p.value for p in plant.parameters.values()}, **dict.fromkeys(plant.inputs, 0.0), "t": 0.0}
+    at = {
+        **{p.name: p.value for p in plant.parameters.values()},
+        **dict.fromkeys(plant.inputs, 0.0),
+        "t": 0.0,
+    }
     return all(float(ex.evaluate(f.rate, {**at, **dict.fromkeys(plant.nodes, T)})) == 0 for T in (10.0, 60.0))
 
 
 def _joule_flows(rig: Rig) -> Iterator[Place]:
     for f in rig.physics.flows.values():
-        squares = [e for e in ex.walk(f.rate) if (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 2)
-                   or (e.op == "*" and e.args[0] is e.args[1])]
+        squares = [
+            e
+            for e in ex.walk(f.rate)
+            if (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 2)
+            or (e.op == "*" and e.args[0] is e.args[1])
+        ]
         if f.target in rig.temperatures and f.source is None and squares and f.target not in ex.names(f.rate):
             yield Place(f.name, {"T": name(f.target)}, flow=f.name)
 
@@ -351,7 +493,7 @@ def _bending_pairs(rig: Rig) -> Iterator[Place]:
     for at in _displacements(rig):
         T = rig.signals("T")
         for k, a in enumerate(T):
-            for b in T[k + 1:]:
+            for b in T[k + 1 :]:
                 yield Place(f"{a}-{b}", {**at.symbols, "TA": name(a), "TB": name(b)}, output=at.output)
 
 
@@ -365,8 +507,10 @@ def _voltages(rig: Rig) -> Iterator[Place]:
 
 
 def _sources(rig: Rig, node: str) -> bool:
-    return any(f.source == node and any(e.op in ("sqrt", "**") and node in ex.names(e) for e in ex.walk(f.rate))
-               for f in rig.physics.flows.values())
+    return any(
+        f.source == node and any(e.op in ("sqrt", "**") and node in ex.names(e) for e in ex.walk(f.rate))
+        for f in rig.physics.flows.values()
+    )
 
 
 def _levels(rig: Rig) -> Iterator[Place]:
@@ -378,8 +522,11 @@ def _levels(rig: Rig) -> Iterator[Place]:
 
 def _orifices(rig: Rig) -> Iterator[Place]:
     for f in rig.physics.flows.values():
-        if f.source and any(e.op == "sqrt" or (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 0.5)
-                            for e in ex.walk(f.rate) if f.source in ex.names(e)):
+        if f.source and any(
+            e.op == "sqrt" or (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 0.5)
+            for e in ex.walk(f.rate)
+            if f.source in ex.names(e)
+        ):
             yield Place(f.name, {}, flow=f.name)
 
 
@@ -394,19 +541,34 @@ def _resistive(rig: Rig) -> Iterator[Place]:
 
 
 PLACES = {
-    "temperature_node": _temperature_nodes, "velocity_node": _velocity_nodes, "conductance": _conductances,
-    "temperature_pair": _pairs, "heated_pair": _heated_pairs, "joule_flow": _joule_flows, "motor": _motors, "drive": _drives,
-    "sensor": _sensors, "reading_in_air": lambda rig: (*_sensors(rig, "temperature"), *_displacements(rig)),
-    "position_sensor": lambda rig: _sensors(rig, "length"), "displacement": _displacements, "member": _members,
-    "bending_pair": _bending_pairs, "voltage_sensor": _voltages, "level_node": _levels, "orifice": _orifices,
-    "resistive": _resistive}
+    "temperature_node": _temperature_nodes,
+    "velocity_node": _velocity_nodes,
+    "conductance": _conductances,
+    "temperature_pair": _pairs,
+    "heated_pair": _heated_pairs,
+    "joule_flow": _joule_flows,
+    "motor": _motors,
+    "drive": _drives,
+    "sensor": _sensors,
+    "reading_in_air": lambda rig: (*_sensors(rig, "temperature"), *_displacements(rig)),
+    "position_sensor": lambda rig: _sensors(rig, "length"),
+    "displacement": _displacements,
+    "member": _members,
+    "bending_pair": _bending_pairs,
+    "voltage_sensor": _voltages,
+    "level_node": _levels,
+    "orifice": _orifices,
+    "resistive": _resistive,
+}
 
 
 # ------------------------------------------------------------------------------------------------------- candidates
 
+
 @dataclass
 class Candidate:
     """An effect at a place, in one of its variants, with one choice of signals. `prefix` makes its names unique."""
+
     effect: Effect
     place: Place
     rig: Rig
@@ -428,7 +590,9 @@ class Candidate:
     def jumps(self) -> bool:
         """Does what a sensor reads hold inputs that go in steps?"""
         y, inputs = self.place.symbols.get("y"), self.rig.plant.inputs
-        return y is not None and any(i in self.rig.moving_inputs and not inputs[i].linear for i in ex.names(y))
+        return y is not None and any(
+            i in self.rig.moving_inputs and not inputs[i].linear for i in ex.names(y)
+        )
 
     def beliefs(self, plant: Plant) -> list[Belief]:
         """What physics says of the effect's parameters in `plant`, for each recording."""
@@ -438,11 +602,19 @@ class Candidate:
         share = 1.0 if any(p.per_recording for p in self.effect.parameters) else 1.0 / len(self.rig.drives)
         out = []
         for d in self.rig.drives:
-            known = {"duration": num(float(d.t[-1] - d.t[0])), "first_air": num(d.first.get(self.rig.air or "", 0.0)),
-                     **{p.name: name(self.own(p.name)) for p in self.effect.parameters if self.own(p.name) in plant.parameters}}
+            known = {
+                "duration": num(float(d.t[-1] - d.t[0])),
+                "first_air": num(d.first.get(self.rig.air or "", 0.0)),
+                **{
+                    p.name: name(self.own(p.name))
+                    for p in self.effect.parameters
+                    if self.own(p.name) in plant.parameters
+                },
+            }
 
             def told(e: Expr, known: Mapping[str, Expr] = known) -> Expr | None:
                 return known.get(str(e.value)) if e.op == "name" else None
+
             out.append(Belief(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, told))))
         return out
 
@@ -450,15 +622,24 @@ class Candidate:
         """-2 log of how likely the values are that `plant` holds for the effect, over all recordings."""
         total = 0.0
         for b in self.beliefs(plant):
-            total += float(ex.evaluate(b.surprise, {n: plant.parameters[n].values.get(b.recording, plant.parameters[n].value)
-                                                    for n in ex.names(b.surprise)}))
+            total += float(
+                ex.evaluate(
+                    b.surprise,
+                    {
+                        n: plant.parameters[n].values.get(b.recording, plant.parameters[n].value)
+                        for n in ex.names(b.surprise)
+                    },
+                )
+            )
         return total
 
     def own(self, parameter: str) -> str:
         """The plant's name of one of the effect's parameters."""
         return f"{parameter}_{self.effect.name}_{re.sub(r'[^A-Za-z0-9_]', '_', self.place.where)}"
 
-    def extend(self, values: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]] | None = None) -> Plant:
+    def extend(
+        self, values: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]] | None = None
+    ) -> Plant:
         """The plant with the effect, its parameters (effect's names) at `values` (a number, or one per recording name)."""
         return _Builder(self, values, ranges or {}).plant()
 
@@ -481,31 +662,48 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
             for variant in range(len(effect.changes)):
                 for k, choice in enumerate(choices):
                     candidate = Candidate(effect, place, rig, variant, choice, f"{variant}{k}")
-                    if effect.name == "cold_junction_drift" and (not rig.air or rig.air not in rig.moving_inputs
-                                                                 or place.where == rig.air):
+                    if effect.name == "cold_junction_drift" and (
+                        not rig.air or rig.air not in rig.moving_inputs or place.where == rig.air
+                    ):
                         continue
                     if effect.name == "sensor_gain" and place.where == rig.air:
                         continue
                     if effect.name == "sensor_lag" and variant and not candidate.jumps:
-                        continue        # on straight lines it is the same
+                        continue  # on straight lines it is the same
                     if effect.name in ("sensor_delay", "sensor_saturation") and place.input in driving:
-                        continue        # a drive that acts late or is clipped is the actuator's entry
+                        continue  # a drive that acts late or is clipped is the actuator's entry
                     out.append(candidate)
     return out
 
 
-_CHANGES = ("flow", "rate", "value", "storage", "node", "split", "drive", "spill", "exponent", "resistance", "straight")
+_CHANGES = (
+    "flow",
+    "rate",
+    "value",
+    "storage",
+    "node",
+    "split",
+    "drive",
+    "spill",
+    "exponent",
+    "resistance",
+    "straight",
+)
 
 
-_form = cache(ex.parse)            # the catalogue's forms are read once
+_form = cache(ex.parse)  # the catalogue's forms are read once
 
 
 class _Builder:
     def __init__(self, c: Candidate, values: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]]):
         self.c, self.rig, self.base = c, c.rig, c.rig.plant
         self.inputs, self.parameters = dict(self.base.inputs), dict(self.base.parameters)
-        self.nodes, self.flows, self.outputs = dict(self.base.nodes), dict(self.base.flows), dict(self.base.outputs)
-        self.made: dict[str, str] = {}          # nodes that the effect brings: its own name to the plant's
+        self.nodes, self.flows, self.outputs = (
+            dict(self.base.nodes),
+            dict(self.base.flows),
+            dict(self.base.outputs),
+        )
+        self.made: dict[str, str] = {}  # nodes that the effect brings: its own name to the plant's
         self.symbols: dict[str, Expr] = {**c.place.symbols, **c.symbols}
         if self.rig.air:
             self.symbols.setdefault("air", name(self.rig.air))
@@ -513,7 +711,9 @@ class _Builder:
         y = place.symbols.get("y")
         if y is not None:
             warm = self._unit_of_y() in TEMPERATURE and self.rig.air
-            self.symbols["reference"] = name(self.rig.air or "") if warm and self.rig.air not in ex.names(y) else num(0.0)
+            self.symbols["reference"] = (
+                name(self.rig.air or "") if warm and self.rig.air not in ex.names(y) else num(0.0)
+            )
         dts = [float(np.median(np.diff(d.t))) for d in self.rig.drives if len(d.t) > 1]
         self.symbols["duration"] = num(max((float(d.t[-1]) for d in self.rig.drives), default=1.0))
         self.symbols["sample"] = num(float(f"{min(dts):.6g}") if dts else 1.0)
@@ -527,8 +727,9 @@ class _Builder:
             limits = (low, high) if np.isfinite(low) and np.isfinite(high) and low < high else None
             if limits:
                 mean = min(max(mean, low), high)
-            self.parameters[own] = Parameter(own, mean, self._unit(e.unit), limits, e.per_recording,
-                                             dict(per) if e.per_recording else {})
+            self.parameters[own] = Parameter(
+                own, mean, self._unit(e.unit), limits, e.per_recording, dict(per) if e.per_recording else {}
+            )
         self.suffix = f"_{c.effect.name}_{re.sub(r'[^A-Za-z0-9_]', '_', place.where)}"
         for s in c.symbols.values():
             for n in ex.names(s):
@@ -543,14 +744,20 @@ class _Builder:
 
     def _unit_of_y(self) -> str | None:
         p = self.c.place
-        return self.base.outputs[p.output].unit if p.output else self.base.inputs[p.input].unit if p.input else None
+        return (
+            self.base.outputs[p.output].unit
+            if p.output
+            else self.base.inputs[p.input].unit
+            if p.input
+            else None
+        )
 
     def _signal_unit(self, e: Expr | None) -> str | None:
         if e is None or e.op != "name":
             return None
         for table in (self.base.nodes, self.base.inputs):
             if e.value in table:
-                return table[e.value].unit      # type: ignore[index]
+                return table[e.value].unit  # type: ignore[index]
         return None
 
     def _unit(self, text: str | None) -> str | None:
@@ -559,10 +766,17 @@ class _Builder:
         node = self.c.place.nodes.get("v")
         rate = None
         if node:
-            rate = next((f.unit for f in self.base.flows.values() if node in (f.source, f.target) and f.unit), None)
-        known = {"unit_of_y": self._unit_of_y(), "unit_of_rate": rate, "unit_of_v": self._signal_unit(self.symbols.get("v")),
-                 "unit_of_x": self._signal_unit(self.symbols.get("x")), "unit_of_u": self._signal_unit(self.symbols.get("u")),
-                 "unit_of_a": self._signal_unit(self.symbols.get("a"))}
+            rate = next(
+                (f.unit for f in self.base.flows.values() if node in (f.source, f.target) and f.unit), None
+            )
+        known = {
+            "unit_of_y": self._unit_of_y(),
+            "unit_of_rate": rate,
+            "unit_of_v": self._signal_unit(self.symbols.get("v")),
+            "unit_of_x": self._signal_unit(self.symbols.get("x")),
+            "unit_of_u": self._signal_unit(self.symbols.get("u")),
+            "unit_of_a": self._signal_unit(self.symbols.get("a")),
+        }
         for key, unit in known.items():
             if key in text:
                 if unit is None:
@@ -572,20 +786,31 @@ class _Builder:
 
     def expression(self, text: str | float) -> Expr:
         """A form of the catalogue with its symbols filled in."""
+
         def change(e: Expr) -> Expr | None:
             return self.symbols.get(e.value) if e.op == "name" else None
+
         return ex.substitute(_form(text), change)
 
     def plant(self) -> Plant:
         for item in self.c.effect.changes[self.c.variant]:
             ((kind, what),) = item.items()
             getattr(self, f"_{kind}")(what)
-        return dataclasses.replace(self.base, inputs=self.inputs, parameters=self._used(), nodes=self.nodes, flows=self.flows,
-                                   outputs=self.outputs)
+        return dataclasses.replace(
+            self.base,
+            inputs=self.inputs,
+            parameters=self._used(),
+            nodes=self.nodes,
+            flows=self.flows,
+            outputs=self.outputs,
+        )
 
     def _used(self) -> dict[str, Parameter]:
-        exprs = [e for n in self.nodes.values() for e in (n.storage, n.initial)] + [f.rate for f in self.flows.values()] \
+        exprs = (
+            [e for n in self.nodes.values() for e in (n.storage, n.initial)]
+            + [f.rate for f in self.flows.values()]
             + [o.value for o in self.outputs.values()]
+        )
         used = set().union(*(ex.names(e) for e in exprs))
         return {k: p for k, p in self.parameters.items() if k in used}
 
@@ -593,7 +818,10 @@ class _Builder:
         label = f"{self.c.effect.name}_{self.c.place.where}".replace("-", "_")
         while label in self.flows or label in self.nodes or label in self.outputs:
             label += "_2"
-        ends = {k: self.c.place.nodes.get(what[k]) or self.made.get(what[k]) if k in what else None for k in ("from", "into")}
+        ends = {
+            k: self.c.place.nodes.get(what[k]) or self.made.get(what[k]) if k in what else None
+            for k in ("from", "into")
+        }
         self.flows[label] = Flow(label, self.expression(what["rate"]), ends["from"], ends["into"], None)
 
     def _rate(self, form: str) -> None:
@@ -612,10 +840,15 @@ class _Builder:
 
         def change(e: Expr) -> Expr | None:
             return new if e.op == "name" and e.value == p.input else None
+
         # The start stays as read: an expression of inputs at the first sample knows no node, no time and no delay.
-        self.flows = {k: dataclasses.replace(f, rate=ex.substitute(f.rate, change)) if k in self.base.flows else f
-                      for k, f in self.flows.items()}
-        self.outputs = {k: dataclasses.replace(o, value=ex.substitute(o.value, change)) for k, o in self.outputs.items()}
+        self.flows = {
+            k: dataclasses.replace(f, rate=ex.substitute(f.rate, change)) if k in self.base.flows else f
+            for k, f in self.flows.items()
+        }
+        self.outputs = {
+            k: dataclasses.replace(o, value=ex.substitute(o.value, change)) for k, o in self.outputs.items()
+        }
 
     def _storage(self, form: str) -> None:
         n = self.base.nodes[self.c.place.nodes["T"]]
@@ -635,14 +868,24 @@ class _Builder:
             spread = spread or self._spread_at_start(source)
 
             def start(e: Expr) -> Expr | None:
-                return self.base.nodes[e.value].initial if e.op == "name" and e.value in self.base.nodes else \
-                    num(0.0) if e.op == "name" and e.value == "t" else e.args[0] if e.op == "delay" else None
+                return (
+                    self.base.nodes[e.value].initial
+                    if e.op == "name" and e.value in self.base.nodes
+                    else num(0.0)
+                    if e.op == "name" and e.value == "t"
+                    else e.args[0]
+                    if e.op == "delay"
+                    else None
+                )
+
             initial = ex.substitute(source, start)
         elif text == "first_air":
             initial = name(self.rig.air or "")
         else:
             initial = self.expression(what["initial"])
-        self.nodes[label] = Node(label, self.expression(what["storage"]), initial, self._unit(what.get("unit")), spread)
+        self.nodes[label] = Node(
+            label, self.expression(what["storage"]), initial, self._unit(what.get("unit")), spread
+        )
 
     def _spread_at_start(self, source: Expr) -> float | None:
         """How uncertain the start of what begins where `source` does is: as uncertain as the nodes in it."""
@@ -658,13 +901,15 @@ class _Builder:
     def _straight(self, symbol: str) -> None:
         """Inputs that hold go on straight lines in this symbol: a sensor's lag is short against a sample, and would otherwise be a
         sample late."""
+
         def change(e: Expr) -> Expr | None:
-            i = self.base.inputs.get(e.value) if e.op == "name" else None       # type: ignore[arg-type]
+            i = self.base.inputs.get(e.value) if e.op == "name" else None  # type: ignore[arg-type]
             if i is None or i.linear:
                 return None
             twin = f"{i.name}{STRAIGHT}"
             self.inputs[twin] = dataclasses.replace(i, name=twin, column=i.column or i.name, linear=True)
             return name(twin)
+
         self.symbols[symbol] = ex.substitute(self.symbols[symbol], change)
 
     def _split(self, what: Mapping[str, Any]) -> None:
@@ -678,7 +923,8 @@ class _Builder:
     def _drive(self, form: str) -> None:
         new, u, f = self.expression(form), self.c.place.input, self.base.flows[self.c.place.flow or ""]
         self.flows[f.name] = dataclasses.replace(
-            f, rate=ex.substitute(f.rate, lambda e: new if e.op == "name" and e.value == u else None))
+            f, rate=ex.substitute(f.rate, lambda e: new if e.op == "name" and e.value == u else None)
+        )
 
     def _spill(self, what: Mapping[str, Any]) -> None:
         a, b = self.c.place.nodes["a"], self.c.place.nodes.get("b")
@@ -690,7 +936,9 @@ class _Builder:
         unit = next((f.unit for f in self.base.flows.values() if f.source == a), None)
         if b:
             self.flows[f"spill_{a}_{b}"] = Flow(f"spill_{a}_{b}", ex.mul(over, share), a, b, unit)
-            self.flows[f"spill_{a}_out"] = Flow(f"spill_{a}_out", ex.mul(over, ex.add(ex.ONE, ex.neg(share))), a, None, unit)
+            self.flows[f"spill_{a}_out"] = Flow(
+                f"spill_{a}_out", ex.mul(over, ex.add(ex.ONE, ex.neg(share))), a, None, unit
+            )
         else:
             self.flows[f"spill_{a}_out"] = Flow(f"spill_{a}_out", over, a, None, unit)
 
@@ -703,7 +951,12 @@ class _Builder:
                 return None
             if e.op == "sqrt":
                 return ex.make("**", e.args[0], n)
-            return ex.make("**", e.args[0], n) if e.op == "**" and e.args[1].op == "num" and e.args[1].value == 0.5 else None
+            return (
+                ex.make("**", e.args[0], n)
+                if e.op == "**" and e.args[1].op == "num" and e.args[1].value == 0.5
+                else None
+            )
+
         self.flows[f.name] = dataclasses.replace(f, rate=ex.substitute(f.rate, change), unit=None)
 
     def _resistance(self, form: str) -> None:
@@ -714,6 +967,7 @@ class _Builder:
                 self.symbols["R"] = e
                 return self.expression(form)
             return None
+
         p = self.c.place
         if p.output:
             o = self.base.outputs[p.output]
@@ -725,7 +979,10 @@ class _Builder:
 
 # ---------------------------------------------------------------------------------------------------------- shapes
 
-SLOW_TURNS, FINE_TURNS = 60.0, 4000     # periods over the span: each looked at up to the first, the strongest up to the second
+SLOW_TURNS, FINE_TURNS = (
+    60.0,
+    4000,
+)  # periods over the span: each looked at up to the first, the strongest up to the second
 
 
 def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count: int = 16) -> np.ndarray:
@@ -745,13 +1002,17 @@ def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count:
         return np.zeros(0)
     bins = 8 * FINE_TURNS
     index = np.clip(((x[good] - np.min(x[good])) / span * bins).astype(int), 0, bins - 1)
-    power = np.abs(np.fft.rfft(np.bincount(index, e[good], bins), 4 * bins))[:4 * FINE_TURNS]      # by a quarter of a turn
-    power[:int(4 * SLOW_TURNS)] = 0.0
+    power = np.abs(np.fft.rfft(np.bincount(index, e[good], bins), 4 * bins))[
+        : 4 * FINE_TURNS
+    ]  # by a quarter of a turn
+    power[: int(4 * SLOW_TURNS)] = 0.0
     peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
     return peaks[np.argsort(-power[peaks])[:count]] / 4
 
 
-def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24) -> list[dict[str, float]]:
+def shape_grid(
+    kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24
+) -> list[dict[str, float]]:
     """The values of a shape to look at in screening. Beside them `picked_from`: of how many the residual itself picked this one, and
     `longest`: beyond which a period would not have come once."""
     rig = candidate.rig
@@ -761,16 +1022,23 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
     def signal(e: Expr) -> np.ndarray:
         parts = []
         for d, run, columns in zip(rig.drives, runs, rig.columns, strict=True):
-            values = {**{c: columns[c] for c in rig.spare}, **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
-                      **dict(zip(rig.plant.nodes, run.x.T, strict=True)), "t": d.t,
-                      **{q: p.value for q, p in rig.plant.parameters.items()}}
+            values = {
+                **{c: columns[c] for c in rig.spare},
+                **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
+                **dict(zip(rig.plant.nodes, run.x.T, strict=True)),
+                "t": d.t,
+                **{q: p.value for q, p in rig.plant.parameters.items()},
+            }
             parts.append(np.broadcast_to(np.asarray(ex.evaluate(e, values), float), d.t.shape))
         return np.concatenate(parts)
+
     if kind == "onsets":
         return [{"onset": float(v)} for v in np.linspace(0, duration, onsets + 2)[1:-1]]
     if kind == "windows":
         edges = np.linspace(0, duration, onsets + 1)
-        return [{"start": float(a), "end": float(b)} for k, a in enumerate(edges[:-1]) for b in edges[k + 1:]]
+        return [
+            {"start": float(a), "end": float(b)} for k, a in enumerate(edges[:-1]) for b in edges[k + 1 :]
+        ]
     if kind == "times":
         return [{"tau": float(v)} for v in np.geomspace(3 * dt, 0.6 * duration, 12)]
     if kind == "lags":
@@ -792,7 +1060,10 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
             if candidate.place.output:
                 j = list(rig.plant.outputs).index(candidate.place.output)
                 fine = _fine_turns(x, [e[:, j] for e in errors], span)
-                return slow + [{"period": float(span / n), "longest": span, "picked_from": 4.0 * FINE_TURNS} for n in fine]
+                return slow + [
+                    {"period": float(span / n), "longest": span, "picked_from": 4.0 * FINE_TURNS}
+                    for n in fine
+                ]
             return slow
         if kind == "phases":
             return [{"phase": 0.0}, {"phase": float(np.pi / 2)}]
@@ -800,14 +1071,17 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
     if kind in ("speeds", "creep_speeds"):
         v = np.abs(signal(symbols["v"]))
         top = float(np.nanmax(v)) or 1.0
-        if kind == "creep_speeds":      # the speed below which dry friction gives way smoothly
+        if kind == "creep_speeds":  # the speed below which dry friction gives way smoothly
             return [{"creep": 1e-3 * top}]
         return [{"speed": float(q)} for q in np.geomspace(0.01 * top, 0.6 * top, 8)]
     target = symbols.get("y") or symbols.get("u") or symbols.get("a")
     z = signal(target) if target is not None else np.array([0.0, 1.0])
     z = z[np.isfinite(z)]
     if kind == "drive_levels":
-        return [{"level": float(v)} for v in np.unique(np.quantile(np.abs(z), [0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98]))]
+        return [
+            {"level": float(v)}
+            for v in np.unique(np.quantile(np.abs(z), [0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98]))
+        ]
     if kind == "small_levels":
         top = float(np.max(np.abs(z))) or 1.0
         return [{"level": float(v)} for v in np.geomspace(0.001 * top, 0.6 * top, 14)]

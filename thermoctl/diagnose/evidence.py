@@ -14,6 +14,7 @@ process would swallow any slow physics of a short record. Where the residual is 
 above LARGE sigmas), something is still missing, its part of the residual is no stationary noise, and its energy counts, too:
 WEIGHT * N * log(rms^2 / (LARGE sigma)^2). Innovations alone would let what is fast decide over what is large.
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -26,19 +27,19 @@ from scipy.optimize import brentq
 
 from thermoctl.diagnose.innovations import variances
 
-LARGE = 1.6         # coloured residual beyond this many sigmas of white noise is physics, not a sensor's colour
-WEIGHT = 0.1        # of the residual's energy beside its innovations, where it is larger than that
+LARGE = 1.6  # coloured residual beyond this many sigmas of white noise is physics, not a sensor's colour
+WEIGHT = 0.1  # of the residual's energy beside its innovations, where it is larger than that
 
-AS_LIKELY = 8.0     # colours whose scores differ by less are both possible (95 % region of three parameters)
+AS_LIKELY = 8.0  # colours whose scores differ by less are both possible (95 % region of three parameters)
 
 _PHI = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 0.9995)
-_SHARE = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99)       # theta / phi
-_FLICKER = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)               # variance of the fastest first-order part over the white one's
-_SLOPES = (0.5, 0.75, 1.0, 1.3)                             # 1/f^slope
-_TIMES = 2.0 * 8.0 ** np.arange(5)                          # their time constants in samples
-_BESIDE = (0.3, 0.5, 0.7, 0.85, 0.93)                       # phi of a first-order part beside flicker noise
-_LARGE = (0.1, 0.25, 0.5)                                   # its variance over the white one's
-_SMALL = (0.003, 0.01, 0.03)                                # the flicker's there, slope 1
+_SHARE = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99)  # theta / phi
+_FLICKER = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # variance of the fastest first-order part over the white one's
+_SLOPES = (0.5, 0.75, 1.0, 1.3)  # 1/f^slope
+_TIMES = 2.0 * 8.0 ** np.arange(5)  # their time constants in samples
+_BESIDE = (0.3, 0.5, 0.7, 0.85, 0.93)  # phi of a first-order part beside flicker noise
+_LARGE = (0.1, 0.25, 0.5)  # its variance over the white one's
+_SMALL = (0.003, 0.01, 0.03)  # the flicker's there, slope 1
 
 
 _Filter = tuple[tuple[float, ...], tuple[float, ...], int]
@@ -48,6 +49,7 @@ _Filter = tuple[tuple[float, ...], tuple[float, ...], int]
 class Colour:
     """The noise of one channel under an explanation: innovation's sigma, the filter ar(z)/ma(z) that turns it into white
     noise, and its -2 log likelihood."""
+
     sigma: float
     ar: tuple[float, ...]
     ma: tuple[float, ...]
@@ -67,20 +69,22 @@ def _mixed() -> tuple[_Filter, ...]:
     return tuple((*flicker(v, 1.0, phi, large), 3) for phi in _BESIDE for large in _LARGE for v in _SMALL)
 
 
-def flicker(variance: float, slope: float = 1.0, beside: float | None = None, large: float = 0.0
-            ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def flicker(
+    variance: float, slope: float = 1.0, beside: float | None = None, large: float = 0.0
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """(ar, ma) of white noise of variance 1 beside first-order parts, the fastest of `variance`: the spectrum
     1 + sum q / |1 - phi e^(-iw)|^2 in factors. With y = cos(w) - 1 its zeros are real and lie between its poles. `beside`: phi
     of one more first-order part, of variance `large`."""
-    phi = np.exp(-1 / _TIMES[::-1])                     # the slowest part's pole comes first in y
-    q = variance * (_TIMES[::-1] / _TIMES[0]) ** (slope - 1) * (1 - phi ** 2)
+    phi = np.exp(-1 / _TIMES[::-1])  # the slowest part's pole comes first in y
+    q = variance * (_TIMES[::-1] / _TIMES[0]) ** (slope - 1) * (1 - phi**2)
     if beside is not None:
         at = int(np.searchsorted(-phi, -beside))
-        phi, q = np.insert(phi, at, beside), np.insert(q, at, large * (1 - beside ** 2))
+        phi, q = np.insert(phi, at, beside), np.insert(q, at, large * (1 - beside**2))
     edge = (1 - phi) ** 2 / (2 * phi)
 
     def spectrum(y: float) -> float:
         return 1 + float(np.sum(q / ((1 - phi) ** 2 - 2 * phi * y)))
+
     zeros = []
     for low, high in zip(edge, [*edge[1:], 1e6], strict=True):
         y = brentq(spectrum, low * (1 + 1e-12), high * (1 - 1e-12), xtol=1e-18, rtol=1e-14)
@@ -105,11 +109,16 @@ def _tried(parts: Sequence[np.ndarray], floor: float) -> list[Colour]:
     e, ends = np.concatenate(parts), np.cumsum([len(p) for p in parts], dtype=np.intp)
 
     def tried(filters: Sequence[_Filter]) -> list[Colour]:
-        found = np.maximum(variances(e, ends, *_arrays(filters)), floor ** 2)
-        return [Colour(float(np.sqrt(v)), ar, ma, n * float(np.log(v)) + parameters * float(np.log(n)))
-                for v, (ar, ma, parameters) in zip(found, filters, strict=True)]
+        found = np.maximum(variances(e, ends, *_arrays(filters)), floor**2)
+        return [
+            Colour(float(np.sqrt(v)), ar, ma, n * float(np.log(v)) + parameters * float(np.log(n)))
+            for v, (ar, ma, parameters) in zip(found, filters, strict=True)
+        ]
+
     found = tried(_filters())
-    if found[0].score - min(c.score for c in found) > AS_LIKELY:        # not white, so a first-order part and flicker may both be there
+    if (
+        found[0].score - min(c.score for c in found) > AS_LIKELY
+    ):  # not white, so a first-order part and flicker may both be there
         found += tried(_mixed())
     return found
 
@@ -120,7 +129,7 @@ def _arrays(filters: Sequence[_Filter]) -> tuple[np.ndarray, np.ndarray, np.ndar
     orders = np.array([len(ar) - 1 for ar, _, _ in filters], dtype=np.intp)
     ar, ma = (np.zeros((len(filters), int(orders.max()) + 1)) for _ in range(2))
     for k, f in enumerate(filters):
-        ar[k, :orders[k] + 1], ma[k, :orders[k] + 1] = f[0], f[1]
+        ar[k, : orders[k] + 1], ma[k, : orders[k] + 1] = f[0], f[1]
     return ar, ma, orders
 
 
@@ -142,11 +151,13 @@ def least_gain(before: Sequence[np.ndarray], after: Sequence[np.ndarray], sigmas
         was, now = _tried(old, 0.6 * sigma), _tried(new, 0.6 * sigma)
         if was and now:
             first, best = min(c.score for c in was), min(now, key=lambda c: c.score)
-            if len(best.ar) == 1 or max(_power(r, sigma) for r in old) > LARGE ** 2:
+            if len(best.ar) == 1 or max(_power(r, sigma) for r in old) > LARGE**2:
                 total += first - best.score
             else:
                 same = {(c.ar, c.ma): c.score for c in now}
-                total += min(c.score - same.get((c.ar, c.ma), best.score) for c in was if c.score <= first + AS_LIKELY)
+                total += min(
+                    c.score - same.get((c.ar, c.ma), best.score) for c in was if c.score <= first + AS_LIKELY
+                )
         total += sum(_price(a, sigma) - _price(b, sigma) for a, b in zip(old, new, strict=True))
     return total
 
@@ -182,12 +193,13 @@ def _power(e: np.ndarray, sigma: float) -> float:
     """Mean square in units of the white noise's, outliers cut; 0 where there is no data."""
     e = np.abs(e[np.isfinite(e)])
     limit = 8 * max(sigma, 1.5 * float(np.median(e))) if len(e) else 0.0
-    return float(np.mean(np.minimum(e, limit) ** 2)) / sigma ** 2 if len(e) else 0.0
+    return float(np.mean(np.minimum(e, limit) ** 2)) / sigma**2 if len(e) else 0.0
 
 
 def _price(e: np.ndarray, sigma: float) -> float:
     e = e[np.isfinite(e)]
     power = _power(e, sigma)
     excess = max(power - 1.0, 0.0)
-    return 0.5 * (excess if excess <= 30 else 30 * (1 + float(np.log(excess / 30)))) \
-        + WEIGHT * len(e) * max(float(np.log(max(power, 1e-9) / LARGE ** 2)), 0.0)
+    return 0.5 * (excess if excess <= 30 else 30 * (1 + float(np.log(excess / 30)))) + WEIGHT * len(e) * max(
+        float(np.log(max(power, 1e-9) / LARGE**2)), 0.0
+    )

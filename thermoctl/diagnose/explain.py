@@ -1,8 +1,9 @@
 """One explanation of the recordings: a plant with some effects added, refitted and scored.
 
-    score = -2 log likelihood in coloured noise (evidence.py) + price of the added parameters (Schwarz)
-            - 2 log prior of the effects, of their parameters, and of how far the plant's own parameters moved     (smaller is better)
+score = -2 log likelihood in coloured noise (evidence.py) + price of the added parameters (Schwarz)
+        - 2 log prior of the effects, of their parameters, and of how far the plant's own parameters moved     (smaller is better)
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -18,29 +19,42 @@ from thermoctl.diagnose.locate import Suspect
 from thermoctl.diagnose.screen import Direction
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import BELIEF_WEIGHT, Fit, Noise, Problem, Scale, default_noise, fit, report, updated
+from thermoctl.plant.refit import (
+    BELIEF_WEIGHT,
+    Fit,
+    Noise,
+    Problem,
+    Scale,
+    default_noise,
+    fit,
+    report,
+    updated,
+)
 from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
-MIN_SAMPLES = 40            # fewer measured values than this decide nothing
-SPREAD = 0.06, 0.2          # least and greatest spread of parameters round their beliefs, in shares of their ranges
+MIN_SAMPLES = 40  # fewer measured values than this decide nothing
+SPREAD = 0.06, 0.2  # least and greatest spread of parameters round their beliefs, in shares of their ranges
 
 
 @dataclass
 class Explanation:
     """A plant with some effects added, refitted to all recordings."""
+
     plant: Plant
     effects: list[Candidate]
     fit: Fit
     score: float
     colours: list[Colour]
-    raw: float = 0.0                                            # the score without the price of parameters and priors
-    away: np.ndarray = field(default_factory=lambda: np.zeros(0))       # the plant's own parameters, from their beliefs
-    spread: float = 0.0                                         # of such distances, that the score was taken with
-    own: list[dict[str, str]] = field(default_factory=list)     # per effect: its parameter to the plant's name
+    raw: float = 0.0  # the score without the price of parameters and priors
+    away: np.ndarray = field(
+        default_factory=lambda: np.zeros(0)
+    )  # the plant's own parameters, from their beliefs
+    spread: float = 0.0  # of such distances, that the score was taken with
+    own: list[dict[str, str]] = field(default_factory=list)  # per effect: its parameter to the plant's name
     direction: Direction | None = None
-    counts: bool = False                                        # more than chance over the whole catalogue would give
+    counts: bool = False  # more than chance over the whole catalogue would give
     probability: float = 0.0
 
     @property
@@ -57,36 +71,73 @@ class Explanation:
 class Case:
     """The recordings and the plant as they came; refits and scores explanations of them."""
 
-    def __init__(self, plant: Plant, tables: Sequence[Table], noise: Sequence[Noise] | None = None,
-                 progress: Callable[[str], None] | None = None):
+    def __init__(
+        self,
+        plant: Plant,
+        tables: Sequence[Table],
+        noise: Sequence[Noise] | None = None,
+        progress: Callable[[str], None] | None = None,
+    ):
         self.plant, self.tables = plant, list(tables)
         self.progress = progress or (lambda text: None)
         self.model = plant.compile()
         self.drives = [self.model.drive(t) for t in self.tables]
-        counts = {o: sum(int(np.isfinite(d.y[:, j]).sum()) for d in self.drives) for j, o in enumerate(self.model.outputs)}
+        counts = {
+            o: sum(int(np.isfinite(d.y[:, j]).sum()) for d in self.drives)
+            for j, o in enumerate(self.model.outputs)
+        }
         if max(counts.values(), default=0) < MIN_SAMPLES:
-            raise InputError(f"{', '.join(t.path for t in self.tables)}: too little data: "
-                             + (f"at most {max(counts.values())} measured values of one output" if any(counts.values())
-                                else "no column of an output of the plant (" + ", ".join(o.column for o in plant.outputs.values()) + ")")
-                             + f"; {MIN_SAMPLES} or more are needed")
-        self.patience = 60.0        # CPU seconds for one refit; set from the time that the plant's own refit took
+            raise InputError(
+                f"{', '.join(t.path for t in self.tables)}: too little data: "
+                + (
+                    f"at most {max(counts.values())} measured values of one output"
+                    if any(counts.values())
+                    else "no column of an output of the plant ("
+                    + ", ".join(o.column for o in plant.outputs.values())
+                    + ")"
+                )
+                + f"; {MIN_SAMPLES} or more are needed"
+            )
+        self.patience = 60.0  # CPU seconds for one refit; set from the time that the plant's own refit took
         self.begun = time.process_time()
         self.noise = tuple(noise or default_noise(plant, self.drives))
-        self.unseen: dict[tuple[int, bool], tuple[Plant, list[np.ndarray]]] = {}        # held-out errors that are known (heldout.py)
-        self.left: dict[int, tuple[Explanation, Suspect | None]] = {}       # what explanations leave, where it is known (remains.py)
-        self.spread = SPREAD[1]     # how far the plant's parameters lie from what was believed, in shares of their ranges
+        self.unseen: dict[
+            tuple[int, bool], tuple[Plant, list[np.ndarray]]
+        ] = {}  # held-out errors that are known (heldout.py)
+        self.left: dict[
+            int, tuple[Explanation, Suspect | None]
+        ] = {}  # what explanations leave, where it is known (remains.py)
+        self.spread = SPREAD[
+            1
+        ]  # how far the plant's parameters lie from what was believed, in shares of their ranges
 
     def drives_of(self, e: Explanation) -> list[Drive]:
         """The recordings as an explanation's plant reads them."""
         return [e.fit.model.drive(t) for t in self.tables]
 
-    def explain(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], iterations: int = 25,
-                tries: int = 0, goal: float = np.inf) -> Explanation:
+    def explain(
+        self,
+        plant: Plant,
+        effects: list[Candidate],
+        own: list[dict[str, str]],
+        iterations: int = 25,
+        tries: int = 0,
+        goal: float = np.inf,
+    ) -> Explanation:
         """Refit a plant to all recordings and score it; `goal`: a cost that it does not go on for when that is out of reach."""
         model = plant.compile()
         drives = [model.drive(t) for t in self.tables]
-        found = fit(model, drives, self.noise, iterations=iterations, tolerance=1e-3, tries=tries, seconds=self.patience, goal=goal,
-                    beliefs=[b for c in effects for b in c.beliefs(plant)])
+        found = fit(
+            model,
+            drives,
+            self.noise,
+            iterations=iterations,
+            tolerance=1e-3,
+            tries=tries,
+            seconds=self.patience,
+            goal=goal,
+            beliefs=[b for c in effects for b in c.beliefs(plant)],
+        )
         return self.scored(updated(plant, found, drives), effects, own, found)
 
     def polished(self, e: Explanation) -> Explanation:
@@ -97,22 +148,42 @@ class Case:
         model = e.plant.compile()
         drives = [model.drive(t) for t in self.tables]
         try:
-            found = fit(model, drives, noise_of(e.colours), iterations=15, seconds=self.patience, beliefs=e.fit.beliefs)
+            found = fit(
+                model,
+                drives,
+                noise_of(e.colours),
+                iterations=15,
+                seconds=self.patience,
+                beliefs=e.fit.beliefs,
+            )
         except (SimulationError, np.linalg.LinAlgError):
             return e
         better = dataclasses.replace(e, plant=updated(e.plant, found, drives), fit=found)
         before, after = self.excess(e), self.excess(better)
         return better if all(after[o] < 1.01 * before[o] for o in before) else e
 
-    def scored(self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], found: Fit) -> Explanation:
+    def scored(
+        self, plant: Plant, effects: list[Candidate], own: list[dict[str, str]], found: Fit
+    ) -> Explanation:
         """The score of a fit: coloured -2 log likelihood and the price of its parameters."""
         colours = channels(found.residuals, [n.sigma for n in self.noise])
-        price = occam(found, {n for o in own for n in o.values()}) + sum(surprise(c) + c.surprise(plant) for c in effects)
+        price = occam(found, {n for o in own for n in o.values()}) + sum(
+            surprise(c) + c.surprise(plant) for c in effects
+        )
         raw = sum(c.score for c in colours)
         away, spread = self._away(found)
         self.spread = min(self.spread, spread)
-        return Explanation(plant, list(effects), found, raw + float(price) + implausible(away, self.spread), colours, raw, away,
-                           self.spread, list(own))
+        return Explanation(
+            plant,
+            list(effects),
+            found,
+            raw + float(price) + implausible(away, self.spread),
+            colours,
+            raw,
+            away,
+            self.spread,
+            list(own),
+        )
 
     def _away(self, found: Fit) -> tuple[np.ndarray, float]:
         """The plant's own parameters' distances from the beliefs, and their spread over those that the data determine."""
@@ -143,7 +214,12 @@ class Case:
             parts = np.concatenate([r[:, j] for r in e.fit.residuals])
             parts = parts[np.isfinite(parts)]
             if len(parts):
-                out[o] = float(np.sqrt(np.mean(np.minimum(np.abs(parts), 8 * max(n.sigma, np.median(np.abs(parts)))) ** 2)) / n.sigma)
+                out[o] = float(
+                    np.sqrt(
+                        np.mean(np.minimum(np.abs(parts), 8 * max(n.sigma, np.median(np.abs(parts)))) ** 2)
+                    )
+                    / n.sigma
+                )
         return out
 
 
@@ -167,7 +243,9 @@ def standard_errors(e: Explanation, drives: Sequence[Drive]) -> dict[str, float]
         if name not in known or k is None:
             out[name] = known.get(name, 0.0)
             continue
-        slope = Scale(e.plant.parameters[name]).slope(float(e.fit.values[0, e.fit.model.parameters.index(name)]))
+        slope = Scale(e.plant.parameters[name]).slope(
+            float(e.fit.values[0, e.fit.model.parameters.index(name)])
+        )
 
         def falls(by: float, k: int = k) -> bool:
             moved = z.copy()
@@ -176,6 +254,7 @@ def standard_errors(e: Explanation, drives: Sequence[Drive]) -> dict[str, float]
                 return problem.evaluate(moved, False)[0] - least > fall
             except SimulationError:
                 return True
+
         widest = max(1.96 * known[name] / slope, 1e-7)
         for sign, room in ((1.0, 1.0 - z[k]), (-1.0, z[k])):
             low, high = 0.0, widest
@@ -193,12 +272,17 @@ def occam(found: Fit, added: Set[str]) -> float:
     """The price of added parameters: Schwarz's log n each; of those that physics has a belief of Laplace's, log det of what is
     known of them by data and belief over what was believed."""
     believed = {n for b in found.beliefs for n in ex.names(b.surprise)}
-    price = float(sum(q in added and q not in believed for q, _ in found.unknowns) * np.log(max(found.samples, 2)))
+    price = float(
+        sum(q in added and q not in believed for q, _ in found.unknowns) * np.log(max(found.samples, 2))
+    )
     told = np.array([q in believed for q, _ in found.unknowns])
     if told.any():
-        floor = BELIEF_WEIGHT ** 2 * np.eye(int(told.sum()))
-        price += float(np.linalg.slogdet(found.hessian)[1] - np.linalg.slogdet(found.hessian[np.ix_(~told, ~told)])[1]
-                       - np.linalg.slogdet(found.believed[np.ix_(told, told)] + floor)[1])
+        floor = BELIEF_WEIGHT**2 * np.eye(int(told.sum()))
+        price += float(
+            np.linalg.slogdet(found.hessian)[1]
+            - np.linalg.slogdet(found.hessian[np.ix_(~told, ~told)])[1]
+            - np.linalg.slogdet(found.believed[np.ix_(told, told)] + floor)[1]
+        )
     return price
 
 
@@ -211,10 +295,14 @@ def implausible(away: np.ndarray, spread: float) -> float:
 def surprise(c: Candidate) -> float:
     """Prior odds as -2 log: a fault in an input's reading, or another form of an entry, is a little less likely. Where a
     displacement lags, its members do (expansion_lag); an encoder does not."""
-    if c.effect.name == "sensor_lag" and c.place.output and any(p.output == c.place.output for p in PLACES["displacement"](c.rig)):
+    if (
+        c.effect.name == "sensor_lag"
+        and c.place.output
+        and any(p.output == c.place.output for p in PLACES["displacement"](c.rig))
+    ):
         return 5.0
     if c.effect.where == "bending_pair" and any(_free_member(c, side) for side in ("TA", "TB")):
-        return 12.0         # with one side's growth already free it is the other side's growth, said in a longer way
+        return 12.0  # with one side's growth already free it is the other side's growth, said in a longer way
     return (6.0 if c.place.input and c.effect.where != "drive" else 0.0) + (1.0 if c.variant else 0.0)
 
 

@@ -8,6 +8,7 @@ A rig's parameter drifts when the straight line through its estimates has a slop
 errors and changes it by more than DRIFT_SHARE over the time seen. A model no longer fits when the newest recording's
 residual is above FIT_LIMIT; the residual after the refit says whether values (identify again) or physics (diagnose).
 """
+
 from __future__ import annotations
 
 import json
@@ -30,7 +31,7 @@ from thermoctl.recording.writer import NAME, TIER
 from thermoctl.yamlfile import InputError, suggest
 
 DRIFT_SIGMA, DRIFT_SHARE, FIT_LIMIT = 4.0, 0.05, 3.0
-ROWS = 4000                     # a recording is thinned to about so many
+ROWS = 4000  # a recording is thinned to about so many
 SUFFIXES = (".parquet", ".csv", ".arrow", TIER)
 ARMED = 3.0
 
@@ -38,6 +39,7 @@ ARMED = 3.0
 @dataclass(frozen=True)
 class Summary:
     """One recording in numbers; NaN where it does not say. estimates: parameter -> (value, standard error)."""
+
     path: str
     rig: str
     begin_s: float
@@ -61,14 +63,16 @@ def find_recordings(folder: str | Path) -> list[str]:
         fs, root = _store(str(folder))
         try:
             found = sorted(fs.unstrip_protocol(p) for p in fs.find(root) if p.endswith(SUFFIXES))
-        except Exception as e:          # each store raises what its own library raises
+        except Exception as e:  # each store raises what its own library raises
             raise InputError(f"{folder}: cannot be listed: {e}") from None
     elif not Path(folder).is_dir():
         raise InputError(f"{folder}: not a folder; one with the rigs' recordings was expected")
     else:
         found = sorted(str(p) for p in Path(folder).rglob("*") if p.is_file() and p.name.endswith(SUFFIXES))
     if not found:
-        raise InputError(f"{folder}: no recordings in it; files ending in {', '.join(SUFFIXES)} were expected")
+        raise InputError(
+            f"{folder}: no recordings in it; files ending in {', '.join(SUFFIXES)} were expected"
+        )
     return found
 
 
@@ -95,7 +99,7 @@ def _local(path: str) -> Iterator[str]:
         copy = f"{folder}/{Path(inside).name}"
         try:
             fs.get_file(inside, copy)
-        except Exception as e:          # as above
+        except Exception as e:  # as above
             raise InputError(f"{path}: cannot be fetched: {e}") from None
         yield copy
 
@@ -126,10 +130,17 @@ def _health(table: Table, path: str, rig: str) -> Summary:
     bits = int(np.bitwise_or.reduce(np.nan_to_num(column("fault_bits", missing)).astype(np.int64)))
     error = (column("output_reference_um", missing) - column("reference_um", missing))[armed]
     slips = column("slips", missing)
-    return Summary(path, rig, float(wall[0]) if math.isfinite(wall[0]) else float(table.t[0]),
-                   float(table.t[-1] - table.t[0]) / 3600.0, float(armed.mean()) if np.isfinite(state).any() else math.nan,
-                   tuple(f.name for f in faults.decode(bits)), float(slips[-1] - slips[0]),
-                   _mean(column("innovation_c", missing)), math.sqrt(_mean(error ** 2)))
+    return Summary(
+        path,
+        rig,
+        float(wall[0]) if math.isfinite(wall[0]) else float(table.t[0]),
+        float(table.t[-1] - table.t[0]) / 3600.0,
+        float(armed.mean()) if np.isfinite(state).any() else math.nan,
+        tuple(f.name for f in faults.decode(bits)),
+        float(slips[-1] - slips[0]),
+        _mean(column("innovation_c", missing)),
+        math.sqrt(_mean(error**2)),
+    )
 
 
 def _mean(values: np.ndarray) -> float:
@@ -139,7 +150,9 @@ def _mean(values: np.ndarray) -> float:
 
 def _thinned(table: Table) -> Table:
     step = max(1, len(table) // ROWS)
-    return Table(table.name, table.path, table.t[::step], {k: v[::step] for k, v in table.columns.items()}, table.meta)
+    return Table(
+        table.name, table.path, table.t[::step], {k: v[::step] for k, v in table.columns.items()}, table.meta
+    )
 
 
 def _model(summary: Summary, table: Table, plant_path: str, names: tuple[str, ...]) -> Summary:
@@ -157,13 +170,21 @@ def _model(summary: Summary, table: Table, plant_path: str, names: tuple[str, ..
         found = fit(model, [drive])
         estimates = {e.name: (e.value, e.sd) for e in report(found, [drive])}
         after = max(r / noise[o].sigma for o, r in found.rms().items() if math.isfinite(r))
-    return Summary(**{**vars(summary), "misfit": ratios[worst], "worst": worst, "misfit_refitted": after,
-                      "estimates": estimates})
+    return Summary(
+        **{
+            **vars(summary),
+            "misfit": ratios[worst],
+            "worst": worst,
+            "misfit_refitted": after,
+            "estimates": estimates,
+        }
+    )
 
 
 @dataclass(frozen=True)
 class Drift:
     """A straight line through a parameter's estimates: change per 30 days, its standard error, share of the mean."""
+
     per_month: float
     sigma: float
     share: float
@@ -173,6 +194,7 @@ class Drift:
 @dataclass(frozen=True)
 class Rig:
     """One rig over all its recordings, oldest first, and what to do about it."""
+
     name: str
     summaries: tuple[Summary, ...]
     drifts: dict[str, Drift]
@@ -184,25 +206,39 @@ def judge(summaries: Iterable[Summary]) -> list[Rig]:
     by_rig: dict[str, list[Summary]] = {}
     for s in summaries:
         by_rig.setdefault(s.rig, []).append(s)
-    return [_judge(name, sorted(group, key=lambda s: (math.isnan(s.begin_s), s.begin_s, s.path)))
-            for name, group in sorted(by_rig.items())]
+    return [
+        _judge(name, sorted(group, key=lambda s: (math.isnan(s.begin_s), s.begin_s, s.path)))
+        for name, group in sorted(by_rig.items())
+    ]
 
 
 def _judge(name: str, group: list[Summary]) -> Rig:
     good = [s for s in group if not s.error]
     names = list(dict.fromkeys(p for s in good for p in s.estimates))
-    drifts = {p: drift([s.begin_s for s in good if p in s.estimates], [s.estimates[p] for s in good if p in s.estimates])
-              for p in names}
+    drifts = {
+        p: drift(
+            [s.begin_s for s in good if p in s.estimates], [s.estimates[p] for s in good if p in s.estimates]
+        )
+        for p in names
+    }
     advice = [f"{Path(s.path).name}: {s.error}" for s in group if s.error]
     if good:
         newest = good[-1]
         if newest.misfit > FIT_LIMIT:
             cured = newest.misfit_refitted <= FIT_LIMIT
-            advice.append(f"the model no longer fits ({newest.worst}: {newest.misfit:.1f} times its noise): "
-                          + ("new values fit, identify again" if cured else "look for what is missing: thermoctl diagnose "
-                             f"{newest.path}"))
-        advice += [f"{p} drifts by {d.per_month:+.3g} a month ({100 * d.share:+.1f} % in the time seen)"
-                   for p, d in drifts.items() if d.drifts]
+            advice.append(
+                f"the model no longer fits ({newest.worst}: {newest.misfit:.1f} times its noise): "
+                + (
+                    "new values fit, identify again"
+                    if cured
+                    else f"look for what is missing: thermoctl diagnose {newest.path}"
+                )
+            )
+        advice += [
+            f"{p} drifts by {d.per_month:+.3g} a month ({100 * d.share:+.1f} % in the time seen)"
+            for p, d in drifts.items()
+            if d.drifts
+        ]
         trips = [f for f in newest.faults if faults.BY_NAME[f].severity != "warning"]
         advice += [f"fault {f}: {faults.BY_NAME[f].remedy}" for f in trips]
     return Rig(name, tuple(group), drifts, tuple(advice))
@@ -223,11 +259,19 @@ def drift(times_s: Sequence[float], estimates: Sequence[tuple[float, float]]) ->
     scatter = np.sum(weight * (value - mean - slope * (t - middle)) ** 2) / (len(t) - 2)
     sigma = math.sqrt(max(scatter, 1.0) / spread)
     share = float(slope * np.ptp(t) / abs(mean)) if mean else 0.0
-    return Drift(float(slope), sigma, share, bool(abs(slope) > DRIFT_SIGMA * sigma and abs(share) > DRIFT_SHARE))
+    return Drift(
+        float(slope), sigma, share, bool(abs(slope) > DRIFT_SIGMA * sigma and abs(share) > DRIFT_SHARE)
+    )
 
 
-def fleet(folder: str, plant: str | None = None, parameters: str = "", workers: int = 0, scheduler: str | None = None,
-          as_json: bool = False) -> int:
+def fleet(
+    folder: str,
+    plant: str | None = None,
+    parameters: str = "",
+    workers: int = 0,
+    scheduler: str | None = None,
+    as_json: bool = False,
+) -> int:
     """Print the rigs of a folder; 1 when one needs attention. workers 0: in this process; scheduler: a Dask address."""
     names = tuple(n.strip() for n in parameters.split(",") if n.strip())
     if names and plant is None:
@@ -235,11 +279,14 @@ def fleet(folder: str, plant: str | None = None, parameters: str = "", workers: 
     ranged = [n for n, p in load(plant).parameters.items() if p.range is not None] if plant else []
     for name in names:
         if name not in ranged:
-            raise InputError(f"{plant}: no parameter '{name}' with a range{suggest(name, ranged)}; expected some of "
-                             f"{', '.join(ranged)}")
+            raise InputError(
+                f"{plant}: no parameter '{name}' with a range{suggest(name, ranged)}; expected some of "
+                f"{', '.join(ranged)}"
+            )
     paths = find_recordings(folder)
     if workers or scheduler:
         from thermoctl.diagnose.prove import cluster
+
         with cluster(scheduler, workers) as client:
             summaries = client.gather([client.submit(summarise, p, plant, names, pure=False) for p in paths])
     else:
@@ -264,6 +311,7 @@ def _show(rigs: Sequence[Rig], names: Sequence[str]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table as Grid
+
     console = Console()
     grid = Grid(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     grid.add_column("rig", no_wrap=True)
@@ -272,10 +320,17 @@ def _show(rigs: Sequence[Rig], names: Sequence[str]) -> None:
     for r in rigs:
         good = [s for s in r.summaries if not s.error]
         newest = good[-1] if good else Summary("", r.name, math.nan, math.nan)
-        grid.add_row(r.name, str(len(r.summaries)), f"{sum(s.hours for s in good):.1f}", _number(100 * newest.armed, "{:.0f} %"),
-                     _number(newest.slips, "{:.0f}"), _number(newest.innovation_c, "{:+.3f}"), _number(newest.proof_um, "{:.3f}"),
-                     _number(newest.misfit, "{:.1f}"),
-                     *(_number(newest.estimates.get(p, (math.nan,))[0], "{:.3g}") for p in names))
+        grid.add_row(
+            r.name,
+            str(len(r.summaries)),
+            f"{sum(s.hours for s in good):.1f}",
+            _number(100 * newest.armed, "{:.0f} %"),
+            _number(newest.slips, "{:.0f}"),
+            _number(newest.innovation_c, "{:+.3f}"),
+            _number(newest.proof_um, "{:.3f}"),
+            _number(newest.misfit, "{:.1f}"),
+            *(_number(newest.estimates.get(p, (math.nan,))[0], "{:.3g}") for p in names),
+        )
     console.print(grid)
     for r in rigs:
         for line in r.advice:

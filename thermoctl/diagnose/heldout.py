@@ -1,4 +1,5 @@
 """What an explanation is worth on data that took no part in its fit."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -15,16 +16,19 @@ from thermoctl.plant.simulate import Drive, Model, SimulationError
 from thermoctl.recording.table import Table
 
 UNDETERMINED = 20.0
-BIN = 6                     # coefficients of a spectrum that are averaged at least
-FORETOLD = 6.0              # standard deviations of chance from which errors follow a prediction
-BLOCKS = 16                 # of a single recording, every other one held out
+BIN = 6  # coefficients of a spectrum that are averaged at least
+FORETOLD = 6.0  # standard deviations of chance from which errors follow a prediction
+BLOCKS = 16  # of a single recording, every other one held out
 
 
 def folds(case: Case, blocks: bool = False) -> list[tuple[list[Table], list[Table]]]:
     """(training tables, test tables): each recording in turn; or each cut into `blocks`, of which every other one is held out,
     and then the others. A single recording is always cut."""
     if len(case.tables) > 1 and not blocks:
-        return [([t for q, t in enumerate(case.tables) if q != r], [case.tables[r]]) for r in range(len(case.tables))]
+        return [
+            ([t for q, t in enumerate(case.tables) if q != r], [case.tables[r]])
+            for r in range(len(case.tables))
+        ]
     measured = {o.column for o in case.plant.outputs.values()}
 
     def masked(table: Table, parity: int) -> Table:
@@ -32,11 +36,14 @@ def folds(case: Case, blocks: bool = False) -> list[tuple[list[Table], list[Tabl
         keep = np.minimum(span * BLOCKS, BLOCKS - 1).astype(int) % 2 == parity
         columns = {k: np.where(keep, v, np.nan) if k in measured else v for k, v in table.columns.items()}
         return dataclasses.replace(table, columns=columns)
+
     even, odd = ([masked(t, parity) for t in case.tables] for parity in (0, 1))
     return [(even, odd), (odd, even)]
 
 
-def unseen_errors(case: Case, plant: Plant, refit: bool = True, blocks: bool = False, beliefs: Sequence[Belief] = ()) -> list[np.ndarray]:
+def unseen_errors(
+    case: Case, plant: Plant, refit: bool = True, blocks: bool = False, beliefs: Sequence[Belief] = ()
+) -> list[np.ndarray]:
     """Free-run errors (N, outputs) on each fold's test data, the plant fitted to that fold's training data only."""
     out: list[np.ndarray] = []
     for train, test in folds(case, blocks):
@@ -46,12 +53,24 @@ def unseen_errors(case: Case, plant: Plant, refit: bool = True, blocks: bool = F
             dx0: Sequence[np.ndarray | None] = [None] * len(test)
             if refit:
                 training = [model.drive(t) for t in train]
-                found = fit(model, training, case.noise, iterations=15, tolerance=1e-3, seconds=case.patience, beliefs=beliefs)
+                found = fit(
+                    model,
+                    training,
+                    case.noise,
+                    iterations=15,
+                    tolerance=1e-3,
+                    seconds=case.patience,
+                    beliefs=beliefs,
+                )
                 model = Model(updated(plant, found, training), model.code)
-                if train[0].path == test[0].path:       # recordings, split: their starts took part
+                if train[0].path == test[0].path:  # recordings, split: their starts took part
                     dx0 = list(found.dx0)
-            out += [_but_for_start(case, model, d) if begin is None and model.uncertain
-                    else d.y - model.run(model.prepare(d), None, begin).y for d, begin in zip(drives, dx0, strict=True)]
+            out += [
+                _but_for_start(case, model, d)
+                if begin is None and model.uncertain
+                else d.y - model.run(model.prepare(d), None, begin).y
+                for d, begin in zip(drives, dx0, strict=True)
+            ]
         except SimulationError:
             out += [np.full_like(d.y, np.nan) for d in drives]
     return out
@@ -65,7 +84,7 @@ def _but_for_start(case: Case, model: Model, d: Drive) -> np.ndarray:
     error = d.y - run.y
     good = np.isfinite(error)
     scale = np.array([n.sigma for n in case.noise])
-    by_start = run.dy[:, :, len(model.active):]
+    by_start = run.dy[:, :, len(model.active) :]
     prior = np.array([model.plant.nodes[n].initial_sigma or 1.0 for n in model.uncertain])
     rows, left = (by_start / scale[None, :, None])[good] * prior, (error / scale)[good]
     shift = np.linalg.solve(rows.T @ rows + np.eye(len(prior)), rows.T @ left) * prior
@@ -108,14 +127,15 @@ def foretold(before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float
             edges[-1] = len(power)
             size = np.diff(edges)
             spectrum = np.repeat(np.add.reduceat(power, edges[:-1]) / size, size)
-            scale = float(np.mean(b[good, j] ** 2)) or 1.0          # every output weighs by its own errors
+            scale = float(np.mean(b[good, j] ** 2)) or 1.0  # every output weighs by its own errors
             follows += float(a[good, j] @ d[good]) / scale
-            chance += float(spectrum @ dct(d, norm="ortho") ** 2) / scale ** 2
+            chance += float(spectrum @ dct(d, norm="ortho") ** 2) / scale**2
     return follows / float(np.sqrt(chance)) if chance else 0.0
 
 
-def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray],
-                draws: int = 400) -> tuple[float, float, float]:
+def pooled_gain(
+    case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray], draws: int = 400
+) -> tuple[float, float, float]:
     """Ratio of held-out rms after / before over all outputs in units of their noise, with its 90 % interval (paired block
     bootstrap), whose upper end is a one-sided 95 % bound. What happens in one block only, a saturation that is reached once, a tank
     that overflows once, is missing from every third draw: there the ratio itself is the bound, where the errors before follow
@@ -134,7 +154,7 @@ def pooled_gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.nda
         x, y = np.nansum((a / sigma) ** 2, axis=1), np.nansum((b / sigma) ** 2, axis=1)
         block = max(5, len(x) // 20)
         n = len(x) // block
-        x, y = x[:n * block].reshape(n, block).sum(1), y[:n * block].reshape(n, block).sum(1)
+        x, y = x[: n * block].reshape(n, block).sum(1), y[: n * block].reshape(n, block).sum(1)
         pairs += [(p, q) for p, q in zip(x, y, strict=True) if p > 0]
     values = np.array(pairs)
     if len(values) < 4:
@@ -152,7 +172,10 @@ def held_out(case: Case, base: Explanation, final: Explanation) -> dict[str, Any
     """Fit the plant's own parameters, and those of the explanation, without some of the data; errors on that data: each recording in
     turn, or blocks of all where only those show what the explanation is worth (`data` says which)."""
     blocks = len(case.tables) == 1 or bool(final.effects) and prediction(case, base, final)[3]
-    out = {"before": unseen_errors(case, case.plant, False, blocks), "refit_only": errors_of(case, base, blocks)}
+    out = {
+        "before": unseen_errors(case, case.plant, False, blocks),
+        "refit_only": errors_of(case, base, blocks),
+    }
     out["after"] = errors_of(case, final, blocks) if final.effects else out["refit_only"]
     figures: dict[str, Any] = {f"held_out_{k}": rms(case.model, v) for k, v in out.items()}
     figures["data"] = "blocks" if blocks else "recordings"
@@ -160,7 +183,9 @@ def held_out(case: Case, base: Explanation, final: Explanation) -> dict[str, Any
     return figures
 
 
-def _gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray], draws: int = 400) -> dict[str, Any]:
+def _gain(
+    case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray], draws: int = 400
+) -> dict[str, Any]:
     """Per output: held-out rms ratio after / refit only with a 95 % interval by paired block bootstrap."""
     rng = np.random.default_rng(2)
     out = {}
@@ -173,19 +198,30 @@ def _gain(case: Case, before: Sequence[np.ndarray], after: Sequence[np.ndarray],
             block = max(5, int(good.sum()) // 25)
             x, y = a[good, j] ** 2, b[good, j] ** 2
             n = len(x) // block
-            pairs += list(zip(x[:n * block].reshape(n, block).mean(1), y[:n * block].reshape(n, block).mean(1), strict=True))
+            pairs += list(
+                zip(
+                    x[: n * block].reshape(n, block).mean(1),
+                    y[: n * block].reshape(n, block).mean(1),
+                    strict=True,
+                )
+            )
         if len(pairs) < 4:
             continue
         values = np.array(pairs)
         index = rng.integers(0, len(values), (draws, len(values)))
         ratio = np.sqrt(values[index, 1].sum(1) / np.maximum(values[index, 0].sum(1), 1e-300))
-        out[o] = {"ratio": float(np.sqrt(values[:, 1].sum() / max(values[:, 0].sum(), 1e-300))),
-                  "interval": [float(np.quantile(ratio, 0.025)), float(np.quantile(ratio, 0.975))]}
+        out[o] = {
+            "ratio": float(np.sqrt(values[:, 1].sum() / max(values[:, 0].sum(), 1e-300))),
+            "interval": [float(np.quantile(ratio, 0.025)), float(np.quantile(ratio, 0.975))],
+        }
     return out
 
 
 def rms(model: Model, residuals: Sequence[np.ndarray]) -> dict[str, float]:
     """Root mean square per output that was measured, of residuals per recording (N, outputs)."""
     stacked = np.concatenate(list(residuals))
-    return {o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2))) for j, o in enumerate(model.outputs)
-            if np.isfinite(stacked[:, j]).any()}
+    return {
+        o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2)))
+        for j, o in enumerate(model.outputs)
+        if np.isfinite(stacked[:, j]).any()
+    }

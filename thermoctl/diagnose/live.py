@@ -5,6 +5,7 @@ The 10 Hz tier of the newest session is read back for some hours, and its innova
 (daemon/misfit.py). The stretch from well before the onset to now is averaged to seconds and written as a CSV whose columns are
 those of the thermal plant.
 """
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -19,25 +20,34 @@ from thermoctl.recording.table import Table, read_table, write_table
 from thermoctl.recording.writer import TIER, recording_files
 from thermoctl.yamlfile import InputError
 
-BEFORE_S = 1800.0           # of a time when the model still fitted, taken along
+BEFORE_S = 1800.0  # of a time when the model still fitted, taken along
 _STEP_S = 1.0
 
 
 def newest(directory: str | Path, rig: str, hours: float) -> Table:
     """The newest session of a rig, at most so many hours back, as recorded. Raises InputError where there is none."""
     folder = Path(directory)
-    files = [p for p in recording_files(folder, TIER) if p.name.startswith(rig + "-")] if folder.is_dir() else []
+    files = (
+        [p for p in recording_files(folder, TIER) if p.name.startswith(rig + "-")] if folder.is_dir() else []
+    )
     parts: list[Table] = []
     for path in reversed(files):
         part = read_table(path)
         if parts and (part.t[-1] > parts[-1].t[0] or parts[0].t[-1] - part.t[0] > hours * 3600):
-            break               # an earlier session, whose clock ran on, or far enough back
+            break  # an earlier session, whose clock ran on, or far enough back
         parts.append(part)
     if not parts:
-        raise InputError(f"{directory}: no recording of the rig '{rig}'; the daemon writes them while `recording: enable` is on")
+        raise InputError(
+            f"{directory}: no recording of the rig '{rig}'; the daemon writes them while `recording: enable` is on"
+        )
     parts.reverse()
     names = set.intersection(*(set(p.columns) for p in parts))
-    return Table(rig, str(files[-1]), np.concatenate([p.t for p in parts]), {n: np.concatenate([p.columns[n] for p in parts]) for n in names})
+    return Table(
+        rig,
+        str(files[-1]),
+        np.concatenate([p.t for p in parts]),
+        {n: np.concatenate([p.columns[n] for p in parts]) for n in names},
+    )
 
 
 def where(settings: Any, table: Table) -> list[Alarm]:
@@ -45,8 +55,10 @@ def where(settings: Any, table: Table) -> list[Alarm]:
     watch = Misfit(compensator(settings))
     out = []
     for k in range(0, len(table.t), 10):
-        rows = slice(k, k + 10)         # as the daemon sees them: an alarm that came and went between is not lost
-        found = watch.add(table.t[rows], table.columns["innovation_c"][rows], table.columns["kalman_gain"][rows])
+        rows = slice(k, k + 10)  # as the daemon sees them: an alarm that came and went between is not lost
+        found = watch.add(
+            table.t[rows], table.columns["innovation_c"][rows], table.columns["kalman_gain"][rows]
+        )
         if found is not None:
             out.append(found)
     return out
@@ -73,12 +85,21 @@ def extract(plant: Plant, table: Table, alarm: Alarm | None, out: str | Path) ->
     wanted = [i.column for i in plant.inputs.values()] + [o.column for o in plant.outputs.values()]
     missing = [i.column for i in plant.inputs.values() if i.column not in known]
     if missing:
-        raise InputError(f"{table.path}: the daemon records no column '{missing[0]}', which the plant reads as an input")
+        raise InputError(
+            f"{table.path}: the daemon records no column '{missing[0]}', which the plant reads as an input"
+        )
     keep = table.t >= (alarm.begin_s - BEFORE_S if alarm is not None else -np.inf)
     columns = {c: known[c][keep] for c in wanted if c in known and np.isfinite(known[c][keep]).any()}
     whole = np.all([np.isfinite(columns[i.column]) for i in plant.inputs.values()], axis=0)
     if not whole.any():
         raise InputError(f"{table.path}: an input of the plant is missing throughout")
     first = int(np.argmax(whole))
-    write_table(out, Table(Path(out).stem, str(out), table.t[keep][first:] - table.t[keep][first],
-                           {k: v[first:] for k, v in columns.items()}))
+    write_table(
+        out,
+        Table(
+            Path(out).stem,
+            str(out),
+            table.t[keep][first:] - table.t[keep][first],
+            {k: v[first:] for k, v in columns.items()},
+        ),
+    )

@@ -13,6 +13,7 @@ the first two with a g for each direction of motion where the node is a velocity
 that follows inputs and its nodes: the flow through a bank of damped resonators (poles exp((-DAMPING +- i) w_k h), frequencies over
 the whole band) beside itself. Noise is independent of past inputs, whatever its colour (Ljung, System Identification, 16.6).
 """
+
 from __future__ import annotations
 
 import itertools
@@ -28,26 +29,27 @@ from thermoctl.diagnose.screen import Metric, Trajectory, _Column, directions, l
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 
-COARSE, FINE = 10, 40       # knots a recording
-LEVELS = 8                  # knots over the values of a signal
-RESONATORS, DAMPING = 12, 0.1       # from two periods a recording to a quarter of the sampling rate
-PEAKS = 16                  # the same for a storage, where a change of phase is narrow
-CYCLES = 3, 200             # fewest and most of a rhythm in the longest recording
-HARMONICS = (1, 2, 4)       # that are summed
-BANDS, SLOWEST, LEAST = 14, 2, 4    # of frequencies, from two cycles a recording on; fewest coefficients of one
+COARSE, FINE = 10, 40  # knots a recording
+LEVELS = 8  # knots over the values of a signal
+RESONATORS, DAMPING = 12, 0.1  # from two periods a recording to a quarter of the sampling rate
+PEAKS = 16  # the same for a storage, where a change of phase is narrow
+CYCLES = 3, 200  # fewest and most of a rhythm in the longest recording
+HARMONICS = (1, 2, 4)  # that are summed
+BANDS, SLOWEST, LEAST = 14, 2, 4  # of frequencies, from two cycles a recording on; fewest coefficients of one
 
 
 @dataclass
 class Suspect:
     """A node or an output with an unknown smooth input, a node, flow or storage with an unknown function of a signal, a flow
     with unknown dynamics, or two outputs that share something: how much of the residual it explains."""
-    kind: str               # 'node', 'output', 'flow', 'storage', 'dynamics', 'rhythm' or 'together'
+
+    kind: str  # 'node', 'output', 'flow', 'storage', 'dynamics', 'rhythm' or 'together'
     name: str
     gain: float
     dims: int
-    follows: str | None = None      # the signal that it is a function of; None: of time
-    period: float = 0.0             # of a rhythm, s
-    looks: int = 1                  # of which this is the best
+    follows: str | None = None  # the signal that it is a function of; None: of time
+    period: float = 0.0  # of a rhythm, s
+    looks: int = 1  # of which this is the best
 
     @property
     def log_p(self) -> float:
@@ -62,14 +64,19 @@ class Suspect:
             return f"a rhythm of {self.period:.4g} s of its own in {self.name} would explain it best"
         if self.kind == "together":
             return f"{self.name} share what is left of them, which the noise of two sensors does not"
-        what = {"node": "an unknown flow into", "output": "an unknown error of", "flow": "an unknown factor of",
-                "storage": "an unknown factor of the storage of"}[self.kind]
+        what = {
+            "node": "an unknown flow into",
+            "output": "an unknown error of",
+            "flow": "an unknown factor of",
+            "storage": "an unknown factor of the storage of",
+        }[self.kind]
         return f"{what} {self.name}, a function of {self.follows or 'time'}, would explain it best"
 
 
 @dataclass
 class Missing:
     """A recovered unknown flow into a node: per recording its times and values (unit of storage times node per second)."""
+
     node: str
     t: list[np.ndarray]
     flow: list[np.ndarray]
@@ -114,21 +121,46 @@ def patterns(metric: Metric, rig: Rig) -> list[Suspect]:
     at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     plant, states = rig.plant, list(metric.model.states)
     signals = {n: [run.x[:, k] for run in metric.runs] for k, n in enumerate(states)}
-    signals |= {i: [d.u[:, j] for d in metric.drives] for j, i in enumerate(plant.inputs) if i in rig.moving_inputs}
+    signals |= {
+        i: [d.u[:, j] for d in metric.drives] for j, i in enumerate(plant.inputs) if i in rig.moving_inputs
+    }
     hats = {n: _levels(parts, LEVELS) for n, parts in signals.items()}
     peaks = {n: _levels(signals[n], PEAKS) for n in states}
     places: list[tuple[str, str, list[tuple[str, float]]]] = [("node", n, [(n, 1.0)]) for n in states]
     for f in plant.flows.values():
-        places.append(("flow", f.name, [(n, s) for n, s in ((f.source, -1.0), (f.target, 1.0)) if n is not None and n in plant.nodes]))
+        places.append(
+            (
+                "flow",
+                f.name,
+                [
+                    (n, s)
+                    for n, s in ((f.source, -1.0), (f.target, 1.0))
+                    if n is not None and n in plant.nodes
+                ],
+            )
+        )
     columns: list[_Column] = []
     for f in plant.flows.values():
         if ex.names(f.rate) & rig.moving_inputs and not ex.names(f.rate) & set(states):
-            ends = [(n, s) for n, s in ((f.source, -1.0), (f.target, 1.0)) if n is not None and n in plant.nodes]
+            ends = [
+                (n, s) for n, s in ((f.source, -1.0), (f.target, 1.0)) if n is not None and n in plant.nodes
+            ]
             parts = []
             for trajectory in at:
                 bank = _resonators(trajectory.value(f.rate, {}), trajectory.drive.t)
-                parts.append([{states.index(n): sign * b / trajectory.value(plant.nodes[n].storage, {}) for n, sign in ends} for b in bank])
-            columns += [_Column(("dynamics", f.name, None), list(forces), [{} for _ in at]) for forces in zip(*parts, strict=True)]
+                parts.append(
+                    [
+                        {
+                            states.index(n): sign * b / trajectory.value(plant.nodes[n].storage, {})
+                            for n, sign in ends
+                        }
+                        for b in bank
+                    ]
+                )
+            columns += [
+                _Column(("dynamics", f.name, None), list(forces), [{} for _ in at])
+                for forces in zip(*parts, strict=True)
+            ]
     places += [("storage", n, [(n, 1.0)]) for n in states]
     for kind, name, ends in places:
         base = []
@@ -137,10 +169,23 @@ def patterns(metric: Metric, rig: Rig) -> list[Suspect]:
                 k = states.index(name)
                 base.append({k: np.gradient(trajectory.run.x[:, k], trajectory.drive.t)})
                 continue
-            rate = trajectory.value(plant.flows[name].rate, {}) if kind == "flow" else np.ones(len(trajectory.drive.t))
-            base.append({states.index(n): sign * rate / trajectory.value(plant.nodes[n].storage, {}) for n, sign in ends})
+            rate = (
+                trajectory.value(plant.flows[name].rate, {})
+                if kind == "flow"
+                else np.ones(len(trajectory.drive.t))
+            )
+            base.append(
+                {
+                    states.index(n): sign * rate / trajectory.value(plant.nodes[n].storage, {})
+                    for n, sign in ends
+                }
+            )
         moving = next((signals[n] for n, _ in ends if n in rig.velocities), None)
-        sides = [[np.ones(len(d.t)) for d in metric.drives]] if moving is None else [[v > 0 for v in moving], [v < 0 for v in moving]]
+        sides = (
+            [[np.ones(len(d.t)) for d in metric.drives]]
+            if moving is None
+            else [[v > 0 for v in moving], [v < 0 for v in moving]]
+        )
         near = [n for n, _ in ends]
         if kind == "storage":
             sides = [[np.ones(len(d.t)) for d in metric.drives]]
@@ -176,23 +221,25 @@ def rhythms(metric: Metric) -> list[Suspect]:
         for j, (index, _, _) in enumerate(metric.problem.rows[r]):
             t = d.t[index]
             if metric.blocks > 1 and len(t):
-                t = t[:len(t) // metric.blocks * metric.blocks].reshape(-1, metric.blocks).mean(axis=1)
-            w = metric.residual[at:at + len(t)]
+                t = t[: len(t) // metric.blocks * metric.blocks].reshape(-1, metric.blocks).mean(axis=1)
+            w = metric.residual[at : at + len(t)]
             at += len(t)
             if len(t) > 4 * CYCLES[0]:
                 parts.setdefault(j, []).append((t, np.clip(w, -4, 4) if np.std(w) < 2 else w))
     found = []
     for j, series in parts.items():
-        fastest = min(0.25 / float(np.median(np.diff(t))) for t, _ in series)       # 1/s
+        fastest = min(0.25 / float(np.median(np.diff(t))) for t, _ in series)  # 1/s
         f = np.arange(CYCLES[0] / span, min(fastest, CYCLES[1] / span), 1 / (3 * span))
         if not len(f):
             continue
-        power = np.zeros(len(f) * max(HARMONICS))                                   # at f_0 + k/(3 span), also for harmonics
+        power = np.zeros(len(f) * max(HARMONICS))  # at f_0 + k/(3 span), also for harmonics
         grid = f[0] + np.arange(len(power)) / (3 * span)
         grid = grid[grid <= fastest]
         for t, w in series:
             size = max(float(np.var(w)), 1.0)
-            power[:len(grid)] += 2 * np.abs(np.exp(-2j * np.pi * grid[:, None] * t) @ w) ** 2 / (len(t) * size)
+            power[: len(grid)] += (
+                2 * np.abs(np.exp(-2j * np.pi * grid[:, None] * t) @ w) ** 2 / (len(t) * size)
+            )
         for count in HARMONICS:
             total, dims = np.zeros(len(f)), np.zeros(len(f), dtype=int)
             for h in range(1, count + 1):
@@ -203,8 +250,17 @@ def rhythms(metric: Metric) -> list[Suspect]:
             full = dims == 2 * len(series) * count
             if full.any():
                 best = int(np.argmax(np.where(full, total, 0.0)))
-                found.append(Suspect("rhythm", metric.model.outputs[j], float(total[best]), int(dims[best]), None, float(1 / f[best]),
-                                     len(f) * len(HARMONICS)))
+                found.append(
+                    Suspect(
+                        "rhythm",
+                        metric.model.outputs[j],
+                        float(total[best]),
+                        int(dims[best]),
+                        None,
+                        float(1 / f[best]),
+                        len(f) * len(HARMONICS),
+                    )
+                )
     return sorted(found, key=lambda s: s.log_p)
 
 
@@ -214,12 +270,18 @@ def together(residuals: Sequence[np.ndarray], colours: Sequence[Colour], plant: 
     names, longest = list(plant.outputs), max(map(len, residuals))
     spectra = []
     for r in residuals:
-        innovations = [np.clip(lfilter(c.ar, c.ma, np.nan_to_num(r[:, j])) / c.sigma, -5, 5) for j, c in enumerate(colours)]
+        innovations = [
+            np.clip(lfilter(c.ar, c.ma, np.nan_to_num(r[:, j])) / c.sigma, -5, 5)
+            for j, c in enumerate(colours)
+        ]
         spectra.append(np.fft.rfft(np.stack(innovations, axis=1), axis=0))
     edges = np.geomspace(SLOWEST, max(longest // 2, SLOWEST + 1), BANDS)
     bands = []
     for low, high in itertools.pairwise(edges):
-        parts = [s[round(low * len(r) / longest):round(high * len(r) / longest)] for s, r in zip(spectra, residuals, strict=True)]
+        parts = [
+            s[round(low * len(r) / longest) : round(high * len(r) / longest)]
+            for s, r in zip(spectra, residuals, strict=True)
+        ]
         bands.append(np.concatenate(parts))
     bands = [b for b in bands if len(b) >= LEAST]
     if not bands:
@@ -231,7 +293,10 @@ def together(residuals: Sequence[np.ndarray], colours: Sequence[Colour], plant: 
         shared = np.abs(cross) ** 2 / np.maximum(np.outer(power, power), 1e-30)
         gain -= 2 * (len(b) - 1) * np.log1p(-np.minimum(shared, 1 - 1e-12))
     pairs = [(i, j) for i, j in itertools.combinations(range(len(names)), 2) if columns[i] != columns[j]]
-    found = [Suspect("together", f"{names[i]} and {names[j]}", float(gain[i, j]), 2 * len(bands), looks=len(pairs)) for i, j in pairs]
+    found = [
+        Suspect("together", f"{names[i]} and {names[j]}", float(gain[i, j]), 2 * len(bands), looks=len(pairs))
+        for i, j in pairs
+    ]
     return sorted(found, key=lambda s: s.log_p)
 
 
@@ -278,7 +343,7 @@ def missing_flow(metric: Metric, node: str, signals: dict[str, list[np.ndarray]]
     rough = np.zeros_like(gram)
     for r in range(len(metric.drives)):
         second = np.diff(np.eye(FINE), 2, axis=0)
-        rough[r * FINE:(r + 1) * FINE, r * FINE:(r + 1) * FINE] = second.T @ second
+        rough[r * FINE : (r + 1) * FINE, r * FINE : (r + 1) * FINE] = second.T @ second
     best: tuple[float, np.ndarray, np.ndarray] | None = None
     for ridge in 10.0 ** np.arange(-8, 2):
         inverse = np.linalg.inv(gram + scale * ridge * rough + 1e-10 * scale * np.eye(len(gram)))
@@ -298,15 +363,17 @@ def missing_flow(metric: Metric, node: str, signals: dict[str, list[np.ndarray]]
         mean_x = dict(zip(metric.model.states, metric.runs[r].x.mean(axis=0), strict=True))
         c = float(ex.evaluate(storage, {**known, **mean_x}))
         edges = np.linspace(d.t[0], d.t[-1], FINE)
-        part = q[r * FINE:(r + 1) * FINE] * c
+        part = q[r * FINE : (r + 1) * FINE] * c
         times.append(edges)
         flows.append(part)
-        seen = np.abs(part) > np.maximum(3 * sd[r * FINE:(r + 1) * FINE] * c, 0.25 * np.max(np.abs(part)))
+        seen = np.abs(part) > np.maximum(3 * sd[r * FINE : (r + 1) * FINE] * c, 0.25 * np.max(np.abs(part)))
         when.append(_intervals(edges, seen))
     rms = float(np.sqrt(np.mean(np.concatenate(flows) ** 2)))
     likeness = {}
     for key, parts in signals.items():
-        a = np.concatenate([np.interp(edges, d.t, s) for edges, d, s in zip(times, metric.drives, parts, strict=True)])
+        a = np.concatenate(
+            [np.interp(edges, d.t, s) for edges, d, s in zip(times, metric.drives, parts, strict=True)]
+        )
         b = np.concatenate(flows)
         if np.ptp(a) > 0 and np.ptp(b) > 0:
             likeness[key] = abs(float(np.corrcoef(a, b)[0, 1]))

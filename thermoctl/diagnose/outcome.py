@@ -1,4 +1,5 @@
 """The outcome of a diagnosis, and its JSON (thermoctl-diagnosis/1, a contract)."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -24,8 +25,9 @@ TRUST = {"explained": 0.93, "ambiguous": 0.9, "unexplained": 0.5}
 @dataclass
 class Diagnosis:
     """All that was found; `result` is the contract's JSON."""
+
     verdict: str
-    base: Explanation                       # refit only
+    base: Explanation  # refit only
     final: Explanation
     rivals: list[Explanation]
     rounds: list[Round]
@@ -40,7 +42,11 @@ class Diagnosis:
 
 def result(case: Case, d: Diagnosis) -> dict[str, Any]:
     """The contract's JSON (thermoctl-diagnosis/1)."""
-    errors = standard_errors(d.final, case.drives_of(d.final)) if d.final.effects and d.verdict != "consistent" else {}
+    errors = (
+        standard_errors(d.final, case.drives_of(d.final))
+        if d.final.effects and d.verdict != "consistent"
+        else {}
+    )
     excess = case.excess(d.base)
     findings = []
     if d.verdict != "consistent":
@@ -54,8 +60,13 @@ def result(case: Case, d: Diagnosis) -> dict[str, Any]:
             if key in seen or e.probability < 0.005:
                 continue
             seen.add(key)
-            shown.append({"effect": e.last.effect.name, "where": e.last.place.where,
-                          "probability": round(e.probability * TRUST[d.verdict], 4)})
+            shown.append(
+                {
+                    "effect": e.last.effect.name,
+                    "where": e.last.place.where,
+                    "probability": round(e.probability * TRUST[d.verdict], 4),
+                }
+            )
     mismatch: list[dict[str, Any]] = []
     for o, x in excess.items():
         if d.verdict == "consistent" or x < 1.1:
@@ -63,28 +74,58 @@ def result(case: Case, d: Diagnosis) -> dict[str, Any]:
         node = next((s.name for s in d.suspects if s.kind == "node"), None)
         index = d.base.fit.model.outputs.index(o)
         rms = d.base.fit.rms()[o]
-        entry: dict[str, Any] = {"channel": o, "rms": rms, "expected_rms": case.noise[index].sigma, "node": node}
+        entry: dict[str, Any] = {
+            "channel": o,
+            "rms": rms,
+            "expected_rms": case.noise[index].sigma,
+            "node": node,
+        }
         if d.missing is not None:
-            unit = next((f.unit for f in case.plant.flows.values() if d.missing.node in (f.source, f.target) and f.unit), None)
-            entry |= {"missing_flow_rms": d.missing.rms, "missing_flow_unit": unit, "when": d.missing.when,
-                      "follows": d.missing.follows}
+            unit = next(
+                (
+                    f.unit
+                    for f in case.plant.flows.values()
+                    if d.missing.node in (f.source, f.target) and f.unit
+                ),
+                None,
+            )
+            entry |= {
+                "missing_flow_rms": d.missing.rms,
+                "missing_flow_unit": unit,
+                "when": d.missing.when,
+                "follows": d.missing.follows,
+            }
         mismatch.append(entry)
     mismatch.sort(key=lambda m: -m["rms"] / max(m["expected_rms"], 1e-300))
-    return _clean({
-        "format": "thermoctl-diagnosis/1", "verdict": d.verdict, "findings": findings, "alternatives": shown,
-        "mismatch": mismatch,
-        "fit": {"before": d.before, "refit_only": d.base.fit.rms(), "after": d.final.fit.rms(),
-                **{k: v for k, v in d.held.items() if k.startswith("held_out")}},
-        "held_out_gain": d.held.get("gain", {}),
-        "next_experiment": d.next_experiment,
-        "suspects": [{"kind": s.kind, "name": s.name, "gain": s.gain, "dims": s.dims} for s in d.suspects[:6]],
-        "chance": d.rounds[0].p_any() if d.rounds else 1.0,
-        "not_seen": not_seen(d) if d.verdict == "consistent" else [],
-        "parameters": [dataclasses.asdict(e) for e in report(d.final.fit, case.drives)],
-        "notes": d.notes})
+    return _clean(
+        {
+            "format": "thermoctl-diagnosis/1",
+            "verdict": d.verdict,
+            "findings": findings,
+            "alternatives": shown,
+            "mismatch": mismatch,
+            "fit": {
+                "before": d.before,
+                "refit_only": d.base.fit.rms(),
+                "after": d.final.fit.rms(),
+                **{k: v for k, v in d.held.items() if k.startswith("held_out")},
+            },
+            "held_out_gain": d.held.get("gain", {}),
+            "next_experiment": d.next_experiment,
+            "suspects": [
+                {"kind": s.kind, "name": s.name, "gain": s.gain, "dims": s.dims} for s in d.suspects[:6]
+            ],
+            "chance": d.rounds[0].p_any() if d.rounds else 1.0,
+            "not_seen": not_seen(d) if d.verdict == "consistent" else [],
+            "parameters": [dataclasses.asdict(e) for e in report(d.final.fit, case.drives)],
+            "notes": d.notes,
+        }
+    )
 
 
-def _finding(d: Diagnosis, c: Candidate, own: Mapping[str, str], errors: Mapping[str, float]) -> dict[str, Any]:
+def _finding(
+    d: Diagnosis, c: Candidate, own: Mapping[str, str], errors: Mapping[str, float]
+) -> dict[str, Any]:
     plant = d.final.plant
     values = {p: plant.parameters[n].value for p, n in own.items()}
     equation = _equation(d, c)
@@ -93,16 +134,31 @@ def _finding(d: Diagnosis, c: Candidate, own: Mapping[str, str], errors: Mapping
         when = [[values["T0"], min(values["T1"], max(float(x.t[-1]) for x in d.rounds[0].metric.drives))]]
     elif "T0" in values:
         when = [[values["T0"], max(float(x.t[-1]) for x in d.rounds[0].metric.drives)]]
-    parameters = {n: {"value": plant.parameters[n].value, "sd": errors.get(n, 0.0),
-                      "unit": plant.parameters[n].unit} for n in own.values()}
-    figures = ", ".join(f"{p} = {v:.4g}" + (f" {plant.parameters[own[p]].unit}" if plant.parameters[own[p]].unit not in (None, "1") else "")
-                        for p, v in values.items())
+    parameters = {
+        n: {"value": plant.parameters[n].value, "sd": errors.get(n, 0.0), "unit": plant.parameters[n].unit}
+        for n in own.values()
+    }
+    figures = ", ".join(
+        f"{p} = {v:.4g}"
+        + (f" {plant.parameters[own[p]].unit}" if plant.parameters[own[p]].unit not in (None, "1") else "")
+        for p, v in values.items()
+    )
     everyone = [d.final, *d.rivals]
     held = sum(e.probability for e in everyone if c.key in {x.key for x in e.effects})
-    probability = min(held / max(sum(e.probability for e in everyone), 1e-9), 0.995) if d.rivals else d.final.probability
-    return {"effect": c.effect.name, "where": c.place.where, "when": when, "probability": round(probability * TRUST[d.verdict], 4),
-            "equation": equation, "parameters": parameters,
-            "summary": f"{c.effect.title} at {c.place.where}: {equation} with {figures}."}
+    probability = (
+        min(held / max(sum(e.probability for e in everyone), 1e-9), 0.995)
+        if d.rivals
+        else d.final.probability
+    )
+    return {
+        "effect": c.effect.name,
+        "where": c.place.where,
+        "when": when,
+        "probability": round(probability * TRUST[d.verdict], 4),
+        "equation": equation,
+        "parameters": parameters,
+        "summary": f"{c.effect.title} at {c.place.where}: {equation} with {figures}.",
+    }
 
 
 def _equation(d: Diagnosis, c: Candidate) -> str:
@@ -116,7 +172,7 @@ def _equation(d: Diagnosis, c: Candidate) -> str:
     if p.flow and p.flow in after.flows:
         return str(after.flows[p.flow].rate)
     n = p.nodes.get("T")
-    return str(after.nodes[n].storage) if n in after.nodes else c.effect.title      # type: ignore[index]
+    return str(after.nodes[n].storage) if n in after.nodes else c.effect.title  # type: ignore[index]
 
 
 def _changed(c: Candidate, plant: Plant) -> set[str]:
@@ -132,9 +188,16 @@ def not_seen(d: Diagnosis) -> list[dict[str, Any]]:
         if amplitude is None or direction.gain <= 0:
             continue
         size = abs(direction.start[amplitude.name] - amplitude.null) / np.sqrt(direction.gain) * 5
-        out.append({"effect": direction.candidate.effect.name, "where": direction.candidate.place.where,
-                    "smallest": size, "parameter": amplitude.name, "unit": amplitude.unit,
-                    "left_after_refit": direction.excited})
+        out.append(
+            {
+                "effect": direction.candidate.effect.name,
+                "where": direction.candidate.place.where,
+                "smallest": size,
+                "parameter": amplitude.name,
+                "unit": amplitude.unit,
+                "left_after_refit": direction.excited,
+            }
+        )
     return sorted(out, key=lambda e: (e["effect"], e["where"]))
 
 

@@ -56,7 +56,9 @@ def program() -> str:
 
 def _program() -> list[Path]:
     package = Path(__file__).parents[1]
-    files = [f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.[ph]*"))]
+    files = [
+        f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.[ph]*"))
+    ]
     code = [f for f in files if f.name not in ("prove.py", "score.py")]  # these read results and make none
     return [*sorted(CATALOGUE.glob("*.yaml")), *code]
 
@@ -73,7 +75,9 @@ def find_jobs(folder: str | Path, number: int | None = None, apart: Sequence[str
     diagnosed one at a time. Raises InputError where there is none."""
     root = Path(folder)
     if not root.is_dir():
-        raise InputError(f"{root}: no such folder; expected a folder of cases, each with plant.yaml and recordings")
+        raise InputError(
+            f"{root}: no such folder; expected a folder of cases, each with plant.yaml and recordings"
+        )
     jobs = []
     for plant in sorted(root.glob("*/plant.yaml")):
         runs = tuple(str(p) for p in sorted(plant.parent.iterdir()) if p.suffix in RECORDINGS)
@@ -96,7 +100,12 @@ def run_one(job: Job, out: str) -> dict[str, Any]:
     from thermoctl.diagnose.run import diagnose
 
     begun, cpu = time.monotonic(), time.process_time()
-    told: dict[str, Any] = {"name": job.name, "fingerprint": job.fingerprint(), "version": __version__, "error": None}
+    told: dict[str, Any] = {
+        "name": job.name,
+        "fingerprint": job.fingerprint(),
+        "version": __version__,
+        "error": None,
+    }
     try:
         diagnose(job.plant, list(job.recordings), out, [Path(e) for e in job.effects])
     except InputError as e:
@@ -200,10 +209,14 @@ def read_answers(jobs: Sequence[Job], answers: Path | None) -> dict[str, dict[st
     for job in jobs:
         path = answers / f"{job.name}.yaml" if answers is not None else Path(job.plant).parent / "answer.yaml"
         if not path.exists():
-            raise InputError(f"{path}: no answer for case {job.name}; give the folder of answers with --answers")
+            raise InputError(
+                f"{path}: no answer for case {job.name}; give the folder of answers with --answers"
+            )
         content = path.read_bytes()
         if sealed and sealed.get(path.name) != hashlib.sha256(content).hexdigest():
-            raise InputError(f"{path}: the answer is not the one that was sealed (manifest.sha256); make the set again")
+            raise InputError(
+                f"{path}: the answer is not the one that was sealed (manifest.sha256); make the set again"
+            )
         answer = load(path).plain()
         if not isinstance(answer, dict):
             raise InputError(f"{path}: expected a mapping with verdict, effects and nearly_the_same")
@@ -324,7 +337,9 @@ def table(content: dict[str, Any]) -> Any:
     """The figures as a rich table."""
     from rich.table import Table
 
-    t = Table(title=f"{content['figures']['cases']} cases, thermoctl {content['version']} ({content['commit']})")
+    t = Table(
+        title=f"{content['figures']['cases']} cases, thermoctl {content['version']} ({content['commit']})"
+    )
     for title, side in (
         ("figure", "left"),
         ("is", "right"),
@@ -373,9 +388,20 @@ def page(content: dict[str, Any], rows: Sequence[scoring.Row]) -> str:
 
     def brief(part: str) -> str:
         groups = content[part]
-        return sheet.table(["", *next(iter(groups.values()), {})], [[k, *b.values()] for k, b in groups.items()])
+        return sheet.table(
+            ["", *next(iter(groups.values()), {})], [[k, *b.values()] for k, b in groups.items()]
+        )
+
     wrong = [
-        (r.case, r.family, f"{r.kind} {r.band or ''}", _names(r.truth), r.verdict, _names(r.findings), r.error or "")
+        (
+            r.case,
+            r.family,
+            f"{r.kind} {r.band or ''}",
+            _names(r.truth),
+            r.verdict,
+            _names(r.findings),
+            r.error or "",
+        )
         for r in rows
         if not (
             r.alike
@@ -405,7 +431,9 @@ def page(content: dict[str, Any], rows: Sequence[scoring.Row]) -> str:
 def _figures(content: dict[str, Any]) -> str:
     e = html.escape
     body = "".join(
-        f"<tr{' class=bad' if reached is False else ''}>" + "".join(f"<td>{e(c)}</td>" for c in cells) + "</tr>"
+        f"<tr{' class=bad' if reached is False else ''}>"
+        + "".join(f"<td>{e(c)}</td>" for c in cells)
+        + "</tr>"
         for *cells, reached in _lines(content)
     )
     return f"<table><tr><th>figure<th>is<th>95 % interval<th>of<th>goal</tr>{body}</table>"
@@ -418,7 +446,9 @@ def _confusion(confusion: dict[str, dict[str, int]]) -> str:
     body = "".join(
         f"<tr><th style='text-align:left'>{e(t)}</th>"
         + "".join(
-            f"<td class={'good' if c.removeprefix('ambiguous: ') == t else 'bad'}><b>{row[c]}</b></td>" if c in row else "<td></td>"
+            f"<td class={'good' if c.removeprefix('ambiguous: ') == t else 'bad'}><b>{row[c]}</b></td>"
+            if c in row
+            else "<td></td>"
             for c in called
         )
         + "</tr>"
@@ -438,11 +468,24 @@ def _plots(content: dict[str, Any], rows: Sequence[scoring.Row]) -> Any:
     figure = Figure(figsize=(12, 6.6), layout="constrained")
     (size, reliable, gain), (wide, onset, clock) = figure.subplots(2, 3)
     for shift, what, label in ((-0.08, "detected", "detected"), (0.08, "exact_name", "exact name")):
-        told = [(k, s) for k, b in enumerate(reversed(scoring.BANDS)) if (s := content["shares"][f"{what}_{b}"])["n"]]
+        told = [
+            (k, s)
+            for k, b in enumerate(reversed(scoring.BANDS))
+            if (s := content["shares"][f"{what}_{b}"])["n"]
+        ]
         y = [s["share"] for _, s in told]
-        spread = [[max(s["share"] - s["low"], 0) for _, s in told], [max(s["high"] - s["share"], 0) for _, s in told]]
+        spread = [
+            [max(s["share"] - s["low"], 0) for _, s in told],
+            [max(s["high"] - s["share"], 0) for _, s in told],
+        ]
         size.errorbar([k + shift for k, _ in told], y, yerr=spread, fmt="o", capsize=3, label=label)
-    size.set(xticks=range(3), xticklabels=["small\n3–6 σ", "middle\n6–15 σ", "large\n> 15 σ"], ylim=(0, 1.05), title="By size", ylabel="share")
+    size.set(
+        xticks=range(3),
+        xticklabels=["small\n3–6 σ", "middle\n6–15 σ", "large\n> 15 σ"],
+        ylim=(0, 1.05),
+        title="By size",
+        ylabel="share",
+    )
     size.legend(loc="lower right")
     reliable.plot([0, 1], [0, 1], color="0.8")
     for b in content["reliability"]:
@@ -450,13 +493,19 @@ def _plots(content: dict[str, Any], rows: Sequence[scoring.Row]) -> Any:
         low, high = s.interval()
         reliable.plot([b["probability"]] * 2, [low, high], color="C0", lw=1)
         reliable.scatter([b["probability"]], [b["right"]], s=12 + 2 * b["n"], color="C0")
-    reliable.set(xlabel="probability given", ylabel="share right", title="Reliability", xlim=(0, 1.02), ylim=(0, 1.05))
+    reliable.set(
+        xlabel="probability given", ylabel="share right", title="Reliability", xlim=(0, 1.02), ylim=(0, 1.05)
+    )
     gains = [r.gain for r in rows if r.gain is not None and r.detected]
     gain.hist([max(min(g, 1.2), -0.2) for g in gains], bins=28, range=(-0.2, 1.2))
     gain.set(xlabel="share of the oracle's held-out gain", ylabel="cases", title="Held-out gain")
     errors = [p["error"] for r in rows for p in r.parameters]
     wide.hist([min(x, 1.0) for x in errors], bins=20, range=(0, 1))
-    wide.set(xlabel="relative error (1: that or more)", ylabel="parameters", title="Effect parameters of right names")
+    wide.set(
+        xlabel="relative error (1: that or more)",
+        ylabel="parameters",
+        title="Effect parameters of right names",
+    )
     onset.hist([min(r.onset_error, 0.2) for r in rows if r.onset_error is not None], bins=20, range=(0, 0.2))
     onset.set(xlabel="share of the recording", ylabel="cases", title="Onset error")
     clock.hist([r.seconds for r in rows if r.seconds is not None], bins=30)
@@ -495,9 +544,15 @@ def real(
             {
                 "name": job.name,
                 "verdict": (result or {}).get("verdict", "failed"),
-                "findings": [(f["effect"], f["where"], f["probability"]) for f in (result or {}).get("findings", [])],
+                "findings": [
+                    (f["effect"], f["where"], f["probability"]) for f in (result or {}).get("findings", [])
+                ],
                 "held_out": {
-                    o: (fit.get("held_out_before", {}).get(o), fit.get("held_out_refit_only", {}).get(o), after)
+                    o: (
+                        fit.get("held_out_before", {}).get(o),
+                        fit.get("held_out_refit_only", {}).get(o),
+                        after,
+                    )
                     for o, after in (fit.get("held_out_after") or {}).items()
                 },
                 "gain": (result or {}).get("held_out_gain"),
@@ -526,7 +581,8 @@ def real_table(entries: Sequence[dict[str, Any]]) -> Any:
     for x in entries:
         found = "\n".join(f"{a} at {b} ({p:.2f})" for a, b, p in x["findings"]) or (x["error"] or "")
         rms = "\n".join(
-            f"{o}: " + " → ".join("–" if v is None else f"{v:.4g}" for v in three) for o, three in x["held_out"].items()
+            f"{o}: " + " → ".join("–" if v is None else f"{v:.4g}" for v in three)
+            for o, three in x["held_out"].items()
         )
         t.add_row(x["name"], x["verdict"], found, rms, f"{x['seconds'] or 0:.0f}")
         for line in x["published"]:
@@ -557,7 +613,12 @@ def command(args: Any) -> int:
     console = Console()
     if args.real:
         entries = real(
-            args.cases, args.out, args.apart.split(",") if args.apart else (), args.scheduler, args.workers, Reporter()
+            args.cases,
+            args.out,
+            args.apart.split(",") if args.apart else (),
+            args.scheduler,
+            args.workers,
+            Reporter(),
         )
         console.print(real_table(entries))
         return 0

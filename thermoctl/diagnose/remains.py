@@ -1,4 +1,5 @@
 """What an explanation leaves of the recordings unexplained, and whether that can be noise."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -11,11 +12,16 @@ from thermoctl.diagnose.evidence import Colour, possible
 from thermoctl.diagnose.explain import Case, Explanation, noise_of
 from thermoctl.diagnose.screen import Metric
 
-REMAINS = -9.0              # log10 p of an unknown input, in the residual's own colour, from which something is left over
-WHITE = -3.5                # the same where every residual is white, so that the chance is what it should be
-RHYTHM = -5.0               # the same of a period, whose chance in noise of any colour is what it should be (tests/diagnose)
-TOGETHER = -5.0             # the same of what two sensors share, whose chance is known, too
-UNLIKE_COLOUR, MOST = -30.0, 0.12       # the same in white noise's metric, and its share of the residual's energy beyond white noise
+REMAINS = -9.0  # log10 p of an unknown input, in the residual's own colour, from which something is left over
+WHITE = -3.5  # the same where every residual is white, so that the chance is what it should be
+RHYTHM = (
+    -5.0
+)  # the same of a period, whose chance in noise of any colour is what it should be (tests/diagnose)
+TOGETHER = -5.0  # the same of what two sensors share, whose chance is known, too
+UNLIKE_COLOUR, MOST = (
+    -30.0,
+    0.12,
+)  # the same in white noise's metric, and its share of the residual's energy beyond white noise
 
 
 def metric_of(case: Case, e: Explanation, colours: Sequence[Colour] | None) -> Metric:
@@ -53,10 +59,17 @@ def _remains(case: Case, e: Explanation) -> locate.Suspect | None:
         rig = Rig(e.plant, metric.drives, [t.columns for t in case.tables])
         looks = [*locate.patterns(metric, rig), *locate.suspects(metric)]
         limit = WHITE - log10(max(len(looks), 1)) if e.white else REMAINS if colours else UNLIKE_COLOUR
-        found = [s for s in looks if s.log_p < (2 * limit if s.kind == "output" else limit)]    # sensors wander by themselves
-        if not found and colours:       # what follows a signal may ring: a rhythm of its own is said where nothing else explains it
+        found = [
+            s for s in looks if s.log_p < (2 * limit if s.kind == "output" else limit)
+        ]  # sensors wander by themselves
+        if (
+            not found and colours
+        ):  # what follows a signal may ring: a rhythm of its own is said where nothing else explains it
             found = [s for s in locate.rhythms(metric)[:1] if s.log_p < RHYTHM]
-        return min(found, key=lambda s: s.log_p, default=None), float(metric.residual @ metric.residual) - len(metric.residual)
+        return min(found, key=lambda s: s.log_p, default=None), float(
+            metric.residual @ metric.residual
+        ) - len(metric.residual)
+
     tinted = [strongest(c)[0] for c in possible(e.fit.residuals, [n.sigma for n in case.noise])]
     if all(tinted):
         return tinted[0]
@@ -64,4 +77,6 @@ def _remains(case: Case, e: Explanation) -> locate.Suspect | None:
         plain, beyond = strongest(None)
         if plain and plain.kind != "output" and plain.gain > MOST * beyond:
             return plain
-    return next((s for s in locate.together(e.fit.residuals, e.colours, e.plant)[:1] if s.log_p < TOGETHER), None)
+    return next(
+        (s for s in locate.together(e.fit.residuals, e.colours, e.plant)[:1] if s.log_p < TOGETHER), None
+    )

@@ -4,6 +4,7 @@
 entries in full; 5 decide: name, set that cannot be told apart, unknown, or nothing; 6 propose the experiment that would
 separate rivals; 7 show on data that took no part what the finding is worth. `diagnose` does it all and writes the result.
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -45,10 +46,13 @@ from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import read_table
 from thermoctl.yamlfile import InputError
 
-NAME = 0.9                  # one explanation is named alone from this probability on
-MANY = 3                    # effects at once, which one that the catalogue lacks explains better
-FAR = 10.0                  # residual (in sensor noise) from which a moving rig is also looked at through an observer
-TEMPERING = 1.9, 3.0        # how much less the score decides than a perfect likelihood would, in white and in coloured noise
+NAME = 0.9  # one explanation is named alone from this probability on
+MANY = 3  # effects at once, which one that the catalogue lacks explains better
+FAR = 10.0  # residual (in sensor noise) from which a moving rig is also looked at through an observer
+TEMPERING = (
+    1.9,
+    3.0,
+)  # how much less the score decides than a perfect likelihood would, in white and in coloured noise
 
 
 def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
@@ -66,14 +70,28 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     _check_noise(case, base, notes)
     base = case.scored(base.plant, [], [], base.fit)
     if quiet := doubt.still(case.drives, case.noise):
-        return Diagnosis("consistent", base, base, [], [look(case, base, entries)], [], None, held_out(case, base, base), [*notes, quiet], None,
-                         start)
+        return Diagnosis(
+            "consistent",
+            base,
+            base,
+            [],
+            [look(case, base, entries)],
+            [],
+            None,
+            held_out(case, base, base),
+            [*notes, quiet],
+            None,
+            start,
+        )
     first = look(case, base, entries)
     clock = _clock(case, base, base, first)
     followed = None
     if clock:
-        most = 0        # a shifted clock that leaves nothing to explain
-    elif max(case.excess(base).values(), default=0.0) > FAR and Rig(base.plant, case.drives, [t.columns for t in case.tables]).velocities:
+        most = 0  # a shifted clock that leaves nothing to explain
+    elif (
+        max(case.excess(base).values(), default=0.0) > FAR
+        and Rig(base.plant, case.drives, [t.columns for t in case.tables]).velocities
+    ):
         followed = following(case, base, entries, most)
     if followed:
         current, reference, rivals = followed
@@ -93,7 +111,9 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
         tinted = look(case, base, entries, coloured=True)
         if tinted.directions:
             best = tinted.directions[0]
-            if log_p(best.gain / inflation(tinted.directions), best.dims) + best.elsewhere < threshold(tinted):
+            if log_p(best.gain / inflation(tinted.directions), best.dims) + best.elsewhere < threshold(
+                tinted
+            ):
                 tinted.finalists = compete(case, tinted, finalists(tinted.directions))
             if tinted.finalists and counts(case, tinted, tinted.finalists[0], entries):
                 left_over = True
@@ -111,15 +131,26 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
             rivals = [r for r in rivals if len(r.effects) == len(kept.effects)]
     # That something is missing was proved on data that took no part; which of the rivals it is, all of the data decide, among
     # those that predict better than the plant, too.
-    better = [e for e in rivals if e.counts and e.score < current.score and len(e.effects) == len(current.effects)]
+    better = [
+        e for e in rivals if e.counts and e.score < current.score and len(e.effects) == len(current.effects)
+    ]
     if better and current is reference:
-        leader = next((e for e in sorted(better, key=lambda e: e.score) if prediction(case, base, e)[0] < 1.0), None)
+        leader = next(
+            (e for e in sorted(better, key=lambda e: e.score) if prediction(case, base, e)[0] < 1.0), None
+        )
         if leader:
             rivals = [current, *(e for e in rivals if e is not leader)]
             current = reference = leader
     if current.effects and current is reference and remains(case, current):
         # What leaves something is ruled out by what fits about as well and leaves nothing.
-        near = sorted((e for e in rivals if len(e.effects) == len(current.effects) and abs(e.score - current.score) < ACCEPT), key=lambda e: e.score)
+        near = sorted(
+            (
+                e
+                for e in rivals
+                if len(e.effects) == len(current.effects) and abs(e.score - current.score) < ACCEPT
+            ),
+            key=lambda e: e.score,
+        )
         whole = next((e for e in near if prediction(case, base, e)[2] < 1.0 and not remains(case, e)), None)
         if whole:
             current = reference = whole
@@ -133,26 +164,36 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     current.probability = reference.probability
     held = held_out(case, base, current)
     if current.effects:
-        share = (worst ** 2 - 1) / max(before_worst ** 2 - 1, 1e-9)
+        share = (worst**2 - 1) / max(before_worst**2 - 1, 1e-9)
         explained = worst < CLEAN or (share < 0.02 and worst < LARGE)
         if explained and (left := remains(case, current)):
             verdict = "unexplained"
             if left.gain > base.raw - current.raw:
-                current, rivals, worst = base, [], before_worst     # the name explains less than what it leaves
+                current, rivals, worst = base, [], before_worst  # the name explains less than what it leaves
                 held = held_out(case, base, current)
-            notes.append(f"beside what is named, something remains that no entry of the catalogue explains: {left.sentence()}")
+            notes.append(
+                f"beside what is named, something remains that no entry of the catalogue explains: {left.sentence()}"
+            )
         elif explained and len(current.effects) >= MANY:
             verdict = "unexplained"
-            notes.append(f"{len(current.effects)} entries of the catalogue together fit; so many at once rather stand in for one thing that it lacks")
+            notes.append(
+                f"{len(current.effects)} entries of the catalogue together fit; so many at once rather stand in for one thing that it lacks"
+            )
         elif explained:
             verdict = "explained" if current.probability >= NAME else "ambiguous"
         else:
             verdict = "unexplained"
             if energy(case, current) > 0.55 * energy(case, base):
-                current, rivals, worst = base, [], before_worst     # what was found explains too little to be named
+                current, rivals, worst = (
+                    base,
+                    [],
+                    before_worst,
+                )  # what was found explains too little to be named
                 held = held_out(case, base, current)
-            notes.append(f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains"
-                         + (f": {left.sentence()}" if (left := remains(case, current)) else ""))
+            notes.append(
+                f"what remains ({worst:.1f} times the sensor's noise at worst) no entry of the catalogue explains"
+                + (f": {left.sentence()}" if (left := remains(case, current)) else "")
+            )
     else:
         left = remains(case, current)
         verdict = "unexplained" if before_worst > LARGE or left_over or left else "consistent"
@@ -161,13 +202,17 @@ def examine(case: Case, entries: Mapping[str, Any], most: int = 3) -> Diagnosis:
     if clock:
         verdict, left_over = "unexplained", True
         notes.insert(0, clock)
-    elif refused := doubt.other_rig(current.fit, [d.y for d in case.drives], excess, LARGE, list(case.plant.parameters)):
+    elif refused := doubt.other_rig(
+        current.fit, [d.y for d in case.drives], excess, LARGE, list(case.plant.parameters)
+    ):
         verdict, current, rivals = "unexplained", base, []
         held = held_out(case, base, base)
         notes.insert(0, refused)
     if current.effects and held["data"] == "blocks" and len(case.tables) > 1:
-        notes.append("one recording alone does not determine this well enough to predict another; the held-out figures are of blocks "
-                     "of all recordings, fitted without them")
+        notes.append(
+            "one recording alone does not determine this well enough to predict another; the held-out figures are of blocks "
+            "of all recordings, fitted without them"
+        )
     notes += [c.effect.caution for c in current.effects if c.effect.caution]
     missing = None
     if verdict != "consistent":
@@ -210,12 +255,17 @@ def _clock(case: Case, base: Explanation, found: Explanation, first: Round) -> s
         if again is None or again.output != guess.output:
             break
         ahead = again.seconds
-    per_sample = base.fit.samples / max(best.fit.samples, 1)        # the shift takes a few samples away
+    per_sample = base.fit.samples / max(best.fit.samples, 1)  # the shift takes a few samples away
     better = seconds > 0 and best.raw * per_sample < found.raw - ACCEPT
-    if better and (found.effects or (max(after.excess(best).values()) < CLEAN and smooth(after, best, coloured=True) > REMAINS)):
-        return (f"{guess.output}: its clock runs about {seconds:.3g} s ahead of the other channels' (shifted back, the residual falls from "
-                f"{base.fit.rms()[guess.output]:.3g} to {best.fit.rms()[guess.output]:.3g}); no sensor reads ahead of time. "
-                "Put the channels on one clock and diagnose again")
+    if better and (
+        found.effects
+        or (max(after.excess(best).values()) < CLEAN and smooth(after, best, coloured=True) > REMAINS)
+    ):
+        return (
+            f"{guess.output}: its clock runs about {seconds:.3g} s ahead of the other channels' (shifted back, the residual falls from "
+            f"{base.fit.rms()[guess.output]:.3g} to {best.fit.rms()[guess.output]:.3g}); no sensor reads ahead of time. "
+            "Put the channels on one clock and diagnose again"
+        )
     return None
 
 
@@ -236,8 +286,10 @@ def _check_noise(case: Case, base: Explanation, notes: list[str]) -> None:
     for j, (o, n) in enumerate(zip(case.plant.outputs.values(), case.noise, strict=True)):
         white = white_sigma([r[:, j] for r in base.fit.residuals])
         if white > 1.3 * n.sigma:
-            notes.append(f"{o.name}: its white noise is {white:.3g} {o.unit or ''}, more than the plant's {n.sigma:.3g}; "
-                         "the larger figure is used")
+            notes.append(
+                f"{o.name}: its white noise is {white:.3g} {o.unit or ''}, more than the plant's {n.sigma:.3g}; "
+                "the larger figure is used"
+            )
             changed.append(Noise(white))
         else:
             changed.append(n)
@@ -272,9 +324,15 @@ def _weigh(current: Explanation, rivals: Sequence[Explanation]) -> None:
         e.probability = float(min(w, 0.995))
 
 
-def diagnose(plant_path: str | Path, recording_paths: Sequence[str | Path], out_dir: str | Path,
-             effects: Sequence[Path] = (), progress: Callable[[str], None] | None = None,
-             drivable: Sequence[str] = (), limits: experiment.Limits = experiment.NONE) -> dict[str, Any]:
+def diagnose(
+    plant_path: str | Path,
+    recording_paths: Sequence[str | Path],
+    out_dir: str | Path,
+    effects: Sequence[Path] = (),
+    progress: Callable[[str], None] | None = None,
+    drivable: Sequence[str] = (),
+    limits: experiment.Limits = experiment.NONE,
+) -> dict[str, Any]:
     """Diagnose recordings against a plant file and write diagnosis.json, plant.yaml and report.html into `out_dir`, and where
     nothing is decided next_experiment.yaml and .csv, all or nothing. `drivable`: inputs that an experiment may drive (default:
     those that moved and are not the surroundings), `limits` of inputs and outputs that it keeps. Returns the JSON's content.
@@ -301,10 +359,15 @@ def diagnose(plant_path: str | Path, recording_paths: Sequence[str | Path], out_
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent) as folder:
         part = Path(folder)
-        save(found.final.plant, part / "plant.yaml", note=f"{Path(plant_path).name}, refitted"
-             + "".join(f"; with {c.effect.name} at {c.place.where}" for c in found.final.effects))
+        save(
+            found.final.plant,
+            part / "plant.yaml",
+            note=f"{Path(plant_path).name}, refitted"
+            + "".join(f"; with {c.effect.name} at {c.place.where}" for c in found.final.effects),
+        )
         load(part / "plant.yaml")
         from thermoctl.diagnose.page import write_report
+
         write_report(case, found, part / "report.html")
         (part / "diagnosis.json").write_text(json.dumps(found.result, indent=1, allow_nan=False) + "\n")
         written = experiment.write(part, case, *proposed) if proposed else []

@@ -113,7 +113,9 @@ class Row:
 
 
 def _same_place(effect: str, a: str, b: str) -> bool:
-    return a == b or (effect in SYMMETRIC and "-" in a and tuple(a.split("-")) == tuple(reversed(b.split("-"))))
+    return a == b or (
+        effect in SYMMETRIC and "-" in a and tuple(a.split("-")) == tuple(reversed(b.split("-")))
+    )
 
 
 def score(
@@ -163,7 +165,8 @@ def score(
         (
             float(f["probability"]),
             # exactly: explanations exclude each other
-            any(f["effect"] == e and _same_place(e, f["where"], w) for e, w in truth) or (f["effect"], f["where"]) in also,
+            any(f["effect"] == e and _same_place(e, f["where"], w) for e, w in truth)
+            or (f["effect"], f["where"]) in also,
         )
         for f in [*result["findings"], *result["alternatives"]]
     ]
@@ -192,8 +195,12 @@ def score(
         exact=exact,
         alike=alike,
         placed=all(map(at, right_by_name)) if right_by_name else None,
-        inside=all(any(near(f, t) for f in everything) for t in truth) if truth and kind != "unknown" else None,
-        inside_exact=all(t[0] in {e for e, _ in everything} for t in truth) if truth and kind != "unknown" else None,
+        inside=all(any(near(f, t) for f in everything) for t in truth)
+        if truth and kind != "unknown"
+        else None,
+        inside_exact=all(t[0] in {e for e, _ in everything} for t in truth)
+        if truth and kind != "unknown"
+        else None,
         set_size=len({e for e, _ in everything}),
         confident=any(float(f["probability"]) >= CONFIDENT for f in result["findings"]),
         onset_error=_onset(answer.get("onset"), result["findings"], duration_s),
@@ -215,7 +222,9 @@ def _matched(findings: Sequence, truth: Sequence, near) -> bool:
     )
 
 
-def _onset(true: float | None, findings: Sequence[Mapping[str, Any]], duration_s: float | None) -> float | None:
+def _onset(
+    true: float | None, findings: Sequence[Mapping[str, Any]], duration_s: float | None
+) -> float | None:
     starts = [f["when"][0][0] for f in findings if f.get("when")]
     if true is None or not starts or not duration_s:
         return None
@@ -245,7 +254,9 @@ def _parameters(
         if found is None:
             continue
         for name, value in values.items():
-            estimate = next((p for n, p in found["parameters"].items() if n == name or n.startswith(f"{name}_")), None)
+            estimate = next(
+                (p for n, p in found["parameters"].items() if n == name or n.startswith(f"{name}_")), None
+            )
             if estimate is not None and value:
                 wide = 1.96 * (estimate["sd"] or 0.0)
                 rows.append(
@@ -259,7 +270,9 @@ def _parameters(
     return rows
 
 
-def reliability(pairs: Sequence[tuple[float, bool]], bins: int = 10) -> tuple[list[dict[str, float]], float | None]:
+def reliability(
+    pairs: Sequence[tuple[float, bool]], bins: int = 10
+) -> tuple[list[dict[str, float]], float | None]:
     """Reliability diagram [{probability, right, n}] over bins of equal width, and the expected calibration error."""
     groups: dict[int, list[tuple[float, bool]]] = {}
     for p, right in pairs:
@@ -292,8 +305,14 @@ def found_by_size(sizes: Sequence[float], found: Sequence[bool]) -> dict[str, fl
     likely = -np.logaddexp(0.0, np.where(hit, -odds, odds)).sum(axis=2)
     i, j = np.unravel_index(int(np.argmax(likely)), likely.shape)
     inside = half[2 * (likely.max() - likely.max(axis=1)) <= 3.84]
-    return {"half": float(half[i]), "low": float(inside[0]), "high": float(inside[-1]),
-            "nine_in_ten": float(half[i] * 9 ** (1 / slope[j])), "slope": float(slope[j]), "n": len(sizes)}
+    return {
+        "half": float(half[i]),
+        "low": float(inside[0]),
+        "high": float(inside[-1]),
+        "nine_in_ten": float(half[i] * 9 ** (1 / slope[j])),
+        "slope": float(slope[j]),
+        "n": len(sizes),
+    }
 
 
 def _quantile(values: Iterable[float | None], q: float) -> float | None:
@@ -373,7 +392,9 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
             if len(r.truth) == 1
             else "two"
         )
-        confusion.setdefault(true, Counter())[("ambiguous: " if r.verdict == "ambiguous" else "") + r.called] += 1
+        confusion.setdefault(true, Counter())[
+            ("ambiguous: " if r.verdict == "ambiguous" else "") + r.called
+        ] += 1
     return {
         "figures": figures,
         "shares": {k: s.plain() for k, s in shares.items()},
@@ -384,9 +405,12 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "reliability": table,
         "found_by_size": by_size,
         "confusion": {t: dict(c) for t, c in sorted(confusion.items())},
-        "by_family": {f: _brief([r for r in rows if r.family == f]) for f in sorted({r.family for r in rows})},
+        "by_family": {
+            f: _brief([r for r in rows if r.family == f]) for f in sorted({r.family for r in rows})
+        },
         "by_effect": {
-            e: _brief([r for r in single if r.truth[0][0] == e]) for e in sorted({r.truth[0][0] for r in single})
+            e: _brief([r for r in single if r.truth[0][0] == e])
+            for e in sorted({r.truth[0][0] for r in single})
         },
     }
 

@@ -9,6 +9,7 @@ plant (`Model.respond`), its change of the outputs adds directly. New nodes are 
 Rows are sums over blocks of samples (white noise stays white), so that thousands of directions fit in memory; shorter blocks
 where something moves.
 """
+
 from __future__ import annotations
 
 import itertools
@@ -24,25 +25,26 @@ from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
 from thermoctl.plant.simulate import Drive, Simulation
 
-ROWS = 8_000               # rows of the screening, all recordings together
-FINE_ROWS = 64_000         # of what moves: it passes a pattern's period, or turns, within a block's time
-EPSILON = 1e-4              # amplitude at which a direction is taken
+ROWS = 8_000  # rows of the screening, all recordings together
+FINE_ROWS = 64_000  # of what moves: it passes a pattern's period, or turns, within a block's time
+EPSILON = 1e-4  # amplitude at which a direction is taken
 CHUNK = 96
-ONSETS = 24                 # of a grid over the recordings
-NEAR = 4.0                  # a lag or delay this many times shorter or longer than the one looked at changes the outputs in proportion
+ONSETS = 24  # of a grid over the recordings
+NEAR = 4.0  # a lag or delay this many times shorter or longer than the one looked at changes the outputs in proportion
 
 
 @dataclass
 class Direction:
     """One candidate at one shape: how much it would explain and where its refit should start."""
+
     candidate: Candidate
     shape: dict[str, float]
     gain: float
     dims: int
     start: dict[str, float]
-    vector: np.ndarray | None = None        # unit direction in projected space, for likeness between candidates
-    excited: float = 0.0                    # share of the direction that the plant's own parameters leave
-    elsewhere: float = 0.0                  # log10 of how many shapes this one was picked from by the residual itself
+    vector: np.ndarray | None = None  # unit direction in projected space, for likeness between candidates
+    excited: float = 0.0  # share of the direction that the plant's own parameters leave
+    elsewhere: float = 0.0  # log10 of how many shapes this one was picked from by the residual itself
 
     @property
     def log_p(self) -> float:
@@ -58,7 +60,9 @@ def log_p(gain: float, dims: int) -> float:
 def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
     with np.errstate(divide="ignore"):
         value = np.log10(gammaincc(0.5 * dims, 0.5 * np.maximum(gain, 0.0)))
-    return np.where(np.isfinite(value), value, -(gain - (dims - 2) * np.log(np.maximum(gain, 1.0))) / (2 * np.log(10)))
+    return np.where(
+        np.isfinite(value), value, -(gain - (dims - 2) * np.log(np.maximum(gain, 1.0))) / (2 * np.log(10))
+    )
 
 
 class Metric:
@@ -74,15 +78,16 @@ class Metric:
             run = self.model.run(d, fitted.values[r], fitted.dx0[r], sensitivities=True)
             columns.append(run.dy)
             self.runs.append(Simulation(run.t, run.x, run.y))
-        self.residual = np.concatenate([self.rows(r, d.y - run.y)
-                                        for r, (d, run) in enumerate(zip(self.drives, self.runs, strict=True))])
+        self.residual = np.concatenate(
+            [self.rows(r, d.y - run.y) for r, (d, run) in enumerate(zip(self.drives, self.runs, strict=True))]
+        )
         basis = np.zeros((len(self.residual), len(self.problem.unknowns)))
         at = 0
         for r, dy in enumerate(columns):
             assert dy is not None
             used = np.flatnonzero(self.problem.columns[r] >= 0)
             block = self.rows(r, dy[:, :, used])
-            basis[at:at + len(block), self.problem.columns[r, used]] = block
+            basis[at : at + len(block), self.problem.columns[r, used]] = block
             at += len(block)
         free = [k for k, (q, _) in enumerate(self.problem.unknowns) if q not in fitted.at_bound]
         basis = basis[:, free]
@@ -98,7 +103,7 @@ class Metric:
         parts = []
         for j in range(len(self.problem.noise)):
             w = self.problem.whiten(r, j, e[:, j])
-            if w.ndim == 1:             # the residual; slopes may be as large as their units make them (W/K^4)
+            if w.ndim == 1:  # the residual; slopes may be as large as their units make them (W/K^4)
                 w = np.clip(w, -1e6, 1e6)
             b = self.blocks
             if b > 1 and len(w):
@@ -123,6 +128,7 @@ class Metric:
 
 # ------------------------------------------------------------------------------------------------- first-order changes
 
+
 class Trajectory:
     """The signals of one recording at the fit, for evaluating changed equations."""
 
@@ -130,18 +136,27 @@ class Trajectory:
         d, run = metric.drives[r], metric.runs[r]
         self.drive, self.run = d, run
         self.values: dict[str, np.ndarray | float] = {
-            **{c: _hold(rig.columns[r][c]) for c in rig.spare}, **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
+            **{c: _hold(rig.columns[r][c]) for c in rig.spare},
+            **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
             **{i + STRAIGHT: u for i, u in zip(rig.plant.inputs, d.u.T, strict=False)},
             **dict(zip(metric.model.parameters, map(float, metric.fit.values[r]), strict=True)),
-            **dict(zip(metric.model.states, run.x.T, strict=True)), "t": d.t, "pi": np.pi}
+            **dict(zip(metric.model.states, run.x.T, strict=True)),
+            "t": d.t,
+            "pi": np.pi,
+        }
         self.first = d.first
         # inputs that hold, as they were until each sample
-        self.until = {i: np.concatenate([u[:1], u[:-1]]) for i, u, linear in
-                      zip(rig.plant.inputs, d.u.T, d.linear, strict=False) if not linear}
+        self.until = {
+            i: np.concatenate([u[:1], u[:-1]])
+            for i, u, linear in zip(rig.plant.inputs, d.u.T, d.linear, strict=False)
+            if not linear
+        }
 
     def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
         """The value of an expression along the trajectory."""
-        return np.broadcast_to(np.asarray(ex.evaluate(e, {**self.values, **extra}), float), self.drive.t.shape)
+        return np.broadcast_to(
+            np.asarray(ex.evaluate(e, {**self.values, **extra}), float), self.drive.t.shape
+        )
 
 
 def _hold(column: np.ndarray) -> np.ndarray:
@@ -150,7 +165,9 @@ def _hold(column: np.ndarray) -> np.ndarray:
     return column[np.where(index < 0, int(np.argmax(good)), index)]
 
 
-def changes(base: Plant, extended: Plant, values: Mapping[str, float], at: Trajectory) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+def changes(
+    base: Plant, extended: Plant, values: Mapping[str, float], at: Trajectory
+) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
     """What the extension changes along the trajectory: slopes dx/dt by state index, outputs by output index."""
     extra: dict[str, np.ndarray | float] = {k: v for k, v in values.items()}
     for n in extended.nodes.values():
@@ -163,7 +180,7 @@ def changes(base: Plant, extended: Plant, values: Mapping[str, float], at: Traje
             continue
         for end, sign in ((f.source, -1.0), (f.target, 1.0)):
             if end in base.nodes:
-                delta = touched.setdefault(end, [])     # type: ignore[arg-type]
+                delta = touched.setdefault(end, [])  # type: ignore[arg-type]
                 delta.append((f.rate, sign))
                 if old is not None:
                     delta.append((old.rate, -sign))
@@ -181,7 +198,9 @@ def changes(base: Plant, extended: Plant, values: Mapping[str, float], at: Traje
             for f in base.flows.values():
                 if node in (f.source, f.target):
                     net += (1.0 if f.target == node else -1.0) * at.value(f.rate, extra)
-            slopes[states.index(node)] = net / at.value(changed.storage, extra) - net / at.value(n.storage, extra)
+            slopes[states.index(node)] = net / at.value(changed.storage, extra) - net / at.value(
+                n.storage, extra
+            )
     outputs = {}
     for j, (key, o) in enumerate(base.outputs.items()):
         new = extended.outputs[key]
@@ -199,7 +218,10 @@ def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], 
             net = ex.add(net, f.rate)
         if f.source == node:
             net = ex.add(net, ex.neg(f.rate))
-    first = {**{k: float(np.asarray(v).flat[0]) for k, v in at.values.items()}, **{k: float(np.asarray(v).flat[0]) for k, v in extra.items()}}
+    first = {
+        **{k: float(np.asarray(v).flat[0]) for k, v in at.values.items()},
+        **{k: float(np.asarray(v).flat[0]) for k, v in extra.items()},
+    }
     start = float(ex.evaluate(n.initial, first, lambda key: at.first[key]))
     t = at.drive.t
     storage = at.value(n.storage, extra)
@@ -222,9 +244,11 @@ def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], 
 
 # ---------------------------------------------------------------------------------------------------------- screening
 
+
 @dataclass
 class _Column:
     """A direction to be built: per recording its forces and its changes of outputs."""
+
     item: tuple
     forces: list[dict[int, np.ndarray]] = field(default_factory=list)
     outputs: list[dict[int, np.ndarray]] = field(default_factory=list)
@@ -234,7 +258,7 @@ def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Seq
     """Whitened rows (rows, k) of columns, a chunk at a time."""
     buffers: dict[str, np.ndarray] = {}
     for at in range(0, len(columns), CHUNK):
-        part = columns[at:at + CHUNK]
+        part = columns[at : at + CHUNK]
         blocks = []
         for r, d in enumerate(metric.drives):
             forces, values = [], []
@@ -245,7 +269,9 @@ def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Seq
             shape = (len(d.t), len(metric.model.outputs), len(part))
             if forces:
                 q = np.nan_to_num(np.stack(values, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
-                dy = metric.model.respond(d, metric.fit.values[r], metric.fit.dx0[r], forces, q, len(part), buffers=buffers)
+                dy = metric.model.respond(
+                    d, metric.fit.values[r], metric.fit.dx0[r], forces, q, len(part), buffers=buffers
+                )
             else:
                 dy = np.zeros(shape)
             for c, column in enumerate(part):
@@ -255,9 +281,14 @@ def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Seq
         yield part, np.concatenate(blocks)
 
 
-def screen(metric: Metric, rig: Rig, found: Sequence[Candidate], draws: np.ndarray | None = None,
-           progress: Callable[[float], None] | None = None,
-           edges: np.ndarray | None = None) -> tuple[list[Direction], np.ndarray | None]:
+def screen(
+    metric: Metric,
+    rig: Rig,
+    found: Sequence[Candidate],
+    draws: np.ndarray | None = None,
+    progress: Callable[[float], None] | None = None,
+    edges: np.ndarray | None = None,
+) -> tuple[list[Direction], np.ndarray | None]:
     """Every candidate's best direction, best first; `edges`: onsets to look at instead of the whole grid. With `draws` (rows, B)
     of standard normal noise, as many rows as a `sketch` has, also, per draw, the smallest log10 p that any candidate would have
     shown by chance (B,)."""
@@ -276,7 +307,9 @@ def screen(metric: Metric, rig: Rig, found: Sequence[Candidate], draws: np.ndarr
         for k, column in enumerate(part):
             candidate, group, _, count = column.item
             entries = pending.setdefault((id(candidate), group), [])
-            entries.append((column, rows[:, k].copy(), float(full[k]), None if by_chance is None else by_chance[k]))
+            entries.append(
+                (column, rows[:, k].copy(), float(full[k]), None if by_chance is None else by_chance[k])
+            )
             if len(entries) < count:
                 continue
             del pending[id(candidate), group]
@@ -296,28 +329,47 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
     duration = max(float(d.t[-1]) for d in metric.drives)
     step, sample = duration / ONSETS, min(float(np.median(np.diff(d.t))) for d in metric.drives)
     while step > 0.5 * sample:
-        near = np.concatenate([found.shape[k] + step * np.arange(-4, 5) / 4 for k in ("onset", "start", "end")
-                               if found.shape.get(k, np.inf) <= duration])
-        better, _ = screen(metric, rig, [found.candidate], edges=np.unique(near[(near >= 0) & (near < duration)]))
+        near = np.concatenate(
+            [
+                found.shape[k] + step * np.arange(-4, 5) / 4
+                for k in ("onset", "start", "end")
+                if found.shape.get(k, np.inf) <= duration
+            ]
+        )
+        better, _ = screen(
+            metric, rig, [found.candidate], edges=np.unique(near[(near >= 0) & (near < duration)])
+        )
         if better and better[0].gain > found.gain:
             found = better[0]
         step /= 4
     return found
 
 
-def _columns(c: Candidate, metric: Metric, at: Sequence[Trajectory], edges: np.ndarray | None = None) -> list[_Column]:
+def _columns(
+    c: Candidate, metric: Metric, at: Sequence[Trajectory], edges: np.ndarray | None = None
+) -> list[_Column]:
     """The columns that one candidate needs. item = (candidate, group, (shape, dim), columns in the group). `edges`: onsets to
     look at instead of the whole grid."""
     effect = c.effect
-    grids = {key: shape_grid(kind, c, metric.runs) if edges is None or kind != "onsets" else [{"onset": float(v)} for v in edges]
-             for key, kind in effect.shapes.items() if kind not in ("phases", "windows")}
+    grids = {
+        key: shape_grid(kind, c, metric.runs)
+        if edges is None or kind != "onsets"
+        else [{"onset": float(v)} for v in edges]
+        for key, kind in effect.shapes.items()
+        if kind not in ("phases", "windows")
+    }
     windowed = "windows" in effect.shapes.values()
     if windowed:
         duration = max(float(d.t[-1]) for d in metric.drives)
-        grids["window"] = [{"start": float(v), "end": 10 * duration}
-                           for v in (np.linspace(0, duration, ONSETS + 1)[:-1] if edges is None else edges)]
+        grids["window"] = [
+            {"start": float(v), "end": 10 * duration}
+            for v in (np.linspace(0, duration, ONSETS + 1)[:-1] if edges is None else edges)
+        ]
     phases = [{"phase": 0.0}, {"phase": float(np.pi / 2)}] if "phases" in effect.shapes.values() else [{}]
-    shapes = [{k: v for part in combination for k, v in part.items()} for combination in itertools.product(*grids.values())] or [{}]
+    shapes = [
+        {k: v for part in combination for k, v in part.items()}
+        for combination in itertools.product(*grids.values())
+    ] or [{}]
     amplitudes = [p for p in effect.parameters if p.amplitude]
     dims = effect.dims if amplitudes else ((1.0,),)
     out = []
@@ -346,8 +398,12 @@ def _columns(c: Candidate, metric: Metric, at: Sequence[Trajectory], edges: np.n
 
 def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float]) -> dict[str, float]:
     """The effect's parameters at amplitudes s and a shape."""
-    known = {"s": s[0] if len(s) else 0.0, **{f"s{k + 1}": v for k, v in enumerate(s) if k}, **shape,
-             "first_air": c.rig.drives[0].first.get(c.rig.air or "", 0.0)}
+    known = {
+        "s": s[0] if len(s) else 0.0,
+        **{f"s{k + 1}": v for k, v in enumerate(s) if k},
+        **shape,
+        "first_air": c.rig.drives[0].first.get(c.rig.air or "", 0.0),
+    }
     out = {}
     for p in c.effect.parameters:
         if p.shape:
@@ -360,8 +416,13 @@ def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float
     return out
 
 
-def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float, np.ndarray | None]], metric: Metric,
-           best: dict[int, Direction], chance: np.ndarray | None) -> np.ndarray | None:
+def _score(
+    c: Candidate,
+    entries: list[tuple[_Column, np.ndarray, float, np.ndarray | None]],
+    metric: Metric,
+    best: dict[int, Direction],
+    chance: np.ndarray | None,
+) -> np.ndarray | None:
     rows = np.stack([e[1] for e in entries], axis=1)
     full = np.array([e[2] for e in entries])
     shape, dim = entries[0][0].item[2]
@@ -391,7 +452,12 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float, np.ndar
         if gains < 0:
             return chance
         a, b, amplitude = at
-        if a == 0 and b < len(edges) and m[b, b] > 1e-12 * max(full) ** 2 and g[b] ** 2 / m[b, b] > 0.8 * gains:
+        if (
+            a == 0
+            and b < len(edges)
+            and m[b, b] > 1e-12 * max(full) ** 2
+            and g[b] ** 2 / m[b, b] > 0.8 * gains
+        ):
             # Heat that ends and a lack of it that begins look alike where parameters absorb a constant: what begins is likelier.
             a, b, amplitude = b, len(edges), g[b] / m[b, b]
             gains = g[a] ** 2 / m[a, a]
@@ -412,7 +478,9 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float, np.ndar
         chance = np.minimum(chance, _log_p(np.einsum("kb,kl,lb->b", z, inverse, z), int(useful.sum())))
     sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
     coefficient = np.zeros(len(g))
-    coefficient[useful] = np.linalg.pinv(sub, rcond=1e-8, hermitian=True) @ (g[useful] / scale[useful]) / scale[useful]
+    coefficient[useful] = (
+        np.linalg.pinv(sub, rcond=1e-8, hermitian=True) @ (g[useful] / scale[useful]) / scale[useful]
+    )
     gain = float(g @ coefficient)
     if len(g) == 1:
         p = amplitudes[0] if amplitudes else None
@@ -427,28 +495,61 @@ def _score(c: Candidate, entries: list[tuple[_Column, np.ndarray, float, np.ndar
             gain = 0.0
     if "phases" in c.effect.shapes.values():
         s = [float(np.hypot(*coefficient))]
-        shape = {**{k: v for k, v in shape.items() if k != "phase"}, "phase": float(np.arctan2(coefficient[1], coefficient[0]))}
+        shape = {
+            **{k: v for k, v in shape.items() if k != "phase"},
+            "phase": float(np.arctan2(coefficient[1], coefficient[0])),
+        }
     elif amplitudes:
         s = list(np.array([e[0].item[2][1] for e in entries]).T @ coefficient)
     else:
         s = [1.0]
-        factor = float(np.clip(coefficient[0], 1e-3, 5.0))          # a short lag or delay changes the outputs in proportion
+        factor = float(
+            np.clip(coefficient[0], 1e-3, 5.0)
+        )  # a short lag or delay changes the outputs in proportion
         shape = {k: v * factor if k == "tau" else v for k, v in shape.items()}
-    _keep(best, c, shape, gain, int(useful.sum()), parameter_values(c, shape, s), rows @ coefficient, float(left[useful].max()))
+    _keep(
+        best,
+        c,
+        shape,
+        gain,
+        int(useful.sum()),
+        parameter_values(c, shape, s),
+        rows @ coefficient,
+        float(left[useful].max()),
+    )
     return chance
 
 
 def _allowed(p, coefficient: float) -> bool:
     at = float(ex.evaluate(p.trial, {"s": coefficient, "tau": 1.0, "first_air": 0.0}))
-    return p.low - 1e-12 <= at <= p.high + 1e-12 or (p.low < p.null < p.high) or \
-        (coefficient > 0 if p.low >= p.null else coefficient < 0 if p.high <= p.null else True)
+    return (
+        p.low - 1e-12 <= at <= p.high + 1e-12
+        or (p.low < p.null < p.high)
+        or (coefficient > 0 if p.low >= p.null else coefficient < 0 if p.high <= p.null else True)
+    )
 
 
-def _keep(best: dict[int, Direction], c: Candidate, shape: dict[str, float], gain: float, dims: int, start: dict[str, float],
-          vector: np.ndarray, excited: float) -> None:
+def _keep(
+    best: dict[int, Direction],
+    c: Candidate,
+    shape: dict[str, float],
+    gain: float,
+    dims: int,
+    start: dict[str, float],
+    vector: np.ndarray,
+    excited: float,
+) -> None:
     size = float(np.linalg.norm(vector))
-    new = Direction(c, {k: v for k, v in shape.items() if k != "picked_from"}, gain, dims, start,
-                    (vector / size).astype(np.float32) if size > 0 else None, excited, float(np.log10(shape.get("picked_from", 1.0))))
+    new = Direction(
+        c,
+        {k: v for k, v in shape.items() if k != "picked_from"},
+        gain,
+        dims,
+        start,
+        (vector / size).astype(np.float32) if size > 0 else None,
+        excited,
+        float(np.log10(shape.get("picked_from", 1.0))),
+    )
     old = best.get(id(c))
     if old is None or new.log_p < old.log_p:
         best[id(c)] = new

@@ -1,5 +1,6 @@
 """The search for what was left out: screen the catalogue from an explanation, refit the best entries in full, keep what
 counts, look again."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -23,27 +24,27 @@ from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulate import Drive, SimulationError
 from thermoctl.yamlfile import InputError
 
-PATIENCE_S = 60.0           # CPU seconds of a diagnosis beyond which it looks at fewer pairs and runners-up,
-HASTE_S = 75.0              # and beyond which it looks for no further effect and at fewer rivals of several
-FINALISTS, ALIKE = 12, 8    # refitted after a screening, and of one effect
-BEGINNINGS = 8              # effects, the best first ones, that are looked at for a second one where something remains
-SPONGE = 1.1                # an unknown function of time that leaves much has to fit better than constant physics by this factor in cost
-LEADERS = 4                 # effects that are refitted once more where parameters ended at the end of their ranges
-ACCEPT = 12.0               # an effect must lower the score by this much beyond its parameters' price
-CLEAN = 1.25                # residual rms over sensor noise up to which the sensors allow no more
+PATIENCE_S = 60.0  # CPU seconds of a diagnosis beyond which it looks at fewer pairs and runners-up,
+HASTE_S = 75.0  # and beyond which it looks for no further effect and at fewer rivals of several
+FINALISTS, ALIKE = 12, 8  # refitted after a screening, and of one effect
+BEGINNINGS = 8  # effects, the best first ones, that are looked at for a second one where something remains
+SPONGE = 1.1  # an unknown function of time that leaves much has to fit better than constant physics by this factor in cost
+LEADERS = 4  # effects that are refitted once more where parameters ended at the end of their ranges
+ACCEPT = 12.0  # an effect must lower the score by this much beyond its parameters' price
+CLEAN = 1.25  # residual rms over sensor noise up to which the sensors allow no more
 # log10 p in white noise's metric of an effect, and of the best smooth unknown beside it, from which no colour of a sensor is likely
 # to have made the first: colour takes up much, or where it is gone leaves nothing
 NO_COLOUR = ((-35.0, -25.0), (-20.0, -3.0))
-MOST_IN_PAIRS = 250         # directions that are looked at two by two
-CHI2_MEDIAN = 0.455         # of one degree of freedom
-LOOK = 0.05                 # chance of noise looking as good as the best direction, below which the best are refitted
-ALARM = 0.005               # chance of noise counting as an effect (twice that in the tail of 1000 draws); unseen data then have their say
-STICKING = 300.0            # times slower than it is screened with dry friction may creep, and is begun a second time: what sticks rests for long
-THRESHOLDS = 3              # times that a threshold at which an effect jumps is sought, each round a refit
-ASTRAY = 0.3                # a refit that gains less than this share of what was screened is begun again, more carefully
-INFLATED = 2.0              # gains of the whole catalogue this much larger than by chance may be other physics that is missing, too
-MARGINAL = 200.0            # a gain in score below this is looked at twice
-DRAWS = 100                 # draws of noise for the chance that any candidate would look as good
+MOST_IN_PAIRS = 250  # directions that are looked at two by two
+CHI2_MEDIAN = 0.455  # of one degree of freedom
+LOOK = 0.05  # chance of noise looking as good as the best direction, below which the best are refitted
+ALARM = 0.005  # chance of noise counting as an effect (twice that in the tail of 1000 draws); unseen data then have their say
+STICKING = 300.0  # times slower than it is screened with dry friction may creep, and is begun a second time: what sticks rests for long
+THRESHOLDS = 3  # times that a threshold at which an effect jumps is sought, each round a refit
+ASTRAY = 0.3  # a refit that gains less than this share of what was screened is begun again, more carefully
+INFLATED = 2.0  # gains of the whole catalogue this much larger than by chance may be other physics that is missing, too
+MARGINAL = 200.0  # a gain in score below this is looked at twice
+DRAWS = 100  # draws of noise for the chance that any candidate would look as good
 
 
 def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, float]]:
@@ -60,15 +61,26 @@ def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, f
             out[p.name] = (-8.0, 8.0)
             continue
         if p.shape == "period":
-            out[p.name] = (0.75 * value, max(value, min(1.33 * value, direction.shape.get("longest", np.inf))))
+            out[p.name] = (
+                0.75 * value,
+                max(value, min(1.33 * value, direction.shape.get("longest", np.inf))),
+            )
             continue
         if p.shape == "level":
             reach = max(abs(value), 1e-9)
-            out[p.name] = (max(p.low, value - 3 * reach), value + 3 * reach) if kind != "small_levels" else (0.0, 5 * reach)
+            out[p.name] = (
+                (max(p.low, value - 3 * reach), value + 3 * reach)
+                if kind != "small_levels"
+                else (0.0, 5 * reach)
+            )
             continue
         if p.shape:
             least = STICKING if kind == "creep_speeds" else 30
-            out[p.name] = (max(p.low, value / least), min(p.high, value * 30)) if kind != "delays" else (0.0, max(value * 8, 0.05 * duration))
+            out[p.name] = (
+                (max(p.low, value / least), min(p.high, value * 30))
+                if kind != "delays"
+                else (0.0, max(value * 8, 0.05 * duration))
+            )
             continue
         floor, ceiling = direction.candidate.bounds(p)
         if np.isfinite(floor) and np.isfinite(ceiling):
@@ -94,7 +106,11 @@ def weaker(direction: Direction, share: float = 0.1) -> Direction:
 def sticking(direction: Direction) -> Direction | None:
     """The direction with a start at dry friction that sticks, from where creep is no slope to follow; None where nothing creeps."""
     effect = direction.candidate.effect
-    start = {p.name: direction.start[p.name] / STICKING for p in effect.parameters if effect.shapes.get(p.shape or "") == "creep_speeds"}
+    start = {
+        p.name: direction.start[p.name] / STICKING
+        for p in effect.parameters
+        if effect.shapes.get(p.shape or "") == "creep_speeds"
+    }
     return dataclasses.replace(direction, start={**direction.start, **start}) if start else None
 
 
@@ -111,20 +127,24 @@ def extend(base: Plant, direction: Direction, drives: Sequence[Drive]) -> tuple[
             value = float(np.clip(value, low + inside, high - inside))
         values[p.name] = value
     plant = direction.candidate.extend(values, ranges)
-    return plant, {p.name: direction.candidate.own(p.name) for p in direction.candidate.effect.parameters
-                   if direction.candidate.own(p.name) in plant.parameters}
+    return plant, {
+        p.name: direction.candidate.own(p.name)
+        for p in direction.candidate.effect.parameters
+        if direction.candidate.own(p.name) in plant.parameters
+    }
 
 
 @dataclass
 class Round:
     """One look at the catalogue from one explanation."""
+
     base: Explanation
     metric: Metric
     rig: Rig
     entries: Mapping[str, Any]
     directions: list[Direction]
     chance: np.ndarray | None
-    inflation: dict[int, float] = field(default_factory=dict)       # by how many effects were added
+    inflation: dict[int, float] = field(default_factory=dict)  # by how many effects were added
     finalists: list[Explanation] = field(default_factory=list)
 
     def trials(self) -> float:
@@ -139,7 +159,9 @@ class Round:
         return float(-np.expm1(self.trials() * np.log1p(-min(10.0 ** self.directions[0].log_p, 1 - 1e-9))))
 
 
-def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool = False) -> Round:
+def look(
+    case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool = False
+) -> Round:
     """Screen the catalogue from an explanation, at the places of the plant as it came: what was left out is the rig's, not that of a
     part which another effect assumed. `coloured`: in the metric of the residual's own colour."""
     model = base.fit.model
@@ -147,11 +169,24 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
     for d in drives:
         model.prepare(d, base.fit.values[drives.index(d)])
     rig = Rig(base.plant, drives, [t.columns for t in case.tables])
-    metric = Metric(dataclasses.replace(base.fit, noise=noise_of(base.colours)) if coloured else base.fit, drives,
-                    FINE_ROWS if rig.velocities else ROWS)
-    added = (base.plant.nodes.keys() | base.plant.flows.keys()) - (case.plant.nodes.keys() | case.plant.flows.keys())
-    found = [c for c in candidates(rig, entries) if c.key not in {e.key for e in base.effects} and not c.place.parts() & added]
-    noise = np.random.default_rng(1).standard_normal((len(metric.sketch(metric.residual[:, None])), draws)) if draws else None
+    metric = Metric(
+        dataclasses.replace(base.fit, noise=noise_of(base.colours)) if coloured else base.fit,
+        drives,
+        FINE_ROWS if rig.velocities else ROWS,
+    )
+    added = (base.plant.nodes.keys() | base.plant.flows.keys()) - (
+        case.plant.nodes.keys() | case.plant.flows.keys()
+    )
+    found = [
+        c
+        for c in candidates(rig, entries)
+        if c.key not in {e.key for e in base.effects} and not c.place.parts() & added
+    ]
+    noise = (
+        np.random.default_rng(1).standard_normal((len(metric.sketch(metric.residual[:, None])), draws))
+        if draws
+        else None
+    )
     ranked, chance = screen(metric, rig, found, noise)
     return Round(base, metric, rig, entries, ranked, chance)
 
@@ -159,8 +194,10 @@ def look(case: Case, base: Explanation, entries: Mapping[str, Any], draws: int =
 def finalists(ranked: Sequence[Direction], count: int = FINALISTS) -> list[Direction]:
     """The best directions, and the best of each effect that is not far behind (of its places at inputs, and of all others: a lag
     of what drives and one of what is read look alike at first order): one per (effect, place)."""
+
     def kind(d: Direction) -> tuple[str, bool]:
         return d.candidate.effect.name, bool(d.candidate.place.input)
+
     taken: dict[tuple[str, str], Direction] = {}
     if not ranked:
         return []
@@ -190,9 +227,11 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
         try:
             plant, own = extend(seen.base.plant, direction, seen.metric.drives)
             effects, owns = [*seen.base.effects, direction.candidate], [*seen.base.own, own]
-            if stepwise:                    # the plant's own parameters first, round the effect as it was screened
+            if stepwise:  # the plant's own parameters first, round the effect as it was screened
                 ranges = {n: plant.parameters[n].range for n in own.values()}
-                plant = _ranged(case.explain(_ranged(plant, dict.fromkeys(ranges)), effects, owns).plant, ranges)
+                plant = _ranged(
+                    case.explain(_ranged(plant, dict.fromkeys(ranges)), effects, owns).plant, ranges
+                )
             e = case.explain(plant, effects, owns, goal=goal + 2 * ACCEPT)
         except (SimulationError, InputError, np.linalg.LinAlgError):
             return None
@@ -207,12 +246,20 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
         stuck = sticking(direction) if direction.gain > 0.5 * strongest else None
         if stuck:
             found.append(tried(stuck))
-        for nearer in (False, True):        # led astray by its first steps: once more step by step, once from nearer to nothing
+        for nearer in (
+            False,
+            True,
+        ):  # led astray by its first steps: once more step by step, once from nearer to nothing
             best = min((e for e in found if e is not None), key=lambda e: e.score, default=None)
-            gained = 0.0 if best is None else max(seen.base.raw - best.raw, seen.base.fit.cost - best.fit.cost)
-            if direction.gain > 0.5 * strongest and (best is None or best.raw > seen.base.raw or gained < ASTRAY * direction.gain):
+            gained = (
+                0.0 if best is None else max(seen.base.raw - best.raw, seen.base.fit.cost - best.fit.cost)
+            )
+            if direction.gain > 0.5 * strongest and (
+                best is None or best.raw > seen.base.raw or gained < ASTRAY * direction.gain
+            ):
                 found.append(tried(weaker(direction)) if nearer else tried(direction, stepwise=True))
         return min((e for e in found if e is not None), key=lambda e: e.score, default=None)
+
     done: list[Explanation] = []
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
         for part in (chosen[:2], chosen[2:]):
@@ -220,7 +267,10 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
             goal = min((e.fit.cost for e in done), default=goal)
         done.sort(key=lambda e: e.score)
         leaders = [e for e in _runners_up(done, LEADERS) if set(e.fit.at_bound) & set(case.plant.parameters)]
-        better = {id(e): found for e, found in zip(leaders, pool.map(lambda e: _released(case, e, goal), leaders), strict=True)}
+        better = {
+            id(e): found
+            for e, found in zip(leaders, pool.map(lambda e: _released(case, e, goal), leaders), strict=True)
+        }
     done = [better.get(id(e), e) for e in done]
     case.reprice([seen.base, *done])
     return _ordered(case, done)
@@ -228,7 +278,11 @@ def compete(case: Case, seen: Round, chosen: Sequence[Direction]) -> list[Explan
 
 def _stepped(case: Case, e: Explanation) -> Explanation:
     """Refitted with the threshold at which its last effect jumps moved to where it fits best: at a jump a refit has no slope to go by."""
-    names = [e.own[-1][p.name] for p in e.last.effect.parameters if e.last.effect.shapes.get(p.shape or "") == "small_levels"]
+    names = [
+        e.own[-1][p.name]
+        for p in e.last.effect.parameters
+        if e.last.effect.shapes.get(p.shape or "") == "small_levels"
+    ]
     if not e.last.variant or not names or names[0] not in e.plant.parameters:
         return e
     for _ in range(THRESHOLDS):
@@ -237,7 +291,9 @@ def _stepped(case: Case, e: Explanation) -> Explanation:
             best = _threshold(case, e, p)
             if abs(best - p.value) < 0.002 * p.value:
                 return e
-            plant = dataclasses.replace(e.plant, parameters={**e.plant.parameters, p.name: dataclasses.replace(p, value=best)})
+            plant = dataclasses.replace(
+                e.plant, parameters={**e.plant.parameters, p.name: dataclasses.replace(p, value=best)}
+            )
             moved = case.explain(plant, e.effects, e.own)
         except (SimulationError, np.linalg.LinAlgError):
             return e
@@ -260,6 +316,7 @@ def _threshold(case: Case, e: Explanation, p: Parameter) -> float:
             values[k] = value
             parts.append(metric.rows(r, d.y - metric.model.run(d, values, e.fit.dx0[r]).y))
         return float(np.sum(metric.project(np.concatenate(parts)) ** 2))
+
     best, ratio = float(e.fit.values[0, k]), 1.3
     costs = {best: cost(best)}
     while ratio > 1.002:
@@ -273,7 +330,9 @@ def _ordered(case: Case, done: Sequence[Explanation]) -> list[Explanation]:
     """Best score first; but what soaks up whatever is missing gives way to constant physics that fits about as well."""
     ordered = sorted(done, key=lambda e: e.score)
     if ordered and _soaks(case, ordered[0]):
-        rival = next((e for e in ordered if e.fit.cost < SPONGE * ordered[0].fit.cost and not _soaks(case, e)), None)
+        rival = next(
+            (e for e in ordered if e.fit.cost < SPONGE * ordered[0].fit.cost and not _soaks(case, e)), None
+        )
         ordered = [rival, *(e for e in ordered if e is not rival)] if rival else ordered
     return ordered
 
@@ -286,10 +345,18 @@ def _soaks(case: Case, e: Explanation) -> bool:
 def _released(case: Case, e: Explanation, goal: float) -> Explanation:
     """Refitted once more with what is pressed against the end of its range back where it was believed: missing physics pushes
     parameters to walls at which they stay when it is found."""
-    parameters = {n: dataclasses.replace(p, value=case.plant.parameters[n].value, values=case.plant.parameters[n].values)
-                  if n in e.fit.at_bound and n in case.plant.parameters else p for n, p in e.plant.parameters.items()}
+    parameters = {
+        n: dataclasses.replace(
+            p, value=case.plant.parameters[n].value, values=case.plant.parameters[n].values
+        )
+        if n in e.fit.at_bound and n in case.plant.parameters
+        else p
+        for n, p in e.plant.parameters.items()
+    }
     try:
-        found = case.explain(dataclasses.replace(e.plant, parameters=parameters), e.effects, e.own, goal=goal + 2 * ACCEPT)
+        found = case.explain(
+            dataclasses.replace(e.plant, parameters=parameters), e.effects, e.own, goal=goal + 2 * ACCEPT
+        )
     except (SimulationError, np.linalg.LinAlgError):
         return e
     found.direction = e.direction
@@ -298,8 +365,13 @@ def _released(case: Case, e: Explanation, goal: float) -> Explanation:
 
 def _ranged(plant: Plant, ranges: Mapping[str, tuple[float, float] | None]) -> Plant:
     """The plant with other ranges of some parameters; None holds one where it is."""
-    return dataclasses.replace(plant, parameters={n: dataclasses.replace(p, range=ranges[n]) if n in ranges else p
-                                                  for n, p in plant.parameters.items()})
+    return dataclasses.replace(
+        plant,
+        parameters={
+            n: dataclasses.replace(p, range=ranges[n]) if n in ranges else p
+            for n, p in plant.parameters.items()
+        },
+    )
 
 
 def pairs(seen: Round, count: int = 4) -> list[tuple[Direction, Direction]]:
@@ -308,11 +380,11 @@ def pairs(seen: Round, count: int = 4) -> list[tuple[Direction, Direction]]:
     alone = [d for d in seen.directions if d.vector is not None and d.dims == 1][:MOST_IN_PAIRS]
     if len(alone) < 2:
         return []
-    vectors = np.stack([d.vector for d in alone], axis=1).astype(float)     # type: ignore[misc]
+    vectors = np.stack([d.vector for d in alone], axis=1).astype(float)  # type: ignore[misc]
     score = vectors.T @ seen.metric.residual
     cosine = vectors.T @ vectors
     a, b = score[:, None], score[None, :]
-    joint = (a ** 2 + b ** 2 - 2 * a * b * cosine) / np.maximum(1 - cosine ** 2, 1e-3)
+    joint = (a**2 + b**2 - 2 * a * b * cosine) / np.maximum(1 - cosine**2, 1e-3)
     joint[np.tril_indices(len(alone))] = 0.0
     out: list[tuple[Direction, Direction]] = []
     for flat in np.argsort(-joint, axis=None)[:200]:
@@ -326,19 +398,25 @@ def pairs(seen: Round, count: int = 4) -> list[tuple[Direction, Direction]]:
     return out
 
 
-def compete_pairs(case: Case, seen: Round, chosen: Sequence[tuple[Direction, Direction]]) -> list[Explanation]:
+def compete_pairs(
+    case: Case, seen: Round, chosen: Sequence[tuple[Direction, Direction]]
+) -> list[Explanation]:
     """Refit each pair in full; best score first."""
+
     def both(item: tuple[Direction, Direction]) -> Explanation | None:
         first, second = item
         try:
             plant, own = extend(seen.base.plant, first, seen.metric.drives)
             moved = dataclasses.replace(second, candidate=_on(second.candidate, plant))
             plant, other = extend(plant, moved, seen.metric.drives)
-            e = case.explain(plant, [*seen.base.effects, first.candidate, moved.candidate], [*seen.base.own, own, other])
+            e = case.explain(
+                plant, [*seen.base.effects, first.candidate, moved.candidate], [*seen.base.own, own, other]
+            )
         except (SimulationError, InputError, LookupError, np.linalg.LinAlgError):
             return None
         e.direction = _both(seen, first, moved)
         return e
+
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
         done = [e for e in pool.map(both, chosen) if e is not None]
     case.reprice([seen.base, *done])
@@ -347,8 +425,11 @@ def compete_pairs(case: Case, seen: Round, chosen: Sequence[tuple[Direction, Dir
 
 def _both(seen: Round, first: Direction, second: Direction) -> Direction:
     """The second with the dimensions and the looks of both: there are as many more pairs than single directions."""
-    return dataclasses.replace(second, dims=first.dims + second.dims,
-                               elsewhere=first.elsewhere + second.elsewhere + float(np.log10(0.5 * seen.trials())))
+    return dataclasses.replace(
+        second,
+        dims=first.dims + second.dims,
+        elsewhere=first.elsewhere + second.elsewhere + float(np.log10(0.5 * seen.trials())),
+    )
 
 
 def inflation(ranked: Sequence[Direction]) -> float:
@@ -369,8 +450,12 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
     added = len(e.effects) - len(seen.base.effects)
     if 0 < gain < MARGINAL:
         gain = min(gain, least_gain(seen.base.fit.residuals, e.fit.residuals, [n.sigma for n in case.noise]))
-        if not e.white and max(case.excess(e).values()) <= LARGE:       # what remains may be noise; beyond that it is other physics
-            if added not in seen.inflation:     # beside what was found: an effect that is found inflates no longer
+        if (
+            not e.white and max(case.excess(e).values()) <= LARGE
+        ):  # what remains may be noise; beyond that it is other physics
+            if (
+                added not in seen.inflation
+            ):  # beside what was found: an effect that is found inflates no longer
                 plain = {k: f for k, f in entries.items() if not f.shapes}
                 seen.inflation[added] = inflation(look(case, e, plain, draws=0, coloured=True).directions)
             gain /= seen.inflation[added]
@@ -381,13 +466,17 @@ def counts(case: Case, seen: Round, e: Explanation, entries: Mapping[str, Any]) 
     if added == 1 and any(white < least for least, _ in NO_COLOUR):
         left = smooth(case, e)
         if any(white < least and left > most for least, most in NO_COLOUR):
-            return True     # with it the residual is white; without it a sensor would need a colour such as none has
+            return True  # with it the residual is white; without it a sensor would need a colour such as none has
     return _stands(seen, e.direction, gain)
 
 
 def _stands(seen: Round, direction: Direction | None, gain: float) -> bool:
     """Is a gain in score more than what noise makes of the best of all candidates?"""
-    return direction is not None and gain > 0 and log_p(gain, direction.dims) + direction.elsewhere < threshold(seen)
+    return (
+        direction is not None
+        and gain > 0
+        and log_p(gain, direction.dims) + direction.elsewhere < threshold(seen)
+    )
 
 
 def threshold(seen: Round) -> float:
@@ -395,8 +484,14 @@ def threshold(seen: Round) -> float:
     return min(float(np.log10(ALARM / seen.trials())), -3.5) if seen.chance is not None else -5.0
 
 
-def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
-           start: Explanation | None = None, first: Round | None = None) -> tuple[Explanation, list[Explanation], list[Round]]:
+def search(
+    case: Case,
+    base: Explanation,
+    entries: Mapping[str, Any],
+    most: int,
+    start: Explanation | None = None,
+    first: Round | None = None,
+) -> tuple[Explanation, list[Explanation], list[Round]]:
     """Add effects (to `start`, if given) while the evidence asks for them; then take each out again. `first`: the look from
     there, where it was taken. Returns the best explanation, its rivals and the looks that were taken."""
     case.progress("screening the catalogue")
@@ -423,7 +518,9 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
             case.progress("looking for two effects that hide each other")
             together = compete_pairs(case, seen, pairs(seen))
             best = next((e for e in together if counts(case, seen, e, entries)), None)
-            beside = next((e for e in seen.finalists[:4] if _stands(seen, e.direction, seen.base.raw - e.raw)), None)
+            beside = next(
+                (e for e in seen.finalists[:4] if _stands(seen, e.direction, seen.base.raw - e.raw)), None
+            )
             if best is None and beside and seen.inflation.get(1, 1.0) > INFLATED:
                 # Beside it the whole catalogue looks good: perhaps not the noise's colour, but other physics.
                 single = {e.last.key: e.direction for e in seen.finalists if e.direction}
@@ -435,13 +532,19 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
             seen.finalists = together + seen.finalists if best else seen.finalists
         if best is None:
             break
-        current, rivals = best, [e for e in seen.finalists if e is not best and e.score > best.score - 2 * ACCEPT]
+        current, rivals = (
+            best,
+            [e for e in seen.finalists if e is not best and e.score > best.score - 2 * ACCEPT],
+        )
         if len(current.effects) >= most or (len(current.effects) > 1 and _spent(case) > HASTE_S):
             break
         case.progress("screening again")
         rounds.append(look(case, current, entries))
-        if len(current.effects) == 1 and _spent(case) < PATIENCE_S \
-                and (max(case.excess(current).values()) > LARGE or remains(case, current)):
+        if (
+            len(current.effects) == 1
+            and _spent(case) < PATIENCE_S
+            and (max(case.excess(current).values()) > LARGE or remains(case, current))
+        ):
             found = otherwise(case, seen, rounds[-1])
             if found and found[0].score < current.score - ACCEPT:
                 current, rivals = found[0], found[1:]
@@ -449,7 +552,9 @@ def search(case: Case, base: Explanation, entries: Mapping[str, Any], most: int,
                     break
                 rounds.append(look(case, current, entries))
     if len(current.effects) > 1:
-        current, rivals = _backward(case, base, current, rivals, entries, rounds[0].finalists if not start else [])
+        current, rivals = _backward(
+            case, base, current, rivals, entries, rounds[0].finalists if not start else []
+        )
     return current, rivals, rounds
 
 
@@ -478,8 +583,9 @@ def otherwise(case: Case, seen: Round, after: Round) -> list[Explanation]:
     return best
 
 
-def following(case: Case, base: Explanation, entries: Mapping[str, Any],
-               most: int) -> tuple[Explanation, Explanation, list[Explanation]] | None:
+def following(
+    case: Case, base: Explanation, entries: Mapping[str, Any], most: int
+) -> tuple[Explanation, Explanation, list[Explanation]] | None:
     """The search with the plant held to the recordings by an observer, then proved in the free run. Returns (explanation
     in the free run, the same under the observer, its rivals there)."""
     case.progress("looking again with the plant held to the recording")
@@ -512,8 +618,14 @@ def _runners_up(found: Sequence[Explanation], count: int = 3) -> list[Explanatio
     return out[:count]
 
 
-def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[Explanation], entries: Mapping[str, Any],
-              alone: Sequence[Explanation]) -> tuple[Explanation, list[Explanation]]:
+def _backward(
+    case: Case,
+    base: Explanation,
+    current: Explanation,
+    rivals: list[Explanation],
+    entries: Mapping[str, Any],
+    alone: Sequence[Explanation],
+) -> tuple[Explanation, list[Explanation]]:
     """With several effects: take each one out, look again at what would fill its place, and keep the best. What else could
     fill a place is a rival, so that each effect's probability is its own; an effect that is left over by itself has those that
     competed with it `alone`."""
@@ -538,7 +650,9 @@ def _backward(case: Case, base: Explanation, current: Explanation, rivals: list[
             if found and found[0].score < current.score - 2:
                 changed |= found[0].last.key != key
                 current = found[0]
-            others += [f for f in found if f is not current and f.last.key not in {c.key for c in current.effects}]
+            others += [
+                f for f in found if f is not current and f.last.key not in {c.key for c in current.effects}
+            ]
         rivals = others or rivals
         if not changed or late:
             break
@@ -583,8 +697,10 @@ def prune(case: Case, base: Explanation, current: Explanation, notes: list[str])
                 weakest = (high, without, c)
         if weakest is None:
             return current
-        notes.append(f"{weakest[2].effect.name} at {weakest[2].place.where} fits better but does not predict held-out data "
-                     "better; it is not counted")
+        notes.append(
+            f"{weakest[2].effect.name} at {weakest[2].place.where} fits better but does not predict held-out data "
+            "better; it is not counted"
+        )
         current = weakest[1]
     return current
 
@@ -592,7 +708,11 @@ def prune(case: Case, base: Explanation, current: Explanation, notes: list[str])
 def _on(c: Candidate, plant: Plant) -> Candidate:
     """The same effect at the same place of another plant. Raises LookupError where that has no such place."""
     rig = Rig(plant, c.rig.drives, c.rig.columns)
-    same = [x for x in candidates(rig, {c.effect.name: c.effect}) if (x.key, x.variant, x.label) == (c.key, c.variant, c.label)]
+    same = [
+        x
+        for x in candidates(rig, {c.effect.name: c.effect})
+        if (x.key, x.variant, x.label) == (c.key, c.variant, c.label)
+    ]
     if not same:
         raise LookupError(f"{c.effect.name} has no place {c.place.where} any more")
     return same[0]

@@ -7,6 +7,7 @@ measured error is judged over test 4B. Estimators:
   better   real poles by separable generalised least squares, Kalman filter with the coil alone and the air's rate as input, output error
   twelve   the same filter and expansion model with all twelve thermometers: what more sensors would buy
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -21,18 +22,42 @@ from thermoctl.identify.statespace import StateSpace
 from thermoctl.yamlfile import InputError
 
 STEP_K, NOISE_K = 0.25, 0.06
-LONGEST_S = 36000.0                   # no expansion takes longer than ten hours
+LONGEST_S = 36000.0  # no expansion takes longer than ten hours
 AIR_FILTER_S = 60.0
-FIRST_ORDER = 6                       # of the better method's model until the air's movement is taken out; then by BIC where none is given
-DRIFT_S = (7200.0, 250.0)             # what no input explains: forgotten in two hours, above the thermometers' noise below 1/(2 pi 250 s)
-PAPER_CHOICES = ((1, 30), (1, 40), (1, 50), (2, 15), (2, 20), (2, 30), (2, 40), (3, 15), (3, 20), (3, 30), (4, 15), (4, 20), (4, 30),
-                 (4, 40), (6, 15), (6, 20), (8, 15), (8, 20))             # s, rows i
+FIRST_ORDER = (
+    6  # of the better method's model until the air's movement is taken out; then by BIC where none is given
+)
+DRIFT_S = (
+    7200.0,
+    250.0,
+)  # what no input explains: forgotten in two hours, above the thermometers' noise below 1/(2 pi 250 s)
+PAPER_CHOICES = (
+    (1, 30),
+    (1, 40),
+    (1, 50),
+    (2, 15),
+    (2, 20),
+    (2, 30),
+    (2, 40),
+    (3, 15),
+    (3, 20),
+    (3, 30),
+    (4, 15),
+    (4, 20),
+    (4, 30),
+    (4, 40),
+    (6, 15),
+    (6, 20),
+    (8, 15),
+    (8, 20),
+)  # s, rows i
 ESTIMATORS = ("siso", "paper", "better", "twelve")
 
 
 @dataclass(frozen=True)
 class Calibration:
     """What the calibration gave. `paper_model`, `mkf`, `paper_um`, `siso_um`; `model`, `kalman`, `better_um`, `twelve`, `twelve_um`."""
+
     paper_model: StateSpace
     mkf: filter.Mkf
     paper_um: expansion.Expansion
@@ -74,7 +99,7 @@ def filled(y: np.ndarray) -> np.ndarray:
 
 def block_mean(v: np.ndarray, q: int) -> np.ndarray:
     """Means over blocks of q rows; an incomplete last block is dropped."""
-    return v[:len(v) // q * q].reshape(len(v) // q, q, -1).mean(1)
+    return v[: len(v) // q * q].reshape(len(v) // q, q, -1).mean(1)
 
 
 def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = None) -> Calibration:
@@ -83,8 +108,10 @@ def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = None) 
     # the paper's way
     paper_model, mkf = identify_paper(test_2, test_4a)
     y4 = test_4a.error_um
-    paper_um = expansion.recursive(_mkf_steps(mkf, test_4a), block_mean(y4[:, None], round(mkf.period_s))[:, 0], mkf.period_s)
-    if paper_um.f1 >= 1:                                     # unstable at the model's period: as fast as is measured, as the paper advises
+    paper_um = expansion.recursive(
+        _mkf_steps(mkf, test_4a), block_mean(y4[:, None], round(mkf.period_s))[:, 0], mkf.period_s
+    )
+    if paper_um.f1 >= 1:  # unstable at the model's period: as fast as is measured, as the paper advises
         paper_um = expansion.recursive(estimate_mkf(mkf, test_4a), y4, 1.0)
     paper_um = replace(paper_um, f1=min(paper_um.f1, float(np.exp(-paper_um.period_s / LONGEST_S))))
     coil = filled(rises(test_4a)[:, :1])
@@ -95,7 +122,9 @@ def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = None) 
     plant = filter.disturbed(filter.with_air(model))
     twelve = filter.steady(plant, variances, r_v, tuple(range(12)))
     twelve_um = fit_expansion(twelve, tests)
-    return Calibration(paper_model, mkf, paper_um, siso_um, model, kalman, better_um, twelve, twelve_um, variances)
+    return Calibration(
+        paper_model, mkf, paper_um, siso_um, model, kalman, better_um, twelve, twelve_um, variances
+    )
 
 
 def identify_paper(test_2: Any, check: Any) -> tuple[StateSpace, filter.Mkf]:
@@ -109,19 +138,22 @@ def identify_paper(test_2: Any, check: Any) -> tuple[StateSpace, filter.Mkf]:
         try:
             model = subspace.identify(u, y, float(period_s), 12, i, "paper")
             mkf = filter.mkf(model, u, y, r_v, float(period_s))
-        except InputError:                                   # too few samples for so many rows
+        except InputError:  # too few samples for so many rows
             continue
         with np.errstate(over="ignore", invalid="ignore"):
-            left = float(np.sqrt(np.mean((estimate_mkf(mkf, check) - measured)**2)))
+            left = float(np.sqrt(np.mean((estimate_mkf(mkf, check) - measured) ** 2)))
         if left < best[0] and (model.stable or best[1] is None):
             best = left, replace(model, info={**model.info, "period_s": period_s, "i": i}), mkf
     if best[1] is None:
-        raise InputError("no choice of sampling and block rows gives a model of order 12 from this test; it is too short")
+        raise InputError(
+            "no choice of sampling and block rows gives a model of order 12 from this test; it is too short"
+        )
     return best[1], best[2]
 
 
-def calibrate_better(tests: list[Any], order: int | None = None,
-                     model: StateSpace | None = None) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion]:
+def calibrate_better(
+    tests: list[Any], order: int | None = None, model: StateSpace | None = None
+) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion]:
     """The better estimator alone, from any tests: (model, filter, its variances, expansion). `model`: one that is known already."""
     model = model or identify_better(tests, order)
     plant = filter.disturbed(filter.with_air(model))
@@ -130,7 +162,9 @@ def calibrate_better(tests: list[Any], order: int | None = None,
     return model, kalman, variances, fit_expansion(kalman, tests)
 
 
-def calibrate_refined(tests: list[Any], order: int | None = None) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion, str]:
+def calibrate_refined(
+    tests: list[Any], order: int | None = None
+) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion, str]:
     """`calibrate_better`, and beside it the same with the thermal model refined by its prediction errors on all tests but the last: of
     the two the one whose filter follows the thermometers of the last test better. (.., what came of it in words)."""
     plain = calibrate_better(tests, order)
@@ -139,7 +173,9 @@ def calibrate_refined(tests: list[Any], order: int | None = None) -> tuple[State
         return *plain, "no better in its own criterion; left out"
     refined = calibrate_better(tests, order, refined_model)
     last = rises(tests[-1])
-    a, b = (float(np.sqrt(np.nanmean((run_kalman(k, tests[-1]) - last)**2))) for k in (plain[1], refined[1]))
+    a, b = (
+        float(np.sqrt(np.nanmean((run_kalman(k, tests[-1]) - last) ** 2))) for k in (plain[1], refined[1])
+    )
     said = f"{b:.4f} K rms with, {a:.4f} K without, over the test that it was not refined on"
     return (*refined, said + "; taken") if b < a else (*plain, said + "; left out")
 
@@ -151,10 +187,15 @@ def refine(model: StateSpace, tests: list[Any]) -> StateSpace:
     air = with_air_alone(model)
     for t in tests:
         y = block_mean(filled(rises(t)) - air.simulate(air_rate(t.air_c)[:, None]), 10)
-        slow = subspace.refine_prediction_error(replace(slow, x0=np.zeros(slow.order)), block_mean(t.power_w[:, None], 10), y)[0]
+        slow = subspace.refine_prediction_error(
+            replace(slow, x0=np.zeros(slow.order)), block_mean(t.power_w[:, None], 10), y
+        )[0]
     if not slow.stable or (np.diag(slow.a) <= 0).any():
         return model
-    return replace(slow.resample(model.period_s), info={**model.info, "prediction_error": slow.info.get("prediction_error")})
+    return replace(
+        slow.resample(model.period_s),
+        info={**model.info, "prediction_error": slow.info.get("prediction_error")},
+    )
 
 
 def with_air_alone(model: StateSpace) -> StateSpace:
@@ -169,8 +210,14 @@ def identify_better(tests: list[Any], order: int | None) -> StateSpace:
     `order` None: by BIC in the last round."""
     moved: list[Any] = [0.0] * len(tests)
     for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
-        model = modal.identify([modal.reduce((t.power_w[:, None], rises(t) - m), 1.0) for t, m in zip(tests, moved, strict=True)], now,
-                               drift_s=DRIFT_S)
+        model = modal.identify(
+            [
+                modal.reduce((t.power_w[:, None], rises(t) - m), 1.0)
+                for t, m in zip(tests, moved, strict=True)
+            ],
+            now,
+            drift_s=DRIFT_S,
+        )
         if round_ < 2:
             alone = with_air_alone(model)
             moved = [alone.simulate(air_rate(t.air_c)[:, None]) for t in tests]
@@ -201,22 +248,36 @@ def run_kalman(k: filter.Kalman, r: Any) -> np.ndarray:
 def fit_expansion(k: filter.Kalman, tests: list[Any]) -> expansion.Expansion:
     """Output error on the filter's own estimates over all calibration tests, the filter's error as the inputs' uncertainty."""
     sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", k.model.c, k.p, k.model.c), 0))
-    return expansion.output_error([run_kalman(k, t) for t in tests], [t.error_um for t in tests], 1.0, sigma,
-                                  [smooth_air(t.air_c) for t in tests], lags=1, output_step_um=0.005)
+    return expansion.output_error(
+        [run_kalman(k, t) for t in tests],
+        [t.error_um for t in tests],
+        1.0,
+        sigma,
+        [smooth_air(t.air_c) for t in tests],
+        lags=1,
+        output_step_um=0.005,
+    )
 
 
 def estimates(c: Calibration, r: Any, starts_anew: bool = False) -> dict[str, np.ndarray]:
     """Each estimator's position error (N,) um over a recording that begins with test 4A, or (`starts_anew`) over another."""
     air = smooth_air(r.air_c)
     start = {k: 0.0 if starts_anew else getattr(c, f"{k}_um").info.get("start_um", 0.0) for k in ESTIMATORS}
-    return {"siso": c.siso_um.predict(filled(rises(r)[:, :1])),
-            "paper": held(c.paper_um.predict(_mkf_steps(c.mkf, r))[:, None], round(c.mkf.period_s), len(r.power_w))[:, 0]
-            if c.paper_um.period_s == c.mkf.period_s else c.paper_um.predict(estimate_mkf(c.mkf, r)),
-            "better": c.better_um.predict(run_kalman(c.kalman, r), air, start["better"]),
-            "twelve": c.twelve_um.predict(run_kalman(c.twelve, r), air, start["twelve"])}
+    return {
+        "siso": c.siso_um.predict(filled(rises(r)[:, :1])),
+        "paper": held(
+            c.paper_um.predict(_mkf_steps(c.mkf, r))[:, None], round(c.mkf.period_s), len(r.power_w)
+        )[:, 0]
+        if c.paper_um.period_s == c.mkf.period_s
+        else c.paper_um.predict(estimate_mkf(c.mkf, r)),
+        "better": c.better_um.predict(run_kalman(c.kalman, r), air, start["better"]),
+        "twelve": c.twelve_um.predict(run_kalman(c.twelve, r), air, start["twelve"]),
+    }
 
 
-def compensator(c: Calibration, kind: str, period_s: float = 0.001, sensor_s: float = 0.1) -> CompensatorModel:
+def compensator(
+    c: Calibration, kind: str, period_s: float = 0.001, sensor_s: float = 0.1
+) -> CompensatorModel:
     """What the daemon runs, at its own period: kind 'paper' (MKF and recursion (5)) or 'better'. Sensor readings come every `sensor_s`.
 
     Process noise is per second, so it scales with the period; a quantised reading ten times a second brings no more information than one
@@ -224,17 +285,33 @@ def compensator(c: Calibration, kind: str, period_s: float = 0.001, sensor_s: fl
     if kind == "paper":
         model = c.paper_model
         alpha, _ = model.output_form()
-        reduced = StateSpace(alpha, model.c @ model.b, np.eye(len(alpha)), model.period_s, np.zeros(len(alpha)))
+        reduced = StateSpace(
+            alpha, model.c @ model.b, np.eye(len(alpha)), model.period_s, np.zeros(len(alpha))
+        )
         reduced = _without_noise_poles(reduced)
         fast = reduced.resample(period_s)
         um = c.paper_um
-        return CompensatorModel("mkf", period_s, reduced.minus_identity(period_s), np.column_stack([fast.b[:, 0], np.zeros(12)]), np.eye(12),
-                                c.mkf.zeta, c.mkf.r_w * period_s / c.mkf.period_s, c.mkf.r_v, um.f1, um.b1, um.b2, um.period_s,
-                                air_filter_s=AIR_FILTER_S)
+        return CompensatorModel(
+            "mkf",
+            period_s,
+            reduced.minus_identity(period_s),
+            np.column_stack([fast.b[:, 0], np.zeros(12)]),
+            np.eye(12),
+            c.mkf.zeta,
+            c.mkf.r_w * period_s / c.mkf.period_s,
+            c.mkf.r_v,
+            um.f1,
+            um.b1,
+            um.b2,
+            um.period_s,
+            air_filter_s=AIR_FILTER_S,
+        )
     return better_compensator(c.kalman, c.better_um, period_s, sensor_s)
 
 
-def better_compensator(kalman: filter.Kalman, um: expansion.Expansion, period_s: float = 0.001, sensor_s: float = 0.1) -> CompensatorModel:
+def better_compensator(
+    kalman: filter.Kalman, um: expansion.Expansion, period_s: float = 0.001, sensor_s: float = 0.1
+) -> CompensatorModel:
     """The better estimator as the daemon runs it; see `compensator`."""
     model = kalman.model
     scale = sensor_s / model.period_s
@@ -245,8 +322,23 @@ def better_compensator(kalman: filter.Kalman, um: expansion.Expansion, period_s:
     p = linalg.solve_discrete_are(at_sensor.a.T, cs.T, q + 1e-16 * np.eye(len(q)), r)
     gain = (p @ cs.T / (cs @ p @ cs.T + r))[:, 0]
     fast = _at_period(model, period_s)
-    return CompensatorModel("kalman", period_s, model.minus_identity(period_s), fast.b, model.c, gain, 0.0, float(r[0, 0]), um.f1, um.b1, um.b2,
-                            um.period_s, b_air=um.b_air, offset_um=um.offset_um, air_filter_s=AIR_FILTER_S)
+    return CompensatorModel(
+        "kalman",
+        period_s,
+        model.minus_identity(period_s),
+        fast.b,
+        model.c,
+        gain,
+        0.0,
+        float(r[0, 0]),
+        um.f1,
+        um.b1,
+        um.b2,
+        um.period_s,
+        b_air=um.b_air,
+        offset_um=um.offset_um,
+        air_filter_s=AIR_FILTER_S,
+    )
 
 
 def _at_period(model: StateSpace, period_s: float) -> StateSpace:

@@ -1,4 +1,5 @@
 """What the commands experiment, identify, model, tune, evaluate and reproduce do; returns are exit statuses."""
+
 from __future__ import annotations
 
 import sys
@@ -16,7 +17,7 @@ from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError, suggest
 
-CUTOFF_HZ = 4.3e-4                     # 1 / (2 pi 370 s), the paper's
+CUTOFF_HZ = 4.3e-4  # 1 / (2 pi 370 s), the paper's
 RELAY_DRIVE, RELAY_UM = 0.1, 0.5
 
 
@@ -24,7 +25,9 @@ def _schedule(name: str, config: str) -> experiments.Schedule:
     path = Path(config).parent / "experiments.yaml"
     tests = experiments.load_experiments(path)
     if name not in tests:
-        raise InputError(f"{path}: no experiment '{name}'{suggest(name, tests)}; there are {', '.join(tests)}")
+        raise InputError(
+            f"{path}: no experiment '{name}'{suggest(name, tests)}; there are {', '.join(tests)}"
+        )
     return tests[name]
 
 
@@ -36,48 +39,66 @@ def spectrum_lines(t: np.ndarray, power: np.ndarray, cutoff_hz: float) -> list[s
     for low, high in pairwise(edges):
         share = 100 * s[(f > low) & (f <= high)].sum() / s.sum()
         mark = "  <- f_c" if high == cutoff_hz else ""
-        out.append(f"  {1e3 * low:8.3f} to {1e3 * high:8.3f} mHz {share:5.1f} % {'#' * round(share / 2)}{mark}")
+        out.append(
+            f"  {1e3 * low:8.3f} to {1e3 * high:8.3f} mHz {share:5.1f} % {'#' * round(share / 2)}{mark}"
+        )
     return out
 
 
-def experiment(name: str, config: str, out: str | None, dry_run: bool, resume: bool, plant: str | None = None) -> int:
+def experiment(
+    name: str, config: str, out: str | None, dry_run: bool, resume: bool, plant: str | None = None
+) -> int:
     """Run a test of experiments.yaml, or the one experiment of the file `name`, on the daemon that answers (its own back end, in real
     time, under its protections), else on the simulated back end, faster than real time; an experiment of inputs also on a plant file in
     the rig's place. What was recorded is kept when it ends early, and gone on with."""
     from thermoctl.evaluate import calibrate
+
     if Path(name).suffix in (".yaml", ".yml"):
         inputs = _of_inputs(name)
         if dry_run or plant:
             return _on_plant(inputs, None if dry_run else plant, Path(out or f"{inputs.name}.csv"))
         schedule, name = inputs.schedule(), inputs.name
     elif plant:
-        raise InputError(f"'{name}' is a test of the actuator's setpoint; --plant takes the file of an experiment that lists inputs")
+        raise InputError(
+            f"'{name}' is a test of the actuator's setpoint; --plant takes the file of an experiment that lists inputs"
+        )
     else:
         schedule = _schedule(name, config)
     settings = load_settings(config)
     t = np.arange(0, schedule.duration_s)
-    power = (schedule.at(t) / 250.0)**2 * 3.3
-    print(f"{schedule.title}: {schedule.duration_s / 60:.0f} min, {len(schedule.commands())} moves, "
-          f"{schedule.setpoint_um.min():g} to {schedule.setpoint_um.max():g} um")
+    power = (schedule.at(t) / 250.0) ** 2 * 3.3
+    print(
+        f"{schedule.title}: {schedule.duration_s / 60:.0f} min, {len(schedule.commands())} moves, "
+        f"{schedule.setpoint_um.min():g} to {schedule.setpoint_um.max():g} um"
+    )
     print(f"about {power.mean():.2f} W on the mean, {power.max():.2f} W at most")
     if np.ptp(power) > 0:
-        print(f"{100 * experiments.share_below(t, power, CUTOFF_HZ):.0f} % of the alternating power below f_c = {CUTOFF_HZ:g} Hz:")
+        print(
+            f"{100 * experiments.share_below(t, power, CUTOFF_HZ):.0f} % of the alternating power below f_c = {CUTOFF_HZ:g} Hz:"
+        )
         print("\n".join(spectrum_lines(t, power, CUTOFF_HZ)))
     low, high = settings.control.setpoint_low_um, settings.control.setpoint_high_um
     if schedule.setpoint_um.min() < low or schedule.setpoint_um.max() > high:
-        raise InputError(f"{config}: the experiment's setpoints leave control.setpoint_low_um..setpoint_high_um ({low:g}..{high:g})")
+        raise InputError(
+            f"{config}: the experiment's setpoints leave control.setpoint_low_um..setpoint_high_um ({low:g}..{high:g})"
+        )
     if dry_run:
         return 0
     path = Path(out or f"{name}.parquet")
-    progress_path = path.with_name(path.name + ".progress")             # how far the schedule came, beside what was recorded
+    progress_path = path.with_name(
+        path.name + ".progress"
+    )  # how far the schedule came, beside what was recorded
     rig = calibrate.rig_of(settings)
     print(f"on {rig.where}")
     earlier, at_s = None, 0.0
     if resume and path.exists() and progress_path.exists() and isinstance(rig, calibrate.DaemonRig):
         earlier = rig.meanwhile(read_table(path))
         at_s = float(progress_path.read_text()) if earlier is not None else 0.0
-        print(f"goes on at {at_s:.0f} s" if earlier is not None else
-              "begins anew: the daemon did not record without a gap since it was ended, and heat does not wait")
+        print(
+            f"goes on at {at_s:.0f} s"
+            if earlier is not None
+            else "begins anew: the daemon did not record without a gap since it was ended, and heat does not wait"
+        )
     control = calibrate.Control(sys.stdin.isatty() and sys.stderr.isatty())
     blocks: list[np.ndarray] = []
     done_s = [at_s]
@@ -96,13 +117,24 @@ def experiment(name: str, config: str, out: str | None, dry_run: bool, resume: b
         ended = e.reason
     if blocks:
         rows = np.vstack(blocks)
-        write_table(path, Table(path.stem, str(path), rows[:, INDEX["t_s"]], {n: rows[:, i] for n, i in INDEX.items() if n != "t_s"}))
+        write_table(
+            path,
+            Table(
+                path.stem,
+                str(path),
+                rows[:, INDEX["t_s"]],
+                {n: rows[:, i] for n, i in INDEX.items() if n != "t_s"},
+            ),
+        )
         print(f"{path}: {len(rows)} rows")
     if not ended:
         progress_path.unlink(missing_ok=True)
         return 0
     progress_path.write_text(f"{done_s[0]:.3f}\n")
-    print(f"ended after {done_s[0]:.0f} of {schedule.duration_s:.0f} s: {ended}; go on with --resume --out {path}", file=sys.stderr)
+    print(
+        f"ended after {done_s[0]:.0f} of {schedule.duration_s:.0f} s: {ended}; go on with --resume --out {path}",
+        file=sys.stderr,
+    )
     return 1
 
 
@@ -118,15 +150,20 @@ def _on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) ->
     """An experiment told, and run on a plant file in the rig's place where one is given."""
     from thermoctl.plant import load
     from thermoctl.plant.simulate import SimulationError
-    print(f"{inputs.title}: {inputs.duration_s / 60:.4g} min, every {inputs.sample_s:g} s; drives "
-          + ", ".join(f"{n} {c[:, 1].min():.4g} to {c[:, 1].max():.4g}" for n, c in inputs.corners.items()))
+
+    print(
+        f"{inputs.title}: {inputs.duration_s / 60:.4g} min, every {inputs.sample_s:g} s; drives "
+        + ", ".join(f"{n} {c[:, 1].min():.4g} to {c[:, 1].max():.4g}" for n, c in inputs.corners.items())
+    )
     if plant_file is None:
         return 0
     plant = load(plant_file)
     t, columns = inputs.columns()
     unsaid = {i.column for i in plant.inputs.values()} - set(columns)
     if unsaid:
-        raise InputError(f"experiment '{inputs.name}' says nothing of {', '.join(sorted(unsaid))}, which {plant_file} reads")
+        raise InputError(
+            f"experiment '{inputs.name}' says nothing of {', '.join(sorted(unsaid))}, which {plant_file} reads"
+        )
     try:
         write_table(path, plant.compile(()).measure(Table(path.stem, str(path), t, columns), seed=len(t)))
     except SimulationError as e:
@@ -138,16 +175,27 @@ def _on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) ->
 def record(experiment_file: Path, recording: Path, config: str, plant: str | None) -> None:
     """Run an experiment file for `thermoctl diagnose --resolve`. Raises InputError where it does not come to its end."""
     if experiment(str(experiment_file), config, str(recording), False, False, plant):
-        raise InputError(f"{experiment_file}: the experiment ended early; what was recorded is in {recording}")
+        raise InputError(
+            f"{experiment_file}: the experiment ended early; what was recorded is in {recording}"
+        )
 
 
 def _recorded(path: str) -> rigs.Recorded:
     """A recording at 1 s as the chain takes it. Raises InputError when a signal is missing."""
     table = read_table(path)
-    need = ["power_w", "air_c", "output_reference_um", "position_raw_um", "setpoint_um", *(f"{p}_c" for p in POINTS)]
+    need = [
+        "power_w",
+        "air_c",
+        "output_reference_um",
+        "position_raw_um",
+        "setpoint_um",
+        *(f"{p}_c" for p in POINTS),
+    ]
     for n in need:
         if n not in table.columns:
-            raise InputError(f"{path}: column '{n}' is missing{suggest(n, table.columns)}; a calibration needs it")
+            raise InputError(
+                f"{path}: column '{n}' is missing{suggest(n, table.columns)}; a calibration needs it"
+            )
     t = np.arange(np.floor(table.t[-1] - table.t[0]) + 1)
     k = np.clip(np.searchsorted(table.t - table.t[0], t + 1e-9, side="right") - 1, 0, None)
     c = {n: table.columns[n][k] for n in need}
@@ -156,10 +204,21 @@ def _recorded(path: str) -> rigs.Recorded:
         c[n] = chain.filled(c[n][:, None])[:, 0]
     error = c["output_reference_um"] - c["position_raw_um"]
     error = error - np.nanmean(error[:5])
-    return rigs.Recorded(t, c["power_w"], c["air_c"], temperatures, error, np.full(temperatures.shape, np.nan), error, c["setpoint_um"])
+    return rigs.Recorded(
+        t,
+        c["power_w"],
+        c["air_c"],
+        temperatures,
+        error,
+        np.full(temperatures.shape, np.nan),
+        error,
+        c["setpoint_um"],
+    )
 
 
-def identify(test_2: str, test_3: str, test_4a: str, config: str, models: str, method: str, order: int) -> int:
+def identify(
+    test_2: str, test_3: str, test_4a: str, config: str, models: str, method: str, order: int
+) -> int:
     """Calibrate from recordings and install the compensator in the folder `models`."""
     settings = load_settings(config)
     r2, r3, r4 = (_recorded(p) for p in (test_2, test_3, test_4a))
@@ -172,13 +231,21 @@ def identify(test_2: str, test_3: str, test_4a: str, config: str, models: str, m
     else:
         thermal, kalman, variances, um, refined = chain.calibrate_refined([r2, r3, r4], order or None)
         model = chain.better_compensator(kalman, um, settings.loop.period_s)
-        left = r4.error_um - um.predict(chain.run_kalman(kalman, r4), chain.smooth_air(r4.air_c), um.info.get("start_um", 0.0))
-        figures |= {"time_constants_s": thermal.info["time_constants_s"], "residual_rms_k": thermal.info["residual_rms"], "variances": variances,
-                    "refinement": refined}
+        left = r4.error_um - um.predict(
+            chain.run_kalman(kalman, r4), chain.smooth_air(r4.air_c), um.info.get("start_um", 0.0)
+        )
+        figures |= {
+            "time_constants_s": thermal.info["time_constants_s"],
+            "residual_rms_k": thermal.info["residual_rms"],
+            "variances": variances,
+            "refinement": refined,
+        }
         print(f"prediction-error refinement: {refined}")
     figures["expansion_rms_um"] = float(np.sqrt(np.nanmean(left**2)))
     path = modelfile.install(models, model, settings.rig.name, [test_2, test_3, test_4a], figures)
-    print(f"{path}: expansion left {figures['expansion_rms_um']:.3g} um rms over test 4A; set compensation.model to it, or to {models}")
+    print(
+        f"{path}: expansion left {figures['expansion_rms_um']:.3g} um rms over test 4A; set compensation.model to it, or to {models}"
+    )
     return 0
 
 
@@ -191,21 +258,28 @@ def model(action: str, models: str, name: str | None) -> int:
     if action == "list":
         for p in modelfile.history(models):
             c = modelfile.load_calibration(p)
-            print(f"{'*' if p == now else ' '} {p.name}  {c.created}  rig {c.rig}  {c.model.kind}  order {len(c.model.A_minus_I)}")
+            print(
+                f"{'*' if p == now else ' '} {p.name}  {c.created}  rig {c.rig}  {c.model.kind}  order {len(c.model.A_minus_I)}"
+            )
         return 0
     c = modelfile.load_calibration(Path(models) / name if name else now)
-    print(f"{name or now.name}: rig {c.rig}, {c.created}, {c.model.kind}, order {len(c.model.A_minus_I)}, f1 {c.model.f1:.5g}")
+    print(
+        f"{name or now.name}: rig {c.rig}, {c.created}, {c.model.kind}, order {len(c.model.A_minus_I)}, f1 {c.model.f1:.5g}"
+    )
     for key, value in {**c.figures, **{f"sha256 {k}": v for k, v in c.fingerprints.items()}}.items():
         print(f"  {key}: {value}")
     return 0
 
 
-def _open_loop(config: str, seconds: float, drive_at: Callable[[float, float], float], what: str) -> tuple[np.ndarray, np.ndarray]:
+def _open_loop(
+    config: str, seconds: float, drive_at: Callable[[float, float], float], what: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Drive the opened back end without the position loop: `drive_at`(s since the amplifier's second of power-up, position um) -> drive,
     within control.output_limit. Returns (t s, position um). Real hardware is paced by the clock. The amplifier is off on every way out.
     Raises InputError when the position leaves protection's range."""
     from hal.backend import ROLE, make_backend
     from thermoctl.daemon.clock import now_ns, sleep_until
+
     settings = load_settings(config)
     backend = make_backend(settings)
     period, paced = settings.loop.period_s, settings.hal.backend == "devices"
@@ -223,24 +297,37 @@ def _open_loop(config: str, seconds: float, drive_at: Callable[[float, float], f
                 since = now - 1.0
             position = float(backend.read(now).value[ROLE["position_um"]])
             if abs(position) > high:
-                raise InputError(f"{what} drove the position to {position:.0f} um, beyond {high:g} um; give a smaller drive")
+                raise InputError(
+                    f"{what} drove the position to {position:.0f} um, beyond {high:g} um; give a smaller drive"
+                )
             if since >= 0:
                 t.append(since)
                 y.append(position)
-            backend.write(float(np.clip(drive_at(since, position), -limit, limit)) if since >= 0 else 0.0, True)
+            backend.write(
+                float(np.clip(drive_at(since, position), -limit, limit)) if since >= 0 else 0.0, True
+            )
     finally:
         backend.write(0.0, False)
         backend.close()
     return np.array(t), np.array(y)
 
 
-def open_loop_step(config: str, drive: float = 0.3, before_s: float = 0.05, after_s: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
+def open_loop_step(
+    config: str, drive: float = 0.3, before_s: float = 0.05, after_s: float = 0.4
+) -> tuple[np.ndarray, np.ndarray]:
     """Step of the drive without the position loop: (t from the step s, position um); see `_open_loop`."""
-    t, y = _open_loop(config, before_s + after_s, lambda since, position: drive if since >= before_s else 0.0, f"the step of {drive:g}")
+    t, y = _open_loop(
+        config,
+        before_s + after_s,
+        lambda since, position: drive if since >= before_s else 0.0,
+        f"the step of {drive:g}",
+    )
     return t - before_s, y
 
 
-def relay_test(config: str, drive: float = 0.1, hysteresis_um: float = 0.5, seconds: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
+def relay_test(
+    config: str, drive: float = 0.1, hysteresis_um: float = 0.5, seconds: float = 1.5
+) -> tuple[np.ndarray, np.ndarray]:
     """Relay feedback (Astrom and Hagglund) about the first position: the drive is +-`drive` against the position, switched beyond
     +-`hysteresis_um`: (t s, position um); see `_open_loop`."""
     centre: list[float] = []
@@ -271,13 +358,19 @@ def tune(config: str, method: str, write: bool) -> int:
     else:
         proposed = tuning.relay(*relay_test(config, RELAY_DRIVE, RELAY_UM), RELAY_DRIVE, RELAY_UM)
     if "Ku" in proposed.figures:
-        print(f"relay of {RELAY_DRIVE:g}: ultimate gain {proposed.figures['Ku']:.4g} per um, period {1e3 * proposed.figures['Tu_s']:.3g} ms")
+        print(
+            f"relay of {RELAY_DRIVE:g}: ultimate gain {proposed.figures['Ku']:.4g} per um, period {1e3 * proposed.figures['Tu_s']:.3g} ms"
+        )
     k0, tau_d, tau_c = tuning.tangent(plant)
-    print(f"open-loop step: K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms, "
-          f"residual {plant.residual:.2g} um")
+    print(
+        f"open-loop step: K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms, "
+        f"residual {plant.residual:.2g} um"
+    )
     for g in (present, proposed):
         m = tuning.margins(plant, g, period, average)
-        print(f"{g.how}: gain margin {m.gain:.2f}, phase margin {m.phase_deg:.0f} deg{'' if m.stable else ', UNSTABLE'}")
+        print(
+            f"{g.how}: gain margin {m.gain:.2f}, phase margin {m.phase_deg:.0f} deg{'' if m.stable else ', UNSTABLE'}"
+        )
     print(tuning.difference(present, proposed))
     if write:
         tuning.write(Path(config), proposed)
@@ -291,14 +384,18 @@ def evaluate(recordings: list[str]) -> int:
         table = read_table(path)
         for n in ("output_reference_um", "setpoint_um"):
             if n not in table.columns:
-                raise InputError(f"{path}: column '{n}' is missing; only a recording with the reference encoder can be judged")
+                raise InputError(
+                    f"{path}: column '{n}' is missing; only a recording with the reference encoder can be judged"
+                )
         setpoint, reference = table.columns["setpoint_um"], table.columns["output_reference_um"]
         limited = table.columns.get("reference_um", setpoint)
         error = reference - limited
         error = error - np.nanmean(error[:10])
         rest = np.abs(limited - setpoint) < 1e-6
         mean, two_s = iso230.mean_and_two_s(error[rest])
-        print(f"{path}: {mean:+.3f} +- {two_s:.3f} um (mean deviation, 2 s, {int(rest.sum())} samples at rest)")
+        print(
+            f"{path}: {mean:+.3f} +- {two_s:.3f} um (mean deviation, 2 s, {int(rest.sum())} samples at rest)"
+        )
         stops = iso230.approaches(limited, reference, max(1, round(2.0 / np.median(np.diff(table.t)))))
         for way, word in ((1, "upwards"), (-1, "downwards")):
             mine = [(v, error[k]) for k, v, d in stops if d == way]
@@ -316,4 +413,5 @@ def evaluate(recordings: list[str]) -> int:
 def reproduce(config: str, plant: str, out: str, seeds: int, quick: bool) -> int:
     """The whole report; 1 when a goal is missed."""
     from thermoctl.evaluate import reproduce as room
+
     return 0 if room.reproduce(plant, config, Path(out), seeds, not quick, print) else 1

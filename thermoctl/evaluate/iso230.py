@@ -7,6 +7,7 @@ unidirectional repeatability      R_i = 4 s_i, R = max_i R_i            written 
 mean bidirectional deviation      (x_up + x_down) / 2;  reversal B_i = x_up - x_down;  M = range of it
 accuracy (systematic, unidirectional)  E = max x_i - min x_i;  A = max(x_i + 2 s_i) - min(x_i - 2 s_i)
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from thermoctl.yamlfile import InputError
 @dataclass(frozen=True)
 class Direction:
     """One direction of approach: targets (m,) um, mean (m,), s (m,), n (m,)."""
+
     targets: np.ndarray
     mean: np.ndarray
     s: np.ndarray
@@ -46,8 +48,12 @@ def unidirectional(targets_um: np.ndarray, deviations_um: np.ndarray) -> Directi
     groups = [deviations_um[targets_um == v] for v in unique]
     if any(len(g) < 2 for g in groups):
         raise InputError("ISO 230-2 needs at least two approaches to every target")
-    return Direction(unique, np.array([g.mean() for g in groups]), np.array([g.std(ddof=1) for g in groups]),
-                     np.array([len(g) for g in groups]))
+    return Direction(
+        unique,
+        np.array([g.mean() for g in groups]),
+        np.array([g.std(ddof=1) for g in groups]),
+        np.array([len(g) for g in groups]),
+    )
 
 
 def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
@@ -56,13 +62,15 @@ def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
     return float(e.mean()), float(2 * e.std(ddof=1))
 
 
-def approaches(setpoint_um: np.ndarray, reference_um: np.ndarray, settle: int) -> list[tuple[int, float, int]]:
+def approaches(
+    setpoint_um: np.ndarray, reference_um: np.ndarray, settle: int
+) -> list[tuple[int, float, int]]:
     """Where the motion stands still: (index `settle` samples after arrival, target, direction +1 or -1)."""
     still = np.concatenate([[False], setpoint_um[1:] == setpoint_um[:-1]])
     out, last = [], 0
     for k in range(1, len(still)):
         if not still[k]:
             last = 1 if setpoint_um[k] > setpoint_um[k - 1] else -1
-        elif not still[k - 1] and k + settle < len(still) and still[k:k + settle].all():
+        elif not still[k - 1] and k + settle < len(still) and still[k : k + settle].all():
             out.append((k + settle, float(setpoint_um[k]), last))
     return out

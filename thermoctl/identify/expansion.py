@@ -14,6 +14,7 @@ The time constant itself cannot be told with so many parameters; the prediction 
 The output moves with the bodies' absolute temperatures, the models speak of rises above the air. T_abs = rise + air, so air enters
 with the sum of all gains: b_air = sum(b1 + b2). A free air regressor is not excited in two hours.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -28,6 +29,7 @@ from thermoctl.yamlfile import InputError
 @dataclass(frozen=True)
 class Expansion:
     """f1, b1 (M,) for T(n-1), b2 (M,) for T(n), um per K; b_air for air - air(0), um/K; offset_um added to the output."""
+
     f1: float
     b1: np.ndarray
     b2: np.ndarray
@@ -65,8 +67,14 @@ def block_ls(rises: np.ndarray, y: np.ndarray, period_s: float) -> Expansion:
     return _from_theta(theta, period_s, {"method": "block least squares (equation error)"})
 
 
-def recursive(rises: np.ndarray, y: np.ndarray, period_s: float, weight: float = 1.0, q0: float = 1e6,
-              own_output: bool = False) -> Expansion:
+def recursive(
+    rises: np.ndarray,
+    y: np.ndarray,
+    period_s: float,
+    weight: float = 1.0,
+    q0: float = 1e6,
+    own_output: bool = False,
+) -> Expansion:
     """The paper's recursion (5) with weight lambda and Q(0) = q0 I; `own_output` puts the model's own past output in the
     regressor as (3) is written, else the measured one (which is what equals the block solution)."""
     _check(rises, y)
@@ -77,12 +85,21 @@ def recursive(rises: np.ndarray, y: np.ndarray, period_s: float, weight: float =
         kernels.rls_own_output(theta, q, phi, np.ascontiguousarray(y[1:]), weight, float(y[0]))
     else:
         kernels.rls_run(theta, q, np.hstack([phi, y[:-1, None]]), np.ascontiguousarray(y[1:]), weight)
-    return _from_theta(theta, period_s, {"method": "recursion (5)", "weight": weight, "own_output": own_output})
+    return _from_theta(
+        theta, period_s, {"method": "recursion (5)", "weight": weight, "own_output": own_output}
+    )
 
 
-def output_error(rises: np.ndarray | list[np.ndarray], y: np.ndarray | list[np.ndarray], period_s: float,
-                 input_sigma_k: float | np.ndarray = 0.0, air: np.ndarray | list[np.ndarray] | None = None,
-                 tau_range_s: tuple[float, float] | None = None, lags: int = 2, output_step_um: float = 0.0) -> Expansion:
+def output_error(
+    rises: np.ndarray | list[np.ndarray],
+    y: np.ndarray | list[np.ndarray],
+    period_s: float,
+    input_sigma_k: float | np.ndarray = 0.0,
+    air: np.ndarray | list[np.ndarray] | None = None,
+    tau_range_s: tuple[float, float] | None = None,
+    lags: int = 2,
+    output_step_um: float = 0.0,
+) -> Expansion:
     """True output error: search over f1 and ridge least squares. rises (N, M) K, y (N,) um (NaN: not measured there), or lists of
     recordings, each with an offset and a start of its own. `air` (N,) degC ties b_air to the sum of the gains.
 
@@ -101,7 +118,7 @@ def output_error(rises: np.ndarray | list[np.ndarray], y: np.ndarray | list[np.n
         raise InputError(f"{int(here.sum())} measured positions for {m} temperatures; at least {4 * m}")
     drives = [r if a is None else r + (a - a[0])[:, None] for r, a in zip(many, airs, strict=True)]
     lo, hi = tau_range_s or (2 * period_s, max(len(r) for r in many) * period_s / 4)
-    sigma2 = np.broadcast_to(np.asarray(input_sigma_k, float)**2, (m,))
+    sigma2 = np.broadcast_to(np.asarray(input_sigma_k, float) ** 2, (m,))
     own = 2 * len(many)
 
     def solve(log_tau: float) -> tuple[float, np.ndarray, float]:
@@ -110,30 +127,46 @@ def output_error(rises: np.ndarray | list[np.ndarray], y: np.ndarray | list[np.n
         for k, drive in enumerate(drives):
             z = np.zeros((len(drive), m * lags + own))
             now = signal.lfilter([0, 1 - f], [1, -f], drive, axis=0)
-            z[:, m * (lags - 1):m * lags] = now
+            z[:, m * (lags - 1) : m * lags] = now
             if lags == 2:
                 z[1:, :m] = now[:-1]
             z[:, m * lags + 2 * k] = 1
-            z[:, m * lags + 2 * k + 1] = f**np.arange(len(drive))
+            z[:, m * lags + 2 * k + 1] = f ** np.arange(len(drive))
             blocks.append(z)
         z = np.vstack(blocks)[here]
         g, right = z.T @ z, z.T @ measured[here]
-        noise = np.concatenate([np.tile(sigma2, lags) * (1 - f) / (1 + f) * here.sum(), np.full(own, 1e-9 * here.sum())])
-        noise[:m * lags] += 1e-6 * np.trace(g[:m * lags, :m * lags]) / (m * lags)
+        noise = np.concatenate(
+            [np.tile(sigma2, lags) * (1 - f) / (1 + f) * here.sum(), np.full(own, 1e-9 * here.sum())]
+        )
+        noise[: m * lags] += 1e-6 * np.trace(g[: m * lags, : m * lags]) / (m * lags)
         theta = linalg.solve(g + np.diag(noise), right, assume_a="pos")
-        cost = float(((measured[here] - z @ theta)**2).sum() + theta @ (noise * theta)) + here.sum() * output_step_um**2 / 12
+        cost = (
+            float(((measured[here] - z @ theta) ** 2).sum() + theta @ (noise * theta))
+            + here.sum() * output_step_um**2 / 12
+        )
         return cost, theta, f
 
     grid = np.linspace(np.log(lo), np.log(hi), 13)
     costs = [solve(v)[0] for v in grid]
     k = int(np.argmin(costs))
-    best = optimize.minimize_scalar(lambda v: solve(v)[0], bounds=(grid[max(k - 1, 0)], grid[min(k + 1, 12)]), method="bounded",
-                                    options={"xatol": 1e-3})
+    best = optimize.minimize_scalar(
+        lambda v: solve(v)[0],
+        bounds=(grid[max(k - 1, 0)], grid[min(k + 1, 12)]),
+        method="bounded",
+        options={"xatol": 1e-3},
+    )
     cost, theta, f = solve(best.x)
-    b2 = (1 - f) * theta[m * (lags - 1):m * lags]
+    b2 = (1 - f) * theta[m * (lags - 1) : m * lags]
     b1 = (1 - f) * theta[:m] if lags == 2 else np.zeros(m)
-    return Expansion(f, b1, b2, period_s, float((b1 + b2).sum()) if air is not None else 0.0, float(theta[-2]),
-                     {"method": "output error", "start_um": float(theta[-1]), "rms_um": float(np.sqrt(cost / here.sum()))})
+    return Expansion(
+        f,
+        b1,
+        b2,
+        period_s,
+        float((b1 + b2).sum()) if air is not None else 0.0,
+        float(theta[-2]),
+        {"method": "output error", "start_um": float(theta[-1]), "rms_um": float(np.sqrt(cost / here.sum()))},
+    )
 
 
 class Bank:
@@ -142,10 +175,18 @@ class Bank:
     Call `update(rises (K, M), y (K,))` with new samples in time order (NaN in y where the reference is absent); `model()`
     gives the present Expansion. About 0.7 us a sample and pole for 12 temperatures."""
 
-    def __init__(self, inputs: int, period_s: float, poles: int = 16, tau_range_s: tuple[float, float] = (20.0, 2000.0),
-                 weight: float = 1.0, prior_sigma: float = 30.0, input_sigma_k: float | np.ndarray = 0.1):
+    def __init__(
+        self,
+        inputs: int,
+        period_s: float,
+        poles: int = 16,
+        tau_range_s: tuple[float, float] = (20.0, 2000.0),
+        weight: float = 1.0,
+        prior_sigma: float = 30.0,
+        input_sigma_k: float | np.ndarray = 0.1,
+    ):
         p = 2 * inputs + 2
-        self.sigma2 = np.broadcast_to(np.asarray(input_sigma_k, float)**2, (inputs,))
+        self.sigma2 = np.broadcast_to(np.asarray(input_sigma_k, float) ** 2, (inputs,))
         self.period_s, self.weight, self.inputs = period_s, weight, inputs
         self.poles = np.exp(-period_s / np.geomspace(*tau_range_s, poles))
         self.r = np.zeros((poles, p, p + 1))
@@ -161,8 +202,17 @@ class Bank:
         rises = np.ascontiguousarray(np.atleast_2d(rises), dtype=float)
         if self.samples == 0 and len(rises):
             self.last[0] = rises[0]
-        kernels.bank_run(self.r, self.cost, self.state, self.poles, np.zeros(1), rises, np.ascontiguousarray(y, dtype=float),
-                         self.weight, self.last)
+        kernels.bank_run(
+            self.r,
+            self.cost,
+            self.state,
+            self.poles,
+            np.zeros(1),
+            rises,
+            np.ascontiguousarray(y, dtype=float),
+            self.weight,
+            self.last,
+        )
         self.samples += len(rises)
 
     def model(self) -> Expansion:
@@ -174,13 +224,20 @@ class Bank:
             rows = self._rows(k)
             left = linalg.qr(rows, mode="r", check_finite=False)[0]
             theta = linalg.solve_triangular(left[:p, :p], left[:p, p])
-            criterion = self.cost[k] + left[p, p]**2
+            criterion = self.cost[k] + left[p, p] ** 2
             if criterion < best[0]:
                 best = (criterion, k, theta)
         _, k, theta = best
         f = float(self.poles[k])
-        return Expansion(f, (1 - f) * theta[:m], (1 - f) * theta[m:2 * m], self.period_s, 0.0, float(theta[-1]),
-                         {"method": "online bank", "start_um": float(theta[2 * m]), "samples": self.samples})
+        return Expansion(
+            f,
+            (1 - f) * theta[:m],
+            (1 - f) * theta[m : 2 * m],
+            self.period_s,
+            0.0,
+            float(theta[-1]),
+            {"method": "online bank", "start_um": float(theta[2 * m]), "samples": self.samples},
+        )
 
     def bounded(self, low: np.ndarray, high: np.ndarray) -> Expansion:
         """The best Expansion of one lag whose static gains (M,) um/K lie within low..high: collinear gains that the data do not tell apart
@@ -190,14 +247,23 @@ class Bank:
         best = (np.inf, 0, np.zeros(m + 2))
         for k in range(len(self.poles)):
             rows = self._rows(k)
-            found = optimize.lsq_linear(rows[:, m:-1], rows[:, -1], (np.append(low, -free), np.append(high, free)))
+            found = optimize.lsq_linear(
+                rows[:, m:-1], rows[:, -1], (np.append(low, -free), np.append(high, free))
+            )
             criterion = self.cost[k] + 2 * found.cost
             if criterion < best[0]:
                 best = (criterion, k, found.x)
         _, k, theta = best
         f = float(self.poles[k])
-        return Expansion(f, np.zeros(m), (1 - f) * theta[:m], self.period_s, 0.0, float(theta[-1]),
-                         {"method": "online bank, bounded", "start_um": float(theta[m]), "samples": self.samples})
+        return Expansion(
+            f,
+            np.zeros(m),
+            (1 - f) * theta[:m],
+            self.period_s,
+            0.0,
+            float(theta[-1]),
+            {"method": "online bank, bounded", "start_um": float(theta[m]), "samples": self.samples},
+        )
 
     def _rows(self, k: int) -> np.ndarray:
         """The triangle of pole k over the ridge that the inputs' error asks for; the last column is the right-hand side."""
@@ -209,7 +275,7 @@ class Bank:
 
 def _from_theta(theta: np.ndarray, period_s: float, info: dict) -> Expansion:
     m = (len(theta) - 1) // 2
-    return Expansion(float(theta[-1]), theta[:m], theta[m:2 * m], period_s, 0.0, 0.0, info)
+    return Expansion(float(theta[-1]), theta[:m], theta[m : 2 * m], period_s, 0.0, 0.0, info)
 
 
 def _check(rises: np.ndarray, y: np.ndarray) -> None:

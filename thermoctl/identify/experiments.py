@@ -7,6 +7,7 @@ from the CSV beside it, or on a plant file in its place.
 A schedule is a list of (seconds, um) corners, joined by straight lines; the law's own rate limiter makes the ramps. Running it
 gives a recording. It runs under all protections: a fault ends it, nothing recorded is lost, and it can be resumed where it stood.
 """
+
 from __future__ import annotations
 
 import time
@@ -27,6 +28,7 @@ SETPOINT = "setpoint_um"
 @dataclass(frozen=True)
 class Schedule:
     """Corners t_s (K,) and setpoint_um (K,), ends at duration_s."""
+
     name: str
     title: str
     t_s: np.ndarray
@@ -52,6 +54,7 @@ class Schedule:
 class Inputs:
     """What a rig's inputs do: {column: corners (K, 2) of seconds and value} on straight lines, ends at duration_s, read every
     sample_s; `assumed`: columns that nobody drives, at the values they were taken to have."""
+
     name: str
     title: str
     corners: dict[str, np.ndarray]
@@ -62,21 +65,29 @@ class Inputs:
     def schedule(self) -> Schedule:
         """The same for the daemon. Raises InputError where it drives more than the setpoint."""
         if set(self.corners) != {SETPOINT}:
-            raise InputError(f"experiment '{self.name}' drives {', '.join(self.corners)}; the daemon commands {SETPOINT} only. Run it "
-                             "by hand from the CSV beside it, or give a plant file in the rig's place (--plant)")
+            raise InputError(
+                f"experiment '{self.name}' drives {', '.join(self.corners)}; the daemon commands {SETPOINT} only. Run it "
+                "by hand from the CSV beside it, or give a plant file in the rig's place (--plant)"
+            )
         t, v = self.corners[SETPOINT].T
         return Schedule(self.name, self.title, t, v, self.duration_s)
 
     def columns(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Times (N,) every sample_s, and each column over them."""
         t = np.arange(int(np.floor(self.duration_s / self.sample_s + 1e-9)) + 1) * self.sample_s
-        return t, {**{n: np.full(len(t), v) for n, v in self.assumed.items()},
-                   **{n: np.interp(t, c[:, 0], c[:, 1]) for n, c in self.corners.items()}}
+        return t, {
+            **{n: np.full(len(t), v) for n, v in self.assumed.items()},
+            **{n: np.interp(t, c[:, 0], c[:, 1]) for n, c in self.corners.items()},
+        }
 
 
 def load_inputs(path: str | Path) -> dict[str, Inputs]:
     """The experiments of a file that list inputs. Raises InputError with the line of a wrong entry."""
-    return {n: _inputs(n, node) for n, node in _head(load(path)).items() if isinstance(node.value, dict) and "inputs" in node.value}
+    return {
+        n: _inputs(n, node)
+        for n, node in _head(load(path)).items()
+        if isinstance(node.value, dict) and "inputs" in node.value
+    }
 
 
 def _head(root: Node) -> dict[str, Node]:
@@ -102,17 +113,28 @@ def _inputs(name: str, node: Node) -> Inputs:
         made = np.array([[_number(q.value[0], 0, 1e9), _number(q.value[1], -1e12, 1e12)] for q in pairs])
         late = int(np.argmax(np.diff(made[:, 0]) <= 0)) + 1
         if made[0, 0] != 0 or np.any(np.diff(made[:, 0]) <= 0):
-            raise pairs[late if made[0, 0] == 0 else 0].error(f"input '{column}': times must begin at 0 and increase")
+            raise pairs[late if made[0, 0] == 0 else 0].error(
+                f"input '{column}': times must begin at 0 and increase"
+            )
         corners[column] = made
     ends = {c: float(made[-1, 0]) for c, made in corners.items()}
     if max(ends.values()) - min(ends.values()) > 1e-9 * max(ends.values()):
-        raise e["inputs"].error("all inputs must end at the same time; they end at " + ", ".join(f"{c} {t:g} s" for c, t in ends.items()))
+        raise e["inputs"].error(
+            "all inputs must end at the same time; they end at "
+            + ", ".join(f"{c} {t:g} s" for c, t in ends.items())
+        )
     assumed = e["assumed"].value if "assumed" in e else {}
     if not isinstance(assumed, dict):
         raise e["assumed"].error("a mapping of columns to numbers was expected")
     duration = max(ends.values())
-    return Inputs(name, str(e["title"].value), corners, {c: _number(v, -1e12, 1e12) for c, v in assumed.items()},
-                  _number(e["sample_s"], duration * 1e-7, duration), duration)
+    return Inputs(
+        name,
+        str(e["title"].value),
+        corners,
+        {c: _number(v, -1e12, 1e12) for c, v in assumed.items()},
+        _number(e["sample_s"], duration * 1e-7, duration),
+        duration,
+    )
 
 
 def load_experiments(path: str | Path) -> dict[str, Schedule]:
@@ -164,8 +186,12 @@ def _parts(node: Node, rate: float, corners: list[tuple[float, float]]) -> None:
                 _hold(corners, end - corners[-1][0], low, rate)
         elif "pulses" in p:
             z = _keys(p["pulses"], "pulses", {"count", "high_um", "active_s", "cutoff_hz", "least_s"})
-            widths, gaps = design_pulses(int(_number(z["count"], 1, 6)), _number(z["active_s"], 10, 1e6),
-                                         _number(z["cutoff_hz"], 1e-6, 10), _number(z["least_s"], 1, 1e6))
+            widths, gaps = design_pulses(
+                int(_number(z["count"], 1, 6)),
+                _number(z["active_s"], 10, 1e6),
+                _number(z["cutoff_hz"], 1e-6, 10),
+                _number(z["least_s"], 1, 1e6),
+            )
             for width, gap in zip(widths, gaps, strict=True):
                 _hold(corners, width, _number(z["high_um"], -1e6, 1e6), rate)
                 _hold(corners, gap, 0.0, rate)
@@ -183,7 +209,9 @@ def _hold(corners: list[tuple[float, float]], seconds: float, value: float, rate
         corners.append((t + seconds, value))
 
 
-def design_pulses(count: int, active_s: float, cutoff_hz: float, least_s: float) -> tuple[list[float], list[float]]:
+def design_pulses(
+    count: int, active_s: float, cutoff_hz: float, least_s: float
+) -> tuple[list[float], list[float]]:
     """Widths and gaps of `count` power pulses that fill `active_s`, none shorter than `least_s`, with the largest part of their
     alternating power below `cutoff_hz` spread over the band: maximises the geometric mean of power over four bands below it.
 
@@ -195,7 +223,9 @@ def design_pulses(count: int, active_s: float, cutoff_hz: float, least_s: float)
         if abs(sum(parts) - active_s) > 1e-6 * active_s:
             continue
         power = _pulse_power(parts[::2], parts[1::2], np.geomspace(cutoff_hz / 10, cutoff_hz, 24))
-        above = _pulse_power(parts[::2], parts[1::2], np.geomspace(cutoff_hz * 1.05, cutoff_hz * 5, 24)).mean()
+        above = _pulse_power(
+            parts[::2], parts[1::2], np.geomspace(cutoff_hz * 1.05, cutoff_hz * 5, 24)
+        ).mean()
         score = np.log(power.reshape(4, 6).mean(1)).mean() - 0.5 * np.log(above)
         if score > best + 1e-12:
             best, found = score, parts
@@ -210,14 +240,14 @@ def _pulse_power(widths: tuple, gaps: tuple, f: np.ndarray) -> np.ndarray:
     for w, g in zip(widths, gaps, strict=True):
         total += (np.exp(-2j * np.pi * f * t) - np.exp(-2j * np.pi * f * (t + w))) / (2j * np.pi * f)
         t += w + g
-    return np.abs(total)**2
+    return np.abs(total) ** 2
 
 
 def spectrum(t_s: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """One-sided power spectrum (f Hz, density) of an equidistant signal, its mean removed, padded fourfold."""
     n, dt = len(power), t_s[1] - t_s[0]
     x = np.fft.rfft(power - power.mean(), 4 * n)
-    return np.fft.rfftfreq(4 * n, dt), np.abs(x)**2 * dt / n * 2
+    return np.fft.rfftfreq(4 * n, dt), np.abs(x) ** 2 * dt / n * 2
 
 
 def share_below(t_s: np.ndarray, power: np.ndarray, cutoff_hz: float) -> float:
@@ -229,6 +259,7 @@ def share_below(t_s: np.ndarray, power: np.ndarray, cutoff_hz: float) -> float:
 @dataclass
 class Progress:
     """How far a run is: simulated or real seconds done of duration, wall seconds used, and the estimate of what is left."""
+
     done_s: float
     duration_s: float
     used_s: float
@@ -252,8 +283,14 @@ class Aborted(Exception):
         self.reason, self.done_s = reason, done_s
 
 
-def run(simulation: Any, schedule: Schedule, every: int = 100, start_s: float = 0.0,
-        progress: Callable[[Progress], None] | None = None, stop: Callable[[], bool] = lambda: False) -> Iterator[np.ndarray]:
+def run(
+    simulation: Any,
+    schedule: Schedule,
+    every: int = 100,
+    start_s: float = 0.0,
+    progress: Callable[[Progress], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Iterator[np.ndarray]:
     """Run a schedule on a `daemon.simulate.Simulation` (armed here); yields blocks of record rows, every `every`-th tick.
 
     Resumes at `start_s` of the schedule. Each block is given out before the next is computed, so an abort loses nothing.
@@ -261,6 +298,7 @@ def run(simulation: Any, schedule: Schedule, every: int = 100, start_s: float = 
     from thermoctl.control import arming
     from thermoctl.control.faults import FAULTS
     from thermoctl.signals import INDEX
+
     period = simulation.period_s
     waiting = [c for c in schedule.commands() if c[0] >= start_s]
     before = [c for c in schedule.commands() if c[0] < start_s]
@@ -293,7 +331,9 @@ def run(simulation: Any, schedule: Schedule, every: int = 100, start_s: float = 
             if block:
                 yield np.array(block)
             standing = [f.name for f in FAULTS if int(row[bits]) >> f.bit & 1]
-            raise Aborted(f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", start_s + k * period)
+            raise Aborted(
+                f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", start_s + k * period
+            )
 
 
 def _keys(node: Node, what: str, needed: set[str], optional: Collection[str] = ()) -> dict[str, Node]:
@@ -302,7 +342,9 @@ def _keys(node: Node, what: str, needed: set[str], optional: Collection[str] = (
         raise node.error(f"{what}: a mapping with {', '.join(sorted(allowed))} was expected")
     for key, value in node.value.items():
         if key not in allowed:
-            raise value.error(f"{what}: '{key}' is not known{suggest(key, allowed)}; {', '.join(sorted(allowed))} are")
+            raise value.error(
+                f"{what}: '{key}' is not known{suggest(key, allowed)}; {', '.join(sorted(allowed))} are"
+            )
     for key in sorted(needed):
         if key not in node.value:
             raise node.error(f"{what}: '{key}' is missing")

@@ -10,6 +10,7 @@ Kalman x(n+1) = A x + B [power, d(air)/dt] + w, y = C x + v, rises above the air
        body (C+ C+'), and a slowly forgotten outside heat as a disturbance state. Their three variances are taken from the
        calibration, where all twelve points are measured: those with which the coil alone estimates the twelve best.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -31,6 +32,7 @@ def sensor_variance(step_k: float, noise_k: float) -> float:
 @dataclass(frozen=True)
 class Mkf:
     """alpha (M, M), beta (M, 1), zeta (M,), R_w and R_v K^2; sigma_1 K^2 (the coil's error variance) for the table."""
+
     alpha: np.ndarray
     beta: np.ndarray
     zeta: np.ndarray
@@ -39,11 +41,21 @@ class Mkf:
     period_s: float
     sigma_1: float
 
-    def run(self, power_w: np.ndarray, coil_k: np.ndarray, start_k: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def run(
+        self, power_w: np.ndarray, coil_k: np.ndarray, start_k: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Filtered rises (N, M) and gains (N,) for power (N,) and coil rises (N,), NaN where no reading came."""
         start = np.zeros(len(self.alpha)) if start_k is None else start_k
-        return kernels.mkf_run(_c(self.alpha), _c(self.beta), _c(self.zeta), self.r_w, self.r_v, _c(start), _c(power_w[:, None]),
-                               _c(coil_k))
+        return kernels.mkf_run(
+            _c(self.alpha),
+            _c(self.beta),
+            _c(self.zeta),
+            self.r_w,
+            self.r_v,
+            _c(start),
+            _c(power_w[:, None]),
+            _c(coil_k),
+        )
 
 
 def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: float) -> Mkf:
@@ -52,10 +64,18 @@ def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: f
     e = e[np.isfinite(e).all(1)]
     centred = e - e.mean(0)
     sigma = centred[:, :1].T @ centred / len(e)
-    r_w = float((e[:, 0]**2).mean() + r_v)
+    r_w = float((e[:, 0] ** 2).mean() + r_v)
     alpha, beta = model.resample(period_s).output_form()
     # the recursion runs at the filter's period: the residual's variance builds up over the identification's
-    return Mkf(alpha, beta[:, :1], sigma[0] / sigma[0, 0], r_w * period_s / max(model.period_s, period_s), r_v, period_s, float(sigma[0, 0]))
+    return Mkf(
+        alpha,
+        beta[:, :1],
+        sigma[0] / sigma[0, 0],
+        r_w * period_s / max(model.period_s, period_s),
+        r_v,
+        period_s,
+        float(sigma[0, 0]),
+    )
 
 
 def with_air(model: StateSpace) -> StateSpace:
@@ -67,18 +87,28 @@ def with_air(model: StateSpace) -> StateSpace:
 @dataclass(frozen=True)
 class Kalman:
     """Steady filter: `model` with inputs [power W, d(air)/dt K/s], gain (n, s) for `sensors`, covariance p (n, n) K^2."""
+
     model: StateSpace
     gain: np.ndarray
     sensors: tuple[int, ...]
     p: np.ndarray
     noise: np.ndarray
 
-    def run(self, power_w: np.ndarray, air_rate: np.ndarray, measured_k: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
+    def run(
+        self, power_w: np.ndarray, air_rate: np.ndarray, measured_k: np.ndarray, x0: np.ndarray | None = None
+    ) -> np.ndarray:
         """Estimated rises (N, M); measured (N, s) or (N,) with NaN where no reading came."""
         measured = np.atleast_2d(measured_k.T).T
         x0 = np.zeros(self.model.order) if x0 is None else x0
-        x = kernels.steady_filter(_c(self.model.a), _c(self.model.b), _c(self.model.c[list(self.sensors)]), _c(self.gain), _c(x0),
-                                  _c(np.column_stack([power_w, air_rate])), _c(measured))
+        x = kernels.steady_filter(
+            _c(self.model.a),
+            _c(self.model.b),
+            _c(self.model.c[list(self.sensors)]),
+            _c(self.gain),
+            _c(x0),
+            _c(np.column_stack([power_w, air_rate])),
+            _c(measured),
+        )
         return x @ self.model.c.T
 
 
@@ -88,8 +118,13 @@ def disturbed(model: StateSpace, tau_s: float = 3600.0) -> StateSpace:
     into = np.linalg.pinv(model.c, rcond=1e-3) @ np.ones(len(model.c)) * model.period_s
     a = np.zeros((n + 1, n + 1))
     a[:n, :n], a[:n, n], a[n, n] = model.a, into, np.exp(-model.period_s / tau_s)
-    return replace(model, a=a, b=np.vstack([model.b, np.zeros((1, m))]), c=np.column_stack([model.c, np.zeros(len(model.c))]),
-                   x0=np.append(model.x0, 0.0))
+    return replace(
+        model,
+        a=a,
+        b=np.vstack([model.b, np.zeros((1, m))]),
+        c=np.column_stack([model.c, np.zeros(len(model.c))]),
+        x0=np.append(model.x0, 0.0),
+    )
 
 
 def process_noise(model: StateSpace, variances: np.ndarray) -> np.ndarray:
@@ -100,8 +135,11 @@ def process_noise(model: StateSpace, variances: np.ndarray) -> np.ndarray:
     q = np.zeros((n, n))
     b = model.b[:k]
     inverse = np.linalg.pinv(model.c[:, :k], rcond=1e-2)
-    q[:k, :k] = (variances[0] * np.outer(b[:, 0], b[:, 0]) + variances[1] * np.outer(b[:, 1], b[:, 1])
-                 + variances[2] * inverse @ inverse.T)
+    q[:k, :k] = (
+        variances[0] * np.outer(b[:, 0], b[:, 0])
+        + variances[1] * np.outer(b[:, 1], b[:, 1])
+        + variances[2] * inverse @ inverse.T
+    )
     if disturbance:
         q[k, k] = variances[3]
     return q
@@ -123,13 +161,20 @@ def steady(model: StateSpace, variances: np.ndarray, r_v: float, sensors: tuple[
 @dataclass(frozen=True)
 class Record:
     """One calibration recording at the filter's period: power (N,) W, air_rate (N,) K/s, rises (N, M) K (NaN: no reading)."""
+
     power_w: np.ndarray
     air_rate: np.ndarray
     rises: np.ndarray
 
 
-def tune(model: StateSpace, records: list[Record], r_v: float, sensors: tuple[int, ...] = (0,), smooth: int = 30,
-         weights: np.ndarray | None = None) -> tuple[Kalman, np.ndarray]:
+def tune(
+    model: StateSpace,
+    records: list[Record],
+    r_v: float,
+    sensors: tuple[int, ...] = (0,),
+    smooth: int = 30,
+    weights: np.ndarray | None = None,
+) -> tuple[Kalman, np.ndarray]:
     """The filter whose `sensors` estimate all points best over the calibration: (filter, variances).
 
     The error is averaged over `smooth` samples, so that thermometer noise of the judged points does not count. `weights` (M,)
@@ -137,28 +182,44 @@ def tune(model: StateSpace, records: list[Record], r_v: float, sensors: tuple[in
     base = np.array([np.log(1e-2), np.log(1e-10), np.log(1e-6), np.log(1e-13)])
     used = 4 if not model.c[:, -1].any() else 3
     w = np.ones(len(model.c)) if weights is None else weights / np.sqrt(np.mean(weights**2))
+
     def cost(x: np.ndarray) -> float:
         try:
-            f = steady(model, np.exp(np.append(x, base[len(x):])), r_v, sensors)
+            f = steady(model, np.exp(np.append(x, base[len(x) :])), r_v, sensors)
         except InputError:
             return 1e9
         total, count = 0.0, 0
         for rec in records:
             e = (f.run(rec.power_w, rec.air_rate, rec.rises[:, list(sensors)]) - rec.rises) * w
-            e = np.nan_to_num(e[:len(e) // smooth * smooth]).reshape(-1, smooth, e.shape[1]).mean(1)
+            e = np.nan_to_num(e[: len(e) // smooth * smooth]).reshape(-1, smooth, e.shape[1]).mean(1)
             total, count = total + float((e**2).sum()), count + e.size
         value = total / count
-        return (value if np.isfinite(value) else 1e9) * (1 + 1e-4 * float(((x - base[:len(x)])**2).sum()))
+        return (value if np.isfinite(value) else 1e9) * (1 + 1e-4 * float(((x - base[: len(x)]) ** 2).sum()))
 
     start = base[:used]
-    best = optimize.minimize(cost, start, method="Nelder-Mead",
-                             options={"maxfev": 140, "xatol": 0.1, "fatol": 1e-7, "initial_simplex": np.vstack([start, start + 3 * np.eye(used)])})
+    best = optimize.minimize(
+        cost,
+        start,
+        method="Nelder-Mead",
+        options={
+            "maxfev": 140,
+            "xatol": 0.1,
+            "fatol": 1e-7,
+            "initial_simplex": np.vstack([start, start + 3 * np.eye(used)]),
+        },
+    )
     variances = np.exp(np.append(best.x, base[used:]))
     return steady(model, variances, r_v, sensors), variances
 
 
-def choose_sensors(model: StateSpace, variances: np.ndarray, r_v: float, gains_um_k: np.ndarray, most: int = 12,
-                   must: tuple[int, ...] = ()) -> list[tuple[tuple[int, ...], float]]:
+def choose_sensors(
+    model: StateSpace,
+    variances: np.ndarray,
+    r_v: float,
+    gains_um_k: np.ndarray,
+    most: int = 12,
+    must: tuple[int, ...] = (),
+) -> list[tuple[tuple[int, ...], float]]:
     """For k = 1..`most` sensors the set with the least standard error of the position: [(sensors, um)].
 
     gains_um_k (M,): static position gain of each point. Forward choice with exchange until nothing improves; k = 1, 2 are

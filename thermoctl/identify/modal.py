@@ -16,6 +16,7 @@ s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only
    (1 - exp(-T/td) z^-1)/(1 - exp(-T/tc) z^-1) first (generalised least squares).
 All models are stable by construction.
 """
+
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
@@ -37,6 +38,7 @@ MOMENTS = 3
 class Blocks:
     """Reduced data: `u` (J, m, r) input moments, `y` (J, l) output means (NaN: no sample), `weight` (J, l) samples in each
     mean over the block's length, `q` samples per block, `period_s` of the samples, `basis` (r, q) the polynomials."""
+
     u: np.ndarray
     y: np.ndarray
     weight: np.ndarray
@@ -52,8 +54,11 @@ def gram_polynomials(q: int, r: int = MOMENTS) -> np.ndarray:
     return np.ascontiguousarray(np.linalg.qr(vander)[0].T)
 
 
-def reduce(chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray, np.ndarray], period_s: float,
-           block_s: float = 10.0) -> Blocks:
+def reduce(
+    chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray, np.ndarray],
+    period_s: float,
+    block_s: float = 10.0,
+) -> Blocks:
     """One pass over samples: `chunks` is (u (N, m), y (N, l)) or an iterable of such pieces; memory does not grow with N
     beyond the blocks. A block without any sample of an output gives NaN there; a last, incomplete block is dropped.
     Raises InputError when an input is missing or the data are shorter than 20 blocks."""
@@ -67,15 +72,17 @@ def reduce(chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray, n
     start = 0
     for cu, cy in chunks:
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T
-        for k in range(0, len(cu), 100_000):                # small pieces: bounded memory whatever the caller's chunks are
-            z = np.ascontiguousarray(np.hstack([cu[k:k + 100_000], cy[k:k + 100_000]]), dtype=float)
+        for k in range(0, len(cu), 100_000):  # small pieces: bounded memory whatever the caller's chunks are
+            z = np.ascontiguousarray(np.hstack([cu[k : k + 100_000], cy[k : k + 100_000]]), dtype=float)
             if u is None:
                 u, y = np.zeros((64, cu.shape[1], len(basis))), np.zeros((64, cy.shape[1]))
                 count = np.zeros_like(y)
             m = cu.shape[1]
             if not np.isfinite(z[:, :m]).all():
                 row = start + int(np.flatnonzero(~np.isfinite(z[:, :m]).all(1))[0])
-                raise InputError(f"an input is missing at sample {row}; identification needs every sample of the inputs")
+                raise InputError(
+                    f"an input is missing at sample {row}; identification needs every sample of the inputs"
+                )
             need = (start + len(z)) // q + 1
             if need > len(u):
                 grow = max(need, 2 * len(u)) - len(u)
@@ -84,13 +91,17 @@ def reduce(chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray, n
             start += len(z)
     blocks = start // q
     if u is None or blocks < 20:
-        raise InputError(f"{start} samples of {period_s:g} s are {blocks} blocks of {q * period_s:g} s; at least 20 are needed")
+        raise InputError(
+            f"{start} samples of {period_s:g} s are {blocks} blocks of {q * period_s:g} s; at least 20 are needed"
+        )
     with np.errstate(invalid="ignore", divide="ignore"):
         means = y[:blocks] / count[:blocks]
     return Blocks(u[:blocks], means, count[:blocks] / q, q, period_s, basis)
 
 
-def _responses(records: list[Blocks], tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _responses(
+    records: list[Blocks], tau: np.ndarray, rest: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stacked `_response` of several recordings: the poles and residues are common, each starts on its own."""
     parts = [_response(b, tau, rest) for b in records]
     return np.vstack([f for f, _, _ in parts]), np.vstack([d for _, d, _ in parts]), parts[0][2]
@@ -102,7 +113,9 @@ def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, flo
         return rows
     forgotten, corner = (np.exp(-records[0].q * records[0].period_s / t) for t in drift_s)
     ends = np.cumsum([len(b.u) for b in records])[:-1]
-    return np.vstack([signal.lfilter([1, -forgotten], [1, -corner], part, axis=0) for part in np.split(rows, ends)])
+    return np.vstack(
+        [signal.lfilter([1, -forgotten], [1, -corner], part, axis=0) for part in np.split(rows, ends)]
+    )
 
 
 def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -112,22 +125,22 @@ def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, 
     q, basis, J = blocks.q, blocks.basis, len(blocks.u)
     i = np.arange(q)
     F, D, owner = [], [], []
-    p = np.exp(-blocks.period_s / tau)                       # per sample
-    dp = p * blocks.period_s / tau                           # dp/d ln tau
-    pq, dpq = p**q, q * p**(q - 1) * dp
+    p = np.exp(-blocks.period_s / tau)  # per sample
+    dp = p * blocks.period_s / tau  # dp/d ln tau
+    pq, dpq = p**q, q * p ** (q - 1) * dp
     for k in range(len(tau)):
-        powers = p[k]**(q - 1 - i)                           # p^(q-1-i)
+        powers = p[k] ** (q - 1 - i)  # p^(q-1-i)
         dpowers = (q - 1 - i) * powers / p[k] * dp[k]
-        held = -np.expm1((q - 1 - i) * np.log(p[k])) / -np.expm1(np.log(p[k]))      # (1 - p^(q-1-i)) / (1 - p)
+        held = -np.expm1((q - 1 - i) * np.log(p[k])) / -np.expm1(np.log(p[k]))  # (1 - p^(q-1-i)) / (1 - p)
         dheld = (-dpowers + held * dp[k]) / (1 - p[k])
-        first = -np.expm1(q * np.log(p[k])) / (1 - p[k]) / q                        # mean of p^i over the block
+        first = -np.expm1(q * np.log(p[k])) / (1 - p[k]) / q  # mean of p^i over the block
         dfirst = (-dpq[k] / q + first * dp[k]) / (1 - p[k])
         # the block's input as moments: its effect on the block's end state and on the block's mean
-        end, dend = blocks.u @ (basis @ powers), blocks.u @ (basis @ dpowers)       # (J, m)
+        end, dend = blocks.u @ (basis @ powers), blocks.u @ (basis @ dpowers)  # (J, m)
         mean, dmean = blocks.u @ (basis @ held) / q, blocks.u @ (basis @ dheld) / q
         for m in range(end.shape[1]):
-            s, ds = kernels.decays(pq[k:k + 1], np.ascontiguousarray(end[:, m])[None])
-            t, _ = kernels.decays(pq[k:k + 1], np.ascontiguousarray(dend[:, m])[None])
+            s, ds = kernels.decays(pq[k : k + 1], np.ascontiguousarray(end[:, m])[None])
+            t, _ = kernels.decays(pq[k : k + 1], np.ascontiguousarray(dend[:, m])[None])
             s, ds = s[0], ds[0] * dpq[k] + t[0]
             # scaled by (1 - p): every column is then of the input's size, whatever its time constant
             f = first * s + mean[:, m]
@@ -137,9 +150,9 @@ def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, 
             owner.append(k)
         if not rest:
             n = np.arange(J)
-            decay = pq[k]**n
+            decay = pq[k] ** n
             F.append(first * decay)
-            D.append(dfirst * decay + first * n * pq[k]**np.maximum(n - 1, 0) * dpq[k] * (n > 0))
+            D.append(dfirst * decay + first * n * pq[k] ** np.maximum(n - 1, 0) * dpq[k] * (n > 0))
             owner.append(k)
     return np.array(F).T, np.array(D).T, np.array(owner)
 
@@ -147,7 +160,7 @@ def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, 
 @dataclass(frozen=True)
 class _Fit:
     tau: np.ndarray
-    theta: np.ndarray        # (columns, l)
+    theta: np.ndarray  # (columns, l)
     cost: float
     iterations: int
 
@@ -158,12 +171,21 @@ def _project(F: np.ndarray, Y: np.ndarray, ridge: float = 1e-7) -> tuple[np.ndar
     norm = np.linalg.norm(F, axis=0)
     norm[norm == 0] = 1
     Q, R = linalg.qr(np.vstack([F / norm, ridge * np.eye(n)]), mode="economic", check_finite=False)
-    theta = linalg.solve_triangular(R, Q[:len(F)].T @ Y, check_finite=False) / norm[:, None]
-    return Q[:len(F)], theta, Y - F @ theta
+    theta = linalg.solve_triangular(R, Q[: len(F)].T @ Y, check_finite=False) / norm[:, None]
+    return Q[: len(F)], theta, Y - F @ theta
 
 
-def _fit(blocks: list[Blocks], Y: np.ndarray, weight: np.ndarray, tau: np.ndarray, rest: bool, iterations: int,
-         bounds: tuple[float, float], ridge: float = 1e-7, drift_s: tuple[float, float] | None = None) -> _Fit:
+def _fit(
+    blocks: list[Blocks],
+    Y: np.ndarray,
+    weight: np.ndarray,
+    tau: np.ndarray,
+    rest: bool,
+    iterations: int,
+    bounds: tuple[float, float],
+    ridge: float = 1e-7,
+    drift_s: tuple[float, float] | None = None,
+) -> _Fit:
     """Levenberg-Marquardt on ln tau. `Y` (J, l) is scaled by each output's noise, `weight` (J,) by row."""
     x = np.log(tau)
     Y = _whitened(Y, blocks, drift_s) * weight[:, None]
@@ -177,7 +199,7 @@ def _fit(blocks: list[Blocks], Y: np.ndarray, weight: np.ndarray, tau: np.ndarra
 
     cost, Q, theta, r, D, owner = evaluate(x)
     damping, done = 1e-3, 0
-    for done in range(1, iterations + 1):                   # noqa: B007
+    for done in range(1, iterations + 1):  # noqa: B007
         PD = D - Q @ (Q.T @ D)
         H = (PD.T @ PD) * (theta @ theta.T)
         g = -((PD.T @ r) * theta).sum(1)
@@ -204,8 +226,15 @@ def _fit(blocks: list[Blocks], Y: np.ndarray, weight: np.ndarray, tau: np.ndarra
     return _Fit(np.exp(x), theta, cost, done)
 
 
-def identify(records: Blocks | list[Blocks], order: int | None = 8, rest: bool = True, iterations: int = 30,
-             tau_range_s: tuple[float, float] | None = None, ridge: float = 1e-7, drift_s: tuple[float, float] | None = None) -> StateSpace:
+def identify(
+    records: Blocks | list[Blocks],
+    order: int | None = 8,
+    rest: bool = True,
+    iterations: int = 30,
+    tau_range_s: tuple[float, float] | None = None,
+    ridge: float = 1e-7,
+    drift_s: tuple[float, float] | None = None,
+) -> StateSpace:
     """Model with `order` real poles per input (None: the least BIC of 1..10) from reduced data, at the blocks' sample period.
 
     Several recordings (of one block length) are fitted together; they must begin at `rest`. `ridge` (of a column's norm) holds residues
@@ -214,10 +243,16 @@ def identify(records: Blocks | list[Blocks], order: int | None = 8, rest: bool =
     estimated too. `drift_s`: see 4. above. Rows where an output is missing are left out for all outputs when the others are whole, else filled by
     two rounds of the model's own output. Raises InputError when an output was never measured."""
     records = [records] if isinstance(records, Blocks) else records
-    blocks = replace(records[0], y=np.vstack([b.y for b in records]), weight=np.vstack([b.weight for b in records]),
-                     u=np.concatenate([b.u for b in records]))
+    blocks = replace(
+        records[0],
+        y=np.vstack([b.y for b in records]),
+        weight=np.vstack([b.weight for b in records]),
+        u=np.concatenate([b.u for b in records]),
+    )
     if len(records) > 1 and not rest or len({(b.q, b.period_s) for b in records}) > 1:
-        raise InputError("recordings that are fitted together must begin at rest and have blocks of one length")
+        raise InputError(
+            "recordings that are fitted together must begin at rest and have blocks of one length"
+        )
     block_s = blocks.q * blocks.period_s
     span = max(len(b.u) for b in records) * block_s
     bounds = tau_range_s or (0.7 * block_s, 2.5 * span)
@@ -252,15 +287,27 @@ def identify(records: Blocks | list[Blocks], order: int | None = 8, rest: bool =
     parameters = order * (1 + theta.shape[1] * theta.shape[2])
     F, _, _ = _responses(records, fit.tau, rest)
     residual = np.where(missing, np.nan, blocks.y - F @ fit.theta * noise)
-    info = {"method": "modal", "time_constants_s": fit.tau[::-1].tolist(), "iterations": fit.iterations,
-            "bic": count * np.log(fit.cost / count) + parameters * np.log(count),
-            "residual_rms": np.sqrt(np.nanmean(residual**2, 0)).tolist(), "block_s": block_s}
+    info = {
+        "method": "modal",
+        "time_constants_s": fit.tau[::-1].tolist(),
+        "iterations": fit.iterations,
+        "bic": count * np.log(fit.cost / count) + parameters * np.log(count),
+        "residual_rms": np.sqrt(np.nanmean(residual**2, 0)).tolist(),
+        "block_s": block_s,
+    }
     return modal(p, residues, free, blocks.period_s, info)
 
 
-def identify_validated(u: np.ndarray, y: np.ndarray, period_s: float, orders: Sequence[int] = (1, 2, 3, 4),
-                       folds: Sequence[float] = (0.4, 0.6, 0.8), ahead: float = 0.2, block_s: float | None = None,
-                       others: Sequence[tuple[np.ndarray, np.ndarray]] = ()) -> StateSpace:
+def identify_validated(
+    u: np.ndarray,
+    y: np.ndarray,
+    period_s: float,
+    orders: Sequence[int] = (1, 2, 3, 4),
+    folds: Sequence[float] = (0.4, 0.6, 0.8),
+    ahead: float = 0.2,
+    block_s: float | None = None,
+    others: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+) -> StateSpace:
     """Model from one record u (N, m), y (N, l); order, kind of start (from equilibrium or not) and ridge by cross-validation.
 
     From the first 40, 60 and 80 % of the record every candidate is identified and run free over the next 20 %: the one with the least
@@ -287,11 +334,13 @@ def identify_validated(u: np.ndarray, y: np.ndarray, period_s: float, orders: Se
                 total = np.inf
                 break
             x0 = m.x0 if choice[1] else m.initial_state(u[:start], y[:start])
-            total += float(np.nanmean((m.simulate(u[:stop], x0)[start:] - y[start:stop])**2))
+            total += float(np.nanmean((m.simulate(u[:stop], x0)[start:] - y[start:stop]) ** 2))
         if np.isfinite(total):
             errors[choice] = float(np.sqrt(total / len(folds)))
     if not errors:
         raise InputError(f"{n} samples are too few to choose an order by cross-validation; give the order")
     best = min(errors, key=errors.__getitem__)
     model = fit(n, *best)
-    return replace(model, info={**model.info, "order": best[0], "rest": best[1], "ridge": best[2], "validation": errors})
+    return replace(
+        model, info={**model.info, "order": best[0], "rest": best[1], "ridge": best[2], "validation": errors}
+    )

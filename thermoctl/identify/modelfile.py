@@ -4,6 +4,7 @@ A file holds the compensator's coefficients with units and sampling, what they w
 figures, the rig's name and date. `current` in the folder names the one in use; older ones stay for a roll back.
 A file is refused when its own checksum, its shape, its rig or its date do not fit.
 """
+
 from __future__ import annotations
 
 import hashlib
@@ -22,14 +23,28 @@ from thermoctl.control.model import CompensatorModel
 from thermoctl.yamlfile import InputError, Node, load
 
 FORMAT = "thermoctl-model/1"
-UNITS = {"period_s": "s", "A_minus_I": "1 per period", "B": "K per W, K per (K/s)", "C": "K", "gain": "K/K", "R_w": "K^2", "R_v": "K^2",
-         "b1": "um/K", "b2": "um/K", "b_air": "um/K", "offset_um": "um", "expansion_period_s": "s", "air_filter_s": "s"}
+UNITS = {
+    "period_s": "s",
+    "A_minus_I": "1 per period",
+    "B": "K per W, K per (K/s)",
+    "C": "K",
+    "gain": "K/K",
+    "R_w": "K^2",
+    "R_v": "K^2",
+    "b1": "um/K",
+    "b2": "um/K",
+    "b_air": "um/K",
+    "offset_um": "um",
+    "expansion_period_s": "s",
+    "air_filter_s": "s",
+}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}")
 
 
 @dataclass(frozen=True)
 class Calibration:
     """A model with what it came from: rig name, `created` (UTC), fingerprints {file name: sha256}, figures {name: number}."""
+
     model: CompensatorModel
     rig: str
     created: str
@@ -46,7 +61,13 @@ def fingerprint(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-def save_model(path: str | Path, model: CompensatorModel, rig: str, recordings: list[str | Path] = (), figures: dict | None = None) -> Path:  # type: ignore[assignment]
+def save_model(
+    path: str | Path,
+    model: CompensatorModel,
+    rig: str,
+    recordings: list[str | Path] = (),
+    figures: dict | None = None,
+) -> Path:  # type: ignore[assignment]
     """Write a calibration; the file appears whole or not at all. Raises InputError when it exists (a calibration is never
     overwritten) or the place cannot be written."""
     path = Path(path)
@@ -54,13 +75,22 @@ def save_model(path: str | Path, model: CompensatorModel, rig: str, recordings: 
         raise InputError(f"{path}: exists; calibrations are never overwritten, choose another name")
     numbers = {k: _plain(v) for k, v in asdict(model).items()}
     content: dict[str, Any] = {
-        "format": FORMAT, "rig": rig, "created": datetime.now(UTC).isoformat(timespec="seconds"), "units": UNITS,
-        "fingerprints": {Path(r).name: fingerprint(r) for r in recordings}, "figures": _plain(figures or {}), "model": numbers}
+        "format": FORMAT,
+        "rig": rig,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "units": UNITS,
+        "fingerprints": {Path(r).name: fingerprint(r) for r in recordings},
+        "figures": _plain(figures or {}),
+        "model": numbers,
+    }
     content["checksum"] = _checksum(content)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _write(path, "# Written by thermoctl; edit nothing here, make another calibration instead.\n"
-               + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
+        _write(
+            path,
+            "# Written by thermoctl; edit nothing here, make another calibration instead.\n"
+            + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120),
+        )
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
     return path
@@ -80,10 +110,14 @@ def load_calibration(path: str | Path, rig: str | None = None) -> Calibration:
     if lacking:
         raise root.error(f"'{sorted(lacking)[0]}' is missing; the file is not whole")
     if content["checksum"] != _checksum({k: v for k, v in content.items() if k != "checksum"}):
-        raise root.value["checksum"].error("the checksum does not fit: the file was changed after it was written; "
-                                           "use another calibration ('thermoctl model list')")
+        raise root.value["checksum"].error(
+            "the checksum does not fit: the file was changed after it was written; "
+            "use another calibration ('thermoctl model list')"
+        )
     if rig is not None and content["rig"] != rig:
-        raise root.value["rig"].error(f"the calibration is of rig '{content['rig']}', this one is '{rig}'; calibrate this rig")
+        raise root.value["rig"].error(
+            f"the calibration is of rig '{content['rig']}', this one is '{rig}'; calibrate this rig"
+        )
     node: Node = root.value["model"]
     numbers: dict[str, Any] = {k: tuple(v) if k == "sensors" else v for k, v in content["model"].items()}
     try:
@@ -98,11 +132,19 @@ def load_model(path: str | Path, rig: str | None = None) -> CompensatorModel:
     return load_calibration(path, rig).model
 
 
-def install(folder: str | Path, model: CompensatorModel, rig: str, recordings: list[str | Path] = (), figures: dict | None = None) -> Path:  # type: ignore[assignment]
+def install(
+    folder: str | Path,
+    model: CompensatorModel,
+    rig: str,
+    recordings: list[str | Path] = (),
+    figures: dict | None = None,
+) -> Path:  # type: ignore[assignment]
     """Save a calibration as the folder's newest and make it current; the one before stays for a roll back."""
     folder = Path(folder)
     number = 1 + max((int(p.stem.split("-")[0]) for p in folder.glob("[0-9]*-*.yaml")), default=0)
-    path = save_model(folder / f"{number:04d}-{datetime.now(UTC):%Y%m%dT%H%M%S}.yaml", model, rig, recordings, figures)
+    path = save_model(
+        folder / f"{number:04d}-{datetime.now(UTC):%Y%m%dT%H%M%S}.yaml", model, rig, recordings, figures
+    )
     _write(folder / "current", path.name + "\n")
     return path
 
@@ -115,7 +157,9 @@ def current(folder: str | Path) -> Path:
     except OSError:
         raise InputError(f"{folder}: no calibration is current; make one with 'thermoctl identify'") from None
     if not _NAME.fullmatch(name) or not (Path(folder) / name).is_file():
-        raise InputError(f"{marker}: names '{name}', which is not there; 'thermoctl model rollback' chooses another")
+        raise InputError(
+            f"{marker}: names '{name}', which is not there; 'thermoctl model rollback' chooses another"
+        )
     return Path(folder) / name
 
 
@@ -131,12 +175,16 @@ def roll_back(folder: str | Path, name: str | None = None) -> Path:
     if name is None:
         older = [p for p in files if p.name < now.name]
         if not older:
-            raise InputError(f"{folder}: {now.name} is the oldest calibration; there is nothing to go back to")
+            raise InputError(
+                f"{folder}: {now.name} is the oldest calibration; there is nothing to go back to"
+            )
         path = older[-1]
     else:
         path = Path(folder) / name
         if path not in files:
-            raise InputError(f"{folder}: no calibration '{name}'; there are {', '.join(p.name for p in files) or 'none'}")
+            raise InputError(
+                f"{folder}: no calibration '{name}'; there are {', '.join(p.name for p in files) or 'none'}"
+            )
     load_calibration(path)
     _write(Path(folder) / "current", path.name + "\n")
     return path

@@ -6,6 +6,7 @@ output-error estimators, which is fed the older ones; its proposal is taken only
 stay within bounds round the calibrated ones, also after many tunings: a tuned model carries the gains of the calibration it came from. Every
 change is a calibration of its own (`modelfile.install`), so it can be rolled back.
 """
+
 from __future__ import annotations
 
 from collections import deque
@@ -23,8 +24,14 @@ class Tuner:
     buckets: coil temperature rises K between which samples are sought; `full` samples fill one; `clip` bounds the change of each gain as a
     part of the largest calibrated gain; the newest `hold_s` seconds are the test."""
 
-    def __init__(self, model: CompensatorModel, buckets_k: tuple[float, ...] = (0.5, 2.0, 4.0, 6.0, 9.0), full: int = 300, clip: float = 0.3,
-                 hold_s: float = 3600.0):
+    def __init__(
+        self,
+        model: CompensatorModel,
+        buckets_k: tuple[float, ...] = (0.5, 2.0, 4.0, 6.0, 9.0),
+        full: int = 300,
+        clip: float = 0.3,
+        hold_s: float = 3600.0,
+    ):
         self.model, self.full, self.clip = model, full, clip
         self.edges = np.array(buckets_k)
         self.counts = np.zeros((2, len(buckets_k) - 1))
@@ -58,9 +65,15 @@ class Tuner:
     def proposal(self) -> tuple[CompensatorModel | None, str]:
         """(model, why): None with the reason while it is too early or no better."""
         if self.progress < 100:
-            return None, f"excitation {self.progress:.0f} %: warm up and cool down through {self.edges[0]:g} to {self.edges[-1]:g} K"
+            return (
+                None,
+                f"excitation {self.progress:.0f} %: warm up and cool down through {self.edges[0]:g} to {self.edges[-1]:g} K",
+            )
         if self.bank.samples < self.hold:
-            return None, f"{self.bank.samples} samples before those kept back to judge by; {self.hold} are needed"
+            return (
+                None,
+                f"{self.bank.samples} samples before those kept back to judge by; {self.hold} are needed",
+            )
         gains = calibrated_gains(self.model)
         width = self.clip * max(np.abs(gains).max(), 1e-12)
         new = self.bank.bounded(gains - width, gains + width)
@@ -68,9 +81,18 @@ class Tuner:
         before, after = self._error(now), self._error(new)
         if not after <= 0.95 * before:
             return None, f"no better: {after:.3g} um against {before:.3g} um with the calibrated model"
-        return replace(self.model, f1=new.f1, b1=new.b1, b2=new.b2, b_air=float((new.b1 + new.b2).sum()) if self.model.b_air else 0.0,
-                       meta={**self.model.meta, "tuned_online": True, "calibrated_gains_um_k": calibrated_gains(self.model).tolist()}), \
-            f"{after:.3g} um against {before:.3g} um"
+        return replace(
+            self.model,
+            f1=new.f1,
+            b1=new.b1,
+            b2=new.b2,
+            b_air=float((new.b1 + new.b2).sum()) if self.model.b_air else 0.0,
+            meta={
+                **self.model.meta,
+                "tuned_online": True,
+                "calibrated_gains_um_k": calibrated_gains(self.model).tolist(),
+            },
+        ), f"{after:.3g} um against {before:.3g} um"
 
     def _error(self, e: Expansion) -> float:
         """Standard error over what was kept back, um; where it began (state and offset) is fitted."""

@@ -4,6 +4,7 @@ x(n+1) = A x(n) + B u(n),   y(n) = C x(n)                                    (31
 output form: y(n+1) = alpha y(n) + beta u(n), alpha = C A C+, beta = C B      (33)
 resampling: [[A, B], [0, I]] at one period is the exponential of [[F, G], [0, 0]] T: its logarithm gives any other period
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,7 @@ class StateSpace:
     """a (n, n), b (n, m), c (l, n), period_s, x0 (n,) at the first sample of the identification data; D = 0.
 
     `info` holds figures of the estimate (method, singular values, residuals) for reports."""
+
     a: np.ndarray
     b: np.ndarray
     c: np.ndarray
@@ -57,8 +59,15 @@ class StateSpace:
     def initial_state(self, u: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Least-squares x0 (n,) so that a free run over u (N, m) meets y (N, l); NaN in y is left out."""
         free = self.simulate(u)
-        columns = np.stack([kernels.simulate(_c(self.a), _c(np.zeros_like(self.b)), _c(self.c), e, _c(np.atleast_2d(u.T).T))
-                            for e in np.eye(self.order)], axis=-1)
+        columns = np.stack(
+            [
+                kernels.simulate(
+                    _c(self.a), _c(np.zeros_like(self.b)), _c(self.c), e, _c(np.atleast_2d(u.T).T)
+                )
+                for e in np.eye(self.order)
+            ],
+            axis=-1,
+        )
         here = np.isfinite(y)
         # over a short stretch slow states look alike: a ridge keeps what cannot be told apart small
         return _ridge(columns[here], (y - free)[here][:, None], 1e-5)[:, 0]
@@ -76,22 +85,26 @@ class StateSpace:
             return self
         bad = [p for p in self.poles if abs(p.imag) < 1e-12 and p.real <= 1e-12]
         if bad:
-            raise InputError(f"the model has a pole at {bad[0].real:.4g} (period {self.period_s:g} s): a real system sampled at "
-                             f"that period has none at or below zero, so it cannot be resampled to {period_s:g} s; it is a noise "
-                             "mode: lower the order or identify with real poles (method 'modal')")
+            raise InputError(
+                f"the model has a pole at {bad[0].real:.4g} (period {self.period_s:g} s): a real system sampled at "
+                f"that period has none at or below zero, so it cannot be resampled to {period_s:g} s; it is a noise "
+                "mode: lower the order or identify with real poles (method 'modal')"
+            )
         n, m = self.b.shape
         big = np.zeros((n + m, n + m))
         big[:n, :n], big[:n, n:], big[n:, n:] = self.a, self.b, np.eye(m)
         rate = linalg.logm(big) * (period_s / self.period_s)
         if np.abs(np.imag(rate)).max() > 1e-9 * np.abs(rate).max():
-            raise InputError(f"the model at {self.period_s:g} s has no real logarithm (a repeated pole below zero); lower the order")
+            raise InputError(
+                f"the model at {self.period_s:g} s has no real logarithm (a repeated pole below zero); lower the order"
+            )
         new = linalg.expm(np.real(rate))
         return replace(self, a=new[:n, :n], b=new[:n, n:], period_s=period_s)
 
     def minus_identity(self, period_s: float) -> np.ndarray:
         """A - I at a (short) period, formed without the subtraction from 1 that loses digits: the series of exp(F T) - I."""
         if self.poles.real.min() <= 0:
-            self.resample(period_s)                                        # raises with the pole's name
+            self.resample(period_s)  # raises with the pole's name
         f = np.real(linalg.logm(self.a)) * (period_s / self.period_s)
         total = term = f
         for k in range(2, 30):
@@ -100,18 +113,22 @@ class StateSpace:
         return total
 
 
-def modal(poles: np.ndarray, residues: np.ndarray, free: np.ndarray, period_s: float, info: dict) -> StateSpace:
+def modal(
+    poles: np.ndarray, residues: np.ndarray, free: np.ndarray, period_s: float, info: dict
+) -> StateSpace:
     """Smallest state space with real `poles` (K,), residues (K, l, m) (y = sum R_k s_k, s(n+1) = p s + u) and free decay
     amplitudes (K, l) of the initial state. A pole whose residue has rank r gets r states."""
     a, b, c, x0 = [], [], [], []
     scale = max(np.abs(residues).max(), 1e-300)
     for p, r, w in zip(poles, residues, free, strict=True):
-        left, s, right = np.linalg.svd(np.column_stack([r * 1.0, w])[:, :r.shape[1] + bool(np.any(w))], full_matrices=False)
+        left, s, right = np.linalg.svd(
+            np.column_stack([r * 1.0, w])[:, : r.shape[1] + bool(np.any(w))], full_matrices=False
+        )
         keep = s > 1e-12 * scale
         for k in np.flatnonzero(keep):
             a.append(p)
             c.append(left[:, k] * s[k])
-            b.append(right[k, :r.shape[1]])
+            b.append(right[k, : r.shape[1]])
             x0.append(right[k, -1] if np.any(w) else 0.0)
     return StateSpace(np.diag(a), np.array(b), np.array(c).T, period_s, np.array(x0), info)
 
@@ -119,7 +136,7 @@ def modal(poles: np.ndarray, residues: np.ndarray, free: np.ndarray, period_s: f
 def fit_percent(y: np.ndarray, model: np.ndarray) -> np.ndarray:
     """NRMSE fit of each column: 100 (1 - |y - model| / |y - mean|); NaN samples left out."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return 100 * (1 - np.sqrt(np.nansum((y - model)**2, 0) / np.nansum((y - np.nanmean(y, 0))**2, 0)))
+        return 100 * (1 - np.sqrt(np.nansum((y - model) ** 2, 0) / np.nansum((y - np.nanmean(y, 0)) ** 2, 0)))
 
 
 def _c(v: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ follows from its upper left neighbour: G[s+1, t+1] = G[s, t] + z(s+N) z(t+N)' - 
 the data, in bounded memory. H = L Q then has L from the Cholesky factor; where that breaks (noise-free data), from a
 blocked QR that carries only the triangle.
 """
+
 from __future__ import annotations
 
 from collections.abc import Iterable
@@ -32,23 +33,28 @@ from thermoctl.identify.statespace import StateSpace, _c, _ridge
 from thermoctl.yamlfile import InputError
 
 WEIGHTINGS = ("paper", "n4sid", "moesp", "cva")
-_ROWS = 10                                   # samples per row of the blocked correlation: a wide product runs at full speed
+_ROWS = 10  # samples per row of the blocked correlation: a wide product runs at full speed
 
 
 @dataclass(frozen=True)
 class Correlations:
     """The Gram matrix of the block Hankel matrix, rows [z(n); ...; z(n+2i-1)], z = [u; y] of m + l entries."""
+
     gram: np.ndarray
     i: int
     m: int
-    l: int                                   # noqa: E741
+    l: int  # noqa: E741
     samples: int
     period_s: float
-    qr: np.ndarray | None = None             # triangle from the blocked QR, where it was asked for
+    qr: np.ndarray | None = None  # triangle from the blocked QR, where it was asked for
 
 
-def correlate(chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray, np.ndarray], period_s: float, i: int = 20,
-              qr: bool = False) -> Correlations:
+def correlate(
+    chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray, np.ndarray],
+    period_s: float,
+    i: int = 20,
+    qr: bool = False,
+) -> Correlations:
     """One pass over (u (N, m), y (N, l)) or pieces of it. `qr` carries the triangle of a blocked QR instead (40 times the
     work, for data without noise). Raises InputError for a missing sample or fewer than 4i samples."""
     if isinstance(chunks, tuple):
@@ -63,16 +69,18 @@ def correlate(chunks: Iterable[tuple[np.ndarray, np.ndarray]] | tuple[np.ndarray
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T
         step = len(cu) if len(cu) <= 20_000 else 10_000
         for k in range(0, len(cu), step):
-            z = np.hstack([cu[k:k + step], cy[k:k + step]])
+            z = np.hstack([cu[k : k + step], cy[k : k + step]])
             if not np.isfinite(z).all():
                 row = total + int(np.flatnonzero(~np.isfinite(z).all(1))[0])
-                raise InputError(f"sample {row} is missing; subspace identification needs every sample (method 'modal' does not)")
+                raise InputError(
+                    f"sample {row} is missing; subspace identification needs every sample (method 'modal' does not)"
+                )
             m, w = cu.shape[1], z.shape[1]
             if sums is None:
                 tail, sums, head = np.empty((0, w)), np.zeros((lags, w, w)), np.empty((0, w))
             total += len(z)
             if len(head) < lags:
-                head = np.vstack([head, z[:lags - len(head)]])
+                head = np.vstack([head, z[: lags - len(head)]])
             z = np.vstack([tail, z])
             # every start n whose window z(n..n+lags-1) lies in z; the start rows are taken _ROWS at a time
             starts = len(z) - lags + 1
@@ -97,24 +105,24 @@ def _add_lags(sums: np.ndarray, z: np.ndarray, starts: int) -> None:
     lags, w = len(sums), z.shape[1]
     blocks = starts // _ROWS
     if blocks:
-        first = z[:blocks * _ROWS].reshape(blocks, _ROWS * w)
+        first = z[: blocks * _ROWS].reshape(blocks, _ROWS * w)
         wide = lags + _ROWS - 1
         products = np.empty((_ROWS * w, wide * w))
         for s in range(0, wide, _ROWS):
             n = min(_ROWS, wide - s)
             if s + blocks * _ROWS + (n < _ROWS) * 0 <= len(z) and n == _ROWS:
-                other = z[s:s + blocks * _ROWS].reshape(blocks, _ROWS * w)
+                other = z[s : s + blocks * _ROWS].reshape(blocks, _ROWS * w)
             else:
-                other = np.lib.stride_tricks.sliding_window_view(z[s:].ravel(), n * w)[::_ROWS * w][:blocks]
-            products[:, s * w:(s + n) * w] = first.T @ other
+                other = np.lib.stride_tricks.sliding_window_view(z[s:].ravel(), n * w)[:: _ROWS * w][:blocks]
+            products[:, s * w : (s + n) * w] = first.T @ other
         for r in range(_ROWS):
-            part = products[r * w:(r + 1) * w, r * w:(r + lags) * w]
+            part = products[r * w : (r + 1) * w, r * w : (r + lags) * w]
             sums += part.reshape(w, lags, w).transpose(1, 0, 2)
-    rest = z[blocks * _ROWS:]
+    rest = z[blocks * _ROWS :]
     n = starts - blocks * _ROWS
     if n:
         for t in range(lags):
-            sums[t] += rest[:n].T @ rest[t:t + n]
+            sums[t] += rest[:n].T @ rest[t : t + n]
 
 
 def _gram(sums: np.ndarray, head: np.ndarray, tail: np.ndarray, columns: int) -> np.ndarray:
@@ -122,27 +130,33 @@ def _gram(sums: np.ndarray, head: np.ndarray, tail: np.ndarray, columns: int) ->
     lags, w, _ = sums.shape
     g = np.empty((lags, w, lags, w))
     g[0] = sums.transpose(1, 0, 2)
-    tail = tail[-(lags - 1):]                                       # z(columns .. columns + lags - 2)
+    tail = tail[-(lags - 1) :]  # z(columns .. columns + lags - 2)
     for s in range(1, lags):
-        a = np.einsum("a,tb->atb", tail[s - 1], tail[s - 1:])
-        b = np.einsum("a,tb->atb", head[s - 1], head[s - 1:lags - 1])
-        g[s][:, s:] = g[s - 1][:, s - 1:-1] + a - b
+        a = np.einsum("a,tb->atb", tail[s - 1], tail[s - 1 :])
+        b = np.einsum("a,tb->atb", head[s - 1], head[s - 1 : lags - 1])
+        g[s][:, s:] = g[s - 1][:, s - 1 : -1] + a - b
         for t in range(s):
             g[s][:, t] = g[t][:, s].T
     return g.reshape(lags * w, lags * w)
 
 
 def _append_qr(triangle: np.ndarray | None, z: np.ndarray, lags: int) -> np.ndarray:
-    rows = np.lib.stride_tricks.sliding_window_view(z, lags, axis=0).transpose(0, 2, 1).reshape(len(z) - lags + 1, -1)
+    rows = (
+        np.lib.stride_tricks.sliding_window_view(z, lags, axis=0)
+        .transpose(0, 2, 1)
+        .reshape(len(z) - lags + 1, -1)
+    )
     stack = rows if triangle is None else np.vstack([triangle, rows])
-    return linalg.qr(stack, mode="r", check_finite=False)[0][:stack.shape[1]]
+    return linalg.qr(stack, mode="r", check_finite=False)[0][: stack.shape[1]]
 
 
 def _factor(c: Correlations) -> np.ndarray:
     """Lower triangular L of H = L Q / sqrt(N) with rows ordered [Uf; Up; Yp; Yf]."""
     i, m, w = c.i, c.m, c.m + c.l
     index = np.arange(2 * i * w).reshape(2 * i, w)
-    order = np.concatenate([index[i:, :m].ravel(), index[:i, :m].ravel(), index[:i, m:].ravel(), index[i:, m:].ravel()])
+    order = np.concatenate(
+        [index[i:, :m].ravel(), index[:i, :m].ravel(), index[:i, m:].ravel(), index[i:, m:].ravel()]
+    )
     if c.qr is not None:
         triangle = linalg.qr(c.qr[:, order], mode="r")[0].T / np.sqrt(c.samples)
         return triangle * np.where(np.diag(triangle) < 0, -1, 1)
@@ -150,13 +164,16 @@ def _factor(c: Correlations) -> np.ndarray:
     try:
         return linalg.cholesky(g, lower=True, check_finite=False)
     except linalg.LinAlgError:
-        raise InputError("the data's correlation matrix is singular (no noise, or an input that does not move); "
-                         "use correlate(..., qr=True) or a richer input") from None
+        raise InputError(
+            "the data's correlation matrix is singular (no noise, or an input that does not move); "
+            "use correlate(..., qr=True) or a richer input"
+        ) from None
 
 
 @dataclass(frozen=True)
 class Subspace:
     """What the projection gave: singular values (descending), left vectors already unweighted, and the factor."""
+
     singular_values: np.ndarray
     left: np.ndarray
     l_factor: np.ndarray
@@ -172,20 +189,22 @@ def project(c: Correlations, weighting: str = "cva") -> Subspace:
     nu, np_ = c.i * c.m, c.i * (2 * c.m + c.l)
     past = L[nu:np_, :np_]
     future = L[np_:, :np_]
-    lff = L[np_:, nu:np_]                                            # Yf on Wp, after Uf
+    lff = L[np_:, nu:np_]  # Yf on Wp, after Uf
     if weighting in ("paper", "n4sid"):
         lww = past[:, nu:]
         if c.qr is None:
             steer = linalg.solve_triangular(lww, lff.T, lower=True, trans="T", check_finite=False).T
         else:
             steer = lff @ np.linalg.pinv(lww, rcond=1e-11)
-        oblique = steer @ past                                       # O_i Q'
+        oblique = steer @ past  # O_i Q'
         scale = None
     else:
         oblique = lff
         scale = None
         if weighting == "cva":
-            scale = linalg.cholesky(lff @ lff.T + L[np_:, np_:] @ L[np_:, np_:].T, lower=True, check_finite=False)
+            scale = linalg.cholesky(
+                lff @ lff.T + L[np_:, np_:] @ L[np_:, np_:].T, lower=True, check_finite=False
+            )
             oblique = linalg.solve_triangular(scale, lff, lower=True, check_finite=False)
     del future
     if c.qr is None:
@@ -201,12 +220,19 @@ def project(c: Correlations, weighting: str = "cva") -> Subspace:
 def choose_order(s: np.ndarray, largest: int = 12) -> int:
     """Order by the singular values: the largest drop on a log scale among the first `largest` + 1."""
     with np.errstate(divide="ignore"):
-        logs = np.log(np.maximum(s[:largest + 1], 1e-300 + s[0] * 1e-14))
+        logs = np.log(np.maximum(s[: largest + 1], 1e-300 + s[0] * 1e-14))
     return int(np.argmax(logs[:-1] - logs[1:])) + 1
 
 
-def identify(u: np.ndarray, y: np.ndarray, period_s: float, order: int | None = 12, i: int = 20, weighting: str = "cva",
-             rest: bool = True) -> StateSpace:
+def identify(
+    u: np.ndarray,
+    y: np.ndarray,
+    period_s: float,
+    order: int | None = 12,
+    i: int = 20,
+    weighting: str = "cva",
+    rest: bool = True,
+) -> StateSpace:
     """Model of `order` (None: by the singular values) from u (N, m), y (N, l).
 
     weighting `paper`: A, C from W1 = W2 = I and B from (26), as printed; it may be unstable. Else A is made stable and B, x(0)
@@ -216,7 +242,12 @@ def identify(u: np.ndarray, y: np.ndarray, period_s: float, order: int | None = 
     sub = project(c, weighting)
     n = order or choose_order(sub.singular_values)
     a, cc = shift(sub, n)
-    info = {"method": "subspace", "weighting": weighting, "i": i, "singular_values": sub.singular_values[:3 * n].tolist()}
+    info = {
+        "method": "subspace",
+        "weighting": weighting,
+        "i": i,
+        "singular_values": sub.singular_values[: 3 * n].tolist(),
+    }
     if weighting == "paper":
         return StateSpace(a, paper_b(sub, a, cc, n), cc, period_s, np.zeros(n), info)
     a = stabilise(a)
@@ -226,7 +257,7 @@ def identify(u: np.ndarray, y: np.ndarray, period_s: float, order: int | None = 
 
 def shift(sub: Subspace, n: int) -> tuple[np.ndarray, np.ndarray]:
     """A (n, n) and C (l, n) from the extended observability matrix (13), (20). Raises InputError when n is too large."""
-    l, i = sub.correlations.l, sub.correlations.i             # noqa: E741
+    l, i = sub.correlations.l, sub.correlations.i  # noqa: E741
     if n >= (i - 1) * l or n > len(sub.singular_values):
         raise InputError(f"order {n} with i = {i} and {l} outputs; at most {(i - 1) * l - 1} is possible")
     gamma = sub.left[:, :n] * np.sqrt(sub.singular_values[:n])
@@ -245,8 +276,9 @@ def stabilise(a: np.ndarray, margin: float = 1e-6) -> np.ndarray:
     return np.real(vectors @ np.diag(new) @ np.linalg.inv(vectors))
 
 
-def input_matrix(a: np.ndarray, c: np.ndarray, u: np.ndarray, y: np.ndarray, rest: bool = False,
-                 ridge: float = 1e-11) -> tuple[np.ndarray, np.ndarray]:
+def input_matrix(
+    a: np.ndarray, c: np.ndarray, u: np.ndarray, y: np.ndarray, rest: bool = False, ridge: float = 1e-11
+) -> tuple[np.ndarray, np.ndarray]:
     """B (n, m) and x0 (n,) by simulation least squares in modal coordinates (rest: x0 = 0)."""
     values, vectors = np.linalg.eig(a)
     values = np.ascontiguousarray(values, dtype=complex)
@@ -254,18 +286,18 @@ def input_matrix(a: np.ndarray, c: np.ndarray, u: np.ndarray, y: np.ndarray, res
     n, m, N = len(a), u.shape[1], len(u)
     s = np.empty((n * (m + (not rest)), N), dtype=complex)
     for k in range(m):
-        s[k * n:(k + 1) * n] = kernels.modal_states(values, _c(u[:, k]))
+        s[k * n : (k + 1) * n] = kernels.modal_states(values, _c(u[:, k]))
     if not rest:
         impulse = np.zeros(N)
         impulse[0] = 1
-        s[m * n:] = kernels.modal_states(values, impulse)
-        s[m * n:, 1:], s[m * n:, 0] = s[m * n:, 1:] * 1.0, 1.0
-        s[m * n:, 1:] *= values[:, None]
+        s[m * n :] = kernels.modal_states(values, impulse)
+        s[m * n :, 1:], s[m * n :, 0] = s[m * n :, 1:] * 1.0, 1.0
+        s[m * n :, 1:] *= values[:, None]
     cols = np.tile(np.arange(n), m + (not rest))
     small = np.empty((2 * len(s), N))
     small[::2], small[1::2] = s.real, s.imag
     gram = small @ small.T
-    gram = (gram[::2, ::2] + gram[1::2, 1::2]) + 1j * (gram[::2, 1::2] - gram[1::2, ::2])     # conj(S) S'
+    gram = (gram[::2, ::2] + gram[1::2, 1::2]) + 1j * (gram[::2, 1::2] - gram[1::2, ::2])  # conj(S) S'
     normal = (cm.conj().T @ cm)[np.ix_(cols, cols)] * gram
     cross = small @ y
     right = ((cross[::2] - 1j * cross[1::2]) * cm.conj().T[cols]).sum(1)
@@ -281,13 +313,13 @@ def input_matrix(a: np.ndarray, c: np.ndarray, u: np.ndarray, y: np.ndarray, res
 def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
     """B by the paper's (21) to (26) with D = 0: the weak step, kept as printed."""
     k, L = sub.correlations, sub.l_factor
-    i, m, l = k.i, k.m, k.l                                       # noqa: E741
+    i, m, l = k.i, k.m, k.l  # noqa: E741
     nu, np_ = i * m, i * (2 * m + l)
     gamma = sub.left[:, :n] * np.sqrt(sub.singular_values[:n])
-    z_i = L[np_:, :np_]                                           # Z_i Q': Yf on [Uf; Up; Yp] is exact in L
+    z_i = L[np_:, :np_]  # Z_i Q': Yf on [Uf; Up; Yp] is exact in L
     pin_i, pin_less = np.linalg.pinv(gamma), np.linalg.pinv(gamma[:-l])
     # Z_{i+1}: Yf- on [Wp+; Uf-]; all of it in the coordinates of the rows of Q (columns of L)
-    uf, up, yp, yf = L[:nu], L[nu:2 * nu], L[2 * nu:np_], L[np_:]
+    uf, up, yp, yf = L[:nu], L[nu : 2 * nu], L[2 * nu : np_], L[np_:]
     seen = np.vstack([up, uf[:m], yp, yf[:l], uf[m:]])
     target = yf[l:]
     q, _ = linalg.qr(seen.T, mode="economic")
@@ -297,13 +329,13 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
     # (24) regressed on Uf, and (25), (26) linear in B (D = 0), solved together: min |left - N(B) Uf|. First K, then B from
     # K without weights, is the same in exact arithmetic without noise and far worse with it (Uf of long pulses is nearly singular)
     nu_factor = uf[:, :nu]
-    target = left[:, :nu]                                          # left, projected on Uf
-    lag, lcg = a @ pin_i, c @ pin_i                                # (n, i l), (l, i l)
+    target = left[:, :nu]  # left, projected on Uf
+    lag, lcg = a @ pin_i, c @ pin_i  # (n, i l), (l, i l)
     steps = np.empty((i, n + l, n))
     for j in range(i):
         # H_i's block column j holds [0...0; D; CB; CAB; ...]: C A^r B = gamma block r times B
-        h_i = np.vstack([np.zeros(((j + 1) * l, n)), gamma[:(i - j - 1) * l]])
-        h_less = np.vstack([np.zeros((j * l, n)), gamma[:(i - 1 - j) * l]])
+        h_i = np.vstack([np.zeros(((j + 1) * l, n)), gamma[: (i - j - 1) * l]])
+        h_less = np.vstack([np.zeros((j * l, n)), gamma[: (i - 1 - j) * l]])
         steps[j, :n] = (np.eye(n) if j == 0 else pin_less @ h_less) - lag @ h_i
         steps[j, n:] = -lcg @ h_i
     matrix = np.einsum("jpa,jbr->prab", steps, nu_factor.reshape(i, m, nu)).reshape(target.size, n * m)
@@ -314,6 +346,7 @@ def real_poles(model: StateSpace, u: np.ndarray, y: np.ndarray, rest: bool = Tru
     """The model with every pole moved to the nearest admissible place of a heat network (real, between 0 and 1) and its
     residues fitted again by least squares: the start of the refinement in `modal`."""
     from thermoctl.identify import modal
+
     tau = np.sort(model.time_constants_s[np.abs(model.poles) > 1e-3])
     tau = np.clip(tau, model.period_s, 2.5 * len(u) * model.period_s)
     blocks = modal.reduce((u, y), model.period_s, model.period_s)
@@ -322,14 +355,21 @@ def real_poles(model: StateSpace, u: np.ndarray, y: np.ndarray, rest: bool = Tru
     p = np.exp(-model.period_s / fit.tau)
     theta = fit.theta.reshape(len(tau), m + (not rest), -1)
     free = np.zeros((len(tau), theta.shape[2])) if rest else theta[:, m]
-    return modal.modal(p, np.moveaxis(theta[:, :m], 1, 2) * (1 - p)[:, None, None], free, model.period_s,
-                       {**model.info, "real_poles": True})
+    return modal.modal(
+        p,
+        np.moveaxis(theta[:, :m], 1, 2) * (1 - p)[:, None, None],
+        free,
+        model.period_s,
+        {**model.info, "real_poles": True},
+    )
 
 
 def innovations(model: StateSpace, u: np.ndarray, y: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """One-step prediction errors (N, l) of x(n+1) = A x + B u + K e, e = y - C x  (6), K = `gain` (n, l)."""
     closed = model.a - gain @ model.c
-    predicted = kernels.simulate(_c(closed), _c(np.hstack([model.b, gain])), _c(model.c), _c(model.x0), _c(np.hstack([u, y])))
+    predicted = kernels.simulate(
+        _c(closed), _c(np.hstack([model.b, gain])), _c(model.c), _c(model.x0), _c(np.hstack([u, y]))
+    )
     return y - predicted
 
 
@@ -347,7 +387,9 @@ def prediction_gain(model: StateSpace, u: np.ndarray, y: np.ndarray) -> np.ndarr
     return model.a @ p @ model.c.T @ np.linalg.inv(model.c @ p @ model.c.T + r)
 
 
-def refine_prediction_error(model: StateSpace, u: np.ndarray, y: np.ndarray, iterations: int = 6) -> tuple[StateSpace, np.ndarray]:
+def refine_prediction_error(
+    model: StateSpace, u: np.ndarray, y: np.ndarray, iterations: int = 6
+) -> tuple[StateSpace, np.ndarray]:
     """Prediction-error refinement of C, B, K and the (real) poles by Gauss-Newton: (model, K (n, l)).
 
     The model must be diagonal (from `modal` or `real_poles`). Minimises the whitened innovations' sum of squares; a step
@@ -355,16 +397,20 @@ def refine_prediction_error(model: StateSpace, u: np.ndarray, y: np.ndarray, ite
     if np.abs(model.a - np.diag(np.diag(model.a))).max() > 1e-12:
         raise InputError("prediction-error refinement starts from a model with real poles (diagonal A)")
     n, m = model.b.shape
-    l = len(model.c)                                             # noqa: E741
+    l = len(model.c)  # noqa: E741
     gain = prediction_gain(model, u, y)
     e = innovations(model, u, y, gain)
     root = np.linalg.inv(linalg.cholesky(np.cov(e.T).reshape(l, l) + 1e-18 * np.eye(l), lower=True))
     uy = _c(np.hstack([u, y]))
 
     def cost(mod: StateSpace, k: np.ndarray) -> float:
-        if not (np.diag(mod.a) > 0).all() or np.abs(np.linalg.eigvals(mod.a - k @ mod.c)).max() >= 1 or not mod.stable:
+        if (
+            not (np.diag(mod.a) > 0).all()
+            or np.abs(np.linalg.eigvals(mod.a - k @ mod.c)).max() >= 1
+            or not mod.stable
+        ):
             return np.inf
-        return float(((innovations(mod, u, y, k) @ root.T)**2).sum())
+        return float(((innovations(mod, u, y, k) @ root.T) ** 2).sum())
 
     best = cost(model, gain)
     for _ in range(iterations):
@@ -380,10 +426,17 @@ def refine_prediction_error(model: StateSpace, u: np.ndarray, y: np.ndarray, ite
         basis = np.eye(n)
         kernel_c = _c(model.c)
         for r, (_, k, _, drive) in enumerate(columns):
-            jac[r] = -(kernels.simulate(_c(closed), _c(basis[:, k:k + 1]), kernel_c, np.zeros(n), _c(drive[:, None])) @ root.T).ravel()
+            jac[r] = -(
+                kernels.simulate(
+                    _c(closed), _c(basis[:, k : k + 1]), kernel_c, np.zeros(n), _c(drive[:, None])
+                )
+                @ root.T
+            ).ravel()
         for j in range(l):
             for k in range(n):
-                d = -kernels.simulate(_c(closed), _c(-gain[:, j:j + 1]), kernel_c, np.zeros(n), _c(x[:, k:k + 1]))
+                d = -kernels.simulate(
+                    _c(closed), _c(-gain[:, j : j + 1]), kernel_c, np.zeros(n), _c(x[:, k : k + 1])
+                )
                 d[:, j] -= x[:, k]
                 jac[len(columns) + j * n + k] = (d @ root.T).ravel()
         h = jac @ jac.T
@@ -400,7 +453,7 @@ def refine_prediction_error(model: StateSpace, u: np.ndarray, y: np.ndarray, ite
                     b[k, j] += v
                 else:
                     k2[k, j] += v
-            c2 = model.c + size * step[len(columns):].reshape(l, n)
+            c2 = model.c + size * step[len(columns) :].reshape(l, n)
             trial = replace(model, a=np.diag(a), b=b, c=c2)
             value = cost(trial, k2)
             if value < best:

@@ -9,6 +9,7 @@ Lambda / IMC (Rivera, Morari, Skogestad) for K0 e^(-s theta)/((t1 s + 1)(t2 s + 
 tI = t1, tD = t2 (half rule for what is faster than theta); parallel form Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI + tD)
 Margins: of the sampled loop L(e^jw) = D(z) G(z), G with a zero-order hold and the dead time, moving average included.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from thermoctl.yamlfile import InputError
 @dataclass(frozen=True)
 class SecondOrder:
     """K0 e^(-s theta) / ((t1 s + 1)(t2 s + 1)), or oscillating: `t1`, `t2` are then complex conjugate. Gain in um per unit of drive."""
+
     gain: float
     t1: complex
     t2: complex
@@ -48,6 +50,7 @@ class SecondOrder:
 @dataclass(frozen=True)
 class Gains:
     """Kp (drive per um), Ti s, Td s, and how they came about."""
+
     kp: float
     ti_s: float
     td_s: float
@@ -65,10 +68,12 @@ def fit_step(t_s: np.ndarray, y_um: np.ndarray, drive: float, at_s: float = 0.0)
     t, y = t[t >= 0], y[t >= 0]
     if len(t) < 20:
         raise InputError(f"{len(t)} samples after the step; at least 20 are needed")
-    final = y[-max(5, len(y) // 5):].mean()
-    noise = np.std(np.diff(y[-max(10, len(y) // 5):])) / np.sqrt(2)
+    final = y[-max(5, len(y) // 5) :].mean()
+    noise = np.std(np.diff(y[-max(10, len(y) // 5) :])) / np.sqrt(2)
     if abs(final) < 5 * noise + 1e-12:
-        raise InputError(f"the step moved the output by {final:.3g} um, its noise is {noise:.3g} um; give a larger step")
+        raise InputError(
+            f"the step moved the output by {final:.3g} um, its noise is {noise:.3g} um; give a larger step"
+        )
     reach = t[np.argmax(np.abs(y) >= 0.632 * abs(final))] + (t[1] - t[0])
 
     def model(p: np.ndarray) -> SecondOrder:
@@ -80,8 +85,12 @@ def fit_step(t_s: np.ndarray, y_um: np.ndarray, drive: float, at_s: float = 0.0)
     for zeta in (0.3, 1.01, 2.0):
         for dead in (0.02, 0.2, 0.5):
             start = [final, np.log(2 * max(zeta, 0.5) / reach), np.log(zeta), np.log(dead * reach)]
-            r = optimize.least_squares(lambda p: model(p).step(t) * drive - y, start, max_nfev=100,
-                                       bounds=([-np.inf, -30, -4, np.log(1e-3 * reach)], [np.inf, 30, 4, np.log(reach * 1.5)]))
+            r = optimize.least_squares(
+                lambda p: model(p).step(t) * drive - y,
+                start,
+                max_nfev=100,
+                bounds=([-np.inf, -30, -4, np.log(1e-3 * reach)], [np.inf, 30, 4, np.log(reach * 1.5)]),
+            )
             if best is None or r.cost < best.cost:
                 best = r
     m = model(best.x)
@@ -101,8 +110,13 @@ def tangent(model: SecondOrder) -> tuple[float, float, float]:
 def ziegler_nichols(model: SecondOrder) -> Gains:
     """Table I from the fitted step response."""
     k0, tau_d, tau_c = tangent(model)
-    return Gains(1.2 * tau_c / (k0 * tau_d), 2 * tau_d, 0.5 * tau_d, "Ziegler-Nichols, step (Table I)",
-                 {"K0": k0, "tau_d_s": tau_d, "tau_c_s": tau_c})
+    return Gains(
+        1.2 * tau_c / (k0 * tau_d),
+        2 * tau_d,
+        0.5 * tau_d,
+        "Ziegler-Nichols, step (Table I)",
+        {"K0": k0, "tau_d_s": tau_d, "tau_c_s": tau_c},
+    )
 
 
 def relay(t_s: np.ndarray, y_um: np.ndarray, amplitude: float, hysteresis_um: float = 0.0) -> Gains:
@@ -112,7 +126,9 @@ def relay(t_s: np.ndarray, y_um: np.ndarray, amplitude: float, hysteresis_um: fl
     t, y = np.asarray(t_s)[tail], y[tail]
     up = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
     if len(up) < 4:
-        raise InputError(f"{max(len(up) - 1, 0)} whole oscillations in the last two thirds of the relay test; at least 3 are needed")
+        raise InputError(
+            f"{max(len(up) - 1, 0)} whole oscillations in the last two thirds of the relay test; at least 3 are needed"
+        )
     crossing = t[up] - y[up] * (t[up + 1] - t[up]) / (y[up + 1] - y[up])
     periods = np.diff(crossing)
     if periods.std() > 0.1 * periods.mean():
@@ -142,6 +158,7 @@ def imc(model: SecondOrder, lambda_s: float | None = None) -> Gains:
 @dataclass(frozen=True)
 class Margins:
     """Of the sampled loop: gain margin (factor), phase margin deg, delay margin s, and whether the closed loop is stable."""
+
     gain: float
     phase_deg: float
     delay_s: float
@@ -155,7 +172,9 @@ def margins(model: SecondOrder, gains: Gains, period_s: float, moving_average: i
     z = np.exp(1j * w * period_s)
     k, ti, td, ts = gains.kp, gains.ti_s, gains.td_s, period_s
     d = k * ((1 + ts / ti + td / ts) - (1 + 2 * td / ts) / z + td / ts / z**2) / (1 - 1 / z)
-    average = np.ones_like(z) if moving_average == 1 else (1 - z**-moving_average) / (1 - 1 / z) / moving_average
+    average = (
+        np.ones_like(z) if moving_average == 1 else (1 - z**-moving_average) / (1 - 1 / z) / moving_average
+    )
     loop = d * average * np.array(_held(model, w, ts))
     size, phase = np.abs(loop), np.unwrap(np.angle(loop))
     phase -= 2 * np.pi * np.round((phase[0] + np.pi / 2) / (2 * np.pi))
@@ -183,21 +202,35 @@ def _held(model: SecondOrder, w: np.ndarray, period_s: float) -> np.ndarray:
     return out
 
 
-def robust(model: SecondOrder, period_s: float, moving_average: int = 1, phase_deg: float = 45.0, gain: float = 2.0) -> Gains:
+def robust(
+    model: SecondOrder, period_s: float, moving_average: int = 1, phase_deg: float = 45.0, gain: float = 2.0
+) -> Gains:
     """The fastest lambda tuning with at least these margins. Raises InputError when none up to 1000 dead times has them."""
     for factor in np.geomspace(0.3, 1000, 60):
         g = imc(model, factor * max(model.theta_s, period_s))
         m = margins(model, g, period_s, moving_average)
         if m.stable and m.phase_deg >= phase_deg and m.gain >= gain:
-            return Gains(g.kp, g.ti_s, g.td_s, f"lambda / IMC with at least {phase_deg:g} deg and factor {gain:g}",
-                         {**g.figures, "gain_margin": m.gain, "phase_margin_deg": m.phase_deg})
+            return Gains(
+                g.kp,
+                g.ti_s,
+                g.td_s,
+                f"lambda / IMC with at least {phase_deg:g} deg and factor {gain:g}",
+                {**g.figures, "gain_margin": m.gain, "phase_margin_deg": m.phase_deg},
+            )
     raise InputError("no lambda tuning reaches the wanted margins on this model")
 
 
 def difference(present: Gains, proposed: Gains) -> str:
     """The change as lines of text, for people; nothing is written."""
-    rows = [("kp", present.kp, proposed.kp), ("ti_s", present.ti_s, proposed.ti_s), ("td_s", present.td_s, proposed.td_s)]
-    return "\n".join(f"  {n:5s} {a:10.4g} -> {b:10.4g}   ({100 * (b / a - 1) if a else float('inf'):+.0f} %)" for n, a, b in rows)
+    rows = [
+        ("kp", present.kp, proposed.kp),
+        ("ti_s", present.ti_s, proposed.ti_s),
+        ("td_s", present.td_s, proposed.td_s),
+    ]
+    return "\n".join(
+        f"  {n:5s} {a:10.4g} -> {b:10.4g}   ({100 * (b / a - 1) if a else float('inf'):+.0f} %)"
+        for n, a, b in rows
+    )
 
 
 def write(config: Path, proposed: Gains) -> None:
@@ -206,15 +239,25 @@ def write(config: Path, proposed: Gains) -> None:
     Raises InputError when the section does not name all three on lines of their own."""
     import os
     import re
+
     text = config.read_text(encoding="utf-8")
     section = re.search(r"^control:.*\n((?:[ \t]+.*\n|\s*\n|#.*\n)*)", text, re.MULTILINE)
     if section is None:
-        raise InputError(f"{config}: no section 'control' with lines of its own; write kp, ti_s, td_s by hand")
+        raise InputError(
+            f"{config}: no section 'control' with lines of its own; write kp, ti_s, td_s by hand"
+        )
     body = section.group(1)
     for name, value in (("kp", proposed.kp), ("ti_s", proposed.ti_s), ("td_s", proposed.td_s)):
-        body, n = re.subn(rf"^([ \t]+{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$", rf"\g<1>{value:.6g}\g<2>", body, flags=re.MULTILINE)
+        body, n = re.subn(
+            rf"^([ \t]+{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$",
+            rf"\g<1>{value:.6g}\g<2>",
+            body,
+            flags=re.MULTILINE,
+        )
         if n != 1:
-            raise InputError(f"{config}: control.{name} does not stand on a line of its own; write it by hand: {value:.6g}")
+            raise InputError(
+                f"{config}: control.{name} does not stand on a line of its own; write it by hand: {value:.6g}"
+            )
     temporary = config.with_name(f".{config.name}.writing")
-    temporary.write_text(text[:section.start(1)] + body + text[section.end(1):], encoding="utf-8")
+    temporary.write_text(text[: section.start(1)] + body + text[section.end(1) :], encoding="utf-8")
     os.replace(temporary, config)

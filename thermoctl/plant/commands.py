@@ -1,4 +1,5 @@
 """The commands simulate, refit, plant show, plant linearise and plant check."""
+
 from __future__ import annotations
 
 import argparse
@@ -16,8 +17,8 @@ from thermoctl.plant.simulate import Drive, Model, SimulationError
 from thermoctl.recording.table import Table, read_table, write_table
 from thermoctl.yamlfile import InputError
 
-RENEWAL = 0.1           # how far, as a share of its range, a state may have strayed from the plant within a block
-RECENT = 0.25           # share of a block from which its data count in full; older ones fade exponentially
+RENEWAL = 0.1  # how far, as a share of its range, a state may have strayed from the plant within a block
+RECENT = 0.25  # share of a block from which its data count in full; older ones fade exponentially
 
 
 def simulate(args: argparse.Namespace) -> int:
@@ -37,16 +38,24 @@ def simulate(args: argparse.Namespace) -> int:
         except SimulationError as e:
             raise InputError(f"{path}: {e}") from None
         runs.append((table, drive, x, y))
-        grid = Grid(title=f"{path}: " + (f"up to {args.horizon:g} s ahead" if args.horizon else "free run"), title_justify="left")
+        grid = Grid(
+            title=f"{path}: " + (f"up to {args.horizon:g} s ahead" if args.horizon else "free run"),
+            title_justify="left",
+        )
         for head in ("output", "samples", "rms error", "largest", "share of the range"):
             grid.add_column(head, justify="left" if head == "output" else "right")
         for j, o in enumerate(plant.outputs.values()):
             error = (drive.y[:, j] - y[:, j])[np.isfinite(drive.y[:, j])]
             if len(error):
                 spread = np.ptp(drive.y[np.isfinite(drive.y[:, j]), j])
-                rms = float(np.sqrt(np.mean(error ** 2)))
-                grid.add_row(o.name, str(len(error)), f"{rms:.4g} {o.unit or ''}", f"{np.max(np.abs(error)):.4g}",
-                             f"{100 * rms / spread:.2f} %" if spread > 0 else "")
+                rms = float(np.sqrt(np.mean(error**2)))
+                grid.add_row(
+                    o.name,
+                    str(len(error)),
+                    f"{rms:.4g} {o.unit or ''}",
+                    f"{np.max(np.abs(error)):.4g}",
+                    f"{100 * rms / spread:.2f} %" if spread > 0 else "",
+                )
             else:
                 grid.add_row(o.name, "0", "not measured", "", "")
         Console().print(grid)
@@ -59,7 +68,9 @@ def simulate(args: argparse.Namespace) -> int:
 
 
 def _all_uncertain(plant: Plant) -> Plant:
-    nodes = {n.name: dataclasses.replace(n, initial_sigma=n.initial_sigma or 1.0) for n in plant.nodes.values()}
+    nodes = {
+        n.name: dataclasses.replace(n, initial_sigma=n.initial_sigma or 1.0) for n in plant.nodes.values()
+    }
     return dataclasses.replace(plant, nodes=nodes)
 
 
@@ -73,21 +84,33 @@ def ahead(model: Model, drive: Drive, horizon_s: float) -> tuple[np.ndarray, np.
     if drive.scale is None:
         model.prepare(drive)
     p = model.vector(None, drive.name)
-    noise = np.array([np.hypot(o.noise or 0.0, (o.resolution or 0.0) / 12 ** 0.5) or 1e-3 * np.nanstd(drive.y[:, j]) or 1e-9
-                      for j, o in enumerate(model.plant.outputs.values())])
+    noise = np.array(
+        [
+            np.hypot(o.noise or 0.0, (o.resolution or 0.0) / 12**0.5)
+            or 1e-3 * np.nanstd(drive.y[:, j])
+            or 1e-9
+            for j, o in enumerate(model.plant.outputs.values())
+        ]
+    )
     scale = np.asarray(drive.scale)
-    x, y = np.full((len(drive.t), len(model.states)), np.nan), np.full((len(drive.t), len(model.outputs)), np.nan)
+    x, y = (
+        np.full((len(drive.t), len(model.states)), np.nan),
+        np.full((len(drive.t), len(model.outputs)), np.nan),
+    )
     state, _ = model.start(drive, p)
     root = np.array([n.initial_sigma or 1.0 for n in model.plant.nodes.values()])
     information = np.diag(1 / np.minimum(root, np.maximum(scale, 1e-12)) ** 2)
     begin = 0
     while begin < len(drive.t) - 1:
-        stop = min(max(int(np.searchsorted(drive.t, drive.t[begin] + horizon_s, side="right")), begin + 2), len(drive.t))
+        stop = min(
+            max(int(np.searchsorted(drive.t, drive.t[begin] + horizon_s, side="right")), begin + 2),
+            len(drive.t),
+        )
         block = drive.part(begin, stop)
         base, _ = model.start(block, p)
         run = model.run(block, p, state - base, sensitivities=True)
         assert run.dx is not None and run.dy is not None
-        new = slice(1 if begin else 0, None)                    # the first sample belongs to the block before
+        new = slice(1 if begin else 0, None)  # the first sample belongs to the block before
         x[begin:stop][new], y[begin:stop][new] = run.x[new], run.y[new]
         recent = np.exp(-(block.t[-1] - block.t) / (2 * RECENT * max(horizon_s, block.t[-1] - block.t[0])))
         matrix, gradient = information.copy(), np.zeros(len(state))
@@ -109,7 +132,11 @@ def ahead(model: Model, drive: Drive, horizon_s: float) -> tuple[np.ndarray, np.
 
 def _write(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y: np.ndarray) -> None:
     columns = {f"{o.column}_simulated": y[:, j] for j, o in enumerate(model.plant.outputs.values())}
-    columns |= {o.column: drive.y[:, j] for j, o in enumerate(model.plant.outputs.values()) if o.column in table.columns}
+    columns |= {
+        o.column: drive.y[:, j]
+        for j, o in enumerate(model.plant.outputs.values())
+        if o.column in table.columns
+    }
     columns |= {f"{s}_state": x[:, i] for i, s in enumerate(model.states)}
     write_table(name, Table(name.stem, str(name), table.t, columns))
 
@@ -117,6 +144,7 @@ def _write(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, 
 def _plot(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y: np.ndarray) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+
     count = len(model.outputs)
     figure = Figure(figsize=(10, max(3.0, 1.9 * count)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -152,7 +180,11 @@ def refit(args: argparse.Namespace) -> int:
             d.scale = None
         fitted = updated(plant, found, drives)
         if args.out:
-            save(fitted, args.out, f"refitted by thermoctl to {', '.join(Path(r).name for r in args.recordings)}")
+            save(
+                fitted,
+                args.out,
+                f"refitted by thermoctl to {', '.join(Path(r).name for r in args.recordings)}",
+            )
         Console().print(_estimates(plant, report(found, drives)))
         grid = Grid(title="rms error", title_justify="left")
         for head in ("recording", "took part", "output", "before", "after"):
@@ -172,14 +204,24 @@ def _estimates(plant: Plant, rows: list[Estimate]) -> Grid:
     grid = Grid(title="parameters", title_justify="left")
     for head in ("name", "before", "value", "standard error", "unit", "remark"):
         grid.add_column(head, justify="right" if head in ("before", "value", "standard error") else "left")
-    words = {"ok": "", "dead": "dead: the data do not feel it", "flat": "flat: only a combination with others is felt"}
+    words = {
+        "ok": "",
+        "dead": "dead: the data do not feel it",
+        "flat": "flat: only a combination with others is felt",
+    }
     for e in rows:
         p = plant.parameters[e.name]
         remark = words.get(e.state, f"at a bound of its range {list(p.range or ())}")
         if e.trades_with:
             remark = (remark + "; " if remark else "") + f"trades with {', '.join(e.trades_with[:4])}"
-        grid.add_row(f"{e.name} ({e.recording})" if e.recording else e.name, f"{p.value:.6g}", f"{e.value:.6g}", f"{e.sd:.2g}",
-                     e.unit or "", remark)
+        grid.add_row(
+            f"{e.name} ({e.recording})" if e.recording else e.name,
+            f"{p.value:.6g}",
+            f"{e.value:.6g}",
+            f"{e.sd:.2g}",
+            e.unit or "",
+            remark,
+        )
     return grid
 
 
@@ -192,13 +234,16 @@ def _errors(plant: Plant, table: Table) -> dict[str, float]:
     if model.uncertain:
         return fit(model, [drive]).rms()
     e = drive.y - model.run(drive).y
-    return {o: float(np.sqrt(np.nanmean(e[:, j] ** 2))) if np.isfinite(e[:, j]).any() else float("nan")
-            for j, o in enumerate(plant.outputs)}
+    return {
+        o: float(np.sqrt(np.nanmean(e[:, j] ** 2))) if np.isfinite(e[:, j]).any() else float("nan")
+        for j, o in enumerate(plant.outputs)
+    }
 
 
 def show(args: argparse.Namespace) -> int:
     """The plant's table, and its picture when --out is given."""
     from thermoctl.plant.show import draw, table
+
     plant = load(args.plant)
     if args.out:
         draw(plant, args.out)
@@ -215,13 +260,18 @@ def linearise(args: argparse.Namespace) -> int:
     """The compensator's model file from a thermal plant."""
     from thermoctl.identify.modelfile import save_model
     from thermoctl.plant import linearise as room
+
     plant = load(args.plant)
     model = room.linearise(plant, args.period, args.sensor_period, args.kind, density=args.heat_density)
     poles = model.meta["time_constants_s"]
-    print(f"{plant.title}: order {len(model.A_minus_I)}, time constants {poles[0]:.4g} to {poles[-1]:.4g} s, "
-          f"coil gain {model.gain[0, 0]:.4g}")
+    print(
+        f"{plant.title}: order {len(model.A_minus_I)}, time constants {poles[0]:.4g} to {poles[-1]:.4g} s, "
+        f"coil gain {model.gain[0, 0]:.4g}"
+    )
     if args.gains:
-        sequence = room.gains(room.thermal(plant), args.sensor_period, args.samples, density=args.heat_density)[:, :, 0]
+        sequence = room.gains(
+            room.thermal(plant), args.sensor_period, args.samples, density=args.heat_density
+        )[:, :, 0]
         t = np.arange(args.samples) * args.sensor_period
         columns = {n: sequence[:, i] for i, n in enumerate(plant.nodes)}
         write_table(args.gains, Table(Path(args.gains).stem, args.gains, t, columns))
@@ -238,6 +288,8 @@ def check(args: argparse.Namespace) -> int:
     for path in args.plants:
         p = load(path)
         free = sum(1 for q in p.parameters.values() if q.range)
-        print(f"{path}: good; {len(p.inputs)} inputs, {len(p.parameters)} parameters ({free} free), {len(p.nodes)} nodes, "
-              f"{len(p.flows)} flows, {len(p.outputs)} outputs")
+        print(
+            f"{path}: good; {len(p.inputs)} inputs, {len(p.parameters)} parameters ({free} free), {len(p.nodes)} nodes, "
+            f"{len(p.flows)} flows, {len(p.outputs)} outputs"
+        )
     return 0

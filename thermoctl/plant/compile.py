@@ -8,6 +8,7 @@ C was chosen by measurement (`make bench`): a plant is ready in some tenths of a
 slope: over 1e-5 of the range of its argument for a state, over half a sampling interval for time. Arguments that hold
 between samples (recorded inputs) keep their true jumps.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -64,7 +65,9 @@ class Code:
         self.slopes = [div(net[n.name], n.storage) for n in plant.nodes.values()]
         self._widths()
         self.source = self._source()
-        self.key = hashlib.sha256((self.source + _TEMPLATE.read_text() + _compiler()[1]).encode()).hexdigest()[:32]
+        self.key = hashlib.sha256(
+            (self.source + _TEMPLATE.read_text() + _compiler()[1]).encode()
+        ).hexdigest()[:32]
         self.library = _library(self.key, self.source)
 
     def _take_out_delays(self) -> None:
@@ -82,16 +85,29 @@ class Code:
                 key = f"{prefix}{len(table)}"
                 table[key] = (e.args[0], e.args[1])
                 return name(key)
+
             return change
-        self.rates = {f.name: ex.substitute(f.rate, named(self.input_delays, "delayed_input_"))
-                      for f in self.plant.flows.values()}
+
+        self.rates = {
+            f.name: ex.substitute(f.rate, named(self.input_delays, "delayed_input_"))
+            for f in self.plant.flows.values()
+        }
         for signal, _ in self.input_delays.values():
             if not ex.names(signal) <= set(self.plant.inputs):
                 raise InputError(f"{self.plant.file}: delay() in a rate may read inputs only, not '{signal}'")
-        self.values = [ex.substitute(o.value, named(self.output_delays, "delayed_")) for o in self.plant.outputs.values()]
-        for signal, _ in self.output_delays.values():           # a file cannot say it (language.py), an effect laid over a plant could
+        self.values = [
+            ex.substitute(o.value, named(self.output_delays, "delayed_")) for o in self.plant.outputs.values()
+        ]
+        for (
+            signal,
+            _,
+        ) in (
+            self.output_delays.values()
+        ):  # a file cannot say it (language.py), an effect laid over a plant could
             if ex.names(signal) & self.output_delays.keys():
-                raise InputError(f"{self.plant.file}: a delay() within a delay() is not part of the language; add the seconds")
+                raise InputError(
+                    f"{self.plant.file}: a delay() within a delay() is not part of the language; add the seconds"
+                )
 
     def _widths(self) -> None:
         """The jumps that are smoothed: by argument, 'state' or 'time'."""
@@ -123,10 +139,18 @@ class Code:
 
     def _source(self) -> str:
         nx, na = len(self.states), len(self.active)
-        jac = [(i, k, d) for i, f in enumerate(self.slopes) for k, s in enumerate(self.states)
-               if (d := derivative(f, s)) is not ZERO]
-        sens = [(i, c, d) for i, f in enumerate(self.slopes) for c, q in enumerate(self.active)
-                if (d := self._by_parameter(f, q)) is not ZERO]
+        jac = [
+            (i, k, d)
+            for i, f in enumerate(self.slopes)
+            for k, s in enumerate(self.states)
+            if (d := derivative(f, s)) is not ZERO
+        ]
+        sens = [
+            (i, c, d)
+            for i, f in enumerate(self.slopes)
+            for c, q in enumerate(self.active)
+            if (d := self._by_parameter(f, q)) is not ZERO
+        ]
         moving = set(self.states) | set(self.inputs) | {"t"}
         self.linear = not any(ex.names(d) & moving for _, _, d in jac)
         delays = list(self.output_delays)
@@ -134,8 +158,14 @@ class Code:
         for values, extra in ((self.values, delays), ([a for a, _ in self.output_delays.values()], [])):
             entries: list[tuple[int, int, int, Expr]] = []
             for r, g in enumerate(values):
-                entries += [(r, 0, k, d) for k, s in enumerate(self.states) if (d := derivative(g, s)) is not ZERO]
-                entries += [(r, 1, c, d) for c, q in enumerate(self.active) if (d := self._by_parameter(g, q)) is not ZERO]
+                entries += [
+                    (r, 0, k, d) for k, s in enumerate(self.states) if (d := derivative(g, s)) is not ZERO
+                ]
+                entries += [
+                    (r, 1, c, d)
+                    for c, q in enumerate(self.active)
+                    if (d := self._by_parameter(g, q)) is not ZERO
+                ]
                 entries += [(r, 2, k, d) for k, s in enumerate(extra) if (d := derivative(g, s)) is not ZERO]
             lists.append((values, entries))
         lu, nm = _sparse_lu(nx, [(i, k) for i, k, _ in jac])
@@ -146,25 +176,37 @@ class Code:
             f"#define NO0 {len(lists[0][1])}\n#define NO1 {len(lists[1][1])}\n"
             f"#define NO {max(len(lists[0][1]), len(lists[1][1]))}\n#define LINEAR {int(self.linear)}\n",
             _PRELUDE,
-            _ints("J_ROW", [i for i, _, _ in jac]), _ints("J_COL", [k for _, k, _ in jac]),
-            _ints("V_ROW", [i for i, _, _ in sens]), _ints("V_COL", [c for _, c, _ in sens]),
-            *(_ints(f"O{o}_ROW", [e[0] for e in lists[o][1]]) + _ints(f"O{o}_KIND", [e[1] for e in lists[o][1]])
-              + _ints(f"O{o}_COL", [e[2] for e in lists[o][1]]) for o in (0, 1)),
+            _ints("J_ROW", [i for i, _, _ in jac]),
+            _ints("J_COL", [k for _, k, _ in jac]),
+            _ints("V_ROW", [i for i, _, _ in sens]),
+            _ints("V_COL", [c for _, c, _ in sens]),
+            *(
+                _ints(f"O{o}_ROW", [e[0] for e in lists[o][1]])
+                + _ints(f"O{o}_KIND", [e[1] for e in lists[o][1]])
+                + _ints(f"O{o}_COL", [e[2] for e in lists[o][1]])
+                for o in (0, 1)
+            ),
             f"static void rhs_{args}, double *out) {{\n{self._emit(self.slopes)}}}\n",
             f"static void jac_{args}, double *out) {{\n{self._emit([d for *_, d in jac])}}}\n",
-            f"static void sens_{args}, double *out) {{\n{self._emit([d for *_, d in sens])}}}\n"]
+            f"static void sens_{args}, double *out) {{\n{self._emit([d for *_, d in sens])}}}\n",
+        ]
         for (values, entries), fn in zip(lists, ("outputs_", "delayed_"), strict=True):
-            parts += [f"static void {fn}{args}, const double *d, double *out) {{\n{self._emit(values)}}}\n",
-                      f"static void {fn[:-1]}_slopes_{args}, const double *d, double *out) {{\n"
-                      f"{self._emit([e[3] for e in entries])}}}\n"]
+            parts += [
+                f"static void {fn}{args}, const double *d, double *out) {{\n{self._emit(values)}}}\n",
+                f"static void {fn[:-1]}_slopes_{args}, const double *d, double *out) {{\n"
+                f"{self._emit([e[3] for e in entries])}}}\n",
+            ]
         return "\n".join([*parts, lu, '#include "integrator.h"\n'])
 
     def _emit(self, exprs: list[Expr]) -> str:
         """Statements that put each expression into out[]; shared parts once."""
-        place = {**{s: f"x[{i}]" for i, s in enumerate(self.states)},
-                 **{s: f"u[{i}]" for i, s in enumerate(self.inputs)},
-                 **{s: f"p[{i}]" for i, s in enumerate(self.parameters)},
-                 **{s: f"d[{i}]" for i, s in enumerate(self.output_delays)}, "t": "t"}
+        place = {
+            **{s: f"x[{i}]" for i, s in enumerate(self.states)},
+            **{s: f"u[{i}]" for i, s in enumerate(self.inputs)},
+            **{s: f"p[{i}]" for i, s in enumerate(self.parameters)},
+            **{s: f"d[{i}]" for i, s in enumerate(self.output_delays)},
+            "t": "t",
+        }
         lines: list[str] = ["(void)t; (void)x; (void)u; (void)p; (void)w;\n"]
         done: dict[int, str] = {}
         for root in exprs:
@@ -194,8 +236,13 @@ class Code:
                 return " * ".join([a[0]] * int(k.value))
             return f"pow({a[0]}, {a[1]})"
         if op in _JUMPS:
-            z = a[0] if op in ("step", "sign", "bump") else \
-                f"({a[0]} - {a[1]})" if op in (">", ">=") else f"({a[1]} - {a[0]})"
+            z = (
+                a[0]
+                if op in ("step", "sign", "bump")
+                else f"({a[0]} - {a[1]})"
+                if op in (">", ">=")
+                else f"({a[1]} - {a[0]})"
+            )
             site = self.jump_index.get(id(argument(e)))
             width = "0.0" if site is None else f"w[{site}]"
             kind = {"sign": "sign_", "bump": "bump_"}.get(op, "strict_" if op in (">", "<") else "step_")
@@ -264,46 +311,80 @@ def _sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, int]:
     put += [f"M[{index[i, k]}] -= a * J[{q}];\n" for q, (i, k) in enumerate(pattern)]
     forward, backward = [], []
     for k in order:
-        put.append(f"if (!(fabs(M[{index[k, k]}]) > 1e-9)) return 0;\nM[{index[k, k]}] = 1 / M[{index[k, k]}];\n")
+        put.append(
+            f"if (!(fabs(M[{index[k, k]}]) > 1e-9)) return 0;\nM[{index[k, k]}] = 1 / M[{index[k, k]}];\n"
+        )
         for i in sorted(columns[k], key=position.__getitem__):
             if position[i] <= position[k]:
                 continue
             put.append(f"M[{index[i, k]}] *= M[{index[k, k]}];\n")
-            put += [f"M[{index[i, j]}] -= M[{index[i, k]}] * M[{index[k, j]}];\n"
-                    for j in sorted(fill[k]) if position[j] > position[k]]
+            put += [
+                f"M[{index[i, j]}] -= M[{index[i, k]}] * M[{index[k, j]}];\n"
+                for j in sorted(fill[k])
+                if position[j] > position[k]
+            ]
             forward.append((i, k, index[i, k]))
     for k in reversed(order):
         backward += [(k, j, index[k, j]) for j in sorted(fill[k]) if position[j] > position[k]]
         backward.append((k, -1, index[k, k]))
     single = "".join(f"r[{i}] -= M[{m}] * r[{k}];\n" for i, k, m in forward)
-    single += "".join(f"r[{k}] *= M[{m}];\n" if j < 0 else f"r[{k}] -= M[{m}] * r[{j}];\n" for k, j, m in backward)
-    return (f"static int factor_(double a, const double *J, double *M) {{ (void)a; (void)J;\n{''.join(put)}return 1; }}\n"
-            f"static void solve_(const double *M, double *r) {{ (void)M; (void)r;\n{single}}}\n"
-            f"static inline void solve_lanes_(const double *restrict M, lanes *restrict r) {{ (void)M; (void)r;\n{single}}}\n", len(index))
+    single += "".join(
+        f"r[{k}] *= M[{m}];\n" if j < 0 else f"r[{k}] -= M[{m}] * r[{j}];\n" for k, j, m in backward
+    )
+    return (
+        f"static int factor_(double a, const double *J, double *M) {{ (void)a; (void)J;\n{''.join(put)}return 1; }}\n"
+        f"static void solve_(const double *M, double *r) {{ (void)M; (void)r;\n{single}}}\n"
+        f"static inline void solve_lanes_(const double *restrict M, lanes *restrict r) {{ (void)M; (void)r;\n{single}}}\n",
+        len(index),
+    )
 
 
 # ------------------------------------------------------------------------------------------------ building and loading
+
 
 @cache
 def _compiler() -> tuple[list[str], str]:
     """The C compiler's command and what identifies its result (version, processor)."""
     for candidate in (os.environ.get("CC"), "cc", "gcc", "clang"):
         if candidate and (path := shutil.which(candidate.split()[0])):
-            version = subprocess.run([path, "--version"], capture_output=True, text=True).stdout.splitlines()[:1]
+            version = subprocess.run([path, "--version"], capture_output=True, text=True).stdout.splitlines()[
+                :1
+            ]
             try:
-                flags = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags")), "")
+                flags = next(
+                    (
+                        line
+                        for line in Path("/proc/cpuinfo").read_text().splitlines()
+                        if line.startswith("flags")
+                    ),
+                    "",
+                )
             except OSError:
                 flags = ""
-            command = [*candidate.split(), "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math",
-                       "-fPIC", "-shared", "-w"]
+            command = [
+                *candidate.split(),
+                "-O3",
+                "-march=native",
+                "-fno-math-errno",
+                "-fno-trapping-math",
+                "-fPIC",
+                "-shared",
+                "-w",
+            ]
             return command, f"{version}{flags}{command}"
-    raise InputError("no C compiler (cc, gcc or clang) was found; install one (Debian: apt-get install gcc) or set CC")
+    raise InputError(
+        "no C compiler (cc, gcc or clang) was found; install one (Debian: apt-get install gcc) or set CC"
+    )
 
 
 def cache_directory() -> Path:
     """Where compiled plants are kept: $THERMOCTL_CACHE, else thermoctl/plants in the user's cache."""
     own = os.environ.get("THERMOCTL_CACHE")
-    return Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thermoctl" / "plants"
+    return (
+        Path(own)
+        if own
+        else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thermoctl" / "plants"
+    )
 
 
 def _library(key: str, source: str) -> ctypes.CDLL:
@@ -315,11 +396,11 @@ def _library(key: str, source: str) -> ctypes.CDLL:
             with tempfile.TemporaryDirectory(dir=folder) as work:
                 _build(Path(work), source)
                 os.replace(Path(work) / "plant.so", path)
-        except OSError:         # a read-only home: build for this process only
+        except OSError:  # a read-only home: build for this process only
             with tempfile.TemporaryDirectory() as work:
                 _build(Path(work), source)
                 return _typed(ctypes.CDLL(str(Path(work) / "plant.so")))
-        if key[0] == "0":       # one build in sixteen: a full folder takes half a second to list
+        if key[0] == "0":  # one build in sixteen: a full folder takes half a second to list
             _trim(folder)
     return _typed(ctypes.CDLL(str(path)))
 
@@ -329,8 +410,11 @@ def _build(work: Path, source: str) -> None:
     # A large file is dominated by straight-line code that -O1 translates as well in a fraction of the time; a small one runs a
     # tenth slower and is ready in less than half of the time, which a diagnosis with its many plants feels.
     command = [("-O1" if a == "-O3" and not 10_000 < len(source) < 400_000 else a) for a in _compiler()[0]]
-    done = subprocess.run([*command, f"-I{_TEMPLATE.parent}", "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],
-                          capture_output=True, text=True)
+    done = subprocess.run(
+        [*command, f"-I{_TEMPLATE.parent}", "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],
+        capture_output=True,
+        text=True,
+    )
     if done.returncode:
         raise InputError(f"the C compiler failed on the plant: {done.stderr.strip()[:500]}")
 
@@ -339,7 +423,7 @@ def _trim(folder: Path, keep: int = 2000, age_s: float = 86_400.0) -> None:
     """Forget the oldest beyond `keep`, but none made within a day: another process may be about to load it."""
     made = []
     for path in folder.glob("*.so"):
-        with contextlib.suppress(OSError):      # another process trims, too
+        with contextlib.suppress(OSError):  # another process trims, too
             made.append((path.stat().st_mtime, path))
     for mtime, path in sorted(made)[:-keep]:
         if time.time() - mtime > age_s:
@@ -363,6 +447,7 @@ def compile_plant(plant: Plant, active: tuple[str, ...] | None = None):
     """The plant as machine code, ready to simulate. `active`: the parameters to give sensitivities for (default: all
     that have a range). Raises InputError for an unknown name or a missing compiler."""
     from thermoctl.plant.simulate import Model
+
     if active is None:
         active = tuple(p.name for p in plant.parameters.values() if p.range)
     for q in active:
@@ -386,10 +471,13 @@ def _code(plant: Plant, active: tuple[str, ...]) -> Code:
 
 def _structure(plant: Plant) -> Mapping:
     """What the code depends on: everything but values, ranges, units and noise."""
-    return {"i": list(plant.inputs), "p": list(plant.parameters),
-            "n": [(n.name, str(n.storage), bool(n.initial_sigma)) for n in plant.nodes.values()],
-            "f": [(f.name, f.source, f.target, str(f.rate)) for f in plant.flows.values()],
-            "o": [(o.name, str(o.value)) for o in plant.outputs.values()]}
+    return {
+        "i": list(plant.inputs),
+        "p": list(plant.parameters),
+        "n": [(n.name, str(n.storage), bool(n.initial_sigma)) for n in plant.nodes.values()],
+        "f": [(f.name, f.source, f.target, str(f.rate)) for f in plant.flows.values()],
+        "o": [(o.name, str(o.value)) for o in plant.outputs.values()],
+    }
 
 
 __all__ = ["Code", "argument", "cache_directory", "compile_plant"]

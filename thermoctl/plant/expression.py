@@ -3,6 +3,7 @@
 An expression is a graph of interned nodes (the same sub-expression is the same object), so that derivatives share
 their parts and the generated C computes each part once.
 """
+
 from __future__ import annotations
 
 import math
@@ -14,16 +15,33 @@ from typing import Any
 
 import numpy as np
 
-FUNCTIONS = {"abs": 1, "sign": 1, "sqrt": 1, "exp": 1, "log": 1, "sin": 1, "cos": 1, "tanh": 1, "min": 2, "max": 2, "step": 1}
+FUNCTIONS = {
+    "abs": 1,
+    "sign": 1,
+    "sqrt": 1,
+    "exp": 1,
+    "log": 1,
+    "sin": 1,
+    "cos": 1,
+    "tanh": 1,
+    "min": 2,
+    "max": 2,
+    "step": 1,
+}
 SPECIAL = ("table", "delay", "first")
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 MAX_LENGTH, MAX_DEPTH, MAX_TOKENS = 20_000, 80, 5_000
-MAX_LEVELS = 250            # of the tree that is read: of brackets, and of terms and factors in a row
-ALLOWED = ("+ - * / **, comparisons, numbers, pi, t, the names of the file, and "
-           + " ".join(FUNCTIONS) + " table delay first")
+MAX_LEVELS = 250  # of the tree that is read: of brackets, and of terms and factors in a row
+ALLOWED = (
+    "+ - * / **, comparisons, numbers, pi, t, the names of the file, and "
+    + " ".join(FUNCTIONS)
+    + " table delay first"
+)
 
-_TOKEN = re.compile(r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
-                    r"|(?P<op>\*\*|<=|>=|==|!=|[-+*/()<>,\[\]]))")
+_TOKEN = re.compile(
+    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
+    r"|(?P<op>\*\*|<=|>=|==|!=|[-+*/()<>,\[\]]))"
+)
 
 
 class ExpressionError(ValueError):
@@ -36,6 +54,7 @@ class Expr:
     'table' (args: x, then the x points, then the y points; value = number of points), 'delay' (args: expression,
     seconds), 'first' (value: name), or, in derivatives only, 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope', 'bump'
     (slope of a smoothed step), 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed)."""
+
     op: str
     args: tuple[Expr, ...] = ()
     value: Any = None
@@ -52,7 +71,7 @@ def make(op: str, *args: Expr, value: Any = None) -> Expr:
     key = (op, tuple(map(id, args)), value)
     found = _INTERNED.get(key)
     if found is None:
-        if len(_INTERNED) > 2_000_000:      # a long-lived process that reads very many plants
+        if len(_INTERNED) > 2_000_000:  # a long-lived process that reads very many plants
             _INTERNED.clear()
             _INTERNED.update({("num", (), 0.0): ZERO, ("num", (), 1.0): ONE})
         found = _INTERNED[key] = Expr(op, args, value)
@@ -122,7 +141,7 @@ def power(a: Expr, b: Expr) -> Expr:
         return ONE
     if a.op == b.op == "num":
         try:
-            value = a.value ** b.value
+            value = a.value**b.value
             if isinstance(value, float) and math.isfinite(value):
                 return num(value)
         except (OverflowError, ZeroDivisionError):
@@ -131,6 +150,7 @@ def power(a: Expr, b: Expr) -> Expr:
 
 
 # ---------------------------------------------------------------------------------------------------------- reading
+
 
 def parse(text: str | int | float) -> Expr:
     """Read an expression. Raises ExpressionError with what stands at fault and what would be allowed."""
@@ -146,7 +166,9 @@ def parse(text: str | int | float) -> Expr:
     while at < len(text):
         match = _TOKEN.match(text, at)
         if not match:
-            raise ExpressionError(f"'{text[at:at + 12].strip()}' is not part of the language; allowed are {ALLOWED}")
+            raise ExpressionError(
+                f"'{text[at : at + 12].strip()}' is not part of the language; allowed are {ALLOWED}"
+            )
         tokens.append((match.lastgroup or "", match.group(match.lastgroup or 0)))
         at = match.end()
     if len(tokens) > MAX_TOKENS:
@@ -182,7 +204,9 @@ class _Reader:
 
     def need(self, text: str) -> None:
         if not self.take(text):
-            raise ExpressionError(f"'{text}' was expected" + (f" before '{self.peek()}'" if self.peek() else " at the end"))
+            raise ExpressionError(
+                f"'{text}' was expected" + (f" before '{self.peek()}'" if self.peek() else " at the end")
+            )
 
     def comparison(self) -> Expr:
         self.depth += 1
@@ -194,7 +218,9 @@ class _Reader:
             self.at += 1
             left = make(op, left, self.sum())
             if self.peek() in COMPARISONS:
-                raise ExpressionError("chained comparisons are not part of the language; use a product of two")
+                raise ExpressionError(
+                    "chained comparisons are not part of the language; use a product of two"
+                )
         self.depth -= 1
         return left
 
@@ -252,8 +278,10 @@ class _Reader:
 
     def call(self, function: str) -> Expr:
         if function not in FUNCTIONS and function not in SPECIAL:
-            raise ExpressionError(f"'{function}' is not a function of the language; allowed are "
-                                  + ", ".join((*FUNCTIONS, *SPECIAL)))
+            raise ExpressionError(
+                f"'{function}' is not a function of the language; allowed are "
+                + ", ".join((*FUNCTIONS, *SPECIAL))
+            )
         self.need("(")
         if function == "first":
             kind, text = self.tokens[self.at] if self.at < len(self.tokens) else ("", "")
@@ -270,8 +298,10 @@ class _Reader:
             ys = self.list()
             self.need(")")
             if len(xs) != len(ys) or len(xs) < 2:
-                raise ExpressionError(f"table() has {len(xs)} x points and {len(ys)} y points; two or more of each, "
-                                      "alike in number, were expected")
+                raise ExpressionError(
+                    f"table() has {len(xs)} x points and {len(ys)} y points; two or more of each, "
+                    "alike in number, were expected"
+                )
             numbers = [x.value for x in xs if x.op == "num"]
             if any(b <= a for a, b in zip(numbers, numbers[1:], strict=False)):
                 raise ExpressionError("the x points of table() must increase")
@@ -304,6 +334,7 @@ class _Reader:
 
 
 # ---------------------------------------------------------------------------------------------------------- looking
+
 
 @lru_cache(maxsize=20_000)
 def walk(expr: Expr) -> tuple[Expr, ...]:
@@ -361,8 +392,10 @@ def _text(e: Expr, outer: int) -> str:
         return f"first({e.value})"
     if e.op == "table":
         k = e.value
-        return (f"table({_text(e.args[0], 0)}, [{', '.join(_text(a, 0) for a in e.args[1:k + 1])}], "
-                f"[{', '.join(_text(a, 0) for a in e.args[k + 1:])}])")
+        return (
+            f"table({_text(e.args[0], 0)}, [{', '.join(_text(a, 0) for a in e.args[1 : k + 1])}], "
+            f"[{', '.join(_text(a, 0) for a in e.args[k + 1 :])}])"
+        )
     p = _PRECEDENCE.get(e.op)
     if p is None:
         return f"{e.op}({', '.join(_text(a, 0) for a in e.args)})"
@@ -376,12 +409,13 @@ def _text(e: Expr, outer: int) -> str:
         text = f"{_text(e.args[0], p + 1)}**{_text(e.args[1], p)}"
     else:
         right = p if e.op in ("+", "*") else p + 1
-        left = p + 1 if e.op in COMPARISONS else p          # a comparison of a comparison needs its brackets
+        left = p + 1 if e.op in COMPARISONS else p  # a comparison of a comparison needs its brackets
         text = f"{_text(e.args[0], left)} {e.op} {_text(e.args[1], right)}"
     return f"({text})" if p < outer else text
 
 
 # ------------------------------------------------------------------------------------------------------ derivatives
+
 
 @lru_cache(maxsize=50_000)
 def derivative(expr: Expr, by: str) -> Expr:
@@ -409,8 +443,15 @@ def _derive(e: Expr, by: str, done: Mapping[int, Expr]) -> Expr:
         case "/":
             return add(div(d[0], a[1]), neg(div(mul(e, d[1]), a[1])))
         case "**":
-            first = mul(mul(a[1], power(a[0], add(a[1], num(-1.0))) if _whole(a[1]) else make("dpow", a[0], a[1])), d[0])
-            return first if d[1] is ZERO else add(first, mul(mul(e, make("log", make("max", a[0], num(1e-300)))), d[1]))
+            first = mul(
+                mul(a[1], power(a[0], add(a[1], num(-1.0))) if _whole(a[1]) else make("dpow", a[0], a[1])),
+                d[0],
+            )
+            return (
+                first
+                if d[1] is ZERO
+                else add(first, mul(mul(e, make("log", make("max", a[0], num(1e-300)))), d[1]))
+            )
         case "abs":
             return mul(make("side", a[0]), d[0])
         case "sqrt":
@@ -426,7 +467,7 @@ def _derive(e: Expr, by: str, done: Mapping[int, Expr]) -> Expr:
         case "tanh":
             return mul(add(ONE, neg(mul(e, e))), d[0])
         case "min" | "max":
-            use = make("le", *(a if e.op == "min" else a[::-1]))         # 1 where the first is taken
+            use = make("le", *(a if e.op == "min" else a[::-1]))  # 1 where the first is taken
             return add(mul(use, d[0]), mul(add(ONE, neg(use)), d[1]))
         case "sign":
             return mul(mul(num(2.0), make("bump", a[0])), d[0])
@@ -441,10 +482,10 @@ def _derive(e: Expr, by: str, done: Mapping[int, Expr]) -> Expr:
         case "table":
             k = e.value
             total = mul(make("table_slope", *a, value=k), d[0])
-            for j in range(k):      # weight of the point j at x: the table of a unit vector
+            for j in range(k):  # weight of the point j at x: the table of a unit vector
                 if d[1 + k + j] is not ZERO:
                     unit = [ONE if i == j else ZERO for i in range(k)]
-                    total = add(total, mul(make("table", a[0], *a[1:k + 1], *unit, value=k), d[1 + k + j]))
+                    total = add(total, mul(make("table", a[0], *a[1 : k + 1], *unit, value=k), d[1 + k + j]))
             return total
     raise ExpressionError(f"'{e.op}' cannot be differentiated by {by} here")
 
@@ -455,8 +496,13 @@ def _whole(e: Expr) -> bool:
 
 # --------------------------------------------------------------------------------------------- evaluating with numpy
 
-def evaluate(expr: Expr, values: Mapping[str, Any], first: Callable[[str], float] | None = None,
-             width: Callable[[Expr], float] | None = None) -> Any:
+
+def evaluate(
+    expr: Expr,
+    values: Mapping[str, Any],
+    first: Callable[[str], float] | None = None,
+    width: Callable[[Expr], float] | None = None,
+) -> Any:
     """The value with numpy. `values`: name to number or array; `first(name)` serves first(); `width(argument)` is the
     half width over which a jump is smoothed (0: a true jump)."""
     done: dict[int, Any] = {}
@@ -467,12 +513,29 @@ def evaluate(expr: Expr, values: Mapping[str, Any], first: Callable[[str], float
 
 
 _NUMPY: dict[str, Callable] = {
-    "+": np.add, "*": np.multiply, "/": np.divide, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt,
-    "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tanh": np.tanh, "min": np.minimum, "max": np.maximum}
+    "+": np.add,
+    "*": np.multiply,
+    "/": np.divide,
+    "neg": np.negative,
+    "abs": np.abs,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tanh": np.tanh,
+    "min": np.minimum,
+    "max": np.maximum,
+}
 
 
-def _value(e: Expr, a: list[Any], values: Mapping[str, Any], first: Callable[[str], float] | None,
-           width: Callable[[Expr], float] | None) -> Any:
+def _value(
+    e: Expr,
+    a: list[Any],
+    values: Mapping[str, Any],
+    first: Callable[[str], float] | None,
+    width: Callable[[Expr], float] | None,
+) -> Any:
     op = e.op
     if op == "num":
         return e.value
@@ -509,12 +572,12 @@ def _value(e: Expr, a: list[Any], values: Mapping[str, Any], first: Callable[[st
     if op in ("table", "table_slope"):
         k = e.value
         x = np.asarray(a[0], float)
-        xs, ys = np.array(a[1:k + 1], float), np.array(a[k + 1:], float)
+        xs, ys = np.array(a[1 : k + 1], float), np.array(a[k + 1 :], float)
         if op == "table":
             return np.interp(x, xs, ys)
         slopes = np.concatenate([[0.0], np.diff(ys) / np.diff(xs), [0.0]])
         return slopes[np.searchsorted(xs, x, side="right")]
-    if op == "delay" and "t" in values:        # over samples at values["t"], on straight lines
+    if op == "delay" and "t" in values:  # over samples at values["t"], on straight lines
         t = np.asarray(values["t"], float)
         return np.interp(t - a[1], t, np.broadcast_to(a[0], t.shape))
     raise ExpressionError(f"'{op}' cannot stand here")

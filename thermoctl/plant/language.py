@@ -5,6 +5,7 @@
 `load` reads a file, `from_plain` the same from plain dicts (a plant that the diagnosis extended), `Plant.plain` gives
 the dicts back and `save` writes them. Every error is one line with file, line, the name at fault and what is allowed.
 """
+
 from __future__ import annotations
 
 import copy
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from thermoctl.plant.simulate import Model
 
 FORMAT = "thermoctl-plant/1"
-MAX_ITEMS = 2_000                       # inputs, nodes, ... of one file
+MAX_ITEMS = 2_000  # inputs, nodes, ... of one file
 _NAME = re.compile(r"[A-Za-z_]\w{0,79}$", re.ASCII)
 _RESERVED = {"pi", "t", *ex.FUNCTIONS, *ex.SPECIAL}
 
@@ -34,6 +35,7 @@ _RESERVED = {"pi", "t", *ex.FUNCTIONS, *ex.SPECIAL}
 @dataclass(frozen=True)
 class Input:
     """A recorded column that drives the simulation; `linear`: straight lines between samples, else held."""
+
     name: str
     unit: str | None = None
     column: str = ""
@@ -44,6 +46,7 @@ class Input:
 @dataclass(frozen=True)
 class Parameter:
     """A number of the physics; `range` is where a refit may move it (None: known); `values` per recording."""
+
     name: str
     value: float
     unit: str | None = None
@@ -56,6 +59,7 @@ class Parameter:
 @dataclass(frozen=True)
 class Node:
     """A stored quantity; `initial_sigma` says how uncertain the start is (None: known)."""
+
     name: str
     storage: Expr
     initial: Expr
@@ -67,6 +71,7 @@ class Node:
 @dataclass(frozen=True)
 class Flow:
     """What leaves node `source` and arrives in node `target` (one of them may be None: the outside)."""
+
     name: str
     rate: Expr
     source: str | None = None
@@ -78,6 +83,7 @@ class Flow:
 @dataclass(frozen=True)
 class Output:
     """What a sensor would read; `noise` is its random error's standard deviation, `resolution` its step."""
+
     name: str
     value: Expr
     unit: str | None = None
@@ -90,6 +96,7 @@ class Output:
 @dataclass(frozen=True)
 class Plant:
     """A checked plant."""
+
     title: str
     inputs: Mapping[str, Input]
     parameters: Mapping[str, Parameter]
@@ -100,23 +107,69 @@ class Plant:
 
     def plain(self) -> dict[str, Any]:
         """Plain dicts and lists, as the file holds them; `from_plain` reads them back."""
+
         def drop(**items: Any) -> dict[str, Any]:
             return {k: v for k, v in items.items() if v is not None and v != {}}
+
         return {
-            "format": FORMAT, "title": self.title,
-            "inputs": {i.name: drop(unit=i.unit, column=None if i.column == i.name else i.column,
-                                    between_samples="linear" if i.linear else None) for i in self.inputs.values()},
-            "parameters": {p.name: drop(value=p.value, unit=p.unit, range=list(p.range) if p.range else None,
-                                        per_recording=p.per_recording or None, values=dict(p.values))
-                           for p in self.parameters.values()},
-            **({"nodes": {n.name: drop(unit=n.unit, storage=_scalar(n.storage), initial=_scalar(n.initial),
-                                       initial_sigma=n.initial_sigma) for n in self.nodes.values()}}
-               if self.nodes else {}),
-            **({"flows": {f.name: drop(**{"from": f.source, "into": f.target}, rate=_scalar(f.rate), unit=f.unit)
-                          for f in self.flows.values()}} if self.flows else {}),
-            "outputs": {o.name: drop(value=_scalar(o.value), column=None if o.column == o.name else o.column,
-                                     unit=o.unit, noise=o.noise, resolution=o.resolution)
-                        for o in self.outputs.values()}}
+            "format": FORMAT,
+            "title": self.title,
+            "inputs": {
+                i.name: drop(
+                    unit=i.unit,
+                    column=None if i.column == i.name else i.column,
+                    between_samples="linear" if i.linear else None,
+                )
+                for i in self.inputs.values()
+            },
+            "parameters": {
+                p.name: drop(
+                    value=p.value,
+                    unit=p.unit,
+                    range=list(p.range) if p.range else None,
+                    per_recording=p.per_recording or None,
+                    values=dict(p.values),
+                )
+                for p in self.parameters.values()
+            },
+            **(
+                {
+                    "nodes": {
+                        n.name: drop(
+                            unit=n.unit,
+                            storage=_scalar(n.storage),
+                            initial=_scalar(n.initial),
+                            initial_sigma=n.initial_sigma,
+                        )
+                        for n in self.nodes.values()
+                    }
+                }
+                if self.nodes
+                else {}
+            ),
+            **(
+                {
+                    "flows": {
+                        f.name: drop(
+                            **{"from": f.source, "into": f.target}, rate=_scalar(f.rate), unit=f.unit
+                        )
+                        for f in self.flows.values()
+                    }
+                }
+                if self.flows
+                else {}
+            ),
+            "outputs": {
+                o.name: drop(
+                    value=_scalar(o.value),
+                    column=None if o.column == o.name else o.column,
+                    unit=o.unit,
+                    noise=o.noise,
+                    resolution=o.resolution,
+                )
+                for o in self.outputs.values()
+            },
+        }
 
     def extended(self, change: Callable[[dict[str, Any]], None], file: str | None = None) -> Plant:
         """The plant after `change` edited a copy of its plain dicts; checked anew, units included."""
@@ -127,6 +180,7 @@ class Plant:
     def compile(self, active: tuple[str, ...] | None = None) -> Model:
         """Machine code with sensitivities to `active` parameters (default: those with a range)."""
         from thermoctl.plant.compile import compile_plant
+
         return compile_plant(self, active)
 
 
@@ -146,12 +200,14 @@ def loads(text: str, file: str = "<text>") -> Plant:
 
 def from_plain(data: Mapping[str, Any], file: str = "<plant>") -> Plant:
     """The same from plain dicts (no line numbers)."""
+
     def node(value: Any) -> yamlfile.Node:
         if isinstance(value, Mapping):
             value = {str(k): node(v) for k, v in value.items()}
         elif isinstance(value, (list, tuple)):
             value = [node(v) for v in value]
         return yamlfile.Node(value, file, 0, 0)
+
     return _plant(node(data))
 
 
@@ -175,7 +231,13 @@ _KEYS = {
     "flows": ("from", "into", "rate", "unit"),
     "outputs": ("value", "unit", "column", "noise", "resolution"),
 }
-_NEEDED = {"inputs": (), "parameters": ("value",), "nodes": ("storage", "initial"), "flows": ("rate",), "outputs": ("value",)}
+_NEEDED = {
+    "inputs": (),
+    "parameters": ("value",),
+    "nodes": ("storage", "initial"),
+    "flows": ("rate",),
+    "outputs": ("value",),
+}
 
 
 def _mapping(node: yamlfile.Node, what: str, keys: tuple[str, ...]) -> dict[str, yamlfile.Node]:
@@ -183,14 +245,18 @@ def _mapping(node: yamlfile.Node, what: str, keys: tuple[str, ...]) -> dict[str,
         raise node.error(f"{what} must be a mapping with {', '.join(keys)}, not {node.value!r}"[:300])
     for key, value in node.value.items():
         if key not in keys:
-            raise value.error(f"unknown key '{key}' in {what}; allowed are {', '.join(keys)}{suggest(key, keys)}")
+            raise value.error(
+                f"unknown key '{key}' in {what}; allowed are {', '.join(keys)}{suggest(key, keys)}"
+            )
     return node.value
 
 
 def _plant(root: yamlfile.Node) -> Plant:
     top = _mapping(root, "a plant file", _KEYS[""])
     if "format" not in top or top["format"].value != FORMAT:
-        raise (top.get("format") or root).error(f"'format: {FORMAT}' was expected at the head of a plant file")
+        raise (top.get("format") or root).error(
+            f"'format: {FORMAT}' was expected at the head of a plant file"
+        )
     if "outputs" not in top:
         raise root.error("no 'outputs': a plant without outputs cannot be compared with a recording")
     items: dict[str, dict[str, dict[str, yamlfile.Node]]] = {}
@@ -206,14 +272,21 @@ def _plant(root: yamlfile.Node) -> Plant:
             raise node.error(f"{len(node.value)} {section}; at most {MAX_ITEMS} are read")
         for name, item in node.value.items():
             if not _NAME.match(name):
-                raise item.error(f"'{name}' is not a name: letters, digits and _ were expected, a letter first")
+                raise item.error(
+                    f"'{name}' is not a name: letters, digits and _ were expected, a letter first"
+                )
             if name in _RESERVED:
                 raise item.error(f"'{name}' is a word of the language and cannot name one of the {section}")
             if name in places and not {section, _section_of(items, name)} <= {"flows", "outputs"}:
-                raise item.error(f"'{name}' already names one of the {_section_of(items, name)} "
-                                 f"(line {places[name].line}); names must differ")
-            entry = _mapping(yamlfile.Node({}, item.file, item.line, item.column) if item.value is None else item,
-                             f"{section[:-1]} '{name}'", _KEYS[section])
+                raise item.error(
+                    f"'{name}' already names one of the {_section_of(items, name)} "
+                    f"(line {places[name].line}); names must differ"
+                )
+            entry = _mapping(
+                yamlfile.Node({}, item.file, item.line, item.column) if item.value is None else item,
+                f"{section[:-1]} '{name}'",
+                _KEYS[section],
+            )
             for key in _NEEDED[section]:
                 if key not in entry:
                     raise item.error(f"{section[:-1]} '{name}' has no '{key}'")
@@ -230,29 +303,54 @@ def _plant(root: yamlfile.Node) -> Plant:
     for name, e in items["inputs"].items():
         between = e["between_samples"].value if "between_samples" in e else "hold"
         if between not in ("hold", "linear"):
-            raise e["between_samples"].error(f"input '{name}': between_samples must be 'hold' or 'linear', not {between!r}")
+            raise e["between_samples"].error(
+                f"input '{name}': between_samples must be 'hold' or 'linear', not {between!r}"
+            )
         inputs[name] = Input(name, _unit(e), _column(e, name), between == "linear", line[name])
     parameters = {name: _parameter(name, e, line[name]) for name, e in items["parameters"].items()}
-    nodes = {name: Node(name, _expr(e["storage"], f"storage of '{name}'"), _expr(e["initial"], f"initial of '{name}'"),
-                        _unit(e), _number(e, "initial_sigma", name, low=0.0), line[name])
-             for name, e in items["nodes"].items()}
+    nodes = {
+        name: Node(
+            name,
+            _expr(e["storage"], f"storage of '{name}'"),
+            _expr(e["initial"], f"initial of '{name}'"),
+            _unit(e),
+            _number(e, "initial_sigma", name, low=0.0),
+            line[name],
+        )
+        for name, e in items["nodes"].items()
+    }
     flows = {}
     for name, e in items["flows"].items():
         ends = []
         for key in ("from", "into"):
             end = e[key].value if key in e else None
             if end is not None and end not in nodes:
-                raise e[key].error(f"flow '{name}': '{end}' is not a node{suggest(str(end), nodes)}; nodes are "
-                                   f"{', '.join(nodes) or 'absent'}")
+                raise e[key].error(
+                    f"flow '{name}': '{end}' is not a node{suggest(str(end), nodes)}; nodes are "
+                    f"{', '.join(nodes) or 'absent'}"
+                )
             ends.append(end)
         if ends == [None, None]:
-            raise places[name].error(f"flow '{name}' has neither 'from' nor 'into'; one node at least was expected")
+            raise places[name].error(
+                f"flow '{name}' has neither 'from' nor 'into'; one node at least was expected"
+            )
         if ends[0] == ends[1]:
             raise places[name].error(f"flow '{name}' leads from '{ends[0]}' to itself")
-        flows[name] = Flow(name, _expr(e["rate"], f"rate of '{name}'"), ends[0], ends[1], _unit(e), line[name])
-    outputs = {name: Output(name, _expr(e["value"], f"value of '{name}'"), _unit(e), _column(e, name),
-                            _number(e, "noise", name, low=0.0), _number(e, "resolution", name, low=0.0), places[name].line)
-               for name, e in items["outputs"].items()}
+        flows[name] = Flow(
+            name, _expr(e["rate"], f"rate of '{name}'"), ends[0], ends[1], _unit(e), line[name]
+        )
+    outputs = {
+        name: Output(
+            name,
+            _expr(e["value"], f"value of '{name}'"),
+            _unit(e),
+            _column(e, name),
+            _number(e, "noise", name, low=0.0),
+            _number(e, "resolution", name, low=0.0),
+            places[name].line,
+        )
+        for name, e in items["outputs"].items()
+    }
     plant = Plant(title, inputs, parameters, nodes, flows, outputs, root.file)
     _check_names(plant, items)
     _check_use(plant, places)
@@ -313,19 +411,28 @@ def _parameter(name: str, e: dict[str, yamlfile.Node], line: int) -> Parameter:
     if "range" in e:
         node = e["range"]
         ends = [v.value for v in node.value] if isinstance(node.value, list) else None
-        if ends is None or len(ends) != 2 or any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in ends) \
-                or not ends[0] < ends[1] or not all(abs(v) < 1e300 for v in ends):
+        if (
+            ends is None
+            or len(ends) != 2
+            or any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in ends)
+            or not ends[0] < ends[1]
+            or not all(abs(v) < 1e300 for v in ends)
+        ):
             raise node.error(f"range of '{name}' must be [low, high] with low below high")
         limits = (float(ends[0]), float(ends[1]))
         if not limits[0] <= value <= limits[1]:
-            raise e["value"].error(f"value of '{name}' is {value:g}, outside its range [{limits[0]:g}, {limits[1]:g}]")
+            raise e["value"].error(
+                f"value of '{name}' is {value:g}, outside its range [{limits[0]:g}, {limits[1]:g}]"
+            )
     per = e["per_recording"].value if "per_recording" in e else False
     if not isinstance(per, bool):
         raise e["per_recording"].error(f"per_recording of '{name}' must be true or false")
     values: dict[str, float] = {}
     if "values" in e:
         if not per or not isinstance(e["values"].value, dict):
-            raise e["values"].error(f"values of '{name}' must map recordings to numbers, and needs per_recording: true")
+            raise e["values"].error(
+                f"values of '{name}' must map recordings to numbers, and needs per_recording: true"
+            )
         for recording, node in e["values"].value.items():
             values[recording] = _number({"values": node}, "values", name) or 0.0
     return Parameter(name, value, _unit(e), limits, per, values, line)
@@ -338,38 +445,69 @@ def _check_names(plant: Plant, items: dict) -> None:
     rules: list[tuple[Expr, yamlfile.Node, str, set[str], str | bool, bool]] = []
     for n in plant.nodes.values():
         entry = items["nodes"][n.name]
-        rules += [(n.storage, entry["storage"], f"storage of '{n.name}'", parameters | nodes, False, False),
-                  (n.initial, entry["initial"], f"initial of '{n.name}'", inputs | parameters, False, True)]
-    rules += [(f.rate, items["flows"][f.name]["rate"], f"rate of '{f.name}'", nodes | inputs | parameters | {"t"}, "inputs", False)
-              for f in plant.flows.values()]
-    rules += [(o.value, items["outputs"][o.name]["value"], f"value of '{o.name}'", nodes | inputs | parameters | {"t"}, "all", False)
-              for o in plant.outputs.values()]
+        rules += [
+            (n.storage, entry["storage"], f"storage of '{n.name}'", parameters | nodes, False, False),
+            (n.initial, entry["initial"], f"initial of '{n.name}'", inputs | parameters, False, True),
+        ]
+    rules += [
+        (
+            f.rate,
+            items["flows"][f.name]["rate"],
+            f"rate of '{f.name}'",
+            nodes | inputs | parameters | {"t"},
+            "inputs",
+            False,
+        )
+        for f in plant.flows.values()
+    ]
+    rules += [
+        (
+            o.value,
+            items["outputs"][o.name]["value"],
+            f"value of '{o.name}'",
+            nodes | inputs | parameters | {"t"},
+            "all",
+            False,
+        )
+        for o in plant.outputs.values()
+    ]
     for expr, place, what, allowed, delays, firsts in rules:
         for e in ex.walk(expr):
             if e.op == "name" and e.value not in allowed:
                 known = e.value in inputs | parameters | nodes | {"t"}
                 reason = "may not stand there" if known else "is not known" + suggest(e.value, allowed)
-                raise place.error(f"{what}: '{e.value}' {reason}; allowed are {', '.join(sorted(allowed))}"[:600])
+                raise place.error(
+                    f"{what}: '{e.value}' {reason}; allowed are {', '.join(sorted(allowed))}"[:600]
+                )
             if e.op == "first" and not firsts:
                 raise place.error(f"{what}: first() may stand in 'initial' only")
             if e.op == "first" and e.value not in recorded:
-                raise place.error(f"{what}: first({e.value}): '{e.value}' is neither input nor output{suggest(e.value, recorded)}")
+                raise place.error(
+                    f"{what}: first({e.value}): '{e.value}' is neither input nor output{suggest(e.value, recorded)}"
+                )
             if e.op == "delay":
                 if not delays:
                     raise place.error(f"{what}: delay() may stand in outputs and, on inputs, in rates only")
                 if not ex.names(e.args[1]) <= parameters:
                     raise place.error(f"{what}: the seconds of delay() must be a number or parameters")
                 if any(inner.op == "delay" for inner in ex.walk(e.args[0])):
-                    raise place.error(f"{what}: a delay() within a delay() is not part of the language; add the seconds")
+                    raise place.error(
+                        f"{what}: a delay() within a delay() is not part of the language; add the seconds"
+                    )
                 if delays == "inputs" and not ex.names(e.args[0]) <= inputs:
                     raise place.error(f"{what}: delay() in a rate may read inputs only")
 
 
 def _check_use(plant: Plant, places: dict[str, yamlfile.Node]) -> None:
     """Nothing stands in the file that nothing uses."""
-    exprs = [e for n in plant.nodes.values() for e in (n.storage, n.initial)] + [f.rate for f in plant.flows.values()] \
+    exprs = (
+        [e for n in plant.nodes.values() for e in (n.storage, n.initial)]
+        + [f.rate for f in plant.flows.values()]
         + [o.value for o in plant.outputs.values()]
-    used = set().union(*(ex.names(e) for e in exprs)) | {e.value for x in exprs for e in ex.walk(x) if e.op == "first"}
+    )
+    used = set().union(*(ex.names(e) for e in exprs)) | {
+        e.value for x in exprs for e in ex.walk(x) if e.op == "first"
+    }
     touched = {end for f in plant.flows.values() for end in (f.source, f.target)}
     for name in plant.nodes:
         if name not in touched:

@@ -9,6 +9,7 @@ Process noise: a heat of unknown course into every body, white with density q (W
 does not hold; measurement noise: the thermocouple's noise and its step. The steady Kalman gain solves the discrete Riccati
 equation at the sensor's period; `gains` gives the time-varying one from an uncertain start.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -23,13 +24,14 @@ from thermoctl.plant.language import Plant
 from thermoctl.yamlfile import InputError
 
 AIR, VOLTAGE, CURRENT, POWER, ERROR = "air_c", "voltage_v", "current_a", "power_w", "position_error_um"
-HEAT_DENSITY = 0.05     # W^2 s: 0.03 W of unknown heat in each body over a minute
+HEAT_DENSITY = 0.05  # W^2 s: 0.03 W of unknown heat in each body over a minute
 
 
 @dataclass(frozen=True)
 class Thermal:
     """A plant's heat in continuous time: A (n, n) 1/s, b (n,) K/J, C (12, n), a (n,) um/K, air_um_k, capacity (n,) J/K,
     variance (12,) of the readings, K^2."""
+
     A: np.ndarray
     b: np.ndarray
     C: np.ndarray
@@ -47,21 +49,31 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
     powered = (VOLTAGE, CURRENT) if VOLTAGE in inputs else (POWER,)
     for column in (AIR, *powered):
         if column not in inputs:
-            raise InputError(f"{plant.file}: no input reads the column '{column}'; a compensator is made from a thermal plant "
-                             "driven by air_c and voltage_v, current_a (or power_w), such as config/plants/actuator_thermal.yaml")
+            raise InputError(
+                f"{plant.file}: no input reads the column '{column}'; a compensator is made from a thermal plant "
+                "driven by air_c and voltage_v, current_a (or power_w), such as config/plants/actuator_thermal.yaml"
+            )
     for column in (*TEMPERATURES, ERROR):
         if column not in outputs:
-            raise InputError(f"{plant.file}: no output for the column '{column}'; a compensator needs all twelve "
-                             f"temperatures and {ERROR}")
-    nodes = list(plant.nodes)           # those that are states: the rest stays where it was
-    point: dict[str, float] = {p.name: p.value for p in plant.parameters.values()} | {i: 0.0 for i in plant.inputs} \
-        | {n: at_c for n in nodes} | {inputs[AIR]: at_c, "t": 0.0}
+            raise InputError(
+                f"{plant.file}: no output for the column '{column}'; a compensator needs all twelve "
+                f"temperatures and {ERROR}"
+            )
+    nodes = list(plant.nodes)  # those that are states: the rest stays where it was
+    point: dict[str, float] = (
+        {p.name: p.value for p in plant.parameters.values()}
+        | {i: 0.0 for i in plant.inputs}
+        | {n: at_c for n in nodes}
+        | {inputs[AIR]: at_c, "t": 0.0}
+    )
     slopes, capacities = [], []
     for n in plant.nodes.values():
         net = ex.ZERO
         for f in plant.flows.values():
-            net = ex.add(net, f.rate if f.target == n.name else ex.neg(f.rate) if f.source == n.name else ex.ZERO)
-        if net is ex.ZERO:              # nothing flows: it remembers the start, from which growth is counted anyway
+            net = ex.add(
+                net, f.rate if f.target == n.name else ex.neg(f.rate) if f.source == n.name else ex.ZERO
+            )
+        if net is ex.ZERO:  # nothing flows: it remembers the start, from which growth is counted anyway
             nodes.remove(n.name)
             continue
         slopes.append(ex.div(net, n.storage))
@@ -69,39 +81,53 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
 
     def values(exprs: list[ex.Expr], where: dict[str, float]) -> np.ndarray:
         return np.array([float(ex.evaluate(e, where)) for e in exprs])
+
     rest = values(slopes, point)
     A = np.array([values([ex.derivative(e, n) for n in nodes], point) for e in slopes])
-    if np.max(np.abs(rest), initial=0.0) > 1e-9 or np.max(np.abs(A.sum(axis=1) + values(
-            [ex.derivative(e, inputs[AIR]) for e in slopes], point))) > 1e-9 * np.max(np.abs(A)):
+    if np.max(np.abs(rest), initial=0.0) > 1e-9 or np.max(
+        np.abs(A.sum(axis=1) + values([ex.derivative(e, inputs[AIR]) for e in slopes], point))
+    ) > 1e-9 * np.max(np.abs(A)):
         worst = nodes[int(np.argmax(np.abs(rest)))]
-        raise InputError(f"{plant.file}: without power the plant does not rest at the air's temperature ('{worst}' drifts "
-                         f"by {np.max(np.abs(rest)):.3g} K/s); such a plant has no model of rises above the air")
+        raise InputError(
+            f"{plant.file}: without power the plant does not rest at the air's temperature ('{worst}' drifts "
+            f"by {np.max(np.abs(rest)):.3g} K/s); such a plant has no model of rises above the air"
+        )
     one_watt = values(slopes, point | {inputs[c]: 1.0 for c in powered})
     C = np.array([values([ex.derivative(outputs[c].value, n) for n in nodes], point) for c in TEMPERATURES])
     growth = outputs[ERROR].value
     a = values([ex.derivative(growth, n) for n in nodes], point)
     air = float(a.sum()) + float(ex.evaluate(ex.derivative(growth, inputs[AIR]), point))
-    variance = np.array([(outputs[c].noise or 0.0) ** 2 + (outputs[c].resolution or 0.0) ** 2 / 12 for c in TEMPERATURES])
+    variance = np.array(
+        [(outputs[c].noise or 0.0) ** 2 + (outputs[c].resolution or 0.0) ** 2 / 12 for c in TEMPERATURES]
+    )
     capacity = values(capacities, point)
     return Thermal(A, one_watt - rest, C, a, air, capacity, np.where(variance > 0, variance, 1e-4))
 
 
-def discrete(model: Thermal, period_s: float, density: float = HEAT_DENSITY) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def discrete(
+    model: Thermal, period_s: float, density: float = HEAT_DENSITY
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A_h - I (n, n), B_h (n, 2) and the process noise's covariance (n, n) K^2 over one period."""
     n = len(model.A)
     phi = expm(np.block([[model.A, np.eye(n)], [np.zeros((n, 2 * n))]]) * period_s)[:n, n:]
-    heat = np.diag(density / model.capacity ** 2)
-    loan = expm(np.block([[-model.A, heat], [np.zeros((n, n)), model.A.T]]) * period_s)     # van Loan 1978
+    heat = np.diag(density / model.capacity**2)
+    loan = expm(np.block([[-model.A, heat], [np.zeros((n, n)), model.A.T]]) * period_s)  # van Loan 1978
     covariance = loan[n:, n:].T @ loan[:n, n:]
     return model.A @ phi, phi @ np.column_stack([model.b, -np.ones(n)]), (covariance + covariance.T) / 2
 
 
-def gains(model: Thermal, sensor_period_s: float, samples: int, sensors: tuple[int, ...] = (0,),
-          start_sd_k: float = 0.5, density: float = HEAT_DENSITY) -> np.ndarray:
+def gains(
+    model: Thermal,
+    sensor_period_s: float,
+    samples: int,
+    sensors: tuple[int, ...] = (0,),
+    start_sd_k: float = 0.5,
+    density: float = HEAT_DENSITY,
+) -> np.ndarray:
     """The time-varying Kalman gain (29), (30): (samples, n, s), from rises that are uncertain by `start_sd_k` at the start."""
     step, _, noise = discrete(model, sensor_period_s, density)
     A, C, R = np.eye(len(step)) + step, model.C[list(sensors)], np.diag(model.variance[list(sensors)])
-    P = np.eye(len(A)) * start_sd_k ** 2
+    P = np.eye(len(A)) * start_sd_k**2
     out = np.empty((samples, len(A), len(sensors)))
     for k in range(samples):
         out[k] = np.linalg.solve(C @ P @ C.T + R, C @ P).T
@@ -110,9 +136,15 @@ def gains(model: Thermal, sensor_period_s: float, samples: int, sensors: tuple[i
     return out
 
 
-def linearise(plant: Plant, period_s: float = 0.001, sensor_period_s: float = 0.1, kind: str = "kalman",
-              sensors: tuple[int, ...] = (0,), density: float = HEAT_DENSITY,
-              expansion_period_s: float = 1.0) -> CompensatorModel:
+def linearise(
+    plant: Plant,
+    period_s: float = 0.001,
+    sensor_period_s: float = 0.1,
+    kind: str = "kalman",
+    sensors: tuple[int, ...] = (0,),
+    density: float = HEAT_DENSITY,
+    expansion_period_s: float = 1.0,
+) -> CompensatorModel:
     """The compensator's model of a thermal plant; `kind` 'kalman' (steady gain) or 'mkf' (scalar recursion with a map
     zeta = covariance of the steady filter's errors with the coil's). Raises InputError."""
     model = thermal(plant)
@@ -124,16 +156,35 @@ def linearise(plant: Plant, period_s: float = 0.001, sensor_period_s: float = 0.
     except (np.linalg.LinAlgError, ValueError) as e:
         raise InputError(f"{plant.file}: no steady Kalman gain exists: {e}") from None
     C, square = model.C, model.C.shape[0] == model.C.shape[1] and np.linalg.cond(model.C) < 1e8
-    T = C if square else np.eye(len(A))             # into the coordinates of the readings (33)
+    T = C if square else np.eye(len(A))  # into the coordinates of the readings (33)
     back = np.linalg.inv(T)
     P_read = C @ P @ C.T
-    gain = T @ np.linalg.solve(C1 @ P @ C1.T + R, C1 @ P).T if kind == "kalman" else T @ P @ C[0] / P_read[0, 0]
+    gain = (
+        T @ np.linalg.solve(C1 @ P @ C1.T + R, C1 @ P).T if kind == "kalman" else T @ P @ C[0] / P_read[0, 0]
+    )
     b2, *_ = np.linalg.lstsq(C.T, model.a, rcond=None)
     if np.max(np.abs(C.T @ b2 - model.a)) > 1e-9 * np.max(np.abs(model.a), initial=1e-12):
         raise InputError(f"{plant.file}: {ERROR} depends on a body whose temperature no output reads")
     return CompensatorModel(
-        kind, period_s, T @ step @ back, T @ B, C @ back, gain, float((C @ noise @ C.T)[0, 0]), float(model.variance[0]),
-        0.0, np.zeros(len(C)), b2, expansion_period_s, sensors, model.air_um_k,
-        meta={"made_from": "plant linearise", "plant": plant.title, "sensor_period_s": sensor_period_s,
-              "heat_density_w2_s": density,
-              "time_constants_s": [round(float(q), 3) for q in np.sort(-1 / np.linalg.eigvals(model.A).real)]})
+        kind,
+        period_s,
+        T @ step @ back,
+        T @ B,
+        C @ back,
+        gain,
+        float((C @ noise @ C.T)[0, 0]),
+        float(model.variance[0]),
+        0.0,
+        np.zeros(len(C)),
+        b2,
+        expansion_period_s,
+        sensors,
+        model.air_um_k,
+        meta={
+            "made_from": "plant linearise",
+            "plant": plant.title,
+            "sensor_period_s": sensor_period_s,
+            "heat_density_w2_s": density,
+            "time_constants_s": [round(float(q), 3) for q in np.sort(-1 / np.linalg.eigvals(model.A).real)],
+        },
+    )

@@ -9,6 +9,7 @@ part of the slow noise with them, which the residuals' plain correlation would m
 
     minimise  n log v + RSS / v + log |M|,   M = sum over channels of J' V^-1 J,   RSS after the parameters' answer -J M^-1 J' V^-1 e
 """
+
 from __future__ import annotations
 
 import dataclasses
@@ -20,8 +21,8 @@ from scipy.optimize import minimize_scalar
 from thermoctl.plant.refit import Fit, Noise, Problem
 from thermoctl.plant.simulate import Drive
 
-CLIP = 6.0          # residuals beyond this many robust sigmas count as so many
-MOST = 0.995        # largest correlation of neighbours
+CLIP = 6.0  # residuals beyond this many robust sigmas count as so many
+MOST = 0.995  # largest correlation of neighbours
 
 
 def innovations(phi: float, white: float, total: float) -> Noise:
@@ -31,7 +32,7 @@ def innovations(phi: float, white: float, total: float) -> Noise:
         return Noise(float(np.sqrt(total)))
     if white < 1e-6 * total:
         return Noise(float(np.sqrt(total)), phi)
-    b = (coloured * (1 - phi ** 2) + white * (1 + phi ** 2)) / (2 * phi * white)
+    b = (coloured * (1 - phi**2) + white * (1 + phi**2)) / (2 * phi * white)
     theta = b - np.sqrt(b * b - 1)
     return Noise(float(np.sqrt(phi * white / theta)), ar=(1.0, -phi), ma=(1.0, -float(theta)))
 
@@ -57,8 +58,13 @@ def coloured(found: Fit, drives: Sequence[Drive]) -> list[Noise]:
             gram[np.ix_(columns, columns)] += jac.T @ jac
             gradient[columns] += jac.T @ w
             square += float(w @ w)
-            size += 2 * (float(np.log(own.rows[r][j][2]).sum()) if len(candidate.ar) == 1 else len(w) * np.log(candidate.sigma))
+            size += 2 * (
+                float(np.log(own.rows[r][j][2]).sum())
+                if len(candidate.ar) == 1
+                else len(w) * np.log(candidate.sigma)
+            )
         return gram, gradient, square, size
+
     now = [parts(j, n) for j, n in enumerate(noise)]
     for j, o in enumerate(outputs):
         count = sum(len(rows[j][0]) for rows in problem.rows)
@@ -67,9 +73,13 @@ def coloured(found: Fit, drives: Sequence[Drive]) -> list[Noise]:
         rest = prior + sum(now[k][0] for k in range(len(noise)) if k != j)
         pull = sum((now[k][1] for k in range(len(noise)) if k != j), np.zeros(len(prior)))
         white = (o.resolution or 0.0) ** 2 / 12
-        plain = max(float(np.mean(np.concatenate([r[np.isfinite(r[:, j]), j] for r in found.residuals]) ** 2)), 1e-24)
+        plain = max(
+            float(np.mean(np.concatenate([r[np.isfinite(r[:, j]), j] for r in found.residuals]) ** 2)), 1e-24
+        )
 
-        def judged(phi: float, j=j, rest=rest, pull=pull, white=white, plain=plain, count=count) -> tuple[float, Noise]:
+        def judged(
+            phi: float, j=j, rest=rest, pull=pull, white=white, plain=plain, count=count
+        ) -> tuple[float, Noise]:
             """-2 log restricted likelihood of channel j, and its noise, the size found by two rounds."""
             total = plain
             for _ in range(3):
@@ -81,7 +91,10 @@ def coloured(found: Fit, drives: Sequence[Drive]) -> list[Noise]:
                 taken = min(float(np.trace(np.linalg.solve(matrix, gram))), 0.5 * count)
                 total *= max(left, 1e-12) / (count - taken)
             return left + size + float(np.linalg.slogdet(matrix)[1]), candidate
-        best = minimize_scalar(lambda phi: judged(phi)[0], bounds=(0.0, MOST), method="bounded", options={"xatol": 0.004})
+
+        best = minimize_scalar(
+            lambda phi: judged(phi)[0], bounds=(0.0, MOST), method="bounded", options={"xatol": 0.004}
+        )
         flat, white_only = judged(0.0)
         noise[j] = judged(float(best.x))[1] if best.fun < flat - 2 else white_only
         noise[j] = dataclasses.replace(noise[j], sigma=max(noise[j].sigma, 1e-3 * found.noise[j].sigma))

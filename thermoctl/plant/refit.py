@@ -12,6 +12,7 @@ Gauss-Newton with Levenberg's damping on the normal equations and half the geode
 
 a parameter that meets its bound is held there until the gradient leads back inside. Sensitivities are exact (compile.py).
 """
+
 from __future__ import annotations
 
 import copy
@@ -28,18 +29,19 @@ from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulate import Drive, Model, SimulationError
 from thermoctl.yamlfile import InputError
 
-HUBER = 4.0             # residuals beyond this many sigmas count linearly
-BELIEF_WEIGHT = 0.02    # a whole range away from the belief costs as much as a fiftieth of a sigma, once
-PROBE = 0.1             # of a step, over which the curvature of the residuals is taken
-HOPELESS = 20.0         # steps, each like the last three
-ODD = 0.25              # share of rows up to which those that weigh less are taken off a product of all rows
-BENT = 0.75             # geodesic acceleration over the step up to which it is believed
+HUBER = 4.0  # residuals beyond this many sigmas count linearly
+BELIEF_WEIGHT = 0.02  # a whole range away from the belief costs as much as a fiftieth of a sigma, once
+PROBE = 0.1  # of a step, over which the curvature of the residuals is taken
+HOPELESS = 20.0  # steps, each like the last three
+ODD = 0.25  # share of rows up to which those that weigh less are taken off a product of all rows
+BENT = 0.75  # geodesic acceleration over the step up to which it is believed
 
 
 @dataclass(frozen=True)
 class Noise:
     """One channel's noise: standard deviation, and its colour over one median sampling interval. With a filter ar(z)/ma(z)
     that turns it into white noise, `sigma` is that of the innovations."""
+
     sigma: float
     phi: float = 0.0
     ar: tuple[float, ...] = (1.0,)
@@ -50,6 +52,7 @@ class Noise:
 class Belief:
     """-2 log of how likely parameters' values are, whatever the data: an expression of the plant's parameters (their values in
     the recording of this name) that is nowhere concave."""
+
     recording: str
     surprise: ex.Expr
 
@@ -58,6 +61,7 @@ class Belief:
 class Fit:
     """What a refit found. `values`: (recordings, parameters) in the model's order; `dx0`: (recordings, uncertain states);
     `covariance` by `unknowns` (name, recording index or None); `residuals`: per recording (N, outputs), NaN if missing."""
+
     model: Model
     values: np.ndarray
     dx0: np.ndarray
@@ -71,7 +75,7 @@ class Fit:
     samples: int
     at_bound: dict[str, str] = field(default_factory=dict)
     beliefs: tuple[Belief, ...] = ()
-    believed: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))      # their share of the hessian
+    believed: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # their share of the hessian
 
     def parameters(self, recording: int = 0) -> dict[str, float]:
         """All parameter values of one recording."""
@@ -80,8 +84,12 @@ class Fit:
     def rms(self) -> dict[str, float]:
         """Root-mean-square residual per output over all recordings."""
         stacked = np.concatenate(self.residuals)
-        return {o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2))) if np.isfinite(stacked[:, j]).any() else float("nan")
-                for j, o in enumerate(self.model.outputs)}
+        return {
+            o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2)))
+            if np.isfinite(stacked[:, j]).any()
+            else float("nan")
+            for j, o in enumerate(self.model.outputs)
+        }
 
 
 class Scale:
@@ -131,14 +139,16 @@ def _rows(d: Drive, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarra
     phi = n.phi ** np.clip(gaps, 0.0, 1e4) if n.phi > 0 else np.zeros(len(gaps))
     scale = np.full(len(index), n.sigma)
     if len(index):
-        scale[1:] = n.sigma * np.sqrt(np.maximum(1 - phi ** 2, 1e-9))
+        scale[1:] = n.sigma * np.sqrt(np.maximum(1 - phi**2, 1e-9))
     return index, phi, scale
 
 
 class Problem:
     """Residuals and Jacobian of a model on several recordings, in the metric of the noise."""
 
-    def __init__(self, model: Model, drives: Sequence[Drive], noise: Sequence[Noise], beliefs: Sequence[Belief] = ()):
+    def __init__(
+        self, model: Model, drives: Sequence[Drive], noise: Sequence[Noise], beliefs: Sequence[Belief] = ()
+    ):
         self.model, self.drives, self.noise = model, list(drives), tuple(noise)
         self.beliefs = tuple(b for b in beliefs if b.recording in {d.name for d in drives})
         if not drives:
@@ -179,8 +189,10 @@ class Problem:
         for q, r in self.unknowns:
             if q in self.scales:
                 p = self.model.plant.parameters[q]
-                value = changes.get(q, p.values.get(self.drives[r].name, p.value) if r is not None else p.value)
-                out.append(self.scales[q].z(min(max(value, p.range[0]), p.range[1])))   # type: ignore[index]
+                value = changes.get(
+                    q, p.values.get(self.drives[r].name, p.value) if r is not None else p.value
+                )
+                out.append(self.scales[q].z(min(max(value, p.range[0]), p.range[1])))  # type: ignore[index]
             else:
                 out.append(0.0)
         return np.array(out)
@@ -188,8 +200,11 @@ class Problem:
     def heard(self, j: int, n: Noise) -> Problem:
         """The same with another noise of output j."""
         other = copy.copy(self)
-        other.noise = (*self.noise[:j], n, *self.noise[j + 1:])
-        other.rows = [[_rows(d, j, n) if k == j else q for k, q in enumerate(rows)] for d, rows in zip(self.drives, self.rows, strict=True)]
+        other.noise = (*self.noise[:j], n, *self.noise[j + 1 :])
+        other.rows = [
+            [_rows(d, j, n) if k == j else q for k, q in enumerate(rows)]
+            for d, rows in zip(self.drives, self.rows, strict=True)
+        ]
         return other
 
     def unpack(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -220,14 +235,31 @@ class Problem:
             part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
         return part / scale.reshape(shape)
 
-    def _weighted(self, r: int, j: int, k: np.ndarray, slope: np.ndarray, w: np.ndarray, weight: np.ndarray, jac: np.ndarray) -> _Rows:
+    def _weighted(
+        self,
+        r: int,
+        j: int,
+        k: np.ndarray,
+        slope: np.ndarray,
+        w: np.ndarray,
+        weight: np.ndarray,
+        jac: np.ndarray,
+    ) -> _Rows:
         """Output j's rows of recording r, from its whitened residuals and their weights (M,) and its slopes (N, k). White noise of
         one size only scales slopes: they are not copied, and what is missing weighs nothing."""
         index, phi, _ = self.rows[r][j]
         noise = self.noise[j]
         if len(noise.ar) > 1 or phi.any() or len(index) < (1 - ODD) * len(jac):
             return _Rows(r, j, k, slope, self.whiten(r, j, jac), w, weight)
-        return _Rows(r, j, k, slope / noise.sigma, jac, self._spread(r, j, w, len(jac)), self._spread(r, j, weight, len(jac)))
+        return _Rows(
+            r,
+            j,
+            k,
+            slope / noise.sigma,
+            jac,
+            self._spread(r, j, w, len(jac)),
+            self._spread(r, j, weight, len(jac)),
+        )
 
     def _spread(self, r: int, j: int, w: np.ndarray, n: int) -> np.ndarray:
         """Values (M,) of output j's measured samples as `n` rows: as they are, or with a zero for each that is missing."""
@@ -254,13 +286,24 @@ class Problem:
         """The columns of recording r's sensitivities that are unknowns, which unknowns, and their slopes d q / d z."""
         used = np.flatnonzero(self.columns[r] >= 0)
         active = self.model.active
-        return used, self.columns[r, used], np.array(
-            [self.scales[active[c]].slope(values[self.model.parameters.index(active[c])]) if c < len(active)
-             else self.sigma0[self.columns[r, c] - self.n_parameters] for c in used])
+        return (
+            used,
+            self.columns[r, used],
+            np.array(
+                [
+                    self.scales[active[c]].slope(values[self.model.parameters.index(active[c])])
+                    if c < len(active)
+                    else self.sigma0[self.columns[r, c] - self.n_parameters]
+                    for c in used
+                ]
+            ),
+        )
 
     def prior(self) -> np.ndarray:
         """What each unknown's belief weighs (its entry in the Gauss-Newton matrix)."""
-        return np.concatenate([np.full(self.n_parameters, BELIEF_WEIGHT ** 2), np.ones(len(self.unknowns) - self.n_parameters)])
+        return np.concatenate(
+            [np.full(self.n_parameters, BELIEF_WEIGHT**2), np.ones(len(self.unknowns) - self.n_parameters)]
+        )
 
     def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray]:
         """Which unknowns recording r feels (k,), and the outputs' slopes by them (N, ny, k)."""
@@ -270,8 +313,9 @@ class Problem:
         assert run.dy is not None
         return k, run.dy[:, :, used] * slope
 
-    def evaluate(self, z: np.ndarray, jacobian: bool,
-                 keep: list[_Rows] | None = None) -> tuple[float, np.ndarray, np.ndarray, list[np.ndarray]]:
+    def evaluate(
+        self, z: np.ndarray, jacobian: bool, keep: list[_Rows] | None = None
+    ) -> tuple[float, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Cost, gradient/2 and Gauss-Newton matrix by the unknowns, raw residuals; what `curvature` needs goes to `keep`. Raises
         SimulationError."""
         values, dx0 = self.unpack(z)
@@ -293,11 +337,13 @@ class Problem:
                 w = self.whiten(r, j, e[:, j])
                 a = np.abs(w)
                 limit = self.huber[j]
-                cost += float(np.sum(np.where(a <= limit, w * w, 2 * limit * a - limit ** 2)))
+                cost += float(np.sum(np.where(a <= limit, w * w, 2 * limit * a - limit**2)))
                 if not jacobian or run.dy is None:
                     continue
                 dy = run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used]
-                rows = self._weighted(r, j, k, slope, w, np.where(a <= limit, 1.0, limit / np.maximum(a, limit)), dy)
+                rows = self._weighted(
+                    r, j, k, slope, w, np.where(a <= limit, 1.0, limit / np.maximum(a, limit)), dy
+                )
                 if keep is not None:
                     keep.append(rows)
                 part_gradient += rows.slope * (rows.jac.T @ (rows.weight * rows.w))
@@ -309,7 +355,7 @@ class Problem:
         cost, gradient, matrix = cost + part, gradient - slope, matrix + bend
         prior = self.prior()
         away = z - self.belief
-        cost += float(np.sum(prior * away ** 2))
+        cost += float(np.sum(prior * away**2))
         return cost, gradient - prior * away, matrix + np.diag(prior), residuals
 
     def believed(self, values: np.ndarray, derivatives: bool) -> tuple[float, np.ndarray, np.ndarray]:
@@ -320,19 +366,27 @@ class Problem:
             r = next(r for r, d in enumerate(self.drives) if d.name == belief.recording)
             known = dict(zip(self.model.parameters, map(float, values[r]), strict=True))
             cost += float(ex.evaluate(belief.surprise, known))
-            felt = [(q, self.columns[r, c], self.scales[q].slope(known[q])) for c, q in enumerate(self.model.active)
-                    if derivatives and self.columns[r, c] >= 0 and q in ex.names(belief.surprise)]
+            felt = [
+                (q, self.columns[r, c], self.scales[q].slope(known[q]))
+                for c, q in enumerate(self.model.active)
+                if derivatives and self.columns[r, c] >= 0 and q in ex.names(belief.surprise)
+            ]
             for q, k, slope in felt:
                 first = ex.derivative(belief.surprise, q)
                 gradient[k] += 0.5 * slope * float(ex.evaluate(first, known))
                 for q2, k2, slope2 in felt:
-                    matrix[k, k2] += 0.5 * slope * slope2 * float(ex.evaluate(ex.derivative(first, q2), known))
+                    matrix[k, k2] += (
+                        0.5 * slope * slope2 * float(ex.evaluate(ex.derivative(first, q2), known))
+                    )
         return cost, gradient, matrix
 
     def curvature(self, z: np.ndarray, step: np.ndarray, kept: Sequence[_Rows]) -> np.ndarray:
         """J^T d2w/dh2 of the whitened residuals w(z + h step), from one more simulation. Raises SimulationError."""
         values, dx0 = self.unpack(z + PROBE * step)
-        errors = [d.y - self.model.run(d, values[r], dx0[r], buffers=self.buffers).y for r, d in enumerate(self.drives)]
+        errors = [
+            d.y - self.model.run(d, values[r], dx0[r], buffers=self.buffers).y
+            for r, d in enumerate(self.drives)
+        ]
         out = np.zeros(len(z))
         for rows in kept:
             r, j = rows.recording, rows.output
@@ -345,6 +399,7 @@ class Problem:
 @dataclass(frozen=True)
 class _Rows:
     """Whitened residuals w (M,) of an output in a recording, what they weigh, and -dw (M, k) by the unknowns over their `slope`."""
+
     recording: int
     output: int
     unknowns: np.ndarray
@@ -364,10 +419,20 @@ def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return jac.T @ jac - few.T @ few
 
 
-def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = None,
-        start: Mapping[str, float] | np.ndarray | None = None, iterations: int = 40, tolerance: float = 1e-4,
-        tries: int = 0, seed: int = 0, seconds: float = 600.0, goal: float = np.inf, beliefs: Sequence[Belief] = (),
-        progress: Callable[[str], None] | None = None) -> Fit:
+def fit(
+    model: Model,
+    drives: Sequence[Drive],
+    noise: Sequence[Noise] | None = None,
+    start: Mapping[str, float] | np.ndarray | None = None,
+    iterations: int = 40,
+    tolerance: float = 1e-4,
+    tries: int = 0,
+    seed: int = 0,
+    seconds: float = 600.0,
+    goal: float = np.inf,
+    beliefs: Sequence[Belief] = (),
+    progress: Callable[[str], None] | None = None,
+) -> Fit:
     """Fit the active parameters that have a range (and uncertain initial states) to the drives.
 
     `seconds` of this thread's CPU time: after which no further iteration is begun. `tries`: how many starts drawn over the ranges are looked at
@@ -384,7 +449,7 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
         looked = []
         for _ in range(tries):
             z = z0.copy()
-            z[:problem.n_parameters] = random.uniform(0.05, 0.95, problem.n_parameters)
+            z[: problem.n_parameters] = random.uniform(0.05, 0.95, problem.n_parameters)
             try:
                 looked.append((problem.evaluate(z, False)[0], z))
             except SimulationError:
@@ -397,9 +462,11 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
     for z in starts:
         try:
             problem.set_outlier_limits(problem.evaluate(z, False)[3])
-            if best is not None:        # another start is followed to its end only if a few steps bring it below
+            if best is not None:  # another start is followed to its end only if a few steps bring it below
                 z = _descend(problem, z, 12, tolerance, deadline, goal).z
-                if _sum_of_squares(problem, problem.evaluate(z, False)[3]) > 0.98 * _sum_of_squares(problem, best.residuals):
+                if _sum_of_squares(problem, problem.evaluate(z, False)[3]) > 0.98 * _sum_of_squares(
+                    problem, best.residuals
+                ):
                     continue
             for _ in range(4):
                 found = _descend(problem, z, iterations, tolerance, deadline, goal)
@@ -419,17 +486,25 @@ def fit(model: Model, drives: Sequence[Drive], noise: Sequence[Noise] | None = N
 
 
 def _sum_of_squares(problem: Problem, residuals: Sequence[np.ndarray]) -> float:
-    return float(sum(np.sum(problem.whiten(r, j, e[:, j]) ** 2) for r, e in enumerate(residuals) for j in range(len(problem.noise))))
+    return float(
+        sum(
+            np.sum(problem.whiten(r, j, e[:, j]) ** 2)
+            for r, e in enumerate(residuals)
+            for j in range(len(problem.noise))
+        )
+    )
 
 
-def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float, deadline: float, goal: float) -> Fit:
+def _descend(
+    problem: Problem, z: np.ndarray, iterations: int, tolerance: float, deadline: float, goal: float
+) -> Fit:
     low = np.concatenate([np.zeros(problem.n_parameters), np.full(len(z) - problem.n_parameters, -8.0)])
     high = np.concatenate([np.ones(problem.n_parameters), np.full(len(z) - problem.n_parameters, 8.0)])
     z = np.clip(z, low, high)
     kept: list[_Rows] = []
     cost, gradient, matrix, residuals = problem.evaluate(z, True, kept)
     damping, done, hopeless = 1e-3, 0, 0
-    for done in range(1, iterations + 1):       # noqa: B007 the count is reported
+    for done in range(1, iterations + 1):  # noqa: B007 the count is reported
         held = ((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0))
         free = np.flatnonzero(~held)
         if not len(free) or time.thread_time() > deadline:
@@ -438,12 +513,14 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float,
         for _ in range(12):
             step = np.zeros_like(z)
             left = free
-            for _ in range(len(free) + 1):              # steps that would leave the box stop at its wall
+            for _ in range(len(free) + 1):  # steps that would leave the box stop at its wall
                 sub = matrix[np.ix_(left, left)]
                 fixed = np.setdiff1d(free, left)
                 rhs = gradient[left] - matrix[np.ix_(left, fixed)] @ step[fixed]
                 step[left] = np.linalg.solve(sub + damping * np.diag(np.diag(sub)), rhs)
-                out = left[(z[left] + step[left] < low[left] - 1e-12) | (z[left] + step[left] > high[left] + 1e-12)]
+                out = left[
+                    (z[left] + step[left] < low[left] - 1e-12) | (z[left] + step[left] > high[left] + 1e-12)
+                ]
                 if not len(out):
                     break
                 step[out] = np.clip(z[out] + step[out], low[out], high[out]) - z[out]
@@ -474,24 +551,47 @@ def _descend(problem: Problem, z: np.ndarray, iterations: int, tolerance: float,
             break
     values, dx0 = problem.unpack(z)
     at_bound = {}
-    for k, (q, _) in enumerate(problem.unknowns[:problem.n_parameters]):
+    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
         if z[k] <= 1e-6:
             at_bound[q] = "low"
         elif z[k] >= 1 - 1e-6:
             at_bound[q] = "high"
-    return Fit(problem.model, values, dx0, cost, problem.unknowns, z, matrix, residuals, problem.noise, done, problem.samples,
-               at_bound, problem.beliefs, problem.believed(values, True)[2])
+    return Fit(
+        problem.model,
+        values,
+        dx0,
+        cost,
+        problem.unknowns,
+        z,
+        matrix,
+        residuals,
+        problem.noise,
+        done,
+        problem.samples,
+        at_bound,
+        problem.beliefs,
+        problem.believed(values, True)[2],
+    )
 
 
-def _bend(problem: Problem, z: np.ndarray, step: np.ndarray, matrix: np.ndarray, damping: float, free: np.ndarray,
-          kept: Sequence[_Rows]) -> np.ndarray:
+def _bend(
+    problem: Problem,
+    z: np.ndarray,
+    step: np.ndarray,
+    matrix: np.ndarray,
+    damping: float,
+    free: np.ndarray,
+    kept: Sequence[_Rows],
+) -> np.ndarray:
     """Half the geodesic acceleration: a plant's parameters trade in valleys that are curved, and a straight step leaves them
     (Transtrum & Sethna 2012, arXiv:1201.5885). Nothing where it is not small beside the step."""
     out = np.zeros_like(step)
     if len(free):
         sub = matrix[np.ix_(free, free)]
         weight = np.diag(sub)
-        out[free] = 0.5 * np.linalg.solve(sub + damping * np.diag(weight), problem.curvature(z, step, kept)[free])
+        out[free] = 0.5 * np.linalg.solve(
+            sub + damping * np.diag(weight), problem.curvature(z, step, kept)[free]
+        )
         if not weight @ out[free] ** 2 <= (0.5 * BENT) ** 2 * (weight @ step[free] ** 2):
             return np.zeros_like(step)
     return out
@@ -499,10 +599,12 @@ def _bend(problem: Problem, z: np.ndarray, step: np.ndarray, matrix: np.ndarray,
 
 # ------------------------------------------------------------------------------------------------------------ reports
 
+
 @dataclass(frozen=True)
 class Estimate:
     """One parameter after a refit. `state`: 'ok', 'at bound', 'dead' (the data do not feel it) or 'flat' (only a
     combination with others is felt); `trades_with`: parameters correlated with it above 0.95."""
+
     name: str
     value: float
     sd: float
@@ -524,9 +626,11 @@ def report(found: Fit, drives: Sequence[Drive] | None = None) -> list[Estimate]:
         p = found.model.plant.parameters[q]
         value = float(found.values[r or 0, found.model.parameters.index(q)])
         slope = Scale(p).slope(value)
-        felt = np.sqrt(max(found.hessian[k, k] - BELIEF_WEIGHT ** 2, 0.0))
+        felt = np.sqrt(max(found.hessian[k, k] - BELIEF_WEIGHT**2, 0.0))
         trades = tuple(found.unknowns[c][0] for c in np.flatnonzero(np.abs(corr[k, :n]) > 0.95) if c != k)
-        state = "dead" if felt < 0.1 else "at bound" if q in found.at_bound else "flat" if sd[k] > 0.5 else "ok"
+        state = (
+            "dead" if felt < 0.1 else "at bound" if q in found.at_bound else "flat" if sd[k] > 0.5 else "ok"
+        )
         name = drives[r].name if drives is not None and r is not None else None
         out.append(Estimate(q, value, float(sd[k] * slope), p.unit, state, trades, name))
     return out
@@ -540,6 +644,8 @@ def updated(plant: Plant, found: Fit, drives: Sequence[Drive]) -> Plant:
         if not p.range:
             continue
         column = found.values[:, found.model.parameters.index(q)]
-        values = {d.name: float(v) for d, v in zip(drives, column, strict=True)} if p.per_recording else p.values
+        values = (
+            {d.name: float(v) for d, v in zip(drives, column, strict=True)} if p.per_recording else p.values
+        )
         parameters[q] = dataclasses.replace(p, value=float(np.clip(np.mean(column), *p.range)), values=values)
     return dataclasses.replace(plant, parameters=parameters)

@@ -3,6 +3,7 @@
 The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the distance in the graph, by majorisation
 (Gansner, Koren, North 2004). What enters from or leaves to the outside and what is read at a node are small satellites.
 """
+
 from __future__ import annotations
 
 import textwrap
@@ -26,7 +27,14 @@ def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, in
     outside: dict[tuple[str, str], list[str]] = {}
     for f in plant.flows.values():
         if f.source and f.target:
-            edges.append((index[f.source], index[f.target], "flow", ", ".join(sorted(ex.names(f.rate) & set(plant.parameters)))))
+            edges.append(
+                (
+                    index[f.source],
+                    index[f.target],
+                    "flow",
+                    ", ".join(sorted(ex.names(f.rate) & set(plant.parameters))),
+                )
+            )
         else:
             outside.setdefault(("in", f.target) if f.target else ("out", f.source or ""), []).append(f.name)
     for (way, node), flows in outside.items():
@@ -45,7 +53,7 @@ def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, in
         i = len(vertices)
         vertices.append(("read", ",".join(nodes), "\n".join(names)))
         edges += [(index[n], i, "read", "") for n in nodes]
-        if not nodes:                               # a static reading: the inputs it is made of stand beside it
+        if not nodes:  # a static reading: the inputs it is made of stand beside it
             used = sorted(set().union(*(ex.names(plant.outputs[o].value) for o in names)) & set(plant.inputs))
             edges += [(len(vertices) + k, i, "read", "") for k in range(len(used))]
             vertices += [("in", n, n) for n in used]
@@ -68,15 +76,22 @@ def layout(count: int, edges: list[tuple[int, int, float]], rounds: int = 400) -
     """Positions (count, 2) of vertices joined by edges of given lengths."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import shortest_path
+
     if count < 2:
         return np.zeros((count, 2))
-    i, j, length = (np.array(c) for c in zip(*edges, strict=True)) if edges else (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+    i, j, length = (
+        (np.array(c) for c in zip(*edges, strict=True))
+        if edges
+        else (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+    )
     d = shortest_path(csr_matrix((length, (i, j)), shape=(count, count)), directed=False)
     reach = np.max(d[np.isfinite(d)], initial=1.0)
     d = np.where(np.isfinite(d), d, reach * 0.6 + 1.0)
-    centred = -0.5 * (np.eye(count) - 1 / count) @ d ** 2 @ (np.eye(count) - 1 / count)
+    centred = -0.5 * (np.eye(count) - 1 / count) @ d**2 @ (np.eye(count) - 1 / count)
     values, vectors = np.linalg.eigh(centred)
-    x = vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 1e-3)) + np.random.default_rng(1).normal(0, 0.01, (count, 2))
+    x = vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 1e-3)) + np.random.default_rng(1).normal(
+        0, 0.01, (count, 2)
+    )
     w = 1 / np.maximum(d, 1e-9) ** 2
     np.fill_diagonal(w, 0)
     laplacian = np.linalg.pinv(np.diag(w.sum(1)) - w)
@@ -106,10 +121,21 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) ->
     would be wider it is drawn closer, without the words on its lines."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+
     vertices, edges = _graph(plant)
     near = {"in", "out", "read"}
-    lengths = [(a, b, 0.75 if {vertices[a][0], vertices[b][0]} & near and kind == "flow" else 0.85 if kind == "read" else 1.6)
-               for a, b, kind, _ in edges]
+    lengths = [
+        (
+            a,
+            b,
+            0.75
+            if {vertices[a][0], vertices[b][0]} & near and kind == "flow"
+            else 0.85
+            if kind == "read"
+            else 1.6,
+        )
+        for a, b, kind, _ in edges
+    ]
     several: dict[int, int] = {}
     for _, b, kind, _ in edges:
         if kind == "read":
@@ -118,46 +144,105 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) ->
     x = layout(len(vertices), lengths)
     span = np.maximum(np.ptp(x, axis=0), 0.5) if len(x) else np.ones(2)
     closer = min(1.0, widest / (2.0 + 1.75 * span[0]))
-    if closer < 0.9:                # the words keep their size: what hangs on a node needs more room beside it
+    if closer < 0.9:  # the words keep their size: what hangs on a node needs more room beside it
         x = layout(len(vertices), [(a, b, q * 1.45 if q < 1.0 else q) for a, b, q in lengths])
         span = np.ptp(x, axis=0)
-    figure = Figure(figsize=(float(np.clip(2.0 + 1.75 * span[0], 6, min(40, widest))),
-                             float(np.clip(1.6 + 1.3 * span[1] * closer ** 0.5, 3.5, 32))))
+    figure = Figure(
+        figsize=(
+            float(np.clip(2.0 + 1.75 * span[0], 6, min(40, widest))),
+            float(np.clip(1.6 + 1.3 * span[1] * closer**0.5, 3.5, 32)),
+        )
+    )
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.92))
     axes.set_axis_off()
-    style = {"node": ("#1b3a5c", "#dce8f5", 9.5), "in": ("#9c3d00", "#fde8d9", 8), "out": ("#4a5560", "#eceff1", 8),
-             "read": ("#1d6b3a", "#e2f3e6", 8)}
+    style = {
+        "node": ("#1b3a5c", "#dce8f5", 9.5),
+        "in": ("#9c3d00", "#fde8d9", 8),
+        "out": ("#4a5560", "#eceff1", 8),
+        "read": ("#1d6b3a", "#e2f3e6", 8),
+    }
     colours = {"flow": "#5a6b7b", "read": "#1d6b3a", "uses": "#9a86b8"}
     boxes = {}
     for i, (kind, key, label) in enumerate(vertices):
         edge, face, size = style[kind]
         if key in marked if kind == "node" else not set(label.split("\n")).isdisjoint(marked):
             edge, face = "#b3261e", "#ffdad6"
-        boxes[i] = axes.text(x[i, 0], x[i, 1], label, ha="center", va="center", fontsize=size, color=edge, zorder=3,
-                             bbox={"boxstyle": "round,pad=0.35" if kind == "node" else "round,pad=0.2", "fc": face, "ec": edge,
-                                   "lw": 1.2 if kind == "node" else 0.6})
+        boxes[i] = axes.text(
+            x[i, 0],
+            x[i, 1],
+            label,
+            ha="center",
+            va="center",
+            fontsize=size,
+            color=edge,
+            zorder=3,
+            bbox={
+                "boxstyle": "round,pad=0.35" if kind == "node" else "round,pad=0.2",
+                "fc": face,
+                "ec": edge,
+                "lw": 1.2 if kind == "node" else 0.6,
+            },
+        )
     margin = 0.45
     axes.set_xlim(x[:, 0].min() - margin, x[:, 0].max() + margin)
     axes.set_ylim(x[:, 1].min() - margin, x[:, 1].max() + margin)
-    figure.canvas.draw()            # gives the boxes their sizes, at which the arrows end
+    figure.canvas.draw()  # gives the boxes their sizes, at which the arrows end
     sizes = {i: axes.transData.inverted().transform(_outline(q)) for i, q in boxes.items()}
     for a, b, kind, label in edges:
-        line = {"arrowstyle": "-" if kind == "read" else "-|>", "color": colours[kind], "mutation_scale": 13, "shrinkA": 0, "shrinkB": 0,
-                "lw": 1.3 if kind == "flow" else 0.8, "ls": {"flow": "-", "read": ":", "uses": "--"}[kind]}
-        axes.annotate("", xy=(*_edge(sizes[b], x[b], x[a]),), xytext=(*_edge(sizes[a], x[a], x[b]),), arrowprops=line, zorder=1)
+        line = {
+            "arrowstyle": "-" if kind == "read" else "-|>",
+            "color": colours[kind],
+            "mutation_scale": 13,
+            "shrinkA": 0,
+            "shrinkB": 0,
+            "lw": 1.3 if kind == "flow" else 0.8,
+            "ls": {"flow": "-", "read": ":", "uses": "--"}[kind],
+        }
+        axes.annotate(
+            "",
+            xy=(*_edge(sizes[b], x[b], x[a]),),
+            xytext=(*_edge(sizes[a], x[a], x[b]),),
+            arrowprops=line,
+            zorder=1,
+        )
         if label and closer > 0.9:
             middle = (x[a] + x[b]) / 2
             broken = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
-            axes.text(middle[0], middle[1], broken, fontsize=6.5, color="#5a6b7b", ha="center", va="center",
-                      zorder=2, bbox={"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85})
-    room = figure.get_figwidth() * 9.5 - (45 if figure.get_figwidth() >= 11 else 0)         # letters of the title in a line
-    figure.text(0.02, 0.995, textwrap.fill(plant.title, max(int(room), 20)), fontsize=12, weight="bold", va="top")
-    words = {"node": "stored quantity", "in": "flow from outside", "out": "flow to outside", "read": "reading"}
+            axes.text(
+                middle[0],
+                middle[1],
+                broken,
+                fontsize=6.5,
+                color="#5a6b7b",
+                ha="center",
+                va="center",
+                zorder=2,
+                bbox={"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85},
+            )
+    room = figure.get_figwidth() * 9.5 - (
+        45 if figure.get_figwidth() >= 11 else 0
+    )  # letters of the title in a line
+    figure.text(
+        0.02, 0.995, textwrap.fill(plant.title, max(int(room), 20)), fontsize=12, weight="bold", va="top"
+    )
+    words = {
+        "node": "stored quantity",
+        "in": "flow from outside",
+        "out": "flow to outside",
+        "read": "reading",
+    }
     for k, (kind, word) in enumerate(words.items()):
         at = 1.0 - 1.215 / figure.get_figwidth() * (4 - k)
-        figure.text(at, 0.025 if figure.get_figwidth() < 11 else 0.965, word, fontsize=8, color=style[kind][0], va="center",
-                    bbox={"boxstyle": "round,pad=0.25", "fc": style[kind][1], "ec": style[kind][0], "lw": 0.6})
+        figure.text(
+            at,
+            0.025 if figure.get_figwidth() < 11 else 0.965,
+            word,
+            fontsize=8,
+            color=style[kind][0],
+            va="center",
+            bbox={"boxstyle": "round,pad=0.25", "fc": style[kind][1], "ec": style[kind][0], "lw": 0.6},
+        )
     return figure
 
 
@@ -173,14 +258,35 @@ def table(plant: Plant) -> list:
         for row in rows:
             made.add_row(*("" if q is None else f"{q:.6g}" if isinstance(q, float) else str(q) for q in row))
         return made
-    parts = [make("Inputs", ("name", "unit", "column", "between samples"),
-                  [(i.name, i.unit, i.column, "linear" if i.linear else "hold") for i in plant.inputs.values()]),
-             make("Parameters", ("name", "value", "unit", "low", "high"),
-                  [(p.name, p.value, p.unit, *(p.range or (None, None))) for p in plant.parameters.values()]),
-             make("Nodes", ("name", "unit", "storage", "initial"),
-                  [(n.name, n.unit, n.storage, n.initial) for n in plant.nodes.values()]),
-             make("Flows", ("name", "from", "into", "rate", "unit"),
-                  [(f.name, f.source or "(outside)", f.target or "(outside)", f.rate, f.unit) for f in plant.flows.values()]),
-             make("Outputs", ("name", "value", "unit", "noise", "step"),
-                  [(o.name, o.value, o.unit, o.noise, o.resolution) for o in plant.outputs.values()])]
+
+    parts = [
+        make(
+            "Inputs",
+            ("name", "unit", "column", "between samples"),
+            [(i.name, i.unit, i.column, "linear" if i.linear else "hold") for i in plant.inputs.values()],
+        ),
+        make(
+            "Parameters",
+            ("name", "value", "unit", "low", "high"),
+            [(p.name, p.value, p.unit, *(p.range or (None, None))) for p in plant.parameters.values()],
+        ),
+        make(
+            "Nodes",
+            ("name", "unit", "storage", "initial"),
+            [(n.name, n.unit, n.storage, n.initial) for n in plant.nodes.values()],
+        ),
+        make(
+            "Flows",
+            ("name", "from", "into", "rate", "unit"),
+            [
+                (f.name, f.source or "(outside)", f.target or "(outside)", f.rate, f.unit)
+                for f in plant.flows.values()
+            ],
+        ),
+        make(
+            "Outputs",
+            ("name", "value", "unit", "noise", "step"),
+            [(o.name, o.value, o.unit, o.noise, o.resolution) for o in plant.outputs.values()],
+        ),
+    ]
     return [p for p in parts if p.row_count]

@@ -1,4 +1,5 @@
 """Simulation of a compiled plant on a recording's inputs: free run, sensitivities, and one fixed period at a time."""
+
 from __future__ import annotations
 
 import ctypes
@@ -17,9 +18,9 @@ from thermoctl.yamlfile import InputError, suggest
 if TYPE_CHECKING:
     from thermoctl.recording.table import Table
 
-RTOL = 1e-7             # local error a step, as a share of each state's range
-JUMP_WIDTH = 1e-5       # half width of a smoothed jump, as a share of the range of its argument
-MAX_STEPS = 2_000      # steps within one sampling interval
+RTOL = 1e-7  # local error a step, as a share of each state's range
+JUMP_WIDTH = 1e-5  # half width of a smoothed jump, as a share of the range of its argument
+MAX_STEPS = 2_000  # steps within one sampling interval
 
 
 class SimulationError(Exception):
@@ -31,14 +32,15 @@ class Drive:
     """What one recording gives to a plant: `t` (N,) seconds from its first sample, `u` (N, inputs) with gaps filled
     (held, or on a straight line for linear inputs), `y` (N, outputs) measured, NaN where missing, `first` the first
     recorded values, and the scales that a simulation on it uses."""
+
     name: str
     t: np.ndarray
     u: np.ndarray
     y: np.ndarray
     first: dict[str, float]
     linear: np.ndarray
-    scale: np.ndarray | None = None          # (nx,) range of each state
-    width: np.ndarray | None = None          # (jumps,) half width of each smoothed jump
+    scale: np.ndarray | None = None  # (nx,) range of each state
+    width: np.ndarray | None = None  # (jumps,) half width of each smoothed jump
 
     def part(self, start: int, stop: int) -> Drive:
         """The samples start..stop-1 (scales kept); time goes on counting from the recording's start."""
@@ -49,6 +51,7 @@ class Drive:
 class Simulation:
     """`x` (N, nx), `y` (N, ny) noise-free; with sensitivities `dx` (N, nx, nq) and `dy` (N, ny, nq) by q = (active
     parameters, uncertain initial states)."""
+
     t: np.ndarray
     x: np.ndarray
     y: np.ndarray
@@ -59,7 +62,12 @@ class Simulation:
 
 
 class _Forces(ctypes.Structure):
-    _fields_ = [("count", ctypes.c_int), ("row", ctypes.c_void_p), ("col", ctypes.c_void_p), ("q", ctypes.c_void_p)]
+    _fields_ = [
+        ("count", ctypes.c_int),
+        ("row", ctypes.c_void_p),
+        ("col", ctypes.c_void_p),
+        ("q", ctypes.c_void_p),
+    ]
 
 
 def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -99,8 +107,10 @@ class Model:
         for j, i in enumerate(self.plant.inputs.values()):
             column = table.columns.get(i.column)
             if column is None:
-                raise InputError(f"{table.path}: no column '{i.column}', which input '{i.name}' of {self.plant.file} reads"
-                                 f"{suggest(i.column, table.columns)}; columns are {', '.join(list(table.columns)[:40])}")
+                raise InputError(
+                    f"{table.path}: no column '{i.column}', which input '{i.name}' of {self.plant.file} reads"
+                    f"{suggest(i.column, table.columns)}; columns are {', '.join(list(table.columns)[:40])}"
+                )
             u[:, j] = _filled(t, column, i.linear, f"{table.path}: column '{i.column}' (input '{i.name}')")
             linear[j] = i.linear
             first[i.name] = float(column[np.isfinite(column)][0])
@@ -113,14 +123,23 @@ class Model:
                     first.setdefault(o.name, float(known[0]))
         return Drive(table.name, t, u, y, first, linear)
 
-    def vector(self, parameters: Mapping[str, float] | np.ndarray | None, recording: str | None = None) -> np.ndarray:
+    def vector(
+        self, parameters: Mapping[str, float] | np.ndarray | None, recording: str | None = None
+    ) -> np.ndarray:
         """All parameters in order: the plant's values (those of the recording where it has its own), then changes."""
         if isinstance(parameters, np.ndarray):
             return np.ascontiguousarray(parameters, float)
-        out = np.array([p.values.get(recording, p.value) if recording else p.value for p in self.plant.parameters.values()])
+        out = np.array(
+            [
+                p.values.get(recording, p.value) if recording else p.value
+                for p in self.plant.parameters.values()
+            ]
+        )
         for key, value in (parameters or {}).items():
             if key not in self.parameters:
-                raise InputError(f"'{key}' is not a parameter of {self.plant.file}{suggest(key, self.parameters)}")
+                raise InputError(
+                    f"'{key}' is not a parameter of {self.plant.file}{suggest(key, self.parameters)}"
+                )
             out[self.parameters.index(key)] = value
         return out
 
@@ -145,8 +164,11 @@ class Model:
                 area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(drive.t))])
                 at = drive.t - td
 
-                def integral(z: np.ndarray, area=area, s=s) -> np.ndarray:      # before the start the first value held
+                def integral(
+                    z: np.ndarray, area=area, s=s
+                ) -> np.ndarray:  # before the start the first value held
                     return np.where(z < drive.t[0], (z - drive.t[0]) * s[0], np.interp(z, drive.t, area))
+
                 dt = np.diff(drive.t)
                 u[:-1, n + j] = np.diff(integral(at)) / dt
                 u[-1, n + j] = u[-2, n + j]
@@ -155,14 +177,22 @@ class Model:
                 u[-1, n + len(self.code.input_delays) + j] = 0.0
         return np.ascontiguousarray(u)
 
-    def start(self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def start(
+        self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Initial states (nx,) and their sensitivities (nx, nq). `dx0`: shifts of the uncertain initial states."""
-        values = {**dict(zip(self.plant.inputs, drive.u[0], strict=False)), **dict(zip(self.parameters, p, strict=True))}
+        values = {
+            **dict(zip(self.plant.inputs, drive.u[0], strict=False)),
+            **dict(zip(self.parameters, p, strict=True)),
+        }
 
         def first(key: str) -> float:
             if key not in drive.first:
-                raise InputError(f"recording {drive.name}: first({key}) is asked for, but the recording has no value of it")
+                raise InputError(
+                    f"recording {drive.name}: first({key}) is asked for, but the recording has no value of it"
+                )
             return drive.first[key]
+
         x0 = np.array([float(ex.evaluate(e, values, first)) for e in self._initial])
         s0 = np.zeros((len(self.states), len(self.unknowns)))
         for i, e in enumerate(self._initial):
@@ -186,13 +216,16 @@ class Model:
         width = np.ones(max(len(jumps), 1))
         for i, (z, kind) in enumerate(jumps):
             if kind == "time":
-                slope = ex.evaluate(ex.derivative(z, "t"), dict(zip(self.parameters, p, strict=True))) \
-                    if ex.names(ex.derivative(z, "t")) <= set(self.parameters) else 1.0
+                slope = (
+                    ex.evaluate(ex.derivative(z, "t"), dict(zip(self.parameters, p, strict=True)))
+                    if ex.names(ex.derivative(z, "t")) <= set(self.parameters)
+                    else 1.0
+                )
                 width[i] = 0.5 * dt * max(abs(float(slope)), 1e-12)
         drive.width = width
         drive.scale = np.full(len(self.states), np.nan)
         moving = any(kind == "state" for _, kind in jumps)
-        for share in ((1e-2, JUMP_WIDTH) if moving else (1.0,)):
+        for share in (1e-2, JUMP_WIDTH) if moving else (1.0,):
             try:
                 run = self._run(drive, p, None, False, 1e-5 if moving else 1e-4)
                 x = run.x
@@ -210,19 +243,35 @@ class Model:
 
     def _signals(self, drive: Drive, p: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
         u = self._delayed_inputs(drive, p)
-        return {**dict(zip(self.code.inputs, u.T, strict=True)), **dict(zip(self.parameters, p, strict=True)),
-                **dict(zip(self.states, x.T, strict=True)), "t": drive.t}
+        return {
+            **dict(zip(self.code.inputs, u.T, strict=True)),
+            **dict(zip(self.parameters, p, strict=True)),
+            **dict(zip(self.states, x.T, strict=True)),
+            "t": drive.t,
+        }
 
-    def run(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None = None, dx0: np.ndarray | None = None,
-            sensitivities: bool = False, rtol: float = RTOL, buffers: dict[str, np.ndarray] | None = None) -> Simulation:
+    def run(
+        self,
+        drive: Drive,
+        parameters: Mapping[str, float] | np.ndarray | None = None,
+        dx0: np.ndarray | None = None,
+        sensitivities: bool = False,
+        rtol: float = RTOL,
+        buffers: dict[str, np.ndarray] | None = None,
+    ) -> Simulation:
         """Free run on a drive. `buffers`: a dict that keeps the large arrays between runs (the next run with it changes
         the states' slopes that the last one returned, and the outputs' of the last one on this drive). Raises SimulationError."""
         if drive.scale is None:
             self.prepare(drive, parameters)
         return self._run(drive, self.vector(parameters, drive.name), dx0, sensitivities, rtol, buffers)
 
-    def simulate(self, table: Table, parameters: Mapping[str, float] | None = None, sensitivities: bool = False,
-                 rtol: float = RTOL) -> Simulation:
+    def simulate(
+        self,
+        table: Table,
+        parameters: Mapping[str, float] | None = None,
+        sensitivities: bool = False,
+        rtol: float = RTOL,
+    ) -> Simulation:
         """Free run on a recording's inputs. Raises InputError, SimulationError."""
         return self.run(self.drive(table), parameters, None, sensitivities, rtol)
 
@@ -230,7 +279,9 @@ class Model:
         """The plant in the rig's place: a recording of the inputs in `table` and what the sensors make of the outputs, with their
         noise and their steps. Uncertain starts are drawn. Raises InputError, SimulationError."""
         rng, drive = np.random.default_rng(seed), self.drive(table)
-        dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(size=len(self.uncertain))
+        dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(
+            size=len(self.uncertain)
+        )
         y = self.run(drive, None, dx0).y
         columns = {i.column: table.columns[i.column] for i in self.plant.inputs.values()}
         for j, o in enumerate(self.plant.outputs.values()):
@@ -238,8 +289,15 @@ class Model:
             columns[o.column] = np.round(read / o.resolution) * o.resolution if o.resolution else read
         return dataclasses.replace(table, columns=columns)
 
-    def _run(self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None, sensitivities: bool, rtol: float,
-             buffers: dict[str, np.ndarray] | None = None) -> Simulation:
+    def _run(
+        self,
+        drive: Drive,
+        p: np.ndarray,
+        dx0: np.ndarray | None,
+        sensitivities: bool,
+        rtol: float,
+        buffers: dict[str, np.ndarray] | None = None,
+    ) -> Simulation:
         lib, n, nx, nq = self.code.library, len(drive.t), len(self.states), len(self.unknowns)
         u = self._delayed_inputs(drive, p)
         width = drive.width if drive.width is not None else np.ones(1)
@@ -249,22 +307,53 @@ class Model:
         info = np.zeros(2)
         if nx:
             if not np.all(np.isfinite(x0)):
-                raise SimulationError(f"{drive.name}: the start of '{self.states[int(np.argmin(np.isfinite(x0)))]}' is not finite")
-            scale = drive.scale if drive.scale is not None and np.all(np.isfinite(drive.scale)) \
+                raise SimulationError(
+                    f"{drive.name}: the start of '{self.states[int(np.argmin(np.isfinite(x0)))]}' is not finite"
+                )
+            scale = (
+                drive.scale
+                if drive.scale is not None and np.all(np.isfinite(drive.scale))
                 else np.abs(x0) + 1e-3
+            )
             atol = rtol * scale
-            failed = lib.integrate(n, _p(drive.t), _p(u), _p(drive.linear), _p(p), _p(width), _p(x0), _p(s0), nq, rtol,
-                                   _p(atol), MAX_STEPS, _p(x), _p(dx), _p(info), None)
+            failed = lib.integrate(
+                n,
+                _p(drive.t),
+                _p(u),
+                _p(drive.linear),
+                _p(p),
+                _p(width),
+                _p(x0),
+                _p(s0),
+                nq,
+                rtol,
+                _p(atol),
+                MAX_STEPS,
+                _p(x),
+                _p(dx),
+                _p(info),
+                None,
+            )
             if failed:
                 at = max(failed - 1, 0)
-                raise SimulationError(f"{drive.name}: the simulation does not get beyond t = {drive.t[at]:.6g} s; states "
-                                      + ", ".join(f"{s} = {v:.3g}" for s, v in zip(self.states, x[at], strict=True)))
+                raise SimulationError(
+                    f"{drive.name}: the simulation does not get beyond t = {drive.t[at]:.6g} s; states "
+                    + ", ".join(f"{s} = {v:.3g}" for s, v in zip(self.states, x[at], strict=True))
+                )
         y, dy = self._observe(drive, u, p, width, x, dx, nq, sensitivities, buffers)
         return Simulation(drive.t, x, y, dx, dy, int(info[0]), int(info[1]))
 
-    def respond(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None, dx0: np.ndarray | None,
-                forces: Sequence[tuple[int, int]], q: np.ndarray, columns: int, rtol: float = 1e-5,
-                buffers: dict[str, np.ndarray] | None = None) -> np.ndarray:
+    def respond(
+        self,
+        drive: Drive,
+        parameters: Mapping[str, float] | np.ndarray | None,
+        dx0: np.ndarray | None,
+        forces: Sequence[tuple[int, int]],
+        q: np.ndarray,
+        columns: int,
+        rtol: float = 1e-5,
+        buffers: dict[str, np.ndarray] | None = None,
+    ) -> np.ndarray:
         """The outputs' first-order response (N, ny, columns) to forces on dx/dt that the plant does not have. Entry e of
         `forces` is (state, column) and has its values, per second, in q[:, e] (N, entries). `buffers`: as of `run`."""
         lib, n, nx = self.code.library, len(drive.t), len(self.states)
@@ -281,29 +370,74 @@ class Model:
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
         dx = _buffer(buffers, "dx", (n, nx, columns))
         atol = rtol * drive.scale
-        if nx and lib.integrate(n, _p(drive.t), _p(u), _p(drive.linear), _p(p), _p(drive.width), _p(x0), _p(s0), columns, rtol,
-                                _p(atol), MAX_STEPS, _p(x), _p(dx), _p(info), ctypes.addressof(force)):
+        if nx and lib.integrate(
+            n,
+            _p(drive.t),
+            _p(u),
+            _p(drive.linear),
+            _p(p),
+            _p(drive.width),
+            _p(x0),
+            _p(s0),
+            columns,
+            rtol,
+            _p(atol),
+            MAX_STEPS,
+            _p(x),
+            _p(dx),
+            _p(info),
+            ctypes.addressof(force),
+        ):
             raise SimulationError(f"{drive.name}: the plant cannot be simulated")
         _, dy = self._observe(drive, u, p, drive.width, x, dx, columns, True, buffers, 0)
         assert dy is not None
         return dy
 
-    def _observe(self, drive: Drive, u: np.ndarray, p: np.ndarray, width: np.ndarray, x: np.ndarray,
-                 dx: np.ndarray | None, nq: int, sensitivities: bool,
-                 buffers: dict[str, np.ndarray] | None = None, own: int = 1) -> tuple[np.ndarray, np.ndarray | None]:
+    def _observe(
+        self,
+        drive: Drive,
+        u: np.ndarray,
+        p: np.ndarray,
+        width: np.ndarray,
+        x: np.ndarray,
+        dx: np.ndarray | None,
+        nq: int,
+        sensitivities: bool,
+        buffers: dict[str, np.ndarray] | None = None,
+        own: int = 1,
+    ) -> tuple[np.ndarray, np.ndarray | None]:
         lib, n, ny, nd = self.code.library, len(drive.t), len(self.outputs), len(self.code.output_delays)
         delayed = slopes = None
         if nd:
             g = np.empty((n, nd))
             dg = np.empty((n, nd, nq)) if sensitivities else None
-            lib.observe(1, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, None, None, _p(g), _p(dg), own)
+            lib.observe(
+                1, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, None, None, _p(g), _p(dg), own
+            )
             delayed, slopes = self._shift(drive.t, g, dg, p, own)
         y = np.empty((n, ny))
         dy = _buffer(buffers, f"dy {id(drive)}", (n, ny, nq)) if sensitivities else None
-        lib.observe(0, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, _p(delayed), _p(slopes), _p(y), _p(dy), own)
+        lib.observe(
+            0,
+            n,
+            _p(drive.t),
+            _p(u),
+            _p(p),
+            _p(width),
+            _p(x),
+            _p(dx),
+            nq,
+            _p(delayed),
+            _p(slopes),
+            _p(y),
+            _p(dy),
+            own,
+        )
         return y, dy
 
-    def _shift(self, t: np.ndarray, g: np.ndarray, dg: np.ndarray | None, p: np.ndarray, own: int) -> tuple[np.ndarray, np.ndarray | None]:
+    def _shift(
+        self, t: np.ndarray, g: np.ndarray, dg: np.ndarray | None, p: np.ndarray, own: int
+    ) -> tuple[np.ndarray, np.ndarray | None]:
         """The arguments of delays, seconds earlier: cubic between samples (Catmull-Rom slopes), held before the start."""
         known = dict(zip(self.parameters, p, strict=True))
         out, dout = np.empty_like(g), None if dg is None else np.empty_like(dg)
@@ -313,11 +447,18 @@ class Model:
             k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
             h = t[k + 1] - t[k]
             s = (at - t[k]) / h
-            basis = ((1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2 * h, s * s * (3 - 2 * s), s * s * (s - 1) * h)
+            basis = (
+                (1 + 2 * s) * (1 - s) ** 2,
+                s * (1 - s) ** 2 * h,
+                s * s * (3 - 2 * s),
+                s * s * (s - 1) * h,
+            )
             rate = np.gradient(g[:, j], t)
-            out[:, j] = basis[0] * g[k, j] + basis[1] * rate[k] + basis[2] * g[k + 1, j] + basis[3] * rate[k + 1]
+            out[:, j] = (
+                basis[0] * g[k, j] + basis[1] * rate[k] + basis[2] * g[k + 1, j] + basis[3] * rate[k + 1]
+            )
             if dg is not None and dout is not None:
-                w = (s[:, None])
+                w = s[:, None]
                 dout[:, j] = (1 - w) * dg[k, j] + w * dg[k + 1, j]
                 slope = np.where(t - td > t[0], (1 - s) * rate[k] + s * rate[k + 1], 0.0)
                 for c, q in enumerate(self.active if own else ()):
@@ -325,8 +466,14 @@ class Model:
                         dout[:, j, c] -= slope * float(ex.evaluate(ex.derivative(seconds, q), known))
         return out, dout
 
-    def stepper(self, period_s: float, u0: np.ndarray, parameters: Mapping[str, float] | None = None,
-                first: Mapping[str, float] | None = None, rtol: float = 1e-5) -> Stepper:
+    def stepper(
+        self,
+        period_s: float,
+        u0: np.ndarray,
+        parameters: Mapping[str, float] | None = None,
+        first: Mapping[str, float] | None = None,
+        rtol: float = 1e-5,
+    ) -> Stepper:
         """One fixed period at a time, for a simulated rig; `u0` (inputs,) are the inputs at the start."""
         return Stepper(self, period_s, np.asarray(u0, float), parameters, dict(first or {}), rtol)
 
@@ -346,6 +493,7 @@ def _filled(t: np.ndarray, column: np.ndarray, linear: bool, what: str) -> np.nd
 @dataclass
 class Stepper:
     """A plant that lives in steps of one period, its inputs held over each; deterministic."""
+
     model: Model
     period_s: float
     u0: np.ndarray
@@ -364,8 +512,14 @@ class Stepper:
         m = self.model
         self._p = m.vector(self.parameters)
         named = dict(zip(m.inputs, u0, strict=True))
-        drive = Drive("start", np.zeros(1), np.atleast_2d(np.asarray(u0, float)).copy(), np.empty((1, 0)), {**named, **self.first},
-                      np.zeros(len(m.inputs), np.intc))
+        drive = Drive(
+            "start",
+            np.zeros(1),
+            np.atleast_2d(np.asarray(u0, float)).copy(),
+            np.empty((1, 0)),
+            {**named, **self.first},
+            np.zeros(len(m.inputs), np.intc),
+        )
         self.x, _ = m.start(drive, self._p)
         self.t = 0.0
         self._u = np.array(u0, float)
@@ -375,7 +529,7 @@ class Stepper:
         self._scale = np.abs(self.x) * 1e-2 + 1e-3
         self._atol = self.rtol * self._scale
         size = ctypes.c_int.in_dll(m.code.library, "memory_size").value
-        self._memory = np.zeros(size)       # the matrix of the exponential method, see integrator.h
+        self._memory = np.zeros(size)  # the matrix of the exponential method, see integrator.h
         tail = (self._atol, self.x, self._y, self._want, self._memory)
         self._pointers = [_p(a) for a in (self._u, self._p, self._width)], [_p(a) for a in tail]
 

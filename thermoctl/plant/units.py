@@ -4,6 +4,7 @@ A flow's unit must follow from its node (storage times node per second), an expr
 anywhere: a bare number, which takes whatever dimension its place asks for, and a name whose unit is not given; what is
 multiplied by them fits anywhere too. Exponents are pure numbers.
 """
+
 from __future__ import annotations
 
 import re
@@ -21,18 +22,69 @@ Dimension = tuple[tuple[str, Fraction], ...]
 
 # The symbols of most plant files, so that these need not wait for pint (half a second to import): kg m s A K mol cd.
 _COMMON = {
-    "1": "", "%": "", "percent": "", "dimensionless": "", "rad": "", "deg": "",
-    "m": "m", "mm": "m", "um": "m", "µm": "m", "nm": "m", "cm": "m", "g": "kg", "kg": "kg", "s": "s", "ms": "s", "us": "s",
-    "min": "s", "h": "s", "A": "A", "mA": "A", "K": "K", "degC": "K", "delta_degC": "K", "mK": "K", "Hz": "s-1", "kHz": "s-1",
-    "N": "kg m s-2", "mN": "kg m s-2", "kN": "kg m s-2", "Pa": "kg m-1 s-2", "kPa": "kg m-1 s-2", "bar": "kg m-1 s-2",
-    "J": "kg m2 s-2", "kJ": "kg m2 s-2", "W": "kg m2 s-3", "mW": "kg m2 s-3", "kW": "kg m2 s-3",
-    "V": "kg m2 s-3 A-1", "mV": "kg m2 s-3 A-1", "kV": "kg m2 s-3 A-1", "ohm": "kg m2 s-3 A-2", "mohm": "kg m2 s-3 A-2",
-    "H": "kg m2 s-2 A-2", "mH": "kg m2 s-2 A-2", "F": "kg-1 m-2 s4 A2", "C": "s A", "T": "kg s-2 A-1", "Wb": "kg m2 s-2 A-1",
+    "1": "",
+    "%": "",
+    "percent": "",
+    "dimensionless": "",
+    "rad": "",
+    "deg": "",
+    "m": "m",
+    "mm": "m",
+    "um": "m",
+    "µm": "m",
+    "nm": "m",
+    "cm": "m",
+    "g": "kg",
+    "kg": "kg",
+    "s": "s",
+    "ms": "s",
+    "us": "s",
+    "min": "s",
+    "h": "s",
+    "A": "A",
+    "mA": "A",
+    "K": "K",
+    "degC": "K",
+    "delta_degC": "K",
+    "mK": "K",
+    "Hz": "s-1",
+    "kHz": "s-1",
+    "N": "kg m s-2",
+    "mN": "kg m s-2",
+    "kN": "kg m s-2",
+    "Pa": "kg m-1 s-2",
+    "kPa": "kg m-1 s-2",
+    "bar": "kg m-1 s-2",
+    "J": "kg m2 s-2",
+    "kJ": "kg m2 s-2",
+    "W": "kg m2 s-3",
+    "mW": "kg m2 s-3",
+    "kW": "kg m2 s-3",
+    "V": "kg m2 s-3 A-1",
+    "mV": "kg m2 s-3 A-1",
+    "kV": "kg m2 s-3 A-1",
+    "ohm": "kg m2 s-3 A-2",
+    "mohm": "kg m2 s-3 A-2",
+    "H": "kg m2 s-2 A-2",
+    "mH": "kg m2 s-2 A-2",
+    "F": "kg-1 m-2 s4 A2",
+    "C": "s A",
+    "T": "kg s-2 A-1",
+    "Wb": "kg m2 s-2 A-1",
 }
-_BASES = {"[length]": "m", "[mass]": "kg", "[time]": "s", "[current]": "A", "[temperature]": "K", "[substance]": "mol",
-          "[luminosity]": "cd"}
-_TOKEN = re.compile(r"\s*(?:(?P<power>\*\*|\^)|(?P<op>[*/()·])|(?P<raised>[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)|"
-                    r"(?P<number>[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)|(?P<symbol>[^\W\d]\w*|%|°C|°))")
+_BASES = {
+    "[length]": "m",
+    "[mass]": "kg",
+    "[time]": "s",
+    "[current]": "A",
+    "[temperature]": "K",
+    "[substance]": "mol",
+    "[luminosity]": "cd",
+}
+_TOKEN = re.compile(
+    r"\s*(?:(?P<power>\*\*|\^)|(?P<op>[*/()·])|(?P<raised>[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)|"
+    r"(?P<number>[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)|(?P<symbol>[^\W\d]\w*|%|°C|°))"
+)
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _WRITTEN = {"kg m2 s-2": "J", "kg m2 s-3": "W", "kg m s-2": "N", "kg m2 s-3 A-1": "V", "kg m2 s-3 A-2": "ohm"}
 _MAX_LENGTH, _MAX_EXPONENT = 100, 100
@@ -42,7 +94,11 @@ def check_units(plant: Plant) -> None:
     """Raises InputError (file:line, both dimensions) at the first unit or expression that does not fit."""
     units: dict[str, Dimension | None] = {"t": (("s", Fraction(1)),)}
     readings: dict[str, Dimension | None] = {}
-    named: list[Input | Parameter | Node] = [*plant.inputs.values(), *plant.parameters.values(), *plant.nodes.values()]
+    named: list[Input | Parameter | Node] = [
+        *plant.inputs.values(),
+        *plant.parameters.values(),
+        *plant.nodes.values(),
+    ]
     for item in named:
         units[item.name] = readings[item.name] = _declared(plant, item.name, item.unit, item.line)
     for output in plant.outputs.values():
@@ -54,8 +110,10 @@ def check_units(plant: Plant) -> None:
         storage = check.expression(node.storage, f"storage of '{node.name}'", node.line)
         check.place(node.initial, f"initial of '{node.name}'", node.line, units[node.name], f"{node.unit}")
         if storage is not None and units[node.name] is not None:
-            rates[node.name] = (_times(_times(storage, units[node.name] or ()), second, -1),
-                                f"from node '{node.name}', storage times node per second")
+            rates[node.name] = (
+                _times(_times(storage, units[node.name] or ()), second, -1),
+                f"from node '{node.name}', storage times node per second",
+            )
     for flow in plant.flows.values():
         what = f"flow '{flow.name}'"
         unit = _declared(plant, what, flow.unit, flow.line)
@@ -64,25 +122,36 @@ def check_units(plant: Plant) -> None:
             if unit is not None:
                 expected, why = rates.setdefault(end, (unit, f"as the other flows of node '{end}'"))
                 if expected != unit:
-                    raise InputError(f"{plant.file}:{flow.line}: {what} has unit {flow.unit} [{_text(unit)}]; "
-                                     f"{_text(expected)} was expected {why}")
-        expected_rate, why = (unit, f"{flow.unit}") if unit is not None else next(
-            (rates[end] for end in (flow.source, flow.target) if end in rates), (None, ""))
+                    raise InputError(
+                        f"{plant.file}:{flow.line}: {what} has unit {flow.unit} [{_text(unit)}]; "
+                        f"{_text(expected)} was expected {why}"
+                    )
+        expected_rate, why = (
+            (unit, f"{flow.unit}")
+            if unit is not None
+            else next((rates[end] for end in (flow.source, flow.target) if end in rates), (None, ""))
+        )
         given = check.place(flow.rate, f"rate of '{flow.name}'", flow.line, expected_rate, why)
         for end in filter(None, (flow.source, flow.target)):
             if unit is None and given is not None:
                 expected, why = rates.setdefault(end, (given, f"as the other flows of node '{end}'"))
                 if expected != given:
-                    raise InputError(f"{plant.file}:{flow.line}: rate of '{flow.name}' is [{_text(given)}]; "
-                                     f"{_text(expected)} was expected {why}")
+                    raise InputError(
+                        f"{plant.file}:{flow.line}: rate of '{flow.name}' is [{_text(given)}]; "
+                        f"{_text(expected)} was expected {why}"
+                    )
     for output in plant.outputs.values():
-        check.place(output.value, f"value of '{output.name}'", output.line, readings[output.name], f"{output.unit}")
+        check.place(
+            output.value, f"value of '{output.name}'", output.line, readings[output.name], f"{output.unit}"
+        )
 
 
 class _Check:
     """Dimensions of expressions, every shared part once."""
 
-    def __init__(self, plant: Plant, units: dict[str, Dimension | None], readings: dict[str, Dimension | None]):
+    def __init__(
+        self, plant: Plant, units: dict[str, Dimension | None], readings: dict[str, Dimension | None]
+    ):
         self.plant, self.units, self.readings = plant, units, readings
         self.known: dict[int, Dimension | None] = {}
 
@@ -90,8 +159,10 @@ class _Check:
         """The dimension of an expression that must be `expected`."""
         given = self.expression(e, what, line)
         if given is not None and expected is not None and given != expected:
-            raise InputError(f"{self.plant.file}:{line}: {what}: '{_short(e)}' is [{_text(given)}], but its place asks for "
-                             f"[{_text(expected)}] ({why})")
+            raise InputError(
+                f"{self.plant.file}:{line}: {what}: '{_short(e)}' is [{_text(given)}], but its place asks for "
+                f"[{_text(expected)}] ({why})"
+            )
         return given if given is not None else expected
 
     def expression(self, root: Expr, what: str, line: int) -> Dimension | None:
@@ -130,8 +201,8 @@ class _Check:
                 raise ValueError(f"the argument of {op}() is [{_text(a[0])}]; it must be dimensionless")
             return ()
         if op == "table":
-            _alike(a[:1 + e.value])
-            return _alike(a[1 + e.value:])
+            _alike(a[: 1 + e.value])
+            return _alike(a[1 + e.value :])
         if op == "delay":
             if a[1] is not None and a[1] != (("s", Fraction(1)),):
                 raise ValueError(f"the seconds of delay() are [{_text(a[1])}]")
@@ -182,8 +253,10 @@ def _raised(base: Dimension, exponent: float) -> Dimension:
 def _text(d: Dimension) -> str:
     """kg m2 s-3 and the like, with the derived unit where there is one."""
     order = {b: i for i, b in enumerate(_BASES.values())}
-    written = " ".join(f"{base}{'' if q == 1 else q if q.denominator == 1 else f'^({q})'}"
-                       for base, q in sorted(d, key=lambda pair: (pair[0] != "kg", order.get(pair[0], 99))))
+    written = " ".join(
+        f"{base}{'' if q == 1 else q if q.denominator == 1 else f'^({q})'}"
+        for base, q in sorted(d, key=lambda pair: (pair[0] != "kg", order.get(pair[0], 99)))
+    )
     return f"{_WRITTEN[written]} = {written}" if written in _WRITTEN else written or "dimensionless"
 
 
@@ -211,7 +284,9 @@ def dimension(unit: str) -> Dimension:
     while at < len(text):
         match = _TOKEN.match(text, at)
         if not match:
-            raise ValueError(f"'{unit}' is not a unit: '{text[at]}' was not expected; one such as W/K or N*s/m was")
+            raise ValueError(
+                f"'{unit}' is not a unit: '{text[at]}' was not expected; one such as W/K or N*s/m was"
+            )
         tokens.append((match.lastgroup or "", match[match.lastgroup or 0]))
         at = match.end()
     try:
@@ -282,11 +357,20 @@ def _symbol(symbol: str) -> Dimension:
         raise ValueError(f"pint knows no unit '{symbol}'") from None
     if not set(found) <= set(_BASES):
         raise ValueError(f"'{symbol}' is no unit of physics that a plant may use")
-    return tuple(sorted((_BASES[key], Fraction(power).limit_denominator(10_000)) for key, power in found.items() if power))
+    return tuple(
+        sorted(
+            (_BASES[key], Fraction(power).limit_denominator(10_000)) for key, power in found.items() if power
+        )
+    )
 
 
 @cache
 def _pint() -> tuple[Callable, tuple[type[Exception], ...]]:
     import pint
+
     registry: pint.UnitRegistry = pint.UnitRegistry()
-    return registry.get_dimensionality, (pint.errors.UndefinedUnitError, pint.errors.DefinitionSyntaxError, AttributeError)
+    return registry.get_dimensionality, (
+        pint.errors.UndefinedUnitError,
+        pint.errors.DefinitionSyntaxError,
+        AttributeError,
+    )

@@ -1,4 +1,5 @@
 """`thermoctl recordings list | info | export | recover`."""
+
 from __future__ import annotations
 
 import argparse
@@ -18,7 +19,9 @@ def list_recordings(args: argparse.Namespace) -> int:
     """One line a recording: begin, length, size, and whether it was closed."""
     folder = Path(args.directory)
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; name the one that recording.directory of the configuration says")
+        raise InputError(
+            f"{folder}: no such folder; name the one that recording.directory of the configuration says"
+        )
     found: list[dict[str, Any]] = []
     for path in sorted(p for kind in (FULL, TIER) for p in recording_files(folder, kind)):
         try:
@@ -26,14 +29,26 @@ def list_recordings(args: argparse.Namespace) -> int:
         except InputError as e:
             found.append({"path": str(path), "error": str(e)})
             continue
-        found.append({"path": str(path), "rows": i.rows, "seconds": i.ends_s - i.begins_s, "bytes": i.bytes,
-                      "whole": i.whole, "begins": _wall(i.begins_wall_s)})
+        found.append(
+            {
+                "path": str(path),
+                "rows": i.rows,
+                "seconds": i.ends_s - i.begins_s,
+                "bytes": i.bytes,
+                "whole": i.whole,
+                "begins": _wall(i.begins_wall_s),
+            }
+        )
     if args.json:
         print(json.dumps([{k: None if v != v else v for k, v in f.items()} for f in found], indent=1))
         return 0
     for f in found:
-        print(f["error"] if "error" in f else f"{f['path']}  {f['begins']}  {f['rows']} rows  {f['seconds']:.3f} s  "
-              f"{f['bytes'] / 1e6:.2f} MB{'' if f['whole'] else '  not closed (killed, or still recording)'}")
+        print(
+            f["error"]
+            if "error" in f
+            else f"{f['path']}  {f['begins']}  {f['rows']} rows  {f['seconds']:.3f} s  "
+            f"{f['bytes'] / 1e6:.2f} MB{'' if f['whole'] else '  not closed (killed, or still recording)'}"
+        )
     if not found:
         print(f"{folder}: no recordings")
     return 0
@@ -45,10 +60,16 @@ def show_info(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({k: None if v != v else v for k, v in dataclasses.asdict(i).items()}, indent=1))
         return 0
-    print(f"{i.path}: {i.rows} rows, t {i.begins_s:g} to {i.ends_s:g} s, begun {_wall(i.begins_wall_s)}, "
-          f"{i.bytes / 1e6:.2f} MB"
-          + ("" if i.whole else f"; not closed: {i.bytes - i.readable_bytes} bytes at its end are no whole batch "
-                                "(`thermoctl recordings recover` writes a closed copy)"))
+    print(
+        f"{i.path}: {i.rows} rows, t {i.begins_s:g} to {i.ends_s:g} s, begun {_wall(i.begins_wall_s)}, "
+        f"{i.bytes / 1e6:.2f} MB"
+        + (
+            ""
+            if i.whole
+            else f"; not closed: {i.bytes - i.readable_bytes} bytes at its end are no whole batch "
+            "(`thermoctl recordings recover` writes a closed copy)"
+        )
+    )
     for name, unit, meaning in i.columns:
         print(f"  {name:<28} {unit:<6} {meaning}")
     for key, text in i.meta.items():
@@ -58,7 +79,9 @@ def show_info(args: argparse.Namespace) -> int:
 
 def export_recording(args: argparse.Namespace) -> int:
     """A recording in another format."""
-    rows = export(args.file, args.out, args.columns.split(",") if args.columns else None, args.begin, args.end)
+    rows = export(
+        args.file, args.out, args.columns.split(",") if args.columns else None, args.begin, args.end
+    )
     print(f"{args.out}: {rows} rows")
     return 0
 
@@ -67,8 +90,10 @@ def recover_recording(args: argparse.Namespace) -> int:
     """A closed copy of a cut recording."""
     path = Path(args.file)
     i = recover(path, args.out or path.with_name(path.stem + ".recovered.arrows"))
-    print(f"{i.path}: {i.rows} rows, t {i.begins_s:g} to {i.ends_s:g} s; {path.stat().st_size - i.bytes + 8} bytes of "
-          "the original's end are left out")
+    print(
+        f"{i.path}: {i.rows} rows, t {i.begins_s:g} to {i.ends_s:g} s; {path.stat().st_size - i.bytes + 8} bytes of "
+        "the original's end are left out"
+    )
     return 0
 
 

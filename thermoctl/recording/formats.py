@@ -3,6 +3,7 @@
 The libraries are an extra, `pip install 'thermoctl[formats]'`. Channels of several rates are laid on the union of their
 times: a slow channel then has most of its cells empty, as in any recording.
 """
+
 from __future__ import annotations
 
 import importlib
@@ -28,7 +29,9 @@ def _library(name: str, path: Path) -> ModuleType:
 
 
 def _damaged(path: Path, kind: str, e: Exception) -> InputError:
-    return InputError(f"{path}: not a whole {kind} file: {str(e).splitlines()[0] if str(e) else type(e).__name__}")
+    return InputError(
+        f"{path}: not a whole {kind} file: {str(e).splitlines()[0] if str(e) else type(e).__name__}"
+    )
 
 
 def _united(path: Path, channels: list[tuple[str, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -37,19 +40,25 @@ def _united(path: Path, channels: list[tuple[str, np.ndarray, np.ndarray]]) -> d
         raise InputError(f"{path}: no channels with a time; at least one was expected")
     for name, t, values in channels:
         if values.dtype.kind not in "fiub" or values.ndim != 1:
-            raise InputError(f"{path}: row 1: channel '{name}': {str(values[:1].tolist())[:40]} stands where a "
-                             "number belongs")
+            raise InputError(
+                f"{path}: row 1: channel '{name}': {str(values[:1].tolist())[:40]} stands where a "
+                "number belongs"
+            )
         wrong = ~(np.diff(t) > 0)
         if wrong.any() or not np.isfinite(t).all():
-            raise InputError(f"{path}: row {int(wrong.argmax()) + 2}: channel '{name}': the time does not increase; "
-                             "strictly increasing seconds were expected")
+            raise InputError(
+                f"{path}: row {int(wrong.argmax()) + 2}: channel '{name}': the time does not increase; "
+                "strictly increasing seconds were expected"
+            )
     grid = channels[0][1]
     if any(not np.array_equal(t, grid) for _, t, _ in channels):
         grid = np.unique(np.concatenate([t for _, t, _ in channels]))
     columns = {"t": grid.astype(np.float64)}
     for name, t, values in channels:
         if name in columns:
-            raise InputError(f"{path}: two channels are called '{name}'; export them under names of their own")
+            raise InputError(
+                f"{path}: two channels are called '{name}'; export them under names of their own"
+            )
         column = np.full(len(grid), np.nan)
         column[np.searchsorted(grid, t)] = values
         columns[name] = column
@@ -63,7 +72,7 @@ def read_mdf(path: Path) -> dict[str, np.ndarray]:
     try:
         with asammdf.MDF(str(path)) as mdf:
             found = [(s.name, np.asarray(s.timestamps), np.asarray(s.samples)) for s in mdf.iter_channels()]
-    except Exception as e:          # asammdf raises what its parsing of damaged bytes happens to raise
+    except Exception as e:  # asammdf raises what its parsing of damaged bytes happens to raise
         raise _damaged(path, "MDF", e) from None
     return _united(path, [c for c in found if c[0] not in ("t", "time")])
 
@@ -74,9 +83,11 @@ def read_tdms(path: Path) -> dict[str, np.ndarray]:
     nptdms = _library("nptdms", path)
     path.stat()
     try:
-        groups = [(g.name, {c.name: (np.asarray(c[:]), dict(c.properties)) for c in g.channels()})
-                  for g in nptdms.TdmsFile.read(str(path)).groups()]
-    except Exception as e:          # npTDMS likewise
+        groups = [
+            (g.name, {c.name: (np.asarray(c[:]), dict(c.properties)) for c in g.channels()})
+            for g in nptdms.TdmsFile.read(str(path)).groups()
+        ]
+    except Exception as e:  # npTDMS likewise
         raise _damaged(path, "TDMS", e) from None
     names = [n for _, channels in groups for n in channels]
     found = []
@@ -91,10 +102,14 @@ def read_tdms(path: Path) -> dict[str, np.ndarray]:
             elif isinstance(step, int | float) and step > 0:
                 t = float(properties.get("wf_start_offset", 0.0)) + step * np.arange(len(values))
             else:
-                raise InputError(f"{path}: channel '{group}/{name}' has no time: no waveform step (wf_increment) and "
-                                 "no channel 't' in its group")
+                raise InputError(
+                    f"{path}: channel '{group}/{name}' has no time: no waveform step (wf_increment) and "
+                    "no channel 't' in its group"
+                )
             if len(t) != len(values):
-                raise InputError(f"{path}: channel '{group}/{name}' has {len(values)} values and {len(t)} times")
+                raise InputError(
+                    f"{path}: channel '{group}/{name}' has {len(values)} values and {len(t)} times"
+                )
             found.append((name if names.count(name) == 1 else f"{group}_{name}", t, values))
     return _united(path, found)
 
@@ -103,8 +118,13 @@ def write_mdf(path: str, table: Table) -> None:
     """MDF 4.10, one channel group, zipped; units of our signals."""
     asammdf = _library("asammdf", Path(path))
     with asammdf.MDF(version="4.10") as mdf:
-        mdf.append([asammdf.Signal(samples=v, timestamps=table.t, name=n, unit=_UNITS.get(n, ""))
-                    for n, v in table.columns.items()], comment=f"thermoctl recording {table.name}")
+        mdf.append(
+            [
+                asammdf.Signal(samples=v, timestamps=table.t, name=n, unit=_UNITS.get(n, ""))
+                for n, v in table.columns.items()
+            ],
+            comment=f"thermoctl recording {table.name}",
+        )
         mdf.save(path, overwrite=True, compression=2)
 
 
@@ -117,12 +137,21 @@ def write_mcap(path: str, table: Table) -> None:
     with open(path, "wb") as f:
         writer = writer_module.Writer(f)
         writer.start(profile="", library="thermoctl")
-        schema = writer.register_schema("thermoctl", "jsonschema", json.dumps(
-            {"type": "object", "properties": {n: {"type": "number", "description": _UNITS.get(n, "")} for n in names}}
-        ).encode())
+        schema = writer.register_schema(
+            "thermoctl",
+            "jsonschema",
+            json.dumps(
+                {
+                    "type": "object",
+                    "properties": {n: {"type": "number", "description": _UNITS.get(n, "")} for n in names},
+                }
+            ).encode(),
+        )
         channel = writer.register_channel("/thermoctl", "json", schema)
         writer.add_metadata("thermoctl", table.meta)
         for time_s, row in zip(clock, values, strict=True):
             data = json.dumps({n: v for n, v in zip(names, row.tolist(), strict=True) if v == v}).encode()
-            writer.add_message(channel, log_time=round(time_s * 1e9), publish_time=round(time_s * 1e9), data=data)
+            writer.add_message(
+                channel, log_time=round(time_s * 1e9), publish_time=round(time_s * 1e9), data=data
+            )
         writer.finish()

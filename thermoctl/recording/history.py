@@ -3,6 +3,7 @@
 Long spans come from the 10 Hz tier, short ones (FULL_SPAN_S and less) from the full rate. Files that are complete are
 reduced to one second once and kept in memory, so that a day is drawn again in milliseconds.
 """
+
 from __future__ import annotations
 
 import re
@@ -18,8 +19,8 @@ from thermoctl.recording.writer import FULL, NAME, TIER, recording_files
 from thermoctl.signals import INDEX, NAMES
 from thermoctl.yamlfile import InputError, suggest
 
-FULL_SPAN_S = 60.0          # at and below this the full rate is shown
-COARSE_SPAN_S = 7200.0      # above this, one second is fine enough
+FULL_SPAN_S = 60.0  # at and below this the full rate is shown
+COARSE_SPAN_S = 7200.0  # above this, one second is fine enough
 MAX_POINTS = 4000
 _CLOCK = "wall_s"
 
@@ -28,6 +29,7 @@ _CLOCK = "wall_s"
 class History:
     """`t` (n,) seconds since 1970, the middle of each bucket that holds a sample; low, mean, high (n,) in the signal's
     unit; `source` 'full' or 'tier'; `files` that were read."""
+
     t: np.ndarray
     low: np.ndarray
     mean: np.ndarray
@@ -57,8 +59,14 @@ def history(directory: str | Path, signal: str, begin_s: float, end_s: float, po
     inside = (wall >= begin_s) & (wall <= end_s) & np.isfinite(mean)
     bucket = np.minimum((wall[inside] - begin_s) / span_s * points, points - 1).astype(np.int64)
     which, low, mean, high = reduce(bucket, low[inside], mean[inside], high[inside])
-    return History(begin_s + (which + 0.5) / points * span_s, low, mean, high, "full" if kind == FULL else "tier",
-                   len(paths))
+    return History(
+        begin_s + (which + 0.5) / points * span_s,
+        low,
+        mean,
+        high,
+        "full" if kind == FULL else "tier",
+        len(paths),
+    )
 
 
 def reduce(bucket: np.ndarray, low: np.ndarray, mean: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -71,13 +79,17 @@ def reduce(bucket: np.ndarray, low: np.ndarray, mean: np.ndarray, high: np.ndarr
         bucket, low, mean, high = bucket[order], low[order], mean[order], high[order]
     starts = np.concatenate(([0], np.flatnonzero(np.diff(bucket)) + 1))
     count = np.diff(np.concatenate((starts, [len(bucket)])))
-    return (bucket[starts], np.fmin.reduceat(low, starts), np.add.reduceat(mean, starts) / count,
-            np.fmax.reduceat(high, starts))
+    return (
+        bucket[starts],
+        np.fmin.reduceat(low, starts),
+        np.add.reduceat(mean, starts) / count,
+        np.fmax.reduceat(high, starts),
+    )
 
 
 def _match(path: Path) -> re.Match[str]:
     found = NAME.match(path.name)
-    assert found is not None                # recording_files gives only such names
+    assert found is not None  # recording_files gives only such names
     return found
 
 
@@ -90,13 +102,13 @@ def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Pa
     try:
         paths = recording_files(directory, kind)
     except OSError:
-        return []                           # nothing was recorded yet
+        return []  # nothing was recorded yet
     chosen = []
     for path in paths:
         try:
             if _start_s(path) <= end_s and path.stat().st_mtime + 1.0 >= begin_s:
                 chosen.append(path)
-        except FileNotFoundError:           # went with the budget meanwhile
+        except FileNotFoundError:  # went with the budget meanwhile
             continue
     return chosen
 
@@ -114,15 +126,19 @@ def _samples(path: Path, signal: str, kind: str, step_s: float) -> tuple[np.ndar
 def _reduced(path: Path, size: int, signal: str, kind: str, step_s: float) -> tuple[np.ndarray, ...]:
     wall, low, mean, high = _read(path, signal, kind)
     there = np.isfinite(mean) & np.isfinite(wall)
-    which, low, mean, high = reduce(np.floor(wall[there] / step_s).astype(np.int64), low[there], mean[there], high[there])
+    which, low, mean, high = reduce(
+        np.floor(wall[there] / step_s).astype(np.int64), low[there], mean[there], high[there]
+    )
     return (which + 0.5) * step_s, low, mean, high
 
 
 def _read(path: Path, signal: str, kind: str) -> tuple[np.ndarray, ...]:
     ranged = kind == TIER and not signal.endswith("_bits") and signal != "t_s"
     names = [f"{signal}_min", signal, f"{signal}_max"] if ranged else [signal] * 3
-    batches = [{n: batch.column(n).to_numpy(zero_copy_only=False) for n in {_CLOCK, *names}}
-               for batch in open_stream(path, {_CLOCK, *names})]
+    batches = [
+        {n: batch.column(n).to_numpy(zero_copy_only=False) for n in {_CLOCK, *names}}
+        for batch in open_stream(path, {_CLOCK, *names})
+    ]
     if not batches:
         return (np.empty(0),) * 4
     columns = {n: np.concatenate([b[n] for b in batches]) for n in {_CLOCK, *names}}

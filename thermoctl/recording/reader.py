@@ -1,4 +1,5 @@
 """What our own recordings hold: rows for a replay, a summary, a mended copy, an export."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -23,15 +24,16 @@ from thermoctl.yamlfile import InputError, suggest
 @dataclass(frozen=True)
 class Info:
     """A recording in short. `whole`: it was closed; else its writer was killed or is still writing."""
+
     path: str
     rows: int
-    begins_s: float               # t of the first and last row; NaN without rows
+    begins_s: float  # t of the first and last row; NaN without rows
     ends_s: float
-    begins_wall_s: float          # NaN where the wall clock is not recorded
+    begins_wall_s: float  # NaN where the wall clock is not recorded
     bytes: int
     readable_bytes: int
     whole: bool
-    columns: tuple[tuple[str, str, str], ...]      # name, unit, meaning
+    columns: tuple[tuple[str, str, str], ...]  # name, unit, meaning
     meta: dict[str, str]
 
 
@@ -52,10 +54,25 @@ def info(path: str | Path) -> Info:
                 wall = batch.column("wall_s")[0].as_py() if "wall_s" in batch.schema.names else np.nan
             rows, ends = rows + batch.num_rows, t[-1].as_py()
     said = {f.name: f.metadata or {} for f in fields}
-    columns = tuple((n, m.get(b"unit", b"").decode(errors="replace"), m.get(b"meaning", b"").decode(errors="replace")) for n, m in said.items())
-    meta = {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (fields.metadata or {}).items()}
-    return Info(str(path), rows, begins, ends, wall, path.stat().st_size, stream.good_bytes, stream.whole, columns,
-                meta)
+    columns = tuple(
+        (n, m.get(b"unit", b"").decode(errors="replace"), m.get(b"meaning", b"").decode(errors="replace"))
+        for n, m in said.items()
+    )
+    meta = {
+        k.decode(errors="replace"): v.decode(errors="replace") for k, v in (fields.metadata or {}).items()
+    }
+    return Info(
+        str(path),
+        rows,
+        begins,
+        ends,
+        wall,
+        path.stat().st_size,
+        stream.good_bytes,
+        stream.whole,
+        columns,
+        meta,
+    )
 
 
 def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
@@ -67,8 +84,10 @@ def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
         raise InputError(f"{path}: no full-rate recording but its 10 Hz tier; a replay needs every tick")
     missing = [n for n in NAMES if n not in table.columns]
     if missing:
-        raise InputError(f"{path}: no full-rate recording of this version: {', '.join(missing[:3])} "
-                         f"{'is' if len(missing) == 1 else 'are'} missing")
+        raise InputError(
+            f"{path}: no full-rate recording of this version: {', '.join(missing[:3])} "
+            f"{'is' if len(missing) == 1 else 'are'} missing"
+        )
     return np.column_stack([table.columns[n] for n in NAMES]), table.meta.get("law", "")
 
 
@@ -95,8 +114,13 @@ def recover(path: str | Path, out: str | Path) -> Info:
     return info(out)
 
 
-def export(path: str | Path, out: str | Path, columns: Iterable[str] | None = None,
-           begin_s: float = -np.inf, end_s: float = np.inf) -> int:
+def export(
+    path: str | Path,
+    out: str | Path,
+    columns: Iterable[str] | None = None,
+    begin_s: float = -np.inf,
+    end_s: float = np.inf,
+) -> int:
     """Write a recording as .parquet, .csv, .mf4 or .mcap; returns the rows written.
 
     columns: only these (beside the time); begin_s, end_s: the part begin_s <= t < end_s. A recording of ours goes to
@@ -117,17 +141,21 @@ def export(path: str | Path, out: str | Path, columns: Iterable[str] | None = No
         raise InputError(f"{out}: cannot be written: {e.strerror or e}") from None
 
 
-def _export_table(path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float) -> int:
+def _export_table(
+    path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float
+) -> int:
     table = read_table(path, want)
     a, b = np.searchsorted(table.t, [begin_s, end_s])
     if a == b:
-        raise InputError(f"{path}: no rows from {begin_s:g} to {end_s:g} s; it holds {table.t[0]:g} to "
-                         f"{table.t[-1]:g} s")
+        raise InputError(
+            f"{path}: no rows from {begin_s:g} to {end_s:g} s; it holds {table.t[0]:g} to {table.t[-1]:g} s"
+        )
     table = dataclasses.replace(table, t=table.t[a:b], columns={n: v[a:b] for n, v in table.columns.items()})
     if kind == ".mcap":
         formats.write_mcap(out, table)
     elif kind == ".mf4":
         from tempfile import TemporaryDirectory  # asammdf insists on its own suffix
+
         with TemporaryDirectory(dir=Path(out).parent) as folder:
             formats.write_mdf(f"{folder}/export.mf4", table)
             Path(folder, "export.mf4").replace(out)
@@ -138,8 +166,10 @@ def _export_table(path: Path, out: str, kind: str, want: list[str] | None, begin
     return len(table)
 
 
-def _export_stream(path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float) -> int:
-    if want is not None:                                    # also says which column there is not
+def _export_stream(
+    path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float
+) -> int:
+    if want is not None:  # also says which column there is not
         read_names = open_stream(path).schema.names
         for name in want:
             if name not in read_names:
@@ -149,8 +179,11 @@ def _export_stream(path: Path, out: str, kind: str, want: list[str] | None, begi
     clock = "t" if "t" in stream.schema.names else "t_s"
     rows = 0
     with ExitStack() as stack:
-        writer = stack.enter_context(pa.csv.CSVWriter(out, stream.schema) if kind == ".csv" else
-                                     pa.parquet.ParquetWriter(out, stream.schema, compression="zstd"))
+        writer = stack.enter_context(
+            pa.csv.CSVWriter(out, stream.schema)
+            if kind == ".csv"
+            else pa.parquet.ParquetWriter(out, stream.schema, compression="zstd")
+        )
         for piece in _pieces(stream, clock, begin_s, end_s):
             writer.write_table(piece)
             rows += piece.num_rows
@@ -159,7 +192,9 @@ def _export_stream(path: Path, out: str, kind: str, want: list[str] | None, begi
     return rows
 
 
-def _pieces(batches: Iterable[pa.RecordBatch], clock: str, begin_s: float, end_s: float) -> Iterator[pa.Table]:
+def _pieces(
+    batches: Iterable[pa.RecordBatch], clock: str, begin_s: float, end_s: float
+) -> Iterator[pa.Table]:
     """Tables of many batches (a row group each), cut to the times asked for, NaN as null."""
     held: list[pa.RecordBatch] = []
     rows = 0
@@ -167,8 +202,12 @@ def _pieces(batches: Iterable[pa.RecordBatch], clock: str, begin_s: float, end_s
         t = batch.column(clock).to_numpy()
         a, b = np.searchsorted(t, [begin_s, end_s])
         if a < b:
-            held.append(pa.RecordBatch.from_arrays(
-                [pa.array(c.to_numpy()[a:b], from_pandas=True) for c in batch.columns], schema=batch.schema))
+            held.append(
+                pa.RecordBatch.from_arrays(
+                    [pa.array(c.to_numpy()[a:b], from_pandas=True) for c in batch.columns],
+                    schema=batch.schema,
+                )
+            )
             rows += b - a
         if rows >= 100_000:
             yield pa.Table.from_batches(held)

@@ -6,6 +6,7 @@ After a power cut a file system may also give back a message whose end is zeros,
 batches carry a CRC-32 of every column (`crc32`, in the schema's order), and a batch that does not agree with it is not
 there.
 """
+
 from __future__ import annotations
 
 import zlib
@@ -31,6 +32,7 @@ def checksums(batch: pa.RecordBatch) -> bytes:
 class Stream:
     """An open stream: iterate for its batches. After that `good_bytes` is where the last whole message ends and
     `whole` says whether the end mark was there (else the writer was killed, or is still writing)."""
+
     path: Path
     schema: pa.Schema
     _source: pa.NativeFile
@@ -72,8 +74,10 @@ def open_stream(path: str | Path, columns: Iterable[str] | None = None) -> Strea
             source = pa.memory_map(str(path))
             reader = pa.ipc.open_stream(source, options=pa.ipc.IpcReadOptions(included_fields=fields))
     except pa.ArrowException as e:
-        raise InputError(f"{path}: no recording in it ({str(e).splitlines()[0]}): it is not an Arrow stream, or was "
-                         "cut before its first row") from None
+        raise InputError(
+            f"{path}: no recording in it ({str(e).splitlines()[0]}): it is not an Arrow stream, or was "
+            "cut before its first row"
+        ) from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: no recording in it: a name of a column is not text") from None
     except OSError as e:
@@ -81,8 +85,9 @@ def open_stream(path: str | Path, columns: Iterable[str] | None = None) -> Strea
     return Stream(path, reader.schema, source, reader, fields, good_bytes=source.tell())
 
 
-def read_batches(path: str | Path,
-                 columns: Iterable[str] | None = None) -> tuple[pa.Schema, list[pa.RecordBatch], bool]:
+def read_batches(
+    path: str | Path, columns: Iterable[str] | None = None
+) -> tuple[pa.Schema, list[pa.RecordBatch], bool]:
     """(schema, every whole batch, whether the end mark was there). Raises InputError as open_stream does."""
     stream = open_stream(path, columns)
     batches = list(stream)

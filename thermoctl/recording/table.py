@@ -3,6 +3,7 @@
 A table has a time column `t` in seconds, strictly increasing, and any number of other columns; every cell is a number
 or missing (NaN). What is not that is refused with file and row, never repaired in silence.
 """
+
 from __future__ import annotations
 
 import csv
@@ -22,7 +23,7 @@ import pyarrow.parquet
 from thermoctl.recording.stream import open_stream
 from thermoctl.yamlfile import InputError, suggest
 
-MAX_CELLS = 250_000_000          # 2 GB of float64; a longer recording is read a few columns or hours at a time
+MAX_CELLS = 250_000_000  # 2 GB of float64; a longer recording is read a few columns or hours at a time
 MAX_CSV_BYTES = 4_000_000_000
 _MISSING = ["", "NaN", "nan", "NAN"]
 _COMMENT = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)
@@ -34,6 +35,7 @@ class Table:
 
     `name` is the file's stem, `path` its path; `meta` holds what the file says about itself (configuration, model).
     """
+
     name: str
     path: str
     t: np.ndarray
@@ -47,6 +49,7 @@ class Table:
 @dataclass(frozen=True)
 class _Raw:
     """What a reader gives: the columns by name (t among them) and how to name a data row (counted from 0)."""
+
     columns: dict[str, np.ndarray]
     meta: dict[str, str]
     place: Callable[[int], str]
@@ -73,7 +76,9 @@ def read_table(path: str | Path, columns: Iterable[str] | None = None) -> Table:
     except pa.ArrowException as e:
         raise InputError(f"{path}: not a whole {path.suffix[1:]} file: {str(e).splitlines()[0]}") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a whole {path.suffix[1:]} file: a name of a column is not text") from None
+        raise InputError(
+            f"{path}: not a whole {path.suffix[1:]} file: a name of a column is not text"
+        ) from None
 
 
 def write_table(path: str | Path, table: Table) -> None:
@@ -93,8 +98,12 @@ def write_table(path: str | Path, table: Table) -> None:
             elif kind == ".parquet":
                 pa.parquet.write_table(arrow, temporary, compression="zstd")
             else:
-                with pa.OSFile(temporary, "wb") as f, pa.ipc.new_file(
-                        f, arrow.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as writer:
+                with (
+                    pa.OSFile(temporary, "wb") as f,
+                    pa.ipc.new_file(
+                        f, arrow.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")
+                    ) as writer,
+                ):
                     writer.write_table(arrow)
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
@@ -103,7 +112,9 @@ def write_table(path: str | Path, table: Table) -> None:
 def to_arrow(table: Table) -> pa.Table:
     """The table as Arrow: `t` first, float64, null where a sample is missing, `meta` as schema metadata."""
     arrays = {"t": table.t, **table.columns}
-    arrow = pa.table({k: pa.array(np.asarray(v, dtype=np.float64), from_pandas=True) for k, v in arrays.items()})
+    arrow = pa.table(
+        {k: pa.array(np.asarray(v, dtype=np.float64), from_pandas=True) for k, v in arrays.items()}
+    )
     return arrow.replace_schema_metadata(table.meta or None)
 
 
@@ -132,7 +143,9 @@ def _checked(path: Path, raw: _Raw) -> Table:
     columns = dict(raw.columns)
     clock = _clock(columns)
     if clock is None:
-        raise InputError(f"{path}: no column 't' (time in seconds); the columns are {', '.join(columns) or 'none'}")
+        raise InputError(
+            f"{path}: no column 't' (time in seconds); the columns are {', '.join(columns) or 'none'}"
+        )
     t = columns[clock] if clock == "t_s" else columns.pop("t")
     if len(t) == 0:
         raise InputError(f"{path}: no rows; at least one sample was expected")
@@ -141,13 +154,17 @@ def _checked(path: Path, raw: _Raw) -> Table:
         if bad.any():
             row = int(bad.argmax())
             what = "the time is missing" if np.isnan(values[row]) else "an infinite value"
-            raise InputError(f"{raw.place(row)}: column '{name}': {what}; a finite number was expected"
-                             + ("" if name == "t" else " (leave the cell empty where a sample is missing)"))
+            raise InputError(
+                f"{raw.place(row)}: column '{name}': {what}; a finite number was expected"
+                + ("" if name == "t" else " (leave the cell empty where a sample is missing)")
+            )
     still = np.diff(t) <= 0
     if still.any():
         row = int(still.argmax()) + 1
         what = "stands twice" if t[row] == t[row - 1] else f"runs backwards from {t[row - 1]:.17g}"
-        raise InputError(f"{raw.place(row)}: the time {t[row]:.17g} {what}; strictly increasing seconds were expected")
+        raise InputError(
+            f"{raw.place(row)}: the time {t[row]:.17g} {what}; strictly increasing seconds were expected"
+        )
     return Table(path.stem, str(path), t, columns, raw.meta)
 
 
@@ -158,8 +175,10 @@ def _clock(names: Iterable[str]) -> str | None:
 
 def _limit(path: Path, rows: int, columns: int) -> None:
     if rows * columns > MAX_CELLS:
-        raise InputError(f"{path}: {rows} rows x {columns} columns; at most {MAX_CELLS} cells are read at once: "
-                         "name fewer columns or cut the recording (thermoctl recordings export --from --to)")
+        raise InputError(
+            f"{path}: {rows} rows x {columns} columns; at most {MAX_CELLS} cells are read at once: "
+            "name fewer columns or cut the recording (thermoctl recordings export --from --to)"
+        )
 
 
 def _picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
@@ -168,15 +187,19 @@ def _picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
         return names
     for name in want:
         if name not in names:
-            raise InputError(f"{path}: no column '{name}'{suggest(name, names)}; the columns are {', '.join(names)}")
+            raise InputError(
+                f"{path}: no column '{name}'{suggest(name, names)}; the columns are {', '.join(names)}"
+            )
     return [n for n in names if n in want or n == _clock(names)]
 
 
 # ------------------------------------------------------------------------------------------------------------- CSV
 def _read_csv(path: Path, want: list[str] | None) -> _Raw:
     if path.stat().st_size > MAX_CSV_BYTES:
-        raise InputError(f"{path}: {path.stat().st_size} bytes; a CSV file of at most {MAX_CSV_BYTES} was expected "
-                         "(convert it to Parquet)")
+        raise InputError(
+            f"{path}: {path.stat().st_size} bytes; a CSV file of at most {MAX_CSV_BYTES} was expected "
+            "(convert it to Parquet)"
+        )
     data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
     bare = _COMMENT.sub(b"", data) if b"#" in data else data
     bare = bare.lstrip(b"\r\n")
@@ -188,12 +211,15 @@ def _read_csv(path: Path, want: list[str] | None) -> _Raw:
         _limit(path, body.count(b"\n"), len(chosen))
         try:
             arrow = pa.csv.read_csv(
-                pa.BufferReader(body), pa.csv.ReadOptions(column_names=names),
-                convert_options=pa.csv.ConvertOptions(column_types=dict.fromkeys(names, pa.float64()),
-                                                      null_values=_MISSING, check_utf8=False))
+                pa.BufferReader(body),
+                pa.csv.ReadOptions(column_names=names),
+                convert_options=pa.csv.ConvertOptions(
+                    column_types=dict.fromkeys(names, pa.float64()), null_values=_MISSING, check_utf8=False
+                ),
+            )
             columns = {n: _numpy(arrow[n]) for n in chosen}
         except pa.ArrowInvalid:
-            columns = None       # the exact place, or what Arrow refuses and Python reads: below
+            columns = None  # the exact place, or what Arrow refuses and Python reads: below
     if columns is None:
         columns = _slow_csv(path, data, names)
         columns = {n: columns[n] for n in _picked(path, names, want)}
@@ -206,15 +232,18 @@ def _header(path: Path, head: bytes) -> list[str]:
     try:
         names = [n.strip() for n in next(csv.reader([head.decode("utf-8")], strict=True))]
     except (UnicodeDecodeError, csv.Error):
-        raise InputError(f"{path}: the header line is not text; a CSV file with the column names first was expected"
-                         ) from None
+        raise InputError(
+            f"{path}: the header line is not text; a CSV file with the column names first was expected"
+        ) from None
     for i, name in enumerate(names):
         if not name:
             raise InputError(f"{path}: column {i + 1} of {len(names)} has no name in the header")
         if name in names[:i]:
             raise InputError(f"{path}: the column '{name}' stands twice in the header")
     if len(names) == 1 and _clock(names) is None and re.search(r"[;\t|]", names[0]):
-        raise InputError(f"{path}: the header has no comma ('{names[0][:60]}'); comma-separated columns were expected")
+        raise InputError(
+            f"{path}: the header has no comma ('{names[0][:60]}'); comma-separated columns were expected"
+        )
     return names
 
 
@@ -229,6 +258,7 @@ def _csv_rows(data: bytes) -> Iterable[tuple[int, list[str]]]:
             number += 1
             if line.strip("\r\n") and not line.lstrip(" \t").startswith("#"):
                 yield line
+
     for cells in csv.reader(counted()):
         yield number, cells
 
@@ -247,7 +277,9 @@ def _slow_csv(path: Path, data: bytes, names: list[str]) -> dict[str, np.ndarray
         if i == 0:
             continue
         if len(cells) != len(names):
-            raise InputError(f"{path}:{line}: {len(cells)} cells; {len(names)} as in the header were expected")
+            raise InputError(
+                f"{path}:{line}: {len(cells)} cells; {len(names)} as in the header were expected"
+            )
         numbers = []
         for name, cell in zip(names, cells, strict=True):
             try:
@@ -255,8 +287,10 @@ def _slow_csv(path: Path, data: bytes, names: list[str]) -> dict[str, np.ndarray
                     raise ValueError
                 numbers.append(float(cell) if cell.strip() else np.nan)
             except ValueError:
-                raise InputError(f"{path}:{line}: column '{name}': '{cell[:40]}' stands where a number belongs "
-                                 "(leave the cell empty where a sample is missing)") from None
+                raise InputError(
+                    f"{path}:{line}: column '{name}': '{cell[:40]}' stands where a number belongs "
+                    "(leave the cell empty where a sample is missing)"
+                ) from None
         values.append(numbers)
     return dict(zip(names, np.array(values, dtype=np.float64).reshape(-1, len(names)).T.copy(), strict=True))
 
@@ -274,14 +308,24 @@ def _from_arrow(path: Path, arrow: pa.Table, want: list[str] | None) -> _Raw:
     columns = {}
     for name in _picked(path, names, want):
         column, kind = arrow[name], arrow.schema.field(name).type
-        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
-                or pa.types.is_decimal(kind) or pa.types.is_null(kind)):
+        if not (
+            pa.types.is_integer(kind)
+            or pa.types.is_floating(kind)
+            or pa.types.is_boolean(kind)
+            or pa.types.is_decimal(kind)
+            or pa.types.is_null(kind)
+        ):
             row, value = next(((i, v.as_py()) for i, v in enumerate(column) if v.is_valid), (0, None))
-            raise InputError(f"{path}: row {row + 1}: column '{name}': {str(value)[:40]!r} ({kind}) stands where a "
-                             "number belongs" + (" (seconds)" if name == "t" else ""))
+            raise InputError(
+                f"{path}: row {row + 1}: column '{name}': {str(value)[:40]!r} ({kind}) stands where a "
+                "number belongs" + (" (seconds)" if name == "t" else "")
+            )
         columns[name] = _numpy(column.cast(pa.float64(), safe=False))
-    meta = {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (arrow.schema.metadata or {}).items()
-            if k not in (b"pandas", b"ARROW:schema")}
+    meta = {
+        k.decode(errors="replace"): v.decode(errors="replace")
+        for k, v in (arrow.schema.metadata or {}).items()
+        if k not in (b"pandas", b"ARROW:schema")
+    }
     return _Raw(columns, meta, lambda row: f"{path}: row {row + 1}")
 
 
@@ -313,19 +357,30 @@ def _read_arrow(path: Path, want: list[str] | None) -> _Raw:
 
 def _read_mdf(path: Path, want: list[str] | None) -> _Raw:
     from thermoctl.recording.formats import read_mdf
+
     return _foreign(path, read_mdf(path), want)
 
 
 def _read_tdms(path: Path, want: list[str] | None) -> _Raw:
     from thermoctl.recording.formats import read_tdms
+
     return _foreign(path, read_tdms(path), want)
 
 
 def _foreign(path: Path, columns: dict[str, np.ndarray], want: list[str] | None) -> _Raw:
-    return _Raw({n: columns[n] for n in _picked(path, list(columns), want)}, {}, lambda row: f"{path}: row {row + 1}")
+    return _Raw(
+        {n: columns[n] for n in _picked(path, list(columns), want)}, {}, lambda row: f"{path}: row {row + 1}"
+    )
 
 
 _READERS: dict[str, Callable[[Path, list[str] | None], _Raw]] = {
-    ".csv": _read_csv, ".parquet": _read_parquet, ".arrow": _read_arrow, ".arrows": _read_arrow,
-    ".feather": _read_arrow, ".mf4": _read_mdf, ".mdf": _read_mdf, ".tdms": _read_tdms}
+    ".csv": _read_csv,
+    ".parquet": _read_parquet,
+    ".arrow": _read_arrow,
+    ".arrows": _read_arrow,
+    ".feather": _read_arrow,
+    ".mf4": _read_mdf,
+    ".mdf": _read_mdf,
+    ".tdms": _read_tdms,
+}
 FORMATS = ", ".join(_READERS)

@@ -7,6 +7,7 @@ after the last one, and what stands before opens (stream.py). Files are named af
 Nothing here raises because of a disk: what could not be written is counted as lost and said once, and the next file is
 tried some seconds later. The daemon goes on.
 """
+
 from __future__ import annotations
 
 import errno
@@ -25,10 +26,10 @@ import pyarrow as pa
 from thermoctl.recording.stream import CRC, END, checksums
 from thermoctl.signals import SIGNALS, Signal
 
-BATCH_S = 0.5              # of ticks in one batch of the full rate: what a power cut may cost
-BATCH_ROWS = 4096          # ... and no more than this where time runs faster
+BATCH_S = 0.5  # of ticks in one batch of the full rate: what a power cut may cost
+BATCH_ROWS = 4096  # ... and no more than this where time runs faster
 TIER_HZ = 10.0
-TIER_BATCH_ROWS = 100      # 10 s: the full rate holds what a cut costs the tier
+TIER_BATCH_ROWS = 100  # 10 s: the full rate holds what a cut costs the tier
 RETRY_S = 5.0
 FULL, TIER = ".arrows", ".10hz.arrows"
 NAME = re.compile(r"^(?P<rig>.+)-(?P<start>\d{8}T\d{6}\.\d{3}Z)(?P<again>-\d+)?(?P<kind>\.10hz)?\.arrows$")
@@ -37,8 +38,10 @@ _COMPRESSED = pa.ipc.IpcWriteOptions(compression="zstd")
 
 def schema(signals: Sequence[Signal], metadata: Mapping[str, str]) -> pa.Schema:
     """float64 columns named as the signals, with unit and meaning; `metadata` is kept in the file."""
-    return pa.schema([pa.field(s.name, pa.float64(), metadata={"unit": s.unit, "meaning": s.meaning}) for s in signals],
-                     metadata=dict(metadata))
+    return pa.schema(
+        [pa.field(s.name, pa.float64(), metadata={"unit": s.unit, "meaning": s.meaning}) for s in signals],
+        metadata=dict(metadata),
+    )
 
 
 class StreamFile:
@@ -51,7 +54,7 @@ class StreamFile:
         self._buffer = io.BytesIO()
         try:
             self._stream = pa.ipc.new_stream(self._buffer, columns, options=_COMPRESSED)
-            self._stream.write_table(columns.empty_table())         # brings the schema message out
+            self._stream.write_table(columns.empty_table())  # brings the schema message out
             self._put()
             folder = os.open(path.parent, os.O_RDONLY)
             try:
@@ -65,8 +68,9 @@ class StreamFile:
 
     def write(self, rows: np.ndarray) -> None:
         """Append rows (k, columns) as one batch."""
-        batch = pa.RecordBatch.from_arrays([pa.array(column) for column in np.ascontiguousarray(rows.T)],
-                                           schema=self.schema)
+        batch = pa.RecordBatch.from_arrays(
+            [pa.array(column) for column in np.ascontiguousarray(rows.T)], schema=self.schema
+        )
         self._stream.write_batch(batch, custom_metadata={CRC: checksums(batch)})
         self._put()
 
@@ -78,7 +82,7 @@ class StreamFile:
             _write_all(self._fd, data)
             os.fdatasync(self._fd)
         except OSError:
-            os.ftruncate(self._fd, self.bytes)                      # no half batch stays behind
+            os.ftruncate(self._fd, self.bytes)  # no half batch stays behind
             os.lseek(self._fd, self.bytes, os.SEEK_SET)
             raise
         self.bytes += len(data)
@@ -94,7 +98,7 @@ class StreamFile:
 def _write_all(fd: int, data: bytes) -> None:
     view = memoryview(data)
     while view:
-        view = view[os.write(fd, view):]
+        view = view[os.write(fd, view) :]
 
 
 class Tier:
@@ -106,9 +110,15 @@ class Tier:
         self.bits = [i for i, n in enumerate(names) if n.endswith("_bits")]
         self.ranged = [i for i in range(len(names)) if i != self.clock and i not in self.bits]
         self.signals = (
-            signals[self.clock], *(signals[i] for i in self.bits), *(signals[i] for i in self.ranged),
-            *(Signal(f"{signals[i].name}_{end}", signals[i].unit, f"{end} of {signals[i].meaning}")
-              for end in ("min", "max") for i in self.ranged))
+            signals[self.clock],
+            *(signals[i] for i in self.bits),
+            *(signals[i] for i in self.ranged),
+            *(
+                Signal(f"{signals[i].name}_{end}", signals[i].unit, f"{end} of {signals[i].meaning}")
+                for end in ("min", "max")
+                for i in self.ranged
+            ),
+        )
         self._open = np.empty((0, len(names)))
 
     def add(self, rows: np.ndarray, last: bool = False) -> np.ndarray:
@@ -128,8 +138,15 @@ class Tier:
         with np.errstate(invalid="ignore"):
             mean = total / np.where(count > 0, count, np.nan)
         words = np.nan_to_num(rows[:, self.bits]).astype(np.int64)
-        return np.hstack((rows[starts][:, [self.clock]], np.bitwise_or.reduceat(words, starts, axis=0), mean,
-                          np.fmin.reduceat(data, starts, axis=0), np.fmax.reduceat(data, starts, axis=0)))
+        return np.hstack(
+            (
+                rows[starts][:, [self.clock]],
+                np.bitwise_or.reduceat(words, starts, axis=0),
+                mean,
+                np.fmin.reduceat(data, starts, axis=0),
+                np.fmax.reduceat(data, starts, axis=0),
+            )
+        )
 
 
 class RecordingWriter:
@@ -140,9 +157,16 @@ class RecordingWriter:
     well again. `error` is what it refused last, '' when all is well.
     """
 
-    def __init__(self, settings: Any, metadata: Mapping[str, str], rig: str = "rig", log: Callable[[str], None] = print,
-                 signals: Sequence[Signal] = SIGNALS, clock: Callable[[], float] = time.monotonic,
-                 wall: Callable[[], float] = time.time):
+    def __init__(
+        self,
+        settings: Any,
+        metadata: Mapping[str, str],
+        rig: str = "rig",
+        log: Callable[[str], None] = print,
+        signals: Sequence[Signal] = SIGNALS,
+        clock: Callable[[], float] = time.monotonic,
+        wall: Callable[[], float] = time.time,
+    ):
         self.directory, self.log, self.clock = Path(settings.directory), log, clock
         self.budget, self.tier_budget = settings.budget_gb * 1e9, settings.tier_budget_gb * 1e9
         self.file_bytes, self.file_s = min(settings.file_mb * 1e6, self.budget / 4), settings.file_s
@@ -156,8 +180,12 @@ class RecordingWriter:
         self._pruned_at = 0
         self._full_file: StreamFile | None = None
         self._tier_file: StreamFile | None = None
-        self._files_of = (re.sub(r"[^\w.-]+", "_", rig) or "rig", schema(signals, {**metadata, "tier": "full"}),
-                          schema(self._tier.signals, {**metadata, "tier": "10 Hz min, mean, max"}), wall)
+        self._files_of = (
+            re.sub(r"[^\w.-]+", "_", rig) or "rig",
+            schema(signals, {**metadata, "tier": "full"}),
+            schema(self._tier.signals, {**metadata, "tier": "10 Hz min, mean, max"}),
+            wall,
+        )
         self._open()
 
     @property
@@ -198,9 +226,11 @@ class RecordingWriter:
             try:
                 self._full_file.write(rows)
             except OSError as e:
-                if e.errno not in (errno.ENOSPC, errno.EDQUOT) or not prune(self.directory, FULL, 0, self.path, 1):
+                if e.errno not in (errno.ENOSPC, errno.EDQUOT) or not prune(
+                    self.directory, FULL, 0, self.path, 1
+                ):
                     raise
-                self._full_file.write(rows)                          # the oldest file made room
+                self._full_file.write(rows)  # the oldest file made room
             self._tier_rows.append(self._tier.add(rows))
             self._flush_tier(TIER_BATCH_ROWS)
             if self._full_file.bytes - self._pruned_at > self.budget / 64:
@@ -246,12 +276,16 @@ class RecordingWriter:
 
     def _prune(self) -> None:
         self._pruned_at = self._full_file.bytes if self._full_file else 0
-        slack = 1 - 1 / 32                                           # what may come until the next look
+        slack = 1 - 1 / 32  # what may come until the next look
         prune(self.directory, FULL, self.budget * slack, self.path)
-        prune(self.directory, TIER, self.tier_budget * slack, self._tier_file.path if self._tier_file else None)
+        prune(
+            self.directory, TIER, self.tier_budget * slack, self._tier_file.path if self._tier_file else None
+        )
 
     def _fail(self, e: OSError) -> None:
-        self.error = f"{self.directory}: nothing is recorded: {e.strerror or e}; trying again every {RETRY_S:g} s"
+        self.error = (
+            f"{self.directory}: nothing is recorded: {e.strerror or e}; trying again every {RETRY_S:g} s"
+        )
         self._failed = self.clock()
         self.log(self.error)
         self._release()
@@ -261,14 +295,16 @@ class RecordingWriter:
             if f is not None:
                 try:
                     f.close()
-                except OSError as e:                                 # without its end mark it opens all the same
+                except OSError as e:  # without its end mark it opens all the same
                     self.log(f"{f.path}: left without an end mark: {e.strerror or e}")
         self._full_file = self._tier_file = None
 
 
 def recording_files(directory: Path, kind: str) -> list[Path]:
     """Our files of one kind (FULL or TIER) in a folder, oldest first."""
-    found = [p for p in directory.iterdir() if (m := NAME.match(p.name)) and bool(m["kind"]) == (kind == TIER)]
+    found = [
+        p for p in directory.iterdir() if (m := NAME.match(p.name)) and bool(m["kind"]) == (kind == TIER)
+    ]
     return sorted(found, key=lambda p: (NAME.match(p.name)["start"], len(p.name), p.name))  # type: ignore[index]
 
 

@@ -1,4 +1,5 @@
 """The one look of all pages: self-contained HTML, no script and no request, light and dark, fit for printing."""
+
 from __future__ import annotations
 
 import html
@@ -34,22 +35,39 @@ _UNIT = re.compile(r"\b(degC|um|us|ohm)\b")
 def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str:
     """A whole HTML page from (heading, HTML body) pairs; `note` stands under the title."""
     parts = [f"<section><h2>{html.escape(h)}</h2>\n{body}\n</section>" if h else body for h, body in sections]
-    return (f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-            f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n<h1>{html.escape(title)}</h1>\n"
-            + (f'<p class="note">{html.escape(note)}</p>\n' if note else "") + "\n".join(parts) + "\n</body></html>\n")
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n<h1>{html.escape(title)}</h1>\n"
+        + (f'<p class="note">{html.escape(note)}</p>\n' if note else "")
+        + "\n".join(parts)
+        + "\n</body></html>\n"
+    )
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = "") -> str:
     """An HTML table; numbers with four significant digits and to the right, words to the left, None as a dash."""
     rows = [list(row) for row in rows]
-    words = [any(isinstance(row[k], str) and not _NUMERIC.match(row[k]) for row in rows if k < len(row)) for k in range(len(head))]
+    words = [
+        any(isinstance(row[k], str) and not _NUMERIC.match(row[k]) for row in rows if k < len(row))
+        for k in range(len(head))
+    ]
 
     def line(cells: Sequence[Any], tag: str) -> str:
-        return "<tr>" + "".join(f'<{tag}{" class=text" if k < len(words) and words[k] else ""}>{cell(v)}</{tag}>'
-                                for k, v in enumerate(cells)) + "</tr>\n"
+        return (
+            "<tr>"
+            + "".join(
+                f"<{tag}{' class=text' if k < len(words) and words[k] else ''}>{cell(v)}</{tag}>"
+                for k, v in enumerate(cells)
+            )
+            + "</tr>\n"
+        )
+
     top = f"<caption>{html.escape(caption)}</caption>" if caption else ""
-    return (f'<div class="wide"><table>{top}<thead>{line(head, "th")}</thead><tbody>\n' + "".join(line(row, "td") for row in rows)
-            + "</tbody></table></div>")
+    return (
+        f'<div class="wide"><table>{top}<thead>{line(head, "th")}</thead><tbody>\n'
+        + "".join(line(row, "td") for row in rows)
+        + "</tbody></table></div>"
+    )
 
 
 def cell(v: Any) -> str:
@@ -66,13 +84,18 @@ def cell(v: Any) -> str:
 def unit(name: str | None) -> str:
     """A unit as people write it: degC is °C, um is µm, no unit is nothing."""
     text = _UNIT.sub(lambda m: {"degC": "°C", "um": "µm", "us": "µs", "ohm": "Ω"}[m[0]], name or "")
-    text = re.sub(r"\*\*(2|3|4)(?![.\d])", lambda m: {"2": "²", "3": "³", "4": "⁴"}[m[1]], text).replace("**", "^").replace("*", "·")
+    text = (
+        re.sub(r"\*\*(2|3|4)(?![.\d])", lambda m: {"2": "²", "3": "³", "4": "⁴"}[m[1]], text)
+        .replace("**", "^")
+        .replace("*", "·")
+    )
     return "" if text == "1" else text.replace("(unit_of_y)", "reading").replace("unit_of_y", "reading")
 
 
 def figure(fig: Any, caption: str = "") -> str:
     """A matplotlib figure as inline SVG with its caption; the figure is closed."""
     import matplotlib.pyplot as plt
+
     for axis in fig.axes:
         axis.spines[["top", "right"]].set_visible(False)
     out = io.StringIO()
@@ -80,4 +103,4 @@ def figure(fig: Any, caption: str = "") -> str:
         fig.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
     plt.close(fig)
     svg = out.getvalue()
-    return f"<figure>{svg[svg.index('<svg'):]}<figcaption>{html.escape(caption)}</figcaption></figure>"
+    return f"<figure>{svg[svg.index('<svg') :]}<figcaption>{html.escape(caption)}</figcaption></figure>"

@@ -4,6 +4,7 @@
 
 Nothing else differs from `thermoctl run`. The probe is compiled (batch.pyx, built by run.py) and part of the figures.
 """
+
 import sys
 from pathlib import Path
 
@@ -23,6 +24,7 @@ def main(config: str, stamps_path: str, ticks: str) -> int:
 
     def probed(settings, shared, rig, stopping, **more):
         run_loop(settings, shared, rig, Probe(stamps, stopping), **more)
+
     loop.run_loop = probed
     return supervisor.run(load_settings(config))
 

@@ -4,6 +4,7 @@
 
 The arithmetic is the short law (predict 12 states, correct, twelve temperatures, PID): less than the daemon's.
 """
+
 import binascii
 import ctypes
 import os
@@ -39,10 +40,10 @@ def main(cpu: str, priority: str, ticks: str, encoder: str, can_port: str, out: 
         wake = time.monotonic_ns()
         buffer += port.read(port.in_waiting)
         while (at := buffer.find(b"\xaa\x55")) >= 0 and len(buffer) >= at + 12:
-            body, crc = buffer[at + 2:at + 10], buffer[at + 10:at + 12]
+            body, crc = buffer[at + 2 : at + 10], buffer[at + 10 : at + 12]
             if binascii.crc_hqx(body, 0xFFFF) == int.from_bytes(crc, "little"):
                 position = struct.unpack("<BHiB", body)[2] * 0.005
-            buffer = buffer[at + 12:]
+            buffer = buffer[at + 12 :]
         while (message := bus.recv(0)) is not None:
             if message.arbitration_id == 0x185:
                 struct.unpack("<HhI", bytes(message.data))

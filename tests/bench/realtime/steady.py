@@ -11,6 +11,7 @@ daemon      the whole daemon with its processes in real time, asked for its stat
 Compared are the medians of the middle and the last third: a process that has settled must not grow by over 1 %, and its
 fewest descriptors (a client comes and goes) must stay the same. Ends with 1 where one does not. `make bench-realtime` runs it after run.py.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -31,7 +32,7 @@ import numpy as np
 
 from tests.bench.realtime.run import ROOT, Bench, machine
 
-Sample = tuple[float, int, int]             # time (h, share or s), resident kB, descriptors
+Sample = tuple[float, int, int]  # time (h, share or s), resident kB, descriptors
 GROWTH = 0.01
 
 
@@ -44,8 +45,14 @@ def look(pid: int | str = "self") -> tuple[int, int]:
 def configuration(work: Path) -> Path:
     """The simulated rig, recording into `work` within a budget that hours of it exceed many times."""
     text = (ROOT / "config/simulated.yaml").read_text()
-    for old, new in (("models/", f"{ROOT}/config/models/"), ("plants/", f"{ROOT}/config/plants/"), ("../recordings", f"{work}/recordings"),
-                     ("../run/", f"{work}/"), ("budget_gb: 2", "budget_gb: 0.05"), ("tier_budget_gb: 0.5", "tier_budget_gb: 0.01")):
+    for old, new in (
+        ("models/", f"{ROOT}/config/models/"),
+        ("plants/", f"{ROOT}/config/plants/"),
+        ("../recordings", f"{work}/recordings"),
+        ("../run/", f"{work}/"),
+        ("budget_gb: 2", "budget_gb: 0.05"),
+        ("tier_budget_gb: 0.5", "tier_budget_gb: 0.01"),
+    ):
         assert old in text, old
         text = text.replace(old, new)
     (work / "steady.yaml").write_text(text)
@@ -64,6 +71,7 @@ def simulated(work: Path, hours: float) -> list[Sample]:
 
     def silent(*_: Any, **__: Any) -> None:
         pass
+
     settings = load_settings(configuration(work))
     shared = Shared.create(f"thermoctl-steady-{os.getpid()}")
     try:
@@ -75,7 +83,7 @@ def simulated(work: Path, hours: float) -> list[Sample]:
         for five_minutes in range(round(12 * hours)):
             for part in range(60):
                 simulation.command("setpoint", 50.0 * (part % 3))
-                if part % 20 == 10:                             # a fault that trips, acknowledged and armed again
+                if part % 20 == 10:  # a fault that trips, acknowledged and armed again
                     simulation.command("disarm")
                     simulation.tick(300)
                     simulation.command("arm")
@@ -97,6 +105,7 @@ def drivers(bench: Bench, ticks: int) -> list[Sample]:
     """A sample every twentieth of the ticks."""
     from hal.backend import make_backend
     from thermoctl.settings import load_settings
+
     backend = make_backend(load_settings(bench.config))
     backend.open()
     found = []
@@ -116,24 +125,32 @@ def daemon(work: Path, minutes: float) -> dict[str, list[Sample]]:
     from thermoctl.daemon.socket import ask
     from thermoctl.settings import load_settings
     from thermoctl.yamlfile import InputError
+
     config = configuration(work)
     settings = load_settings(config)
     with (work / "daemon.log").open("w") as log:
-        process = subprocess.Popen([sys.executable, "-m", "thermoctl.cli", "run", "--config", str(config)], stderr=log, cwd=ROOT)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "thermoctl.cli", "run", "--config", str(config)], stderr=log, cwd=ROOT
+        )
     found: dict[str, list[Sample]] = {}
 
     def asked(**request: Any) -> dict[str, Any]:
         with contextlib.suppress(InputError):
             return ask(settings.socket.path, request)
         return {}
+
     try:
         begin = time.monotonic()
         while asked(command="status").get("state") != "READY":
             if process.poll() is not None or time.monotonic() - begin > 60.0:
                 raise SystemExit("the daemon did not start:\n" + (work / "daemon.log").read_text())
             time.sleep(0.05)
-        children = sorted(int(p) for p in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split())
-        names = dict(zip(("loop", "recorder", "commands", "idle loop"), children, strict=True)) | {"supervisor": process.pid}
+        children = sorted(
+            int(p) for p in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        )
+        names = dict(zip(("loop", "recorder", "commands", "idle loop"), children, strict=True)) | {
+            "supervisor": process.pid
+        }
         asked(command="arm")
         begin, rounds, reloads = time.monotonic(), 0, 0
         while (now := time.monotonic() - begin) < minutes * 60.0:
@@ -142,8 +159,14 @@ def daemon(work: Path, minutes: float) -> dict[str, list[Sample]]:
                 asked(command="setpoint", value=float(20 * (rounds // 50 % 3)))
             if rounds % 500 == 0:
                 text = config.read_text()
-                config.write_text(text.replace("kp: 0.01\n", "kp: 0.0101\n") if "kp: 0.01\n" in text else text.replace("kp: 0.0101\n", "kp: 0.01\n"))
-                reloads += bool(asked(command="reload").get("ok"))      # a machine that is busy may not answer in time
+                config.write_text(
+                    text.replace("kp: 0.01\n", "kp: 0.0101\n")
+                    if "kp: 0.01\n" in text
+                    else text.replace("kp: 0.0101\n", "kp: 0.01\n")
+                )
+                reloads += bool(
+                    asked(command="reload").get("ok")
+                )  # a machine that is busy may not answer in time
             if rounds % 100 == 0 and now > 10.0:
                 for name, pid in names.items():
                     found.setdefault(name, []).append((now, *look(pid)))
@@ -176,13 +199,18 @@ def table(found: dict[str, tuple[str, list[Sample]]]) -> Iterator[tuple[str, boo
         before, after = (float(np.median(kb[s])) for s in (slice(third, -third), slice(-third, None)))
         slope = float(np.polyfit(t[third:], kb[third:], 1)[0])
         kept = after - before <= GROWTH * before and fds[third:-third].min() == fds[-third:].min()
-        yield (f"| {what} | {over} | {kb[third]} to {kb[-1]} kB | {after - before:+.0f} kB | {slope:+.1f} kB/"
-               f"{'h' if 'h ' in over else 'min' if 'min' in over else 'run'} | {fds[third:].min()} to {fds[third:].max()} | "
-               f"{'yes' if kept else '**no**'} |", kept)
+        yield (
+            f"| {what} | {over} | {kb[third]} to {kb[-1]} kB | {after - before:+.0f} kB | {slope:+.1f} kB/"
+            f"{'h' if 'h ' in over else 'min' if 'min' in over else 'run'} | {fds[third:].min()} to {fds[third:].max()} | "
+            f"{'yes' if kept else '**no**'} |",
+            kept,
+        )
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--hours", type=float, default=6.0, help="of simulated time")
     parser.add_argument("--minutes", type=float, default=5.0, help="of the real daemon")
     parser.add_argument("--wire-ticks", type=int, default=1_000_000)
@@ -196,16 +224,30 @@ def main() -> int:
             bench = Bench(work, 1)
             bench.start_peer()
             try:
-                found["serial and CAN drivers"] = f"{args.wire_ticks:,} ticks", in_child(drivers, bench, args.wire_ticks)
+                found["serial and CAN drivers"] = (
+                    f"{args.wire_ticks:,} ticks",
+                    in_child(drivers, bench, args.wire_ticks),
+                )
             finally:
                 bench.stop_peer()
         for name, samples in (daemon(work, args.minutes) if args.minutes else {}).items():
-            found[f"daemon: {name}"] = f"{args.minutes:g} min", [(t / 60.0, *more) for t, *more in samples]       # type: ignore[misc]
+            found[f"daemon: {name}"] = f"{args.minutes:g} min", [(t / 60.0, *more) for t, *more in samples]  # type: ignore[misc]
         if args.hours:
-            found["loop, recorder, supervisor, commands"] = f"{args.hours:g} h of simulated time", in_child(simulated, work, args.hours)
+            found["loop, recorder, supervisor, commands"] = (
+                f"{args.hours:g} h of simulated time",
+                in_child(simulated, work, args.hours),
+            )
     lines = list(table(found))
-    text = "\n".join([*machine(), "", "| what | over | resident | last third over middle third | slope | descriptors | steady |",
-                      "|---|---|---|---|---|---|---|", *(line for line, _ in lines), ""])
+    text = "\n".join(
+        [
+            *machine(),
+            "",
+            "| what | over | resident | last third over middle third | slope | descriptors | steady |",
+            "|---|---|---|---|---|---|---|",
+            *(line for line, _ in lines),
+            "",
+        ]
+    )
     print(text)
     if args.out:
         args.out.write_text(text)
