@@ -113,6 +113,23 @@ def test_pairs_need_both():
     assert both.kind == "pair"
 
 
+def test_in_the_open_world_strays_count_and_a_partly_explained_name_is_a_name():
+    told = answer(("radiation", "a"), band="large") | {"world": "open"}
+    found = [finding("radiation", "a", 0.97), finding("sensor_drift", "y", 0.7)]
+    rows = [
+        score.score("1", told, result("partly_explained", found[:1])),
+        score.score("2", told, result("partly_explained", found)),
+        score.score("3", answer() | {"world": "open"}, result("unexplained")),
+        score.score("4", answer(), result("consistent")),
+    ]
+    content = score.summary(rows)
+    assert content["figures"]["cases"] == 1 and content["open_world"]["cases"] == 3
+    shares = content["open_world"]["shares"]
+    assert (shares["named_and_placed"]["k"], shares["named_and_placed"]["n"]) == (1, 2)
+    assert shares["nothing_named_where_nothing_is"]["share"] == 1.0
+    assert content["open_world"]["strays_per_diagnosis"] == pytest.approx(1 / 3)
+
+
 def test_unknown_and_failed():
     assert score.score("1", answer(("?", "a")), result("unexplained")).called == "unknown"
     row = score.score("1", answer(("?", "a")), result("explained", [finding("radiation", "a", 0.95)]))

@@ -25,6 +25,7 @@ from scipy.optimize import lsq_linear
 
 from tests.concealed import sensors
 from tests.concealed.judge import BANDS, TELL_APART, Judge, beyond, snr
+from tests.concealed.open_world import jittered, open_world, with_world
 from tests.concealed.rig import Scene, Suspect
 from tests.concealed.rigs_motion import Flexure, FreeStage
 from tests.concealed.rigs_tanks import Tanks
@@ -293,8 +294,9 @@ def make_case(
     families: Sequence[str] = tuple(FAMILIES),
     short: bool = False,
     kind: str | None = None,
+    world: str = "closed",
 ) -> tuple[dict, list[list[tuple[str, np.ndarray]]], dict]:
-    """Case `number` of a set: (plant, columns of each run, answer)."""
+    """Case `number` of a set: (plant, columns of each run, answer). world "open" adds misfits that nobody will name."""
     slot = plan(seed, number + 1, families, kind)[number]
     held = [f for f in families if slot.effect is None or f in holders()[slot.effect]]
     at = held.index(slot.family)
@@ -325,6 +327,15 @@ def make_case(
             f"case {number + 1:04d}: {slot.effect or slot.kind} not visible as asked in {ATTEMPTS} draws"
         )
     kind = slot.kind
+    opened, named = None, runs
+    if world == "open":
+        if not effects:
+            bench.measure([])
+        signal = told["snr"][0] if effects else 0.0
+        opened = open_world(
+            scene, bench, effects, runs, signal, np.random.default_rng([seed, number, attempt, 3])
+        )
+        scene, runs = with_world(scene, opened), opened.runs
     answer = {
         "verdict": "consistent" if kind == "none" else "unexplained" if kind == "unknown" else "explained",
         "effects": [["?" if e.startswith("?") else e, w] for e, w, _ in effects],
@@ -341,13 +352,21 @@ def make_case(
         "parameters": [{k: float(v) for k, v in published(e, p).items()} for e, _, p in effects],
         "true_parameters": {k: float(f"{v:.6g}") for k, v in scene.theta.items()},
     }
+    if opened is not None:
+        answer |= {
+            "world": "open",
+            "verdict": "partly_explained" if effects else "unexplained",
+            **opened.told,
+        }
+        if kind == "unknown":
+            answer["verdict"] = "unexplained"
     if kind == "unknown":
         answer["outside_catalogue"] = [e for e, _, _ in effects]
     dirt_kind = rng.choice(["clean", "outliers", "gaps", "slow"], p=[0.55, 0.15, 0.2, 0.1])
     tables, oracle = [], []
     slow = rng.integers(len(scene.outputs)) if dirt_kind == "slow" and len(scene.outputs) > 1 else -1
     for k, run in enumerate(scene.runs):
-        columns = [("t", run["t"])]
+        columns = [("t", jittered(run["t"], opened.clock_jitter if opened else 0.0, rng))]
         columns += [(c, run[key]) for c, key in scene.columns.items()]
         for j, c in enumerate(scene.output_columns):
             dirt = (
@@ -361,7 +380,7 @@ def make_case(
                 dirt = {"every": 5}
             y = sensors.record(runs[k][:, j], bench.noise[j], scene.sd[j], scene.resolution[j], dirt, rng)
             columns.append((c, y))
-            oracle.append((scene.outputs[j], np.sqrt(np.nanmean((y - runs[k][:, j]) ** 2))))
+            oracle.append((scene.outputs[j], np.sqrt(np.nanmean((y - named[k][:, j]) ** 2))))
         tables.append(columns)
     answer["dirt"] = str(dirt_kind)
     answer["oracle_rms"] = {
@@ -555,6 +574,12 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--smoke", action="store_true", help="short records")
     p.add_argument("--answers", default=None, help="folder for the sealed answers, or 'inside'")
     p.add_argument("--families", default=",".join(FAMILIES))
+    p.add_argument(
+        "--world",
+        choices=["closed", "open", "both"],
+        default="closed",
+        help="open: with small misfits that nobody will name; both: every second case",
+    )
     p.add_argument("--kind", choices=sorted(set(KINDS)), help="only cases of this kind")
     a = p.parse_args(argv)
     inside = a.answers == "inside"
@@ -571,7 +596,8 @@ def main(argv: list[str] | None = None) -> int:
         if target.exists():
             continue
         try:
-            plant, tables, answer = make_case(a.seed, number, a.families.split(","), a.smoke, a.kind)
+            world = ("closed", "open")[number % 2] if a.world == "both" else a.world
+            plant, tables, answer = make_case(a.seed, number, a.families.split(","), a.smoke, a.kind, world)
         except NotVisible as e:
             print(f"{e}; the set has a gap there", file=sys.stderr, flush=True)
             continue

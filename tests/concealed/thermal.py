@@ -73,7 +73,7 @@ def simulate(net: Network, theta: dict, run: dict, rows: list[Variant]) -> np.nd
             lin[j, i] -= g0[e]
     touching = np.array([g0[(a == k) | (b == k)].sum() for k in range(nb)])
     for k in range(nb):
-        g = net.stiffness * max(touching[k], 1e-3) * cells
+        g = run.get("stiffness", net.stiffness) * max(touching[k], 1e-3) * cells
         for c in range(cells - 1):
             i = surface[k] + c
             lin[i : i + 2, i : i + 2] += g * np.array([[1, -1], [-1, 1]])

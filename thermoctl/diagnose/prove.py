@@ -380,6 +380,25 @@ def _lines(content: dict[str, Any]) -> Iterator[tuple[str, str, str, str, str, b
             curve = content["found_by_size"].get(key.removeprefix("half_found_at_"))
             wide, of = (f"{curve['low']:.1f}–{curve['high']:.1f}", str(curve["n"])) if curve else ("", "")
             yield title, f"{value:.3g}", wide, of, text, reached
+    yield from _open_lines(content["open_world"])
+
+
+def _open_lines(found: dict[str, Any]) -> Iterator[tuple[str, str, str, str, str, bool | None]]:
+    """The lines of the cases with small misfits that nobody will name."""
+    for key, s in found.get("shares", {}).items():
+        if s["n"]:
+            wide = f"{100 * s['low']:.0f}–{100 * s['high']:.0f} %"
+            yield (
+                f"open world: {key.replace('_', ' ')}",
+                f"{100 * s['share']:.1f} %",
+                wide,
+                f"{s['k']}/{s['n']}",
+                "",
+                None,
+            )
+    for key in ("strays_per_diagnosis", "calibration_error", "gain_median"):
+        if found.get(key) is not None:
+            yield f"open world: {key.replace('_', ' ')}", f"{found[key]:.3g}", "", "", "", None
 
 
 def page(content: dict[str, Any], rows: Sequence[scoring.Row]) -> str:

@@ -28,6 +28,7 @@ from thermoctl.yamlfile import InputError
 
 SYMMETRIC = ("missing_link", "bending")  # `a-b` and `b-a` name the same place
 BANDS = ("large", "middle", "small")
+NAMING = ("explained", "partly_explained", "ambiguous")  # verdicts that state a name
 CONFIDENT = 0.9  # a name given with at least this probability counts as stated with confidence
 
 # the figures to reach (issue "The proof"): name -> (figure, at least / at most)
@@ -108,6 +109,8 @@ class Row:
     gain: float | None
     seconds: float | None
     error: str | None
+    world: str = "closed"  # open: with small misfits that nobody will name
+    strays: int = 0  # findings that are neither a true effect nor one that the data cannot tell from it
     calibration: list[tuple[float, bool]] = field(default_factory=list)
     parameters: list[dict[str, Any]] = field(default_factory=list)
 
@@ -156,7 +159,7 @@ def score(
             or any(_same_place(e, found[1], w) and e == found[0] for e, w in alike_places)
         )
 
-    named = verdict in ("explained", "ambiguous") and bool(findings)
+    named = verdict in NAMING and bool(findings)
     exact = bool(truth) and Counter(e for e, _ in findings) == true_names
     alike = bool(truth) and len(findings) == len(truth) and _matched(findings, truth, near)
     right_by_name = [f for f in findings if any(near(f, t) for t in truth)]
@@ -207,6 +210,8 @@ def score(
         gain=_gain(result.get("fit", {}), answer.get("oracle_rms")),
         seconds=seconds,
         error=error,
+        world=str(answer.get("world", "closed")),
+        strays=sum(not any(near(f, t) for t in truth) for f in findings),
         calibration=probabilities,
         parameters=_parameters(truth, answer.get("parameters", []), result["findings"]),
     )
@@ -325,13 +330,16 @@ def _quantile(values: Iterable[float | None], q: float) -> float | None:
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """All figures of a set, ready for JSON: `figures` (one number each), `shares` (with intervals), tables."""
+    """All figures of a set, ready for JSON: `figures` (one number each), `shares` (with intervals), tables; those of the
+    cases with unnamed misfits apart, under `open_world`."""
+    opened = open_world([r for r in rows if r.world == "open"])
+    rows = [r for r in rows if r.world != "open"]
     null = [r for r in rows if r.kind == "none"]
     single = [r for r in rows if r.kind == "one"]
     known = [r for r in rows if r.kind not in ("none", "unknown")]
     unknown = [r for r in rows if r.kind == "unknown"]
     two = [r for r in rows if r.kind in ("pair", "cancel")]
-    stated = [r for r in rows if r.verdict == "explained" and r.findings]
+    stated = [r for r in rows if r.verdict in ("explained", "partly_explained") and r.findings]
     banded = single if any(r.band for r in single) else known
     bands: dict[str, list[Row]] = {b: [r for r in banded if r.band == b] for b in BANDS}
     shares = {
@@ -349,7 +357,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "place_right": share(bool(r.placed) for r in known if r.placed is not None),
         "onset_within_2_percent": share(r.onset_error <= 0.02 for r in known if r.onset_error is not None),
         "unknown_called_unknown": share(r.verdict == "unexplained" for r in unknown),
-        "confidently_misnamed": share(r.verdict == "explained" and r.confident for r in unknown),
+        "confidently_misnamed": share(r.verdict in NAMING[:2] and r.confident for r in unknown),
         "pairs_both_right": share(r.alike for r in two),
         "pairs_one_right": share(any(f[0] in {e for e, _ in r.truth} for f in r.findings) for r in two),
         "interval_coverage": share(p["covered"] for r in rows for p in r.parameters),
@@ -402,6 +410,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
             k: {"goal": g, "at": side, "is": figures.get(k), "reached": _reached(figures.get(k), g, side)}
             for k, (g, side) in GOALS.items()
         },
+        "open_world": opened,
         "reliability": table,
         "found_by_size": by_size,
         "confusion": {t: dict(c) for t, c in sorted(confusion.items())},
@@ -412,6 +421,29 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
             e: _brief([r for r in single if r.truth[0][0] == e])
             for e in sorted({r.truth[0][0] for r in single})
         },
+    }
+
+
+def open_world(rows: Sequence[Row]) -> dict[str, Any]:
+    """Figures of the cases that hold small misfits which nobody will name; empty without any."""
+    if not rows:
+        return {}
+    visible = [r for r in rows if r.kind == "one" and r.band in ("large", "middle")]
+    null = [r for r in rows if r.kind == "none"]
+    given = [x for r in rows for x in r.calibration]
+    shares = {
+        "named_and_placed": share(r.alike and bool(r.placed) for r in visible),
+        "truth_among_findings": share(bool(r.named and r.inside) for r in visible),
+        "without_strays": share(r.strays == 0 for r in rows),
+        "nothing_named_where_nothing_is": share(not r.findings for r in null),
+        "unknown_not_named": share(not r.named for r in rows if r.kind == "unknown"),
+    }
+    return {
+        "cases": len(rows),
+        "shares": {k: s.plain() for k, s in shares.items()},
+        "strays_per_diagnosis": sum(r.strays for r in rows) / len(rows),
+        "calibration_error": reliability(given)[1],
+        "gain_median": _quantile((r.gain for r in visible if r.findings), 0.5),
     }
 
 
