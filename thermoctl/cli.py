@@ -185,10 +185,12 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
 
     def service(args: argparse.Namespace) -> int:
         from thermoctl import manual
+        from thermoctl.daemon.service import units
 
-        return room().service_files(args.action, args.config, args.root) or manual.manual(
-            parser(), args.action, args.root
-        )
+        done = room().service_files(args.action, args.config, args.root)
+        if done or (args.action == "uninstall" and units(Path(args.root))):
+            return done  # manual page and completions go with the last unit
+        return manual.manual(parser(), args.action, args.root)
 
     run = _add(
         sub,

@@ -286,7 +286,7 @@ class SocketSettings:
     """The command socket."""
 
     path: str = option(
-        "the Unix socket; lock, pid and log stand beside it", "../run/thermoctl.sock", restart=True
+        "the Unix socket; lock, log and kept estimates stand beside it", "../run/thermoctl.sock", restart=True
     )
     group: str = option("group that may command; empty: the daemon's own", "", restart=True)
 

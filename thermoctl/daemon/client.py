@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+from thermoctl.daemon.lock import holder
 from thermoctl.daemon.socket import ask
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
@@ -49,9 +50,12 @@ def request(config: str, command: str, value: float | None = None, as_json: bool
 
 def status(config: str, as_json: bool = False) -> int:
     """The daemon's state; 0, or 1 when it does not run or a fault stands."""
+    settings = load_settings(config)
     try:
-        answer = ask(load_settings(config).socket.path, {"command": "status"})
+        answer = ask(settings.socket.path, {"command": "status"})
     except InputError as e:
+        if (pid := holder(settings)) is not None:
+            e = InputError(f"{e.args[0]}; pid {pid} holds the rig: it starts, stops or drives it by itself")
         if as_json:
             print(json.dumps({"ok": False, "state": "OFF", "error": str(e)}))
         else:
@@ -178,6 +182,8 @@ def doctor(config: str, seconds: float = 2.0) -> int:
     from thermoctl.signals import SIGNALS
 
     settings = load_settings(config)
+    if (pid := holder(settings)) is not None:  # a second master on its buses could disarm it
+        raise InputError(f"{config}: pid {pid} holds the rig; look with `thermoctl status`, or stop it first")
     backend = make_backend(settings)
     units = {s.name: s.unit for s in SIGNALS}
     try:
@@ -221,14 +227,13 @@ def doctor(config: str, seconds: float = 2.0) -> int:
     return 1 if bad else 0
 
 
-def service_files(action: str, config: str, root: str) -> int:
+def service_files(action: str, config: str | None, root: str) -> int:
     """service install | uninstall."""
     from thermoctl.daemon import service as services
 
-    if action == "uninstall":
-        return services.uninstall(Path(root))
-    settings = load_settings(config)
-    return services.install(Path(settings.path), Path(root))
+    if action == "install":
+        return services.install(Path(config or ""), Path(root))
+    return services.uninstall(Path(config) if config else None, Path(root))
 
 
 def demo(config: str, seconds: float | None) -> int:
