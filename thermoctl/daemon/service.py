@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.daemon.lock import holder
+from thermoctl.daemon.loop import die_with_parent
 from thermoctl.daemon.socket import ask, settled
 from thermoctl.settings import load_settings
 from thermoctl.shipped import shipped
@@ -150,9 +151,11 @@ def log_path(settings: Any) -> Path:
 
 
 class Background(subprocess.Popen):
-    """`thermoctl run` on a configuration, its log appended to `log_path`; `began` is where in it this run begins."""
+    """`thermoctl run` on a configuration, its log appended to `log_path`; `began` is where in it this run begins.
 
-    def __init__(self, settings: Any):
+    dies_with_us: it is asked to stop when this process ends, however that ends."""
+
+    def __init__(self, settings: Any, dies_with_us: bool = False):
         log = log_path(settings)
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as out:
@@ -172,6 +175,7 @@ class Background(subprocess.Popen):
                 stdout=out,
                 stderr=out,
                 start_new_session=True,
+                preexec_fn=die_with_parent if dies_with_us else None,
             )
         self.log = log
 
