@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from thermoctl import __version__
+from thermoctl import __version__, which_rig
 from thermoctl.yamlfile import InputError
 
 for _name in (
@@ -42,6 +42,16 @@ def _add(
         parser.add_argument(*flags, **options)
     parser.set_defaults(run=run)
     return parser
+
+
+CONFIG = (
+    "--config",
+    {
+        "metavar": "FILE",
+        "help": "configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, /etc/thermoctl/rig.yaml)",
+    },
+)
+"""The option of every command that means a rig; `main` puts the file found by `which_rig.find_config` into it."""
 
 
 def _with(
@@ -165,14 +175,8 @@ def _virtual_rig(config: str, line: str) -> int:
 
 def _daemon_commands(sub: argparse._SubParsersAction) -> None:
     """run, demo, start, stop, restart, status, arm, disarm, setpoint, reload, check, doctor, latency, virtual-rig."""
-    config = (
-        "--config",
-        {
-            "metavar": "FILE",
-            "help": "configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, /etc/thermoctl/rig.yaml)",
-        },
-    )
     as_json = ("--json", {"action": "store_true", "help": "one JSON object, for programs"})
+    file = ("file", {"nargs": "?", "metavar": "CONFIG", "help": "the same as --config CONFIG"})
 
     def room():
         from thermoctl.daemon import client
@@ -181,10 +185,12 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
 
     def service(args: argparse.Namespace) -> int:
         from thermoctl import manual
+        from thermoctl.daemon.service import units
 
-        return room().service_files(args.action, args.config, args.root) or manual.manual(
-            parser(), args.action, args.root
-        )
+        done = room().service_files(args.action, args.config, args.root)
+        if done or (args.action == "uninstall" and units(Path(args.root))):
+            return done  # manual page and completions go with the last unit
+        return manual.manual(parser(), args.action, args.root)
 
     run = _add(
         sub,
@@ -195,7 +201,7 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
             if a.hours is None
             else room().run_simulated_time(a.config, a.hours, a.no_compensation, a.out)
         ),
-        config,
+        CONFIG,
     )
     run.add_argument(
         "--simulated-time", action="store_true", help="no clock: run the simulated rig as fast as it goes"
@@ -210,7 +216,7 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
         "demo",
         "the closed loop on the simulated rig with a live view; Ctrl-C stops safely",
         lambda a: room().demo(a.config, a.seconds),
-        config,
+        CONFIG,
         ("--seconds", {"type": float, "metavar": "S", "help": "stop by itself after S seconds"}),
     )
     for action, help in (
@@ -218,13 +224,13 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
         ("stop", "stop it; the amplifier is disabled first"),
         ("restart", "stop, then start"),
     ):
-        _add(sub, action, help, _with(lambda a, name: room().service(a.config, name), action), config)
+        _add(sub, action, help, _with(lambda a, name: room().service(a.config, name), action), CONFIG)
     _add(
         sub,
         "status",
         "state, position, compensation, temperatures, faults with remedies; exit 1 when a fault stands",
         lambda a: room().status(a.config, a.json),
-        config,
+        CONFIG,
         as_json,
     )
     for command, help in (
@@ -237,7 +243,7 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
             command,
             help,
             _with(lambda a, name: room().request(a.config, name, None, a.json), command),
-            config,
+            CONFIG,
             as_json,
         )
     _add(
@@ -246,7 +252,7 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
         "move the output to VALUE_UM at the limited rate",
         lambda a: room().request(a.config, "setpoint", a.value, a.json),
         ("value", {"type": float, "metavar": "VALUE_UM"}),
-        config,
+        CONFIG,
         as_json,
     )
     _add(
@@ -254,14 +260,16 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
         "check",
         "validate a configuration with its model, plant and profiles; touches no hardware",
         lambda a: room().check(a.config),
-        ("config", {"metavar": "CONFIG"}),
+        file,
+        CONFIG,
     )
     _add(
         sub,
         "doctor",
         "connect, read every channel, show values with units and rates; drives nothing",
         lambda a: room().doctor(a.config, a.seconds),
-        ("config", {"metavar": "CONFIG"}),
+        file,
+        CONFIG,
         ("--seconds", {"type": float, "default": 2.0, "help": "how long to read (default 2)"}),
     )
     _add(
@@ -269,7 +277,7 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
         "latency",
         "histogram of lateness and busy time, slips, and an idle loop's beside it",
         lambda a: room().latency(a.config, a.json),
-        config,
+        CONFIG,
         as_json,
     )
     _add(
@@ -284,7 +292,7 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
         "virtual-rig",
         "play the devices of a configuration at the other end of their wires, in real time",
         lambda a: _virtual_rig(a.config, a.tell),
-        ("--config", {"metavar": "FILE", "default": "config/wire.yaml"}),
+        CONFIG,
         (
             "--tell",
             {
@@ -301,7 +309,7 @@ def _daemon_commands(sub: argparse._SubParsersAction) -> None:
         "install or remove the systemd unit, its user, its device rules, the manual page and the shells' completions",
         service,
         ("action", {"choices": ["install", "uninstall"]}),
-        config,
+        CONFIG,
         ("--root", {"default": "/", "metavar": "DIR", "help": "install below this directory"}),
     )
 
@@ -365,14 +373,6 @@ def _recording_commands(sub: argparse._SubParsersAction) -> None:
 
 def _identify_commands(sub: argparse._SubParsersAction) -> None:
     """experiment, identify, model, tune, evaluate, reproduce."""
-    config = (
-        "--config",
-        {
-            "metavar": "FILE",
-            "default": "config/simulated.yaml",
-            "help": "configuration (default config/simulated.yaml)",
-        },
-    )
 
     def room():
         from thermoctl.evaluate import commands
@@ -391,7 +391,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
                 "help": "a test of experiments.yaml, or a file of experiments with one in it",
             },
         ),
-        config,
+        CONFIG,
         (
             "--plant",
             {
@@ -414,7 +414,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
         ("test_2", {"metavar": "TEST_2"}),
         ("test_3", {"metavar": "TEST_3"}),
         ("test_4a", {"metavar": "TEST_4A"}),
-        config,
+        CONFIG,
         (
             "--models",
             {"metavar": "DIR", "default": "models", "help": "folder of calibrations (default models)"},
@@ -445,7 +445,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
         "tune",
         "propose PID gains from an open-loop step on the simulated rig; shown as a difference",
         lambda a: room().tune(a.config, a.method, a.write),
-        config,
+        CONFIG,
         (
             "--method",
             {"choices": ("imc", "zn", "relay"), "default": "imc", "help": "default imc, with margins"},
@@ -464,7 +464,14 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
         "reproduce",
         "the paper's tests on simulated rigs: one report with the paper's numbers, ours by its method, ours by the better one",
         lambda a: room().reproduce(a.config, a.plant, a.out, a.seeds, a.quick),
-        config,
+        (
+            "--config",
+            {
+                "metavar": "FILE",
+                "default": "config/simulated.yaml",
+                "help": "the simulated rig (config/simulated.yaml)",
+            },
+        ),
         ("--plant", {"metavar": "FILE", "default": "config/plants/actuator_truth.yaml", "help": "the truth"}),
         ("--out", {"metavar": "DIR", "default": "out/reproduce", "help": "default out/reproduce"}),
         ("--seeds", {"type": int, "default": 12, "help": "rigs (default 12)"}),
@@ -577,14 +584,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
             {"type": int, "default": 3, "metavar": "N", "help": "with --resolve: at most N experiments (3)"},
         ),
         ("--rig", {"metavar": "PLANT", "help": "with --resolve: a plant file in the rig's place"}),
-        (
-            "--config",
-            {
-                "metavar": "FILE",
-                "default": "config/simulated.yaml",
-                "help": "with --resolve and --live: the rig, with all protections (config/simulated.yaml)",
-            },
-        ),
+        CONFIG,
         ("--json", {"action": "store_true", "help": "print the result as JSON"}),
         ("--quiet", {"action": "store_true", "help": "no progress, no summary"}),
     )
@@ -633,14 +633,13 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
 
 def _people_commands(sub: argparse._SubParsersAction) -> None:
     """dashboard, monitor, mqtt, calibrate, fleet, completion, manual."""
-    config = ("--config", {"metavar": "FILE", "help": "configuration, found as by `thermoctl status`"})
 
     def dashboard(args: argparse.Namespace) -> int:
-        from thermoctl.daemon.client import settings_of
         from thermoctl.daemon.dashboard import dashboard
+        from thermoctl.settings import load_settings
 
         return dashboard(
-            settings_of(args.config),
+            load_settings(args.config),
             args.listen,
             args.commands,
             args.metrics,
@@ -654,7 +653,7 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
         "dashboard",
         "the rig in the browser: read-only and on this machine only, unless told otherwise",
         dashboard,
-        config,
+        CONFIG,
         (
             "--listen",
             {
@@ -688,17 +687,17 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     )
 
     def monitor(args: argparse.Namespace) -> int:
-        from thermoctl.daemon.client import settings_of
         from thermoctl.daemon.monitor import monitor
+        from thermoctl.settings import load_settings
 
-        return monitor(settings_of(args.config), args.interval, args.once)
+        return monitor(load_settings(args.config), args.interval, args.once)
 
     _add(
         sub,
         "monitor",
         "the rig in the terminal, as over ssh; commands nothing",
         monitor,
-        config,
+        CONFIG,
         (
             "--interval",
             {
@@ -715,11 +714,11 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     )
 
     def mqtt(args: argparse.Namespace) -> int:
-        from thermoctl.daemon.client import settings_of
         from thermoctl.daemon.mqtt import mqtt
+        from thermoctl.settings import load_settings
 
         return mqtt(
-            settings_of(args.config),
+            load_settings(args.config),
             args.broker,
             args.topic,
             args.rate,
@@ -733,7 +732,7 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
         "mqtt",
         "publish state, faults and availability to an MQTT broker; takes no commands",
         mqtt,
-        config,
+        CONFIG,
         ("--broker", {"required": True, "metavar": "HOST[:PORT]"}),
         ("--topic", {"default": "", "metavar": "TOPIC", "help": "below this (thermoctl/RIG)"}),
         ("--rate", {"type": float, "default": 1.0, "metavar": "HZ", "help": "messages a second (1)"}),
@@ -743,12 +742,9 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     )
 
     def calibrate(args: argparse.Namespace) -> int:
-        from thermoctl.daemon.client import find_config
         from thermoctl.evaluate.calibrate import calibrate
 
-        return calibrate(
-            find_config(args.config), args.out, args.models, args.order, args.gains, args.accept, args.again
-        )
+        return calibrate(args.config, args.out, args.models, args.order, args.gains, args.accept, args.again)
 
     _add(
         sub,
@@ -756,7 +752,7 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
         "doctor, step, PID, tests, model, proof, one after the other; goes on where it was ended; writes nothing "
         "outside its folder before it is accepted",
         calibrate,
-        config,
+        CONFIG,
         ("--out", {"metavar": "DIR", "help": "the calibration's folder (calibration/RIG)"}),
         (
             "--models",
@@ -824,7 +820,7 @@ def parser() -> argparse.ArgumentParser:
         prog="thermoctl", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     top.add_argument("--version", action="version", version=f"thermoctl {__version__}")
-    sub = top.add_subparsers(metavar="COMMAND", required=True)
+    sub = top.add_subparsers(metavar="COMMAND", dest="command", required=True)
     for declare in (
         _daemon_commands,
         _recording_commands,
@@ -841,6 +837,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status."""
     args = parser().parse_args(argv)
     try:
+        which_rig.choose(args)
         return args.run(args) or 0
     except InputError as e:
         print(f"thermoctl: {e}", file=sys.stderr)

@@ -93,10 +93,11 @@ class LoopSettings:
     )
     pace: str = option(
         "what starts a tick: the clock, or the position encoder's frame (the clock, when none came for two "
-        "periods)",
+        "periods); tick: the clock, but each tick counts as one period, so that a simulated rig on a machine that "
+        "stalls runs slower instead of faulting",
         "clock",
         restart=True,
-        choices=("clock", "device"),
+        choices=("clock", "device", "tick"),
     )
     overrun: str = option(
         "what happens after a tick that took too long: skip the ticks it covered and keep the phase",
@@ -286,7 +287,7 @@ class SocketSettings:
     """The command socket."""
 
     path: str = option(
-        "the Unix socket; lock, pid and log stand beside it", "../run/thermoctl.sock", restart=True
+        "the Unix socket; lock, log and kept estimates stand beside it", "../run/thermoctl.sock", restart=True
     )
     group: str = option("group that may command; empty: the daemon's own", "", restart=True)
 
@@ -522,9 +523,10 @@ def _together(settings: Settings, root: Node) -> None:
     needed = {"simulated": "plant", "devices": "devices", "replay": "recording"}[hal.backend]
     if not getattr(hal, needed):
         raise place("hal", "backend").error(f"hal.{needed} is missing: the back end '{hal.backend}' needs it")
-    if settings.loop.pace == "device" and hal.backend != "devices":
+    backend = {"device": "devices", "tick": "simulated"}.get(settings.loop.pace, hal.backend)
+    if hal.backend != backend:
         raise place("loop", "pace").error(
-            f"loop.pace: device needs hal.backend: devices, found '{hal.backend}'; set pace: clock"
+            f"loop.pace: {settings.loop.pace} needs hal.backend: {backend}, found '{hal.backend}'; set pace: clock"
         )
 
 

@@ -11,7 +11,7 @@ cdef int _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS
 cdef int _B_FOLLOWING, _B_HOT, _B_HOT_MODEL, _B_HEATING, _B_DISAGREES, _B_POWER, _B_STUCK, _B_BOUND, _B_SLEWING
 cdef int _B_SATURATED, _B_AMPLIFIER, _B_NOT_FOLLOWING, _B_LATE, _B_NOT_FINITE
 cdef int _B_ELECTRICAL, _B_DISPLACED, _B_MONITORED
-cdef double _GAP_S, _RESUME_C, _COPPER
+cdef double _GAP_S, _RESUME_C, _COPPER, _AIR_READINGS
 cdef bits_t _TRIP_OTHERS, _CRITICAL
 
 cdef bint finite(double value) noexcept nogil
@@ -62,6 +62,8 @@ cdef class Law:
     cdef void _judge_readings(self, double dt) noexcept
     cdef void _power_and_air(self) noexcept
     cdef void _start_air(self, double value) noexcept
+    @cython.locals(i=cython.int, s=cython.double)
+    cdef void _average_air_start(self) noexcept
     @cython.locals(i=cython.int)
     cdef void _forget(self) noexcept
     @cython.locals(i=cython.int, j=cython.int, s=cython.double, left=cython.double, step=cython.double)

@@ -1,58 +1,38 @@
 """What the commands print: each function is one command of the command line, given the configuration's path.
 
-Exit status as in cli.py. The configuration is found by --config, else $THERMOCTL_CONFIG, else config/simulated.yaml
-here, else /etc/thermoctl/rig.yaml.
+Exit status as in cli.py. `which_rig.choose` found the configuration.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
+from thermoctl.daemon.lock import holder
 from thermoctl.daemon.socket import ask
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
 
 
-def find_config(given: str | None) -> str:
-    """The configuration's path. Raises InputError when there is none."""
-    candidates = (
-        [given]
-        if given
-        else [os.environ.get("THERMOCTL_CONFIG"), "config/simulated.yaml", "/etc/thermoctl/rig.yaml"]
-    )
-    for path in candidates:
-        if path and (given or Path(path).exists()):
-            return path
-    raise InputError("no configuration found; give one with --config FILE or in THERMOCTL_CONFIG")
-
-
-def settings_of(config: str | None) -> Any:
-    """The validated settings of `find_config(config)`."""
-    return load_settings(find_config(config))
-
-
-def run(config: str | None) -> int:
+def run(config: str) -> int:
     """The daemon in the foreground."""
     from thermoctl.daemon.supervisor import run as supervise
 
-    return supervise(settings_of(config))
+    return supervise(load_settings(config))
 
 
-def service(config: str | None, action: str) -> int:
+def service(config: str, action: str) -> int:
     """start, stop or restart."""
     from thermoctl.daemon import service as services
 
-    return getattr(services, action)(settings_of(config))
+    return getattr(services, action)(load_settings(config))
 
 
-def request(config: str | None, command: str, value: float | None = None, as_json: bool = False) -> int:
+def request(config: str, command: str, value: float | None = None, as_json: bool = False) -> int:
     """arm, disarm, setpoint or reload; 0, or 1 when the daemon refuses."""
-    answer = ask(settings_of(config).socket.path, {"command": command, "value": value})
+    answer = ask(load_settings(config).socket.path, {"command": command, "value": value})
     if as_json:
         print(json.dumps(answer))
     elif not answer["ok"]:
@@ -68,11 +48,14 @@ def request(config: str | None, command: str, value: float | None = None, as_jso
     return 0 if answer["ok"] else 1
 
 
-def status(config: str | None, as_json: bool = False) -> int:
+def status(config: str, as_json: bool = False) -> int:
     """The daemon's state; 0, or 1 when it does not run or a fault stands."""
+    settings = load_settings(config)
     try:
-        answer = ask(settings_of(config).socket.path, {"command": "status"})
+        answer = ask(settings.socket.path, {"command": "status"})
     except InputError as e:
+        if (pid := holder(settings)) is not None:
+            e = InputError(f"{e.args[0]}; pid {pid} holds the rig: it starts, stops or drives it by itself")
         if as_json:
             print(json.dumps({"ok": False, "state": "OFF", "error": str(e)}))
         else:
@@ -121,9 +104,9 @@ def _number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def latency(config: str | None, as_json: bool = False) -> int:
+def latency(config: str, as_json: bool = False) -> int:
     """Histograms of lateness and busy time, slips, and the reference loop's lateness of the same run."""
-    answer = ask(settings_of(config).socket.path, {"command": "latency"})
+    answer = ask(load_settings(config).socket.path, {"command": "latency"})
     if as_json:
         print(json.dumps(answer))
         return 0
@@ -199,6 +182,8 @@ def doctor(config: str, seconds: float = 2.0) -> int:
     from thermoctl.signals import SIGNALS
 
     settings = load_settings(config)
+    if (pid := holder(settings)) is not None:  # a second master on its buses could disarm it
+        raise InputError(f"{config}: pid {pid} holds the rig; look with `thermoctl status`, or stop it first")
     backend = make_backend(settings)
     units = {s.name: s.unit for s in SIGNALS}
     try:
@@ -246,24 +231,23 @@ def service_files(action: str, config: str | None, root: str) -> int:
     """service install | uninstall."""
     from thermoctl.daemon import service as services
 
-    if action == "uninstall":
-        return services.uninstall(Path(root))
-    settings = settings_of(config)
-    return services.install(Path(settings.path), Path(root))
+    if action == "install":
+        return services.install(Path(config or ""), Path(root))
+    return services.uninstall(Path(config) if config else None, Path(root))
 
 
-def demo(config: str | None, seconds: float | None) -> int:
+def demo(config: str, seconds: float | None) -> int:
     """The live view of a daemon of its own."""
     from thermoctl.daemon.view import demo as show
 
-    return show(settings_of(config), seconds)
+    return show(load_settings(config), seconds)
 
 
-def run_simulated_time(config: str | None, hours: float, no_compensation: bool, out: str | None) -> int:
+def run_simulated_time(config: str, hours: float, no_compensation: bool, out: str | None) -> int:
     """Hours of rig time without a clock; see simulate.warm_up_proof."""
     from thermoctl.daemon.simulate import trapezoids
 
-    return trapezoids(settings_of(config), hours, not no_compensation, out)
+    return trapezoids(load_settings(config), hours, not no_compensation, out)
 
 
 def replay(recording: str) -> int:

@@ -28,7 +28,7 @@ cdef class Rig:
     cpdef publish(self, double now_s, double dt_s, double lateness_us)
     cpdef keep_state(self)
 
-@cython.locals(paced=cython.bint, lateness=Histogram, busy=Histogram, period_ns=cython.longlong, spin_ns=cython.longlong,
+@cython.locals(paced=cython.bint, counted=cython.bint, lateness=Histogram, busy=Histogram, period_ns=cython.longlong, spin_ns=cython.longlong,
                before=cython.longlong, now=cython.longlong, deadline=cython.longlong, slept=cython.longlong,
                slept_before=cython.longlong, gap_ns=cython.longlong, late_ns=cython.longlong, skipped=cython.longlong,
                lateness_us=cython.double)

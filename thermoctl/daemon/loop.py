@@ -157,6 +157,7 @@ def run_loop(
     """Tick until `stopping()`; the caller has opened the back end and disables the amplifier afterwards."""
     period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
     paced = settings.loop.pace == "device"
+    counted = settings.loop.pace == "tick"
     if paced:
         rig.backend.check_pacing()
     shared.counters[START_S], shared.counters[LOOP_PID] = rig.start_s, os.getpid()
@@ -180,7 +181,10 @@ def run_loop(
             slept = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
             gap_ns = slept - slept_before if slept - slept_before > _SUSPEND_NS else 0
             slept_before = slept
-        rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)
+        if counted:  # a late tick is one period like any other: the rig's time stands while the machine does
+            rig.tick(rig.start_s + (rig.law.tick + 1) * rig.law.period_s, rig.law.period_s, lateness_us)
+        else:
+            rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)
         if rig.law.tick > warm_up_ticks:
             lateness.add(lateness_us)
             busy.add(rig.busy_us)

@@ -1,10 +1,13 @@
-"""start, stop, restart: through systemd where the unit is installed, else in the background with a pid file; and the
-unit's installation."""
+"""start, stop, restart of the rig that a configuration describes, known by its lock and socket; and the systemd units.
+
+A daemon is found the same way whether `thermoctl run`, `thermoctl start` or systemd started it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -13,106 +16,174 @@ import time
 from pathlib import Path
 from typing import Any
 
+from thermoctl.daemon.lock import holder
+from thermoctl.daemon.loop import die_with_parent
 from thermoctl.daemon.socket import ask, settled
+from thermoctl.settings import load_settings
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 
-UNIT = "thermoctl.service"
-START_S, STOP_S = 60.0, 10.0
+START_S = 90.0  # as TimeoutStartSec= of the unit: devices connect before the first tick
+STOP_S = 30.0  # the supervisor gives its processes 3 and 10 s before it kills them
 SOURCE = shipped("systemd")
-FILES = {  # what `service install` puts where
-    "thermoctl.service": "/etc/systemd/system/thermoctl.service",
-    "thermoctl.sysusers": "/etc/sysusers.d/thermoctl.conf",
-    "thermoctl.tmpfiles": "/etc/tmpfiles.d/thermoctl.conf",
-    "99-thermoctl.rules": "/etc/udev/rules.d/99-thermoctl.rules",
+UNITS = "etc/systemd/system"
+FIRST = "thermoctl.service"  # the unit of the first rig; further ones are thermoctl-RIG.service
+SHARED = {  # what every unit needs
+    "thermoctl.sysusers": "etc/sysusers.d/thermoctl.conf",
+    "thermoctl.tmpfiles": "etc/tmpfiles.d/thermoctl.conf",
+    "99-thermoctl.rules": "etc/udev/rules.d/99-thermoctl.rules",
 }
-
-
-def _systemd(root: str = "/") -> bool:
-    return Path("/run/systemd/system").is_dir() and Path(root, FILES[UNIT].lstrip("/")).exists()
+LIVE = Path("/run/systemd/system")  # there where systemd runs the machine
 
 
 def _systemctl(*arguments: str) -> int:
-    return subprocess.run(["systemctl", *arguments], check=False).returncode
+    return 3 if subprocess.run(["systemctl", *arguments], check=False).returncode else 0
 
 
-def pid_file(settings: Any) -> Path:
-    """Where the pid of a daemon in the background stands."""
-    return Path(settings.socket.path).with_suffix(".pid")
+def units(root: Path = Path("/")) -> dict[str, Path]:
+    """The installed units below `root`, each with the configuration that it runs."""
+    found = {}
+    for path in sorted((root / UNITS).glob("thermoctl*.service")):
+        if config := re.search(r"^ExecStart=.* --config (.+)$", path.read_text(), re.MULTILINE):
+            found[path.name] = Path(config[1]).resolve()
+    return found
 
 
-def _running(settings: Any) -> int | None:
-    """The pid of the daemon that the pid file names, when it is alive and ours."""
-    try:
-        pid = int(pid_file(settings).read_text())
-        line = Path(f"/proc/{pid}/cmdline").read_bytes()
-    except (OSError, ValueError):
+def _unit_for(settings: Any) -> str | None:
+    """The installed unit that runs this very configuration."""
+    if not LIVE.is_dir():
         return None
-    return pid if b"thermoctl" in line else None
+    config = Path(settings.path).resolve()
+    return next((name for name, runs in units().items() if runs == config), None)
+
+
+def _unit_of(pid: int) -> str | None:
+    """The unit that systemd started this process in, when it is one of ours."""
+    try:
+        groups = Path(f"/proc/{pid}/cgroup").read_text()
+    except OSError:
+        return None
+    found = re.search(r"/(thermoctl[^/\n]*\.service)$", groups, re.MULTILINE)
+    return found[1] if found else None
 
 
 def start(settings: Any) -> int:
-    """Start the daemon and wait until it has warmed up and takes commands; 0, or 3 with the end of its log."""
-    if _systemd():
-        return 3 if _systemctl("start", UNIT) else 0
-    if _running(settings):
-        print("already running")
+    """Start the daemon, by its unit where one runs this configuration, and wait until it takes commands.
+
+    Returns 0, or 3 with the daemon's own error."""
+    if (pid := holder(settings)) is not None:
+        print(f"already running (pid {pid}, {_state(settings)})")
         return 0
-    pid_file(settings).parent.mkdir(parents=True, exist_ok=True)
-    log = Path(settings.socket.path).with_suffix(".log")
-    with log.open("ab") as out:
-        begin = out.tell()
-        process = subprocess.Popen(
-            [sys.executable, "-m", "thermoctl.cli", "run", "--config", str(Path(settings.path).absolute())],
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=out,
-            start_new_session=True,
-        )
-    pid_file(settings).write_text(f"{process.pid}\n")
+    unit = _unit_for(settings)
+    process = None if unit else Background(settings)
+    if unit and _systemctl("start", unit):
+        print(f"thermoctl: {unit} did not start; its log: journalctl -u {unit}", file=sys.stderr)
+        return 3
+    log = f"journalctl -u {unit}" if unit else str(log_path(settings))
     deadline = time.monotonic() + START_S
-    while time.monotonic() < deadline and process.poll() is None:
+    while time.monotonic() < deadline and (process is None or process.poll() is None):
+        pid = holder(settings)
         with contextlib.suppress(InputError):
-            if settled(ask(settings.socket.path, {"command": "status"})):
-                print(f"started (pid {process.pid}, log {log})")
+            now = ask(settings.socket.path, {"command": "status"})
+            if settled(now) and pid is not None and (process is None or pid == process.pid):
+                print(f"started (pid {pid}, {now['state']}, log {log})")
                 return 0
         time.sleep(0.1)
-    pid_file(settings).unlink(missing_ok=True)
-    with log.open("rb") as lines:
-        lines.seek(begin)
-        sys.stderr.write(lines.read().decode(errors="replace"))
-    if process.poll() is None:
-        process.terminate()
-        process.wait(STOP_S)
-    print(f"thermoctl: the daemon did not start within {START_S:g} s; its log is {log}", file=sys.stderr)
+    if process is not None:
+        if process.poll() is None:
+            process.terminate()
+            process.wait(STOP_S)
+        sys.stderr.write(process.said())
+    print(f"thermoctl: the daemon did not start; its log: {log}", file=sys.stderr)
     return 3
 
 
+def _state(settings: Any) -> str:
+    """The state of whoever holds the rig, for a message."""
+    try:
+        return ask(settings.socket.path, {"command": "status"})["state"]
+    except InputError:
+        return "it does not answer"
+
+
 def stop(settings: Any) -> int:
-    """Stop it and wait until it is gone; 0 also when none runs."""
-    if _systemd():
-        return 3 if _systemctl("stop", UNIT) else 0
-    pid = _running(settings)
+    """Disarm and stop whoever holds the rig, and wait until it is gone; 0 also when nobody does.
+
+    Never asks: it is the safe direction. A rig that another configuration describes is not touched."""
+    pid = holder(settings)
     if pid is None:
         print("not running")
         return 0
-    os.kill(pid, signal.SIGTERM)
-    deadline = time.monotonic() + STOP_S
-    while _running(settings) == pid:
-        if time.monotonic() > deadline:
-            print(f"thermoctl: pid {pid} does not stop within {STOP_S:g} s", file=sys.stderr)
+    with contextlib.suppress(
+        InputError
+    ):  # what does not answer is ended all the same; its end disables the amplifier
+        ask(settings.socket.path, {"command": "disarm"})
+    unit = _unit_of(pid)
+    if unit:
+        if _systemctl("stop", unit):
             return 3
-        with contextlib.suppress(ChildProcessError):
-            os.waitpid(pid, os.WNOHANG)
+    else:
+        try:
+            os.kill(pid, signal.SIGTERM)
+        except ProcessLookupError:
+            pass  # it ends already
+        except PermissionError:
+            print(f"thermoctl: pid {pid} is another user's: stop it as that user or root", file=sys.stderr)
+            return 3
+    deadline = time.monotonic() + STOP_S
+    while holder(settings) == pid:
+        if time.monotonic() > deadline:
+            print(f"thermoctl: pid {pid} does not end within {STOP_S:g} s", file=sys.stderr)
+            return 3
         time.sleep(0.05)
-    pid_file(settings).unlink(missing_ok=True)
-    print("stopped")
+    print(f"stopped (pid {pid})")
     return 0
 
 
 def restart(settings: Any) -> int:
     """Stop, then start."""
     return stop(settings) or start(settings)
+
+
+def log_path(settings: Any) -> Path:
+    """Where a daemon that `start` put in the background writes its log: beside its socket."""
+    return Path(settings.socket.path).with_suffix(".log")
+
+
+class Background(subprocess.Popen):
+    """`thermoctl run` on a configuration, its log appended to `log_path`; `began` is where in it this run begins.
+
+    dies_with_us: it is asked to stop when this process ends, however that ends."""
+
+    def __init__(self, settings: Any, dies_with_us: bool = False):
+        log = log_path(settings)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("ab") as out:
+            self.began = out.tell()
+            super().__init__(
+                # -P: a folder here that is called thermoctl is not taken for the installed package
+                [
+                    sys.executable,
+                    "-P",
+                    "-m",
+                    "thermoctl.cli",
+                    "run",
+                    "--config",
+                    str(Path(settings.path).absolute()),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=out,
+                start_new_session=True,
+                preexec_fn=die_with_parent if dies_with_us else None,
+            )
+        self.log = log
+
+    def said(self) -> str:
+        """What it wrote into its log."""
+        with self.log.open("rb") as lines:
+            lines.seek(self.began)
+            return lines.read().decode(errors="replace")
 
 
 def _program() -> Path:
@@ -125,42 +196,80 @@ def _program() -> Path:
     )
 
 
-def install(config: Path, root: Path = Path("/"), prefix: Path | None = None) -> int:
-    """Install unit, user, run directory and device rules under `root`, with this installation's program in the unit.
+def install(config: Path, root: Path = Path("/")) -> int:
+    """Install the unit of this configuration under `root`, with user, run directory and device rules.
 
-    Tells systemd about it when `root` is the running system. Raises InputError where a file cannot be written.
+    The first rig's unit is thermoctl.service, a further one's thermoctl-RIG.service; no other rig's unit is changed.
+    systemd is informed where `root` is the running system. Raises InputError where a file cannot be written or two rigs collide.
     """
-    program = prefix or _program()
+    settings = load_settings(config)
+    config = config.resolve()
+    unit = _unit_name(settings, config, root)
+    text = (SOURCE / FIRST).read_text().replace("@PROGRAM@", str(_program())).replace("@CONFIG@", str(config))
+    files = {f"{UNITS}/{unit}": text} | {
+        target: (SOURCE / name).read_text() for name, target in SHARED.items()
+    }
     try:
-        for name, target in FILES.items():
-            text = (SOURCE / name).read_text()
-            text = text.replace("@PROGRAM@", str(program)).replace("@CONFIG@", str(config.absolute()))
-            path = root / target.lstrip("/")
+        for target, content in files.items():
+            path = root / target
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text)
+            path.write_text(content)
             print(f"wrote {path}")
     except OSError as e:
         raise InputError(f"{e.filename}: cannot be written: {e.strerror}; run it as root") from None
-    if root == Path("/") and Path("/run/systemd/system").is_dir():
+    if root == Path("/") and LIVE.is_dir():
         for command in (
             ["systemd-sysusers"],
-            ["systemd-tmpfiles", "--create", FILES["thermoctl.tmpfiles"]],
+            ["systemd-tmpfiles", "--create", "/" + SHARED["thermoctl.tmpfiles"]],
             ["udevadm", "control", "--reload"],
             ["systemctl", "daemon-reload"],
         ):
             if shutil.which(command[0]):
                 subprocess.run(command, check=False)
-        print("`systemctl enable --now thermoctl` starts it now and at every boot")
+        print(f"`systemctl enable --now {unit}` starts rig '{settings.rig.name}' now and at every boot")
     return 0
 
 
-def uninstall(root: Path = Path("/")) -> int:
-    """Stop the unit and remove what `install` wrote; user and recordings stay."""
-    live = root == Path("/") and Path("/run/systemd/system").is_dir()
-    if live and _systemd():
-        _systemctl("disable", "--now", UNIT)
-    for target in FILES.values():
-        path = root / target.lstrip("/")
+def _unit_name(settings: Any, config: Path, root: Path) -> str:
+    """The unit for this configuration: the one that runs it already, else a free name. Raises InputError for a collision."""
+    installed = units(root)
+    for name, other in installed.items():
+        if other == config:
+            return name
+        if _socket_of(other) == settings.socket.path:
+            raise InputError(
+                f"{config}: socket.path {settings.socket.path} is also that of {other}, which {name} runs; give this rig its own"
+            )
+    name = "thermoctl-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", settings.rig.name) + ".service"
+    if name in installed:
+        raise InputError(f"{config}: rig.name '{settings.rig.name}': {name} runs {installed[name]} already")
+    return name if FIRST in installed else FIRST
+
+
+def _socket_of(config: Path) -> str | None:
+    try:
+        return load_settings(config).socket.path
+    except InputError:  # gone or broken: it collides with nothing
+        return None
+
+
+def uninstall(config: Path | None, root: Path = Path("/")) -> int:
+    """Stop and remove the unit of this configuration (None: the only one); with the last one what all of them share.
+
+    User and recordings stay. Returns 1 where no such unit is installed."""
+    installed = units(root)
+    chosen = [n for n, runs in installed.items() if config is None or runs == config.resolve()]
+    if len(chosen) != 1:
+        there = ", ".join(f"{n} ({c})" for n, c in installed.items()) or "none"
+        print(
+            f"thermoctl: which unit? Installed: {there}; name its configuration by --config", file=sys.stderr
+        )
+        return 1
+    live = root == Path("/") and LIVE.is_dir()
+    if live:
+        _systemctl("disable", "--now", chosen[0])
+    for target in (f"{UNITS}/{chosen[0]}", *(SHARED.values() if len(installed) == 1 else ())):
+        path = root / target
         try:
             path.unlink()
             print(f"removed {path}")

@@ -16,7 +16,6 @@ as if it had ended.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import multiprocessing
 import os
 import signal
@@ -37,6 +36,7 @@ from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep
 from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
+from thermoctl.daemon.lock import hold
 from thermoctl.daemon.shared import BEATS, LOOP_PID, RESUMED, WARNINGS, Shared
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
@@ -329,7 +329,7 @@ def run(settings: Any, log: Log = console_log) -> int:
             "warning",
             what="the law runs interpreted, not compiled: far too slow for a rig; run `make install`",
         )
-    lock = _only_one(settings)
+    lock = hold(settings)
     compensator(settings)
     law_parameters(settings)
     if settings.compensation.tune:  # loaded only then: it brings scipy with it
@@ -384,21 +384,6 @@ def run(settings: Any, log: Log = console_log) -> int:
         if board is not None:
             board.close()
         os.close(lock)
-
-
-def _only_one(settings: Any) -> int:
-    path = Path(settings.socket.path).with_suffix(".lock")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise InputError(
-            f"{path}: another daemon runs on this socket; stop it first (thermoctl stop)"
-        ) from None
-    except OSError as e:
-        raise InputError(f"{path}: cannot be made: {e.strerror}; check socket.path") from None
-    return lock
 
 
 def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child], log: Log) -> int:

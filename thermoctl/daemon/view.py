@@ -1,99 +1,318 @@
-"""`demo`: a daemon of its own, armed and moving, with the monitor's view in front of it."""
+"""`demo`: a simulated rig of its own, armed and moving, with the monitor's view in front of it.
+
+The demo drives nothing but its own child: its configuration, socket, lock, log and recordings stand in a folder of their
+own beside the rig's socket, and before it arms, moves or disarms it checks that its child holds the lock.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import select
 import signal
-import subprocess
 import sys
+import termios
+import threading
 import time
+import tty
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+import numpy as np
+from rich.console import Console, Group
 from rich.live import Live
+from rich.text import Text
 
+from thermoctl.daemon.dashboard import make_server, url
+from thermoctl.daemon.lock import holder
 from thermoctl.daemon.monitor import errors, ramp_of, remember, screen
+from thermoctl.daemon.service import START_S, STOP_S, Background
 from thermoctl.daemon.socket import ask
+from thermoctl.daemon.watch import Watch
+from thermoctl.settings import effective, load_settings
 from thermoctl.yamlfile import InputError
 
-START_S = 60.0
-STROKE_UM, HALF_CYCLE_S = 40.0, 8.0  # quick enough to watch; the limiter gives the trapezoids
+MOTION, CYCLE_S = ((0.0, 240.0), (70.0, 200.0)), 90.0
+"""(s in the cycle, setpoint um). 240 um take 0.78 A, 2.9 W: the shaft grows by 2 um in a minute."""
+MEAN_S = 2.0  # the sentence says means over this: a single reading has 0.01 um of noise
+SHOWN_UM = 0.2  # growth from which on the sentence compares; below, noise would decide
+STALL_S = 10.0  # a machine that stands for less than this does not end the demo
+DASHBOARD = "127.0.0.1:8765"
 
 
 def demo(settings: Any, seconds: float | None = None) -> int:
-    """Start the daemon, arm, move in trapezoids and show it until Ctrl-C or for `seconds`. Without a terminal: a line a
-    second. Returns 1 when a fault stands at the end, or the daemon's own exit status."""
-    console = Console()
-    log_path = Path(settings.socket.path).with_suffix(".log")
-    log_path.parent.mkdir(parents=True, exist_ok=True)
-    with log_path.open("wb") as log:
-        daemon = subprocess.Popen(
-            [sys.executable, "-m", "thermoctl.cli", "run", "--config", settings.path],
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
+    """Start a daemon of its own, arm, move and show it until Ctrl-C or for `seconds`.
+
+    Returns 1 when a fault stands at the end, 3 when the daemon did not start. Raises InputError for a rig that is not simulated
+    and while another demo runs here."""
+    if settings.hal.backend != "simulated":
+        raise InputError(
+            f"{settings.path}: demo moves a simulated rig only, and this one's back end is '{settings.hal.backend}'; "
+            "for it: `thermoctl run` or `start`, then `thermoctl arm`; for the demo: --config config/simulated.yaml"
         )
-    signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
-    faulty = False
+    own = _own(settings)
+    with _stopped_by_signals():
+        show = _Demo(own, Console())
+        try:
+            return show.run(seconds)
+        except KeyboardInterrupt:
+            return 0
+        finally:
+            _ignore_signals()
+            show.close()
+
+
+def demo_folder(settings: Any) -> Path:
+    """Where the demo of this configuration keeps what it writes: beside the rig's socket."""
+    return Path(settings.socket.path).parent / "demo"
+
+
+def _own(settings: Any) -> Any:
+    """The configuration of the demo, written into its folder: the rig of `settings` with all else of its own.
+
+    Its time counts ticks, so that a machine that stalls slows the rig down instead of faulting it."""
+    folder, beside = demo_folder(settings), Path(settings.path).absolute().parent
+    folder.mkdir(parents=True, exist_ok=True)
+    hal = settings.hal
+    own = dataclasses.replace(
+        settings,
+        loop=dataclasses.replace(settings.loop, pace="tick"),
+        protection=dataclasses.replace(settings.protection, late_s=STALL_S),
+        hal=dataclasses.replace(
+            hal, plant=str(beside / hal.plant), truth=str(beside / hal.truth) if hal.truth else ""
+        ),
+        recording=dataclasses.replace(settings.recording, directory=str(folder / "recordings")),
+        socket=dataclasses.replace(settings.socket, path=str(folder / "rig.sock")),
+    )
+    if (pid := holder(own)) is not None:
+        raise InputError(f"{folder}: another demo runs here (pid {pid}); stop it first")
+    (folder / "rig.state").unlink(missing_ok=True)  # the simulated rig starts cold
+    path = folder / "rig.yaml"
+    path.write_text(f"# Written by `thermoctl demo` from {settings.path}.\n{effective(own)}")
+    return load_settings(path)
+
+
+@contextlib.contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP end the demo as Ctrl-C does."""
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {n: signal.signal(n, interrupt) for n in numbers}
     try:
-        if not _wait_for_ready(settings, daemon):
-            sys.stderr.write(log_path.read_text(errors="replace"))
-            return daemon.poll() or 3
-        answer = ask(settings.socket.path, {"command": "arm"})
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _ignore_signals() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the way out is not interrupted
+
+
+class _Demo:
+    """The daemon of `settings` as a child, and what the terminal shows of it."""
+
+    def __init__(self, settings: Any, console: Console):
+        self.settings, self.console = settings, console
+        self.child = Background(settings, dies_with_us=True)
+        self.page = ""
+        self.growth = Growth()
+        self.slips: deque[tuple[float, int]] = deque()
+        self.faulty = False
+
+    def ask(self, command: str, **more: Any) -> dict[str, Any]:
+        """A request to our own child. Raises InputError where it does not hold the lock."""
+        if holder(self.settings) != self.child.pid:
+            raise InputError(f"{self.settings.socket.path}: the demo's daemon does not run")
+        return ask(self.settings.socket.path, {"command": command, **more})
+
+    def run(self, seconds: float | None) -> int:
+        if not self._ready():
+            sys.stderr.write(self.child.said())
+            return 3
+        answer = self.ask("arm")
         if not answer["ok"]:
             raise InputError(answer["error"])
-        faulty = _show(settings, console, daemon, seconds)
-    except KeyboardInterrupt:
-        pass
-    finally:
+        with self._dashboard():
+            self._show(seconds)
+        return int(self.faulty or self.child.poll() is not None)
+
+    def close(self) -> None:
+        """Disarm and end the child; say what came of it."""
         with contextlib.suppress(InputError):
-            ask(settings.socket.path, {"command": "disarm"})
-        daemon.terminate()
-        code = daemon.wait(15)
-    console.print(f"stopped; the amplifier is disabled. Log: {log_path}")
-    return 1 if faulty else code
+            self.ask("disarm")
+        self.child.terminate()
+        self.child.wait(STOP_S)
+        say = self.console.print
+        say(self.growth.sentence(), highlight=False)
+        folder = Path(self.settings.path).parent
+        say(
+            f"Stopped; the amplifier is disabled. Recording: {folder}/recordings, log: {self.child.log}",
+            highlight=False,
+        )
+        say(
+            "Next: `thermoctl start`, `arm`, `setpoint 100` and `dashboard` do the same by hand.",
+            highlight=False,
+        )
 
+    def _ready(self) -> bool:
+        deadline = time.monotonic() + START_S
+        while time.monotonic() < deadline and self.child.poll() is None:
+            with contextlib.suppress(InputError):
+                if self.ask("status")["state"] == "READY":
+                    return True
+            time.sleep(0.1)
+        return False
 
-def _wait_for_ready(settings: Any, daemon: subprocess.Popen) -> bool:
-    deadline = time.monotonic() + START_S
-    while time.monotonic() < deadline and daemon.poll() is None:
-        with contextlib.suppress(InputError):
-            if ask(settings.socket.path, {"command": "status"})["state"] == "READY":
-                return True
-        time.sleep(0.1)
-    return False
+    @contextlib.contextmanager
+    def _dashboard(self) -> Iterator[None]:
+        """Serve the page on DASHBOARD, or on a free port where that is taken."""
+        watch = Watch(self.settings)
+        try:
+            server = make_server(self.settings, DASHBOARD, watch)
+        except InputError:
+            server = make_server(self.settings, "127.0.0.1:0", watch)
+        for work in (watch.run, server.serve_forever):
+            threading.Thread(target=work, daemon=True).start()
+        self.page = url(server)
+        try:
+            yield
+        finally:
+            watch.stop()
+            server.shutdown()
+            server.server_close()
 
-
-def _show(settings: Any, console: Console, daemon: subprocess.Popen, seconds: float | None) -> bool:
-    """The view until it is time; whether a fault stood at the end."""
-    begin, turn = time.monotonic(), 0
-    trails: dict[str, deque[float]] = {}
-    interval_s = 0.25 if console.is_terminal else 1.0
-    faulty = False
-    with contextlib.ExitStack() as stack:
-        live = stack.enter_context(Live(console=console, auto_refresh=False)) if console.is_terminal else None
-        while daemon.poll() is None and (seconds is None or time.monotonic() - begin < seconds):
-            status = ask(settings.socket.path, {"command": "status"})
-            faulty = any(f["severity"] != "warning" for f in status["faults"])
-            if status["state"] == "ARMED" and time.monotonic() - begin >= turn * HALF_CYCLE_S:
-                ask(
-                    settings.socket.path,
-                    {"command": "setpoint", "value": STROKE_UM if turn % 2 == 0 else -STROKE_UM},
-                )
-                turn += 1
-            remember(trails, status)
-            if live is not None:
-                latency = ask(settings.socket.path, {"command": "latency"})
-                live.update(screen(status, latency, trails, console.width, ramp_of(console)), refresh=True)
+    def _show(self, seconds: float | None) -> None:
+        begin, moved = time.monotonic(), -1.0
+        trails: dict[str, deque[float]] = {}
+        interval_s = 0.25 if self.console.is_terminal else 1.0
+        origin_s = self.ask("status")["uptime_s"]
+        with contextlib.ExitStack() as stack:
+            live = None
+            if self.console.is_terminal:
+                stack.enter_context(_keys())
+                live = stack.enter_context(Live(console=self.console, auto_refresh=False))
             else:
-                with_, without = errors(status)
-                error = "-" if with_ is None else f"{with_:+.3f} um (without compensation {without:+.3f} um)"
-                print(
-                    f"{status['state']} tick {status['ticks']} setpoint {status['setpoint_um']:.1f} um, error {error}"
-                    f", coil {status['temperatures_c']['coil']:.2f} C, {status['slips']} slips",
-                    flush=True,
+                print(f"dashboard {self.page}", flush=True)
+            while self.child.poll() is None and (seconds is None or time.monotonic() - begin < seconds):
+                status = self.ask("status")
+                self.faulty = any(f["severity"] != "warning" for f in status["faults"])
+                at_s = status["uptime_s"] - origin_s
+                if status["state"] == "ARMED" and (due := corner(at_s))[0] > moved:
+                    self.ask("setpoint", value=due[1])
+                    moved = due[0]
+                self.growth.add(status)
+                remember(trails, status)
+                if live is None:
+                    print(self._line(status), flush=True)
+                    time.sleep(interval_s)
+                    continue
+                latency = self.ask("latency")
+                view = screen(status, latency, trails, self.console.width, ramp_of(self.console))
+                live.update(Group(*self._head(status), view), refresh=True)
+                key = _key(interval_s)
+                if key == "q":
+                    return
+                if key == "a" and status["state"] == "FAULT":
+                    self.ask("disarm")
+                    moved = -1.0 if self.ask("arm")["ok"] else moved
+
+    def _head(self, status: dict[str, Any]) -> list[Text]:
+        """Above the monitor's screen: the sentence, the page; then late ticks, and what to do about a fault."""
+        lines = [
+            Text(self.growth.sentence(), "bold"),
+            Text(f"dashboard {self.page}   q or Ctrl-C stops", "dim"),
+        ]
+        now = time.monotonic()
+        self.slips.append((now, status["slips"]))
+        while now - self.slips[0][0] > 1.0:
+            self.slips.popleft()
+        late = status["slips"] - self.slips[0][1]
+        if late > 50:
+            lines.append(
+                Text(
+                    f"this machine was late: {late} ticks skipped in the last second, the rig's time stood",
+                    "yellow",
                 )
-            time.sleep(interval_s)
-    return faulty
+            )
+        if status["state"] == "FAULT":
+            first = status["faults"][0]
+            lines.append(Text(f"{first['name']}: {first['meaning']} -> {first['remedy']}", "red"))
+            lines.append(Text("press a to acknowledge the fault and arm again, q to stop", "bold red"))
+        lines.append(Text())
+        return lines
+
+    def _line(self, status: dict[str, Any]) -> str:
+        with_, without = errors(status)
+        error = "-" if with_ is None else f"{with_:+.3f} um (without compensation {without:+.3f} um)"
+        line = (
+            f"{status['state']} tick {status['ticks']} setpoint {status['setpoint_um']:.1f} um, error {error}"
+            f", coil {status['temperatures_c']['coil']:.2f} C, {status['slips']} slips"
+        )
+        if status["state"] == "FAULT":
+            names = ", ".join(f["name"] for f in status["faults"])
+            line += f"; {names}: `thermoctl disarm --config {self.settings.path}` acknowledges, `arm` goes on"
+        return line
+
+
+def corner(at_s: float) -> tuple[float, float]:
+    """The newest (s, setpoint um) of the motion, `at_s` after arming."""
+    cycles, within = divmod(at_s, CYCLE_S)
+    t, value = max(c for c in MOTION if c[0] <= within)
+    return t + cycles * CYCLE_S, value
+
+
+class Growth:
+    """How far the shaft has grown and what compensation leaves of it: means over the newest MEAN_S."""
+
+    def __init__(self) -> None:
+        self.values: deque[tuple[float, float, float]] = deque()
+
+    def add(self, status: dict[str, Any]) -> None:
+        """Take a status; nothing while the reference moves."""
+        with_, without = errors(status)
+        if with_ is None or without is None or status["reference_um"] != status["setpoint_um"]:
+            return
+        now_s = status["uptime_s"]
+        self.values.append((now_s, with_, without))
+        while now_s - self.values[0][0] > MEAN_S:
+            self.values.popleft()
+
+    def sentence(self) -> str:
+        """What it says in one sentence."""
+        if not self.values:
+            return f"Moving to {MOTION[0][1]:g} um; holding it takes 3 W, which warm the coil and lengthen the shaft."
+        left, grown = (abs(float(v)) for v in np.mean(np.array(self.values)[:, 1:], axis=0))
+        if grown < SHOWN_UM:
+            return f"The shaft has grown {grown:.2f} um so far: in a minute it will be about 2 um."
+        times = f": {grown / max(left, 0.005):.0f} times less" if left < grown / 2 else ""
+        return f"The shaft has grown {grown:.1f} um; compensation leaves {left:.2f} um{times}."
+
+
+@contextlib.contextmanager
+def _keys() -> Iterator[None]:
+    """Keys come one by one and unseen, where the terminal can do that."""
+    if not sys.stdin.isatty():
+        yield
+        return
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _key(wait_s: float) -> str:
+    """The key that was pressed within `wait_s`, or ''."""
+    if not sys.stdin.isatty():
+        time.sleep(wait_s)
+        return ""
+    ready, _, _ = select.select([sys.stdin], [], [], wait_s)
+    return sys.stdin.read(1) if ready else ""

@@ -1,0 +1,76 @@
+"""Who holds a rig: one lock beside its socket, held by whatever drives it (the daemon, or a command that drives by itself).
+
+The lock ends with its last holder, however that ends; the file holds the holder's process id.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from thermoctl.yamlfile import InputError
+
+PROBE_S = 0.2  # a command that only looks (`holder`) has the lock for less than this
+
+
+def lock_path(settings: Any) -> Path:
+    """Return the lock's file, beside the rig's socket."""
+    return Path(settings.socket.path).with_suffix(".lock")
+
+
+def hold(settings: Any) -> int:
+    """Take the rig's lock; returns the open file that keeps it. Raises InputError where another process holds the rig."""
+    path = lock_path(settings)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as e:
+        raise InputError(f"{path}: cannot be made: {e.strerror}; check socket.path") from None
+    deadline = time.monotonic() + PROBE_S
+    while not _locked(file, fcntl.LOCK_EX):
+        if time.monotonic() > deadline:
+            pid = _written(file)
+            os.close(file)
+            raise InputError(
+                f"{path}: another daemon runs on this socket (pid {pid}) and holds the rig; "
+                "look with `thermoctl status`, stop it with `thermoctl stop`"
+            )
+        time.sleep(0.01)
+    os.ftruncate(file, 0)
+    os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
+    return file
+
+
+def holder(settings: Any) -> int | None:
+    """Return the process id that holds the rig, None where nobody does. Raises InputError where this user may not look."""
+    path = lock_path(settings)
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except PermissionError:
+        raise InputError(f"{path}: not allowed; the rig is for its group (see socket.group)") from None
+    try:
+        while not _locked(file, fcntl.LOCK_SH):
+            if pid := _written(file):
+                return pid
+            time.sleep(0.01)  # locked a moment ago, not yet written
+        return None
+    finally:
+        os.close(file)
+
+
+def _locked(file: int, kind: int) -> bool:
+    try:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _written(file: int) -> int:
+    text = os.pread(file, 32, 0).strip()
+    return int(text) if text.isdigit() else 0
