@@ -20,14 +20,13 @@ FALLBACKS = ("config/simulated.yaml", "/etc/thermoctl/rig.yaml")
 class Act:
     """What a command may do to a rig; one row of docs/reference/commands-that-act.md.
 
-    beside: what it does where another process holds the rig; touches: whether it then may change that process' rig at all."""
+    question: what it asks before; beside: what it does where another process holds the rig."""
 
     command: str
     does: str
     question: str
     beside: str
     status: str
-    touches: bool = False
 
 
 _OWN = "none: the command is the person's own act"
@@ -61,16 +60,14 @@ ACTS = (
         "none: it is the safe direction",
         "stops it: its purpose; never the rig of another configuration",
         "0, also where nobody holds the rig; 3 it does not end",
-        True,
     ),
-    Act("restart", "stop, then start", "none", "as stop, then start", "as stop, then start", True),
+    Act("restart", "stop, then start", "none", "as stop, then start", "as stop, then start"),
     Act(
         "arm",
         "enables the amplifier and holds the measured position",
         _OWN,
         "its purpose; refused in FAULT",
         "1 refused; 2 no daemon",
-        True,
     ),
     Act(
         "disarm",
@@ -78,7 +75,6 @@ ACTS = (
         "none: it is the safe direction",
         "its purpose",
         "1 a fault still stands; 2 no daemon",
-        True,
     ),
     Act(
         "setpoint",
@@ -86,7 +82,6 @@ ACTS = (
         _OWN,
         "its purpose; refused unless ARMED",
         "1 refused; 2 no daemon or no number",
-        True,
     ),
     Act(
         "reload",
@@ -94,7 +89,6 @@ ACTS = (
         _OWN,
         "its purpose",
         "1 the file is not valid; 2 no daemon",
-        True,
     ),
     Act(
         "tune", "moves the stage by short setpoint ramps", _MOVES, _THROUGH, "0; 2 no `go`; 3 the rig refuses"
@@ -126,7 +120,6 @@ ACTS = (
         "the token, and a question on the page before arming",
         "its purpose",
         "2 the address is taken",
-        True,
     ),
     Act(
         "virtual-rig",
