@@ -11,12 +11,16 @@ listed = $(BIN)/python -c "import tomllib; p = tomllib.load(open('pyproject.toml
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run help rig-hour bench-law test lint format install develop clean reproduce bench-identification test-identification prove
+.PHONY: run help first-minute rig-hour bench-law test lint format install develop clean reproduce bench-identification test-identification prove
 run: install                       # the closed loop on the simulated rig with a live view; Ctrl-C stops safely
 	$(BIN)/thermoctl demo --config config/simulated.yaml
 
 help:                              # this list
 	@grep -hE '^[a-z-]+:.*#' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*# */\1\t/' | sort | awk -F'\t' '{printf "  make %-22s %s\n", $$1, $$2}'
+
+RUNS ?= 5
+first-minute: install              # errors with and without compensation at 20, 60 and 120 s of RUNS demos, from their own recordings
+	$(BIN)/python tests/first_minute.py $(RUNS)
 
 rig-hour: install                  # an hour of rig time in the paper's trapezoids, compensation on and off, judged by the reference encoder
 	$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1

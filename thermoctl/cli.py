@@ -170,7 +170,12 @@ def _virtual_rig(config: str, line: str) -> int:
     from hal.virtual.rig import main
     from thermoctl.settings import load_settings
 
-    return main(load_settings(config), line)
+    settings = load_settings(config)
+    if settings.hal.backend != "devices":
+        raise InputError(
+            f"{config}: no devices to play: hal.backend is '{settings.hal.backend}'; give --config config/wire.yaml"
+        )
+    return main(settings, line)
 
 
 def _daemon_commands(sub: argparse._SubParsersAction) -> None:

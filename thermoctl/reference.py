@@ -1,6 +1,6 @@
 """The reference pages in docs/, written from the tables in the code: `python -m thermoctl.reference [--check]`.
 
-docs/reference/{configuration,signals,faults,effects,cli}.md and docs/faults/NAME.md. With --check nothing is written;
+docs/reference/{configuration,signals,faults,effects,cli,commands-that-act}.md and docs/faults/NAME.md. With --check nothing is written;
 exit status 1 says which page is stale.
 """
 
@@ -18,6 +18,7 @@ from thermoctl.control.faults import FAULTS, Fault
 from thermoctl.diagnose.effects import catalogue
 from thermoctl.settings import SECTIONS, options
 from thermoctl.signals import SIGNALS
+from thermoctl.which_rig import ACTS
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 _HEAD = "<!-- Written by `python -m thermoctl.reference`; change the table in the code, not this page. -->\n"
@@ -112,6 +113,24 @@ def faults() -> str:
     )
 
 
+def commands_that_act() -> str:
+    """Every command that can move, arm, disarm or stop a rig."""
+    return (
+        _HEAD + "# Commands that act on a rig\n\nEvery command that can move, arm, disarm or stop a rig.\n\n"
+        "**Which rig.** `--config FILE`, else `$THERMOCTL_CONFIG`, else `config/simulated.yaml` in the current folder, else "
+        "`/etc/thermoctl/rig.yaml`. A command below prints the file that it chose by itself, on stderr. Whoever drives a rig holds the "
+        "lock beside its socket; a command finds the daemon there, whether `thermoctl run`, `thermoctl start` or systemd started it.\n\n"
+        "**Which question.** Stopping and disarming never ask. `arm` and `setpoint` are a person's own act. A command that decides "
+        "by itself how the rig moves says so and asks first.\n\n"
+        + _table(
+            ("command", "what it does", "question", "where another process holds the rig", "exit status"),
+            ((f"`{a.command}`", a.does, a.question, a.beside, a.status) for a in ACTS),
+        )
+        + "\nOtherwise 0; 2 is unusable input, 3 the hardware or the system refused, 130 interrupted "
+        "([all commands](cli.md)).\n"
+    )
+
+
 def fault(f: Fault) -> str:
     """The page of one fault."""
     return (
@@ -172,8 +191,8 @@ def cli() -> str:
 def pages() -> dict[Path, str]:
     """Every generated page by its path below docs/."""
     made = {
-        Path("reference", f"{make.__name__}.md"): make()
-        for make in (configuration, signals, faults, effects, cli)
+        Path("reference", f"{make.__name__.replace('_', '-')}.md"): make()
+        for make in (configuration, signals, faults, effects, cli, commands_that_act)
     }
     return made | {Path("faults", f"{f.name}.md"): fault(f) for f in FAULTS}
 

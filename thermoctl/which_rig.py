@@ -8,31 +8,135 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 from thermoctl.yamlfile import InputError
 
 FALLBACKS = ("config/simulated.yaml", "/etc/thermoctl/rig.yaml")
-ACTING = frozenset(
-    (
+
+
+@dataclass(frozen=True)
+class Act:
+    """What a command may do to a rig; one row of docs/reference/commands-that-act.md.
+
+    question: what it asks before; beside: what it does where another process holds the rig."""
+
+    command: str
+    does: str
+    question: str
+    beside: str
+    status: str
+
+
+_OWN = "none: the command is the person's own act"
+_MOVES = "says what moves, how far, how long and how warm, and asks for `go`, or takes `--yes`; without a terminal and `--yes`: status 2"
+_THROUGH = "runs through that daemon's law and protection, from READY only, and disarms at its end; a rig that is ARMED or in FAULT is left alone"
+ACTS = (
+    Act(
         "run",
+        "starts the daemon in the foreground; drives nothing before somebody arms",
+        "none",
+        "refused",
+        "2 held",
+    ),
+    Act(
         "demo",
+        "starts a copy of a simulated rig with its own lock, socket, log and recordings, arms and moves it",
+        "none: it refuses every back end but the simulated one",
+        "runs beside it and leaves it alone",
+        "0 stopped; 1 a fault stood; 2 no simulated rig, or another demo runs; 3 not started",
+    ),
+    Act(
         "start",
+        "starts the daemon: the unit that runs this configuration, else in the background; drives nothing",
+        "none",
+        "says `already running` with its state; changes nothing",
+        "0; 3 with the daemon's own error",
+    ),
+    Act(
         "stop",
-        "restart",
+        "disarms, then ends whoever holds the rig, by its unit where systemd started it",
+        "none: it is the safe direction",
+        "stops it: its purpose; never the rig of another configuration",
+        "0, also where nobody holds the rig; 3 it does not end",
+    ),
+    Act("restart", "stop, then start", "none", "as stop, then start", "as stop, then start"),
+    Act(
         "arm",
+        "enables the amplifier and holds the measured position",
+        _OWN,
+        "its purpose; refused in FAULT",
+        "1 refused; 2 no daemon",
+    ),
+    Act(
         "disarm",
+        "disables the amplifier; in FAULT acknowledges",
+        "none: it is the safe direction",
+        "its purpose",
+        "1 a fault still stands; 2 no daemon",
+    ),
+    Act(
         "setpoint",
+        "moves the output at the limited rate",
+        _OWN,
+        "its purpose; refused unless ARMED",
+        "1 refused; 2 no daemon or no number",
+    ),
+    Act(
         "reload",
-        "tune",
+        "applies changed limits and gains between two ticks",
+        _OWN,
+        "its purpose",
+        "1 the file is not valid; 2 no daemon",
+    ),
+    Act(
+        "tune", "moves the stage by short setpoint ramps", _MOVES, _THROUGH, "0; 2 no `go`; 3 the rig refuses"
+    ),
+    Act(
         "experiment",
+        "moves the stage by a schedule of setpoints",
+        _MOVES,
+        _THROUGH,
+        "0; 1 ended early; 2 no `go`; 3 the rig refuses",
+    ),
+    Act(
         "calibrate",
+        "tune, then the tests of experiments.yaml",
+        _MOVES,
+        _THROUGH,
+        "0; 1 ended early; 2 no `go`; 3 the rig refuses",
+    ),
+    Act(
         "diagnose",
+        "with --resolve: runs the proposed experiment",
+        _MOVES,
+        _THROUGH,
+        "0; 2 no `go`; 3 the rig refuses",
+    ),
+    Act(
         "dashboard",
+        "with --commands: takes arm, disarm and setpoint from the page",
+        "the token, and a question on the page before arming",
+        "its purpose",
+        "2 the address is taken",
+    ),
+    Act(
         "virtual-rig",
+        "plays the devices of a configuration; drives no amplifier. `--tell` breaks or mends a virtual device",
+        "none",
+        "leaves it alone: a virtual rig that runs already is not replaced",
+        "2 another virtual rig runs, or no back end `devices`",
+    ),
+    Act(
         "service",
-    )
+        "install writes the unit of this configuration and starts nothing; uninstall stops and removes it",
+        "none",
+        "install leaves it alone; uninstall stops the rig of its own unit",
+        "0; 1 no such unit; 2 it cannot be written, or two rigs collide",
+    ),
 )
+ACTING = frozenset(act.command for act in ACTS)
 """Commands that can move, arm, disarm or stop a rig: each prints the file that it chose by itself."""
 
 

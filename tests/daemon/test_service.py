@@ -1,5 +1,6 @@
 """start, stop, restart and status know a daemon by its lock and socket; the systemd units, installed below a directory."""
 
+import contextlib
 import os
 import re
 import shutil
@@ -14,13 +15,16 @@ from thermoctl.cli import main
 from thermoctl.daemon import lock, service
 from thermoctl.manual import PLACES
 from thermoctl.settings import load_settings
+from thermoctl.yamlfile import InputError
 
 
 # ------------------------------------------------------------------------------------------------ lock and socket
 @pytest.fixture
 def unrecorded(config):
     config.write_text(config.read_text().replace("recording:", "recording:\n  enable: false"))
-    return config
+    yield config
+    with contextlib.suppress(InputError):  # what a test that failed left running
+        service.stop(load_settings(config))
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.terminal_theme import DIMMED_MONOKAI
 from running import Running
 
-from thermoctl.daemon import dashboard, monitor
+from thermoctl.daemon import dashboard, monitor, view
 from thermoctl.daemon.metrics import metrics
 from thermoctl.daemon.socket import Commands, status
 from thermoctl.daemon.watch import Watch
@@ -29,7 +29,7 @@ from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 20.0
-HEATING_S = 240.0  # of rig time before the page's test
+HEATING_S = 90.0  # of rig time before the page's test
 TOKEN = "a-token-of-tests-0123456789"
 
 
@@ -145,16 +145,18 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
     running.base_s -= HEATING_S + 60.0
     recorded(settings, 23.5, running.base_s)  # and a day before
     running.arm()
-    running.send(3, 240.0)
-    while running.now_s < HEATING_S:  # 2.9 W: the coil goes to 28 degC, the shaft grows by 10 um
-        running.tick(10000)
-        writer.write(np.array(waiting))
-        waiting.clear()
+    begin_s = running.now_s
+
+    def move_until(end_s):  # as `thermoctl demo` does: what README's picture shows is what `make run` does
+        while running.now_s < end_s:
+            running.send(3, view.corner(running.now_s - begin_s)[1])
+            running.tick(5000)
+            writer.write(np.array(waiting))
+            waiting.clear()
+
+    move_until(HEATING_S)
     with served(settings) as (server, watch):
-        for setpoint in (200.0, 240.0, 120.0, 12.5):  # the page shows this minute although it opens after it
-            running.send(3, setpoint)
-            running.tick(15000)
-        writer.write(np.array(waiting))
+        move_until(HEATING_S + 60.0)  # the page shows this minute although it opens after it
         writer.close()
         running.record = None
         running.run()
@@ -162,9 +164,9 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         browser.open(dashboard.url(server))
         browser.until("document.getElementById('state').textContent === 'ARMED'")
         shown = browser.until(
-            "(t => t.startsWith('12.5') && t)(document.querySelector('[data-v=setpoint_um]').textContent)"
+            "(t => t.startsWith('240') && t)(document.querySelector('[data-v=setpoint_um]').textContent)"
         )
-        assert shown == "12.500 µm"
+        assert shown == "240.000 µm"
         coil = status(running.shared)["temperatures_c"]["coil"]
         assert (
             abs(
@@ -215,7 +217,7 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         assert {"skip", "pause", "theme", "c-position", "c-error", "signal", "span", "c-history"} <= reached
         browser.js("document.getElementById('c-position').focus()")
         browser.key("End")
-        browser.until("/reference 12\\.500/.test(document.getElementById('r-position').textContent)")
+        browser.until("/reference 240\\.000/.test(document.getElementById('r-position').textContent)")
         browser.keep("dashboard-light")
         seen_in_the_terminal(browser, running, settings)
         browser.open(dashboard.url(server))

@@ -480,7 +480,7 @@ class Law:
         if self.verdict[_AIR] == 0.0:
             if self.air_known == 0.0:
                 self._start_air(self.last[_AIR])
-            if self.air_started < _AIR_READINGS and self.fresh[_AIR]:
+            elif self.air_started < _AIR_READINGS and self.fresh[_AIR]:
                 self._average_air_start()
             self.air_rate_k_s = (self.last[_AIR] - self.air_c) / self.air_filter_s
             self.air_c += self.air_rate_k_s * self.dt
