@@ -76,8 +76,8 @@ link; `amplifier_state` one of AMP_*; `amplifier_fault` the error code (CiA-402 
 ROLE = {name: i for i, name in enumerate(ROLES)}
 OK, STALE, ERROR, ABSENT = 0, 1, 2, 3
 STATUS_NAMES = ("OK", "STALE", "ERROR", "ABSENT")
-AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED, AMP_FAULT = 0.0, 1.0, 2.0, 3.0
-"""amplifier_state: not answering or starting up; powered and not driving; driving; fault of its own."""
+AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_QUICK_STOP = 0.0, 1.0, 2.0, 3.0, 4.0
+"""amplifier_state: starting up or lost; powered and not driving; driving; fault of its own; stopped by its quick stop."""
 
 
 class HardwareError(Exception):

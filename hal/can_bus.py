@@ -21,6 +21,10 @@ canopen and the EDS file.
       0x6F  0x07  quick stop active              0x00 disable voltage
       0x4F  0x0F  fault reaction active          -
       0x4F  0x08  fault                          0x80 fault reset (rising edge), only while we do not want to drive
+
+Only a new `enable` takes the steps. A drive that was in 'operation enabled' and leaves it without our command (quick
+stop from an input, supply, its own fault) is disabled, and stays so until `enable` was withdrawn and is given again.
+Until then its state reads as the one it left to, so that a stop between two ticks is seen, too.
 """
 
 from __future__ import annotations
@@ -42,7 +46,15 @@ import canopen
 import cantools
 from canopen.objectdictionary import datatypes
 
-from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
+from hal.backend import (
+    AMP_DISABLED,
+    AMP_ENABLED,
+    AMP_FAULT,
+    AMP_OFFLINE,
+    AMP_QUICK_STOP,
+    HardwareError,
+    Sample,
+)
 from hal.devices import Device
 from hal.profile import Binding, Cia402, Dbc, LineSettings
 from hal.serial_port import open_port
@@ -68,11 +80,12 @@ _SLCAN_BITRATES = {
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of the kernel
 _EXTENDED, _REMOTE, _ERROR_FLAG, _BUS_OFF = 0x8000_0000, 0x4000_0000, 0x2000_0000, 0x40
 _SYNC_ID, _RESET_S = SYNC_ID, FAULT_RESET_S
-_OFFLINE, _DISABLED, _ENABLED, _FAULT = (
+_OFFLINE, _DISABLED, _ENABLED, _FAULT, _QUICK_STOP = (
     AMP_OFFLINE,
     AMP_DISABLED,
     AMP_ENABLED,
     AMP_FAULT,
+    AMP_QUICK_STOP,
 )  # numbers of C, by can_bus.pxd
 _FORMATS = {
     datatypes.INTEGER8: "b",
@@ -83,6 +96,18 @@ _FORMATS = {
     datatypes.UNSIGNED32: "I",
     datatypes.BOOLEAN: "B",
 }
+
+_STATES = (
+    (0x4F, 0x00, "not ready to switch on"),
+    (0x4F, 0x40, "switched off (switch on disabled)"),
+    (0x6F, 0x21, "switched off (ready to switch on)"),
+    (0x6F, 0x23, "switched on, operation disabled"),
+    (0x6F, 0x27, "operation enabled"),
+    (0x6F, 0x07, "quick stop active"),
+    (0x4F, 0x0F, "fault reaction active"),
+    (0x4F, 0x08, "fault"),
+    (0, 0, "a state that CiA 402 does not know"),
+)
 
 Frame = tuple[int, bytes]
 
@@ -208,12 +233,19 @@ def open_can(port: str, ids: tuple[int, ...]) -> SlcanPort | LibraryPort:
 
 
 def drive_state(status_word: int) -> float:
-    """AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED or AMP_FAULT for a CiA-402 status word."""
+    """The amplifier_state (AMP_*, hal.backend) of a CiA-402 status word."""
     if status_word & 0x4F in (0x0F, 0x08):
         return _FAULT
     if status_word & 0x6F == 0x27:
         return _ENABLED
+    if status_word & 0x6F == 0x07:
+        return _QUICK_STOP
     return _OFFLINE if status_word & 0x4F == 0x00 else _DISABLED
+
+
+def state_name(status_word: int) -> str:
+    """The CiA-402 state of a status word in the standard's words."""
+    return next(name for mask, value, name in _STATES if status_word & mask == value)
 
 
 def next_control_word(status_word: int, enable: bool) -> int:
@@ -303,6 +335,11 @@ class Cia402Device(Device):
                 for b in binding.bounds
             ],
         )
+        if binding.profile.drive is not None and all(b.channel.source != 0x6041 for b in binding.bounds):
+            raise InputError(
+                f"{binding.place}: a drive needs its status word (object 0x6041) in the role amplifier_state: "
+                "without it nobody sees that the drive stopped by itself"
+            )
         self._is_state = array("i", [b.channel.source == 0x6041 for b in binding.bounds])
         self._patience_s, self._heartbeat_s = max(3 * spec.heartbeat_s, spec.watchdog_s), spec.heartbeat_s
         self._master = spec.master_id
@@ -311,6 +348,8 @@ class Cia402Device(Device):
         self._ids = (0x080 + self._node, 0x180 + self._node, 0x580 + self._node, 0x700 + self._node)
         self._status_word = self._fault_code = self._heard = self._emergencies = 0
         self._heard_s = self._beat_s = self._reset_s = -math.inf
+        self._wanted = self._driving = self._left = False
+        self._left_to, self._left_word = _OFFLINE, -1
 
     def connect(self) -> None:
         """Open the port, check the identity, configure heartbeats, mode and PDOs, start the node; it stays off."""
@@ -332,6 +371,7 @@ class Cia402Device(Device):
         network.finish()
         self._port = port
         self._status_word = 0
+        self._watch_state(_OFFLINE)  # it was lost while it drove: not enabled again by itself
         self._heard_s = time.monotonic()
         self._beat_s = self._reset_s = -math.inf
 
@@ -392,9 +432,10 @@ class Cia402Device(Device):
             if kind == 0x180 and size == self._transmit_size:
                 self._status_word = int(self._number(data, 0))
                 self._heard += 1
+                state = self._watch_state(drive_state(self._status_word))
                 for i in range(len(self._index)):
                     if self._is_state[i]:
-                        self.put(sample, i, drive_state(self._status_word), now_s)
+                        self.put(sample, i, state, now_s)
                     else:
                         self.put(
                             sample,
@@ -414,6 +455,15 @@ class Cia402Device(Device):
         if now_s - self._heard_s > self._patience_s:
             raise HardwareError(f"no heartbeat of node {self._node} for {self._patience_s * 1e3:.0f} ms")
 
+    def _watch_state(self, state: float) -> float:
+        """The state to show: what the drive is in, or what it left 'operation enabled' to by itself."""
+        if self._driving and not self._left and state != _ENABLED:
+            self._left, self._left_to = True, state
+            self._left_word = self._status_word
+        if self._wanted and state == _ENABLED and not self._left:
+            self._driving, self._left_word = True, -1
+        return self._left_to if self._left and state != _FAULT else state
+
     def _number(self, data: int, k: int) -> float:
         """Object k of TPDO 1."""
         span = 1
@@ -426,8 +476,12 @@ class Cia402Device(Device):
         port, counts = self._port, 0
         if port is None:
             raise HardwareError("not connected")
-        word = next_control_word(self._status_word, enable)
-        if enable and drive_state(self._status_word) == _ENABLED:
+        self._wanted = enable
+        if not enable:
+            self._driving = self._left = False
+        steps = enable and not self._left
+        word = next_control_word(self._status_word, steps)
+        if steps and drive_state(self._status_word) == _ENABLED:
             counts = nearest(min(max(drive, self._low), self._high) / self._scale)
             counts = min(max(counts, -self._command_limit), self._command_limit)
         elif not enable and self._status_word & 0x4F == 0x08 and now_s - self._reset_s >= _RESET_S:
@@ -438,6 +492,16 @@ class Cia402Device(Device):
             self._beat_s = now_s
             port.queue(0x700 + self._master, 0x05, 1)
         port.flush()
+
+    def explain(self, sample: Sample, role: int) -> str:
+        """Also how a drive left 'operation enabled' by itself, until it is enabled anew."""
+        found = super().explain(sample, role)
+        if found or self._left_word < 0 or not self._is_state[self.roles.index(role)]:
+            return found
+        return (
+            f"{self.name}: left 'operation enabled' without a command: {state_name(self._left_word)} "
+            f"(status word 0x{self._left_word:04X}): check its stop, limit and enable inputs and its supply"
+        )
 
     def counters(self) -> dict[str, int]:
         """Frames, lines that were none, emergencies, reconnections."""

@@ -154,7 +154,11 @@ class ProtectionSettings:
     )
     low: dict[str, float] = option("smallest believable reading", factory=dict)
     high: dict[str, float] = option("largest believable reading", factory=dict)
-    rate: dict[str, float] = option("largest believable change per second", factory=dict, low=0.0)
+    rate: dict[str, float] = option(
+        "largest believable change per second; of a temperature over at least 0.1 s, and twice in a row",
+        factory=dict,
+        low=0.0,
+    )
     stale_s: dict[str, float] = option("longest time without a new reading", factory=dict, unit="s", low=0.0)
     frozen_s: dict[str, float] = option(
         "longest time with exactly the same reading", factory=dict, unit="s", low=0.0
@@ -179,7 +183,7 @@ class ProtectionSettings:
     idle_s: float = option("for how long either may be larger", 0.5, "s", 0.0, 60.0)
     saturation_s: float = option("longest time at the drive's limit", 0.5, "s", 0.0, 3600.0)
     amplifier_s: float = option(
-        "longest time until an enabled amplifier reports that it drives", 1.0, "s", 0.0, 60.0
+        "longest time after arming until the amplifier reports that it drives", 1.0, "s", 0.0, 60.0
     )
     late_s: float = option(
         "longest time between two ticks; above 1 s also what the supervisor lets the loop stand still",
@@ -198,7 +202,8 @@ class ProtectionSettings:
         "largest mean difference of a watched temperature from its estimate", 8.0, "K", 0.0, 1e3
     )
     resistance_ohm: float = option(
-        "the coil's resistance at 20 degC, against which voltage and current are compared; 0: not",
+        "the coil's resistance at 20 degC: voltage and current are compared with it, and without a voltage reading "
+        "the power is R I^2; 0: not known",
         0.0,
         "ohm",
         0.0,
@@ -519,6 +524,11 @@ def _together(settings: Settings, root: Node) -> None:
         if protection.low[name] >= protection.high[name]:
             raise place("protection", "high").error(
                 f"protection.high.{name} must be above protection.low.{name}"
+            )
+    for name in ("supply_v", "amplifier_state", "amplifier_fault"):
+        if name in protection.frozen_s:
+            raise place("protection", "frozen_s").error(
+                f"protection.frozen_s.{name}: what an amplifier reports stands still when all is well; take it out"
             )
     needed = {"simulated": "plant", "devices": "devices", "replay": "recording"}[hal.backend]
     if not getattr(hal, needed):

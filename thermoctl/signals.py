@@ -3,7 +3,7 @@
 A record row is one tick's signals in this order, all float64. The shared memory, the recording's schema, `status`, the
 dashboard and the reference page derive from this table.
 
-Rows replay: the signals `dt_s` to `status_bits` are everything the law was given, those from `state` on what it gave.
+Rows replay: the signals `dt_s` to `delay_bits` are everything the law was given, those from `state` on what it gave.
 """
 
 from __future__ import annotations
@@ -69,10 +69,16 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("air_c", "degC", "chamber air", -40.0, 80.0),
     *_points("_c", "measured"),
     Signal("supply_v", "V", "the amplifier's supply", 0.0),
-    Signal("amplifier_state", "1", "0 offline, 1 disabled, 2 enabled, 3 fault", 0.0, 3.0),
+    Signal("amplifier_state", "1", "0 offline, 1 disabled, 2 enabled, 3 fault, 4 quick stop", 0.0, 4.0),
     Signal("amplifier_fault", "1", "the amplifier's own error code; 0 none", 0.0),
     Signal("fresh_bits", "1", "bit c: channel c had a new reading in this tick", 0.0),
     Signal("status_bits", "1", "two bits a channel: 0 OK, 1 stale, 2 error, 3 absent", 0.0),
+    Signal(
+        "delay_bits",
+        "1",
+        "four bits a temperature, air first: age of a new reading when it arrived, 25 ms each, at most 15",
+        0.0,
+    ),
     # What the law gave.
     Signal("state", "1", "0 OFF, 1 SAFE, 2 READY, 3 ARMED, 4 FAULT", 0.0, 4.0),
     Signal(

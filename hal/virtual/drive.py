@@ -75,16 +75,18 @@ class Cia402Drive:
     """The drive. The rig sets readings in `od[index, 0].value` and takes `command` (counts of the target).
 
     `command_object` is the target that drives (0x2071, 0x6071); `alive` False: unpowered, mute;
-    `heartbeat` False: its own heartbeat is off."""
+    `heartbeat` False: its own heartbeat is off; `stop_until_s`: so long its stop input is active."""
 
     node: int
     command_object: int = 0x2071
     alive: bool = True
     heartbeat: bool = True
+    stop_until_s: float = -math.inf
     od: dict[tuple[int, int], Entry] = field(init=False)
     state: int = DISABLED
     nmt: int = PRE_OPERATIONAL
     _control: int = 0
+    _stopping: bool = False
     _master_seen_s: float | None = None
     _beat_s: float = -math.inf
     _out: list[Frame] = field(default_factory=list)
@@ -121,6 +123,7 @@ class Cia402Drive:
         can_id, data = frame
         if not self.alive:
             return
+        self._watch_stop(now_s)
         if can_id == 0x000 and len(data) == 2 and data[1] in (0, self.node):
             self._command_nmt(data[0])
         elif can_id == 0x080:
@@ -138,6 +141,7 @@ class Cia402Drive:
         if not self.alive:
             self._out.clear()
             return []
+        self._watch_stop(now_s)
         limit_s = (self.od[0x1016, 1].value & 0xFFFF) / 1000
         if limit_s and self._master_seen_s is not None and now_s - self._master_seen_s > limit_s:
             self._master_seen_s = None
@@ -149,6 +153,12 @@ class Cia402Drive:
             self._out.append((0x700 + self.node, bytes([self.nmt])))
         out, self._out = self._out, []
         return out
+
+    def _watch_stop(self, now_s: float) -> None:
+        """The stop input: quick stop from 'operation enabled', and no way there while it is active."""
+        self._stopping = now_s < self.stop_until_s
+        if self._stopping and self.state == ENABLED:
+            self.state = QUICK_STOP
 
     def _command_nmt(self, command: int) -> None:
         if command in (0x81, 0x82):
@@ -176,7 +186,7 @@ class Cia402Drive:
         elif word & 0x0F == 0x07:  # switch on / disable operation
             if self.state in (READY, ENABLED, SWITCHED_ON):
                 self.state = SWITCHED_ON
-        elif word & 0x0F == 0x0F and self.state in (SWITCHED_ON, ENABLED):
+        elif word & 0x0F == 0x0F and self.state in (SWITCHED_ON, ENABLED) and not self._stopping:
             self.state = ENABLED
 
     def _mapped(self, mapping: int) -> list[tuple[int, int]]:

@@ -251,6 +251,7 @@ class DriveOnSlcan(SlcanDevice):
             "heartbeat": self.flag(self.drive, "heartbeat"),
             "power": self._power,
             "fault": self._fault,
+            "stop": self._stop,
         }
 
     def _power(self, argument: str) -> None:
@@ -264,6 +265,13 @@ class DriveOnSlcan(SlcanDevice):
             self.drive.fault(int(argument, 0) & 0xFFFF)
         except ValueError:
             raise InputError(f"fault: an error code as 0x2310 was expected, found '{argument}'") from None
+
+    def _stop(self, argument: str) -> None:
+        """The stop input is active for so many ms."""
+        try:
+            self.drive.stop_until_s = time.monotonic() + float(argument) * 1e-3
+        except ValueError:
+            raise InputError(f"stop: a time in ms as 50 was expected, found '{argument}'") from None
 
     @property
     def output(self) -> float:

@@ -69,7 +69,8 @@ class Bench:
         self.value = channels(np.nan, position_um=8.0, voltage_v=0.0, current_a=0.0, air_c=AIR, coil_c=AIR)
         self.status = np.where(np.isnan(self.value), 3, 0).astype(np.uint8)
         self.fresh = (self.status == 0).astype(np.uint8)
-        self.law.bind(self.value, self.fresh, self.status)
+        self.delay = np.zeros(len(faults.CHANNELS), dtype=np.uint8)
+        self.law.bind(self.value, self.fresh, self.status, self.delay)
 
     def set(self, **values):
         for name, number in values.items():
@@ -177,6 +178,69 @@ def rate_to_the_bit(module):
     ).armed()  # a tick without time: one period
     bench.set(position_um=9.0).tick(dt=0.0).well()
     bench.set(position_um=10.5).tick(dt=0.0).safe("position_rate")
+
+
+THERMAL = ("air_c", *faults.TEMPERATURES)
+
+
+@scenario
+def a_temperature_exceeds_its_rate_twice(module):
+    """Twice in a row, counted from the last one believed; until then the last one stays. Other readings trip at once."""
+    required = channels(0, **dict.fromkeys((*REQUIRED, "supply_v", *THERMAL), 1))
+    for name in (*THERMAL, "current_a", "supply_v"):
+        for sign in (1.0, -1.0):
+            changes = {"rate": channels(math.inf, **{name: 10.0}), "required": required}
+            bench = Bench(module, **changes).set(**dict.fromkeys(THERMAL, AIR), supply_v=24.0).armed()
+            bench.set(current_a=0.0).tick(9)
+            start = bench.value[AT[name]]
+            if name not in THERMAL:
+                bench.set(**{name: start + sign}).tick().safe(f"{GROUP[name]}_rate")
+                continue
+            bench.set(**{name: start + sign}).tick().well()  # 10 K/s x 0.1 s, in one period
+            beyond = math.nextafter(start + 2 * sign, sign * math.inf)
+            bench.set(**{name: beyond}).tick().well()
+            assert bench.law.last[AT[name]] == start + sign
+            bench.set(**{name: start + sign}).tick().well()  # an outlier
+            bench.set(**{name: beyond}).tick().well().tick().safe(f"{GROUP[name]}_rate")
+            bench.tick().tick(command=arming.DISARM)  # the new level is believed
+            assert bench.state == arming.SAFE and bench.shown == set()
+
+
+@scenario
+def a_suspect_temperature_is_not_used(module):
+    """It moves no estimate, corrects nothing, and is no reading of the same again."""
+    for name, gain in (("coil_c", [[0.5], [0.0]]), ("bobbin_c", [[0.5, 0.0], [0.0, 0.5]])):
+        m = replace(model(), gain=np.array(gain), sensors=(0,) if name == "coil_c" else (0, 1))
+        bench = Bench(module, m, rate=channels(10.0), innovation_limit_c=2.0, innovation_time_s=P)
+        bench.set(bobbin_c=AIR).armed().set(**{name: AIR + 30.0}).tick().well()
+        assert list(bench.law.x) == [0.0, 0.0] and bench.law.innovation_c == 0.0
+        bench.set(**{name: AIR + 0.5}).tick().well()
+        assert bench.law.x[0 if name == "coil_c" else 1] == 0.25
+    bench = Bench(module, rate=channels(10.0), frozen_s=channels(math.inf, coil_c=4 * P)).set(
+        coil_c=AIR + 0.25
+    )
+    bench.tick(3).set(coil_c=AIR + 30.0).tick()
+    assert bench.law.same_s[AT["coil_c"]] == 2 * P and bench.shown == set()
+    bench.tick()
+    assert bench.law.same_s[AT["coil_c"]] == 0.0 and bench.shown == {"coil_rate"}
+
+
+@scenario
+def a_rate_is_over_the_samples_own_times(module):
+    """Two samples 0.25 s apart by arrival: their delays, 25 ms each, come off and on."""
+    for before, late, seconds in ((0, 0, 0.25), (0, 4, 0.15), (4, 0, 0.35), (2, 2, 0.25), (0, 10, 0.1)):
+        for beyond in (False, True):
+            bench = Bench(module, rate=channels(math.inf, coil_c=10.0)).armed()
+            bench.delay[AT["coil_c"]] = before
+            bench.tick().silent("coil_c").tick(255).well()
+            bench.delay[AT["coil_c"]] = late
+            edge = AIR + 10.0 * seconds
+            bench.set(coil_c=edge + 1e-9 if beyond else edge - 1e-9).tick().well()
+            assert bench.law.suspect[AT["coil_c"]] == float(beyond), (before, late, beyond)
+    bench = Bench(module, frozen_s=channels(math.inf, coil_c=4 * P)).tick(2)
+    bench.delay[AT["coil_c"]] = 15  # sampled before the last one was: as if one period had passed
+    bench.tick()
+    assert bench.law.same_s[AT["coil_c"]] == 2 * P
 
 
 @scenario
@@ -313,10 +377,11 @@ def saturation_to_the_tick(module):
 
 @scenario
 def amplifier_to_the_tick(module):
-    bench = Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=1.0).tick(4).well()
-    bench.set(amplifier_state=2.0).tick().set(amplifier_state=0.0).tick(4).well().tick().safe(
-        "amplifier_not_following"
-    )
+    for state in (0.0, 1.0, 4.0):  # the enable sequence after arming has this time
+        bench = Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=state).tick(4).well()
+        bench.tick().safe("amplifier_not_following")
+        bench = Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=state).tick(4).well()
+        bench.set(amplifier_state=2.0).tick(9).well()
     bench = Bench(module, amplifier_s=4 * P).armed().set(amplifier_state=2.0).tick(9).well()
     bench.set(amplifier_state=1.0).say(1, "amplifier_state").tick(9).well("amplifier_stale")
     bench = Bench(module, amplifier_s=4 * P).set(amplifier_state=1.0).armed().tick(4, command=arming.DISARM)
@@ -331,6 +396,106 @@ def amplifier_to_the_tick(module):
         .tick()
         .well("amplifier_stale")
     )
+
+
+@scenario
+def an_amplifier_that_stops_by_itself(module):
+    """Once enabled after arming, another state trips in the same tick; only DISARM and ARM drive again."""
+    for state in (0.0, 1.0, 4.0):
+        bench = Bench(module, amplifier_s=1.0, kp=1.0).set(amplifier_state=1.0).armed()
+        bench.tick(3).well().set(amplifier_state=2.0).tick().well()
+        bench.set(amplifier_state=state).tick().safe("amplifier_stopped")
+        bench.set(amplifier_state=2.0).tick(3, command=arming.ARM).safe("amplifier_stopped")
+        bench.tick(command=arming.DISARM).tick(9, command=arming.ARM)  # it drives: not READY
+        assert bench.state == arming.SAFE and bench.shown == set()
+        bench.set(amplifier_state=1.0).tick(2).tick(command=arming.ARM).tick(9).well()  # the sequence anew
+    for state in (0.0, 1.0, 2.0, 4.0):  # told to stop: no fault
+        bench = Bench(module, amplifier_s=1.0).armed().set(amplifier_state=2.0).tick(3)
+        bench.tick(command=arming.DISARM).set(amplifier_state=state).tick(9)
+        assert bench.shown == set() and bench.state == (arming.SAFE if state == 2.0 else arming.READY)
+    bench = Bench(module).armed().set(amplifier_state=2.0).tick().set(amplifier_state=3.0).tick()
+    bench.safe("amplifier_fault")
+    bench = Bench(module).armed().set(amplifier_state=2.0).tick()
+    bench.set(amplifier_state=1.0).say(1, "amplifier_state").tick(9).well("amplifier_stale")  # not known
+    bench.set(amplifier_state=1.0).tick().safe("amplifier_stopped")
+    for name in ("supply_v", "amplifier_state"):  # no reading that stands still has its bit
+        Bench(module, frozen_s=channels(0.0)).set(**{name: 2.0}).tick(9)
+        bench = Bench(module, frozen_s=channels(math.inf, **{name: 0.0})).set(**{name: 2.0}).tick(9)
+        assert bench.shown == set()
+
+
+@scenario
+def an_amplifier_that_drives_while_disabled(module):
+    bench = Bench(module, amplifier_s=4 * P).set(amplifier_state=2.0).warm()
+    assert bench.state == arming.SAFE and bench.shown == {"amplifier_not_following"}
+    bench.set(amplifier_state=1.0).tick(2)
+    assert bench.state == arming.READY and bench.shown == set()
+    bench.set(amplifier_state=2.0).tick(command=arming.ARM)
+    assert bench.state == arming.SAFE and bench.shown == set()
+    bench.tick(3)
+    assert bench.shown == set()
+    bench.tick()
+    assert bench.shown == {"amplifier_not_following"}
+
+
+@scenario
+def nothing_integrates_against_a_drive_that_is_off(module):
+    """Reference at the stage and v = 0 until it reports enabled; the setpoint given meanwhile counts."""
+    bench = Bench(
+        module, kp=0.125, ti_s=0.25, setpoint_rate_um_s=1024.0, setpoint_high_um=15.0, amplifier_s=1.0
+    )
+    bench.set(amplifier_state=1.0).armed().tick(command=arming.SETPOINT, value=20.0)
+    for k in range(9):
+        bench.set(position_um=8.0 + k).tick().well()
+        assert (bench.law.v, bench.law.drive, bench.law.eps1, bench.law.d1) == (0.0, 0.0, 0.0, 0.0)
+        assert bench.law.reference_um == 8.0 + k and bench.law.setpoint_um == 15.0
+    bench.set(amplifier_state=2.0, position_um=8.0).tick().well()
+    assert bench.law.reference_um == 15.0 and bench.law.v > 0.0  # from the stage, 1 um a period, downwards
+    bench.tick(9)
+    v = bench.law.v
+    assert v != 0.0 and bench.law.reference_um == 15.0
+    bench.set(amplifier_state=4.0).tick().safe("amplifier_stopped")
+    bench = Bench(module, kp=0.125, ti_s=0.25).armed().set(position_um=7.0)
+    bench.set(amplifier_state=1.0).say(2, "amplifier_state").tick(3)
+    assert bench.law.v != 0.0  # an amplifier that reports nothing is believed to drive
+
+
+@scenario
+def power_without_a_voltage_meter(module):
+    """R I^2 at the coil's temperature; not a number where neither voltage nor resistance is known."""
+
+    def bench(m=None, **changes):
+        b = Bench(module, m, required=channels(0), **{"resistance_ohm": 4.0, **changes})
+        return b.say(3, "voltage_v")
+
+    b = bench(replace(model(), C=np.zeros((12, 2)))).set(coil_c=120.0).armed().set(current_a=1.5).tick()
+    assert b.law.outputs[11] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5  # by the coil's reading
+    b.set(current_a=-1.5).tick()
+    assert b.law.outputs[11] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5
+    b.say(2, "current_a").tick()
+    assert b.law.outputs[11] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5  # the last good one
+    b.say(2, "coil_c").set(current_a=1.5).tick()
+    assert b.law.outputs[11] == 9.0  # at 20 degC
+    b = bench().set(air_c=20.0, coil_c=20.0).armed()
+    b.law.x[0] = 100.0
+    b.set(current_a=1.5).tick(2)
+    assert b.law.outputs[11] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5  # by the estimate
+    b = bench().say(2, "air_c", "coil_c").tick()
+    b.law.T[0] = 50.0
+    b.set(current_a=1.5).tick()
+    assert b.law.outputs[11] == 9.0  # an estimate above no air says nothing
+    b = bench(power_limit_w=8.0, power_time_s=P).set(air_c=20.0, coil_c=20.0).armed().set(current_a=1.5)
+    b.tick(2).safe("power_limit")
+    b = bench(resistance_ohm=0.0).armed().set(current_a=1.5).tick(2).well()
+    assert math.isnan(b.law.outputs[11]) and b.law.power_w == 0.0
+    b = bench().say(3, "current_a").armed().tick(2).well()
+    assert math.isnan(b.law.outputs[11])
+    b = Bench(module, required=channels(0), resistance_ohm=4.0).set(voltage_v=2.0, current_a=1.0).armed()
+    assert b.law.outputs[11] == 2.0  # with a meter: its own
+    b.say(2, "voltage_v").set(current_a=3.0).tick()
+    assert b.law.outputs[11] == 2.0  # at fault: the last good one
+    b = Bench(module, required=channels(0)).set(voltage_v=2.0, current_a=1.0).armed()
+    assert b.law.outputs[11] == 2.0
 
 
 @scenario
@@ -433,7 +598,7 @@ def all_at_once(module):
     bench.law.configure(bench.parameters)
     bench.law.v, bench.law.x[0] = 4.0, 99.0
     bench.set(
-        position_um=20.0, voltage_v=9.0, current_a=1.0, coil_c=40.0, bobbin_c=60.0, amplifier_state=3.0
+        position_um=20.0, voltage_v=9.0, current_a=1.0, coil_c=40.0, bobbin_c=60.0, amplifier_fault=1.0
     ).say(2, "shaft_1_c")
     bench.tick(external=1 << faults.BIT["amplifier_write"])
     bench.safe(
@@ -441,7 +606,6 @@ def all_at_once(module):
         "following_error",
         "drive_saturated",
         "amplifier_not_following",
-        "amplifier_fault",
         "coil_overtemperature",
         "coil_overtemperature_model",
         "coil_heating_rate",
@@ -453,6 +617,11 @@ def all_at_once(module):
         "monitored_disagrees",
         "monitored_error",
     )
+    bench = Bench(module, amplifier_s=0.0).armed().set(amplifier_state=3.0).say(2, "shaft_1_c").tick()
+    bench.safe("amplifier_fault", "amplifier_not_following", "monitored_error")
+    bench = Bench(module).armed().set(amplifier_state=2.0).tick().set(amplifier_state=1.0)
+    bench.say(2, "shaft_1_c").tick(external=1 << faults.BIT["amplifier_write"])
+    bench.safe("amplifier_stopped", "monitored_error", "amplifier_write")
     bench = Bench(module, idle_current_a=0.5, idle_s=0.0, power_limit_w=1.0, power_time_s=P).warm()
     bench.law.x[0] = math.nan
     bench.set(voltage_v=9.0, current_a=1.0).tick(external=1 << faults.BIT["amplifier_write"])
@@ -694,8 +863,11 @@ def voltage_and_current(module):
         resistance_v=0.5,
     )
     b.law.configure(replace(b.parameters, resistance_v=0.25))
-    b.say(2, "air_c", "coil_c").set(current_a=1.0, voltage_v=4.0).tick(5)
-    assert b.shown == {"air_error", "coil_error"}  # no temperature: R at 20 degC
+    b.say(2, "air_c", "coil_c").set(current_a=1.0, voltage_v=9.0).tick(5)
+    assert b.shown == {"air_error", "coil_error"}  # no temperature: not compared
+    b = bench(required=channels(0), resistance_tolerance=0.0).say(2, "coil_c")
+    b.set(current_a=1.0, voltage_v=9.0).tick()
+    assert b.shown == {"coil_error", "electrical_disagrees"}  # the estimate's temperature
 
 
 def replace_gain(module, bench):
@@ -1117,7 +1289,7 @@ def the_fault_table(module):
     )
     assert [table.FAULTS[5 * g + k].name for g in range(7) for k in range(5)] == [
         f"{g}_{k}" for g in table.GROUPS for k in table.KINDS
-    ]
+    ][:-1] + ["amplifier_stopped"]
     severity = {f.name: f.severity for f in table.FAULTS}
     assert {n for n, s in severity.items() if s == "critical"} == {
         "coil_overtemperature",

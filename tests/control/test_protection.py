@@ -10,7 +10,17 @@ from tests.control import protection
 from thermoctl.control import law
 
 CONTROL = Path(law.__file__).parent
-PROTECTION = ("_judge_readings", "_agree", "_compare_order", "protect", "_arm", "_report")
+PROTECTION = (
+    "_judge_readings",
+    "_judge_reading",
+    "_resistance",
+    "_watch_amplifier",
+    "_agree",
+    "_compare_order",
+    "protect",
+    "_arm",
+    "_report",
+)
 """The functions of law.py that belong to the protection; arming.py and faults.py belong to it whole."""
 
 

@@ -144,21 +144,19 @@ def test_histogram_and_percentiles():
     assert np.isnan(percentiles(np.zeros(4, np.uint64))).all()
 
 
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 3)), min_size=20, max_size=20))
-def test_readings_pack_into_two_exact_numbers(channels):
-    fresh = np.array([f for f, _ in channels], dtype=np.uint8)
-    status = np.array([s for _, s in channels], dtype=np.uint8)
-    row, values, outputs = np.zeros(3 + 20 + 2 + 4), np.arange(20.0), np.arange(4.0)
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 3), st.integers(0, 15)), min_size=20, max_size=20))
+def test_readings_pack_into_three_exact_numbers(channels):
+    fresh, status, delay = np.array(channels, dtype=np.uint8).T.copy()
+    delay[:4] = delay[17:] = 0  # of temperatures only
+    row, values, outputs = np.zeros(3 + 20 + 3 + 4), np.arange(20.0), np.arange(4.0)
     record = Record(row, 3)
-    record.bind(values, fresh, status, outputs)
+    record.bind(values, fresh, status, delay, outputs)
     row[:3] = 7, 8.5, 9
     record.fill()
-    np.testing.assert_array_equal(np.delete(row, [23, 24]), [7, 8.5, 9, *values, *outputs])
-    packed = row[23], row[24]
-    again = np.zeros(20, np.uint8), np.zeros(20, np.uint8)
-    unpack_readings(*packed, *again)
-    np.testing.assert_array_equal(again[0], fresh)
-    np.testing.assert_array_equal(again[1], status)
+    np.testing.assert_array_equal(np.delete(row, [23, 24, 25]), [7, 8.5, 9, *values, *outputs])
+    again = np.zeros((3, 20), np.uint8)
+    unpack_readings(*row[23:26], *again)
+    np.testing.assert_array_equal(again, [fresh, status, delay])
 
 
 @pytest.mark.parametrize("spin_ns", [0, 200_000])

@@ -12,7 +12,7 @@ from tests.daemon.conftest import make_model
 from thermoctl.control import arming, faults
 from thermoctl.control.law import OUTPUTS
 from thermoctl.daemon.assemble import law_parameters
-from thermoctl.daemon.recorder import law_metadata, read_law_metadata
+from thermoctl.daemon.recorder import LAW_VERSION, law_metadata, read_law_metadata
 from thermoctl.daemon.replay import replay
 from thermoctl.daemon.simulate import Simulation, run_simulated
 from thermoctl.settings import CHANNELS
@@ -184,9 +184,12 @@ def test_replay_refuses_what_it_cannot_replay(session):
         replay(np.delete(rows, 10, axis=0), session.metadata, "x.arrow")
     with pytest.raises(InputError, match="a replay cannot start"):
         replay(rows[3:], session.metadata)
-    for text in ("{}", "nonsense", '{"version": 1}'):
+    for text in ("{}", "nonsense", '{"version": 2}'):
         with pytest.raises(InputError, match="no usable law"):
             replay(rows, text)
+    old = session.metadata.replace(f'"version": {LAW_VERSION}', '"version": 1')
+    with pytest.raises(InputError, match="law version 1, this program has version 2.*that recorded it"):
+        replay(rows, old)
 
 
 def test_law_metadata_comes_back_exact(session):

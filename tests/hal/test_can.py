@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
+from hal.backend import (
+    AMP_DISABLED,
+    AMP_ENABLED,
+    AMP_FAULT,
+    AMP_OFFLINE,
+    AMP_QUICK_STOP,
+    HardwareError,
+    Sample,
+)
 from hal.can_bus import drive_state, next_control_word, open_can
 from hal.virtual.drive import (
     DISABLED,
@@ -70,7 +78,7 @@ def test_any_bytes_leave_parser_and_adapter_able(chunks):
         (0x0231, AMP_DISABLED, 0x07, 0x00),
         (0x0233, AMP_DISABLED, 0x0F, 0x06),
         (0x0237, AMP_ENABLED, 0x0F, 0x06),
-        (0x0217, AMP_DISABLED, 0x00, 0x00),
+        (0x0217, AMP_QUICK_STOP, 0x00, 0x00),
         (0x021F, AMP_FAULT, 0x00, 0x00),
         (0x0218, AMP_FAULT, 0x00, 0x00),
     ],

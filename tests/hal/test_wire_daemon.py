@@ -160,3 +160,29 @@ def test_killed_daemon_leaves_the_amplifier_off(chain):
     r = chain.reference()
     late = r.t > killed + 0.5  # watchdog 0.2 s
     assert late.any() and not r.columns["enabled"][late].any() and not r.columns["drive"][late].any()
+
+
+@pytest.mark.parametrize("stop_ms", [5, 50, 550])
+def test_a_stop_input_ends_driving_until_a_person_arms(chain, stop_ms):
+    """The drive's quick stop, pulsed while the stage is held off its rest, with the shipped amplifier_s of 1 s."""
+    chain.arm()
+    assert chain.ask("setpoint", 15.0)["ok"]
+    chain.until(lambda s: abs(s["position_um"] - 15) < 1, 30)
+    pulsed = time.monotonic()
+    chain.tell(f"drive stop {stop_ms}")
+    s = chain.until(lambda s: s["state"] == "FAULT", 5)
+    assert "amplifier_stopped" in [f["name"] for f in s["faults"]] and s["control_v"] == 0.0
+    ticks = s["ticks"]
+    chain.until(lambda s: s["ticks"] > ticks + stop_ms + 1000, 20)
+    assert not chain.ask("arm")["ok"]  # FAULT is acknowledged first
+    again = time.monotonic()
+    armed = chain.arm()
+    assert abs(armed["setpoint_um"] - armed["position_um"]) < 0.5
+    chain.stop()
+    r = chain.reference()
+    on, at = r.columns["enabled"] > 0, r.t
+    off = at[(at > pulsed) & ~on]
+    print(f"stop of {stop_ms} ms: drive off {(off[0] - pulsed) * 1e3:.0f} ms after the command was typed")
+    assert not on[(at > off[0]) & (at < again)].any()  # never driven again by itself
+    driven = on[1:] & on[:-1] & (at[1:] > again)
+    assert driven.any() and np.abs(np.diff(r.columns["position_um"]))[driven].max() < 2.0

@@ -284,7 +284,7 @@ def set_(name, value):
         ("drive: supply off", {"amplifier_stale", "amplifier_error"}, 25, no_supply, ""),
         (
             "drive: restarts by itself",
-            {"amplifier_error", "amplifier_not_following"},
+            {"amplifier_error", "amplifier_stopped"},
             5,
             lambda w: w.drive.power_up(),
             "",
@@ -328,7 +328,7 @@ def test_wire(wired, hazard, expected, limit, begin, cause):
 def test_the_drive_leaves_operation_by_itself(wired, state):
     """Each other state of CiA-402, held by a drive that does not go back to work."""
     code = {"FAULT_REACTION": 0x0F}.get(state) if state == "FAULT_REACTION" else getattr(drives, state)
-    expected = {"amplifier_fault"} if state == "FAULT_REACTION" else {"amplifier_not_following"}
+    expected = {"amplifier_fault"} if state == "FAULT_REACTION" else {"amplifier_stopped"}
 
     def stays(wires):
         step = wires.drive._step_state
@@ -336,9 +336,26 @@ def test_the_drive_leaves_operation_by_itself(wired, state):
         wires.drive._step_state = lambda word: step(word) if word == 0 else None
 
     try:
-        happens(wired, f"drive: {state.lower().replace('_', ' ')} while armed", expected, 100, stays, "")
+        happens(wired, f"drive: {state.lower().replace('_', ' ')} while armed", expected, 2, stays, "")
     finally:
         vars(wired.wires.drive).pop("_step_state", None)
+
+
+@pytest.mark.parametrize("stop_s", [0.005, 0.05, 0.55])
+def test_a_stop_input_ends_driving_for_good(wired, stop_s):
+    """Pulsed while the stage is held off its rest: no current ever flows again without a new arming."""
+    wired.ready_to_be_spoiled(15.0)
+    drive = wired.wires.drive
+    drive.stop_until_s = wired.wires.now_s + stop_s
+    ticks, found, way = wired.detect({"amplifier_stopped"}, 3)
+    assert found == {"amplifier_stopped"} and wired["amplifier_state"] == 4.0 and wired["control_v"] == 0.0
+    assert "quick stop active" in wired.wires.problem("amplifier_state")
+    for _ in range(round(stop_s / wired.period_s) + 200):
+        wired.tick()
+        assert drive.command == 0 and drive.state != drives.ENABLED and wired.state == "FAULT"
+    jump = wired.comes_back()
+    assert wired.wires.problem("amplifier_state") == ""
+    say("Wires", f"drive: stop input for {stop_s * 1e3:g} ms", 3, ticks, found, way, jump)
 
 
 def test_single_errors_are_survived(wired):

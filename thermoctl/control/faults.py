@@ -106,6 +106,14 @@ _READINGS = [
     for group in GROUPS
     for kind, meaning, remedy in _KINDS
 ]
+# All 53 bits are taken. What an amplifier reports stands still when all is well: in the place of a fault that it
+# cannot have stands the one of its own. The other bits keep their places in older recordings.
+_READINGS[-1] = (
+    "amplifier_stopped",
+    "fault",
+    "the amplifier stopped driving without being told: quick stop, or switched off",
+    "release the stop or limit input, check its supply and enable input; then `thermoctl disarm` and `thermoctl arm`",
+)
 
 _OTHERS = [
     (
@@ -177,8 +185,8 @@ _OTHERS = [
     (
         "amplifier_not_following",
         "fault",
-        "the amplifier does not drive although it was enabled: it reports another "
-        "state, or the coil's current is not the one asked for",
+        "the amplifier does not do what it is told: it was not enabled in time after arming, drives "
+        "while disabled, or the coil's current is not the one asked for",
         "check its supply, its enable input, its heartbeat and the coil's leads; see `thermoctl status` for its state",
     ),
     (

@@ -6,12 +6,13 @@ ctypedef unsigned long long bits_t
 
 cdef int _OK, _STALE, _ERROR, _ABSENT, _NONE, _SETPOINT, _OFF, _ARMED, _FAULT, _COMMANDS, _WARM_UP, _N, _M
 cdef const uint8_t[::1] _NEXT
-cdef int _POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL, _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT
+cdef int _POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL, _SUPPLY
+cdef int _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT
 cdef int _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS
 cdef int _B_FOLLOWING, _B_HOT, _B_HOT_MODEL, _B_HEATING, _B_DISAGREES, _B_POWER, _B_STUCK, _B_BOUND, _B_SLEWING
-cdef int _B_SATURATED, _B_AMPLIFIER, _B_NOT_FOLLOWING, _B_LATE, _B_NOT_FINITE
+cdef int _B_SATURATED, _B_AMPLIFIER, _B_STOPPED, _B_NOT_FOLLOWING, _B_LATE, _B_NOT_FINITE
 cdef int _B_ELECTRICAL, _B_DISPLACED, _B_MONITORED
-cdef double _GAP_S, _RESUME_C, _COPPER, _AIR_READINGS
+cdef double _GAP_S, _RESUME_C, _COPPER, _AIR_READINGS, _THERMAL_S, _DELAY_S, _NAN
 cdef bits_t _TRIP_OTHERS, _CRITICAL
 
 cdef bint finite(double value) noexcept nogil
@@ -20,13 +21,13 @@ cdef double clip(double value, double low, double high) noexcept nogil
 cdef class Law:
     cdef readonly object model, parameters, outputs
     cdef int n, sensors_used, average_length
-    cdef bint mkf, compensate_on, hold, expands
+    cdef bint mkf, compensate_on, hold, expands, reports, enabled, powered
     cdef double[:, ::1] A, B, C, K
     cdef readonly double correction_step_s
     cdef double[::1] b1, b2, dx, e, low, high, rate, stale_s, frozen_s, required, out
     cdef int[::1] sensors, group, predicts
     cdef double[::1] value
-    cdef uint8_t[::1] fresh, status
+    cdef uint8_t[::1] fresh, status, delay
     cdef double b_air, f1, offset_um, expansion_period_s, R_w, R_v, air_filter_s, model_period_s, a1a1, first_gain
     cdef readonly double period_s, dt
     cdef double kp, ti_s, td_s, output_limit, setpoint_rate_um_s, setpoint_low_um, setpoint_high_um, bound_um, slew_um_s
@@ -45,10 +46,10 @@ cdef class Law:
     cdef public double coil_elapsed_s, power_mean_w, following_s, idle_s, saturation_s, amplifier_s, enable, drive
     cdef public double control_v
     cdef public double air_started, resumed, model_error_c, ohm_v, ohm_scale_v, current_error_a, displaced_um
-    cdef public double position_zero_um, zeroed, reference_error_um, reference_zero_um, reference_zeroed, exchanged
-    cdef public double[::1] x, T, T_before, average, age, last, same_s, seen, verdict, corrections, apart_c
+    cdef public double position_zero_um, zeroed, reference_error_um, reference_zero_um, reference_zeroed, exchanged, driving
+    cdef public double[::1] x, T, T_before, average, age, since_s, suspect, last, same_s, seen, verdict, corrections, apart_c
 
-    cpdef bind(self, double[::1] value, uint8_t[::1] fresh, uint8_t[::1] status)
+    cpdef bind(self, double[::1] value, uint8_t[::1] fresh, uint8_t[::1] status, uint8_t[::1] delay=*)
     cpdef step(self, double dt, int command=*, double command_value=*, bits_t external=*)
     @cython.locals(i=cython.int, j=cython.int, m=cython.int, n=cython.int, s=cython.double, scale=cython.double)
     cpdef estimate(self, double dt)
@@ -56,10 +57,16 @@ cdef class Law:
     cpdef compensate(self)
     @cython.locals(k=cython.int, s=cython.double, step=cython.double, eps=cython.double, change=cython.double, d=cython.double)
     cpdef control(self, int command, double command_value)
-    @cython.locals(one=bits_t, found=bits_t, reports=cython.bint, driven=cython.bint)
+    @cython.locals(one=bits_t, found=bits_t, driven=cython.bint)
     cpdef protect(self, int command, bits_t external)
-    @cython.locals(one=bits_t, bit=bits_t, c=cython.int, kind=cython.int, status=cython.int, value=cython.double, elapsed=cython.double)
+    @cython.locals(one=bits_t, bit=bits_t, c=cython.int, kind=cython.int, status=cython.int)
     cdef void _judge_readings(self, double dt) noexcept
+    @cython.locals(late=cython.double, elapsed=cython.double, allowed=cython.double, thermal=cython.bint, jumped=cython.bint)
+    cdef void _judge_reading(self, int c, double value) noexcept
+    @cython.locals(s=cython.double)
+    cdef double _resistance(self) noexcept
+    @cython.locals(one=bits_t, told=cython.bint, waits=cython.bint)
+    cdef void _watch_amplifier(self) noexcept
     cdef void _power_and_air(self) noexcept
     cdef void _start_air(self, double value) noexcept
     @cython.locals(i=cython.int, s=cython.double)

@@ -34,6 +34,16 @@ RESUME_LIMIT_C from them they are dropped, and the start is as without.
 A reading that is not valid is never used (`last` holds the newest valid one). The encoder's reading is held for a
 tick without a new frame (1 to 3 % of the ticks of a polled encoder): the differences then come one tick later and
 nothing is lost.
+
+The rate of a reading is its change over the time between the samples, not between their arrivals. A temperature is
+given at least THERMAL_S for a change: a bonded sensor follows no faster, so that two answers of a bus in close order
+say nothing of the rate, and one digit up to rate x THERMAL_S is no jump (2 K at 20 K/s). A temperature that exceeds its
+rate is not used; it trips when the next reading still exceeds it, counted from the last one that was believed. A body
+with heat capacity stays where it jumped to; an outlier does not.
+
+While ARMED, an amplifier that reports another state than enabled holds the controller at v = 0 and the reference at the
+stage: nothing integrates against a drive that is off. `amplifier_s` is the time for the enable sequence after arming.
+An amplifier that was enabled since and is no more trips at once. One that still reports enabled keeps READY away.
 """
 
 from __future__ import annotations
@@ -69,12 +79,15 @@ OUTPUTS = (
 
 MAX_AVERAGE = 64
 WARM_UP_TICKS = 100
+THERMAL_S = 0.1  # a temperature's change counts over at least this time: a bonded sensor's own time constant
+DELAY_S = 0.025  # unit of `delay`: four bits a temperature are recorded, 15 is 375 ms, above an answer's 300 ms timeout
 MAX_GAP_S = 10.0  # a longer time between two ticks makes the estimate worthless
 RESUME_LIMIT_C = 2.0  # estimates of an earlier run are kept when the coil's first reading is as close as this
 AIR_READINGS = 30.0  # of the air's first ones, whose mean is the origin: 0.02 K of noise in one would be 0.03 um for good
 COPPER_1_K = 0.00393  # temperature coefficient of the coil's resistance, from 20 degC
 _GAP_S, _RESUME_C, _COPPER, _WARM_UP = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K, WARM_UP_TICKS
 _AIR_READINGS = AIR_READINGS
+_THERMAL_S, _DELAY_S, _NAN = THERMAL_S, DELAY_S, float("nan")
 COMPILED = not __file__.endswith(".py")
 """False when this module runs interpreted: right for coverage, a hundred times too slow for a rig."""
 
@@ -84,7 +97,7 @@ _NONE, _SETPOINT, _OFF, _ARMED, _FAULT = arming.NONE, arming.SETPOINT, arming.OF
 _NEXT, _COMMANDS = arming.TABLE, len(arming.COMMANDS)
 _N, _M = len(faults.CHANNELS), len(faults.TEMPERATURES)
 _POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL = 0, 1, 2, 3, 4, 5
-_AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT = 18, 2, 3
+_SUPPLY, _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT = 17, 18, 2, 3
 _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS = 0, 1, 2, 3, 4, 5
 _B_FOLLOWING = faults.BIT["following_error"]
 _B_HOT, _B_HOT_MODEL = faults.BIT["coil_overtemperature"], faults.BIT["coil_overtemperature_model"]
@@ -92,13 +105,14 @@ _B_HEATING, _B_DISAGREES = faults.BIT["coil_heating_rate"], faults.BIT["coil_dis
 _B_POWER, _B_STUCK = faults.BIT["power_limit"], faults.BIT["coil_stuck_on"]
 _B_BOUND, _B_SLEWING = faults.BIT["compensation_bound"], faults.BIT["compensation_slewing"]
 _B_SATURATED, _B_AMPLIFIER = faults.BIT["drive_saturated"], faults.BIT["amplifier_fault"]
+_B_STOPPED = faults.BIT["amplifier_stopped"]
 _B_NOT_FOLLOWING, _B_LATE = faults.BIT["amplifier_not_following"], faults.BIT["loop_late"]
 _B_NOT_FINITE = faults.BIT["not_finite"]
 _B_ELECTRICAL, _B_DISPLACED = faults.BIT["electrical_disagrees"], faults.BIT["position_disagrees"]
 _B_MONITORED = faults.BIT["monitored_disagrees"]
 _TRIP_OTHERS = (
     faults.mask("fault", "critical") >> (len(faults.GROUPS) * _KINDS) << (len(faults.GROUPS) * _KINDS)
-)
+) | 1 << faults.BIT["amplifier_stopped"]
 _CRITICAL = faults.mask("critical")
 
 _SCALARS = (
@@ -153,6 +167,7 @@ _SCALARS = (
     "reference_zero_um",
     "reference_zeroed",
     "exchanged",
+    "driving",
 )
 _WHOLE = ("state", "tick", "latched", "average_at", "averaged")
 _VECTORS = (
@@ -161,6 +176,8 @@ _VECTORS = (
     "T_before",
     "average",
     "age",
+    "since_s",
+    "suspect",
     "last",
     "same_s",
     "seen",
@@ -241,6 +258,7 @@ class Law:
         self.x, self.T, self.T_before = np.zeros(self.n), np.zeros(_M), np.zeros(_M)
         self.average = np.zeros(MAX_AVERAGE)
         self.age, self.last, self.same_s = np.zeros(_N), np.zeros(_N), np.zeros(_N)
+        self.since_s, self.suspect = np.zeros(_N), np.zeros(_N)
         self.seen, self.verdict = np.zeros(_N), np.zeros(_N)
         self.state, self.latched, self.tick, self.average_at, self.averaged = arming.OFF, 0, 0, 0, 0
         self.v = self.eps1 = self.d1 = 0.0
@@ -258,19 +276,24 @@ class Law:
         self.displaced_um = self.position_zero_um = self.zeroed = 0.0
         self.reference_error_um = self.reference_zero_um = self.reference_zeroed = 0.0
         self.exchanged = 0.0
-        self.following_s = self.idle_s = self.saturation_s = self.amplifier_s = 0.0
+        self.following_s = self.idle_s = self.saturation_s = self.amplifier_s = self.driving = 0.0
         self.enable = self.drive = self.control_v = 0.0
         self.average_length = 1
         self.out = np.zeros(len(OUTPUTS))
         self.outputs = np.asarray(self.out)
         self.faults = 0
         self.hold = 0
+        self.reports = self.enabled = self.powered = False
         self.configure(parameters)
         self.bind(np.full(_N, np.nan), np.zeros(_N, dtype=np.uint8), np.full(_N, _ABSENT, dtype=np.uint8))
 
-    def bind(self, value, fresh, status):
-        """The arrays over CHANNELS that hold the readings of each tick: value float64, fresh uint8, status uint8."""
+    def bind(self, value, fresh, status, delay=None):
+        """The arrays over CHANNELS that hold the readings of each tick: value float64, fresh uint8, status uint8.
+
+        delay: uint8, the age of a new reading when it arrived, in units of DELAY_S; None: read in the tick.
+        """
         self.value, self.fresh, self.status = value, fresh, status
+        self.delay = np.zeros(_N, dtype=np.uint8) if delay is None else delay
 
     def configure(self, parameters: Parameters):
         """Take new gains and limits, all at once, between two ticks; the state stays."""
@@ -286,6 +309,7 @@ class Law:
         self.compensate_on, self.bound_um, self.slew_um_s = p.compensate > 0.0, p.bound_um, p.slew_um_s
         self.low, self.high, self.rate = p.low.copy(), p.high.copy(), p.rate.copy()
         self.stale_s, self.frozen_s, self.required = p.stale_s.copy(), p.frozen_s.copy(), p.required.copy()
+        self.frozen_s[_SUPPLY:] = np.inf  # an amplifier's words stand still when all is well
         self.following_um, self.following_limit_s = p.following_um, p.following_s
         self.coil_limit_c = p.coil_limit_c
         self.coil_rate_limit, self.coil_rate_time_s = p.coil_rate_k_s, p.coil_rate_time_s
@@ -429,6 +453,7 @@ class Law:
         self.hold = 0
         for c in range(_N):
             self.age[c] += self.dt
+            self.since_s[c] += self.dt
             status = self.status[c]
             if status == _ABSENT and self.required[c] == 0.0:
                 self.verdict[c] = 1.0 + _K_ERROR
@@ -438,21 +463,7 @@ class Law:
             elif status == _STALE:
                 self.verdict[c] = 1.0 + _K_STALE
             elif self.fresh[c]:
-                value = self.value[c]
-                elapsed = max(self.age[c], self.period_s)
-                if not (self.low[c] <= value <= self.high[c]) or not finite(value):
-                    self.verdict[c] = 1.0 + _K_RANGE
-                elif self.seen[c] > 0.0 and abs(value - self.last[c]) > self.rate[c] * elapsed:
-                    self.verdict[c] = 1.0 + _K_RATE
-                    self.last[c] = value
-                else:
-                    if self.seen[c] > 0.0 and value == self.last[c]:
-                        self.same_s[c] += elapsed
-                    else:
-                        self.same_s[c] = 0.0
-                    self.verdict[c] = 1.0 + _K_FROZEN if self.same_s[c] > self.frozen_s[c] else 0.0
-                    self.last[c] = value
-                    self.seen[c] = 1.0
+                self._judge_reading(c, self.value[c])
                 self.age[c] = 0.0
             elif self.age[c] > self.stale_s[c] or (self.seen[c] == 0.0 and self.verdict[c] == 0.0):
                 self.verdict[c] = 1.0 + _K_STALE
@@ -468,11 +479,46 @@ class Law:
                         self.hold = 1
         if dt > self.late_s:
             self.faults |= one << _B_LATE
+        self.reports = self.status[_AMPLIFIER_STATE] == _OK
+        self.enabled = self.reports and self.value[_AMPLIFIER_STATE] == _AMPLIFIER_ENABLED
+
+    def _judge_reading(self, c, value):
+        """Range, rate and liveness of a new reading; `last` and `since_s` are of the newest one that was believed."""
+        late = _DELAY_S * self.delay[c]
+        elapsed = max(self.since_s[c] - late, self.period_s)
+        thermal = _AIR <= c < _SUPPLY
+        allowed = self.rate[c] * (max(elapsed, _THERMAL_S) if thermal else elapsed)
+        jumped = self.seen[c] > 0.0 and abs(value - self.last[c]) > allowed
+        if not (self.low[c] <= value <= self.high[c]) or not finite(value):
+            self.verdict[c] = 1.0 + _K_RANGE
+        elif jumped and thermal and self.suspect[c] == 0.0:
+            self.suspect[c] = 1.0  # one reading proves no jump: the next one decides
+        else:
+            if self.seen[c] > 0.0 and value == self.last[c]:
+                self.same_s[c] += elapsed
+            else:
+                self.same_s[c] = 0.0
+            if jumped:
+                self.verdict[c] = 1.0 + _K_RATE
+            else:
+                self.verdict[c] = 1.0 + _K_FROZEN if self.same_s[c] > self.frozen_s[c] else 0.0
+            self.last[c] = value
+            self.seen[c] = 1.0
+            self.suspect[c] = 0.0
+            self.since_s[c] = late
 
     def _power_and_air(self):
-        """q(n): electrical power, rate of the low-passed air; the last good value while a reading is at fault."""
+        """q(n): electrical power, rate of the low-passed air; the last good value while a reading is at fault.
+
+        Without a voltage meter the power is R I^2. `powered`: some power can be known; else its output is NaN.
+        """
+        self.powered = self.status[_CURRENT] != _ABSENT and (
+            self.status[_VOLTAGE] != _ABSENT or self.resistance_ohm > 0.0
+        )
         if self.verdict[_VOLTAGE] == 0.0 and self.verdict[_CURRENT] == 0.0:
             self.power_w = self.last[_VOLTAGE] * self.last[_CURRENT]
+        elif self.status[_VOLTAGE] == _ABSENT and self.verdict[_CURRENT] == 0.0:
+            self.power_w = self._resistance() * self.last[_CURRENT] * self.last[_CURRENT]
         elif self.enable == 0.0:
             self.power_w = 0.0
         self.power_mean_w += (self.power_w - self.power_mean_w) * min(1.0, self.dt / self.power_time_s)
@@ -484,6 +530,15 @@ class Law:
                 self._average_air_start()
             self.air_rate_k_s = (self.last[_AIR] - self.air_c) / self.air_filter_s
             self.air_c += self.air_rate_k_s * self.dt
+
+    def _resistance(self):
+        """The coil's, ohm, at its temperature: estimated, or else read; at 20 degC while neither is known."""
+        s = 20.0
+        if self.predicts[0] and self.air_known > 0.0:
+            s = self.T[0] + self.air_c
+        elif self.verdict[_COIL] == 0.0:
+            s = self.last[_COIL]
+        return self.resistance_ohm * (1.0 + _COPPER * (s - 20.0))
 
     def _start_air(self, value):
         """The air's low-pass starts at its first reading; the first one of all is where the expansion counts from."""
@@ -505,7 +560,7 @@ class Law:
 
     def _correct(self):
         """(35): every new valid reading of a correcting sensor moves the state; the coil's first one starts it."""
-        coil_new = self.fresh[_COIL] and self.verdict[_COIL] == 0.0
+        coil_new = self.fresh[_COIL] and self.verdict[_COIL] == 0.0 and self.suspect[_COIL] == 0.0
         if self.resumed > 0.0 and coil_new:  # do the kept estimates still fit?
             s = self.value[_COIL] - self.air_c
             for j in range(self.n):
@@ -524,7 +579,7 @@ class Law:
         for k in range(self.sensors_used):
             c = _COIL + self.sensors[k]
             self.e[k] = 0.0
-            if self.fresh[c] and self.verdict[c] == 0.0:
+            if self.fresh[c] and self.verdict[c] == 0.0 and self.suspect[c] == 0.0:
                 s = self.value[c] - self.air_c
                 for j in range(self.n):
                     s -= self.C[self.sensors[k], j] * self.x[j]
@@ -624,7 +679,10 @@ class Law:
     # ---- control ------------------------------------------------------------------------------------------------
 
     def control(self, command, command_value):
-        """Moving average, setpoint limiter, velocity-form PID (41). Not armed: the setpoint follows the stage."""
+        """Moving average, setpoint limiter, velocity-form PID (41). Not armed: the setpoint follows the stage.
+
+        The reference follows the stage, and v stays 0, also while an armed amplifier reports that it does not drive.
+        """
         if self.fresh[_POSITION] and self.verdict[_POSITION] == 0.0:
             if self.averaged == 0.0:
                 for k in range(MAX_AVERAGE):
@@ -638,12 +696,15 @@ class Law:
             self.position_um = s / self.average_length
         self.compensated_um = self.position_um + self.compensation_um
         if self.state != _ARMED:
-            self.setpoint_um = self.reference_um = self.compensated_um
+            self.setpoint_um = self.compensated_um
+        else:
+            if command == _SETPOINT and finite(command_value):
+                self.setpoint_um = command_value
+            self.setpoint_um = clip(self.setpoint_um, self.setpoint_low_um, self.setpoint_high_um)
+        if self.state != _ARMED or (self.reports and not self.enabled):
+            self.reference_um = self.compensated_um
             self.v = self.eps1 = self.d1 = 0.0
             return
-        if command == _SETPOINT and finite(command_value):
-            self.setpoint_um = command_value
-        self.setpoint_um = clip(self.setpoint_um, self.setpoint_low_um, self.setpoint_high_um)
         step = self.setpoint_rate_um_s * self.dt
         self.reference_um = clip(self.setpoint_um, self.reference_um - step, self.reference_um + step)
         eps = self.reference_um - self.compensated_um
@@ -669,23 +730,15 @@ class Law:
             self.saturation_s = self.saturation_s + self.dt if abs(self.v) >= self.output_limit else 0.0
             if self.saturation_s > self.saturation_limit_s:
                 found |= one << _B_SATURATED
-            reports = (
-                self.status[_AMPLIFIER_STATE] == _OK and self.value[_AMPLIFIER_STATE] != _AMPLIFIER_ENABLED
-            )
-            self.amplifier_s = self.amplifier_s + self.dt if reports else 0.0
-            if self.amplifier_s > self.amplifier_limit_s:
-                found |= one << _B_NOT_FOLLOWING
             self.idle_s = 0.0
         else:
-            self.following_s = self.saturation_s = self.amplifier_s = 0.0
+            self.following_s = self.saturation_s = 0.0
             driven = (
                 self.verdict[_CURRENT] == 0.0 and abs(self.last[_CURRENT]) > self.idle_current_a
             ) or abs(self.power_w) > self.idle_power_w
             self.idle_s = self.idle_s + self.dt if driven else 0.0
             if self.idle_s > self.idle_limit_s:
                 found |= one << _B_STUCK
-        if self.status[_AMPLIFIER_STATE] == _OK and self.value[_AMPLIFIER_STATE] == _AMPLIFIER_FAULT:
-            found |= one << _B_AMPLIFIER
         if self.verdict[_COIL] == 0.0 and self.last[_COIL] > self.coil_limit_c:
             found |= one << _B_HOT
         if self.T[0] + self.air_c > self.coil_limit_c:
@@ -708,6 +761,7 @@ class Law:
             and finite(self.power_w)
         ):
             found |= one << _B_NOT_FINITE
+        self._watch_amplifier()
         self._agree()
         self.faults |= found
         self.trips |= self.faults & _TRIP_OTHERS
@@ -716,6 +770,23 @@ class Law:
         self.enable = 1.0 if self.state == _ARMED and finite(self.v) else 0.0
         self.drive = clip(self.v, -self.output_limit, self.output_limit) if self.enable > 0.0 else 0.0
         self._report()
+
+    def _watch_amplifier(self):
+        """What the amplifier reports of itself against what it was told: enabled where ARMED, else disabled."""
+        one = 1
+        told = self.state == _ARMED
+        if not told:
+            self.driving = 0.0
+        if self.reports and self.value[_AMPLIFIER_STATE] == _AMPLIFIER_FAULT:
+            self.faults |= one << _B_AMPLIFIER
+        elif self.reports and not self.enabled and self.driving > 0.0:
+            self.faults |= one << _B_STOPPED
+        if told and self.enabled:
+            self.driving = 1.0
+        waits = self.reports and self.enabled != told and self.driving == 0.0
+        self.amplifier_s = self.amplifier_s + self.dt if waits else 0.0
+        if self.amplifier_s > self.amplifier_limit_s:
+            self.faults |= one << _B_NOT_FOLLOWING
 
     def _agree(self):
         """Readings against each other, low-passed; `drive` is still what was asked for one tick ago."""
@@ -732,8 +803,7 @@ class Law:
             and self.resistance_ohm > 0.0
             and (estimated or self.verdict[_COIL] == 0.0)
         ):
-            s = self.T[0] + self.air_c if estimated else self.last[_COIL]
-            s = self.resistance_ohm * amperes * (1.0 + _COPPER * (s - 20.0))
+            s = self._resistance() * amperes
             self.ohm_v += part * (self.last[_VOLTAGE] - s - self.ohm_v)
             self.ohm_scale_v += part * (max(abs(self.last[_VOLTAGE]), abs(s)) - self.ohm_scale_v)
             if abs(self.ohm_v) > self.resistance_tolerance * self.ohm_scale_v + self.resistance_v:
@@ -794,7 +864,10 @@ class Law:
     def _arm(self, command):
         """The state machine; what tripped stays in `fault_bits` until FAULT is left."""
         before, known = self.state, command if 0 <= command < _COMMANDS else _NONE
-        started, tripped, critical = self.tick > _WARM_UP, self.trips != 0, (self.trips & _CRITICAL) != 0
+        started, critical = self.tick > _WARM_UP, (self.trips & _CRITICAL) != 0
+        tripped = self.trips != 0 or (
+            before < _ARMED and self.amplifier_s > 0.0
+        )  # it still drives: not READY
         self.state = _NEXT[(((before * _COMMANDS + known) * 2 + started) * 2 + tripped) * 2 + critical]
         if self.state == _FAULT:
             self.latched = self.latched | self.trips
@@ -817,7 +890,7 @@ class Law:
         o[8] = self.control_v
         o[9] = self.drive
         o[10] = self.enable
-        o[11] = self.power_w
+        o[11] = self.power_w if self.powered else _NAN
         o[12] = self.air_rate_k_s
         for m in range(_M):
             o[13 + m] = self.T[m] + self.air_c

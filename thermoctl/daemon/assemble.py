@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from hal.profile import bind
 from thermoctl.control.faults import CHANNELS
 from thermoctl.control.model import CompensatorModel, Parameters, zero_model
-from thermoctl.yamlfile import InputError
+from thermoctl.yamlfile import InputError, load
 
 
 def law_parameters(settings: Any) -> Parameters:
@@ -59,6 +60,30 @@ def _by_channel(given: Any, default: float, where: str) -> np.ndarray:
             raise InputError(f"{where}: no channel '{name}'; expected one of {', '.join(CHANNELS)}")
         array[CHANNELS.index(name)] = number
     return array
+
+
+def power_warning(settings: Any) -> str:
+    """What is lost, with file:line, where the coil's power cannot be known; '' where it can."""
+    protection = settings.protection
+    if settings.hal.backend != "devices":
+        return ""
+    folder = Path(settings.path).parent
+    roles = {b.role for node in settings.hal.devices for b in bind(node, folder).bounds}
+    lacks = [] if "current_a" in roles else ["current_a"]
+    if "voltage_v" not in roles and protection.resistance_ohm == 0.0:
+        lacks.append("voltage_v (or protection.resistance_ohm, for R I^2)")
+    if not lacks:
+        return ""
+    root = load(settings.path)
+    section = root.value.get("protection", root)
+    place = section.value.get("power_limit_w", section) if section is not root else root
+    return str(
+        place.error(
+            f"the coil's power is unknown without {' and '.join(lacks)}: protection.power_limit_w "
+            f"({protection.power_limit_w:g} W) can never trip, and the model is driven with 0 W: its estimates and the "
+            "compensation follow the coil's reading alone"
+        )
+    )
 
 
 def compensator(settings: Any) -> CompensatorModel:

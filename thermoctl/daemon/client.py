@@ -159,12 +159,14 @@ def _bars(bins: list[list[int]], width: int = 50) -> str:
 def check(config: str) -> int:
     """Validate the configuration, the model, the plant and the profiles; no hardware is touched."""
     from hal.backend import make_backend
-    from thermoctl.daemon.assemble import compensator, law_parameters
+    from thermoctl.daemon.assemble import compensator, law_parameters, power_warning
 
     settings = load_settings(config)
     law_parameters(settings)
     model = compensator(settings)
     make_backend(settings)
+    if warning := power_warning(settings):
+        print(f"warning: {warning}")
     print(
         f"{config}: good. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, model "
         f"{settings.compensation.model or 'none'} ({model.kind}, order {len(model.A_minus_I)})"

@@ -1,11 +1,13 @@
 # C types for loop.py, which is the tick; see there.
 cimport cython
+from libc.stdint cimport uint8_t
 from hal.devices cimport DevicesBackend
 from thermoctl.control.law cimport Law
 from thermoctl.daemon.clock cimport now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring cimport Histogram, Mailbox, Record, Ring
 
-cdef int _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS
+cdef int _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS, _AIR, _SUPPLY, _LATEST
+cdef double _DELAY_S
 
 cdef class Rig:
     cdef public object backend, publish_row, parameter_box, state_box, reading, row, wall_s, suspended_ns
@@ -15,11 +17,12 @@ cdef class Rig:
     cdef public double start_s, value, busy_us
     cdef public long long slips, generation, external, write_failed
     cdef public int command
-    cdef double[::1] _head
+    cdef double[::1] _head, _time_s
+    cdef uint8_t[::1] _fresh, _delay
 
     @cython.locals(begin=cython.longlong, end=cython.longlong)
     cpdef tick(self, double now_s, double dt_s, double lateness_us=*, clock_ns=*)
-    @cython.locals(devices=DevicesBackend)
+    @cython.locals(devices=DevicesBackend, c=cython.int, age=cython.double)
     cpdef sample(self, double now_s)
     cpdef _obey(self, double kind, double value)
     @cython.locals(devices=DevicesBackend)

@@ -22,7 +22,7 @@ import numpy as np
 
 from hal.devices import DevicesBackend
 from thermoctl.control import arming, faults
-from thermoctl.control.law import Law
+from thermoctl.control.law import DELAY_S, Law
 from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring import Mailbox, Record, Ring
@@ -40,6 +40,8 @@ _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = (
     SUSPEND_EVERY,
     SUSPEND_NS,
 )  # numbers of C, by loop.pxd
+_AIR, _SUPPLY = faults.CHANNELS.index("air_c"), faults.CHANNELS.index("supply_v")
+_DELAY_S, _LATEST = DELAY_S, 15
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
 
 
@@ -68,6 +70,7 @@ class Rig:
         self.reading: Any = None
         self.row = self._head = np.zeros(len(SIGNALS))
         self.record = Record(self.row, _HEAD)
+        self._delay = np.zeros(len(faults.CHANNELS), np.uint8)
         self.slips = self.generation = self.external = self.write_failed = 0
         self.command, self.value, self.busy_us = arming.NONE, 0.0, 0.0
         self.wall_s: Callable[[], float] | None = None
@@ -98,8 +101,13 @@ class Rig:
         if reading is not self.reading:  # the same object every time, by contract
             self.reading = reading
             fresh = reading.fresh.view(np.uint8)
-            self.law.bind(reading.value, fresh, reading.status)
-            self.record.bind(reading.value, fresh, reading.status, self.law.outputs)
+            self._fresh, self._time_s = fresh, reading.time_s
+            self.law.bind(reading.value, fresh, reading.status, self._delay)
+            self.record.bind(reading.value, fresh, reading.status, self._delay, self.law.outputs)
+        for c in range(_AIR, _SUPPLY):
+            if self._fresh[c]:  # temperatures come from slow buses: when was each one read?
+                age = (now_s - self._time_s[c]) / _DELAY_S
+                self._delay[c] = 0 if age < 0.0 else _LATEST if age >= _LATEST else int(age)
         self.command, self.value, self.external = 0, 0.0, self.write_failed
         if self.mailbox is not None and self.mailbox.waiting():
             self._obey(*self.mailbox.take())

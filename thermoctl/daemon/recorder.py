@@ -23,6 +23,7 @@ from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, Share
 from thermoctl.signals import INDEX
 
 INTERVAL_S = 0.1
+LAW_VERSION = 2  # of the law's inputs, state and arithmetic: a replay is bit for bit only within one
 _TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
 _ARRAYS = ("A_minus_I", "B", "C", "gain", "b1", "b2")
 _NUMBERS = (
@@ -60,7 +61,7 @@ def law_metadata(
     """What a replay needs besides the rows, as JSON: model, parameters, the law's state after `tick` (None: new)."""
     return json.dumps(
         {
-            "version": 1,
+            "version": LAW_VERSION,
             "period_s": period_s,
             "generation": generation,
             "tick": tick,
@@ -80,6 +81,8 @@ def law_metadata(
 def read_law_metadata(text: str) -> dict[str, Any]:
     """The reverse: period_s, generation, tick, state (or None), parameters (Parameters), model (CompensatorModel)."""
     found = json.loads(text)
+    if found["version"] != LAW_VERSION:
+        raise ValueError(f"law version {found['version']}, this program has version {LAW_VERSION}")
     m = found["model"]
     values: dict[str, Any] = {name: m[name] for name in _NUMBERS} | {"sensors": tuple(m["sensors"])}
     values |= {name: decode(m[name]["values"]).reshape(m[name]["shape"]) for name in _ARRAYS}

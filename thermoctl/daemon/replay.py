@@ -13,6 +13,7 @@ from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
 _CHANNELS, _OUTPUTS = INDEX["position_raw_um"], INDEX["state"]
+_BITS = [INDEX[n] for n in ("fresh_bits", "status_bits", "delay_bits")]
 _DT, _COMMAND, _VALUE, _EXTERNAL = (INDEX[n] for n in ("dt_s", "command", "command_value", "external_bits"))
 
 
@@ -40,7 +41,7 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
             law.restore(found["state"])
     except (ValueError, KeyError, TypeError, OverflowError) as e:
         raise InputError(
-            f"{name}: holds no usable law to replay ({e}); it was not recorded by this version"
+            f"{name}: holds no usable law to replay ({e}): replay it with the version that recorded it"
         ) from None
     ticks = rows[:, INDEX["tick"]]
     skipped = int(np.searchsorted(ticks, tick, side="right"))
@@ -56,22 +57,22 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
             f"{name}: ticks are missing after tick {rows[missing[0], INDEX['tick']]:.0f} (the recorder "
             "fell behind); a replay would not start from the same state"
         )
-    whole = rows[:, [_COMMAND, _EXTERNAL, _OUTPUTS - 2, _OUTPUTS - 1]]
+    whole = rows[:, [_COMMAND, _EXTERNAL, *_BITS]]
     wrong = np.flatnonzero(
-        ~((whole == np.floor(whole)) & (np.abs(whole) <= [100, 2.0**53, 2.0**53, 2.0**53])).all(axis=1)
+        ~((whole == np.floor(whole)) & (np.abs(whole) <= [100, *[2.0**53] * 4])).all(axis=1)
     )
     if len(wrong):
         raise InputError(
             f"{name}: tick {rows[wrong[0], INDEX['tick']]:.0f} has a command, or bits, that are no whole number: "
             "damaged"
         )
-    n = _OUTPUTS - 2 - _CHANNELS
-    value, fresh, status = np.zeros(n), np.zeros(n, dtype=np.uint8), np.zeros(n, dtype=np.uint8)
-    law.bind(value, fresh, status)
+    n = _BITS[0] - _CHANNELS
+    value, (fresh, status, delay) = np.zeros(n), np.zeros((3, n), dtype=np.uint8)
+    law.bind(value, fresh, status, delay)
     given = np.empty((len(rows), len(OUTPUTS)))
     for k, row in enumerate(rows):
-        value[:] = row[_CHANNELS : _OUTPUTS - 2]
-        unpack_readings(row[_OUTPUTS - 2], row[_OUTPUTS - 1], fresh, status)
+        value[:] = row[_CHANNELS : _BITS[0]]
+        unpack_readings(*row[_BITS], fresh, status, delay)
         law.step(row[_DT], int(row[_COMMAND]), row[_VALUE], int(row[_EXTERNAL]))
         given[k] = law.outputs
     recorded = np.ascontiguousarray(rows[:, _OUTPUTS:])

@@ -22,7 +22,7 @@ cdef class Histogram:
 
 cdef class Record:
     cdef double[::1] row, value, outputs
-    cdef uint8_t[::1] fresh, status
+    cdef uint8_t[::1] fresh, status, delay
     cdef int head
 
     cpdef void fill(self) noexcept

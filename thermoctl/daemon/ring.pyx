@@ -12,6 +12,10 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+cdef enum:
+    FIRST_DELAYED = 4           # the channels whose delay is recorded: air_c and the twelve temperatures; 13 x 4 bits
+    DELAYED = 13                # are exact in a float64
+
 cdef extern from *:
     """
     #include <stdint.h>
@@ -164,34 +168,40 @@ cdef class Record:
     """The record row of a tick, filled in place behind its first `head` scalars, which the loop writes itself. `bind` gives it
     what it copies from.
 
-    Layout (signals.SIGNALS): head scalars | values of the channels | fresh bits (one a channel) | status bits (two) | outputs
-    of the law; the bits as whole float64 numbers.
+    Layout (signals.SIGNALS): head scalars | values of the channels | fresh bits (one a channel) | status bits (two) |
+    delay bits (four a temperature) | outputs of the law; the bits as whole float64 numbers.
     """
     def __init__(self, double[::1] row, int head):
         self.row, self.head = row, head
 
-    def bind(self, double[::1] value, unsigned char[::1] fresh, unsigned char[::1] status, double[::1] outputs):
+    def bind(self, double[::1] value, unsigned char[::1] fresh, unsigned char[::1] status, unsigned char[::1] delay,
+             double[::1] outputs):
         """The arrays of the back end's sample and of the law. Raises ValueError where they do not make up a row."""
-        if self.head + value.shape[0] + 2 + outputs.shape[0] != self.row.shape[0] or value.shape[0] > 26:
-            raise ValueError(f"{self.head} + {value.shape[0]} + 2 + {outputs.shape[0]} numbers are not a row of {self.row.shape[0]}")
-        self.value, self.fresh, self.status, self.outputs = value, fresh, status, outputs
+        if self.head + value.shape[0] + 3 + outputs.shape[0] != self.row.shape[0] or value.shape[0] > 26:
+            raise ValueError(f"{self.head} + {value.shape[0]} + 3 + {outputs.shape[0]} numbers are not a row of {self.row.shape[0]}")
+        self.value, self.fresh, self.status, self.delay, self.outputs = value, fresh, status, delay, outputs
 
     cpdef void fill(self) noexcept:
         """What the bound arrays hold now into the row."""
         cdef int k, n = <int>self.value.shape[0]
-        cdef uint64_t f = 0, s = 0
+        cdef uint64_t f = 0, s = 0, d = 0
         memcpy(&self.row[self.head], &self.value[0], n * sizeof(double))
         for k in range(n):
             f |= <uint64_t>(self.fresh[k] != 0) << k
             s |= <uint64_t>(self.status[k] & 3) << (2 * k)
-        self.row[self.head + n], self.row[self.head + n + 1] = <double>f, <double>s
-        memcpy(&self.row[self.head + n + 2], &self.outputs[0], self.outputs.shape[0] * sizeof(double))
+        for k in range(FIRST_DELAYED, min(n, FIRST_DELAYED + DELAYED)):
+            d |= <uint64_t>(self.delay[k] & 15) << (4 * (k - FIRST_DELAYED))
+        self.row[self.head + n], self.row[self.head + n + 1], self.row[self.head + n + 2] = <double>f, <double>s, <double>d
+        memcpy(&self.row[self.head + n + 3], &self.outputs[0], self.outputs.shape[0] * sizeof(double))
 
 
-def unpack_readings(double fresh_bits, double status_bits, unsigned char[::1] fresh, unsigned char[::1] status):
+def unpack_readings(double fresh_bits, double status_bits, double delay_bits, unsigned char[::1] fresh,
+                    unsigned char[::1] status, unsigned char[::1] delay):
     """The reverse of what `Record.fill` packs, into the given arrays."""
-    cdef uint64_t f = <uint64_t>fresh_bits, s = <uint64_t>status_bits
+    cdef uint64_t f = <uint64_t>fresh_bits, s = <uint64_t>status_bits, d = <uint64_t>delay_bits
     cdef int c
     for c in range(fresh.shape[0]):
         fresh[c] = f >> c & 1
         status[c] = s >> (2 * c) & 3
+        if FIRST_DELAYED <= c < FIRST_DELAYED + DELAYED:
+            delay[c] = d >> (4 * (c - FIRST_DELAYED)) & 15

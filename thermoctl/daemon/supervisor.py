@@ -281,6 +281,14 @@ class _Notify:
             s.sendall(text.encode())
 
 
+def _left_to(fault: faults.Fault, row: np.ndarray) -> str:
+    """Of an amplifier that stopped by itself: where its status word says that it went."""
+    if fault.name != "amplifier_stopped":
+        return ""
+    states = {0.0: "not ready", 1.0: "switched off", 4.0: "quick stop"}
+    return f"; it reports: {states.get(row[INDEX['amplifier_state']], 'nothing')}"
+
+
 class _Watcher:
     """Puts changes of state and faults into the log, from the ring: the loop itself logs nothing."""
 
@@ -316,7 +324,7 @@ class _Watcher:
                     fault.severity,
                     tick=int(rows[k, INDEX["tick"]]),
                     name=fault.name,
-                    meaning=repr(fault.meaning),
+                    meaning=repr(fault.meaning + _left_to(fault, rows[k])),
                     remedy=repr(fault.remedy),
                 )
         self.before = (pairs[-1, 0], pairs[-1, 1])

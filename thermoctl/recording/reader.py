@@ -86,7 +86,7 @@ def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
     if missing:
         raise InputError(
             f"{path}: no full-rate recording of this version: {', '.join(missing[:3])} "
-            f"{'is' if len(missing) == 1 else 'are'} missing"
+            f"{'is' if len(missing) == 1 else 'are'} missing; replay it with the version that recorded it"
         )
     return np.column_stack([table.columns[n] for n in NAMES]), table.meta.get("law", "")
 
