@@ -350,7 +350,7 @@ class Cia402Device(Device):
             elif kind == 0x080 and size == 8:
                 self._fault_code = data & 0xFFFF
                 self._emergencies += 1
-            elif port.can_id(k) == 0x700 + self._master:
+            elif kind == 0x700 + self._master - self._node:
                 raise foreign_heartbeat(self._master, self.binding.port)
         if now_s - self._heard_s > self._patience_s:
             raise HardwareError(f"no heartbeat of node {self._node} for {self._patience_s * 1e3:.0f} ms")

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from hal.backend import ABSENT, ERROR, ROLE, ROLES, STALE, HardwareError, Sample
-from hal.profile import Binding, bind, check_rig
+from hal.profile import Binding, bind, check_rig, rig_notes
 from hal.wire import Ages, Channels, wait_readable
 from thermoctl.yamlfile import InputError
 
@@ -122,10 +122,18 @@ class Device:
 def make_devices(settings: Any) -> list[Device]:
     """The drivers of `settings.hal.devices` (yamlfile nodes), not connected. Profiles are relative to the config file.
     Raises InputError."""
-    folder = Path(settings.path).parent
-    bindings = [bind(node, folder) for node in settings.hal.devices]
+    bindings = _bindings(settings)
     check_rig(bindings)
     return [_driver(b) for b in bindings]
+
+
+def _bindings(settings: Any) -> list[Binding]:
+    return [bind(node, Path(settings.path).parent) for node in settings.hal.devices]
+
+
+def device_notes(settings: Any) -> list[str]:
+    """What is allowed in `settings.hal.devices` and yet probably meant otherwise, a line each. Raises InputError."""
+    return rig_notes(_bindings(settings))
 
 
 def driving_devices(settings: Any) -> list[Device]:
@@ -326,8 +334,7 @@ class DevicesBackend:
             try:
                 device.connect()
             except (HardwareError, OSError) as e:
-                if (now := f"{e}; trying again") != why:
-                    device.miss_all(f"{why}; now: {e}")
+                device.miss_all(why if str(e) in why else f"{why}; now: {e}")
                 continue
             device.problems.clear()
             device.counts["reconnections"] += 1
