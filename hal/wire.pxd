@@ -9,7 +9,7 @@ cdef enum:
     MAX_FRAMES = 1024           # of a read: the shortest Lawicel frame has 6 bytes
     MAX_QUEUED = 32             # frames of one send
     MAX_PENDING = 4096          # bytes that wait for a line which takes none: then it counts as lost
-    EXTENDED_FLAG = 0x80000000  # of a can_id: 29 bits (as in the kernel's struct can_frame)
+    EXTENDED_FLAG = 1 << 31      # of a can_id: 29 bits (as in the kernel's struct can_frame)
 
 cdef class Framer:
     cdef readonly object spec

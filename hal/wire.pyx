@@ -20,7 +20,7 @@ from posix.unistd cimport read as c_read, write as c_write
 
 from hal.profile import CRCS, FIELD_TYPES
 
-EXTENDED = EXTENDED_FLAG
+EXTENDED = 0x80000000
 """Bit 31 of an identifier: it has 29 bits. An 11-bit identifier of the same number is another one."""
 
 cdef extern from "<poll.h>" nogil:
