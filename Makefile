@@ -155,7 +155,8 @@ diagnose-recordings: install       # real rigs from their naive plants: what is 
 .PHONY: fuzz
 FUZZ_S ?= 20
 TARGETS := plant config expression serial slcan modbus csv parquet arrow arrows commands metadata
-fuzz: install                      # FUZZ_S seconds for each that reads bytes from outside, twice; a find ends it, its input stays in build/fuzz
+fuzz: install                      # every driver behind its port for an hour's frames; then FUZZ_S seconds for each that reads bytes from outside, twice; a find ends it, its input stays in build/fuzz
+	$(BIN)/python -m tests.fuzz.drivers
 	for target in $(TARGETS); do $(BIN)/python -m tests.fuzz.targets $$target --seconds $(FUZZ_S) || exit 1; done
 	-$(BIN)/python -m pip install --quiet --editable '.[fuzz]'
 	if $(BIN)/python -c "import atheris" 2>/dev/null; then for target in $(TARGETS); do \

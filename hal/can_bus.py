@@ -52,7 +52,7 @@ from hal.cia402 import (
     switch_off,
 )
 from hal.devices import Device
-from hal.profile import ERROR_CODE, STATUS_WORD, Binding, Cia402, Dbc, LineSettings
+from hal.profile import STATUS_WORD, Binding, Cia402, Dbc, LineSettings
 from hal.serial_port import open_port
 from hal.wire import EXTENDED, CanPort, SlcanLine, nearest
 
@@ -148,7 +148,9 @@ class LibraryPort(CanPort):
                 if self._socket is None:
                     self._bus.send(
                         can.Message(
-                            arbitration_id=can_id & ~EXTENDED, data=data, is_extended_id=bool(can_id & EXTENDED)
+                            arbitration_id=can_id & ~EXTENDED,
+                            data=data,
+                            is_extended_id=bool(can_id & EXTENDED),
                         )
                     )
                 else:
@@ -408,7 +410,10 @@ class DbcDevice(Device):
         spec: Dbc = binding.profile.bus_spec
         self._port: SlcanPort | LibraryPort | None = None
         self._messages: dict[int, tuple[Any, list[tuple[int, str]]]] = {}
-        self._quiet, self._why = 0, ""  # frames since the last reading, and what was wrong with the last of them
+        self._quiet, self._why = (
+            0,
+            "",
+        )  # frames since the last reading, and what was wrong with the last of them
         for i, b in enumerate(binding.bounds):
             message = spec.database.get_message_by_name(b.channel.source.message)
             can_id = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
@@ -436,7 +441,9 @@ class DbcDevice(Device):
                 self._quiet += 1
                 if can_id ^ EXTENDED in self._messages:
                     here, there = (29, 11) if can_id & EXTENDED else (11, 29)
-                    self._why = f"0x{can_id & ~EXTENDED:X} came as {here}-bit id, the DBC file says {there} bits"
+                    self._why = (
+                        f"0x{can_id & ~EXTENDED:X} came as {here}-bit id, the DBC file says {there} bits"
+                    )
                 continue
             try:
                 values = entry[0].decode(data, decode_choices=False)
@@ -453,13 +460,13 @@ class DbcDevice(Device):
 
     def silence(self) -> str:
         """What arrives instead of a reading."""
-        wanted = ", ".join(
-            f"0x{i & ~EXTENDED:X} ({29 if i & EXTENDED else 11} bits)" for i in self._messages
-        )
+        wanted = ", ".join(f"0x{i & ~EXTENDED:X} ({29 if i & EXTENDED else 11} bits)" for i in self._messages)
         if self._quiet:
             return f"{self._quiet} frames came and gave no reading: {self._why or f'none is {wanted}'}"
         if self._port is not None and self._port.ignored:
-            return f"{self._port.ignored} remote or CAN FD frames came, {wanted} as classic data frame is wanted"
+            return (
+                f"{self._port.ignored} remote or CAN FD frames came, {wanted} as classic data frame is wanted"
+            )
         return f"{super().silence()}, the bitrate, and who sends {wanted}"
 
     def counters(self) -> dict[str, int]:

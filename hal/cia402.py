@@ -28,7 +28,10 @@ NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET_COMMUNICATION = 0x01, 0x80, 0x82
 HEARTBEAT_LOST = 0x8130  # CiA 301 error code of a missing heartbeat
 PDO_INVALID, PDO_NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a PDO's COB-ID
 CONTROL_WORD: Object = (0x6040, 0)
-LISTEN_S, LISTEN_BEATS = 0.1, 5  # for a foreign heartbeat, before anything is sent: at least, and in our own periods
+LISTEN_S, LISTEN_BEATS = (
+    0.1,
+    5,
+)  # for a foreign heartbeat, before anything is sent: at least, and in our own periods
 DOUBLE_ANSWERS = 3  # second answers to one request, from which on two devices share the node id
 _FORMATS = {
     datatypes.INTEGER8: "b",
@@ -125,7 +128,9 @@ class Sdo:
             if answer:
                 return self._checked(answer, item, what)
             if time.monotonic() > end:
-                raise HardwareError(f"no answer to object {object_name(item)} within {self.timeout_s:g} s: {self._others()}")
+                raise HardwareError(
+                    f"no answer to object {object_name(item)} within {self.timeout_s:g} s: {self._others()}"
+                )
             time.sleep(0.0005)
 
     def _checked(self, answer: bytes, item: Object, what: str) -> bytes:
@@ -168,7 +173,9 @@ def set_up(sdo: Sdo, spec: Cia402, formats: dict[Object, str], where: str) -> in
     port.send((NMT_ID, bytes((NMT_PRE_OPERATIONAL, node))))  # PDOs rest while they are mapped
     profile = sdo.read((0x1000, 0)) & 0xFFFF
     if profile != 402:
-        raise HardwareError(f"node {node} has device profile {profile}, 402 (drive) was expected: is the node id right?")
+        raise HardwareError(
+            f"node {node} has device profile {profile}, 402 (drive) was expected: is the node id right?"
+        )
     sdo.write(CONTROL_WORD, "H", 0)
     sdo.write((0x1016, 1), "I", spec.master_id << 16 | round(spec.watchdog_s * 1000))
     sdo.write((0x1017, 0), "H", round(spec.heartbeat_s * 1000))
@@ -183,7 +190,9 @@ def set_up(sdo: Sdo, spec: Cia402, formats: dict[Object, str], where: str) -> in
         sdo.write(CONTROL_WORD, "H", 0)
         fault_code = sdo.read((0x603F, 0))
     if sdo.double >= DOUBLE_ANSWERS:
-        raise HardwareError(f"two devices answer as node {node}: give one of them another node id; both would be driven")
+        raise HardwareError(
+            f"two devices answer as node {node}: give one of them another node id; both would be driven"
+        )
     if 0x700 + spec.master_id in sdo.heartbeats:
         raise foreign_heartbeat(spec.master_id, where)
     port.send((NMT_ID, bytes((NMT_START, node))))
@@ -226,7 +235,9 @@ def check_objects(objects: Objects, spec: Cia402) -> dict[Object, str]:
     formats = {item: objects.format(item, "transmit") for item in spec.transmit}
     formats[spec.command] = objects.format(spec.command, "command")
     if not formats[spec.command].islower():
-        raise InputError(f"{objects.place}: command: {spec.eds}: object {object_name(spec.command)} has no sign")
+        raise InputError(
+            f"{objects.place}: command: {spec.eds}: object {object_name(spec.command)} has no sign"
+        )
     for index, sub, value in spec.start_up:
         letter = formats[index, sub] = objects.format((index, sub), "start_up")
         try:

@@ -88,9 +88,7 @@ class Device:
 
     def miss(self, bound: int, problem: str) -> None:
         """Note why no reading of the bound channel number `bound` came; the last value stands until it is stale."""
-        self.problems[self.roles[bound]] = (
-            f"{self.name} {self.binding.bounds[bound].channel.name}: {problem}"
-        )
+        self.problems[self.roles[bound]] = f"{self.name} {self.binding.bounds[bound].channel.name}: {problem}"
 
     def fail_all(self, sample: Sample, problem: str) -> None:
         """Mark every channel as ERROR."""

@@ -37,8 +37,14 @@ EXCEPTIONS = {
     5: ("acknowledge", "it is still at work on an earlier request: lower 'rate_hz'"),
     6: ("device busy", "another master may be asking it, or we ask too often: lower 'rate_hz'"),
     8: ("memory parity error", "the device's memory is damaged: restart it"),
-    10: ("gateway path unavailable", "the gateway has no line for this unit: check its configuration and 'address'"),
-    11: ("gateway target silent", "no unit of this address answers behind the gateway: check 'address', power and line"),
+    10: (
+        "gateway path unavailable",
+        "the gateway has no line for this unit: check its configuration and 'address'",
+    ),
+    11: (
+        "gateway target silent",
+        "no unit of this address answers behind the gateway: check 'address', power and line",
+    ),
 }
 """Modbus exception codes: the text, and what to do."""
 BUSY, PASSING = (5, 6), (5, 6, 10, 11)  # asked again at once; never a statement on the channel itself
@@ -109,11 +115,7 @@ class ModbusDevice(Device):
         """Open the connection or the serial port. Raises HardwareError."""
         port, line = self.binding.port, self.binding.profile.line
         tcp = re.fullmatch(r"tcp:(\[[^]]+\]|[^:]+):(\d+)", port)
-        common: dict[str, Any] = {
-            "timeout": self._spec.timeout_s,
-            "retries": 0,
-            "trace_packet": self._trace,
-        }
+        common: dict[str, Any] = {"timeout": self._spec.timeout_s, "retries": 0, "trace_packet": self._trace}
         try:
             if tcp:
                 self._client = ModbusTcpClient(tcp[1].strip("[]"), port=int(tcp[2]), **common)
@@ -211,7 +213,9 @@ class ModbusDevice(Device):
             return code
         words = getattr(answer, "registers", None)
         if answer.function_code != (4 if block.kind == "input" else 3) or words is None:
-            raise NoAnswer(f"function {answer.function_code} was answered, {block.kind} registers were asked for")
+            raise NoAnswer(
+                f"function {answer.function_code} was answered, {block.kind} registers were asked for"
+            )
         if len(words) != block.count:
             raise NoAnswer(f"{len(words)} registers were answered, {block.count} were asked for")
         self.counts["frames"] += 1
@@ -249,7 +253,9 @@ class ModbusDevice(Device):
         now_s = time.monotonic()
         for i, register in block.members:
             hint = register_hint(register.address) if code == 2 else ""
-            text = f"{self._named(block)}: exception {code} ({name}): {remedy}" + (f"; {hint}" if hint else "")
+            text = f"{self._named(block)}: exception {code} ({name}): {remedy}" + (
+                f"; {hint}" if hint else ""
+            )
             stale_s = self.binding.bounds[i].channel.stale_after_s
             if code not in PASSING and now_s - sample.time_s[self.roles[i]] > stale_s:
                 self.fail(sample, i, text)

@@ -291,7 +291,9 @@ class Cia402:
     mode: int  # 0x6060 mode of operation: 4 profile torque, 10 cyclic torque, < 0 vendor's
     command: Object  # takes the drive
     transmit: tuple[Object, ...]  # of TPDO 1, the first is the status word 0x6041
-    master_id: int = 0  # our own node id: its heartbeat is what the drive watches; 0: 127 - the drive's node id
+    master_id: int = (
+        0  # our own node id: its heartbeat is what the drive watches; 0: 127 - the drive's node id
+    )
     heartbeat_s: float = 0.02  # we send ours and ask the drive for its own this often
     watchdog_s: float = 0.1  # the drive stops when ours is missing for so long
     start_up: tuple[tuple[int, int, int], ...] = ()  # further (index, subindex, value) written at set-up
@@ -436,7 +438,9 @@ def _channel(name: str, s: Section, bus: str, spec: Any) -> Channel:
 
 def _check_dbc_unit(s: Section, spec: Dbc, channel: Channel) -> None:
     """Raise where the DBC file's unit is not the profile's and no scale converts between them."""
-    signal = spec.database.get_message_by_name(channel.source.message).get_signal_by_name(channel.source.signal)
+    signal = spec.database.get_message_by_name(channel.source.message).get_signal_by_name(
+        channel.source.signal
+    )
     theirs = _DBC_UNITS.get(signal.unit or "", signal.unit or "")
     if theirs == channel.unit or abs(channel.scale) != 1.0:
         return
@@ -479,7 +483,9 @@ def _binary_frame(top: Section, folder: Path) -> BinaryFrame:
     sequence = _named(s, "sequence", names) if s.get("sequence", False) else ""
     order = {"little": "<", "big": ">"}
     if s.get("crc", False) is None:
-        raise s.node.error(f"frame: 'crc' is missing: one of {', '.join(CRCS)} ('none': frames are not checked)")
+        raise s.node.error(
+            f"frame: 'crc' is missing: one of {', '.join(CRCS)} ('none': frames are not checked)"
+        )
     frame = BinaryFrame(
         sync,
         tuple(fields),
@@ -599,9 +605,13 @@ def _object(node: Node, key: str) -> Object:
     found = re.fullmatch(r"(0x[0-9A-Fa-f]{4})(?::(0x[0-9A-Fa-f]{1,2}|\d{1,3}))?", str(node.value))
     if found is None and isinstance(node.value, int) and not isinstance(node.value, bool):
         return _integer(node, key, 0x1000, 0xFFFF), 0
-    index, sub = (int(found[1], 16), int(found[2] or "0", 0 if "x" in (found[2] or "") else 10)) if found else (0, 0)
+    index, sub = (
+        (int(found[1], 16), int(found[2] or "0", 0 if "x" in (found[2] or "") else 10)) if found else (0, 0)
+    )
     if not 0x1000 <= index <= 0xFFFF or sub > 255:
-        raise node.error(f"{key}: an object as 0x6041, or 0x30D1:1 with its sub-index, was expected, found {_kind(node)}")
+        raise node.error(
+            f"{key}: an object as 0x6041, or 0x30D1:1 with its sub-index, was expected, found {_kind(node)}"
+        )
     return index, sub
 
 
@@ -804,7 +814,5 @@ def register_hint(address: int) -> str:
     """What a manual means by such a register number, where it counts from 30001 or 40001; '' elsewhere."""
     for base, kind in ((30001, "input"), (40001, "holding")):
         if base <= address < base + 9999:
-            return (
-                f"addresses count from 0; where the manual calls it {address}, it is kind: {kind}, register: {address - base}"
-            )
+            return f"addresses count from 0; where the manual calls it {address}, it is kind: {kind}, register: {address - base}"
     return ""

@@ -123,7 +123,10 @@ class SerialDevice(Device):
         self._framer = Framer(spec) if isinstance(spec, BinaryFrame) else None
         self._lines = LineReader()
         self._due_s, self._waited = 0.0, False
-        self._unread, self._why = 0, ""  # lines since the last reading that gave none, and why the last of them
+        self._unread, self._why = (
+            0,
+            "",
+        )  # lines since the last reading that gave none, and why the last of them
         if self._framer:
             names = [n for n, _ in spec.fields]
             self._index = array("i", [names.index(b.channel.source) for b in binding.bounds])
@@ -203,7 +206,9 @@ class SerialDevice(Device):
         spec: TextLine = self.binding.profile.bus_spec
         if spec.request and now_s >= self._due_s:
             self._due_s = now_s + 1.0 / spec.request_hz
-            with contextlib.suppress(BlockingIOError):  # the line takes nothing now: ask again at the next due time
+            with contextlib.suppress(
+                BlockingIOError
+            ):  # the line takes nothing now: ask again at the next due time
                 os.write(self._fd, spec.request)
         for raw in self._lines.feed(data) if data else ():
             line = raw.decode("ascii", "replace")

@@ -81,7 +81,10 @@ def why_no_number(text: str, line: str, base: int, decimal: str) -> str:
     kind = "hexadecimal" if base == 16 else f"decimal (sign of decimals '{decimal}')"
     other = [
         f"{key}: {value}"
-        for b, d, key, value in ((16, decimal, "base", "16"), (10, "," if decimal == "." else ".", "decimal", ""))
+        for b, d, key, value in (
+            (16, decimal, "base", "16"),
+            (10, "," if decimal == "." else ".", "decimal", ""),
+        )
         if (b, d) != (base, decimal) and number(text, b, d) is not None
         for value in (value or f"'{d}'",)
     ]

@@ -305,6 +305,7 @@ class SlcanAdapter:
         if not self.open:
             return b""
         return b"".join(
-            (b"T%08X" % (i & ~EXTENDED) if i & EXTENDED else b"t%03X" % i) + b"%d%s\r" % (len(d), d.hex().upper().encode())
+            (b"T%08X" % (i & ~EXTENDED) if i & EXTENDED else b"t%03X" % i)
+            + b"%d%s\r" % (len(d), d.hex().upper().encode())
             for i, d in frames
         )

@@ -169,7 +169,9 @@ def test_a_lost_axis_stops_although_the_other_axis_lives(bus):
     assert drive_b.command == 250_000 and b.backend.sample.value[STATE] == AMP_ENABLED
 
 
-@pytest.mark.parametrize("more,message", [("", "heartbeat 0x77A .node id 122."), (", master_id: 99", "heartbeat 0x763")])
+@pytest.mark.parametrize(
+    "more,message", [("", "heartbeat 0x77A .node id 122."), (", master_id: 99", "heartbeat 0x763")]
+)
 def test_a_foreign_producer_of_our_heartbeat_is_refused_before_anything_is_sent(bus, more, message):
     drive, other = bus.drive(5), bus.member()
     done = threading.Event()
@@ -206,7 +208,10 @@ def test_the_master_id_of_the_binding_counts(bus):
     drive, m = bus.drive(5), bus.master(5, ", master_id: 99")
     m.backend.open()
     assert drive.od[0x1016, 1] >> 16 == 99
-    for text, message in ((", master_id: 5", "the drive's own node id"), (", master_id: 128", "outside 1 .. 127")):
+    for text, message in (
+        (", master_id: 5", "the drive's own node id"),
+        (", master_id: 128", "outside 1 .. 127"),
+    ):
         with pytest.raises(InputError, match=message):
             Master(bus.port, 5, text)
 
@@ -227,7 +232,9 @@ def test_an_sdo_abort_names_object_value_and_reason(bus):
     assert "termination" not in text and text.count("axis 5") == 1 and text.count(bus.port) == 1
 
 
-@pytest.mark.parametrize("strict", [lambda v: 0 if v & 0x4000_0000 else 0x06090030, lambda v: 0x06090030 if v & 0x4000_0000 else 0])
+@pytest.mark.parametrize(
+    "strict", [lambda v: 0 if v & 0x4000_0000 else 0x06090030, lambda v: 0x06090030 if v & 0x4000_0000 else 0]
+)
 def test_the_no_rtr_bit_of_the_tpdo_is_as_the_drive_wants_it(bus, strict):
     drive, m = bus.drive(5, refuse={(0x1800, 1): strict}), bus.master(5)
     m.backend.open()
@@ -239,7 +246,9 @@ def test_a_slow_drive_needs_the_option(bus, tmp_path):
     bus.drive(5, slow_s=0.1)
     (tmp_path / "drive-cia402.eds").write_text(EDS)
     for timeout, message in (("0.02", "no answer to object 0x1000 within 0.02 s.*sdo_timeout_s"), ("3", "")):
-        (tmp_path / "d.yaml").write_text(DRIVE.replace("  node_id: 5\n", f"  node_id: 5\n  sdo_timeout_s: {timeout}\n"))
+        (tmp_path / "d.yaml").write_text(
+            DRIVE.replace("  node_id: 5\n", f"  node_id: 5\n  sdo_timeout_s: {timeout}\n")
+        )
         m = bus.master(5, profile="d.yaml", folder=tmp_path)
         if message:
             with pytest.raises(HardwareError, match=message):
@@ -269,7 +278,9 @@ def test_a_tpdo_of_another_length_is_told(bus):
     bus.drive(5, transmit_size=6)
     m = bus.master(5)
     m.backend.open()
-    until(lambda s: "TPDO 1 frames came with 6 bytes, 8 were mapped" in m.backend.problem("amplifier_state"), m)
+    until(
+        lambda s: "TPDO 1 frames came with 6 bytes, 8 were mapped" in m.backend.problem("amplifier_state"), m
+    )
     assert m.backend.sample.status[STATE] == STALE and m.backend.counters()["axis 5.errors"] > 0
 
 
@@ -307,12 +318,17 @@ def with_sub_indices(tmp_path, transmit="[0x6041, 0x30D1:1]", item="0x30D1:1", m
     eds = EDS.replace(f"SupportedObjects={count}", f"SupportedObjects={count + 1}\n{count + 1}=0x30D1", 1)
     if "=0x30D1" not in eds.partition("[OptionalObjects]")[2][:2000]:
         eds = EDS.replace("[OptionalObjects]\nSupportedObjects=", "[OptionalObjects]\nSupportedObjects=", 1)
-    eds = eds.replace("[1A00]\nParameterName=TPDO1 mapping parameter\nObjectType=0x9", "[1A00]\nParameterName=TPDO1 mapping parameter\nObjectType=0x8")
+    eds = eds.replace(
+        "[1A00]\nParameterName=TPDO1 mapping parameter\nObjectType=0x9",
+        "[1A00]\nParameterName=TPDO1 mapping parameter\nObjectType=0x8",
+    )
     (tmp_path / "drive-cia402.eds").write_text(eds + ARRAY)
     text = DRIVE.replace("[0x6041, 0x6078, 0x6079]", transmit).replace("object: 0x6078", f"object: {item}")
     text = "\n".join(line for line in text.split("\n") if "0x6079" not in line or "transmit" in line)
     (tmp_path / "d.yaml").write_text(text.replace("  node_id: 5\n", f"  node_id: 5\n{more}"))
-    node = "{name: d, profile: d.yaml, port: 'virtual:x', roles: {state: amplifier_state, current: current_a}}"
+    node = (
+        "{name: d, profile: d.yaml, port: 'virtual:x', roles: {state: amplifier_state, current: current_a}}"
+    )
     return Cia402Device(bind(yamlfile.loads(node.replace("virtual:x", f"virtual:{tmp_path.name}")), tmp_path))
 
 
@@ -340,13 +356,22 @@ def test_an_object_with_a_sub_index_is_mapped_and_read(tmp_path):
 @pytest.mark.parametrize(
     "how,message",
     [
-        ({"transmit": "[0x6041, 0x30D1]", "item": "0x6041"}, "transmit: .*object 0x30D1 has sub-indices; say which, as 0x30D1:1, 0x30D1:2"),
-        ({"transmit": "[0x6041, 0x30D1:9]", "item": "0x6041"}, "object 0x30D1:9 has no sub-index 9; it has 1, 2"),
+        (
+            {"transmit": "[0x6041, 0x30D1]", "item": "0x6041"},
+            "transmit: .*object 0x30D1 has sub-indices; say which, as 0x30D1:1, 0x30D1:2",
+        ),
+        (
+            {"transmit": "[0x6041, 0x30D1:9]", "item": "0x6041"},
+            "object 0x30D1:9 has no sub-index 9; it has 1, 2",
+        ),
         ({"transmit": "[0x6041, 0x6078:1]", "item": "0x6041"}, "object 0x6078:1 has no sub-indices"),
         ({"transmit": "[0x6041, 0x5555]", "item": "0x6041"}, "object 0x5555 is not in it"),
         ({"transmit": "[0x6041, 0x30D1:1, 0x30D1:2]"}, "a PDO has 8 bytes, these objects take 10"),
         ({"more": "  start_up: [{index: 0x5555, value: 1}]\n"}, "start_up: .*object 0x5555 is not in it"),
-        ({"more": "  start_up: [{index: 0x6060, value: 300}]\n"}, "start_up: 300 does not fit object 0x6060 .8 bits, with sign."),
+        (
+            {"more": "  start_up: [{index: 0x6060, value: 300}]\n"},
+            "start_up: 300 does not fit object 0x6060 .8 bits, with sign.",
+        ),
     ],
 )
 def test_objects_that_the_eds_has_not_are_told_by_check(tmp_path, how, message):
@@ -375,7 +400,9 @@ def shunt(tmp_path):
 
     def make(extended=False):
         dbc = (CONFIG / "devices/meter-can.dbc").read_text()
-        (tmp_path / "meter-can.dbc").write_text(dbc.replace("BO_ 801", f"BO_ {801 | 1 << 31}") if extended else dbc)
+        (tmp_path / "meter-can.dbc").write_text(
+            dbc.replace("BO_ 801", f"BO_ {801 | 1 << 31}") if extended else dbc
+        )
         (tmp_path / "meter-can.yaml").write_text((CONFIG / "devices/meter-can.yaml").read_text())
         adapter = Adapter()
         node = f"{{name: shunt, profile: meter-can.yaml, port: '{adapter.port}', roles: {{voltage: voltage_v, current: current_a}}}}"
@@ -399,7 +426,11 @@ def test_an_identifier_of_another_length_is_another_one(shunt, extended, wanted,
     adapter.say(other)
     device.read(sample, 1.0)
     assert not sample.fresh.any()
-    words = "came as 11-bit id, the DBC file says 29 bits" if extended else "came as 29-bit id, the DBC file says 11 bits"
+    words = (
+        "came as 11-bit id, the DBC file says 29 bits"
+        if extended
+        else "came as 29-bit id, the DBC file says 11 bits"
+    )
     assert f"1 frames came and gave no reading: 0x321 {words}" in device.silence()
     adapter.say(wanted)
     device.read(sample, 1.0)
@@ -409,10 +440,16 @@ def test_an_identifier_of_another_length_is_another_one(shunt, extended, wanted,
 @pytest.mark.parametrize("extended", [False, True])
 def test_identifiers_of_both_lengths_through_the_library(tmp_path, extended):
     dbc = (CONFIG / "devices/meter-can.dbc").read_text()
-    (tmp_path / "meter-can.dbc").write_text(dbc.replace("BO_ 801", f"BO_ {801 | 1 << 31}") if extended else dbc)
+    (tmp_path / "meter-can.dbc").write_text(
+        dbc.replace("BO_ 801", f"BO_ {801 | 1 << 31}") if extended else dbc
+    )
     (tmp_path / "meter-can.yaml").write_text((CONFIG / "devices/meter-can.yaml").read_text())
     node = f"{{name: s, profile: meter-can.yaml, port: 'virtual:{tmp_path.name}', roles: {{voltage: voltage_v}}}}"
-    device, sample, sender = DbcDevice(bind(yamlfile.loads(node), tmp_path)), Sample(), can.Bus(tmp_path.name, interface="virtual")
+    device, sample, sender = (
+        DbcDevice(bind(yamlfile.loads(node), tmp_path)),
+        Sample(),
+        can.Bus(tmp_path.name, interface="virtual"),
+    )
     device.connect()
     data = bytes.fromhex("127A00DC0BFF0700")
     odd = [
@@ -442,7 +479,12 @@ def test_frames_of_29_bits_are_none_of_the_drives(bus):
     other, m = bus.member(), bus.master(5)
     m.backend.open()
     until(lambda s: s.value[STATE] == AMP_DISABLED and s.status[STATE] == OK, m)
-    for can_id, data in ((0x185, "0800640000000000"), (0x705, "00"), (0x085, "1023010000000000"), (0x77A, "05")):
+    for can_id, data in (
+        (0x185, "0800640000000000"),
+        (0x705, "00"),
+        (0x085, "1023010000000000"),
+        (0x77A, "05"),
+    ):
         other.send(can.Message(arbitration_id=can_id, data=bytes.fromhex(data), is_extended_id=True))
     frames = m.device._heard
     until(lambda s: m.device._heard > frames + 20, m)
@@ -452,7 +494,10 @@ def test_frames_of_29_bits_are_none_of_the_drives(bus):
 
 def test_lawicel_text_as_in_its_manual():
     parser = SlcanParser()
-    assert parser.feed(b"t1852ABCD\rT000001852ABCD\r") == [(0x185, b"\xab\xcd"), (1 << 31 | 0x185, b"\xab\xcd")]
+    assert parser.feed(b"t1852ABCD\rT000001852ABCD\r") == [
+        (0x185, b"\xab\xcd"),
+        (1 << 31 | 0x185, b"\xab\xcd"),
+    ]
     assert parser.feed(b"r1852\rR000001852\rd1859" + b"00" * 12 + b"\rT200000000\rt8000\r") == []
     assert parser.ignored == 3 and parser.bad == 2
 
@@ -499,7 +544,11 @@ def test_a_device_that_nobody_requires_may_be_absent_at_the_start(tmp_path, bus)
     reference = ROLE["output_reference_um"]
     assert backend.sample.status[reference] == STALE
     problem = backend.problem("output_reference_um")
-    assert problem.startswith("reference position: ") and "no such device" in problem and "trying again" in problem
+    assert (
+        problem.startswith("reference position: ")
+        and "no such device" in problem
+        and "trying again" in problem
+    )
     master, slave = os.openpty()
     tty.setraw(slave)
     (tmp_path / "encoder").symlink_to(os.ttyname(slave))
@@ -510,7 +559,10 @@ def test_a_device_that_nobody_requires_may_be_absent_at_the_start(tmp_path, bus)
         return sample.status[reference] == OK
 
     until(send_and_see, m)
-    assert backend.sample.value[reference] == pytest.approx(10.0) and backend.problem("output_reference_um") == ""
+    assert (
+        backend.sample.value[reference] == pytest.approx(10.0)
+        and backend.problem("output_reference_um") == ""
+    )
     backend.close()
     needed = DevicesBackend([encoder], [], None, ["output_reference_um"])
     (tmp_path / "encoder").unlink()

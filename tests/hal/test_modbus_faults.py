@@ -149,7 +149,9 @@ def sample(device):
 
 
 def held(sample):
-    return all(sample.status[k] == OK for k in (COIL, AIR, SHAFT)) and sample.value[COIL] == pytest.approx(21.5)
+    return all(sample.status[k] == OK for k in (COIL, AIR, SHAFT)) and sample.value[COIL] == pytest.approx(
+        21.5
+    )
 
 
 @pytest.mark.parametrize("times", [1, LOST_POLLS - 1])
@@ -181,7 +183,9 @@ def test_a_busy_device_is_asked_again_at_once(module, device, sample, code):
     assert sample.value[COIL] == pytest.approx(99.9) and device.counters()["errors"] == 2
 
 
-@pytest.mark.parametrize("code,words", [(4, "failure of its own"), (6, "busy"), (8, "memory"), (11, "behind the gateway")])
+@pytest.mark.parametrize(
+    "code,words", [(4, "failure of its own"), (6, "busy"), (8, "memory"), (11, "behind the gateway")]
+)
 def test_one_exception_leaves_the_values_standing(module, device, sample, code, words):
     module.answers = [bytes((0x84, code))] * 3
     device.poll(sample)
@@ -213,7 +217,10 @@ def test_an_illegal_register_is_named_and_takes_no_other_along(module, device, s
         device.poll(fresh)
         assert fresh.value[COIL] == pytest.approx(99.9) and fresh.status[COIL] == fresh.status[SHAFT] == OK
         assert fresh.status[AIR] == ERROR
-    assert "m b: input register 11: exception 2 (illegal register address): check 'register' and 'kind'" in device.problems[AIR]
+    assert (
+        "m b: input register 11: exception 2 (illegal register address): check 'register' and 'kind'"
+        in device.problems[AIR]
+    )
     module.asked.clear()
     device.poll(fresh)
     assert len(module.asked) == 3  # the good ones in one request each side of the gap, the bad one alone
@@ -264,7 +271,9 @@ def test_damaged_answers_leave_the_values_standing(module, device, sample, spoil
     assert held(sample) and words in device.problems[COIL]
 
 
-@pytest.mark.parametrize("answer", [b"\x04\x04\x00\x01\x00\x02", b"\x03\x0a" + bytes(10), b"\x2b\x0e", b"\x04"])
+@pytest.mark.parametrize(
+    "answer", [b"\x04\x04\x00\x01\x00\x02", b"\x03\x0a" + bytes(10), b"\x2b\x0e", b"\x04"]
+)
 def test_a_foreign_answer_is_no_reading(module, device, sample, answer):
     """Too few registers, another function, another protocol."""
     module.answers = [answer]

@@ -71,14 +71,20 @@ def test_hexadecimal_lines_are_read_as_such(gauge, line, counts):
     assert gauge("(?P<x>[-+][0-9A-F]+)$", channel=", base: 16").says(line) == counts
 
 
-@pytest.mark.parametrize("pattern", ["[-+][0-9A-F]+", r"\\S+", "[0-9A-Fa-f]{4}", "[^,]*", r"[-+]?[\\dABCDEF]+"])
+@pytest.mark.parametrize(
+    "pattern", ["[-+][0-9A-F]+", r"\\S+", "[0-9A-Fa-f]{4}", "[^,]*", r"[-+]?[\\dABCDEF]+"]
+)
 def test_a_group_that_takes_letters_must_say_its_base(tmp_path, pattern):
     pattern = pattern.replace("\\\\", "\\")
     for base in (", base: 10", ", base: 16"):
-        (tmp_path / "gauge.yaml").write_text(PROFILE.format(pattern=f"(?P<x>{pattern})$", text="", channel=base))
+        (tmp_path / "gauge.yaml").write_text(
+            PROFILE.format(pattern=f"(?P<x>{pattern})$", text="", channel=base)
+        )
         assert load_profile(tmp_path / "gauge.yaml")
     (tmp_path / "gauge.yaml").write_text(PROFILE.format(pattern=f"(?P<x>{pattern})$", text="", channel=""))
-    with pytest.raises(InputError, match=r"gauge.yaml:\d+:\d+: .*'x' .*letters A to F: say base: 16, or base: 10"):
+    with pytest.raises(
+        InputError, match=r"gauge.yaml:\d+:\d+: .*'x' .*letters A to F: say base: 16, or base: 10"
+    ):
         load_profile(tmp_path / "gauge.yaml")
 
 
@@ -96,7 +102,11 @@ def test_decimal_patterns_need_no_base():
         ("(?P<x>[-+.,0-9]+)$", "1,5", ["'1,5'", "is no decimal", "decimal: ','"]),
         ("(?P<x>[-+.0-9]+)", "1,5", ["'1,5'", "the number goes on behind '1'"]),
         ("(?P<x>[-+.0-9]+)", "1.5e3", ["'1.5e3'", "the number goes on behind '1.5'"]),
-        ("(?P<x>[-+.0-9]+)$", "-   5.23", ["'-   5.23'", "blanks stand between sign and digits", "[-+] *[0-9.]+"]),
+        (
+            "(?P<x>[-+.0-9]+)$",
+            "-   5.23",
+            ["'-   5.23'", "blanks stand between sign and digits", "[-+] *[0-9.]+"],
+        ),
         ("X=(?P<x>[-+.0-9]+)$", "ERR 7", ["'ERR 7'", "the pattern is X="]),
         ("X=(?P<x>[-+.0-9]+)$", "0: X=5", ["fits further right"]),
         ("(?P<x>[-+.0-9]+)$", "--5", ["'--5' is no decimal"]),

@@ -209,7 +209,10 @@ def test_open_reports_every_device_that_is_missing(wired):
 def test_a_wrong_node_is_told(wire):
     device = next(d for d in make_devices(wire.settings) if d.drives)
     device._node = 6
-    with pytest.raises(HardwareError, match="node 6: set-up failed: no answer to object 0x1000 .*check power, node id|node 6: .*heartbeats of nodes 5"):
+    with pytest.raises(
+        HardwareError,
+        match="node 6: set-up failed: no answer to object 0x1000 .*check power, node id|node 6: .*heartbeats of nodes 5",
+    ):
         device.connect()
 
 
@@ -233,7 +236,9 @@ def test_poller_through_a_board_in_shared_memory(wire):
         wire.until(lambda s: s.fresh[COIL] and s.time_s[COIL] > first, backend=backend)
         obey(wire, "thermocouples unplug")
         wire.until(lambda s: s.status[COIL] == STALE, limit_s=6.0, backend=backend)
-        assert "connection is gone" in backend.problem("coil_c") or "reconnecting" in backend.problem("coil_c")
+        assert "connection is gone" in backend.problem("coil_c") or "reconnecting" in backend.problem(
+            "coil_c"
+        )
         obey(wire, "thermocouples plug")
         wire.until(lambda s: s.status[COIL] == OK, limit_s=5.0, backend=backend)
         stop.set()
