@@ -145,24 +145,24 @@ class LibraryPort(CanPort):
         """Send what was queued, without waiting. Raises OSError when the bus is gone or takes nothing any more."""
         for can_id, data in self.queued():
             try:
-                if self._socket is None:
-                    self._bus.send(
-                        can.Message(
-                            arbitration_id=can_id & ~EXTENDED,
-                            data=data,
-                            is_extended_id=bool(can_id & EXTENDED),
-                        )
-                    )
-                else:
-                    self._socket.send(_FRAME.pack(can_id, len(data), data))
+                self._send(can_id, data)
                 self._pending = 0
-            except (BlockingIOError, can.CanOperationError) as e:
+            except (BlockingIOError, can.CanError) as e:
                 self._queue_full(e)
             except OSError as e:
                 if e.errno != errno.ENOBUFS:
                     raise
                 self._queue_full(e)
+            except Exception as e:  # of whatever interface
+                raise OSError(errno.EIO, f"{type(e).__name__}: {e}") from None
         return 0
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        if self._socket is not None:
+            self._socket.send(_FRAME.pack(can_id, len(data), data))
+            return
+        extended = bool(can_id & EXTENDED)
+        self._bus.send(can.Message(arbitration_id=can_id & ~EXTENDED, data=data, is_extended_id=extended))
 
     def _queue_full(self, why: Exception) -> None:
         self.bad += 1

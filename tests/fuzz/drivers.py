@@ -178,15 +178,15 @@ class Gauge(Fuzzed):
 
     def __init__(self) -> None:
         self.line = Line()
-        self.device: Any = SerialDevice(
-            bound("meter-serial-text.yaml", self.line.path, "voltage: voltage_v")
-        )
+        self.device: Any = SerialDevice(bound("meter-serial-text.yaml", self.line.path, "voltage: voltage_v"))
 
     def good(self) -> bytes:
         return b"\r\nV=+3.1250 A=+0.6250\r\n"
 
     def frame(self, r: random.Random) -> bytes:
-        number = r.choice((b"+3.125", b"1e9", b"1e999", b"--", b"1,5", b"-   5", b".", b"9" * 400, b"nan", b"1e", b"\xff"))
+        number = r.choice(
+            (b"+3.125", b"1e9", b"1e999", b"--", b"1,5", b"-   5", b".", b"9" * 400, b"nan", b"1e", b"\xff")
+        )
         whole = b"V=" + number + b" A=+0.6" + r.choice((b"\r\n", b"\n", b"", b"\r"))
         return whole if r.random() < 0.5 else damaged(whole, r)
 
@@ -220,7 +220,9 @@ class ShuntOnSlcan(Fuzzed):
         return b"\r" + lawicel(801, False, SHUNT)
 
     def frame(self, r: random.Random) -> bytes:
-        whole = r.choice((lawicel(*can_frame(r, (801, 802))), b"z\r", b"\a", b"r3218\r", b"d321F" + b"0" * 128 + b"\r"))
+        whole = r.choice(
+            (lawicel(*can_frame(r, (801, 802))), b"z\r", b"\a", b"r3218\r", b"d321F" + b"0" * 128 + b"\r")
+        )
         return whole if r.random() < 0.7 else damaged(whole, r)
 
     def send(self, frames: list[bytes]) -> None:
@@ -268,7 +270,11 @@ class DriveOnSlcan(Fuzzed):
     def __init__(self) -> None:
         self.line = Line()
         self.device: Any = Cia402Device(
-            bound("drive-cia402.yaml", f"slcan:{self.line.path}", "state: amplifier_state, fault: amplifier_fault, supply: supply_v")
+            bound(
+                "drive-cia402.yaml",
+                f"slcan:{self.line.path}",
+                "state: amplifier_state, fault: amplifier_fault, supply: supply_v",
+            )
         )
 
     def connect(self) -> None:
@@ -293,8 +299,6 @@ class DriveOnSlcan(Fuzzed):
         self.line.send(b"".join(frames))
 
 
-
-
 class Module(Fuzzed):
     """A Modbus device that answers anything."""
 
@@ -303,7 +307,9 @@ class Module(Fuzzed):
 
     def __init__(self) -> None:
         self.answers: list[Callable[[bytes], bytes]] = []
-        text = (CONFIG / "thermocouples-modbus-12.yaml").read_text().replace("timeout_s: 0.5", "timeout_s: 0.01")
+        text = (
+            (CONFIG / "thermocouples-modbus-12.yaml").read_text().replace("timeout_s: 0.5", "timeout_s: 0.01")
+        )
         (FOLDER / "module.yaml").write_text(text)
         self.device: Any = ModbusDevice(
             bound("module.yaml", self.listen(), "thermocouple_1: coil_c, thermocouple_9: shaft_1_c", FOLDER)
@@ -423,8 +429,14 @@ class Setup(Fuzzed):
             message = self.bus.recv(1.0)
             if message is not None and message.arbitration_id == 0x605:
                 r = random.Random(self.answers.pop() if self.answers else b"")
-                honest = bytes((0x43 if message.data[0] == 0x40 else 0x60, *message.data[1:4])) + b"\x92\x01\x02\0"
-                body = honest if r.random() < 0.95 else r.choice((r.randbytes(r.randrange(9)), bytes((r.randrange(256),)) + honest[1:]))
+                honest = (
+                    bytes((0x43 if message.data[0] == 0x40 else 0x60, *message.data[1:4])) + b"\x92\x01\x02\0"
+                )
+                body = (
+                    honest
+                    if r.random() < 0.95
+                    else r.choice((r.randbytes(r.randrange(9)), bytes((r.randrange(256),)) + honest[1:]))
+                )
                 self.bus.send(can.Message(arbitration_id=0x585, data=body, is_extended_id=False))
 
     def connect(self) -> None:

@@ -186,3 +186,24 @@ def test_the_virtual_rig_refuses_a_bus_it_cannot_play():
     )
     with pytest.raises(InputError, match="slcan ports only"):
         virtual_device(bind(node, CONFIG / "devices"), None)
+
+
+def test_check_says_what_is_allowed_and_yet_unusual(tmp_path, capsys):
+    from thermoctl.daemon.client import check
+
+    (tmp_path / "module.yaml").write_text(MODULE.replace("register: 0,", "register: 40001,"))
+    (tmp_path / "rig.yaml").write_text(
+        "rig: {name: measures}\ncontrol: {kp: 0.01, ti_s: 0.004, td_s: 0.001, output_limit: 1.5}\n"
+        "protection: {required: [coil_c]}\nhal:\n  backend: devices\n  devices:\n"
+        "    - {profile: module.yaml, port: 'tcp:127.0.0.1:502', roles: {thermocouple_1: coil_c}}\n"
+        f"socket: {{path: {tmp_path}/rig.sock}}\nrecording: {{directory: {tmp_path}}}\n"
+    )
+    assert check(str(tmp_path / "rig.yaml")) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert "no device takes the command" in notes[0] and "cannot be driven" in notes[0]
+    assert (
+        "module.yaml:" in notes[1]
+        and "register 40001" in notes[1]
+        and "kind: holding, register: 0" in notes[1]
+    )
+    assert len(notes) == 2
