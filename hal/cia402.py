@@ -28,10 +28,8 @@ NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET_COMMUNICATION = 0x01, 0x80, 0x82
 HEARTBEAT_LOST = 0x8130  # CiA 301 error code of a missing heartbeat
 PDO_INVALID, PDO_NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a PDO's COB-ID
 CONTROL_WORD: Object = (0x6040, 0)
-LISTEN_S, LISTEN_BEATS = (
-    0.1,
-    5,
-)  # for a foreign heartbeat, before anything is sent: at least, and in our own periods
+LISTEN_S, LISTEN_BEATS = 0.1, 5
+"""How long to listen for a foreign heartbeat before anything is sent: at least, and in periods of our own."""
 DOUBLE_ANSWERS = 3  # second answers to one request, from which on two devices share the node id
 _FORMATS = {
     datatypes.INTEGER8: "b",
@@ -52,7 +50,9 @@ class Objects:
         try:
             self._dictionary: Any = canopen.import_od(str(spec.eds), node_id=node)
         except Exception as e:  # the parsers of two libraries
-            raise InputError(f"{place}: {spec.eds}: no EDS file: {str(e).splitlines()[0]}") from None
+            raise InputError(
+                f"{place}: {spec.eds}: no EDS file: {(str(e).splitlines() or [type(e).__name__])[0]}"
+            ) from None
 
     def format(self, item: Object, key: str) -> str:
         """The struct letter of an object's number; `key` is where the profile names it."""

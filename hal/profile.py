@@ -291,9 +291,7 @@ class Cia402:
     mode: int  # 0x6060 mode of operation: 4 profile torque, 10 cyclic torque, < 0 vendor's
     command: Object  # takes the drive
     transmit: tuple[Object, ...]  # of TPDO 1, the first is the status word 0x6041
-    master_id: int = (
-        0  # our own node id: its heartbeat is what the drive watches; 0: 127 - the drive's node id
-    )
+    master_id: int = 0  # our own node id, whose heartbeat the drive watches; 0: 127 - the drive's node id
     heartbeat_s: float = 0.02  # we send ours and ask the drive for its own this often
     watchdog_s: float = 0.1  # the drive stops when ours is missing for so long
     start_up: tuple[tuple[int, int, int], ...] = ()  # further (index, subindex, value) written at set-up
@@ -534,7 +532,9 @@ def _dbc(top: Section, folder: Path) -> Dbc:
     except OSError as e:
         raise node.error(f"dbc: {path} cannot be read: {e.strerror}") from None
     except Exception as e:  # cantools raises parse errors of several libraries
-        raise node.error(f"dbc: {path} is not a DBC file: {str(e).splitlines()[0]}") from None
+        raise node.error(
+            f"dbc: {path} is not a DBC file: {(str(e).splitlines() or [type(e).__name__])[0]}"
+        ) from None
 
 
 def _cia402(top: Section, folder: Path) -> Cia402:
