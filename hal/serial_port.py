@@ -81,10 +81,15 @@ def open_port(path: str, line: LineSettings) -> serial.Serial:
         raise HardwareError(f"{path}: {hint}") from None
     if line.latency_timer_ms:
         set_latency_timer(path, line.latency_timer_ms)
-    settings = termios.tcgetattr(port.fileno())
-    settings[6][termios.VMIN] = 1  # so that 'nothing yet' (EAGAIN) differs from 'gone' (no bytes)
-    termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
-    os.set_blocking(port.fileno(), False)
+    try:
+        settings = termios.tcgetattr(port.fileno())
+        settings[6][termios.VMIN] = 1  # so that 'nothing yet' (EAGAIN) differs from 'gone' (no bytes)
+        termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
+        termios.tcflush(port.fileno(), termios.TCIOFLUSH)
+        os.set_blocking(port.fileno(), False)
+    except (OSError, termios.error) as e:  # pulled out meanwhile; termios.error is no OSError
+        port.close()
+        raise HardwareError(f"{path}: gone while it was opened ({e})") from None
     return port
 
 
@@ -137,7 +142,6 @@ class SerialDevice(Device):
         """Open the port; frames in its buffer are dropped."""
         self._port = open_port(self.binding.port, self.binding.profile.line)
         self._fd = self._port.fileno()
-        termios.tcflush(self._fd, termios.TCIOFLUSH)
         self._lines.reset()
         self._waited, self._unread = False, 0
         if self._framer:

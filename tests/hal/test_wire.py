@@ -287,3 +287,22 @@ def test_the_reference_is_recorded_with_a_time_that_the_daemon_shares(wire):
     table = read_table(path)
     assert abs(table.t[-1] - stopped) < 5 and table.t[0] < begin + 0.1
     assert len(table.t) >= 90 and {"output_reference_um", "drive", "enabled"} <= set(table.columns)
+
+
+def test_a_port_that_goes_while_it_is_opened_is_a_hardware_error(monkeypatch):
+    """termios.error is no OSError: it would end the thread that connects a device again."""
+    import termios
+
+    from hal.profile import LineSettings
+    from hal.serial_port import open_port
+
+    master, slave = os.openpty()
+
+    def gone(*_):
+        raise termios.error(5, "Input/output error")
+
+    monkeypatch.setattr(termios, "tcflush", gone)
+    with pytest.raises(HardwareError, match="gone while it was opened"):
+        open_port(os.ttyname(slave), LineSettings())
+    os.close(master)
+    os.close(slave)
