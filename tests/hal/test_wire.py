@@ -4,6 +4,7 @@ right channel status, quickly, and comes back (issue 2, 'Must show' 5)."""
 import math
 import os
 import re
+import sys
 import threading
 import time
 
@@ -298,7 +299,11 @@ def test_a_port_that_goes_while_it_is_opened_is_a_hardware_error(monkeypatch):
 
     master, slave = os.openpty()
 
-    def gone(*_):
+    real = termios.tcflush
+
+    def gone(*arguments):
+        if sys._getframe(1).f_globals["__name__"].startswith("serial."):  # pyserial's own: still there
+            return real(*arguments)
         raise termios.error(5, "Input/output error")
 
     monkeypatch.setattr(termios, "tcflush", gone)
