@@ -171,7 +171,8 @@ diagnose-recordings: develop       # real rigs from their naive plants: what is 
 .PHONY: fuzz
 FUZZ_S ?= 20
 TARGETS := plant config expression serial slcan modbus csv parquet arrow arrows commands metadata
-fuzz: develop                      # FUZZ_S seconds for each that reads bytes from outside, twice; a find stays in build/fuzz
+fuzz: develop                      # drivers behind their ports for an hour's frames; then FUZZ_S seconds for each reader, twice
+	$(BIN)/python -m tests.fuzz.drivers
 	for target in $(TARGETS); do $(BIN)/python -m tests.fuzz.targets $$target --seconds $(FUZZ_S) || exit 1; done
 	-$(call listed,p['project']['optional-dependencies']['fuzz']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	if $(BIN)/python -c "import atheris" 2>/dev/null; then for target in $(TARGETS); do \

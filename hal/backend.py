@@ -6,10 +6,11 @@ fault-injecting wrapper goes around any of them.
 
 The contract
 - `open()` may block and raises HardwareError (one line: device, port, what was expected, what to do) or
-  yamlfile.InputError (the configuration is at fault). Opening drives nothing: the amplifier is disabled afterwards.
+  yamlfile.InputError (the configuration is at fault). Opening drives nothing: the amplifier is disabled afterwards. A
+  device without a role in `protection.required` may be absent: it is STALE, with its message, until it comes.
 - `read(now_s)` never blocks, never raises for a device that misbehaves, and allocates no arrays: it returns the same
-  `Sample` object every time, refilled in place. Copy what must outlive the tick. A device that fails shows in `status`
-  and is reconnected in the background; its channels come back by themselves.
+  `Sample` object every time, refilled in place. Copy what must outlive the tick. A device that is gone is reconnected in
+  the background; its last values stand until they are stale, and its channels come back by themselves.
 - `write(drive, enable)` never blocks. `drive` is the amplifier's command in the unit of the `drive` channel's profile
   (A for a CiA-402 drive in torque mode, V for a voltage amplifier; for the simulation the unit of the plant's input).
   A drive that is not finite, or `enable` False, sends zero and disables. A drive beyond the limits is clipped.
@@ -23,12 +24,15 @@ The sample: arrays over ROLES (index by `ROLE[name]`), all of length len(ROLES)
 - `time_s`  float64, when that reading was taken (clock of `now_s`); -inf before the first one.
 - `fresh`   bool, True when a reading arrived that earlier `read` calls had not shown.
 - `status`  uint8: OK; STALE (newest reading older than the profile's `stale_after_s`, the value is held);
-            ERROR (device gone, reported invalid, sentinel such as an open thermocouple, outside the profile's range);
+            ERROR (what the device says of itself: reported invalid, sentinel such as an open thermocouple, a register
+            it refuses, outside the profile's range; and the amplifier's roles at once when its link is gone);
             ABSENT (no device is bound to this role: not a fault).
 `wait_frame(due_ns, until_ns)` (real devices only; loop.pace: device) waits until the position's device has sent a whole
 frame, at most until `until_ns`, and only until `due_ns` while that device is gone; `check_pacing()` raises InputError
 where no device of the rig can give the time.
-`problem(role)` says in one line why a role is not OK. `counters()` counts frames, errors and reconnections by device.
+`problem(role)` says in one line why a role is not OK ('' when it is), in the device's own words: register, exception,
+checksum, open wire, length of a frame, how often. `counters()` gives `<device>.frames`, `.errors`, `.reconnections` and
+what else a driver counts.
 
 Slow buses. `slow_devices(settings)` lists devices whose `poll()` blocks (any profile with `bus: modbus`): the daemon
 runs each in a process of its own with `hal.board.run_poller`, which writes newest values to a `hal.board.Board` in
@@ -137,7 +141,9 @@ def make_backend(settings: Any, board: Any = None) -> Backend:
     elif kind == "devices":
         from hal.devices import DevicesBackend
 
-        backend = DevicesBackend(fast_devices(settings), slow_devices(settings), board)
+        backend = DevicesBackend(
+            fast_devices(settings), slow_devices(settings), board, settings.protection.required
+        )
     else:
         raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated, devices or replay")
     if settings.hal.faults:
@@ -159,3 +165,14 @@ def slow_devices(settings: Any) -> list:
     from hal.devices import make_devices
 
     return [d for d in make_devices(settings) if d.slow]
+
+
+def disable_amplifier(settings: Any) -> None:
+    """Disable the amplifier of `hal.devices` over a link of its own: for when the loop can no longer do it. No other device is
+    opened, and a mistake in another device's profile does not count. Raises HardwareError, OSError, InputError."""
+    if settings.hal.backend != "devices":
+        return
+    from hal.devices import driving_devices
+
+    for device in driving_devices(settings):
+        device.switch_off()

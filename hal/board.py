@@ -17,10 +17,21 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import ABSENT, ERROR, ROLES, HardwareError, Sample
+from hal.backend import ABSENT, ROLES, STALE, HardwareError, Sample
 from hal.devices import RECONNECT_S, Device, make_devices
 
-_ROW = np.dtype([("sequence", "u8"), ("value", "f8"), ("time_s", "f8"), ("status", "u8"), ("text", "S400")])
+COUNTED = ("frames", "errors", "lost", "reconnections")
+"""What a poller posts of its device's counters, in the row of the device's first role."""
+_ROW = np.dtype(
+    [
+        ("sequence", "u8"),
+        ("value", "f8"),
+        ("time_s", "f8"),
+        ("status", "u8"),
+        ("text", "S400"),
+        ("counts", "u8", len(COUNTED)),
+    ]
+)
 _SIZE = _ROW.itemsize * len(ROLES)
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -87,9 +98,9 @@ class Board:
                 sample.time_s[role],
                 sample.status[role],
             )
-            row["text"] = (
-                device.problems.get(role, "").encode()[:400] if sample.status[role] == ERROR else b""
-            )
+            row["text"] = device.problems.get(role, "").encode()[:400]
+        counts = device.counters()
+        self.rows["counts"][first] = [counts.get(name, 0) for name in COUNTED]
         self._sequence[first] = writing + 1
 
     def merge(self, sample: Sample, roles: list[int], seen: int) -> int:
@@ -119,6 +130,10 @@ class Board:
         """The text a poller left on this role."""
         return bytes(self.rows[role]["text"]).decode("utf-8", "replace")
 
+    def counts(self, device: Device) -> dict[str, int]:
+        """The device's counters as its poller posted them, by name."""
+        return dict(zip(COUNTED, self.rows["counts"][device.roles[0]].tolist(), strict=True))
+
     def close(self) -> None:
         """The creator removes the name; the memory goes with its last user."""
         if self._path is not None and self._owner:
@@ -127,9 +142,10 @@ class Board:
 
 def poll_until(device: Device, board: Board, stop: threading.Event) -> None:
     """Poll a slow device at its fastest channel's rate, posting to the board, until `stop` is set. A device that is
-    gone is posted as ERROR and connected again."""
+    gone is connected again; its last values stand, and their age tells."""
     period_s = 1.0 / max(b.channel.rate_hz for b in device.binding.bounds)
     sample = Sample()
+    sample.status[device.roles] = STALE
     due = time.monotonic()
     while not stop.is_set():
         try:
@@ -142,7 +158,7 @@ def poll_until(device: Device, board: Board, stop: threading.Event) -> None:
                 device.counts["reconnections"] += 1
             device.up = False
             device.disconnect()
-            device.fail_all(sample, f"{e}; reconnecting")
+            device.miss_all(f"{e}; reconnecting")
         board.post(sample, device)
         due += period_s if device.up else RECONNECT_S
         now = time.monotonic()

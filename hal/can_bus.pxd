@@ -14,10 +14,10 @@ cdef class SlcanPort(SlcanLine):
     cdef public object _port
 
 cdef class Cia402Device(Device):
-    cdef public object _spec, _dictionary
+    cdef public object _spec, _formats
     cdef public CanPort _port
-    cdef public int _node, _master, _status_word, _fault_code, _transmit_size, _receive_size
-    cdef public long long _command_limit, _heard, _emergencies
+    cdef public int _odd_size, _node, _master, _status_word, _fault_code, _transmit_size, _receive_size
+    cdef public long long _command_limit, _heard, _emergencies, _odd
     cdef public int[::1] _index, _is_state, _shift, _bits, _signed
     cdef public double _patience_s, _heartbeat_s, _heard_s, _beat_s, _reset_s, _low, _high, _scale
     cdef public tuple _ids

@@ -9,8 +9,10 @@ Ports ("interface:channel@bitrate", bitrate 1000000 where left out)
 
 A CiA-402 drive in the tick: RPDO 1 = control word | command, then SYNC; TPDO 1 answers the SYNC with status word |
 readings and is read one tick later. Heartbeats both ways: the drive stops by itself when ours is missing for
-`watchdog_s`, we say ERROR when its own is. Set-up (identity, heartbeats, mode, PDO mapping, NMT start) runs through
-canopen and the EDS file.
+`watchdog_s`, we say ERROR when its own is. Set-up (identity, heartbeats, mode, PDO mapping, NMT start): hal.cia402.
+
+Identifiers of 29 bits carry the bit EXTENDED everywhere, so that they never match an 11-bit one of the same number.
+Remote frames, error frames and CAN FD frames are counted and passed over.
 
     status word & mask = value -> state          control word that takes the next step towards 'operation enabled'
       0x4F  0x00  not ready to switch on         -                        (the drive goes on by itself)
@@ -31,20 +33,15 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import logging
 import math
 import os
 import re
 import struct
-import threading
 import time
 from array import array
 from typing import Any
 
 import can
-import canopen
-import cantools
-from canopen.objectdictionary import datatypes
 
 from hal.backend import (
     AMP_DISABLED,
@@ -55,15 +52,23 @@ from hal.backend import (
     HardwareError,
     Sample,
 )
+from hal.cia402 import (
+    NMT_ID,
+    NMT_RESET_COMMUNICATION,
+    SYNC_ID,
+    Objects,
+    Sdo,
+    check_objects,
+    foreign_heartbeat,
+    set_up,
+    switch_off,
+)
 from hal.devices import Device
-from hal.profile import Binding, Cia402, Dbc, LineSettings
+from hal.profile import STATUS_WORD, Binding, Cia402, Dbc, LineSettings
 from hal.serial_port import open_port
-from hal.wire import CanPort, SlcanLine, nearest
+from hal.wire import EXTENDED, CanPort, SlcanLine, nearest
 from thermoctl.yamlfile import InputError
 
-SYNC_ID, NMT_ID = 0x080, 0x000
-HEARTBEAT_LOST = 0x8130  # CiA 301 error code of a missing heartbeat
-SDO_TIMEOUT_S = 0.3
 MAX_TAKEN = 500  # frames of a bus that one tick takes
 FAULT_RESET_S = 1.0  # between attempts to reset a drive's fault while it is not wanted to drive
 _SLCAN_BITRATES = {
@@ -78,7 +83,7 @@ _SLCAN_BITRATES = {
     1_000_000: 8,
 }
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of the kernel
-_EXTENDED, _REMOTE, _ERROR_FLAG, _BUS_OFF = 0x8000_0000, 0x4000_0000, 0x2000_0000, 0x40
+_REMOTE, _ERROR_FLAG, _BUS_OFF = 0x4000_0000, 0x2000_0000, 0x40
 _SYNC_ID, _RESET_S = SYNC_ID, FAULT_RESET_S
 _OFFLINE, _DISABLED, _ENABLED, _FAULT, _QUICK_STOP = (
     AMP_OFFLINE,
@@ -87,16 +92,6 @@ _OFFLINE, _DISABLED, _ENABLED, _FAULT, _QUICK_STOP = (
     AMP_FAULT,
     AMP_QUICK_STOP,
 )  # numbers of C, by can_bus.pxd
-_FORMATS = {
-    datatypes.INTEGER8: "b",
-    datatypes.INTEGER16: "h",
-    datatypes.INTEGER32: "i",
-    datatypes.UNSIGNED8: "B",
-    datatypes.UNSIGNED16: "H",
-    datatypes.UNSIGNED32: "I",
-    datatypes.BOOLEAN: "B",
-}
-
 _STATES = (
     (0x4F, 0x00, "not ready to switch on"),
     (0x4F, 0x40, "switched off (switch on disabled)"),
@@ -109,6 +104,7 @@ _STATES = (
     (0, 0, "a state that CiA 402 does not know"),
 )
 
+
 Frame = tuple[int, bytes]
 
 
@@ -120,7 +116,7 @@ class SlcanPort(SlcanLine):
             raise HardwareError(
                 f"slcan:{path}: bitrate {bitrate} is not one of {', '.join(map(str, _SLCAN_BITRATES))}"
             )
-        self._port = open_port(path, LineSettings(baud=3_000_000), f"slcan:{path}")
+        self._port = open_port(path, LineSettings(baud=3_000_000))
         super().__init__(self._port.fileno())
         os.write(self._port.fileno(), b"\r\rC\rS%d\rO\r" % _SLCAN_BITRATES[bitrate])
 
@@ -128,6 +124,11 @@ class SlcanPort(SlcanLine):
     def bad(self) -> int:
         """Lines that were no frame, and frames that the adapter refused."""
         return self.parser.bad + self.parser.refused
+
+    @property
+    def ignored(self) -> int:
+        """Remote frames and CAN FD frames."""
+        return self.parser.ignored
 
     def close(self) -> None:
         """Close the channel and the line."""
@@ -143,7 +144,11 @@ class LibraryPort(CanPort):
     def __init__(self, interface: str, channel: str, bitrate: int, ids: tuple[int, ...]) -> None:
         in_kernel = (
             [
-                {"can_id": i, "can_mask": 0x1FFF_FFFF if i > 0x7FF else 0x7FF, "extended": i > 0x7FF}
+                {
+                    "can_id": i & ~EXTENDED,
+                    "can_mask": 0x1FFF_FFFF if i & EXTENDED else 0x7FF,
+                    "extended": bool(i & EXTENDED),
+                }
                 for i in ids
             ]
             if interface == "socketcan"
@@ -161,27 +166,30 @@ class LibraryPort(CanPort):
         self._socket = self._bus.socket if interface == "socketcan" else None
         if self._socket is not None:
             self._socket.setblocking(False)
-        self.bad = self._pending = 0
+        self.bad = self.ignored = self._pending = 0
 
     def flush(self) -> int:
         """Send what was queued, without waiting. Raises OSError when the bus is gone or takes nothing any more."""
         for can_id, data in self.queued():
             try:
-                if self._socket is None:
-                    self._bus.send(
-                        can.Message(arbitration_id=can_id, data=data, is_extended_id=can_id > 0x7FF)
-                    )
-                else:
-                    flag = _EXTENDED if can_id > 0x7FF else 0
-                    self._socket.send(_FRAME.pack(can_id | flag, len(data), data))
+                self._send(can_id, data)
                 self._pending = 0
-            except (BlockingIOError, can.CanOperationError) as e:
+            except (BlockingIOError, can.CanError) as e:
                 self._queue_full(e)
             except OSError as e:
                 if e.errno != errno.ENOBUFS:
                     raise
                 self._queue_full(e)
+            except Exception as e:  # of whatever interface
+                raise OSError(errno.EIO, f"{type(e).__name__}: {e}") from None
         return 0
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        if self._socket is not None:
+            self._socket.send(_FRAME.pack(can_id, len(data), data))
+            return
+        extended = bool(can_id & EXTENDED)
+        self._bus.send(can.Message(arbitration_id=can_id & ~EXTENDED, data=data, is_extended_id=extended))
 
     def _queue_full(self, why: Exception) -> None:
         self.bad += 1
@@ -195,27 +203,47 @@ class LibraryPort(CanPort):
         taken = 0
         while taken < MAX_TAKEN:
             if self._socket is None:
-                message = self._bus.recv(0)
+                message = self._receive()
                 if message is None:
                     break
-                if self._wanted is None or message.arbitration_id in self._wanted:
-                    taken += self.deliver(message.arbitration_id, bytes(message.data))
+                can_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+                if message.is_error_frame:
+                    self.bad += 1
+                elif message.is_remote_frame or message.is_fd:
+                    self.ignored += 1
+                elif self._wanted is None or can_id in self._wanted:
+                    taken += self.deliver(can_id, bytes(message.data))
                 continue
             try:
-                raw_id, size, data = _FRAME.unpack(self._socket.recv(16))
+                raw = self._socket.recv(16)
             except BlockingIOError:
                 break
+            if len(raw) != _FRAME.size:
+                self.ignored += 1
+                continue
+            raw_id, size, data = _FRAME.unpack(raw)
             if raw_id & _ERROR_FLAG:
                 self.bad += 1
                 if raw_id & _BUS_OFF:
                     raise HardwareError("CAN bus-off: check wiring, termination and bitrate")
-            elif not raw_id & _REMOTE:
-                taken += self.deliver(raw_id & 0x1FFF_FFFF, data[:size])
+            elif raw_id & _REMOTE:
+                self.ignored += 1
+            else:
+                taken += self.deliver(raw_id, data[:size])
         return taken
+
+    def _receive(self) -> Any:
+        """The library's next message, or None. What else it raises is an interface that failed."""
+        try:
+            return self._bus.recv(0)
+        except OSError:
+            raise
+        except Exception as e:
+            raise OSError(errno.EIO, f"{type(e).__name__}: {e}") from None
 
     def close(self) -> None:
         """Leave the bus."""
-        with contextlib.suppress(can.CanError, OSError):
+        with contextlib.suppress(Exception):  # of whatever interface
             self._bus.shutdown()
 
 
@@ -260,43 +288,6 @@ def next_control_word(status_word: int, enable: bool) -> int:
     return 0x0F if state in (0x23, 0x27) else 0x00
 
 
-def _format(dictionary: Any, index: int) -> str:
-    """struct letter of an object; KeyError where it is missing or no number of up to 4 bytes."""
-    return _FORMATS[dictionary[index].data_type]
-
-
-class _SetupNetwork(canopen.Network):
-    """canopen over one of our ports, for the time of the set-up: a thread passes frames on."""
-
-    def __init__(self, port: SlcanPort | LibraryPort) -> None:
-        super().__init__()
-        self._port, self._done = port, threading.Event()
-        self._thread = threading.Thread(target=self._pass_on, daemon=True)
-        self.failure: Exception | None = None
-        self._thread.start()
-
-    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """As canopen asks for it; `remote` frames are none of what we send."""
-        self._port.send((can_id, bytes(data)))
-
-    def _pass_on(self) -> None:
-        while not self._done.is_set():
-            try:
-                frames = self._port.receive()
-            except (OSError, HardwareError) as e:
-                self.failure = e
-                return
-            for can_id, data in frames:
-                self.notify(can_id, bytearray(data), time.time())
-            if not frames:
-                self._done.wait(0.0005)
-
-    def finish(self) -> None:
-        """Stop passing frames on, and wait for the thread."""
-        self._done.set()
-        self._thread.join(1.0)
-
-
 class Cia402Device(Device):
     """A CiA-402 drive: takes the command, gives its state, current and DC-link voltage."""
 
@@ -305,48 +296,34 @@ class Cia402Device(Device):
         spec: Cia402 = binding.profile.bus_spec
         self._spec, self._node = spec, binding.address
         self._port: CanPort | None = None
-        dictionary = canopen.import_od(str(spec.eds), node_id=self._node)
-        try:
-            formats = [_format(dictionary, i) for i in spec.transmit]
-            command = _format(dictionary, spec.command)
-        except KeyError as e:
-            raise InputError(
-                f"{binding.profile.file}: {spec.eds}: object {e} of the PDOs is not in it"
-            ) from None
-        if not command.islower():
-            raise InputError(
-                f"{binding.profile.file}: {spec.eds}: the command 0x{spec.command:X} has no sign"
-            )
+        self._formats = check_objects(Objects(spec, binding.profile.file, self._node), spec)
+        formats, command = [self._formats[o] for o in spec.transmit], self._formats[spec.command]
         sizes = [struct.calcsize(f) for f in formats]
         self._transmit_size, self._receive_size = sum(sizes), 2 + struct.calcsize(command)
         self._shift = array("i", [8 * sum(sizes[:k]) for k in range(len(sizes))])
         self._bits = array("i", [8 * size for size in sizes])
         self._signed = array("i", [f.islower() for f in formats])
         self._command_limit = 2 ** (8 * struct.calcsize(command) - 1) - 1
-        self._dictionary = dictionary
-        if self._transmit_size > 8:
-            raise InputError(
-                f"{binding.profile.file}: a PDO has 8 bytes, transmit takes {self._transmit_size}"
-            )
-        self._index = array(
-            "i",
-            [
-                spec.transmit.index(b.channel.source) if b.channel.source in spec.transmit else -1
-                for b in binding.bounds
-            ],
-        )
-        if binding.profile.drive is not None and all(b.channel.source != 0x6041 for b in binding.bounds):
+        if binding.profile.drive is not None and all(b.channel.source != STATUS_WORD for b in binding.bounds):
             raise InputError(
                 f"{binding.place}: a drive needs its status word (object 0x6041) in the role amplifier_state: "
                 "without it nobody sees that the drive stopped by itself"
             )
-        self._is_state = array("i", [b.channel.source == 0x6041 for b in binding.bounds])
+        sources = [b.channel.source for b in binding.bounds]
+        self._index = array("i", [spec.transmit.index(o) if o in spec.transmit else -1 for o in sources])
+        self._is_state = array("i", [o == STATUS_WORD for o in sources])
         self._patience_s, self._heartbeat_s = max(3 * spec.heartbeat_s, spec.watchdog_s), spec.heartbeat_s
         self._master = spec.master_id
         if binding.profile.drive is not None:
             (self._low, self._high), self._scale = binding.profile.drive.limits, binding.profile.drive.scale
-        self._ids = (0x080 + self._node, 0x180 + self._node, 0x580 + self._node, 0x700 + self._node)
+        self._ids = (
+            0x080 + self._node,
+            0x180 + self._node,
+            0x580 + self._node,
+            *range(0x701, 0x780),  # heartbeats: the drive's, and who else sends ours
+        )
         self._status_word = self._fault_code = self._heard = self._emergencies = 0
+        self._odd_size, self._odd = -1, 0
         self._heard_s = self._beat_s = self._reset_s = -math.inf
         self._wanted = self._driving = self._left = False
         self._left_to, self._left_word = _OFFLINE, -1
@@ -354,63 +331,26 @@ class Cia402Device(Device):
     def connect(self) -> None:
         """Open the port, check the identity, configure heartbeats, mode and PDOs, start the node; it stays off."""
         port = open_can(self.binding.port, self._ids)
-        network = _SetupNetwork(port)
         try:
-            self._set_up(network)
-        except (canopen.SdoAbortedError, canopen.SdoCommunicationError, KeyError, OSError) as e:
-            network.finish()
+            sdo = Sdo(port, self._node, self._spec.sdo_timeout_s)
+            self._fault_code = set_up(sdo, self._spec, self._formats, self.binding.port)
+        except (HardwareError, OSError) as e:
             port.close()
-            raise HardwareError(
-                f"{self.name}: {self.binding.port} node {self._node}: set-up failed "
-                f"({network.failure or e}): check power, node id, bitrate and termination"
-            ) from None
-        except HardwareError:
-            network.finish()
-            port.close()
-            raise
-        network.finish()
+            raise HardwareError(f"{self.binding.port} node {self._node}: set-up failed: {e}") from None
         self._port = port
         self._status_word = 0
         self._watch_state(_OFFLINE)  # it was lost while it drove: not enabled again by itself
+        self._odd_size, self._odd = -1, 0
         self._heard_s = time.monotonic()
         self._beat_s = self._reset_s = -math.inf
 
-    def _set_up(self, network: _SetupNetwork) -> None:
-        logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what it would log, we raise
-        spec = self._spec
-        node = network.add_node(self._node, self._dictionary)
-        assert isinstance(node, canopen.RemoteNode)
-        node.sdo.RESPONSE_TIMEOUT, node.sdo.MAX_RETRIES = SDO_TIMEOUT_S, 1
-        network.send_message(
-            NMT_ID, bytes((0x80, self._node))
-        )  # pre-operational: PDOs rest while they are mapped
-        device_type = node.sdo[0x1000].raw
-        if device_type & 0xFFFF != 402:
-            raise HardwareError(
-                f"{self.name}: node {self._node} says device profile {device_type & 0xFFFF}, "
-                "402 (drive) was expected: is the node id right?"
-            )
-        node.sdo[0x1016][1].raw = spec.master_id << 16 | round(spec.watchdog_s * 1000)
-        node.sdo[0x1017].raw = round(spec.heartbeat_s * 1000)
-        node.sdo[0x6040].raw = 0
-        node.sdo[0x6060].raw = spec.mode
-        for index, sub, value in spec.start_up:
-            (node.sdo[index][sub] if sub else node.sdo[index]).raw = value
-        for pdo, cob_id, objects in (
-            (node.tpdo[1], 0x180, spec.transmit),
-            (node.rpdo[1], 0x200, (0x6040, spec.command)),
-        ):
-            pdo.clear()
-            for index in objects:
-                pdo.add_variable(index)
-            pdo.cob_id, pdo.trans_type, pdo.enabled = cob_id + self._node, 1, True
-            pdo.save()
-        self._fault_code = node.sdo[0x603F].raw
-        if self._fault_code == HEARTBEAT_LOST:  # it missed us while we were away: no news
-            node.sdo[0x6040].raw = 0x80
-            node.sdo[0x6040].raw = 0
-            self._fault_code = node.sdo[0x603F].raw
-        network.send_message(NMT_ID, bytes((0x01, self._node)))  # operational
+    def switch_off(self) -> None:
+        """Disable the drive over a link of its own. Raises HardwareError when it does not confirm."""
+        port = open_can(self.binding.port, self._ids)
+        try:
+            switch_off(Sdo(port, self._node, self._spec.sdo_timeout_s), self._receive_size)
+        finally:
+            port.close()
 
     def disconnect(self) -> None:
         """Send the drive back to its power-on state and close the port."""
@@ -419,17 +359,20 @@ class Cia402Device(Device):
             with contextlib.suppress(
                 OSError
             ):  # reset communication: PDOs and watchdog are forgotten, it is off
-                port.send((NMT_ID, bytes((0x82, self._node))))
+                port.send((NMT_ID, bytes((NMT_RESET_COMMUNICATION, self._node))))
             port.close()
 
     def read(self, sample: Sample, now_s: float) -> None:
-        """Take TPDO 1, emergencies and the drive's heartbeat. HardwareError when the heartbeat is missing."""
+        """Take TPDO 1, emergencies and the drive's heartbeat. HardwareError when the heartbeat is missing, or when another
+        device sends ours."""
         port = self._port
         if port is None:
             raise HardwareError("not connected")
         for k in range(port.take()):
             kind, size, data = port.can_id(k) - self._node, port.size(k), port.data(k)
-            if kind == 0x180 and size == self._transmit_size:
+            if kind == 0x180 and size != self._transmit_size:
+                self._odd_size, self._odd = size, self._odd + 1
+            elif kind == 0x180:
                 self._status_word = int(self._number(data, 0))
                 self._heard += 1
                 state = self._watch_state(drive_state(self._status_word))
@@ -452,6 +395,8 @@ class Cia402Device(Device):
             elif kind == 0x080 and size == 8:
                 self._fault_code = data & 0xFFFF
                 self._emergencies += 1
+            elif kind == 0x700 + self._master - self._node:
+                raise foreign_heartbeat(self._master, self.binding.port)
         if now_s - self._heard_s > self._patience_s:
             raise HardwareError(f"no heartbeat of node {self._node} for {self._patience_s * 1e3:.0f} ms")
 
@@ -503,11 +448,23 @@ class Cia402Device(Device):
             f"(status word 0x{self._left_word:04X}): check its stop, limit and enable inputs and its supply"
         )
 
+    def silence(self) -> str:
+        """What the drive sends instead of TPDO 1."""
+        if self._odd_size >= 0:
+            return (
+                f"{self._odd} TPDO 1 frames came with {self._odd_size} bytes, {self._transmit_size} were mapped: "
+                "does another master map it?"
+            )
+        return (
+            f"heartbeats of node {self._node} come, but no answer to SYNC (TPDO 1, 0x{0x180 + self._node:X}): "
+            "did it leave the state operational?"
+        )
+
     def counters(self) -> dict[str, int]:
-        """Frames, lines that were none, emergencies, reconnections."""
+        """Frames, lines that were none or TPDOs of another length, emergencies, reconnections, frames of other kinds."""
         self.counts.update(frames=self._heard, emergencies=self._emergencies)
         if self._port is not None:
-            self.counts["errors"] = self._port.bad
+            self.counts.update(errors=self._port.bad + self._odd, ignored=self._port.ignored)
         return self.counts
 
 
@@ -519,13 +476,19 @@ class DbcDevice(Device):
         spec: Dbc = binding.profile.bus_spec
         self._port: SlcanPort | LibraryPort | None = None
         self._messages: dict[int, tuple[Any, list[tuple[int, str]]]] = {}
+        self._quiet, self._why = (
+            0,
+            "",
+        )  # frames since the last reading, and what was wrong with the last of them
         for i, b in enumerate(binding.bounds):
             message = spec.database.get_message_by_name(b.channel.source.message)
-            self._messages.setdefault(message.frame_id, (message, []))[1].append((i, b.channel.source.signal))
+            can_id = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+            self._messages.setdefault(can_id, (message, []))[1].append((i, b.channel.source.signal))
 
     def connect(self) -> None:
         """Open the port."""
         self._port = open_can(self.binding.port, tuple(self._messages))
+        self._quiet = 0
 
     def disconnect(self) -> None:
         """Close the port."""
@@ -534,18 +497,46 @@ class DbcDevice(Device):
             port.close()
 
     def read(self, sample: Sample, now_s: float) -> None:
-        """Decode what has arrived."""
-        assert self._port is not None
-        for can_id, data in self._port.receive():
+        """Decode what has arrived. A frame that does not decode is counted, and told by `silence`."""
+        port = self._port
+        if port is None:
+            raise HardwareError("not connected")
+        for can_id, data in port.receive():
             entry = self._messages.get(can_id)
             if entry is None:
+                self._quiet += 1
+                if can_id ^ EXTENDED in self._messages:
+                    here, there = (29, 11) if can_id & EXTENDED else (11, 29)
+                    self._why = (
+                        f"0x{can_id & ~EXTENDED:X} came as {here}-bit id, the DBC file says {there} bits"
+                    )
                 continue
             try:
                 values = entry[0].decode(data, decode_choices=False)
-            except (cantools.database.DecodeError, ValueError):
+                readings = [(i, float(values[signal])) for i, signal in entry[1] if signal in values]
+            except Exception as e:  # what the library makes of foreign bytes
                 self.counts["errors"] += 1
+                self._quiet += 1
+                self._why = f"{entry[0].name} came with {len(data)} bytes and does not decode ({e})"
                 continue
             self.counts["frames"] += 1
-            for i, signal in entry[1]:
-                if signal in values:
-                    self.put(sample, i, float(values[signal]), now_s)
+            for i, value in readings:
+                self._quiet, self._why = 0, ""
+                self.put(sample, i, value, now_s)
+
+    def silence(self) -> str:
+        """What arrives instead of a reading."""
+        wanted = ", ".join(f"0x{i & ~EXTENDED:X} ({29 if i & EXTENDED else 11} bits)" for i in self._messages)
+        if self._quiet:
+            return f"{self._quiet} frames came and gave no reading: {self._why or f'none is {wanted}'}"
+        if self._port is not None and self._port.ignored:
+            return (
+                f"{self._port.ignored} remote or CAN FD frames came, {wanted} as classic data frame is wanted"
+            )
+        return f"{super().silence()}, the bitrate, and who sends {wanted}"
+
+    def counters(self) -> dict[str, int]:
+        """Frames, frames that did not decode, frames of other kinds, reconnections."""
+        if self._port is not None:
+            self.counts["ignored"] = self._port.ignored
+        return self.counts

@@ -3,7 +3,8 @@ cimport cython
 from hal.wire cimport Ages, Channels
 
 cdef class Device:
-    cdef public object binding, name, problems, counts
+    cdef public object binding, name, counts
+    cdef public dict problems
     cdef public list roles
     cdef public bint slow, drives, up
     cdef public Channels _channels
@@ -14,7 +15,7 @@ cdef class Device:
 
 cdef class DevicesBackend:
     cdef public list fast, slow
-    cdef public object board, sample, _pacing
+    cdef public object board, sample, required, _pacing
     cdef public object _stop
     cdef public dict _owner, _seen, _repairs
     cdef public list _threads

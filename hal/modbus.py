@@ -2,7 +2,9 @@
 
 Ports: "tcp:host:port" or "rtu:/dev/serial/by-id/...". Channels are registers; neighbours are read in one block. A value
 of several words is put together by its word order (bytes inside a word are big-endian, by the protocol); sentinel
-numbers, such as an open thermocouple's, make the channel an ERROR while the others stay OK.
+numbers, such as an open thermocouple's, make the channel an ERROR while the others stay OK. A lost or damaged answer, or a
+device that is busy, leaves the last values standing. A block that is refused is read register by register, so that one
+illegal address takes no other along.
 """
 
 from __future__ import annotations
@@ -12,30 +14,47 @@ import math
 import re
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import serial
 from pymodbus import ModbusException
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+from pymodbus.exceptions import ConnectionException
 
 from hal.backend import HardwareError, Sample
 from hal.devices import Device
-from hal.profile import FIELD_TYPES, Binding, Modbus, Register
+from hal.profile import FIELD_TYPES, Binding, Modbus, Register, register_hint
 from hal.serial_port import open_port
+from hal.wire import crc16
 
 EXCEPTIONS = {
-    1: "illegal function",
-    2: "illegal register address",
-    3: "illegal value",
-    4: "device failure",
-    5: "acknowledge",
-    6: "device busy",
-    8: "memory parity",
-    10: "gateway path",
-    11: "gateway target silent",
+    1: ("illegal function", "try the other 'kind' (input, holding)"),
+    2: ("illegal register address", "check 'register' and 'kind'; addresses count from 0"),
+    3: ("illegal value", "it may not give so many registers at once: lower 'max_block'"),
+    4: ("device failure", "the device reports a failure of its own: check it and its sensors"),
+    5: ("acknowledge", "it is still at work on an earlier request: lower 'rate_hz'"),
+    6: ("device busy", "another master may be asking it, or we ask too often: lower 'rate_hz'"),
+    8: ("memory parity error", "the device's memory is damaged: restart it"),
+    10: (
+        "gateway path unavailable",
+        "the gateway has no line for this unit: check its configuration and 'address'",
+    ),
+    11: (
+        "gateway target silent",
+        "no unit of this address answers behind the gateway: check 'address', power and line",
+    ),
 }
+"""Modbus exception codes: the text, and what to do."""
+BUSY, PASSING = (5, 6), (5, 6, 10, 11)  # asked again at once; never a statement on the channel itself
+REFUSED = (2, 3)  # a register of the block may be at fault: they are read one by one
+BUSY_TRIES, BUSY_PAUSE_S = 3, 0.02
+LOST_POLLS = 3  # without any answer, then the link is opened again
+
+
+class NoAnswer(Exception):
+    """A request was not answered, or not by what Modbus allows: lost, cut short, wrong checksum, another unit."""
 
 
 @dataclass(frozen=True)
@@ -48,16 +67,17 @@ class Block:
     members: tuple[tuple[int, Register], ...]
 
 
-def plan_blocks(registers: Sequence[Register], spec: Modbus) -> list[Block]:
-    """The fewest requests: neighbours of one kind share a block over gaps <= max_gap, up to max_block registers."""
+def plan_blocks(registers: Iterable[tuple[int, Register]], max_gap: int, max_block: int) -> list[Block]:
+    """The fewest requests for (number of the channel, register): neighbours of one kind share a block over gaps <= max_gap,
+    up to max_block registers."""
     blocks: list[Block] = []
-    for i, r in sorted(enumerate(registers), key=lambda item: (item[1].kind, item[1].address)):
+    for i, r in sorted(registers, key=lambda item: (item[1].kind, item[1].address)):
         last = blocks[-1] if blocks else None
         if (
             last
             and last.kind == r.kind
-            and r.address - last.address - last.count <= spec.max_gap
-            and r.address + r.words - last.address <= spec.max_block
+            and r.address - last.address - last.count <= max_gap
+            and r.address + r.words - last.address <= max_block
         ):
             count = max(last.count, r.address + r.words - last.address)
             blocks[-1] = Block(r.kind, last.address, count, (*last.members, (i, r)))
@@ -79,38 +99,41 @@ class ModbusDevice(Device):
 
     def __init__(self, binding: Binding) -> None:
         super().__init__(binding)
+        self.counts["lost"] = 0
         self._client: Any = None
-        self._blocks = plan_blocks([b.channel.source for b in binding.bounds], binding.profile.bus_spec)
+        self._spec: Modbus = binding.profile.bus_spec
+        self._plan()
+        self._lost_polls = 0
+        self._heard = b""  # what came in answer to the last request
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what it would log, we raise
+
+    def _plan(self) -> None:
+        registers = [b.channel.source for b in self.binding.bounds]
+        self._blocks = plan_blocks(enumerate(registers), self._spec.max_gap, self._spec.max_block)
 
     def connect(self) -> None:
         """Open the connection or the serial port. Raises HardwareError."""
-        spec: Modbus = self.binding.profile.bus_spec
         port, line = self.binding.port, self.binding.profile.line
         tcp = re.fullmatch(r"tcp:(\[[^]]+\]|[^:]+):(\d+)", port)
+        common: dict[str, Any] = {"timeout": self._spec.timeout_s, "retries": 0, "trace_packet": self._trace}
         try:
             if tcp:
-                self._client = ModbusTcpClient(
-                    tcp[1].strip("[]"), port=int(tcp[2]), timeout=spec.timeout_s, retries=0
-                )
+                self._client = ModbusTcpClient(tcp[1].strip("[]"), port=int(tcp[2]), **common)
             elif port.startswith("rtu:"):
-                open_port(port[4:], line, self.name).close()  # its message is better, and it sets the latency
+                open_port(port[4:], line).close()  # its message is better, and it sets the latency
                 self._client = ModbusSerialClient(
-                    port[4:],
-                    baudrate=line.baud,
-                    parity=line.parity,
-                    stopbits=line.stop_bits,
-                    timeout=spec.timeout_s,
-                    retries=0,
+                    port[4:], baudrate=line.baud, parity=line.parity, stopbits=line.stop_bits, **common
                 )
             else:
-                raise HardwareError(f"{self.name}: port '{port}': tcp:host:port or rtu:/dev/... was expected")
+                raise HardwareError(f"port '{port}': tcp:host:port or rtu:/dev/... was expected")
             connected = self._client.connect()
         except (OSError, ModbusException, serial.SerialException) as e:
-            raise HardwareError(f"{self.name}: {port}: cannot be opened ({e})") from None
+            raise HardwareError(f"{port}: cannot be opened ({e})") from None
         if not connected:
             self._client.close()
-            raise HardwareError(f"{self.name}: {port}: nobody answers: check power, network and address")
+            raise HardwareError(f"{port}: nobody answers: check power, network and address")
+        self._lost_polls = 0
+        self._plan()
 
     def disconnect(self) -> None:
         """Close the connection."""
@@ -119,42 +142,128 @@ class ModbusDevice(Device):
             client.close()
 
     def poll(self, sample: Sample) -> None:
-        """Read every block. A device that answers with an exception makes the block's channels ERROR; one that does not
-        answer raises HardwareError."""
-        for block in self._blocks:
-            read = (
-                self._client.read_input_registers
-                if block.kind == "input"
-                else self._client.read_holding_registers
-            )
+        """Read every block. A lost answer leaves the last values standing and ends this poll: its late answer must not be
+        taken for the next block's. Raises HardwareError when the link is gone or LOST_POLLS in a row had no answer."""
+        for block in list(self._blocks):
+            try:
+                self._read(sample, block)
+                self._lost_polls = 0
+            except NoAnswer as e:
+                self.counts["lost"] += 1
+                self._lost_polls += 1
+                for i, _ in block.members:
+                    self.miss(i, f"{self._named(block)}: {e}")
+                if self._lost_polls >= LOST_POLLS:
+                    raise HardwareError(f"{self.binding.port}: {self._named(block)}: {e}") from None
+                at = self._blocks.index(block) + 1  # the next poll starts behind it
+                self._blocks = self._blocks[at:] + self._blocks[:at]
+                return
+
+    def silence(self) -> str:
+        """Its poller says why as soon as it can."""
+        return "its poller has posted nothing"
+
+    def _read(self, sample: Sample, block: Block) -> None:
+        answer = self._request(block)
+        if isinstance(answer, list):
+            self._store(sample, block, answer)
+        elif answer in REFUSED and (len(block.members) > 1 or block.count > block.members[0][1].words):
+            self._read_singly(sample, block)
+        else:
+            self._refused(sample, block, answer)
+
+    def _read_singly(self, sample: Sample, block: Block) -> None:
+        """Read a refused block's registers one by one, and keep apart from now on what is refused: a single register, or
+        the gaps between them."""
+        refused: list[Block] = []
+        for member in block.members:
+            single = Block(block.kind, member[1].address, member[1].words, (member,))
+            answer = self._request(single)
+            if isinstance(answer, list):
+                self._store(sample, single, answer)
+            else:
+                refused.append(single)
+                self._refused(sample, single, answer)
+        bad = {i for b in refused for i, _ in b.members}
+        good = plan_blocks((m for m in block.members if m[0] not in bad), 0, self._spec.max_block)
+        at = self._blocks.index(block)
+        self._blocks[at : at + 1] = [*good, *refused]
+
+    def _request(self, block: Block) -> list[int] | int:
+        """The words of a block, or the number of the exception. Raises NoAnswer, or HardwareError when the link is gone."""
+        client, code = self._client, 0
+        read = client.read_input_registers if block.kind == "input" else client.read_holding_registers
+        for _ in range(BUSY_TRIES):
+            self._heard = b""
             try:
                 answer = read(block.address, count=block.count, device_id=self.binding.address)
-            except (ModbusException, OSError, serial.SerialException) as e:
-                self.counts["errors"] += 1
-                raise HardwareError(f"{self.name}: {self.binding.port}: no valid answer ({e})") from None
-            now_s = time.monotonic()
-            problem = ""
-            if answer.isError():
-                code = getattr(answer, "exception_code", 0)
-                problem = f"answered exception {code} ({EXCEPTIONS.get(code, 'unknown')})"
-            elif len(answer.registers) != block.count:
-                problem = f"answered {len(answer.registers)} registers of {block.count}"
-            if problem:
-                self.counts["errors"] += 1
+            except (ConnectionException, OSError, serial.SerialException) as e:
+                self.counts["lost"] += 1
+                raise HardwareError(f"{self.binding.port}: the connection is gone ({e})") from None
+            except Exception:  # what comes from a device may be anything to the library
+                raise NoAnswer(self._what_came()) from None
+            if not answer.isError():
+                break
+            self.counts["errors"] += 1
+            code = getattr(answer, "exception_code", 0)
+            if code not in BUSY:
+                return code
+            time.sleep(BUSY_PAUSE_S)
+        else:
+            return code
+        words = getattr(answer, "registers", None)
+        if answer.function_code != (4 if block.kind == "input" else 3) or words is None:
+            raise NoAnswer(
+                f"function {answer.function_code} was answered, {block.kind} registers were asked for"
+            )
+        if len(words) != block.count:
+            raise NoAnswer(f"{len(words)} registers were answered, {block.count} were asked for")
+        self.counts["frames"] += 1
+        return list(words)
+
+    def _trace(self, sending: bool, data: bytes) -> bytes:
+        if not sending:
+            self._heard = data
+        return data
+
+    def _what_came(self) -> str:
+        heard, unit = self._heard, self.binding.address
+        if not heard:
+            return f"no answer within {self._spec.timeout_s:g} s: check power, wiring, address {unit} and the line's settings"
+        text = f"no valid answer: {len(heard)} bytes came ({heard[:12].hex(' ')}{' ..' if len(heard) > 12 else ''})"
+        if not self.binding.port.startswith("rtu:"):
+            return f"{text}: cut short, or no Modbus TCP"
+        if len(heard) < 4 or crc16("modbus", heard[:-2]) != int.from_bytes(heard[-2:], "little"):
+            return f"{text} with a wrong CRC, or cut short: check the baud rate, parity, termination and other masters"
+        return f"{text} of unit {heard[0]}, unit {unit} was asked: check 'address'"
+
+    def _store(self, sample: Sample, block: Block, words: list[int]) -> None:
+        now_s = time.monotonic()
+        for i, register in block.members:
+            at = register.address - block.address
+            raw = decode(words[at : at + register.words], register)
+            if raw in register.sentinels or math.isnan(raw):
+                self.fail(sample, i, f"register {register.address} reads {raw:g}: open or missing sensor")
             else:
-                self.counts["frames"] += 1
-            for i, register in block.members:
-                if problem:
-                    self.fail(
-                        sample,
-                        i,
-                        f"{problem} to {block.kind} registers {block.address}.."
-                        f"{block.address + block.count - 1}: check the register map",
-                    )
-                    continue
-                at = register.address - block.address
-                raw = decode(answer.registers[at : at + register.words], register)
-                if raw in register.sentinels or math.isnan(raw):
-                    self.fail(sample, i, f"register {register.address} reads {raw:g}: open or missing sensor")
-                else:
-                    self.put(sample, i, raw, now_s)
+                self.put(sample, i, raw, now_s)
+
+    def _refused(self, sample: Sample, block: Block, code: int) -> None:
+        """An exception was answered. It is the channel's ERROR once it has lasted as long as a reading may be old."""
+        name, remedy = EXCEPTIONS.get(code, ("unknown", "see the device's manual"))
+        now_s = time.monotonic()
+        for i, register in block.members:
+            hint = register_hint(register.address) if code == 2 else ""
+            text = f"{self._named(block)}: exception {code} ({name}): {remedy}" + (
+                f"; {hint}" if hint else ""
+            )
+            stale_s = self.binding.bounds[i].channel.stale_after_s
+            if code not in PASSING and now_s - sample.time_s[self.roles[i]] > stale_s:
+                self.fail(sample, i, text)
+            else:
+                self.miss(i, text)
+
+    @staticmethod
+    def _named(block: Block) -> str:
+        if len(block.members) == 1:
+            return f"{block.kind} register {block.address}"
+        return f"{block.kind} registers {block.address}..{block.address + block.count - 1}"

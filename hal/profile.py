@@ -12,6 +12,7 @@ profile, port and which channel plays which role of `hal.backend.ROLES`.
 from __future__ import annotations
 
 import math
+import os
 import re
 import struct
 from collections.abc import Iterable, Mapping
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from hal.backend import ROLES
+from hal.text_number import BASES, DECIMALS, takes_letters
 from thermoctl import yamlfile
 from thermoctl.yamlfile import InputError, Node, suggest
 
@@ -37,7 +39,7 @@ FIELD_TYPES = {
     "float32": "f",
     "float64": "d",
 }
-CRCS = ("ccitt-false", "xmodem", "modbus")
+CRCS = ("ccitt-false", "xmodem", "modbus", "none")
 _NAME = re.compile(r"[A-Za-z_]\w{0,59}$", re.ASCII)
 
 # A channel's unit must be convertible to its role's: role suffix -> {unit: (factor, offset)}.
@@ -48,6 +50,10 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "c": {"degC": (1, 0), "K": (1, -273.15)},
     "": {"1": (1, 0)},
 }
+# How DBC files write the units above, where they write them otherwise.
+_DBC_UNITS = {"°C": "degC", "C": "degC", "deg C": "degC", "Celsius": "degC", "µm": "um", "μm": "um"}
+EXCLUSIVE = ("slcan:", "rtu:", "/")
+"""What the ports begin with that one program can open once."""
 
 
 class Section:
@@ -215,7 +221,8 @@ class LineSettings:
 
 @dataclass(frozen=True)
 class BinaryFrame:
-    """sync | payload length (uint8, where has_length) | payload of typed fields | CRC-16 (of what follows sync).
+    """sync | payload length (uint8, where has_length) | payload of typed fields | CRC-16 (of what follows sync; crc "none":
+    no check at all).
 
     `sequence` names a counter field (lost frames are counted); `invalid` = (field, mask): any of those bits set marks
     the readings of the frame as errors."""
@@ -237,11 +244,21 @@ class BinaryFrame:
 
 @dataclass(frozen=True)
 class TextLine:
-    """A line that matches `pattern` gives its named groups as readings; `request` is sent every 1/request_hz."""
+    """A line that matches `pattern` gives its named groups as readings; `request` is sent every 1/request_hz. `decimal` is
+    the sign between a number's whole part and its decimals."""
 
     pattern: re.Pattern[str]
     request: bytes = b""
     request_hz: float = 0.0
+    decimal: str = "."
+
+
+@dataclass(frozen=True)
+class TextField:
+    """A named group of a text pattern, and the base of the number in it."""
+
+    group: str
+    base: int
 
 
 @dataclass(frozen=True)
@@ -260,6 +277,11 @@ class DbcSource:
     signal: str
 
 
+Object = tuple[int, int]
+"""Index and sub-index in a CANopen object dictionary; a profile writes 0x6041, or 0x30D1:1 for sub-index 1."""
+STATUS_WORD, ERROR_CODE = (0x6041, 0), (0x603F, 0)
+
+
 @dataclass(frozen=True)
 class Cia402:
     """A CiA-402 drive: EDS, the object that takes the command, the two PDOs, and the times of both heartbeats."""
@@ -267,12 +289,13 @@ class Cia402:
     eds: Path
     node_id: int
     mode: int  # 0x6060 mode of operation: 4 profile torque, 10 cyclic torque, < 0 vendor's
-    command: int  # object that takes the drive
-    transmit: tuple[int, ...]  # objects of TPDO 1, the first is the status word 0x6041
-    master_id: int = 127  # our own node id: its heartbeat is what the drive watches
+    command: Object  # takes the drive
+    transmit: tuple[Object, ...]  # of TPDO 1, the first is the status word 0x6041
+    master_id: int = 0  # our own node id, whose heartbeat the drive watches; 0: 127 - the drive's node id
     heartbeat_s: float = 0.02  # we send ours and ask the drive for its own this often
     watchdog_s: float = 0.1  # the drive stops when ours is missing for so long
     start_up: tuple[tuple[int, int, int], ...] = ()  # further (index, subindex, value) written at set-up
+    sdo_timeout_s: float = 0.3  # how long the drive may take for an answer at set-up
 
 
 @dataclass(frozen=True)
@@ -393,9 +416,10 @@ def _channel(name: str, s: Section, bus: str, spec: Any) -> Channel:
     scale = s.number("scale", 1.0)
     if scale == 0.0:
         raise _must(s.get("scale")).error("scale: 0 makes every reading the same")
+    unit = s.text("unit")
     channel = Channel(
         name,
-        s.text("unit"),
+        unit,
         scale,
         s.number("offset", 0.0),
         s.interval("range"),
@@ -404,8 +428,26 @@ def _channel(name: str, s: Section, bus: str, spec: Any) -> Channel:
         _SOURCES[bus](s, spec),
         s.node.place,
     )
+    if isinstance(spec, Dbc):
+        _check_dbc_unit(s, spec, channel)
     s.end()
     return channel
+
+
+def _check_dbc_unit(s: Section, spec: Dbc, channel: Channel) -> None:
+    """Raise where the DBC file's unit is not the profile's and no scale converts between them."""
+    signal = spec.database.get_message_by_name(channel.source.message).get_signal_by_name(
+        channel.source.signal
+    )
+    theirs = _DBC_UNITS.get(signal.unit or "", signal.unit or "")
+    if theirs == channel.unit or abs(channel.scale) != 1.0:
+        return
+    for units in _UNITS.values():
+        if theirs in units and theirs != "1":
+            raise _must(s.get("unit")).error(
+                f"unit: the DBC file gives {signal.name} in {signal.unit}, the profile says {channel.unit} with scale 1; "
+                f"say unit: {theirs}, or the scale from {signal.unit} to {channel.unit}"
+            )
 
 
 def _named(s: Section, key: str, names: Iterable[str]) -> str:
@@ -438,12 +480,16 @@ def _binary_frame(top: Section, folder: Path) -> BinaryFrame:
         i.end()
     sequence = _named(s, "sequence", names) if s.get("sequence", False) else ""
     order = {"little": "<", "big": ">"}
+    if s.get("crc", False) is None:
+        raise s.node.error(
+            f"frame: 'crc' is missing: one of {', '.join(CRCS)} ('none': frames are not checked)"
+        )
     frame = BinaryFrame(
         sync,
         tuple(fields),
         order[s.text("endian", "little", order)],
         s.flag("length", True),
-        s.text("crc", "ccitt-false", CRCS),
+        s.text("crc", choices=CRCS),
         order[s.text("crc_endian", "little", order)],
         sequence,
         invalid,
@@ -467,7 +513,9 @@ def _text_line(top: Section, folder: Path) -> TextLine:
     if not pattern.groupindex:
         raise node.error("pattern: named groups (?P<name>...) were expected, one for each reading")
     request = s.text("request", "").encode("ascii", "replace").decode("unicode_escape").encode("latin-1")
-    spec = TextLine(pattern, request, s.number("request_hz", 0.0, 0, 1000))
+    spec = TextLine(
+        pattern, request, s.number("request_hz", 0.0, 0, 1000), s.text("decimal", ".", choices=DECIMALS)
+    )
     if bool(spec.request) != (spec.request_hz > 0):
         raise s.node.error("text: 'request' and 'request_hz' belong together")
     s.end()
@@ -484,7 +532,9 @@ def _dbc(top: Section, folder: Path) -> Dbc:
     except OSError as e:
         raise node.error(f"dbc: {path} cannot be read: {e.strerror}") from None
     except Exception as e:  # cantools raises parse errors of several libraries
-        raise node.error(f"dbc: {path} is not a DBC file: {str(e).splitlines()[0]}") from None
+        raise node.error(
+            f"dbc: {path} is not a DBC file: {(str(e).splitlines() or [type(e).__name__])[0]}"
+        ) from None
 
 
 def _cia402(top: Section, folder: Path) -> Cia402:
@@ -493,8 +543,8 @@ def _cia402(top: Section, folder: Path) -> Cia402:
     eds = folder / s.text("eds")
     if not eds.is_file():
         raise _must(s.get("eds")).error(f"eds: {eds} cannot be read: no such file")
-    transmit = tuple(_integer(n, "transmit", 0x1000, 0xFFFF) for n in s.list("transmit"))
-    if not transmit or transmit[0] != 0x6041:
+    transmit = tuple(_object(n, "transmit") for n in s.list("transmit"))
+    if not transmit or transmit[0] != STATUS_WORD:
         raise _must(s.get("transmit")).error(
             "transmit: the objects of TPDO 1, the status word '0x6041' first"
         )
@@ -513,12 +563,13 @@ def _cia402(top: Section, folder: Path) -> Cia402:
         eds,
         s.integer("node_id", 1, 1, 126),
         s.integer("mode", low=-128, high=127),
-        s.integer("command", low=0x1000, high=0xFFFF),
+        _object(_must(s.get("command")), "command"),
         transmit,
-        s.integer("master_id", 127, 1, 127),
+        s.integer("master_id", 0, 1, 127),
         s.number("heartbeat_s", 0.02, 1e-3, 1),
         s.number("watchdog_s", 0.1, 2e-3, 10),
         tuple(start_up),
+        s.number("sdo_timeout_s", 0.3, 0.01, 10),
     )
     if spec.watchdog_s < 2 * spec.heartbeat_s:
         raise s.node.error(
@@ -549,13 +600,45 @@ def _dbc_source(s: Section, spec: Dbc) -> DbcSource:
     )
 
 
-def _cia402_source(s: Section, spec: Cia402) -> int:
-    index = s.integer("object", low=0x1000, high=0xFFFF)
-    if index not in spec.transmit and index not in (0x603F,):
-        raise _must(s.get("object")).error(
-            f"object: 0x{index:04X} is not sent by the drive; add it to 'transmit'"
+def _object(node: Node, key: str) -> Object:
+    """An object: 0x6041, or 0x30D1:1 with the sub-index (decimal, or 0x.. in hexadecimal)."""
+    found = re.fullmatch(r"(0x[0-9A-Fa-f]{4})(?::(0x[0-9A-Fa-f]{1,2}|\d{1,3}))?", str(node.value))
+    if found is None and isinstance(node.value, int) and not isinstance(node.value, bool):
+        return _integer(node, key, 0x1000, 0xFFFF), 0
+    index, sub = (
+        (int(found[1], 16), int(found[2] or "0", 0 if "x" in (found[2] or "") else 10)) if found else (0, 0)
+    )
+    if not 0x1000 <= index <= 0xFFFF or sub > 255:
+        raise node.error(
+            f"{key}: an object as 0x6041, or 0x30D1:1 with its sub-index, was expected, found {_kind(node)}"
         )
-    return index
+    return index, sub
+
+
+def object_name(item: Object) -> str:
+    """An object as a profile writes it: 0x6041, 0x30D1:1."""
+    return f"0x{item[0]:04X}" + (f":{item[1]}" if item[1] else "")
+
+
+def _cia402_source(s: Section, spec: Cia402) -> Object:
+    item = _object(_must(s.get("object")), "object")
+    if item not in spec.transmit and item != ERROR_CODE:
+        raise _must(s.get("object")).error(
+            f"object: {object_name(item)} is not sent by the drive; add it to 'transmit'"
+        )
+    return item
+
+
+def _text_field(s: Section, spec: TextLine) -> TextField:
+    group = _named(s, "field", spec.pattern.groupindex)
+    base = s.integer("base", 10)
+    if base not in BASES:
+        raise _must(s.get("base")).error(f"base: {base} is not one of {', '.join(map(str, BASES))}")
+    if s.get("base", False) is None and takes_letters(spec.pattern, group):
+        raise s.node.error(
+            f"{s.what}: group '{group}' of the pattern also takes the letters A to F: say base: 16, or base: 10"
+        )
+    return TextField(group, base)
 
 
 def _register(s: Section, spec: Modbus) -> Register:
@@ -581,7 +664,7 @@ _BUS_SPECS: dict[str, Any] = {
 }
 _SOURCES: dict[str, Any] = {
     "serial-binary": lambda s, spec: _named(s, "field", [n for n, _ in spec.fields]),
-    "serial-lines": lambda s, spec: _named(s, "field", spec.pattern.groupindex),
+    "serial-lines": _text_field,
     "can-dbc": _dbc_source,
     "can-cia402": _cia402_source,
     "modbus": _register,
@@ -598,9 +681,10 @@ def resolve_port(port: str, folder: Path) -> str:
 
 
 def bind(node: Node, folder: Path) -> Binding:
-    """One item of `hal.devices`: {profile, port, roles: {channel: role}, name?, address?, stale_after_s?, watchdog_s?};
-    `profile` is relative to `folder`. The last two replace the profile's on a machine that cannot keep them. Raises
-    InputError: unknown channel, unknown role, unit that does not fit the role."""
+    """One item of `hal.devices`: {profile, port, roles: {channel: role}, name?, address?, stale_after_s?, watchdog_s?,
+    master_id?}; `profile` is relative to `folder`. stale_after_s and watchdog_s replace the profile's on a machine that
+    cannot keep them, master_id where another device of the bus has that id. Raises InputError: unknown channel, unknown
+    role, unit that does not fit the role."""
     s = Section(node, "device")
     profile_node = _must(s.get("profile"))
     path = folder / s.text("profile")
@@ -634,16 +718,32 @@ def bind(node: Node, folder: Path) -> Binding:
             )
         bounds.append(_bound(role, profile.channels[name]))
     default = getattr(profile.bus_spec, "node_id", getattr(profile.bus_spec, "unit_id", 0))
+    low, high = (1, 126) if profile.bus == "can-cia402" else (0, 247)
+    address = s.integer("address", default, low, high)
+    if profile.bus == "can-cia402":
+        profile = replace(profile, bus_spec=_with_master(s, profile.bus_spec, address))
+    elif (master := s.get("master_id", False)) is not None:
+        raise master.error(f"master_id: a {profile.bus} device has none")
     binding = Binding(
         s.text("name", profile.model),
         profile,
         resolve_port(s.text("port"), folder),
-        s.integer("address", default, 0, 247),
+        address,
         tuple(bounds),
         node.place,
     )
     s.end()
     return binding
+
+
+def _with_master(s: Section, spec: Cia402, node: int) -> Cia402:
+    """The drive's description with our own node id: the binding's, else the profile's, else 127 - the drive's."""
+    master = s.integer("master_id", spec.master_id or 127 - node, 1, 127)
+    if master == node:
+        raise s.node.error(
+            f"master_id: {master} is the drive's own node id; the drive would watch itself: choose one that is free on the bus"
+        )
+    return replace(spec, master_id=master)
 
 
 def role_units(role: str) -> dict[str, tuple[float, float]]:
@@ -670,9 +770,15 @@ def _bound(role: Node, channel: Channel) -> Bound:
 
 
 def check_rig(bindings: Iterable[Binding]) -> None:
-    """Raise InputError where two devices claim one role, or two would drive."""
+    """Raise InputError where two devices claim one role, two would drive, or two open a port that only one can."""
     claimed: dict[str, Binding] = {}
+    opened: dict[str, Binding] = {}
     for b in bindings:
+        if (first := opened.setdefault(_exclusive_port(b), b)) is not b and b.port.startswith(EXCLUSIVE):
+            raise InputError(
+                f"{b.place}: {b.name} and {first.name} ({first.place}) both open {b.port}, which one device can open once; "
+                "give each an adapter of its own, or read both as channels of one profile"
+            )
         for role in [x.role for x in b.bounds] + (["drive"] if b.profile.drive else []):
             if role in claimed:
                 raise InputError(
@@ -680,3 +786,33 @@ def check_rig(bindings: Iterable[Binding]) -> None:
                     f"({claimed[role].place}); keep one of them"
                 )
             claimed[role] = b
+
+
+def _exclusive_port(b: Binding) -> str:
+    """The port without interface and bitrate, links followed: what two devices may not share."""
+    if not b.port.startswith(EXCLUSIVE):
+        return b.port
+    return os.path.realpath(re.sub(r"^(slcan|rtu):|@\d+$", "", b.port))
+
+
+def rig_notes(bindings: Iterable[Binding]) -> list[str]:
+    """What is allowed and yet probably meant otherwise, a line each (for `thermoctl check`)."""
+    notes = []
+    bindings = list(bindings)
+    if not any(b.profile.drive for b in bindings):
+        notes.append(
+            "no device takes the command (a can-cia402 profile with 'drive'): this rig measures, it cannot be driven"
+        )
+    for b in bindings:
+        for x in b.bounds:
+            if isinstance(x.channel.source, Register) and (hint := register_hint(x.channel.source.address)):
+                notes.append(f"{x.channel.place}: register {x.channel.source.address}: {hint}")
+    return notes
+
+
+def register_hint(address: int) -> str:
+    """What a manual means by such a register number, where it counts from 30001 or 40001; '' elsewhere."""
+    for base, kind in ((30001, "input"), (40001, "holding")):
+        if base <= address < base + 9999:
+            return f"addresses count from 0; where the manual calls it {address}, it is kind: {kind}, register: {address - base}"
+    return ""

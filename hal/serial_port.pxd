@@ -5,7 +5,8 @@ from hal.wire cimport Framer
 
 cdef class SerialDevice(Device):
     cdef public object _port, _lines
-    cdef public int _fd, _flags
+    cdef public str _why
+    cdef public int _fd, _flags, _unread
     cdef public unsigned long long _bad_flags
     cdef public bint _waited
     cdef public Framer _framer

@@ -19,7 +19,8 @@ import serial
 
 from hal.backend import HardwareError, Sample
 from hal.devices import Device
-from hal.profile import BinaryFrame, Binding, LineSettings
+from hal.profile import BinaryFrame, Binding, LineSettings, TextField, TextLine
+from hal.text_number import cut_short, number, shown, why_no_match, why_no_number
 from hal.wire import Framer, read_available, wait_readable
 
 MAX_LINE = 1024  # a text line longer than this is garbage
@@ -45,13 +46,18 @@ class LineReader:
         self._buffer[:] = rest
         return [line for line in lines if 0 < len(line) <= MAX_LINE]
 
+    @property
+    def pending(self) -> int:
+        """Bytes of a line that has no end yet."""
+        return MAX_LINE if self._dropping else len(self._buffer)
+
     def reset(self) -> None:
         """Forget half a line."""
         self._buffer.clear()
         self._dropping = False
 
 
-def open_port(path: str, line: LineSettings, what: str) -> serial.Serial:
+def open_port(path: str, line: LineSettings) -> serial.Serial:
     """Open and configure a serial port exclusively, non-blocking. Raises HardwareError with what to do."""
     try:
         port = serial.Serial(
@@ -72,13 +78,18 @@ def open_port(path: str, line: LineSettings, what: str) -> serial.Serial:
             errno.EBUSY: "in use by another program: stop it first",
             errno.EINVAL: f"cannot do {line.baud} baud, parity {line.parity}: see the profile's 'line'",
         }.get(code or 0, str(e))
-        raise HardwareError(f"{what}: {path}: {hint}") from None
+        raise HardwareError(f"{path}: {hint}") from None
     if line.latency_timer_ms:
         set_latency_timer(path, line.latency_timer_ms)
-    settings = termios.tcgetattr(port.fileno())
-    settings[6][termios.VMIN] = 1  # so that 'nothing yet' (EAGAIN) differs from 'gone' (no bytes)
-    termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
-    os.set_blocking(port.fileno(), False)
+    try:
+        settings = termios.tcgetattr(port.fileno())
+        settings[6][termios.VMIN] = 1  # so that 'nothing yet' (EAGAIN) differs from 'gone' (no bytes)
+        termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
+        termios.tcflush(port.fileno(), termios.TCIOFLUSH)
+        os.set_blocking(port.fileno(), False)
+    except (OSError, termios.error) as e:  # pulled out meanwhile; termios.error is no OSError
+        port.close()
+        raise HardwareError(f"{path}: gone while it was opened ({e})") from None
     return port
 
 
@@ -117,6 +128,10 @@ class SerialDevice(Device):
         self._framer = Framer(spec) if isinstance(spec, BinaryFrame) else None
         self._lines = LineReader()
         self._due_s, self._waited = 0.0, False
+        self._unread, self._why = (
+            0,
+            "",
+        )  # lines since the last reading that gave none, and why the last of them
         if self._framer:
             names = [n for n, _ in spec.fields]
             self._index = array("i", [names.index(b.channel.source) for b in binding.bounds])
@@ -125,11 +140,10 @@ class SerialDevice(Device):
 
     def connect(self) -> None:
         """Open the port; frames in its buffer are dropped."""
-        self._port = open_port(self.binding.port, self.binding.profile.line, self.name)
+        self._port = open_port(self.binding.port, self.binding.profile.line)
         self._fd = self._port.fileno()
-        termios.tcflush(self._fd, termios.TCIOFLUSH)
         self._lines.reset()
-        self._waited = False
+        self._waited, self._unread = False, 0
         if self._framer:
             self._framer.reset()
 
@@ -171,19 +185,63 @@ class SerialDevice(Device):
             self.counts.update(frames=framer.frames, errors=framer.bad, lost=framer.lost)
         return self.counts
 
+    def silence(self) -> str:
+        """What arrives instead of a reading."""
+        framer, line = self._framer, self.binding.profile.line
+        if framer is None:
+            if self._unread:
+                return f"{self._unread} lines gave no reading; {self._why}"
+            if self._lines.pending:
+                return f"{self._lines.pending} bytes came and no line end (CR or LF): check baud {line.baud} and parity"
+            return super().silence()
+        if not framer.quiet_bytes:
+            return super().silence()
+        came = f"{framer.quiet_bytes} bytes came"
+        if framer.quiet_sums > framer.quiet_lengths:
+            return f"{came}, {framer.quiet_sums} frames with a wrong CRC: check 'crc', 'crc_endian', 'fields', baud {line.baud}"
+        if framer.quiet_lengths:
+            return (
+                f"{came}, {framer.quiet_lengths} frames with another length byte than {framer.spec.payload.size}: "
+                f"check 'length', 'fields' and baud {line.baud}"
+            )
+        return f"{came} without a whole frame that begins with {framer.spec.sync.hex(' ')}: check 'sync' and baud {line.baud}"
+
     def _take_lines(self, sample: Sample, data: bytes, now_s: float) -> None:
-        spec = self.binding.profile.bus_spec
+        spec: TextLine = self.binding.profile.bus_spec
         if spec.request and now_s >= self._due_s:
             self._due_s = now_s + 1.0 / spec.request_hz
-            os.write(self._fd, spec.request)
-        for line in self._lines.feed(data) if data else ():
-            match = spec.pattern.match(line.decode("ascii", "replace"))
-            if match is None:
+            with contextlib.suppress(
+                BlockingIOError
+            ):  # the line takes nothing now: ask again at the next due time
+                os.write(self._fd, spec.request)
+        for raw in self._lines.feed(data) if data else ():
+            line = raw.decode("ascii", "replace")
+            problem = self._take_line(sample, line, now_s)
+            if problem:
                 self.counts["errors"] += 1
+                self._unread, self._why = self._unread + 1, problem
+            else:
+                self.counts["frames"] += 1
+                self._unread = 0
+
+    def _take_line(self, sample: Sample, line: str, now_s: float) -> str:
+        """Store the readings of a line; why it gave none, or ''. A line in which one number cannot be read gives none at all."""
+        spec: TextLine = self.binding.profile.bus_spec
+        match = spec.pattern.match(line)
+        if match is None:
+            return why_no_match(line, spec.pattern)
+        values: list[tuple[int, float]] = []
+        for i, bound in enumerate(self.binding.bounds):
+            field: TextField = bound.channel.source
+            text = match[field.group]
+            if text is None:  # a reading of another kind of line
                 continue
-            self.counts["frames"] += 1
-            for i, bound in enumerate(self.binding.bounds):
-                try:
-                    self.put(sample, i, float(match[bound.channel.source]), now_s)
-                except (ValueError, TypeError):
-                    self.counts["errors"] += 1
+            value = number(text, field.base, spec.decimal)
+            if value is None:
+                return why_no_number(text, line, field.base, spec.decimal)
+            if cut_short(line, match, field.group):
+                return f"received {shown(line)}: the number goes on behind {shown(text)}, where the pattern ends: end it with $"
+            values.append((i, value))
+        for i, value in values:
+            self.put(sample, i, value, now_s)
+        return ""

@@ -9,16 +9,17 @@ cdef enum:
     MAX_FRAMES = 1024           # of a read: the shortest Lawicel frame has 6 bytes
     MAX_QUEUED = 32             # frames of one send
     MAX_PENDING = 4096          # bytes that wait for a line which takes none: then it counts as lost
+    EXTENDED_FLAG = 1 << 31      # of a can_id: 29 bits (as in the kernel's struct can_frame)
 
 cdef class Framer:
     cdef readonly object spec
-    cdef readonly long frames, bad, skipped, lost
+    cdef readonly long frames, bad, skipped, lost, quiet_bytes, quiet_sums, quiet_lengths
     cdef readonly int size
     cdef object _payload
     cdef uint8_t[MAX_READ + MAX_FRAME] _buffer
     cdef uint8_t[MAX_FRAME] _newest
     cdef uint8_t[8] _sync
-    cdef int _length, _sync_size, _head, _payload_size, _has_length, _crc_kind, _crc_big, _big, _sequence, _known
+    cdef int _length, _sync_size, _head, _payload_size, _has_length, _crc_kind, _crc_size, _crc_big, _big, _sequence, _known
     cdef int[MAX_FIELDS] _offset
     cdef char[MAX_FIELDS] _type
     cdef uint64_t _modulus_mask
@@ -34,12 +35,12 @@ cpdef bint wait_readable(int fd, int64_t until_ns) except -1
 cpdef bytes encode_slcan(uint32_t can_id, bytes data)
 
 cdef struct Frame:
-    uint32_t can_id
+    uint32_t can_id             # with EXTENDED_FLAG where it has 29 bits
     int size
     uint64_t data               # its bytes, the first one lowest
 
 cdef class SlcanParser:
-    cdef public long bad, refused
+    cdef public long bad, refused, ignored
     cdef Frame[MAX_FRAMES] _frames
     cdef int _count
     cdef uint8_t[MAX_MESSAGE] _rest

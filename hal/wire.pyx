@@ -1,7 +1,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The bytes of a tick: frames with a CRC, Lawicel CAN in ASCII, checked readings; compiled, because a tick meets them cold.
 
-A binary frame on the wire:   sync (1..8 bytes) | length (uint8, optional) | payload | CRC-16 over all that follows sync
+A binary frame on the wire:   sync (1..8 bytes) | length (uint8, optional) | payload | CRC-16 over all that follows sync (optional)
 
 Framing resynchronises after garbage: a frame whose length or CRC is wrong costs its first byte, and the search goes on
 from the next one, so a true frame behind a false sync is never lost. Nothing here waits, and what a sender can fill is
@@ -19,6 +19,9 @@ from posix.time cimport CLOCK_MONOTONIC, clock_gettime, timespec
 from posix.unistd cimport read as c_read, write as c_write
 
 from hal.profile import CRCS, FIELD_TYPES
+
+EXTENDED = 0x80000000
+"""Bit 31 of an identifier: it has 29 bits. An 11-bit identifier of the same number is another one."""
 
 cdef extern from "<poll.h>" nogil:
     cdef struct pollfd:
@@ -101,7 +104,8 @@ def read_available(int fd) -> bytes:
 
 cdef class Framer:
     """Bytes in, frames out. `newest` is the payload tuple of the last good frame (() before the first); `frames`, `bad`
-    (wrong lengths and CRCs), `skipped` (bytes outside frames) and `lost` (gaps of the sequence counter) count.
+    (wrong lengths and CRCs), `skipped` (bytes outside frames) and `lost` (gaps of the sequence counter) count. The `quiet_`
+    counters start again at every good frame: bytes that came, wrong CRCs (`sums`) and wrong length bytes since then.
 
     spec: hal.profile.BinaryFrame.
     """
@@ -112,7 +116,8 @@ cdef class Framer:
         memcpy(self._sync, <const char *><bytes>spec.sync, self._sync_size)
         self._head = self._sync_size + self._has_length
         self._payload_size = self._payload.size
-        self.size = self._head + self._payload_size + 2
+        self._crc_size = 0 if spec.crc == "none" else 2
+        self.size = self._head + self._payload_size + self._crc_size
         if self.size > MAX_FRAME or len(spec.fields) > MAX_FIELDS:
             raise ValueError(f"a frame of {self.size} bytes and {len(spec.fields)} fields; at most {MAX_FRAME} and {MAX_FIELDS}")
         self._crc_kind, self._crc_big = CRCS.index(spec.crc), spec.crc_endian == ">"
@@ -143,6 +148,8 @@ cdef class Framer:
     def encode(self, *values) -> bytes:
         """A frame with these field values."""
         body = (bytes([self._payload_size]) if self._has_length else b"") + self._payload.pack(*values)
+        if not self._crc_size:
+            return self.spec.sync + body
         return self.spec.sync + body + crc16(self.spec.crc, body).to_bytes(2, "big" if self._crc_big else "little")
 
     def feed(self, const uint8_t[::1] data) -> int:
@@ -153,6 +160,7 @@ cdef class Framer:
             part = min(<Py_ssize_t>MAX_READ, data.shape[0] - at)
             memcpy(self._buffer + self._length, &data[at], part)
             self._length += <int>part
+            self.quiet_bytes += part
             good += self._scan()
             at += part
         return good
@@ -163,11 +171,12 @@ cdef class Framer:
         if got == 0:
             return 0
         self._length += got
+        self.quiet_bytes += got
         return self._scan()
 
     cdef int _scan(self) noexcept:
         cdef uint8_t *buffer = self._buffer
-        cdef int at = 0, start, end, n = self._length, good = 0, found
+        cdef int at = 0, start, end, n = self._length, good = 0, found, whole_length
         cdef uint16_t crc
         cdef uint64_t before
         while at < n:
@@ -181,16 +190,20 @@ cdef class Framer:
                 break
             self.skipped += start - at
             at = start
-            found = not self._has_length or n <= at + self._sync_size or buffer[at + self._sync_size] == self._payload_size
+            whole_length = not self._has_length or n <= at + self._sync_size or buffer[at + self._sync_size] == self._payload_size
+            found = whole_length
             if found:
                 if n - at < self.size:
                     break
                 end = at + self.size
-                crc = (<uint16_t>(buffer[end - 2] << 8) | buffer[end - 1] if self._crc_big
-                       else <uint16_t>(buffer[end - 1] << 8) | buffer[end - 2])
-                found = _crc16(self._crc_kind, buffer + at + self._sync_size, self.size - self._sync_size - 2) == crc
+                if self._crc_size:
+                    crc = (<uint16_t>(buffer[end - 2] << 8) | buffer[end - 1] if self._crc_big
+                           else <uint16_t>(buffer[end - 1] << 8) | buffer[end - 2])
+                    found = _crc16(self._crc_kind, buffer + at + self._sync_size, self.size - self._sync_size - 2) == crc
             if not found:
                 self.bad += 1
+                self.quiet_lengths += not whole_length
+                self.quiet_sums += whole_length
                 self.skipped += 1
                 at += 1
                 continue
@@ -202,6 +215,7 @@ cdef class Framer:
             else:
                 memcpy(self._newest, buffer + at + self._head, self._payload_size)
             self._known = 1
+            self.quiet_bytes = self.quiet_sums = self.quiet_lengths = 0
             good += 1
             at = end
         memmove(buffer, buffer + at, n - at)
@@ -248,6 +262,7 @@ cdef class Framer:
     def reset(self) -> None:
         """Forget half a frame and the sequence (after a reconnection)."""
         self._length = self._known = 0
+        self.quiet_bytes = self.quiet_sums = self.quiet_lengths = 0
 
 
 cdef int _nibble(uint8_t c) noexcept nogil:
@@ -261,7 +276,8 @@ cdef char *_DIGITS = b"0123456789ABCDEF"
 
 
 cdef int _encode(char *out, uint32_t can_id, const uint8_t *data, int size) noexcept nogil:
-    cdef int digits = 3 if can_id <= 0x7FF else 8, at = 1, i
+    cdef int digits = 8 if can_id & EXTENDED_FLAG else 3, at = 1, i
+    can_id &= 0x1FFFFFFF if digits == 8 else 0x7FF
     out[0] = b't' if digits == 3 else b'T'
     for i in range(digits):
         out[at] = _DIGITS[can_id >> (4 * (digits - 1 - i)) & 15]
@@ -284,15 +300,16 @@ cdef uint64_t _whole(bytes data) except? 1:
 
 
 cpdef bytes encode_slcan(uint32_t can_id, bytes data):
-    """A data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR above 0x7FF."""
+    """A data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR where the id has the bit EXTENDED."""
     cdef char[MAX_MESSAGE] out
     cdef uint64_t value = _whole(data)
     return out[:_encode(out, can_id, <const uint8_t *>&value, <int>len(data))]
 
 
 cdef class SlcanParser:
-    """Bytes from an adapter in, data frames out. Acknowledgements (z, Z, CR) pass silently; BEL, which refuses a
-    command, is counted in `refused`, what is no valid message in `bad`. Time stamps after the data are ignored."""
+    """Bytes from an adapter in, data frames out; the id of a 29-bit frame (T) has the bit EXTENDED. Acknowledgements (z, Z, CR)
+    pass silently. `refused` counts BEL, by which the adapter refuses a command, `ignored` remote and CAN FD frames, `bad`
+    what is no valid message. Time stamps after the data are ignored."""
 
     @property
     def pending(self) -> int:
@@ -332,8 +349,10 @@ cdef class SlcanParser:
         cdef uint32_t can_id = 0
         cdef uint64_t body = 0
         if m[0] != b't' and m[0] != b'T':
-            self.bad += not (m[0] == b'z' or m[0] == b'Z' or m[0] == b'r' or m[0] == b'R' or m[0] == b'F' or m[0] == b'V'
-                             or m[0] == b'N')
+            if m[0] in (b'r', b'R', b'd', b'D', b'b', b'B'):    # remote frames; CAN FD as CANable 2 writes them
+                self.ignored += 1
+            else:
+                self.bad += not (m[0] == b'z' or m[0] == b'Z' or m[0] == b'F' or m[0] == b'V' or m[0] == b'N')
             return
         digits = 3 if m[0] == b't' else 8
         size = m[1 + digits] - 48 if self._length > 1 + digits else -1
@@ -346,6 +365,11 @@ cdef class SlcanParser:
                 self.bad += 1
                 return
             can_id = can_id << 4 | <uint32_t>high
+        if can_id > (0x7FF if digits == 3 else 0x1FFFFFFF):
+            self.bad += 1
+            return
+        if digits == 8:
+            can_id |= EXTENDED_FLAG
         for i in range(size):
             high, low = _nibble(m[2 + digits + 2 * i]), _nibble(m[3 + digits + 2 * i])
             if high < 0 or low < 0:
@@ -379,8 +403,9 @@ cdef class CanPort:
         raise NotImplementedError
 
     cpdef bint deliver(self, uint32_t can_id, bytes data) except -1:
-        """For subclasses in Python: one more frame that has arrived since `begin`; False where there is no room."""
-        if self._count == MAX_FRAMES:
+        """For subclasses in Python: one more frame that has arrived since `begin`; False where there is no room, or it has more
+        than 8 bytes."""
+        if self._count == MAX_FRAMES or len(data) > 8:
             return False
         self._own[self._count] = Frame(can_id, <int>len(data), _whole(data))
         self._count += 1
@@ -405,7 +430,7 @@ cdef class CanPort:
         return 0
 
     cpdef uint32_t can_id(self, int k) noexcept:
-        """Identifier of frame k of the last `take`."""
+        """Identifier of frame k of the last `take`, with the bit EXTENDED where it has 29 bits."""
         return self._in[k].can_id
 
     cpdef int size(self, int k) noexcept:

@@ -11,6 +11,8 @@ import math
 import struct
 from dataclasses import dataclass, field
 
+from hal.wire import EXTENDED
+
 NOT_READY, DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
 BOOT, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 HEARTBEAT_LOST = 0x8130
@@ -303,7 +305,8 @@ class SlcanAdapter:
         try:
             size = int(c[1 + digits : 2 + digits])
             data = bytes.fromhex(c[2 + digits :].decode("ascii"))
-            return (int(c[1 : 1 + digits], 16), data) if len(data) == size <= 8 else None
+            can_id = int(c[1 : 1 + digits], 16) | (EXTENDED if digits == 8 else 0)
+            return (can_id, data) if len(data) == size <= 8 else None
         except ValueError:
             return None
 
@@ -311,4 +314,8 @@ class SlcanAdapter:
         """Frames from the bus, for the host; none while the channel is closed."""
         if not self.open:
             return b""
-        return b"".join(b"t%03X%d%s\r" % (i, len(d), d.hex().upper().encode()) for i, d in frames)
+        return b"".join(
+            (b"T%08X" % (i & ~EXTENDED) if i & EXTENDED else b"t%03X" % i)
+            + b"%d%s\r" % (len(d), d.hex().upper().encode())
+            for i, d in frames
+        )

@@ -26,12 +26,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hal.profile import Binding, Bound, bind, check_rig
+from hal.profile import ERROR_CODE, STATUS_WORD, Binding, Bound, bind, check_rig
 from hal.serial_port import LineReader
 from hal.simulated import PlantRig, make_rig
 from hal.virtual.drive import Cia402Drive, SlcanAdapter
 from hal.virtual.modbus import ModbusUnit
-from hal.wire import Framer, encode_slcan
+from hal.wire import EXTENDED, Framer, encode_slcan
 from thermoctl.yamlfile import InputError, suggest
 
 MAX_STEPS = 50  # periods caught up at once; a longer stop of this program shifts the plant's time
@@ -212,7 +212,7 @@ class TextMeter(VirtualDevice):
                 self.pty.send(line[: len(line) // 2] if self.half else line)
 
     def _line(self) -> bytes:
-        values = {b.channel.source: self.reading(b) or 0.0 for b in self.binding.bounds}
+        values = {b.channel.source.group: self.reading(b) or 0.0 for b in self.binding.bounds}
         pattern = self.binding.profile.bus_spec.pattern.pattern
         filled = re.sub(r"\(\?P<(\w+)>[^)]*\)", lambda m: f"{values.get(m[1], 0.0):+.5f}", pattern)
         return filled.strip("^$").encode() + b"\r\n"
@@ -246,7 +246,7 @@ class DriveOnSlcan(SlcanDevice):
 
     def __init__(self, binding: Binding, rig: PlantRig) -> None:
         super().__init__(binding, rig)
-        self.drive = Cia402Drive(binding.address, binding.profile.bus_spec.command)
+        self.drive = Cia402Drive(binding.address, binding.profile.bus_spec.command[0])
         self.verbs = {
             "heartbeat": self.flag(self.drive, "heartbeat"),
             "power": self._power,
@@ -290,8 +290,8 @@ class DriveOnSlcan(SlcanDevice):
     def tick(self, now_s: float, tick: int) -> None:
         """Send what is due at now_s."""
         for b in self.binding.bounds:
-            if b.channel.source not in (0x6041, 0x603F) and (raw := self.reading(b)) is not None:
-                self.drive.od[b.channel.source, 0].value = round(raw)
+            if b.channel.source not in (STATUS_WORD, ERROR_CODE) and (raw := self.reading(b)) is not None:
+                self.drive.od[b.channel.source].value = round(raw)
         self._send(b"", now_s)
 
     def _send(self, answer: bytes, now_s: float) -> None:
@@ -329,7 +329,8 @@ class DbcSender(SlcanDevice):
                     if b.channel.source.message == name
                 }
             )
-            self.pty.send(encode_slcan(message.frame_id, bytes(message.encode(values, strict=False))))
+            can_id = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+            self.pty.send(encode_slcan(can_id, bytes(message.encode(values, strict=False))))
 
 
 class ModbusOnWire(VirtualDevice):

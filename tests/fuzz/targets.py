@@ -161,7 +161,7 @@ def slcan() -> tuple[Callable[[bytes], Any], list[bytes]]:
                 )
 
     frames = b"".join(
-        encode_slcan(i, bytes(range(n))) for i, n in ((0x185, 6), (0x705, 1), (0x1FFFFFFF, 8), (0, 0))
+        encode_slcan(i, bytes(range(n))) for i, n in ((0x185, 6), (0x705, 1), (0x9FFFFFFF, 8), (0, 0))
     )
     return one, [
         b"\x07\x01\x20\x03" + frames + b"z\r\aZ\rV1013\rF00\r",

@@ -60,6 +60,7 @@ def make_settings(directory: Path, **hal: object) -> SimpleNamespace:
     return SimpleNamespace(
         path=str(CONFIG / "devices/rig.yaml"),
         loop=SimpleNamespace(period_s=0.001),
+        protection=SimpleNamespace(required=tuple(ROLE)),
         hal=SimpleNamespace(**{**values, **hal}),
     )
 

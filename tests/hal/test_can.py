@@ -25,13 +25,14 @@ from hal.virtual.drive import (
     Cia402Drive,
     SlcanAdapter,
 )
-from hal.wire import SlcanParser, encode_slcan
+from hal.wire import EXTENDED, SlcanParser, encode_slcan
 
 
 def test_slcan_ascii():
     assert encode_slcan(0x185, b"\x27\x02\xff") == b"t18532702FF\r"
     assert encode_slcan(0x080, b"") == b"t0800\r"
-    assert encode_slcan(0x18FF1234, b"\x01") == b"T18FF1234101\r"
+    assert encode_slcan(EXTENDED | 0x18FF1234, b"\x01") == b"T18FF1234101\r"
+    assert encode_slcan(EXTENDED | 0x185, b"") == b"T000001850\r"
 
 
 def test_slcan_answers_and_refusals_between_frames():
@@ -47,7 +48,15 @@ def test_slcan_answers_and_refusals_between_frames():
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8)), max_size=10), st.integers(1, 9))
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 0x7FF) | st.integers(EXTENDED, EXTENDED | 0x1FFFFFFF), st.binary(max_size=8)
+        ),
+        max_size=10,
+    ),
+    st.integers(1, 9),
+)
 def test_slcan_round_trip_however_cut(frames, size):
     stream = b"".join(encode_slcan(*f) for f in frames)
     parser, out = SlcanParser(), []

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.modbus import decode, plan_blocks
-from hal.profile import Modbus, Register
+from hal.profile import Register
 from hal.virtual.modbus import ModbusUnit, encode
 from hal.wire import crc16
 
@@ -86,14 +86,14 @@ def test_neighbours_share_a_block_over_small_gaps_only():
         register(40),
         register(3, kind="holding"),
     ]
-    blocks = plan_blocks(registers, Modbus(1))
+    blocks = plan_blocks(enumerate(registers), max_gap=8, max_block=100)
     assert [(b.kind, b.address, b.count) for b in blocks] == [
         ("holding", 3, 1),
         ("input", 0, 18),
         ("input", 40, 1),
     ]
     assert sorted(i for b in blocks for i, _ in b.members) == list(range(15))
-    assert [b.count for b in plan_blocks(registers[:12], Modbus(1, max_block=5))] == [5, 5, 2]
+    assert [b.count for b in plan_blocks(enumerate(registers[:12]), 8, 5)] == [5, 5, 2]
 
 
 @given(
@@ -107,7 +107,7 @@ def test_neighbours_share_a_block_over_small_gaps_only():
 )
 def test_blocks_cover_every_register_and_keep_the_limit(items, gap, limit):
     registers = [register(a, t) for a, t in items]
-    blocks = plan_blocks(registers, Modbus(1, max_gap=gap, max_block=limit))
+    blocks = plan_blocks(enumerate(registers), gap, limit)
     for b in blocks:
         assert 1 <= b.count <= limit
         for _, r in b.members:

@@ -15,6 +15,8 @@ from thermoctl.yamlfile import InputError
 PROFILES = sorted((CONFIG / "devices").glob("*.yaml"))
 ENCODER = (CONFIG / "devices/encoder-serial.yaml").read_text()
 DRIVE = (CONFIG / "devices/drive-cia402.yaml").read_text()
+TEXT = (CONFIG / "devices/meter-serial-text.yaml").read_text()
+SHUNT = (CONFIG / "devices/meter-can.yaml").read_text()
 MODULE = (CONFIG / "devices/thermocouples-modbus-8.yaml").read_text()
 
 
@@ -48,7 +50,8 @@ CASES = [
     (ENCODER, "field: counts", "field: count", "did you mean 'counts'"),
     (ENCODER, "type: int32", "type: int33", "did you mean 'int32'"),
     (ENCODER, "[0xAA, 0x55]", "[0xAA, 0x155]", "is outside 0 .. 255"),
-    (ENCODER, "crc: ccitt-false", "crc: none", "ccitt-false, xmodem, modbus"),
+    (ENCODER, "crc: ccitt-false", "crc: crc32", "ccitt-false, xmodem, modbus, none"),
+    (ENCODER, "  crc: ccitt-false\n", "", "'crc' is missing"),
     (ENCODER, "baud: 921600", "baud: 1", "is outside 50 .. 20000000"),
     (ENCODER, "channels:\n", "channels:\n  position: {field: counts}\n", "stands twice"),
     (DRIVE, "eds: drive-cia402.eds", "eds: none.eds", "none.eds cannot be read"),
@@ -57,6 +60,13 @@ CASES = [
     (DRIVE, ", limits: [-2.5, 2.5]", "", "'limits' is missing"),
     (DRIVE, "watchdog_s: 0.1", "watchdog_s: 0.03", "below two heartbeats"),
     (DRIVE, "object: 0x6078", "object: 0x6077", "is not sent by the drive"),
+    (DRIVE, "[0x6041, 0x6078", "[0x6041, 0x6078:x", "0x30D1:1 with its sub-index, was expected"),
+    (DRIVE, "mode: 10 ", "mode: 10\n  master_id: 200 ", "is outside 1 .. 127"),
+    (DRIVE, "mode: 10 ", "mode: 10\n  sdo_timeout_s: 0 ", "is outside 0.01"),
+    (TEXT, "field: volts,", "field: volts, base: 8,", "base: 8 is not one of 10, 16"),
+    (TEXT, "[-+.0-9eE]+) A", "[-+0-9A-F]+) A", "say base: 16, or base: 10"),
+    (TEXT, "text:", "text:\n  decimal: ;", "';' is not one of ., ,"),
+    (SHUNT, "unit: A", "unit: mA", "gives Current in A, the profile says mA with scale 1"),
     (MODULE, "register: 0,", "register: 70000,", "is outside 0 .. 65535"),
     (MODULE, "modbus: {unit_id: 1", "modbus: {unit_id: 300", "is outside 0 .. 247"),
     (
@@ -71,7 +81,7 @@ CASES = [
 @pytest.mark.parametrize("good,old,new,message", CASES, ids=[c[3][:30] for c in CASES])
 def test_each_mistake_has_its_place_and_a_word(tmp_path, good, old, new, message):
     assert old in good
-    for name in ("drive-cia402.eds",):
+    for name in ("drive-cia402.eds", "meter-can.dbc"):
         (tmp_path / name).write_bytes((CONFIG / "devices" / name).read_bytes())
     path = tmp_path / "device.yaml"
     path.write_text(good.replace(old, new, 1))
@@ -176,3 +186,24 @@ def test_the_virtual_rig_refuses_a_bus_it_cannot_play():
     )
     with pytest.raises(InputError, match="slcan ports only"):
         virtual_device(bind(node, CONFIG / "devices"), None)
+
+
+def test_check_says_what_is_allowed_and_yet_unusual(tmp_path, capsys):
+    from thermoctl.daemon.client import check
+
+    (tmp_path / "module.yaml").write_text(MODULE.replace("register: 0,", "register: 40001,"))
+    (tmp_path / "rig.yaml").write_text(
+        "rig: {name: measures}\ncontrol: {kp: 0.01, ti_s: 0.004, td_s: 0.001, output_limit: 1.5}\n"
+        "protection: {required: [coil_c]}\nhal:\n  backend: devices\n  devices:\n"
+        "    - {profile: module.yaml, port: 'tcp:127.0.0.1:502', roles: {thermocouple_1: coil_c}}\n"
+        f"socket: {{path: {tmp_path}/rig.sock}}\nrecording: {{directory: {tmp_path}}}\n"
+    )
+    assert check(str(tmp_path / "rig.yaml")) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert "no device takes the command" in notes[0] and "cannot be driven" in notes[0]
+    assert (
+        "module.yaml:" in notes[1]
+        and "register 40001" in notes[1]
+        and "kind: holding, register: 0" in notes[1]
+    )
+    assert len(notes) == 2

@@ -249,21 +249,21 @@ def set_(name, value):
             {"position_stale"},
             12,
             set_("spoil_frame", flip),
-            "no new reading",
+            "with a wrong CRC",
         ),
         (
             "encoder: noise instead of frames",
             {"position_stale"},
             12,
             set_("spoil_frame", garbage),
-            "no new reading",
+            "bytes came",
         ),
         (
             "encoder: half of each frame",
             {"position_stale"},
             12,
             set_("spoil_frame", lambda f: f[:6]),
-            "no new reading",
+            "bytes came",
         ),
         (
             "encoder: says that its signal is too weak",
@@ -272,8 +272,8 @@ def set_(name, value):
             set_("status", 1),
             "reports an error",
         ),
-        ("encoder: silent", {"position_stale"}, 12, set_("spoil_frame", lambda f: b""), "no new reading"),
-        ("encoder: cable out", {"position_error"}, 2, lambda w: w.encoder.unplug(), "lost on"),
+        ("encoder: silent", {"position_stale"}, 12, set_("spoil_frame", lambda f: b""), "nothing arrives"),
+        ("encoder: cable out", {"position_stale"}, 12, lambda w: w.encoder.unplug(), "lost on"),
         (
             "drive: its heartbeat is missing",
             {"amplifier_error"},
@@ -410,14 +410,14 @@ def test_usb_renumbering(wired, tmp_path):
     old = os.readlink(tmp_path / "encoder")
     held = os.openpty()  # the old number is taken by something else
     wired.wires.encoder.unplug()
-    ticks, found, way = wired.detect({"position_error"}, 2)
+    ticks, found, way = wired.detect({"position_stale"}, 12)
     keeper = os.openpty()
     wired.wires.encoder.plug()
     assert os.readlink(tmp_path / "encoder") != old or True
     jump = wired.comes_back(60.0)
-    say("Wires", "USB renumbering: the encoder under another number", 2, ticks, found, way, jump)
+    say("Wires", "USB renumbering: the encoder under another number", 12, ticks, found, way, jump)
     wired.wires.encoder.unplug()
-    wired.settle(lambda: wired.state == "FAULT", 10)
+    wired.settle(lambda: wired.state == "FAULT", 13)
     wired.wires.spoil_frame = lambda frame: b"V=+3.1250 A=+0.6250\r\n"
     position = wired["position_um"]
     wired.wires.encoder.plug()

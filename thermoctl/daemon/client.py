@@ -159,6 +159,7 @@ def _bars(bins: list[list[int]], width: int = 50) -> str:
 def check(config: str) -> int:
     """Validate the configuration, the model, the plant and the profiles; no hardware is touched."""
     from hal.backend import make_backend
+    from hal.devices import device_notes
     from thermoctl.daemon.assemble import compensator, law_parameters, power_warning
 
     settings = load_settings(config)
@@ -171,6 +172,9 @@ def check(config: str) -> int:
         f"{config}: good. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, model "
         f"{settings.compensation.model or 'none'} ({model.kind}, order {len(model.A_minus_I)})"
     )
+    if settings.hal.backend == "devices":
+        for note in device_notes(settings):
+            print(f"note: {note}")
     return 0
 
 

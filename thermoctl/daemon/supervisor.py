@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import structlog
 
-from hal.backend import HardwareError, make_backend, slow_devices
+from hal.backend import HardwareError, disable_amplifier, make_backend, slow_devices
 from thermoctl.control import arming, faults
 from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep
@@ -92,14 +92,9 @@ class _Stop:
 
 
 def safe_amplifier(settings: Any, log: Log) -> bool:
-    """Disable the amplifier through a back end of our own: when the loop can no longer do it."""
+    """Disable the amplifier over a link of our own: when the loop can no longer do it. No other device is opened."""
     try:
-        backend = make_backend(settings)
-        try:
-            backend.open()
-            backend.write(0.0, False)
-        finally:
-            backend.close()
+        disable_amplifier(settings)
         return True
     except (HardwareError, InputError, OSError) as e:
         log("the amplifier could not be disabled from here; its own watchdog must do it", error=e)
