@@ -122,6 +122,7 @@ def _loop_process(settings: Any, shared: Shared, board: Any) -> int:
             shared.parameters,
             shared.state,
             time.monotonic(),
+            shared.make_remarks(settings.loop.period_s),
         )
         _resume(settings, shared, rig)
 
