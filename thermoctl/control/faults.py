@@ -136,7 +136,7 @@ _OTHERS = [
     (
         "amplifier_not_following",
         "fault",
-        "the amplifier does not drive although it was enabled: it reports another state, or the coil's current is not the one asked for",
+        "the amplifier was enabled and does not drive: it reports another state, or the current is not the one asked for",
     ),
     (
         "loop_late",
@@ -152,17 +152,17 @@ _OTHERS = [
     (
         "electrical_disagrees",
         "fault",
-        "coil voltage and current do not fit its resistance: a sensor of the two drifted, hangs, is open, shorted or swapped, or the coil's lead is broken",
+        "coil voltage and current do not fit its resistance: one of the sensors or the coil's lead is bad",
     ),
     (
         "position_disagrees",
         "fault",
-        "the position is not where the coil's current holds the stage: encoder drifted, hangs, lost its zero or counts backwards, or the stage is blocked",
+        "the position is not where the coil's current holds the stage: the encoder is wrong, or the stage is blocked",
     ),
     (
         "monitored_disagrees",
         "warning",
-        "the output reference or a temperature that is only watched stays away from its estimate: drifted or swapped sensor, or a model of another rig",
+        "the output reference or a temperature that is only watched stays away from its estimate",
     ),
 ]
 

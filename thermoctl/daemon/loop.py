@@ -72,7 +72,8 @@ class Rig:
         self.reading: Any = None
         self.row = self._head = np.zeros(len(SIGNALS))
         self.record = Record(self.row, _HEAD)
-        self.remarks, self.said = remarks, [(0.0, "")] * _N
+        self.remarks: Any = remarks
+        self.said = [(0.0, "")] * _N
         self._status = np.zeros(_N, np.uint8)
         self.slips = self.generation = self.external = self.write_failed = 0
         self.command, self.value, self.busy_us = arming.NONE, 0.0, 0.0
