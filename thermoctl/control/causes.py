@@ -5,6 +5,7 @@ A fault follows from a cause that FOLLOWS names, or from one that a device's los
     late ticks            -> whatever is judged over time: ages, jumps, following, saturation, the amplifier's answers
     a lost reading        -> its own other kinds, and all that is computed from it
     the amplifier         -> what it no longer drives: following, saturation, current, voltage
+    any trip              -> the amplifier is disabled and the stage swings back: position and electrical_disagrees
     two readings together -> readings lost within TOGETHER_S have one cause (a module, a bus, a supply)
 
 A cause may show after its consequence (a filter, a slower bus): up to BEFORE_S later. A fault more than WITHIN_S after a
@@ -29,6 +30,7 @@ def _of(*groups: str) -> set[str]:
 _MOTION = {"following_error", "drive_saturated", "position_disagrees"}
 _THERMAL = {"coil_disagrees", "monitored_disagrees", "compensation_slewing", "compensation_bound"}
 _ELECTRIC = {"electrical_disagrees", "amplifier_not_following", "power_limit", "coil_stuck_on"}
+_AFTER_TRIP = {"position_disagrees", "electrical_disagrees"}
 _TIMED = {name for name in _of(*GROUPS) if name.endswith(("_stale", "_rate"))}
 
 FOLLOWS: dict[str, set[str]] = {
@@ -103,6 +105,8 @@ def follows(fault: Standing, cause: Standing) -> bool:
     """Whether `fault` follows from `cause`."""
     after_s = fault.t_s - cause.t_s
     if _lost(fault.name) and _lost(cause.name) and 0.0 <= after_s <= TOGETHER_S:
+        return True
+    if fault.name in _AFTER_TRIP and BY_NAME[cause.name].severity != "warning" and 0.0 < after_s <= WITHIN_S:
         return True
     return fault.name in FOLLOWS.get(cause.name, ()) and -BEFORE_S <= after_s <= WITHIN_S
 
