@@ -5,6 +5,7 @@ simulated time (tests/hazards), as are the spoiled readings of hal.faulty.
 """
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -73,7 +74,7 @@ CAUSES = [
         "thermocouple module unplugged",
         HazardRig,
         injected("error", *TEMPERATURES, "air_c"),
-        "_error",
+        "coil_error",
         "bracket_2_c",
     ),
     ("coil thermocouple silent", HazardRig, injected("drop", "coil_c"), "coil_stale", "coil_c"),
@@ -115,7 +116,13 @@ CAUSES = [
     ),
     ("machine late by 40 ms", HazardRig, late(0.040), "late by 40 ms", "position_um"),
     ("drive's enable input opened", HazardRig, switched_off, "amplifier_not_following", ""),
-    ("amplifier drives by itself", HazardRig, injected("stuck", by=0.3), "", ""),
+    (
+        "amplifier drives 0.3 A, whatever it is told",
+        HazardRig,
+        injected("stuck", by=0.3),
+        "following_error",
+        "",
+    ),
     ("encoder's cable pulled", WiredRig, unplug("encoder"), "position_error", "reconnecting"),
     ("encoder's checksums wrong", WiredRig, spoil, "position_", "position_um"),
     ("encoder mute", WiredRig, silent, "position_stale", "no new"),
@@ -173,7 +180,8 @@ def test_the_first_line_names_the_cause(
         assert first in lines[0], "\n".join(lines)
         assert device in "\n".join([*lines, *message_lines(now)]), (lines, message_lines(now))
         assert lines[1].startswith("    -> ")
-        ROWS.append((what, lines[0].split(" at ")[0] + ": " + lines[0].split(": ", 1)[1], lines[1][7:]))
+        line = re.sub(r" at \d\d:\d\d:\d\d, tick \d+", "", lines[0]).replace(f"{tmp_path}/", "/dev/")
+        ROWS.append((what, line, lines[1][7:]))
     finally:
         rig.close()
 

@@ -140,7 +140,7 @@ def in_order(standing: Iterable[Standing], trips: int) -> list[tuple[Standing, s
 
 def _reach(name: str) -> int:
     """Of faults of one tick the one from which more follows is the cause."""
-    return len(FOLLOWS.get(name, ())) + (100 if name == "loop_late" else 0)
+    return len(FOLLOWS.get(name, ())) + (100 if name == "loop_late" else name.startswith("coil_"))
 
 
 def severity_of(name: str, trips: int) -> str:

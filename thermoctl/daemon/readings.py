@@ -126,12 +126,17 @@ def _messages(
     fault: causes.Standing, found: Mapping[str, Any], begin_s: float, code: Mapping[str, Any] | None
 ) -> list[str]:
     """The devices' own words for this fault: those of its channels that are not well, or were so since it began."""
-    said = []
+    roles: dict[str, list[str]] = {}  # by what is said: a lost device says the same for each channel
+    texts: dict[str, str] = {}
     for role in causes.channels_of(fault.name):
         r = found[role]
         since = r["message_wall_s"] is not None and r["message_wall_s"] >= begin_s + fault.t_s - 0.5
         if r["message"] and (since or r["state"] not in ("OK", "ABSENT")):
-            said.append(f"{role}: {r['message']}")
+            words = r["message"].removeprefix(f"{role}: ")
+            tail = words.split(": ", 1)[-1]
+            roles.setdefault(tail, []).append(role)
+            texts.setdefault(tail, words)
+    said = [f"{', '.join(roles[tail])}: {text}" for tail, text in texts.items()]
     if fault.name in ("amplifier_fault", "amplifier_error", "amplifier_not_following") and code is not None:
         said.insert(0, f"the drive reports {code['text']}")
     return said
