@@ -136,6 +136,10 @@ demo-concealed: develop            # six and more effects concealed in rigs of t
 hazards: develop                   # every hazard with its limit; the table of what was measured goes to docs/proof/hazards.md
 	THERMOCTL_HAZARDS=docs/proof/hazards.md $(BIN)/python -m pytest -m "slow or not slow" tests/hazards
 
+.PHONY: causes
+causes: install                    # 27 broken things, the first line that is shown, its remedy: docs/proof/causes.md
+	THERMOCTL_CAUSES=docs/proof/causes.md $(BIN)/python -m pytest -m slow tests/people/test_causes.py
+
 .PHONY: walkthrough
 walkthrough:                       # a new user's walk: a clean clone, every command of README, a diagnosed recording
 	$(PYTHON) tests/walkthrough/walk.py

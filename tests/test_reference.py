@@ -2,7 +2,8 @@
 
 import shutil
 
-from thermoctl.control.faults import FAULTS
+from thermoctl.control.faults import FAULTS, KINDS
+from thermoctl.control.remedies import REMEDIES
 from thermoctl.reference import DOCS, pages, stale
 from thermoctl.settings import options
 
@@ -23,4 +24,18 @@ def test_every_option_and_fault_is_there():
     for key, _, option in options():
         assert f"| `{key.split('.')[1]}` |" in text["reference/configuration.md"] and option.meaning
     for f in FAULTS:
-        assert f.remedy[1:] in text[f"faults/{f.name}.md"]
+        page, words = text[f"faults/{f.name}.md"], REMEDIES[f.name]
+        assert all(part.rstrip(".")[1:] in page for part in words), f.name
+    assert set(REMEDIES) == {f.name for f in FAULTS}, "one remedy a fault"
+
+
+def test_the_encoders_page_is_about_encoders():
+    """Each page speaks of its own device; CAN's bus-off has its sentence where a CAN device may stand."""
+    text = {p.stem: t for p, t in pages().items() if p.parent.name == "faults"}
+    for name in ("position", "voltage", "current", "amplifier"):
+        for kind in KINDS:
+            assert "thermocouple" not in text[f"{name}_{kind}"].lower()
+    assert all("left the bus" in text[n] for n in ("amplifier_error", "current_error", "amplifier_write"))
+    assert len({t.split("## Cause")[1].split("Then `")[0] for t in text.values()}) == len(FAULTS), (
+        "no two alike"
+    )

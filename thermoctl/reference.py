@@ -14,7 +14,9 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
+from thermoctl.control.remedies import REMEDIES
 from thermoctl.diagnose.effects import catalogue
 from thermoctl.settings import SECTIONS, options
 from thermoctl.signals import SIGNALS
@@ -133,13 +135,33 @@ def commands_that_act() -> str:
 
 def fault(f: Fault) -> str:
     """The page of one fault."""
+    words = REMEDIES[f.name]
+    channels = causes.channels_of(f.name)
+    cause_of = sorted(n for n, after in causes.FOLLOWS.items() if f.name in after)
     return (
-        f"{_HEAD}# {f.name}\n\n{f.meaning[0].upper()}{f.meaning[1:]}.\n\nThis is {_SEVERITY[f.severity]} Bit {f.bit} "
-        f"of `fault_bits` (value {1 << f.bit}).\n\n## What to do\n\n{f.remedy[0].upper()}{f.remedy[1:]}.\n\nThen "
-        "`thermoctl status` shows whether it stands; `thermoctl disarm` acknowledges a latched one, and "
-        "`thermoctl arm` starts again from the measured position.\n\n"
-        "All faults: [reference](../reference/faults.md).\n"
+        f"{_HEAD}# {f.name}\n\n{_sentence(f.meaning)}\n\nThis is {_SEVERITY[f.severity]} Bit {f.bit} "
+        f"of `fault_bits` (value {1 << f.bit})."
+        + (
+            f" Channels: {', '.join(f'`{c}`' for c in channels)}; a warning where none of those at fault is in "
+            "`protection.required`."
+            if channels
+            else ""
+        )
+        + f"\n\n## Cause\n\n{_sentence(words.cause)}\n\n## How to check\n\n{_sentence(words.check)}\n\n"
+        f"## How to cure\n\n{_sentence(words.cure)}\n\n"
+        "Then `thermoctl disarm` acknowledges a latched fault, and `thermoctl arm` starts again from the measured "
+        "position.\n\n"
+        + (
+            f"It may follow from {', '.join(f'[{n}]({n}.md)' for n in cause_of)}: `thermoctl status` then names that first.\n\n"
+            if cause_of
+            else ""
+        )
+        + "All faults: [reference](../reference/faults.md).\n"
     )
+
+
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:].rstrip(".") + "."
 
 
 def effects() -> str:

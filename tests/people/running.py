@@ -29,6 +29,9 @@ class Spoilt:
     def write(self, drive, enable):
         self.inner.write(drive, enable)
 
+    def problem(self, role):
+        return f"thermocouples {role}: open wire" if role in self.broken else self.inner.problem(role)
+
     def mend(self, role):
         self.broken.discard(role)
         self.inner.read(0.0).status[ROLE[role]] = OK
@@ -52,6 +55,7 @@ class Running:
             self.shared.mailbox,
             self.shared.parameters,
             self.shared.state,
+            remarks=self.shared.make_remarks(settings.loop.period_s),
         )
         self.rig.wall_s = lambda: self.base_s + self.now_s
         self.base_s, self.now_s, self.record = time.time(), 0.0, None

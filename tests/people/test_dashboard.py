@@ -138,7 +138,7 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
     """From a look at the armed rig to a pulled sensor: numbers, drawing, fault with remedy, capture, history, themes."""
     Path(settings.recording.directory).mkdir(exist_ok=True)
     writer = RecordingWriter(
-        settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: running.base_s
+        settings.recording, {"rig": "simulated"}, "simulated", clock=lambda: 0.0, wall=lambda: running.base_s
     )
     waiting = []
     running.record = lambda row: waiting.append(row.copy())
@@ -237,7 +237,9 @@ def test_the_page_shows_the_rig_and_a_fault(settings, running, browser):
         fault = browser.until(
             "(t => t.includes('coil error') && t)(document.getElementById('fault-list').textContent)"
         )
-        assert "→ look at `thermoctl status`" in fault
+        assert (
+            "coil_c: thermocouples coil_c: open wire" in fault and "→ read the sensor's own message" in fault
+        )
         assert browser.js("document.getElementById('faults').className") == "w12 alarm"
         assert browser.js("document.getElementById('fault-list').getAttribute('role')") == "alert"
         browser.until("!document.getElementById('capture').disabled")
@@ -512,7 +514,11 @@ def recorded(settings, hours, wall_s, hertz=1.0):
     rows[n // 2, INDEX["compensation_um"]] = 77.0
     rows[n // 3 : n // 3 + 900, INDEX["air_c"]] = np.nan
     writer = RecordingWriter(
-        settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: float(rows[0, INDEX["wall_s"]])
+        settings.recording,
+        {"rig": "simulated"},
+        "simulated",
+        clock=lambda: 0.0,
+        wall=lambda: float(rows[0, INDEX["wall_s"]]),
     )
     writer.write(rows)
     writer.close()
@@ -524,7 +530,7 @@ def test_a_day_of_history_is_decimated_without_losing_a_spike(settings):
     rows = recorded(settings, 24.0, end, 0.25)
     for path in Path(settings.recording.directory).iterdir():
         os.utime(path, (end, end))
-    found = history(settings.recording.directory, "compensation_um", end - 86400.0, end, 500)
+    found = history(settings.recording.directory, "simulated", "compensation_um", end - 86400.0, end, 500)
     assert 400 <= len(found.t) <= 500 and found.source == "tier" and found.files == 1
     assert (
         found.high.max() == 77.0
@@ -537,14 +543,16 @@ def test_a_day_of_history_is_decimated_without_losing_a_spike(settings):
     for k in (0, 123, 250, 499):  # against the rows themselves
         inside = rows[(wall >= edges[k]) & (wall < edges[k + 1]), INDEX["compensation_um"]]
         assert found.mean[k] == pytest.approx(inside.mean(), rel=0.02, abs=0.02)
-    zoom = history(settings.recording.directory, "compensation_um", end - 43210.0, end - 43190.0, 500)
+    zoom = history(
+        settings.recording.directory, "simulated", "compensation_um", end - 43210.0, end - 43190.0, 500
+    )
     assert zoom.source == "full" and zoom.high.max() == 77.0 and 5 <= len(zoom.t) <= 6
-    hole = history(settings.recording.directory, "air_c", end - 86400.0, end, 500)
+    hole = history(settings.recording.directory, "simulated", "air_c", end - 86400.0, end, 500)
     assert 480 <= len(hole.t) < 500
-    assert len(history(settings.recording.directory, "air_c", 5.0, 100.0).t) == 0
-    assert len(history(settings.recording.directory + "-none", "air_c", 5.0, 100.0).t) == 0
+    assert len(history(settings.recording.directory, "simulated", "air_c", 5.0, 100.0).t) == 0
+    assert len(history(settings.recording.directory + "-none", "simulated", "air_c", 5.0, 100.0).t) == 0
     with pytest.raises(InputError, match="did you mean 'air_c'"):
-        history(settings.recording.directory, "air_x", 0.0, 1.0)
+        history(settings.recording.directory, "simulated", "air_x", 0.0, 1.0)
 
 
 # ---------------------------------------------------------------------------------------------------------- metrics
@@ -625,11 +633,11 @@ def test_the_monitor_on_a_recorded_status(settings, running):
     console = Console(file=io.StringIO(), width=80, record=True, force_terminal=True)
     console.print(monitor.screen(recorded_status, answer, trails, 80))
     text = console.export_text(clear=False)
-    assert "FAULT" in text and "coil_error" in text and "-> look at `thermoctl status`" in text
+    assert "FAULT" in text and "coil_error" in text and "-> read the sensor's own message" in text
     for point in POINTS:
         assert point.replace("_", " ") in text
     assert f"{recorded_status['compensated_um']:.3f}" in text and "error without it" in text
-    assert "▁" in text and "█" in text and "lateness" in text and "readings: coil_c ERROR" in text
+    assert "▁" in text and "█" in text and "lateness" in text and "coil_c error, 0.0 s old" in text
     assert all(len(line.rstrip()) <= 80 for line in text.splitlines())
     down, none = monitor.look(settings.socket.path + ".gone")
     console.print(monitor.screen(down, none, trails, 80))

@@ -12,7 +12,10 @@ import numpy as np
 from hal.profile import bind
 from thermoctl.control.faults import CHANNELS
 from thermoctl.control.model import CompensatorModel, Parameters, zero_model
+from thermoctl.settings import RigSettings
 from thermoctl.yamlfile import InputError, load
+
+UNNAMED = RigSettings().name
 
 
 def law_parameters(settings: Any) -> Parameters:
@@ -98,3 +101,11 @@ def compensator(settings: Any) -> CompensatorModel:
 def shared_name(settings: Any) -> str:
     """The name of the daemon's shared memory: one daemon a socket path."""
     return f"thermoctl-{zlib.crc32(str(Path(settings.socket.path).absolute()).encode()):08x}"
+
+
+def rig_identity(settings: Any) -> str:
+    """What its recordings call the rig: rig.name, or, where none is given, the configuration's name and a hash of its path."""
+    if settings.rig.name != UNNAMED:
+        return settings.rig.name
+    path = Path(settings.path).absolute()
+    return f"{path.stem}-{zlib.crc32(str(path).encode()):08x}"

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 from thermoctl.daemon.lock import holder
+from thermoctl.daemon.readings import fault_lines, value_lines
 from thermoctl.daemon.socket import ask
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
@@ -72,36 +73,12 @@ def status(config: str, as_json: bool = False) -> int:
         f"{answer['state']}   {answer['ticks']} ticks in {answer['uptime_s']:.1f} s, {answer['slips']} slips, "
         f"busy {answer['busy_us']:.0f} us"
     )
-    print(
-        "   ".join(
-            f"{label} {_number(answer[key])} um"
-            for label, key in (
-                ("setpoint", "setpoint_um"),
-                ("position", "position_um"),
-                ("compensation", "compensation_um"),
-                ("output", "output_reference_um"),
-            )
-        )
-    )
-    coil, estimate = answer["temperatures_c"]["coil"], answer["estimates_c"]["coil"]
-    print(
-        f"drive {_number(answer['drive'])}   power {_number(answer['power_w'])} W   air {_number(answer['air_c'], 2)}"
-        f" C   coil {_number(coil, 2)} C, estimated {_number(estimate, 2)} C"
-    )
-    bad = {role: state for role, state in answer["channels"].items() if state not in ("OK", "ABSENT")}
-    if bad:
-        print("readings: " + ", ".join(f"{role} {state}" for role, state in bad.items()))
+    print("\n".join([*fault_lines(answer["faults"]), *value_lines(answer)]))
     if answer.get("tuning_percent") is not None:
         print(f"tuning of the expansion model: {answer['tuning_percent']:.0f} % of the excitation seen")
     if answer["recorder"]["lost"]:
         print(f"recorder: {answer['recorder']['lost']} ticks lost")
-    for fault in answer["faults"]:
-        print(f"{fault['severity']} {fault['name']}: {fault['meaning']}\n    -> {fault['remedy']}")
     return 1 if faulty else 0
-
-
-def _number(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def latency(config: str, as_json: bool = False) -> int:

@@ -41,7 +41,9 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from thermoctl.daemon.assemble import rig_identity
 from thermoctl.daemon.metrics import CONTENT_TYPE, metrics
+from thermoctl.daemon.readings import SOURCES, hide_invalid, invalid
 from thermoctl.daemon.socket import ask
 from thermoctl.daemon.watch import Watch
 from thermoctl.recording.history import history
@@ -290,6 +292,7 @@ class Handler(BaseHTTPRequestHandler):
                 "power_limit_w": settings.protection.power_limit_w,
                 "setpoint_low_um": settings.control.setpoint_low_um,
                 "setpoint_high_um": settings.control.setpoint_high_um,
+                "sources": SOURCES,
                 "signals": [{"name": s.name, "unit": s.unit, "meaning": s.meaning} for s in SIGNALS],
             }
         )
@@ -298,10 +301,12 @@ class Handler(BaseHTTPRequestHandler):
         end = query.number("end", time.time())
         found = history(
             self.server.settings.recording.directory,
+            rig_identity(self.server.settings),
             query.text("signal", "compensation_um"),
             query.number("begin", end - 3600.0),
             end,
             int(query.number("points", 800.0)),
+            invalid,
         )
         self._json(
             {
@@ -339,7 +344,7 @@ class Handler(BaseHTTPRequestHandler):
                 "ok": True,
                 **capture.summary(),
                 "t": _numbers(capture.rows[:, INDEX["t_s"]] - capture.t_s, 6),
-                "values": _numbers(capture.rows[:, INDEX[signal]]),
+                "values": _numbers(hide_invalid(capture.rows, signal)),
             }
         )
 

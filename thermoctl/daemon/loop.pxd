@@ -4,14 +4,17 @@ from libc.stdint cimport uint8_t
 from hal.devices cimport DevicesBackend
 from thermoctl.control.law cimport Law
 from thermoctl.daemon.clock cimport now_ns, sleep_until, suspended_ns, wall_s
-from thermoctl.daemon.ring cimport Histogram, Mailbox, Record, Ring
+from thermoctl.daemon.ring cimport Histogram, Mailbox, Record, Remarks, Ring
 
-cdef int _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS, _AIR, _SUPPLY, _LATEST
+cdef int _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS, _AIR, _SUPPLY, _LATEST, _N, _OFF, _STATE, _CODE, _ABSENT
 cdef double _DELAY_S
 
 cdef class Rig:
     cdef public object backend, publish_row, parameter_box, state_box, reading, row, wall_s, suspended_ns
     cdef public Record record
+    cdef public Remarks remarks
+    cdef public list said
+    cdef unsigned char[::1] _status
     cdef public Mailbox mailbox
     cdef public Law law
     cdef public double start_s, value, busy_us
@@ -29,6 +32,10 @@ cdef class Rig:
     cpdef actuate(self)
     @cython.locals(law=Law, head='double[::1]', ring=Ring)
     cpdef publish(self, double now_s, double dt_s, double lateness_us)
+    @cython.locals(law=Law, head='double[::1]', off=cython.bint, new=cython.bint, bits=cython.ulonglong, trips=cython.ulonglong, c=cython.int)
+    cpdef remark(self, double t_s, double dt_s)
+    @cython.locals(verdict=cython.double)
+    cdef _say(self, int c, double t_s)
     cpdef keep_state(self)
 
 @cython.locals(paced=cython.bint, counted=cython.bint, lateness=Histogram, busy=Histogram, period_ns=cython.longlong, spin_ns=cython.longlong,

@@ -20,12 +20,13 @@ from typing import Any
 
 import numpy as np
 
+from hal.backend import ABSENT
 from hal.devices import DevicesBackend
 from thermoctl.control import arming, faults
 from thermoctl.control.law import DELAY_S, Law
 from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns, wall_s
-from thermoctl.daemon.ring import Mailbox, Record, Ring
+from thermoctl.daemon.ring import Mailbox, Record, Remarks, Ring
 from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
 from thermoctl.signals import INDEX, SIGNALS
 
@@ -42,6 +43,8 @@ _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = (
 )  # numbers of C, by loop.pxd
 _AIR, _SUPPLY = faults.CHANNELS.index("air_c"), faults.CHANNELS.index("supply_v")
 _DELAY_S, _LATEST = DELAY_S, 15
+_N, _OFF, _STATE, _CODE = len(faults.CHANNELS), arming.OFF, INDEX["state"], INDEX["amplifier_fault"]
+_ABSENT = ABSENT
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
 
 
@@ -49,7 +52,7 @@ class Rig:
     """Back end, law and record of one rig, and the stages of its tick.
 
     backend: opened; publish: the ring that takes the finished rows, or a function that is called with each; mailbox,
-    parameters, state: as in shared.Shared, or None where nobody commands. wall_s, suspended_ns: other clocks than the system's.
+    parameters, state, remarks: as in shared.Shared, or None where nobody commands or reads. wall_s, suspended_ns: other clocks than the system's.
     """
 
     def __init__(
@@ -63,6 +66,7 @@ class Rig:
         parameter_box: Any = None,
         state_box: Any = None,
         start_s: float = 0.0,
+        remarks: Remarks | None = None,
     ):
         self.backend, self.publish_row, self.mailbox = backend, publish, mailbox
         self.parameter_box, self.state_box, self.start_s = parameter_box, state_box, start_s
@@ -71,6 +75,9 @@ class Rig:
         self.row = self._head = np.zeros(len(SIGNALS))
         self.record = Record(self.row, _HEAD)
         self._delay = np.zeros(len(faults.CHANNELS), np.uint8)
+        self.remarks: Any = remarks
+        self.said = [(0.0, "")] * _N
+        self._status = np.zeros(_N, np.uint8)
         self.slips = self.generation = self.external = self.write_failed = 0
         self.command, self.value, self.busy_us = arming.NONE, 0.0, 0.0
         self.wall_s: Callable[[], float] | None = None
@@ -104,6 +111,7 @@ class Rig:
             self._fresh, self._time_s = fresh, reading.time_s
             self.law.bind(reading.value, fresh, reading.status, self._delay)
             self.record.bind(reading.value, fresh, reading.status, self._delay, self.law.outputs)
+            self._status = reading.status
         for c in range(_AIR, _SUPPLY):
             if self._fresh[c]:  # temperatures come from slow buses: when was each one read?
                 age = (now_s - self._time_s[c]) / _DELAY_S
@@ -150,8 +158,47 @@ class Rig:
             ring.write(head)
         else:
             self.publish_row(self.row)
+        if self.remarks is not None:
+            self.remark(head[0], dt_s)
         if law.tick % _STATE_EVERY == 1:
             self.keep_state()
+
+    def remark(self, t_s: float, dt_s: float) -> None:
+        """What the row does not say of its readings. One channel a tick is looked at for a new line of text, all of them
+        where a fault is new. Nothing is a fault while the law warms up."""
+        law, head = self.law, self._head
+        off = head[_STATE] == _OFF
+        bits = 0 if off else law.faults | law.latched
+        trips = 0 if off else law.trips | law.latched
+        new = self.remarks.fill(law.age, law.verdict, bits, trips, t_s, law.tick, dt_s, head[_CODE])
+        if new:
+            for c in range(_N):
+                self._say(c, t_s)
+        elif not off:
+            self._say(law.tick % _N, t_s)
+
+    def _say(self, c: int, t_s: float) -> None:
+        """Channel c's line, where it is not well and the line is new."""
+        verdict = self.law.verdict[c]
+        if self._status[c] == _ABSENT or (verdict == 0.0 and self.said[c][0] == 0.0):
+            return
+        words = self.backend.problem(faults.CHANNELS[c]) if verdict > 0.0 and self._status[c] else ""
+        if (verdict, words) == self.said[c]:
+            return
+        self.said[c] = (verdict, words)
+        if verdict > 0.0:
+            self.remarks.put(c, t_s, (words or self._verdict_in_words(c, int(verdict) - 1)).encode())
+
+    def _verdict_in_words(self, c: int, kind: int) -> str:
+        """What the law says of a reading of which the device says nothing."""
+        p, value = self.law.parameters, self.reading.value[c]
+        return (
+            "reported as invalid",
+            f"no new reading within protection.stale_s ({p.stale_s[c]:g} s)",
+            f"reads {value:g}, outside protection.low..high ({p.low[c]:g}..{p.high[c]:g})",
+            f"jumped to {value:g}, faster than protection.rate ({p.rate[c]:g} a second)",
+            f"stands at {value:g} without a change for longer than protection.frozen_s ({p.frozen_s[c]:g} s)",
+        )[kind]
 
     def keep_state(self) -> None:
         """The law's state, its tick and generation into the box: where a replay, or the next run, may begin."""

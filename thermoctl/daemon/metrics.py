@@ -1,7 +1,9 @@
 """The daemon's numbers in Prometheus' text format (version 0.0.4).
 
 Every number of the newest row becomes `thermoctl_<signal>` with the signal's own unit as its ending; the temperatures
-carry the point as a label. Lateness and busy time are histograms in seconds, faults are 0 or 1 each.
+carry the point as a label.
+What is not valid is NaN; `thermoctl_reading_ok` and `thermoctl_reading_age_seconds` say so by role.
+Lateness and busy time are histograms in seconds, faults are 0 or 1 each.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from thermoctl.control import arming, faults
+from thermoctl.daemon.readings import readings, valid
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared
 from thermoctl.signals import INDEX, POINTS, SIGNALS
 
@@ -47,6 +50,8 @@ def metrics(shared: Shared | None) -> str:
     family("thermoctl_up", "gauge", "1 while the daemon runs", [("", float(row is not None))])
     if shared is None or row is None:
         return "\n".join(lines) + "\n"
+    found = readings(shared, row)
+    row = np.array([v if valid(n, found) else math.nan for n, v in zip(INDEX, row, strict=True)])
     state, bits = int(row[INDEX["state"]]), int(row[INDEX["fault_bits"]])
     family(
         "thermoctl_state",
@@ -59,6 +64,19 @@ def metrics(shared: Shared | None) -> str:
         "gauge",
         "1 while the fault stands",
         [(f'{{name="{f.name}",severity="{f.severity}"}}', float(bits >> f.bit & 1)) for f in faults.FAULTS],
+    )
+    fitted = {role: r for role, r in found.items() if r["state"] != "ABSENT"}
+    family(
+        "thermoctl_reading_ok",
+        "gauge",
+        "1 while the role's reading is valid",
+        [(f'{{role="{role}"}}', float(r["state"] == "OK")) for role, r in fitted.items()],
+    )
+    family(
+        "thermoctl_reading_age_seconds",
+        "gauge",
+        "time since the role's newest reading",
+        [(f'{{role="{role}"}}', r["age_s"]) for role, r in fitted.items()],
     )
     family(
         "thermoctl_temperature_celsius",

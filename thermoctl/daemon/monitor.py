@@ -14,12 +14,21 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from thermoctl.daemon.readings import fault_lines, message_lines, number, span
 from thermoctl.daemon.socket import ask
 from thermoctl.yamlfile import InputError
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 KEPT = 240  # samples of a sparkline
 STYLE = {"ARMED": "bold green", "FAULT": "bold white on red", "READY": "bold yellow"}
+_READINGS = {
+    "position, mean": "position_um",
+    "compensated": "position_um",
+    "output (proof)": "output_reference_um",
+    "innovation": "coil_c",
+    "air": "air_c",
+}
+"""Rows of the numbers and the channel that they stand or fall with."""
 TRAILS = (
     ("compensated", "compensated_um", "um", 3),
     ("error with", "with", "um", 3),
@@ -34,9 +43,10 @@ TRAILS = (
 def errors(status: dict[str, Any]) -> tuple[float | None, float | None]:
     """(what the output errs by with compensation, what it would err by without), um; None unless armed.
 
-    From the proof encoder where there is one, else what the law believes."""
+    From the proof encoder where there is one, else as the law estimates it. None, too, while that encoder is not well."""
     reference, output = status.get("reference_um"), status.get("output_reference_um")
-    output = status.get("compensated_um") if output is None else output
+    if status.get("channels", {}).get("output_reference_um", "ABSENT") == "ABSENT":
+        output = status.get("compensated_um")
     if status["state"] != "ARMED" or reference is None or output is None:
         return None, None
     return output - reference, output - reference + status["compensation_um"]
@@ -75,29 +85,30 @@ def screen(
     ramp: str = BLOCKS,
 ) -> Group:
     """The view of one moment from what the command socket answers, for a terminal `width` characters wide."""
-    faults = [
-        Text.assemble(
-            (f"{f['severity']} {f['name']}: ", "bold red" if f["severity"] != "warning" else "bold yellow"),
-            f"{f['meaning']}\n   -> {f['remedy']}",
-        )
-        for f in status["faults"]
-    ]
+    faults = _faults(status["faults"])
     head = Text.assemble(("thermoctl ", "bold"), (f" {status['state']} ", STYLE.get(status["state"], "bold")))
     if "channels" not in status:
         return Group(head, *faults)
     head.append(
-        f"   {status['ticks']} ticks   {status['slips']} slips   up {_span(status['uptime_s'])}"
+        f"   {status['ticks']} ticks   {status['slips']} slips   up {span(status['uptime_s'])}"
         f"   recorder lost {status['recorder']['lost']}"
     )
-    both = Table.grid(padding=(0, 4))
+    both = Table.grid(padding=(0, 3))
     both.add_row(_numbers(status), _temperatures(status))
-    bad = [f"{role} {state}" for role, state in status["channels"].items() if state not in ("OK", "ABSENT")]
-    parts: list[RenderableType] = [head, Text(), both, Text(), _trails(trails, width, ramp)]
+    parts: list[RenderableType] = [head, *faults, Text(), both, Text(), _trails(trails, width, ramp)]
     if latency is not None:
         parts.append(_timing(latency, ramp))
-    if bad:
-        parts.append(Text("readings: " + ", ".join(bad), style="yellow"))
-    return Group(*parts, *(faults or [Text("no faults", style="green")]))
+    parts += [Text(line, style="yellow") for line in message_lines(status)]
+    return Group(*parts, *([] if faults else [Text("no faults", style="green")]))
+
+
+def _faults(standing: list[dict[str, Any]]) -> list[Text]:
+    """The fault lines of `status` in colour: the cause first."""
+    lines = []
+    for line in fault_lines(standing):
+        style = "dim" if line.startswith(" ") else "bold yellow" if line.startswith("warning") else "bold red"
+        lines.append(Text(line, style=style))
+    return lines
 
 
 def _numbers(status: dict[str, Any]) -> Table:
@@ -120,20 +131,36 @@ def _numbers(status: dict[str, Any]) -> Table:
         ("innovation", status["innovation_c"], "K"),
         ("air", status["air_c"], "C"),
     ):
-        table.add_row(label, _number(value, 3), unit)
+        table.add_row(label, _value(status, label, value), unit)
     return table
+
+
+def _value(status: dict[str, Any], label: str, value: float | None) -> Text:
+    """The number; where it has none because a reading is not valid, that reading's state and age."""
+    role = _READINGS.get(label)
+    reading = status["readings"][role] if role and value is None else None
+    if reading is None or reading["state"] in ("OK", "ABSENT"):
+        return Text(number(value, 3))
+    return Text(f"- {reading['state'].lower()}", style="yellow")
 
 
 def _temperatures(status: dict[str, Any]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("temperature, C")
-    for title in ("meas.", "est.", "diff."):
+    table.add_column("temp., C", no_wrap=True)
+    estimated = status["estimates_state"] == "OK"
+    for title in ("meas.", "est." if estimated else "est.?", "diff."):
         table.add_column(title, justify="right")
+    table.add_column(no_wrap=True)  # age of what is not valid
     for name, measured in status["temperatures_c"].items():
-        estimate = status["estimates_c"][name]
+        estimate, reading = status["estimates_c"][name], status["readings"][f"{name}_c"]
         difference = None if measured is None or estimate is None else measured - estimate
+        dead = reading["state"] not in ("OK", "ABSENT")
         table.add_row(
-            name.replace("_", " "), _number(measured, 2), _number(estimate, 2), _number(difference, 2)
+            Text(name.replace("_", " "), style="yellow" if dead else ""),
+            Text("-" if dead else number(measured, 2), style="yellow" if dead else ""),
+            Text(number(estimate, 2), style="" if estimated else "dim"),
+            Text(reading["state"].lower(), style="yellow") if dead else number(difference, 2),
+            span(reading["age_s"]) if dead else "",
         )
     return table
 
@@ -162,21 +189,10 @@ def _timing(latency: dict[str, Any], ramp: str) -> Text:
     return Text.assemble(
         ("lateness      ", "dim"),
         (f"[{shape}]", "cyan"),
-        f" p50 {_number(late['p50_us'], 0)}, p99 {_number(late['p99_us'], 0)}, max "
-        f"{_number(late['largest_us'], 0)}; busy p99 {_number(busy['p99_us'], 0)}"
+        f" p50 {number(late['p50_us'], 0)}, p99 {number(late['p99_us'], 0)}, max "
+        f"{number(late['largest_us'], 0)}; busy p99 {number(busy['p99_us'], 0)}"
         f" of {latency['period_us']:.0f} us",
     )
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"  # + 0.0: no -0.00
-
-
-def _span(seconds: float | None) -> str:
-    if seconds is None:
-        return "-"
-    hours, minutes = int(seconds // 3600), int(seconds % 3600 // 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min" if minutes else f"{seconds:.0f} s"
 
 
 def ramp_of(console: Console) -> str:
@@ -193,9 +209,7 @@ def look(path: str, with_latency: bool = True) -> tuple[dict[str, Any], dict[str
             "ok": False,
             "state": "OFF",
             "ticks": 0,
-            "faults": [
-                {"name": "no daemon", "severity": "warning", "meaning": str(e), "remedy": "it is asked again"}
-            ],
+            "faults": [{"name": "no daemon", "severity": "warning", "meaning": str(e), "remedy": "retrying"}],
         }, None
 
 

@@ -13,13 +13,14 @@ import base64
 import json
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
 from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.misfit import Misfit
-from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, Shared
+from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, RUN_S, Shared
 from thermoctl.signals import INDEX
 
 INTERVAL_S = 0.1
@@ -194,17 +195,16 @@ class Recorder:
 
 def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Recorder:
     """The recorder of a daemon: files hold the configuration in force, every option, and the law's metadata."""
-    from thermoctl.daemon.assemble import compensator, law_parameters
+    from thermoctl.daemon.assemble import compensator, law_parameters, rig_identity
     from thermoctl.recording.writer import RecordingWriter
     from thermoctl.settings import effective
 
-    config = effective(settings)
+    config, rig = effective(settings), rig_identity(settings)
+    run = datetime.fromtimestamp(float(shared.counters[RUN_S]), UTC).strftime("%Y%m%dT%H%M%SZ")
 
     def open_writer(law: str) -> RecordingWriter:
-        metadata = {"rig": settings.rig.name, "config": config, "law": law}
-        return RecordingWriter(
-            settings.recording, metadata, settings.rig.name, lambda text: log("recorder", what=text)
-        )
+        metadata = {"rig": rig, "run": run, "config": config, "law": law}
+        return RecordingWriter(settings.recording, metadata, rig, lambda text: log("recorder", what=text))
 
     return Recorder(
         shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer, log

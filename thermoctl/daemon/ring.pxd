@@ -26,3 +26,15 @@ cdef class Record:
     cdef int head
 
     cpdef void fill(self) noexcept
+
+cdef class Remarks:
+    cdef double[::1] ages, verdicts, numbers
+    cdef double[:, ::1] onsets
+    cdef double[::1] times
+    cdef uint64_t[::1] sequences
+    cdef uint8_t[:, ::1] texts
+    cdef uint64_t bits
+    cdef double late_limit_s, late_at_s, late_s
+
+    cpdef bint fill(self, double[::1] age, double[::1] verdict, uint64_t bits, uint64_t trips, double t_s, double tick, double dt_s, double code) noexcept
+    cpdef put(self, int channel, double t_s, bytes text)

@@ -6,6 +6,7 @@ looks at `head` again: what may have been overwritten meanwhile is dropped and c
 Mailbox: (kind, value) commands from one producer to the loop, lock-free, oldest refused when full.
 Box: one vector with a sequence number (odd while written): parameters to the loop, the law's state from it.
 Histogram: counts of whole microseconds.
+Remarks: what the row does not say of its readings: age, verdict, when each standing fault began, and the device's own words.
 """
 from libc.stdint cimport uint64_t
 from libc.string cimport memcpy
@@ -193,6 +194,75 @@ cdef class Record:
             d |= <uint64_t>(self.delay[k] & 15) << (4 * (k - FIRST_DELAYED))
         self.row[self.head + n], self.row[self.head + n + 1], self.row[self.head + n + 2] = <double>f, <double>s, <double>d
         memcpy(&self.row[self.head + n + 3], &self.outputs[0], self.outputs.shape[0] * sizeof(double))
+
+
+TRIPS, CODE, CODE_S = range(3)
+"""Places in `Remarks.numbers`: fault bits that trip; the drive's newest error code other than 0, and when it came (t_s)."""
+LATE_TICKS = 5.0    # so many periods without a tick are worth a word beside a fault
+LATE_FOR_S = 1.0    # ... for so long after
+
+
+cdef class Remarks:
+    """What the loop says beside the row, in shared memory. Channels are faults.CHANNELS.
+
+    ages, verdicts float64 (channels,): of every tick, as in the law;  numbers float64 (3,): TRIPS, CODE, CODE_S;
+    onsets float64 (64, 3): t_s and tick of each fault bit's onset, longest tick of the second before where late, s, else 0;
+    sequences uint64, times float64 (channels,), texts uint8 (channels, n): one line a channel and the t_s since when it stands,
+    a seqlock each, written when the line changes. The line stays when the channel is well again.
+    """
+
+    def __init__(self, double[::1] ages, double[::1] verdicts, double[::1] numbers, double[:, ::1] onsets,
+                 uint64_t[::1] sequences, double[::1] times, uint8_t[:, ::1] texts, double period_s=0.001):
+        self.ages, self.verdicts, self.numbers, self.onsets = ages, verdicts, numbers, onsets
+        self.sequences, self.times, self.texts = sequences, times, texts
+        self.bits, self.late_at_s, self.late_s = 0, -1e9, 0.0
+        self.late_limit_s = LATE_TICKS * period_s
+
+    cpdef bint fill(self, double[::1] age, double[::1] verdict, uint64_t bits, uint64_t trips, double t_s, double tick,
+                    double dt_s, double code) noexcept:
+        """A tick's remarks (by the loop only); true when a fault bit is new."""
+        cdef uint64_t new = bits & ~self.bits
+        cdef int c, n = <int>self.ages.shape[0]
+        self.bits = bits
+        for c in range(n):
+            self.ages[c], self.verdicts[c] = age[c], verdict[c]
+        if dt_s > self.late_limit_s:
+            self.late_s = dt_s if t_s - self.late_at_s > LATE_FOR_S else max(dt_s, self.late_s)
+            self.late_at_s = t_s
+        self.numbers[0] = <double>trips
+        if code > 0.0 and code != self.numbers[1]:
+            self.numbers[1], self.numbers[2] = code, t_s
+        if new:
+            for c in range(64):
+                if new >> c & 1:
+                    self.onsets[c, 0], self.onsets[c, 1] = t_s, tick
+                    self.onsets[c, 2] = self.late_s if t_s - self.late_at_s <= LATE_FOR_S else 0.0
+        return new != 0
+
+    cpdef put(self, int channel, double t_s, bytes text):
+        """Replace a channel's line (by the loop only); what is too long is cut."""
+        cdef uint64_t before = self.sequences[channel]
+        cdef int k, size = <int>self.texts.shape[1]
+        cdef const unsigned char[::1] data = text[:size].ljust(size, b"\0")
+        store_release(&self.sequences[channel], before + 1)
+        fence()
+        self.times[channel] = t_s
+        memcpy(&self.texts[channel, 0], &data[0], size)
+        fence()
+        store_release(&self.sequences[channel], before + 2)
+
+    def get(self, int channel):
+        """(changes so far, t_s since when it stands, line); ('', NaN) before the first one. None while it is being written."""
+        cdef uint64_t before = load_acquire(&self.sequences[channel])
+        if before == 0:
+            return 0, float("nan"), ""
+        if before & 1:
+            return None
+        t_s, text = self.times[channel], bytes(self.texts[channel])
+        fence()
+        if load_acquire(&self.sequences[channel]) != before:
+            return None
+        return int(before), t_s, text.rstrip(b"\0").decode("utf-8", "replace")
 
 
 def unpack_readings(double fresh_bits, double status_bits, double delay_bits, unsigned char[::1] fresh,

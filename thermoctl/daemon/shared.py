@@ -6,6 +6,7 @@ own class starts one more process beside the daemon, which removes what a killed
 
     ring        the record of every tick (rows in the order of signals.SIGNALS)
     mailbox     commands to the loop;  parameters: the block that a RELOAD command applies
+    remarks     age and verdict of every reading, onset of every standing fault, and what the devices say of themselves
     state       the law's state now and then, with its tick and generation: where a recording's replay starts
     lateness, busy, reference   histograms, microseconds
     counters    start time, ticks of the reference loop, process ids
@@ -16,13 +17,15 @@ from __future__ import annotations
 import json
 import mmap
 import os
+import time
 import zlib
 from pathlib import Path
 
 import numpy as np
 
+from thermoctl.control.faults import CHANNELS
 from thermoctl.control.model import NAMES
-from thermoctl.daemon.ring import Box, Histogram, Mailbox, Ring
+from thermoctl.daemon.ring import Box, Histogram, Mailbox, Remarks, Ring
 from thermoctl.signals import SIGNALS
 from thermoctl.yamlfile import InputError
 
@@ -31,6 +34,7 @@ MAGIC = 0x7468726D6F63746C  # 'thrmoctl'
 ROWS = 8192  # ticks a reader may lag behind
 BINS = 4096  # us
 STATE_NUMBERS = 1024
+TEXT_WORDS = 40  # 8 bytes each, of a device's line
 SHARED_MEMORY = Path("/dev/shm")
 
 _AREAS = (
@@ -48,10 +52,17 @@ _AREAS = (
     ("reference", "u8", (BINS + 1,)),
     ("largest", "f8", (3,)),
     ("counters", "f8", (16,)),
+    ("ages", "f8", (len(CHANNELS),)),
+    ("verdicts", "f8", (len(CHANNELS),)),
+    ("remark_numbers", "f8", (3,)),
+    ("onsets", "f8", (64, 3)),
+    ("text_sequences", "u8", (len(CHANNELS),)),
+    ("text_times", "f8", (len(CHANNELS),)),
+    ("texts", "u8", (len(CHANNELS), TEXT_WORDS)),
 )
-START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED = range(7)
+START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED, RUN_S = range(8)
 """Places in `counters`; TUNING is 1 + percent, 0 where nothing is tuned; RESUMED is 1 where the law began with the
-estimates of an earlier run."""
+estimates of an earlier run; RUN_S is when this run began, seconds since 1970."""
 BEATS = 8
 """From here on in `counters`: each helper process counts its rounds, so that one that hangs is seen."""
 _LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES]).encode())
@@ -77,6 +88,21 @@ class Shared:
         self.busy = Histogram(a["busy"], a["largest"][1:2])
         self.reference = Histogram(a["reference"], a["largest"][2:3])
         self.counters = a["counters"]
+        self.remarks = self.make_remarks()
+
+    def make_remarks(self, period_s: float = 0.001) -> Remarks:
+        """The remarks' areas; period_s is for the writer."""
+        a = self.areas
+        return Remarks(
+            a["ages"],
+            a["verdicts"],
+            a["remark_numbers"],
+            a["onsets"],
+            a["text_sequences"],
+            a["text_times"],
+            a["texts"].view("u1"),
+            period_s,
+        )
 
     @classmethod
     def create(cls, name: str) -> Shared:
@@ -96,6 +122,7 @@ class Shared:
         finally:
             os.close(file)
         shared.areas["header"][:] = MAGIC, VERSION, _LAYOUT, size
+        shared.counters[RUN_S] = time.time()
         return shared
 
     @classmethod

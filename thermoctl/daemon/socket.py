@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.control import arming, faults
+from thermoctl.daemon import readings
 from thermoctl.daemon.loop import RELOAD
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
 from thermoctl.signals import INDEX, POINTS, SIGNALS
@@ -33,7 +34,8 @@ ANSWER_S = 1.0  # how long a command may take to show in the loop
 
 
 def status(shared: Shared) -> dict[str, Any]:
-    """The newest row as `thermoctl status --json` gives it; faults with meaning and remedy."""
+    """The newest row as `thermoctl status --json` gives it: a number whose reading is not valid is null, `readings` has its
+    state, age and the device's words; faults with the cause first."""
     row = shared.ring.newest()
     if row is None:
         return {
@@ -45,7 +47,11 @@ def status(shared: Shared) -> dict[str, Any]:
             "position_um": None,
             "compensation_um": None,
         }
-    number = {name: (float(row[i]) if math.isfinite(row[i]) else None) for name, i in INDEX.items()}
+    found = readings.readings(shared, row)
+    number = {
+        name: float(row[i]) if math.isfinite(row[i]) and readings.valid(name, found) else None
+        for name, i in INDEX.items()
+    }
     busy = percentiles(shared.areas["busy"])
     return {
         "state": arming.STATES[int(row[INDEX["state"]])],
@@ -79,7 +85,10 @@ def status(shared: Shared) -> dict[str, Any]:
                 "amplifier_fault",
             )
         },
-        "channels": channel_states(int(row[INDEX["status_bits"]])),
+        "channels": {role: r["state"] for role, r in found.items()},
+        "readings": found,
+        "estimates_state": "OK" if found["coil_c"]["state"] == "OK" else "NOT CORRECTED",
+        "drive_code": readings.drive_code(shared, row),
         "temperatures_c": {p: number[f"{p}_c"] for p in POINTS},
         "estimates_c": {p: number[f"{p}_est_c"] for p in POINTS},
         "lateness_us": number["lateness_us"],
@@ -90,10 +99,8 @@ def status(shared: Shared) -> dict[str, Any]:
             "rows": int(shared.counters[RECORDER_ROWS]),
             "lost": int(shared.counters[RECORDER_LOST]),
         },
-        "faults": [
-            {"name": f.name, "severity": f.severity, "meaning": f.meaning, "remedy": f.remedy}
-            for f in faults.decode(row[INDEX["fault_bits"]])
-        ],
+        "wall_s": number["wall_s"],
+        "faults": readings.standing_faults(shared, row, found),
     }
 
 
@@ -189,7 +196,7 @@ class Commands:
             peer=peer,
             ok=answer["ok"],
             value=request.get("value"),
-            error=answer.get("error"),
+            error=str(answer["error"]).splitlines()[0] if "error" in answer else None,
         )
         return answer
 
@@ -212,11 +219,13 @@ class Commands:
         now = status(self.shared)
         if now["state"] == wanted:
             return {"ok": True, "state": now["state"], "setpoint_um": now["setpoint_um"]}
-        causes = "; ".join(f"{f['name']}: {f['meaning']} ({f['remedy']})" for f in now["faults"])
+        lines = readings.fault_lines(now["faults"])
         return {
             "ok": False,
             "state": now["state"],
-            "error": f"{refusal}: the state is {now['state']}{' because of ' + causes if causes else ''}",
+            "error": "\n  ".join(
+                [f"{refusal}: the state is {now['state']}{' because of' if lines else ''}", *lines]
+            ),
         }
 
     def _arm(self, request: dict) -> dict[str, Any]:

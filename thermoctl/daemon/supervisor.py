@@ -33,7 +33,7 @@ import structlog
 from hal.backend import HardwareError, disable_amplifier, make_backend, slow_devices
 from thermoctl.control import arming, faults
 from thermoctl.control.law import COMPILED
-from thermoctl.daemon import keep
+from thermoctl.daemon import keep, readings
 from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.lock import hold
@@ -117,6 +117,7 @@ def _loop_process(settings: Any, shared: Shared, board: Any) -> int:
             shared.parameters,
             shared.state,
             time.monotonic(),
+            shared.make_remarks(settings.loop.period_s),
         )
         _resume(settings, shared, rig)
 
@@ -276,28 +277,26 @@ class _Notify:
             s.sendall(text.encode())
 
 
-def _left_to(fault: faults.Fault, row: np.ndarray) -> str:
-    """Of an amplifier that stopped by itself: where its status word says that it went."""
-    if fault.name != "amplifier_stopped":
-        return ""
-    states = {0.0: "not ready", 1.0: "switched off", 4.0: "quick stop"}
-    return f"; it reports: {states.get(row[INDEX['amplifier_state']], 'nothing')}"
-
-
 class _Watcher:
-    """Puts changes of state and faults into the log, from the ring: the loop itself logs nothing."""
+    """Puts changes of state, faults and the devices' messages into the log: the loop itself logs nothing. Faults are told
+    with their cause first; while the law warms up (OFF) nothing is one."""
 
     def __init__(self, shared: Shared, log: Log):
         self.shared, self.log = shared, log
         self.position, self.before = 0, (float(arming.OFF), 0.0)
         self.told: dict[str, float] = {}
+        self.changes = [0] * len(faults.CHANNELS)
+        self.code: Any = None
 
     def look(self) -> None:
         rows, self.position, _ = self.shared.ring.read(self.position)
         if not len(rows):
             return
+        self._devices(rows[-1])
         pairs = rows[:, [INDEX["state"], INDEX["fault_bits"]]]
+        pairs[pairs[:, 0] == arming.OFF, 1] = 0.0
         changed = np.flatnonzero((np.diff(np.vstack([self.before, pairs]), axis=0) != 0).any(axis=1))
+        new = 0
         for k in changed[:20]:
             state, bits = pairs[k]
             before_state, before_bits = self.before if k == 0 else pairs[k - 1]
@@ -308,21 +307,50 @@ class _Watcher:
                     was=arming.STATES[int(before_state)],
                     now=arming.STATES[int(state)],
                 )
-            for fault in faults.decode(int(bits) & ~int(before_bits)):
-                if (
-                    rows[k, INDEX["t_s"]] - self.told.get(fault.name, -np.inf) < TELL_AGAIN_S
-                    and state == before_state
-                ):
-                    continue
-                self.told[fault.name] = rows[k, INDEX["t_s"]]
-                self.log(
-                    fault.severity,
-                    tick=int(rows[k, INDEX["tick"]]),
-                    name=fault.name,
-                    meaning=repr(fault.meaning + _left_to(fault, rows[k])),
-                    remedy=repr(fault.remedy),
-                )
+                self.told.clear()
+            new |= int(bits) & ~int(before_bits)
         self.before = (pairs[-1, 0], pairs[-1, 1])
+        if new:
+            self._faults(rows[-1], new)
+
+    def _faults(self, row: np.ndarray, new: int) -> None:
+        """Those of `new`, causes first, also where they are gone again by now."""
+        row = row.copy()
+        row[INDEX["fault_bits"]] = float(int(row[INDEX["fault_bits"]]) | new)
+        for f in readings.standing_faults(self.shared, row, readings.readings(self.shared, row)):
+            name = f["name"]
+            if not new >> faults.BIT[name] & 1 or f["t_s"] - self.told.get(name, -np.inf) < TELL_AGAIN_S:
+                continue
+            self.told[name] = f["t_s"]
+            if f["late_s"]:
+                self.log("late", ms=round(f["late_s"] * 1e3), before=name, remedy=repr(readings.LATE_REMEDY))
+            self.log(
+                f["severity"],
+                tick=f["tick"],
+                name=name,
+                follows=f["follows"] or None,
+                device=repr("; ".join(f["messages"])) if f["messages"] else None,
+                meaning=repr(f["meaning"]),
+                remedy=None if f["follows"] else repr(f["remedy"]),
+            )
+
+    def _devices(self, row: np.ndarray) -> None:
+        """New lines of the devices, and the drive's error code; a channel's again only after TELL_AGAIN_S."""
+        if row[INDEX["state"]] == arming.OFF:
+            return
+        for c, role in enumerate(faults.CHANNELS):
+            said = self.shared.remarks.get(c)
+            if said is None or said[0] == self.changes[c]:
+                continue
+            self.changes[c] = said[0]
+            if said[1] - self.told.get(role, -np.inf) >= TELL_AGAIN_S:
+                self.told[role] = said[1]
+                self.log("device", role=role, at_s=round(said[1], 3), message=repr(said[2]))
+        code = readings.drive_code(self.shared, row)
+        numbers = self.shared.areas["remark_numbers"][1:].tolist()
+        if code is not None and numbers != self.code:
+            self.code = numbers
+            self.log("device", role="amplifier_fault", message=repr(f"the drive reports {code['text']}"))
 
 
 def run(settings: Any, log: Log = console_log) -> int:

@@ -21,6 +21,7 @@ import numpy as np
 
 from thermoctl.control import arming, faults
 from thermoctl.daemon.assemble import compensator, shared_name
+from thermoctl.daemon.readings import hide_invalid
 from thermoctl.daemon.shared import Shared
 from thermoctl.daemon.socket import latency, status
 from thermoctl.signals import INDEX
@@ -191,17 +192,14 @@ class Watch:
         if newest is not None:
             frame.update(
                 wall_s=float(newest[_WALL]),
-                position_raw_um=_finite(newest[INDEX["position_raw_um"]]),
+                position_raw_um=frame["readings"]["position_um"]["value"],
                 innovation_sigma_c=self._sigma(newest),
             )
         if len(rows):
             with np.errstate(all="ignore"):
                 frame["range"] = {
-                    n: [
-                        _finite(np.fmin.reduce(rows[:, INDEX[n]])),
-                        _finite(np.fmax.reduce(rows[:, INDEX[n]])),
-                    ]
-                    for n in RANGED
+                    n: [_finite(np.fmin.reduce(column)), _finite(np.fmax.reduce(column))]
+                    for n, column in ((n, hide_invalid(rows, n)) for n in RANGED)
                 }
         return frame
 
@@ -214,11 +212,13 @@ class Watch:
         """The last row of each PAST_STEP_S of the newest minute into `past`."""
         rows = rows[rows[:, _WALL] > rows[-1, _WALL] - PAST_S]
         step = np.floor(rows[:, _WALL] / PAST_STEP_S)
-        for row in rows[np.append(np.diff(step) != 0, True)]:
+        rows = rows[np.append(np.diff(step) != 0, True)]
+        columns = {n: hide_invalid(rows, n) for n in PAST}
+        for k, row in enumerate(rows):
             point = {
                 "ok": True,
                 "state": arming.STATES[int(row[INDEX["state"]])],
-                **{n: _finite(row[INDEX[n]]) for n in PAST},
+                **{n: _finite(column[k]) for n, column in columns.items()},
             }
             if self.past and row[_WALL] < self.past[-1]["wall_s"]:
                 self.past.clear()  # the clock was set back
@@ -240,7 +240,7 @@ class Watch:
                 after = rows[rows[:, _T] <= capture.t_s + AFTER_S]
                 capture.rows = np.concatenate((capture.rows, after))
                 capture.whole = len(after) < len(rows)
-        bits = rows[:, _BITS].astype(np.int64) & _TRIPS
+        bits = np.where(rows[:, INDEX["state"]] == arming.OFF, 0, rows[:, _BITS].astype(np.int64) & _TRIPS)
         before = np.concatenate((bits[:1] if self._bits is None else [self._bits], bits[:-1]))
         for k in np.flatnonzero(bits & ~before):
             names = [f.name for f in faults.decode(int(bits[k] & ~before[k]))]

@@ -14,9 +14,12 @@ from thermoctl.recording.reader import export, info, recover
 from thermoctl.recording.writer import FULL, TIER, recording_files
 from thermoctl.yamlfile import InputError
 
+UNKNOWN_RIG = "unknown rig"
+"""Recordings of before they named their rig."""
+
 
 def list_recordings(args: argparse.Namespace) -> int:
-    """One line a recording: begin, length, size, and whether it was closed."""
+    """One line a recording, by rig and run: begin, length, size, and whether it was closed."""
     folder = Path(args.directory)
     if not folder.is_dir():
         raise InputError(
@@ -32,6 +35,8 @@ def list_recordings(args: argparse.Namespace) -> int:
         found.append(
             {
                 "path": str(path),
+                "rig": i.meta.get("rig") or UNKNOWN_RIG,
+                "run": i.meta.get("run", ""),
                 "rows": i.rows,
                 "seconds": i.ends_s - i.begins_s,
                 "bytes": i.bytes,
@@ -42,11 +47,16 @@ def list_recordings(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps([{k: None if v != v else v for k, v in f.items()} for f in found], indent=1))
         return 0
+    found.sort(key=lambda f: (f.get("rig", ""), f.get("run", ""), f["path"]))
+    heading = None
     for f in found:
+        if "rig" in f and (f["rig"], f["run"]) != heading:
+            heading = f["rig"], f["run"]
+            print(f"{f['rig']}{', run ' + f['run'] if f['run'] else ''}:")
         print(
             f["error"]
             if "error" in f
-            else f"{f['path']}  {f['begins']}  {f['rows']} rows  {f['seconds']:.3f} s  "
+            else f"  {f['path']}  {f['begins']}  {f['rows']} rows  {f['seconds']:.3f} s  "
             f"{f['bytes'] / 1e6:.2f} MB{'' if f['whole'] else '  not closed (killed, or still recording)'}"
         )
     if not found:

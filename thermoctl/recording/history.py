@@ -1,5 +1,7 @@
 """History for a plot: any signal over hours or days, as the least, mean and largest value of each pixel's span.
 
+Only recordings of one rig are drawn, by the name in their metadata; those without a name belong to no rig. A reading that was
+stale or in error is no sample.
 Long spans come from the 10 Hz tier, short ones (FULL_SPAN_S and less) from the full rate. Files that are complete are
 reduced to one second once and kept in memory, so that a day is drawn again in milliseconds.
 """
@@ -7,6 +9,7 @@ reduced to one second once and kept in memory, so that a day is drawn again in m
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -22,7 +25,7 @@ from thermoctl.yamlfile import InputError, suggest
 FULL_SPAN_S = 60.0  # at and below this the full rate is shown
 COARSE_SPAN_S = 7200.0  # above this, one second is fine enough
 MAX_POINTS = 4000
-_CLOCK = "wall_s"
+_CLOCK, _STATUS = "wall_s", "status_bits"
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,18 @@ class History:
     files: int
 
 
-def history(directory: str | Path, signal: str, begin_s: float, end_s: float, points: int = 800) -> History:
-    """The signal from begin_s to end_s (seconds since 1970) in at most `points` buckets; empty where nothing is recorded.
+def history(
+    directory: str | Path,
+    rig: str,
+    signal: str,
+    begin_s: float,
+    end_s: float,
+    points: int = 800,
+    invalid: Callable[[np.ndarray, str], np.ndarray] | None = None,
+) -> History:
+    """The rig's signal from begin_s to end_s (seconds since 1970) in at most `points` buckets; empty where nothing is recorded.
+
+    invalid(status_bits, signal) says which samples are none (daemon.readings.invalid); None takes all.
 
     Raises InputError for an unknown signal, a span that is empty, or points out of 2..MAX_POINTS.
     """
@@ -52,8 +65,8 @@ def history(directory: str | Path, signal: str, begin_s: float, end_s: float, po
     span_s = end_s - begin_s
     kind = FULL if span_s <= FULL_SPAN_S else TIER
     step_s = 1.0 if span_s > COARSE_SPAN_S else 0.0
-    paths = _within(Path(directory), kind, begin_s, end_s)
-    parts = [_samples(path, signal, kind, step_s) for path in paths]
+    paths = [p for p in _within(Path(directory), kind, begin_s, end_s) if rig_of(p) == rig]
+    parts = [_samples(path, signal, kind, step_s, invalid) for path in paths]
     empty = np.empty(0)
     wall, low, mean, high = (np.concatenate([p[k] for p in parts]) if parts else empty for k in range(4))
     inside = (wall >= begin_s) & (wall <= end_s) & np.isfinite(mean)
@@ -113,18 +126,40 @@ def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Pa
     return chosen
 
 
-def _samples(path: Path, signal: str, kind: str, step_s: float) -> tuple[np.ndarray, ...]:
+def rig_of(path: Path) -> str:
+    """The rig that a recording's metadata names; '' where it names none or cannot be read."""
+    try:
+        return _rig_of(path, path.stat().st_ino)
+    except (InputError, OSError):
+        return ""
+
+
+@lru_cache(maxsize=4096)
+def _rig_of(path: Path, inode: int) -> str:
+    return (open_stream(path).schema.metadata or {}).get(b"rig", b"").decode(errors="replace")
+
+
+Invalid = Callable[[np.ndarray, str], np.ndarray] | None
+
+
+def _samples(path: Path, signal: str, kind: str, step_s: float, invalid: Invalid) -> tuple[np.ndarray, ...]:
     """(wall, low, mean, high) of one file, reduced to `step_s` (0: as recorded); a broken file gives nothing."""
     try:
         size = path.stat().st_size
-        return _reduced(path, size, signal, kind, step_s) if step_s else _read(path, signal, kind)
+        return (
+            _reduced(path, size, signal, kind, step_s, invalid)
+            if step_s
+            else _read(path, signal, kind, invalid)
+        )
     except (InputError, OSError):
         return (np.empty(0),) * 4
 
 
 @lru_cache(maxsize=512)
-def _reduced(path: Path, size: int, signal: str, kind: str, step_s: float) -> tuple[np.ndarray, ...]:
-    wall, low, mean, high = _read(path, signal, kind)
+def _reduced(
+    path: Path, size: int, signal: str, kind: str, step_s: float, invalid: Invalid
+) -> tuple[np.ndarray, ...]:
+    wall, low, mean, high = _read(path, signal, kind, invalid)
     there = np.isfinite(mean) & np.isfinite(wall)
     which, low, mean, high = reduce(
         np.floor(wall[there] / step_s).astype(np.int64), low[there], mean[there], high[there]
@@ -132,14 +167,16 @@ def _reduced(path: Path, size: int, signal: str, kind: str, step_s: float) -> tu
     return (which + 0.5) * step_s, low, mean, high
 
 
-def _read(path: Path, signal: str, kind: str) -> tuple[np.ndarray, ...]:
+def _read(path: Path, signal: str, kind: str, invalid: Invalid) -> tuple[np.ndarray, ...]:
     ranged = kind == TIER and not signal.endswith("_bits") and signal != "t_s"
     names = [f"{signal}_min", signal, f"{signal}_max"] if ranged else [signal] * 3
+    wanted = {_CLOCK, _STATUS, *names}
     batches = [
-        {n: batch.column(n).to_numpy(zero_copy_only=False) for n in {_CLOCK, *names}}
-        for batch in open_stream(path, {_CLOCK, *names})
+        {n: batch.column(n).to_numpy(zero_copy_only=False) for n in wanted}
+        for batch in open_stream(path, wanted)
     ]
     if not batches:
         return (np.empty(0),) * 4
-    columns = {n: np.concatenate([b[n] for b in batches]) for n in {_CLOCK, *names}}
-    return columns[_CLOCK], *(columns[n] for n in names)
+    columns = {n: np.concatenate([b[n] for b in batches]) for n in wanted}
+    bad = np.zeros(len(columns[_CLOCK]), bool) if invalid is None else invalid(columns[_STATUS], signal)
+    return columns[_CLOCK], *(np.where(bad, np.nan, columns[n]) for n in names)
