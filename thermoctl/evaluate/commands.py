@@ -303,6 +303,10 @@ def tune(config: str, method: str, write: bool, yes: bool) -> int:
         )
     print(tuning.difference(present, proposed))
     if write:
+        if not m.stable:
+            raise InputError(
+                f"{config}: not written, the proposed gains make this loop unstable; take --method imc"
+            )
         tuning.write(Path(config), proposed)
         print(f"written to {config}; 'thermoctl reload' applies it")
     return 0

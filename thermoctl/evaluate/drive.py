@@ -411,7 +411,7 @@ def agreed(rig: SimulatedRig | DaemonRig, schedules: Sequence[Schedule], yes: bo
     Raises InputError for setpoints outside the configuration's limits, for a coil that would become too hot, and where nobody can
     be asked."""
     settings = rig.settings
-    c, p, devices = settings.control, settings.protection, settings.hal.devices
+    c, p = settings.control, settings.protection
     low = min(float(s.setpoint_um.min()) for s in schedules)
     high = max(float(s.setpoint_um.max()) for s in schedules)
     if low < c.setpoint_low_um or high > c.setpoint_high_um:
@@ -433,7 +433,9 @@ def agreed(rig: SimulatedRig | DaemonRig, schedules: Sequence[Schedule], yes: bo
     )
     print(f"rig '{settings.rig.name}' ({settings.path}), back end {settings.hal.backend}: {rig.where}")
     if settings.hal.backend == "devices":
-        print("devices: " + ", ".join(f"{d.name} at {d.port}" for d in devices))
+        from hal.devices import make_devices
+
+        print("devices: " + ", ".join(f"{d.name} at {d.binding.port}" for d in make_devices(settings)))
     print(
         f"moves the output from {low:.4g} to {high:.4g} um, {span(sum(s.duration_s for s in schedules))} in all; "
         f"coil {warm}, the protection trips at {p.coil_limit_c:g} degC",

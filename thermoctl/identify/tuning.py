@@ -21,7 +21,9 @@ from scipy import optimize, signal
 
 from thermoctl.yamlfile import InputError
 
-UNCERTAIN = 0.2  # standard error of ln(natural frequency) above which no gains are proposed
+UNCERTAIN_DEG = (
+    5.0  # standard error of the response's phase near the crossover, above which no gains are proposed
+)
 
 
 @dataclass(frozen=True)
@@ -99,11 +101,20 @@ def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s:
     best = min(tries, key=lambda r: r.cost)
     x = unit_response(best.x)
     rms = float(np.sqrt(2 * best.cost / len(y)))
-    sd = rms * np.sqrt(np.diag(np.linalg.pinv(best.jac.T @ best.jac)))
-    if not np.any(x) or sd[0] > UNCERTAIN:
+    normal = best.jac.T @ best.jac
+    covariance = rms**2 * np.linalg.inv(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(3))
+    w = np.geomspace(0.1, 1 / period_s, 400)
+    phases = np.unwrap(np.angle(model(best.x).frequency(w)))
+    w = w[[min(np.searchsorted(-phases, np.pi * 2 / 3), len(w) - 1)]]  # where 60 degrees are left
+    slope = [
+        np.angle(model(best.x + d).frequency(w) / model(best.x - d).frequency(w))[0] / 2e-3
+        for d in 1e-3 * np.eye(3)
+    ]
+    uncertain_deg = float(np.degrees(np.sqrt(slope @ covariance @ slope)))
+    if not np.any(x) or uncertain_deg > UNCERTAIN_DEG:
         raise InputError(
-            f"the position moved by {np.ptp(y):.3g} um with {rms:.2g} um of noise: too little to determine its response to the "
-            "drive; raise control.setpoint_rate_um_s"
+            f"the position moved by {np.ptp(y):.3g} um with {rms:.2g} um of noise: its phase at {w[0] / (2 * np.pi):.3g} Hz is "
+            f"known to {uncertain_deg:.2g} deg only, {UNCERTAIN_DEG:g} were expected; raise control.setpoint_rate_um_s"
         )
     return replace(model(best.x, float(x @ y / (x @ x))), residual=rms)
 
