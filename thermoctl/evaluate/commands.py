@@ -63,6 +63,7 @@ def experiment(
         if dry_run or plant:
             return _on_plant(inputs, None if dry_run else plant, Path(out or f"{inputs.name}.csv"))
         schedule, name = inputs.schedule(), inputs.name
+        _check_predicted(inputs, load_settings(config))
     elif plant:
         raise InputError(
             f"'{name}' is a test of the actuator's setpoint; --plant takes the file of an experiment that lists inputs"
@@ -81,6 +82,20 @@ def experiment(
     if not drive.agreed(rig, [schedule], yes):
         return 1
     return _record(rig, schedule, Path(out or f"{name}.parquet"), resume)
+
+
+def _check_predicted(inputs: experiments.Inputs, settings: Any) -> None:
+    """Refuse an experiment that a diagnosis expects to leave the rig's protection. Raises InputError with the reading."""
+    p = settings.protection
+    for column, (low, high) in inputs.predicted.items():
+        channel = "position_um" if column == "position_raw_um" else column
+        top = min(p.high.get(channel, np.inf), p.coil_limit_c if channel == "coil_c" else np.inf)
+        bottom = p.low.get(channel, -np.inf)
+        if low < bottom or high > top:
+            raise InputError(
+                f"experiment '{inputs.name}': {column} would reach {low:.4g} to {high:.4g}, the protection of {settings.path} "
+                f"allows {bottom:g} to {top:g}"
+            )
 
 
 def _say_power(settings: Any, schedule: experiments.Schedule) -> None:
