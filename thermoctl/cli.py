@@ -568,7 +568,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
                 "action": "append",
                 "metavar": "NAME=LOW:HIGH",
                 "help": "what an input or output of the rig may reach in the next "
-                "experiment (repeatable; default: about what was recorded)",
+                "experiment (repeatable; default: not beyond what was recorded)",
             },
         ),
         (

@@ -20,6 +20,7 @@ from thermoctl.identify import modelfile
 from thermoctl.identify.experiments import Aborted, load_experiments
 from thermoctl.recording.table import read_table
 from thermoctl.recording.writer import RecordingWriter
+from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -96,7 +97,11 @@ def test_from_doctor_to_proof_with_an_end_in_between(settings, capsys, monkeypat
     (m0, s0), (m1, s1) = installed.figures["proof_before_um"], installed.figures["proof_after_um"]
     assert abs(m1) + s1 < 0.15 * (abs(m0) + s0), "the model takes the growth away"
     assert set(installed.fingerprints) == {"test_2.parquet", "test_3.parquet", "test_4a.parquet"}
-    assert config.read_bytes() != before and "set it to" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    order = len(installed.model.A_minus_I)
+    assert f"order {order} (" in report and "set compensation.model in rig.yaml to models" in said
+    assert cli.main(["model", "list"]) == 0 and f"order {order}" in capsys.readouterr().out
+    assert Path(load_settings(config).compensation.model).resolve() == (folder / "models").resolve()
     assert cli.main(["check", "rig.yaml"]) == 0
     (folder / "experiments.yaml").write_text(SHORT.replace("[90, 250]", "[91, 250]"))
     assert cli.main(command) == 2 and "--again" in capsys.readouterr().err

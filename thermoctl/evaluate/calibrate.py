@@ -15,6 +15,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -119,8 +120,9 @@ class Wizard:
             if control.ended:
                 return False
             if step in self.tests:
-                if not self._test(number, step, control):
-                    return False
+                with control.listening():
+                    if not self._test(number, step, control):
+                        return False
             else:
                 figures = getattr(self, f"_{step}")()
                 self.done[step] = figures
@@ -214,9 +216,8 @@ class Wizard:
         )
         blocks, ended, began = [], None, time.monotonic()
         try:
-            with control.listening():
-                for block in self.rig.run(schedule, show, control, earlier, at_s, model):
-                    blocks.append(block)
+            for block in self.rig.run(schedule, show, control, earlier, at_s, model):
+                blocks.append(block)
         except Aborted as e:
             ended = e
         self._used_s += time.monotonic() - began
@@ -276,7 +277,8 @@ class Wizard:
             figures,
         )
         return {
-            "said": f"order {model.order}, temperatures to {figures['residual_rms_k']:.3f} K rms, expansion to "
+            "said": f"order {len(compensator.A_minus_I)} ({model.order} poles of the identified model, the rest for disturbing heat), "
+            f"temperatures to {figures['residual_rms_k']:.3f} K rms, expansion to "
             f"{figures['expansion_rms_um']:.3f} um rms of {_rms(last.error_um):.2f}",
             **figures,
             "grown_rms_um": _rms(last.error_um),
@@ -337,10 +339,24 @@ class Wizard:
                 for k, g in ((k, self.done["pid"][k]) for k in ("present", "proposed"))
             )
             lines.append(f"write into {self.settings.path}:\n{tuning.difference(present, proposed)}")
+        if not self._in_use(models):
+            now = self.settings.compensation.model or "not set"
+            lines.append(
+                f"set compensation.model in {self.settings.path} to {self._model_option(models)} (now {now})"
+            )
         return lines
 
+    def _in_use(self, models: Path) -> bool:
+        return Path(self.settings.compensation.model or ".").resolve() == models.resolve()
+
+    def _model_option(self, models: Path) -> str:
+        """The folder of calibrations as the configuration names it: relative to the configuration."""
+        return os.path.relpath(models.resolve(), Path(self.settings.path).resolve().parent)
+
     def accept(self, models: Path, gains: bool) -> None:
-        """Install the model, and the gains when asked. Raises InputError when the proof is no better than nothing."""
+        """Install the model, name it in the configuration, and write the gains when asked.
+
+        Raises InputError when the proof is no better than nothing."""
         if not self.done["proof"]["better"]:
             raise InputError(
                 f"{self.folder}: the proof shows no smaller error with the new model than without; nothing was installed"
@@ -360,14 +376,17 @@ class Wizard:
         if gains:
             g = self.done["pid"]["proposed"]
             tuning.write(Path(self.settings.path), tuning.Gains(g["kp"], g["ti_s"], g["td_s"], g["how"]))
-            self.fingerprint = self._fingerprint()
-            self._save()
-        self.say(f"{path} is current; older ones stay (`thermoctl model rollback`).")
-        if Path(self.settings.compensation.model or ".").resolve() not in (models.resolve(), path.resolve()):
-            self.say(
-                f"compensation.model is {self.settings.compensation.model or 'not set'}: set it to {models.resolve()} to use it, then "
-                "`thermoctl restart`"
-            )
+        if not self._in_use(models):
+            try:
+                values = {"model": self._model_option(models)}
+                tuning.write_values(Path(self.settings.path), "compensation", values)
+            except InputError as e:  # the model is installed; the person names it
+                self.say(str(e))
+        self.fingerprint = self._fingerprint()
+        self._save()
+        self.say(
+            f"{path} is current; older ones stay (`thermoctl model rollback`). `thermoctl restart` uses it."
+        )
 
 
 def _channel(signal_name: str) -> str:

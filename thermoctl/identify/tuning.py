@@ -236,30 +236,31 @@ def difference(present: Gains, proposed: Gains) -> str:
 
 
 def write(config: Path, proposed: Gains) -> None:
-    """Write kp, ti_s, td_s into the control section of a configuration, other lines untouched; on request only.
+    """Write kp, ti_s, td_s into the control section of a configuration; on request only. Raises InputError as `write_values`."""
+    numbers = {"kp": proposed.kp, "ti_s": proposed.ti_s, "td_s": proposed.td_s}
+    write_values(config, "control", {n: f"{v:.6g}" for n, v in numbers.items()})
 
-    Raises InputError when the section does not name all three on lines of their own."""
+
+def write_values(config: Path, section: str, values: dict[str, str]) -> None:
+    """Write values into a section of a configuration, other lines and all comments untouched.
+
+    Raises InputError when the section does not name each on a line of its own."""
     import os
     import re
 
     text = config.read_text(encoding="utf-8")
-    section = re.search(r"^control:.*\n((?:[ \t]+.*\n|\s*\n|#.*\n)*)", text, re.MULTILINE)
-    if section is None:
-        raise InputError(
-            f"{config}: no section 'control' with lines of its own; write kp, ti_s, td_s by hand"
-        )
-    body = section.group(1)
-    for name, value in (("kp", proposed.kp), ("ti_s", proposed.ti_s), ("td_s", proposed.td_s)):
-        body, n = re.subn(
-            rf"^([ \t]+{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$",
-            rf"\g<1>{value:.6g}\g<2>",
-            body,
-            flags=re.MULTILINE,
-        )
+    found = re.search(rf"^{section}:.*\n((?:[ \t]+.*\n|\s*\n|#.*\n)*)", text, re.MULTILINE)
+    by_hand = ", ".join(f"{n}: {v}" for n, v in values.items())
+    if found is None:
+        raise InputError(f"{config}: no section '{section}' with lines of its own; write by hand: {by_hand}")
+    body = found.group(1)
+    for name, value in values.items():
+        line = re.compile(rf"^([ \t]+{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$", re.MULTILINE)
+        body, n = line.subn(lambda m, value=value: f"{m[1]}{value}{m[2]}", body)  # type: ignore[misc]
         if n != 1:
             raise InputError(
-                f"{config}: control.{name} does not stand on a line of its own; write it by hand: {value:.6g}"
+                f"{config}: {section}.{name} does not stand on a line of its own; write by hand: {by_hand}"
             )
     temporary = config.with_name(f".{config.name}.writing")
-    temporary.write_text(text[: section.start(1)] + body + text[section.end(1) :], encoding="utf-8")
+    temporary.write_text(text[: found.start(1)] + body + text[found.end(1) :], encoding="utf-8")
     os.replace(temporary, config)
