@@ -262,3 +262,65 @@ def test_a_coil_that_would_become_too_hot_is_not_driven(settings):
     rig.settings = cool
     with pytest.raises(InputError, match="coil_limit_c"):
         drive.agreed(rig, [schedule], True)
+
+
+@pytest.mark.slow  # two programs and wires in real time, 1 minute
+def test_the_drive_itself_is_off_whatever_is_killed(tmp_path):
+    """At the wire, judged by the emulated drive: 100 samples a second of whether it is enabled, by the machine's own clock.
+
+    Killing a process is answered by the daemon or by the drive's own watchdog; either way within ten watchdog times on a busy
+    machine, and what was measured is printed."""
+    from tests.hal.test_wire_daemon import CLI, Chain
+
+    (tmp_path / "experiments.yaml").write_text(EXPERIMENT)
+    chain = Chain(tmp_path)
+    watchdog_s = 0.2  # of the drive, in config/wire.yaml
+
+    def enabled():
+        table = chain.reference()
+        return table.t, table.columns["enabled"] == 1
+
+    def scenario(command, what, event):
+        begin = time.monotonic()
+        while chain.status().get("state") != "READY":
+            chain.ask("disarm")
+            assert time.monotonic() - begin < 60, chain.status()
+            time.sleep(0.05)  # how often we ask, not a wait
+        arguments = [a.replace("rig.yaml", str(chain.config)) for a in COMMANDS[command]]
+        process = subprocess.Popen([*CLI, *arguments], stderr=subprocess.PIPE, cwd=tmp_path, text=True)
+        chain.until(lambda s: s.get("state") == "ARMED" and s.get("uptime_s", 0) > 0, 60)
+        while not enabled()[1][-1]:
+            assert time.monotonic() - begin < 60, (command, what)
+        at = time.monotonic()
+        event(process)
+        _, err = process.communicate(timeout=60)
+        while (seen := enabled())[1][-1] or seen[0][-1] < at + 2 * watchdog_s:
+            assert time.monotonic() - at < 60, (command, what)
+        seconds = max(float(seen[0][seen[1]][-1]) - at, 0.0)  # the last sample in which it was driven
+        print(f"{command}, {what}: driven for {1e3 * seconds:.0f} ms after it")
+        assert seconds < 10 * watchdog_s, (command, what)
+        if what != "kill -9 of the command":
+            assert process.returncode == 3 and err.count("\n") == 1, err
+
+    try:
+        for command in COMMANDS:
+            scenario(command, "encoder unplugged", lambda p: chain.tell("encoder unplug"))
+            chain.tell("encoder plug")
+            scenario(command, "SIGTERM of the command", lambda p: p.terminate())
+            scenario(command, "kill -9 of the command", lambda p: p.kill())
+            loop = int(_loop_pid(chain))
+            scenario(command, "kill -9 of the loop", lambda p, pid=loop: os.kill(pid, signal.SIGKILL))
+            assert chain.daemon.wait(60) == 1
+            chain.daemon = subprocess.Popen(
+                [*CLI, "run", "--config", str(chain.config)], stderr=subprocess.DEVNULL
+            )
+            chain.until(lambda s: s.get("state") == "READY", 60)
+    finally:
+        chain.stop()
+
+
+def _loop_pid(chain):
+    from thermoctl.daemon.assemble import shared_name
+    from thermoctl.daemon.shared import LOOP_PID, Shared
+
+    return Shared.attach(shared_name(load_settings(chain.config))).counters[LOOP_PID]
