@@ -71,6 +71,7 @@ def experiment(
     else:
         schedule = _schedule(name, config)
     settings = load_settings(config)
+    drive.within_limits(settings, [schedule])
     print(
         f"{schedule.title}: {drive.span(schedule.duration_s)}, {len(schedule.commands())} moves, "
         f"{schedule.setpoint_um.min():g} to {schedule.setpoint_um.max():g} um"
@@ -194,7 +195,7 @@ def _on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) ->
     return 0
 
 
-def record(experiment_file: Path, recording: Path, config: str, plant: str | None, yes: bool) -> None:
+def record(experiment_file: Path, recording: Path, config: str, plant: str | None, yes: bool = False) -> None:
     """Run an experiment file for `thermoctl diagnose --resolve`. Raises HardwareError where it does not come to its end."""
     if experiment(str(experiment_file), config, str(recording), False, False, plant, yes):
         raise HardwareError(
@@ -303,7 +304,8 @@ def tune(config: str, method: str, write: bool, yes: bool) -> int:
         return 1
     rows = drive.excite(rig, schedule, drive.Control(False))
     period, average = settings.loop.period_s, int(c.moving_average)
-    plant = tuning.fit_response(*(rows[:, INDEX[n]] for n in ("t_s", "drive", "position_raw_um")), period)
+    t, u, y = (rows[:, INDEX[n]] for n in ("t_s", "drive", "position_raw_um"))
+    plant = tuning.fit_response(t, u, y, period)
     present = tuning.Gains(c.kp, c.ti_s, c.td_s, "present")
     proposed = tuning.ziegler_nichols(plant) if method == "zn" else tuning.robust(plant, period, average)
     k0, tau_d, tau_c = tuning.tangent(plant)

@@ -405,20 +405,27 @@ def forecast(settings: Any, schedule: Schedule, coil_c: float) -> tuple[np.ndarr
     return power, coil_c + float(rise.max()) if model.C[0].any() else None
 
 
+def within_limits(settings: Any, schedules: Sequence[Schedule]) -> tuple[float, float]:
+    """The lowest and highest setpoint, um. Raises InputError where they leave the configuration's limits."""
+    c = settings.control
+    low = min(float(s.setpoint_um.min()) for s in schedules)
+    high = max(float(s.setpoint_um.max()) for s in schedules)
+    if low < c.setpoint_low_um or high > c.setpoint_high_um:
+        raise InputError(
+            f"{settings.path}: the setpoints leave control.setpoint_low_um..setpoint_high_um ({c.setpoint_low_um:g}.."
+            f"{c.setpoint_high_um:g}): {low:.4g} to {high:.4g} um"
+        )
+    return low, high
+
+
 def agreed(rig: SimulatedRig | DaemonRig, schedules: Sequence[Schedule], yes: bool) -> bool:
     """Say which rig, what will move, how far, how long and how warm; on a daemon's rig True only when the person types go, or `yes`.
 
     Raises InputError for setpoints outside the configuration's limits, for a coil that would become too hot, and where nobody can
     be asked."""
     settings = rig.settings
-    c, p = settings.control, settings.protection
-    low = min(float(s.setpoint_um.min()) for s in schedules)
-    high = max(float(s.setpoint_um.max()) for s in schedules)
-    if low < c.setpoint_low_um or high > c.setpoint_high_um:
-        raise InputError(
-            f"{settings.path}: the setpoints, {low:.4g} to {high:.4g} um, leave control.setpoint_low_um..setpoint_high_um "
-            f"({c.setpoint_low_um:g}..{c.setpoint_high_um:g})"
-        )
+    p = settings.protection
+    low, high = within_limits(settings, schedules)
     coil_c = float(rig.now()["temperatures_c"]["coil"] or math.nan)
     peaks = [forecast(settings, s, coil_c)[1] for s in schedules]
     known = [t for t in peaks if t is not None and math.isfinite(t)]

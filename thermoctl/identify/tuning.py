@@ -105,7 +105,8 @@ def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s:
     covariance = rms**2 * np.linalg.inv(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(3))
     w = np.geomspace(0.1, 1 / period_s, 400)
     phases = np.unwrap(np.angle(model(best.x).frequency(w)))
-    w = w[[min(np.searchsorted(-phases, np.pi * 2 / 3), len(w) - 1)]]  # where 60 degrees are left
+    k = min(int(np.searchsorted(-phases, np.pi * 2 / 3)), len(w) - 1)
+    w = w[k : k + 1]  # where 60 degrees are left
     slope = [
         np.angle(model(best.x + d).frequency(w) / model(best.x - d).frequency(w))[0] / 2e-3
         for d in 1e-3 * np.eye(3)
