@@ -289,3 +289,15 @@ def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment
     (size,) = finding["parameters"].values()
     assert size["value"] == pytest.approx(2.5e-9, rel=0.1)
     assert not (tmp_path / "out/next_experiment.yaml").exists()
+
+
+def test_a_missing_flow_is_not_said_to_follow_the_daemons_own_estimates():
+    from thermoctl.diagnose.run import _signals
+
+    columns = {
+        n: np.zeros(3) for n in ("coil_est_c", "coil_est_c_max", "coil_c", "coil_c_max", "slips", "power_w")
+    }
+    nothing = SimpleNamespace(drives=[], runs=[], model=SimpleNamespace(states=[]))
+    rig = SimpleNamespace(plant=SimpleNamespace(inputs={}), moving_inputs=[], spare=[*columns])
+    case = SimpleNamespace(tables=[SimpleNamespace(columns=columns)])
+    assert set(_signals(case, SimpleNamespace(rig=rig, metric=nothing))) == {"coil_c", "power_w"}
