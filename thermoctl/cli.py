@@ -29,6 +29,12 @@ Exit status: 0 done; 1 the answer is no (a check failed, the daemon is not runni
 line on stderr says what, where, what was expected); 3 the hardware or the system refused; 130 interrupted."""
 
 
+YES = (
+    "--yes",
+    {"action": "store_true", "help": "start without asking; without a terminal a rig moves only with it"},
+)
+
+
 def _add(
     sub: argparse._SubParsersAction,
     name: str,
@@ -388,7 +394,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
         sub,
         "experiment",
         "run a test of experiments.yaml, or an experiment file such as a diagnosis proposes, and record it",
-        lambda a: room().experiment(a.name, a.config, a.out, a.dry_run, a.resume, a.plant),
+        lambda a: room().experiment(a.name, a.config, a.out, a.dry_run, a.resume, a.plant, a.yes),
         (
             "name",
             {
@@ -410,6 +416,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
             {"action": "store_true", "help": "show schedule, power and spectrum figures; drive nothing"},
         ),
         ("--resume", {"action": "store_true", "help": "go on where an aborted recording ends"}),
+        YES,
     )
     _add(
         sub,
@@ -448,14 +455,21 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
     _add(
         sub,
         "tune",
-        "propose PID gains from an open-loop step on the simulated rig; shown as a difference",
-        lambda a: room().tune(a.config, a.method, a.write),
+        "propose PID gains from the closed loop's answer to setpoint ramps of a few um; arms the rig, with all protections, after a "
+        "question",
+        lambda a: room().tune(a.config, a.method, a.write, a.yes),
         CONFIG,
         (
             "--method",
-            {"choices": ("imc", "zn", "relay"), "default": "imc", "help": "default imc, with margins"},
+            {
+                "choices": ("imc", "zn"),
+                "default": "imc",
+                "help": "imc: lambda tuning with a phase margin of 45 deg and a gain margin of 2 (default); "
+                "zn: Ziegler-Nichols, Table I of the paper",
+            },
         ),
         ("--write", {"action": "store_true", "help": "write the proposal into the configuration"}),
+        YES,
     )
     _add(
         sub,
@@ -493,7 +507,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
         def record(experiment: Path, recording: Path) -> None:  # the rig is another room's business
             from thermoctl.evaluate import commands
 
-            commands.record(experiment, recording, args.config, args.rig)
+            commands.record(experiment, recording, args.config, args.rig, args.yes)
 
         args.record = record
         return command.diagnose(args)
@@ -566,7 +580,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
                 "action": "append",
                 "metavar": "NAME=LOW:HIGH",
                 "help": "what an input or output of the rig may reach in the next "
-                "experiment (repeatable; default: about what was recorded)",
+                "experiment (repeatable; default: not beyond what was recorded)",
             },
         ),
         (
@@ -584,6 +598,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
                 "help": "run the next experiment on the rig, add its data and decide again",
             },
         ),
+        YES,
         (
             "--rounds",
             {"type": int, "default": 3, "metavar": "N", "help": "with --resolve: at most N experiments (3)"},
@@ -749,7 +764,9 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     def calibrate(args: argparse.Namespace) -> int:
         from thermoctl.evaluate.calibrate import calibrate
 
-        return calibrate(args.config, args.out, args.models, args.order, args.gains, args.accept, args.again)
+        return calibrate(
+            args.config, args.out, args.models, args.order, args.gains, args.accept, args.again, args.yes
+        )
 
     _add(
         sub,
@@ -767,6 +784,7 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
         ("--gains", {"action": "store_true", "help": "an acceptance also writes the proposed PID gains"}),
         ("--accept", {"action": "store_true", "help": "install the model when the proof is done"}),
         ("--again", {"action": "store_true", "help": "forget an earlier run in the folder"}),
+        YES,
     )
 
     def fleet(args: argparse.Namespace) -> int:
@@ -851,6 +869,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except KeyboardInterrupt:
         return 130
+    except Exception as e:
+        from hal.backend import HardwareError
+
+        if not isinstance(e, HardwareError):
+            raise
+        print(f"thermoctl: {e}", file=sys.stderr)
+        return 3
 
 
 if __name__ == "__main__":

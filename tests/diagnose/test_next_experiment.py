@@ -1,6 +1,7 @@
 """The experiment that tells explanations apart: proposed inside the rig's limits, written, run, and decisive."""
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from thermoctl.plant.language import loads
 from thermoctl.recording.table import Table, read_table, write_table
 from thermoctl.yamlfile import InputError
 
+CONFIG = Path(__file__).resolve().parents[2] / "config/simulated.yaml"
 BELIEF = """format: thermoctl-plant/1
 title: Heated block
 inputs: {heat: {unit: W}, air: {unit: degC}}
@@ -44,9 +46,13 @@ def short_pulses():
 
 @pytest.fixture(scope="module")
 def undecided():
+    return shared_by_two(BELIEF, TRUTH, short_pulses())
+
+
+def shared_by_two(belief, truth, inputs):
     """A case, and a diagnosis of it that two refitted explanations share; both stand for what a whole diagnosis would hold."""
-    table = loads(TRUTH).compile(()).measure(short_pulses(), seed=1)
-    case = Case(loads(BELIEF), [table])
+    table = loads(truth).compile(()).measure(inputs, seed=1)
+    case = Case(loads(belief), [table])
     base = case.explain(case.plant, [], [], iterations=40)
     entries = {
         k: e
@@ -72,8 +78,61 @@ def test_proposal_stays_inside_the_limits_and_is_the_best_per_hour(undecided):
     assert entry["bits_per_hour"] == pytest.approx(entry["bits"] / (entry["duration_s"] / 3600))
     near, _ = experiment.propose(
         case, found
-    )  # no limits told: about what was recorded, and there they look alike
+    )  # no limits given: not beyond what was recorded, and there they look alike
     assert near["bits"] < 0.5 * entry["bits"] and near["also_helpful"]
+
+
+HOT_END = BELIEF.replace("heat: {unit: W}", "heat: {unit: W}, fan: {unit: '1'}").replace(
+    "rate: G * (T - air)", "rate: (G + 0.15 * fan) * (T - air)"
+)
+HOT_TRUTH = HOT_END.replace(
+    "flows: {",
+    "flows: {missing: {from: T, rate: 1.07e-10 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, ",
+)
+
+
+def printing():
+    """A hot-end on its thermostat: full heat, then pulses about it, the fan on for half of the time."""
+    t = np.arange(360) * 5.0
+    heat = np.where((t > 30) & (t < 290), 60.0, np.where((t > 700) & (np.sin(t / 40) > 0.5), 60.0, 0.0))
+    heat = np.where((t > 300) & (t < 700) & (np.sin(t / 25) > 0.3), 60.0, heat)
+    return Table(
+        "run_1", "run_1", t, {"heat": heat, "fan": np.where(t > 400, 1.0, 0.0), "air": np.full(len(t), 22.0)}
+    )
+
+
+def test_a_hot_end_is_not_heated_beyond_what_was_recorded(tmp_path):
+    """Full heat at fan 0 would go on far beyond the hottest reading: neither as any hypothesis nor as the truth has it."""
+    case, found = shared_by_two(HOT_END, HOT_TRUTH, printing())
+    entry, chosen = experiment.propose(case, found)
+    (p,) = entry["predicted"].values()
+    top = float(case.tables[0].columns["T_block"].max())
+    assert top > 200 and p["high"] <= top and p["recorded"][1] == pytest.approx(top)
+    assert loads(HOT_TRUTH).compile(()).simulate(chosen.table(case.plant, 5.0)).y.max() <= top
+    full = Table(
+        "full",
+        "full",
+        np.arange(600) * 5.0,
+        {"heat": np.full(600, 60.0), "fan": np.zeros(600), "air": np.full(600, 22.0)},
+    )
+    assert loads(HOT_TRUTH).compile(()).simulate(full).y.max() > top + 20, "the danger is there"
+    experiment.write(tmp_path, case, entry, chosen)
+    text = (tmp_path / "next_experiment.yaml").read_text()
+    assert (
+        f"{p['high']:.4g} degC predicted (recorded" in text
+        and "predicted (recorded" in experiment.peaks(entry)[0]
+    )
+    (read,) = load_inputs(tmp_path / "next_experiment.yaml").values()
+    assert read.predicted["T_block"] == pytest.approx((p["low"], p["high"]), rel=1e-4)
+
+
+def test_an_experiment_that_would_leave_the_protection_is_refused(tmp_path, capsys):
+    (tmp_path / "hot.yaml").write_text(
+        "format: thermoctl-experiments/1\nexperiments:\n  hot:\n    title: hot\n    sample_s: 1\n    inputs:\n"
+        "      setpoint_um: {corners: [[0, 0], [60, 200]]}\n    predicted:\n      coil_c: [22, 85]\n"
+    )
+    assert main(["experiment", str(tmp_path / "hot.yaml"), "--config", str(CONFIG)]) == 2
+    assert "coil_c would reach 22 to 85" in capsys.readouterr().err
 
 
 def test_distance_is_what_dense_algebra_says():
@@ -166,7 +225,7 @@ def test_on_the_programs_own_rig_the_setpoint_is_driven(tmp_path):
     chosen = experiment.Excitation(
         "hold", 60.0, {"heat": np.array([[0, 0.0], [10, 1.5], [60, 1.5]])}, {"air": 20.0}
     )
-    experiment.write(tmp_path, case, {"why": "", "sample_s": 1.0}, chosen)
+    experiment.write(tmp_path, case, {"why": "", "sample_s": 1.0, "predicted": {}, "limits": {}}, chosen)
     schedule = load_experiments(tmp_path / "next_experiment.yaml")["next_experiment"]
     assert schedule.setpoint_um == pytest.approx([0, 150, 150]) and schedule.commands() == [
         (0.0, "setpoint", pytest.approx(150.0))
@@ -230,3 +289,15 @@ def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment
     (size,) = finding["parameters"].values()
     assert size["value"] == pytest.approx(2.5e-9, rel=0.1)
     assert not (tmp_path / "out/next_experiment.yaml").exists()
+
+
+def test_a_missing_flow_is_not_said_to_follow_the_daemons_own_estimates():
+    from thermoctl.diagnose.run import _signals
+
+    columns = {
+        n: np.zeros(3) for n in ("coil_est_c", "coil_est_c_max", "coil_c", "coil_c_max", "slips", "power_w")
+    }
+    nothing = SimpleNamespace(drives=[], runs=[], model=SimpleNamespace(states=[]))
+    rig = SimpleNamespace(plant=SimpleNamespace(inputs={}), moving_inputs=[], spare=[*columns])
+    case = SimpleNamespace(tables=[SimpleNamespace(columns=columns)])
+    assert set(_signals(case, SimpleNamespace(rig=rig, metric=nothing))) == {"coil_c", "power_w"}

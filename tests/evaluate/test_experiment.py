@@ -11,8 +11,7 @@ from thermoctl import cli
 from thermoctl.daemon import tuner
 from thermoctl.daemon.assemble import compensator
 from thermoctl.daemon.simulate import Simulation
-from thermoctl.evaluate import commands
-from thermoctl.identify import modelfile, tuning
+from thermoctl.identify import modelfile
 from thermoctl.identify.online import Tuner
 from thermoctl.recording.table import read_table
 from thermoctl.settings import load_settings
@@ -141,15 +140,28 @@ def test_experiment_refuses_what_the_rig_may_not_do(quick, capsys):
     )
 
 
-def test_relay_oscillates_at_the_loops_own_limit(quick):
-    t, y = commands.relay_test("rig.yaml", 0.1, 0.5)
-    g = tuning.relay(t, y, 0.1, 0.5)
-    step = tuning.fit_step(*commands.open_loop_step("rig.yaml"), 0.3)
-    w = 2 * np.pi / g.figures["Tu_s"]
-    # the describing function's point lies on the plant's own frequency response (its dead time and the hold of a period included)
-    assert g.figures["Ku"] * abs(step.frequency(np.array([w]))[0]) == pytest.approx(1, rel=0.35)
-    with pytest.raises(InputError, match="smaller drive"):
-        commands.relay_test("rig.yaml", 1.5, 450)
+def test_tune_names_the_shipped_loops_margins_and_keeps_an_unstable_proposal_out(quick, capsys):
+    """The margin that the shipped gains have on the simulated rig is where it becomes unstable; --write takes no unstable gains."""
+    assert cli.main(["tune", "--config", "rig.yaml", "--write", "--method", "imc"]) == 0
+    said = capsys.readouterr().out
+    gain = float(re.search(r"present: gain margin ([\d.]+)", said)[1])
+    settings = load_settings("rig.yaml")
+    assert f"kp: {settings.control.kp:g}" in (quick / "rig.yaml").read_text() and settings.control.kp != 0.01
+
+    def trips(kp):
+        c = dataclasses.replace(settings.control, kp=kp, ti_s=0.004, td_s=0.001)
+        simulation = Simulation(dataclasses.replace(settings, control=c))
+        simulation.arm()
+        simulation.command("setpoint", 20.0)
+        state = simulation.tick(4000)[INDEX["state"]]
+        simulation.close()
+        return state != 3
+
+    assert not trips(0.01 * gain * 0.95) and trips(0.01 * gain * 1.1)
+    before = (quick / "rig.yaml").read_bytes()
+    assert cli.main(["tune", "--config", "rig.yaml", "--write", "--method", "zn"]) == 2
+    said, err = capsys.readouterr()
+    assert "UNSTABLE" in said and "not written" in err and (quick / "rig.yaml").read_bytes() == before
 
 
 def test_a_wrong_expansion_is_tuned_while_the_reference_is_there(quick, monkeypatch):
@@ -243,12 +255,22 @@ def test_an_experiment_at_the_wire_is_ended_and_goes_on(tmp_path):
     chain = Chain(tmp_path)
     try:
         out = tmp_path / "short.parquet"
-        command = [*CLI, "experiment", "short", "--config", str(chain.config), "--out", str(out), "--resume"]
+        command = [
+            *CLI,
+            "experiment",
+            "short",
+            "--config",
+            str(chain.config),
+            "--out",
+            str(out),
+            "--resume",
+            "--yes",
+        ]
         first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         chain.until(lambda s: s.get("state") == "ARMED" and (s.get("position_um") or 0) > 10, 60)
         first.send_signal(signal.SIGINT)
         said, err = first.communicate(timeout=60)
-        assert first.returncode == 1 and "ended after" in err and "daemon at" in said, (said, err)
+        assert first.returncode == 3 and "ended after" in err and "daemon at" in said, (said, err)
         kept = read_table(out)
         assert len(kept) > 5 and chain.status()["state"] != "ARMED"
         goes_on, again = "", []

@@ -14,12 +14,13 @@ from browser import PICTURES, Browser, find
 
 from thermoctl import cli
 from thermoctl.daemon.socket import status
-from thermoctl.evaluate import calibrate
-from thermoctl.evaluate.calibrate import Control, DaemonRig
+from thermoctl.evaluate import drive
+from thermoctl.evaluate.drive import Control, DaemonRig
 from thermoctl.identify import modelfile
 from thermoctl.identify.experiments import Aborted, load_experiments
 from thermoctl.recording.table import read_table
 from thermoctl.recording.writer import RecordingWriter
+from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,7 +60,7 @@ def test_from_doctor_to_proof_with_an_end_in_between(settings, capsys, monkeypat
             process.send_signal(signal.SIGINT)
             break
     said += process.stdout.read()
-    assert process.wait(60) == 1 and "test_2 ended at" in said and "on request" in said
+    assert process.wait(60) == 3 and "test_2 ended at" in said and "on request" in said
     out = folder / "calibration/simulated"
     kept = len(read_table(out / "test_2.part.parquet"))
     assert kept >= 1000 and (out / "test_1.parquet").exists() and not (out / "test_2.parquet").exists()
@@ -96,7 +97,11 @@ def test_from_doctor_to_proof_with_an_end_in_between(settings, capsys, monkeypat
     (m0, s0), (m1, s1) = installed.figures["proof_before_um"], installed.figures["proof_after_um"]
     assert abs(m1) + s1 < 0.15 * (abs(m0) + s0), "the model takes the growth away"
     assert set(installed.fingerprints) == {"test_2.parquet", "test_3.parquet", "test_4a.parquet"}
-    assert config.read_bytes() != before and "set it to" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    order = len(installed.model.A_minus_I)
+    assert f"order {order} (" in report and "set compensation.model in rig.yaml to models" in said
+    assert cli.main(["model", "list"]) == 0 and f"order {order}" in capsys.readouterr().out
+    assert Path(load_settings(config).compensation.model).resolve() == (folder / "models").resolve()
     assert cli.main(["check", "rig.yaml"]) == 0
     (folder / "experiments.yaml").write_text(SHORT.replace("[90, 250]", "[91, 250]"))
     assert cli.main(command) == 2 and "--again" in capsys.readouterr().err
@@ -120,15 +125,15 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
         control.ended = p.done_s > 0.8
 
     with pytest.raises(Aborted, match="on request") as ended:
-        for block in rig.run(schedule, None, 0.0, end_late, control):
+        for block in rig.run(schedule, end_late, control):
             rows.append(block)
     assert 0.8 < ended.value.done_s < schedule.duration_s and status(running.shared)["state"] != "ARMED"
-    part = calibrate._table(np.vstack(rows), tmp_path / "short.part.parquet")
+    part = drive.as_table(np.vstack(rows), tmp_path / "short.part.parquet")
     with monkeypatch.context() as m:
-        m.setattr(calibrate, "GAP_S", 0.0)
+        m.setattr(drive, "GAP_S", 0.0)
         assert rig.meanwhile(part) is None, "nothing was recorded since, and now is later"
     Path(settings.recording.directory).mkdir()
-    monkeypatch.setattr(calibrate, "GAP_S", 60.0)  # this machine may be slow to write
+    monkeypatch.setattr(drive, "GAP_S", 60.0)  # this machine may be slow to write
     with running.lock:
         writer = RecordingWriter(
             settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: recorded[0][INDEX["wall_s"]]
@@ -140,25 +145,21 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
         "ten rows a second of rig time"
     )
     control.ended = False
-    rows = np.vstack(list(rig.run(schedule, whole, 0.8, lambda p: None, control)))
+    rows = np.vstack(list(rig.run(schedule, lambda p: None, control, whole, 0.8)))
     assert (np.diff(rows[:, INDEX["t_s"]]) > 0).all() and np.nanmax(rows[:, INDEX["setpoint_um"]]) == 5.0
     assert len(rows) > len(whole) and status(running.shared)["state"] != "ARMED"
 
 
 def test_a_rig_is_at_rest_when_its_points_are_alike_or_none_moves():
     alike, warm, offsets = np.full(12, 22.0), np.linspace(22, 27, 12), np.linspace(21, 23, 12)
-    assert calibrate.at_rest([(0.0, alike + np.linspace(0, 0.25, 12))]) and not calibrate.at_rest(
-        [(0.0, warm)]
-    )
+    assert drive.at_rest([(0.0, alike + np.linspace(0, 0.25, 12))]) and not drive.at_rest([(0.0, warm)])
     cooling = [(60.0 * k, alike + 5.0 * np.exp(-k / 15) * np.linspace(0, 1, 12)) for k in range(40)]
-    rested = [calibrate.at_rest(cooling[: k + 1]) for k in range(40)]
+    rested = [drive.at_rest(cooling[: k + 1]) for k in range(40)]
     assert not any(rested[:30]) and rested[-1], "5 K with a time constant of a quarter of an hour"
     steady = [(60.0 * k, offsets) for k in range(12)]
-    assert not calibrate.at_rest(steady[:9]) and calibrate.at_rest(steady), (
-        "thermocouples that differ, all still"
-    )
+    assert not drive.at_rest(steady[:9]) and drive.at_rest(steady), "thermocouples that differ, all still"
     missing = np.where(np.arange(12) == 3, np.nan, alike)
-    assert calibrate.at_rest([(0.0, missing)])
+    assert drive.at_rest([(0.0, missing)])
 
 
 def test_a_rig_that_cannot_be_calibrated_is_told_so(settings, capsys):
@@ -173,8 +174,8 @@ def test_a_rig_that_cannot_be_calibrated_is_told_so(settings, capsys):
             f"profile: {ROOT}/config/devices/encoder-serial.yaml, roles: {{position: position_um}}}}]",
         )
     )
-    assert cli.main(["calibrate", "--config", str(config), *out]) == 2
-    assert "no daemon answers" in capsys.readouterr().err
+    assert cli.main(["calibrate", "--config", str(config), *out]) == 3
+    assert "no daemon holds this rig" in capsys.readouterr().err
     config.write_text(text)
     (config.parent / "experiments.yaml").write_text(SHORT.replace("test_4b", "test_9"))
     assert cli.main(["calibrate", "--config", str(config), *out]) == 2

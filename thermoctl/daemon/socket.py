@@ -13,11 +13,12 @@ import grp
 import json
 import math
 import os
+import select
 import selectors
 import socket
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -232,6 +233,13 @@ class Commands:
         deadline = time.monotonic() + ANSWER_S  # a loop that was just started warms up for 0.1 s
         while not settled(status(self.shared)) and time.monotonic() < deadline:
             time.sleep(0.005)
+        held = bool(request.get("held"))
+        if self._state() == "ARMED" and held:
+            return {
+                "ok": False,
+                "state": "ARMED",
+                "error": "not armed for this command: the rig is ARMED already, somebody uses it; `thermoctl disarm` ends that",
+            }
         if self._state() == "ARMED":
             return {"ok": True, "state": "ARMED", "setpoint_um": status(self.shared)["setpoint_um"]}
         if self._state() == "FAULT":
@@ -240,13 +248,20 @@ class Commands:
                 "not armed, a fault is latched: `thermoctl disarm` acknowledges it once its cause is gone",
             )
         self._send(arming.ARM)
-        return self._result("ARMED", "not armed")
+        answer = self._result("ARMED", "not armed")
+        return {**answer, "held": held and answer["ok"]}
+
+    def let_go(self, peer: str) -> None:
+        """Disarm: the connection that the rig was armed for is gone, however its program ended."""
+        if self._state() == "ARMED":
+            self.log("command", name="disarm", peer=peer, ok=True, why="its connection is gone")
+            self._send(arming.DISARM)
 
     def _disarm(self, request: dict) -> dict[str, Any]:
         self._send(arming.DISARM)
         now = self._state()
         if now in ("SAFE", "READY", "OFF"):
-            return {"ok": True, "state": now}
+            return {"ok": True, "state": now, "held": False}
         return self._result("SAFE", "the amplifier is disabled, but the fault still stands")
 
     def _setpoint(self, request: dict) -> dict[str, Any]:
@@ -278,8 +293,11 @@ class Commands:
 
 
 class _Client:
+    """One connection; `holds`: the rig was armed for as long as it lasts."""
+
     def __init__(self, connection: socket.socket, peer: str):
         self.connection, self.peer, self.received, self.unsent = connection, peer, b"", b""
+        self.holds = False
 
 
 def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
@@ -343,7 +361,9 @@ def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector
             client.received += data
         if not client.unsent and b"\n" in client.received:
             line, client.received = client.received.split(b"\n", 1)
-            client.unsent = json.dumps(commands.answer(line, client.peer)).encode() + b"\n"
+            answer = commands.answer(line, client.peer)
+            client.holds = answer.pop("held", client.holds)
+            client.unsent = json.dumps(answer).encode() + b"\n"
         if not client.unsent and len(client.received) > MAX_LINE:
             raise OSError("an endless line")
         if client.unsent:
@@ -354,29 +374,63 @@ def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector
     except OSError:
         selector.unregister(client.connection)
         client.connection.close()
+        if client.holds:
+            with contextlib.suppress(InputError):  # the loop is gone, too
+                commands.let_go(client.peer)
+
+
+class Connection:
+    """A connection to the daemon at `path`: one request after the other. Raises InputError when nobody answers.
+
+    A rig armed with {"command": "arm", "held": true} is disarmed by the daemon when the connection ends, however it ends."""
+
+    def __init__(self, path: Path | str, timeout_s: float = 3.0):
+        self.path, self.timeout_s = path, timeout_s
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.socket.settimeout(timeout_s)
+        with self._answering():
+            self.socket.connect(str(path))
+
+    def ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        """The answer to one request."""
+        with self._answering():
+            self.socket.sendall(json.dumps(request).encode() + b"\n")
+            received = b""
+            while not received.endswith(b"\n"):
+                data = self.socket.recv(1 << 16)
+                if not data:
+                    raise InputError(f"{self.path}: the daemon closed the connection; see its log")
+                received += data
+        return json.loads(received)
+
+    def lost(self, wait_s: float) -> bool:
+        """Wait for `wait_s`; True as soon as the daemon closes the connection. Between two requests only."""
+        return bool(select.select([self.socket], [], [], wait_s)[0])
+
+    def __enter__(self) -> Connection:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
+
+    @contextlib.contextmanager
+    def _answering(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as e:
+            self.socket.close()
+            if isinstance(e, PermissionError):
+                text = "not allowed; the socket is for its group (see socket.group)"
+            elif isinstance(e, FileNotFoundError | ConnectionRefusedError):
+                text = "the daemon is not running; `thermoctl start` or `thermoctl run --config FILE`"
+            elif isinstance(e, TimeoutError):
+                text = f"no answer within {self.timeout_s:g} s; see the daemon's log"
+            else:
+                text = "the daemon broke the connection off; see its log"
+            raise InputError(f"{self.path}: {text}") from None
 
 
 def ask(path: Path | str, request: dict[str, Any], timeout_s: float = 3.0) -> dict[str, Any]:
     """One request to the daemon at `path`. Raises InputError when nobody answers."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(timeout_s)
-        try:
-            connection.connect(str(path))
-            connection.sendall(json.dumps(request).encode() + b"\n")
-            received = b""
-            while not received.endswith(b"\n"):
-                data = connection.recv(1 << 16)
-                if not data:
-                    raise InputError(f"{path}: the daemon closed the connection; see its log")
-                received += data
-        except PermissionError:
-            raise InputError(f"{path}: not allowed; the socket is for its group (see socket.group)") from None
-        except (FileNotFoundError, ConnectionRefusedError):
-            raise InputError(
-                f"{path}: the daemon is not running; `thermoctl start` or `thermoctl run --config FILE`"
-            ) from None
-        except ConnectionError:
-            raise InputError(f"{path}: the daemon broke the connection off; see its log") from None
-        except TimeoutError:
-            raise InputError(f"{path}: no answer within {timeout_s:g} s; see the daemon's log") from None
-    return json.loads(received)
+    with Connection(path, timeout_s) as connection:
+        return connection.ask(request)

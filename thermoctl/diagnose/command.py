@@ -333,10 +333,14 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
     for note in found["notes"]:
         console.print(f"note: {note}", markup=False)
     if found["next_experiment"]:
+        from thermoctl.diagnose.experiment import peaks
+
         told = found["next_experiment"]
         console.print(
             f"next experiment: {told['profile']}. {told['why']} {told['also_helpful'] or ''}", markup=False
         )
+        for line in peaks(told):
+            console.print(f"    {line}", markup=False)
         console.print(
             f"run it: thermoctl experiment {Path(out) / told['file']}  (or by hand: next_experiment.csv), "
             "or let `thermoctl diagnose --resolve` do it",

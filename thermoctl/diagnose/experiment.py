@@ -12,7 +12,8 @@ What the experiment tells about which explanation is true, in bits (lower bound 
 Chosen is the most I per hour among those that reach ENOUGH of the best I. The family: levels, steps both ways, warm-up and
 cool-down, trapezoids slow and fast, triangles small and large, pseudo-random sequences of two bands; every input by itself and
 all together, in several lengths and from several starts. Inputs stay inside the range, and below the speed, that was recorded,
-and readings within REACH of their recorded range of it, unless the rig's own limits are told.
+and every reading, as every surviving hypothesis predicts it, inside its recorded range, unless limits are given. Where nothing of
+the family stays inside, it is tried again with smaller excursions of the inputs (SHARES).
 """
 
 from __future__ import annotations
@@ -53,7 +54,12 @@ POINTS, READINGS = (
 SECONDS = 30.0  # after which no further candidate is looked at
 ENOUGH = 0.8  # of the best experiment's bits that a shorter one must reach
 TOGETHER = 0.98  # correlation from which two inputs are taken to be one lever (voltage and current)
-REACH = 0.5  # how far beyond its recorded range, as a share of it, a reading may go
+SHARES = (
+    1.0,
+    0.7,
+    0.5,
+    0.3,
+)  # of the inputs' recorded excursion from rest, the largest that keeps readings inside
 TOLD_APART = 20.0  # D that decides: odds of e^(D/2) for one of two on the mean
 SURROUNDINGS = ("K", "W/m^2", "Pa")  # dimensions of what the surroundings do and no one commands
 
@@ -438,11 +444,14 @@ def propose(
                 D[i, k] = D[k, i] = distance(told[i], told[k], pairs, s)  # type: ignore[arg-type]
         return bits(D, weights), D, told
 
-    candidates = family(case.plant, case.tables, drive, step)
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        scores = list(pool.map(judged, candidates))
-    good = [(x, s) for x, s in zip(candidates, scores, strict=True) if s is not None]
-    if not good:
+    for share in SHARES:
+        candidates = family(case.plant, case.tables, [_smaller(lever, share) for lever in drive], step)
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            scores = list(pool.map(judged, candidates))
+        good = [(x, s) for x, s in zip(candidates, scores, strict=True) if s is not None]
+        if good:
+            break
+    else:
         return None
     most = max(s[0] for _, s in good)
     chosen, (told_bits, D, told) = max(
@@ -490,21 +499,70 @@ def propose(
         "candidates": len(good),
         "separates": apart,
         "inputs": inputs,
+        "predicted": _predicted(case, outputs, told),
+        "limits": {n: list(span) for n, span in limits.items()},
         "file": FILES[0],
     }
     return entry, chosen
 
 
+def _smaller(lever: Lever, share: float) -> Lever:
+    """The lever with its range drawn together about its rest."""
+    return dataclasses.replace(
+        lever,
+        low=lever.rest + share * (lever.low - lever.rest),
+        high=lever.rest + share * (lever.high - lever.rest),
+    )
+
+
+def _recorded(case: Case, j: int) -> np.ndarray:
+    """All readings of output number j."""
+    return np.concatenate([d.y[np.isfinite(d.y[:, j]), j] for d in case.drives])
+
+
 def _leaves(case: Case, outputs: Sequence[str], told: Sequence[Any], limits: Limits) -> bool:
-    """Would any reading leave its limits? Where none are told, they are what was recorded and REACH of it beyond."""
+    """Whether any hypothesis predicts a reading outside its limits. Where none are given: outside the recorded range, which is
+    widened only to where the rig starts from."""
     for j, o in enumerate(outputs):
-        y = np.concatenate([d.y[np.isfinite(d.y[:, j]), j] for d in case.drives])
-        if len(y):
-            room = REACH * np.ptp(y)
-            low, high = limits.get(o, (y.min() - room, y.max() + room))
-            if any(p[0][:, j].min() < low or p[0][:, j].max() > high for p in told):
+        y = _recorded(case, j)
+        for p in told if len(y) or o in limits else ():
+            low, high = (
+                limits.get(o, (min(y.min(), p[0][0, j]), max(y.max(), p[0][0, j]))) if len(y) else limits[o]
+            )
+            if p[0][:, j].min() < low or p[0][:, j].max() > high:
                 return True
     return False
+
+
+def _predicted(case: Case, outputs: Sequence[str], told: Sequence[Any]) -> dict[str, dict[str, Any]]:
+    """For each output its unit, the lowest and highest value that any hypothesis predicts, and what was recorded."""
+    out = {}
+    for j, o in enumerate(outputs):
+        y = _recorded(case, j)
+        out[o] = {
+            "unit": case.plant.outputs[o].unit,
+            "column": case.plant.outputs[o].column,
+            "low": float(min(p[0][:, j].min() for p in told)),
+            "high": float(max(p[0][:, j].max() for p in told)),
+            "recorded": [float(y.min()), float(y.max())] if len(y) else None,
+        }
+    return out
+
+
+def peaks(entry: Mapping[str, Any]) -> list[str]:
+    """The predicted range of every reading of a proposal beside what was recorded, and the limits it was kept in, as lines."""
+    lines = []
+    for name, p in entry["predicted"].items():
+        unit = f" {p['unit']}" if p["unit"] else ""
+        known = (
+            f"recorded {p['recorded'][0]:.4g} to {p['recorded'][1]:.4g}"
+            if p["recorded"]
+            else "never recorded"
+        )
+        limit = entry["limits"].get(name)
+        kept = f", --limit {limit[0]:g} to {limit[1]:g}" if limit else ""
+        lines.append(f"{name}: {p['low']:.4g} to {p['high']:.4g}{unit} predicted ({known}{kept})")
+    return lines
 
 
 def _sensor(
@@ -568,6 +626,7 @@ def write(folder: Path, case: Case, entry: Mapping[str, Any], chosen: Excitation
     lines = [
         f"# {chosen.title}",
         f"# {entry['why']}",
+        *(f"# {line}" for line in peaks(entry)),
         f"format: {FORMAT}",
         "experiments:",
         "  next_experiment:",
@@ -585,6 +644,14 @@ def write(folder: Path, case: Case, entry: Mapping[str, Any], chosen: Excitation
     if still:
         lines.append("    assumed:            # what the surroundings were taken to be; not driven")
         lines += [f"      {json.dumps(column)}: {v:.9g}" for column, v in still.items()]
+    if entry["predicted"]:
+        lines.append(
+            "    predicted:          # lowest and highest of each reading; checked against the rig's protection"
+        )
+        lines += [
+            f"      {json.dumps(p['column'])}: [{p['low']:.6g}, {p['high']:.6g}]"
+            for p in entry["predicted"].values()
+        ]
     (folder / FILES[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
     t = np.arange(0.0, chosen.duration_s + 1e-9, max(entry["sample_s"], chosen.duration_s / 20_000))
     write_table(

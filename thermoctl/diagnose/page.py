@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermoctl.diagnose import experiment
 from thermoctl.diagnose.command import sentence
 from thermoctl.diagnose.effects import Candidate
 from thermoctl.plant.show import drawing
@@ -364,6 +365,7 @@ def _next(told: dict[str, Any] | None) -> str:
     body = _p(
         f"{told['profile']}, {told['duration_s']:.4g} s. {told['why']} {told.get('also_helpful') or ''}"
     )
+    body += _items(experiment.peaks(told))
     moving = {
         k: np.array(v) for k, v in told["inputs"].items() if len(v) > 1 and np.ptp([p[1] for p in v]) > 0
     }

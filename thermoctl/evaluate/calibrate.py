@@ -11,35 +11,33 @@ the same seed gives the same rows, so a test that was ended is simply run again.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import math
-import select
-import signal
+import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thermoctl.control import arming, faults
-from thermoctl.control.model import CompensatorModel
-from thermoctl.evaluate import chain
+from thermoctl.evaluate import chain, drive
+from thermoctl.evaluate.drive import Control, DaemonRig, SimulatedRig, as_table, span
 from thermoctl.evaluate.iso230 import mean_and_two_s
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
-from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.recording.table import read_table, write_table
 from thermoctl.report.page import figure, page, table
 from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX, NAMES, POINTS
+from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError
 
 TESTS = ("test_1", "test_2", "test_3", "test_4a")
 STEPS = ("doctor", "step", "pid", *TESTS, "model", "test_4b", "proof")
+SHOWN_S = 3.0  # of the step's recording, in the report
 NEEDED = (
     "position_raw_um",
     "output_reference_um",
@@ -48,284 +46,6 @@ NEEDED = (
     "air_c",
     *(f"{p}_c" for p in POINTS),
 )
-EVERY_S = 0.1  # between the rows that are kept
-STEP_DRIVE = 0.3  # of the open-loop step, in units of the drive
-REST_K, REST_S = (
-    0.5,
-    600.0,
-)  # at rest: no two points further apart, or none moved by more than that in so long
-GAP_S = 2.0  # a hole in the daemon's own recording that a test does not survive
-
-
-class Control:
-    """What the person at the keyboard wants: the first Ctrl-C pauses, Enter goes on, a second Ctrl-C (or SIGTERM) ends."""
-
-    def __init__(self, interactive: bool):
-        self.interactive, self.paused, self.ended = interactive, False, False
-
-    def interrupt(self, number: int, _: Any = None) -> None:
-        """A signal came."""
-        if number == signal.SIGINT and self.interactive and not self.paused:
-            self.paused = True
-            print(
-                "\npaused; the setpoint is held. Enter goes on, Ctrl-C ends (what is recorded is kept)",
-                file=sys.stderr,
-            )
-        else:
-            self.ended = True
-
-    def pausing(self) -> bool:
-        """Whether it is paused now; waits up to 0.2 s for Enter."""
-        if self.paused and not self.ended and select.select([sys.stdin], [], [], 0.2)[0]:
-            sys.stdin.readline()
-            self.paused = False
-        return self.paused and not self.ended
-
-    @contextlib.contextmanager
-    def listening(self) -> Iterator[None]:
-        """Signals come here while it lasts."""
-        before = {n: signal.signal(n, self.interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-
-# ------------------------------------------------------------------------------------------------------------ the rigs
-
-
-class SimulatedRig:
-    """The configuration's simulated back end, in this process, each test from rest."""
-
-    where = "the simulated rig, faster than real time"
-
-    def __init__(self, settings: Any):
-        self.settings = settings
-
-    def look(self) -> dict[str, str]:
-        """Status of each channel once the law is READY."""
-        from thermoctl.daemon.simulate import Simulation
-        from thermoctl.daemon.socket import channel_states
-
-        simulation = Simulation(self.settings)
-        try:
-            ready = simulation.until(lambda row: row[INDEX["state"]] == arming.READY, 20.0)
-            row = simulation.row
-            if not ready:
-                names = ", ".join(f.name for f in faults.decode(row[INDEX["fault_bits"]])) or "none"
-                raise InputError(f"{self.settings.path}: not READY within 20 s; faults: {names}")
-            return channel_states(int(row[INDEX["status_bits"]]))
-        finally:
-            simulation.close()
-
-    def step(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """An open-loop step of STEP_DRIVE: (t s, position um)."""
-        from thermoctl.evaluate.commands import open_loop_step
-
-        return open_loop_step(self.settings.path, STEP_DRIVE)
-
-    def run(
-        self,
-        schedule: Schedule,
-        earlier: Table | None,
-        at_s: float,
-        progress: Callable[[Progress], None],
-        control: Control,
-        model: CompensatorModel | None = None,
-    ) -> Iterator[np.ndarray]:
-        """Rows of a test, with `model` acting when given. `earlier` is not needed: the same rows come again."""
-        from thermoctl.daemon.simulate import Simulation
-
-        s = self.settings
-        s = dataclasses.replace(
-            s, compensation=dataclasses.replace(s.compensation, enable=model is not None, model="")
-        )
-        if model is None:  # nothing is estimated yet that the coil could be compared with
-            s = dataclasses.replace(s, protection=dataclasses.replace(s.protection, innovation_limit_c=1e3))
-        simulation = Simulation(s, model)
-
-        def stop() -> bool:
-            while control.pausing():
-                pass
-            return control.ended
-
-        try:
-            yield from experiments.run(
-                simulation, schedule, round(EVERY_S / simulation.period_s), 0.0, progress, stop
-            )
-        except RuntimeError as e:
-            raise Aborted(str(e), 0.0) from None
-        finally:
-            simulation.close()
-
-
-class DaemonRig:
-    """The rig that a running daemon holds."""
-
-    def __init__(self, settings: Any):
-        self.settings = settings
-        self.where = f"the daemon at {settings.socket.path}, in real time"
-
-    def _ask(self, command: str, value: float | None = None) -> dict[str, Any]:
-        from thermoctl.daemon.socket import ask
-
-        answer = ask(self.settings.socket.path, {"command": command, "value": value})
-        if not answer["ok"]:
-            raise InputError(answer["error"])
-        return answer
-
-    def look(self) -> dict[str, str]:
-        """Status of each channel; raises InputError while a fault stands."""
-        answer = self._ask("status")
-        for f in answer["faults"]:
-            if f["severity"] != "warning":
-                raise InputError(f"fault {f['name']}: {f['meaning']}; {f['remedy']}")
-        return answer["channels"]
-
-    def step(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """None: the amplifier is the daemon's; an open-loop step needs it stopped (thermoctl tune)."""
-        return None
-
-    def run(
-        self,
-        schedule: Schedule,
-        earlier: Table | None,
-        at_s: float,
-        progress: Callable[[Progress], None],
-        control: Control,
-        model: CompensatorModel | None = None,
-    ) -> Iterator[np.ndarray]:
-        """Rows of a test from `at_s` of its schedule on, those before it from `earlier` and the daemon's recording.
-
-        Disarms at the end. While paused the setpoint is held and the rows go on: heat does not wait, and the model is fitted to
-        what was measured, not to the schedule. Raises Aborted when the law leaves ARMED or the person ends it."""
-        from thermoctl.daemon.assemble import shared_name
-        from thermoctl.daemon.shared import Shared
-
-        shared = Shared.attach(shared_name(self.settings))
-        stride = round(EVERY_S / self.settings.loop.period_s)
-        if earlier is not None:
-            yield _rows(earlier)
-        else:
-            self._rest(control)
-        if self._ask("status")["state"] != "ARMED":
-            self._ask("arm")
-        position, done = shared.ring.head, at_s
-        commands = schedule.commands()
-        before = [c for c in commands if c[0] < at_s]
-        waiting = [*before[-1:], *(c for c in commands if c[0] >= at_s)]
-        began = last = time.monotonic()
-        try:
-            while done < schedule.duration_s:
-                if not control.pausing():
-                    while waiting and waiting[0][0] <= done:
-                        self._ask("setpoint", waiting.pop(0)[2])
-                    time.sleep(0.05)
-                    done += time.monotonic() - last
-                last = time.monotonic()
-                rows, position, _ = shared.ring.read(position)
-                kept = rows[rows[:, INDEX["tick"]] % stride == 0]
-                if len(kept):
-                    yield kept
-                progress(Progress(min(done, schedule.duration_s), schedule.duration_s, last - began))
-                newest = rows[-1] if len(rows) else shared.ring.newest()
-                if newest is not None and newest[INDEX["state"]] != arming.ARMED:
-                    names = (
-                        ", ".join(f.name for f in faults.decode(newest[INDEX["fault_bits"]]))
-                        or "somebody disarmed it"
-                    )
-                    raise Aborted(f"the law left ARMED: {names}", done)
-                if control.ended:
-                    raise Aborted("ended on request", done)
-        finally:
-            with contextlib.suppress(InputError):
-                self._ask("setpoint", 0.0)
-                self._ask("disarm")
-
-    def _rest(self, control: Control) -> None:
-        """Wait until the rig is at rest: the models are fitted from there. Raises Aborted when the person ends it."""
-        seen: list[tuple[float, np.ndarray]] = []
-        told = -math.inf
-        while True:
-            now, status = time.monotonic(), self._ask("status")
-            seen.append(
-                (now, np.array([math.nan if v is None else v for v in status["temperatures_c"].values()]))
-            )
-            if at_rest(seen):
-                return
-            if control.ended:
-                raise Aborted("ended on request", 0.0)
-            if now - told >= 60.0:
-                told, warm = now, seen[-1][1]
-                print(
-                    f"   the rig is still warm ({np.nanmin(warm):.1f} to {np.nanmax(warm):.1f} degC): waiting until it is at rest",
-                    file=sys.stderr,
-                    flush=True,
-                )
-            time.sleep(1.0)
-
-    def meanwhile(self, earlier: Table) -> Table | None:
-        """`earlier` with what the daemon recorded since, or None when that has a hole longer than GAP_S."""
-        from thermoctl.recording.writer import TIER, recording_files
-
-        parts = [_rows(earlier)]
-        wall, folder = INDEX["wall_s"], Path(self.settings.recording.directory)
-        for path in recording_files(folder, TIER) if folder.is_dir() else ():
-            with contextlib.suppress(InputError):
-                rows = _rows(read_table(path))
-                parts.append(
-                    rows[
-                        (rows[:, wall] > parts[-1][-1, wall])
-                        & (rows[:, INDEX["t_s"]] > parts[-1][-1, INDEX["t_s"]])
-                    ]
-                )
-                parts = [p for p in parts if len(p)]
-        rows = np.vstack(parts)
-        if np.diff(rows[:, wall]).max(initial=0.0) > GAP_S or time.time() - rows[-1, wall] > GAP_S:
-            return None
-        return _table(rows, earlier.path)
-
-
-def rig_of(settings: Any) -> SimulatedRig | DaemonRig:
-    """The rig that tests run on: the daemon's where one answers, else the simulated one. Raises InputError where there is neither."""
-    from thermoctl.daemon.socket import ask
-
-    try:
-        ask(settings.socket.path, {"command": "status"})
-        return DaemonRig(settings)
-    except InputError:
-        if settings.hal.backend != "simulated":
-            raise InputError(
-                f"{settings.path}: hal.backend is '{settings.hal.backend}' and no daemon answers on {settings.socket.path}; "
-                "start it first (thermoctl start)"
-            ) from None
-    return SimulatedRig(settings)
-
-
-def at_rest(seen: list[tuple[float, np.ndarray]]) -> bool:
-    """Whether a rig of these temperatures, (s, degC (12,)) oldest first, is at rest: all alike within REST_K, or, because thermocouples
-    differ by a degree, none moved by more than REST_K in the last REST_S."""
-    now, newest = seen[-1]
-    if np.nanmax(newest) - np.nanmin(newest) <= REST_K:
-        return True
-    window = [t for at, t in seen if at >= now - REST_S]
-    return now - seen[0][0] >= REST_S and bool(
-        np.nanmax(np.nanmax(window, axis=0) - np.nanmin(window, axis=0)) <= REST_K
-    )
-
-
-def _rows(t: Table) -> np.ndarray:
-    return np.column_stack([t.t if n == "t_s" else t.columns.get(n, np.full(len(t), np.nan)) for n in NAMES])
-
-
-def _table(rows: np.ndarray, path: str | Path) -> Table:
-    return Table(
-        Path(path).stem,
-        str(path),
-        rows[:, INDEX["t_s"]],
-        {n: rows[:, i] for n, i in INDEX.items() if n != "t_s"},
-    )
 
 
 # ---------------------------------------------------------------------------------------------------------- the wizard
@@ -400,8 +120,9 @@ class Wizard:
             if control.ended:
                 return False
             if step in self.tests:
-                if not self._test(number, step, control):
-                    return False
+                with control.listening():
+                    if not self._test(number, step, control):
+                        return False
             else:
                 figures = getattr(self, f"_{step}")()
                 self.done[step] = figures
@@ -412,7 +133,7 @@ class Wizard:
 
     # ------------------------------------------------------------------------------------------------ single steps
     def _doctor(self) -> dict[str, Any]:
-        states = self.rig.look()
+        states = self.rig.now()["channels"]
         bad = {
             n: states.get(_channel(n), "ABSENT") for n in NEEDED if states.get(_channel(n), "ABSENT") != "OK"
         }
@@ -425,18 +146,18 @@ class Wizard:
         return {"said": f"{len(NEEDED)} channels read well", "channels": states}
 
     def _step(self) -> dict[str, Any]:
-        measured = self.rig.step()
-        if measured is None:
-            return {
-                "said": "left out: the daemon holds the amplifier; stop it and use `thermoctl tune` for new gains"
-            }
-        t, y = measured
-        fitted = tuning.fit_step(t, y, STEP_DRIVE)
+        s = self.settings
+        rows = drive.excite(self.rig, drive.triangles(s, self.rig.now()["compensated_um"]), Control(False))
+        t, u, y = (rows[:, INDEX[n]] for n in ("t_s", "drive", "position_raw_um"))
+        fitted = tuning.fit_response(t, u, y, s.loop.period_s)
         k0, tau_d, tau_c = tuning.tangent(fitted)
+        model = fitted.response(u - u[0], s.loop.period_s)
+        shown = slice(0, round(SHOWN_S / s.loop.period_s))
         return {
             "said": f"K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms",
-            "t": t.tolist(),
-            "y": y.tolist(),
+            "t": (t[shown] - t[0]).tolist(),
+            "measured_um": (y - y.mean())[shown].tolist(),
+            "fitted_um": (model - model.mean())[shown].tolist(),
             "k0": k0,
             "tau_d_s": tau_d,
             "tau_c_s": tau_c,
@@ -446,20 +167,9 @@ class Wizard:
             "theta_s": fitted.theta_s,
         }
 
-    def _fitted(self) -> tuning.SecondOrder | None:
-        s = self.done["step"]
-        return (
-            tuning.SecondOrder(s["gain"], complex(*s["t1"]), complex(*s["t2"]), s["theta_s"])
-            if "gain" in s
-            else None
-        )
-
     def _pid(self) -> dict[str, Any]:
-        fitted, c = self._fitted(), self.settings.control
-        if fitted is None:
-            return {
-                "said": f"left out; the present gains stay: kp {c.kp:g}, ti {c.ti_s:g} s, td {c.td_s:g} s"
-            }
+        s, c = self.done["step"], self.settings.control
+        fitted = tuning.SecondOrder(s["gain"], complex(*s["t1"]), complex(*s["t2"]), s["theta_s"])
         period, average = self.settings.loop.period_s, int(c.moving_average)
         gains = {
             "present": tuning.Gains(c.kp, c.ti_s, c.td_s, "present"),
@@ -494,7 +204,7 @@ class Wizard:
                 if earlier is not None
                 else f"   {name} begins anew: the daemon did not record without a gap since it was ended"
             )
-        self.say(f"{number:2d}/{len(STEPS)} {name}: {schedule.title}, {_span(schedule.duration_s)}")
+        self.say(f"{number:2d}/{len(STEPS)} {name}: {schedule.title}, {span(schedule.duration_s)}")
         left_s = sum(
             self.tests[n].duration_s for n in STEPS[number:] if n in self.tests and n not in self.done
         )
@@ -506,16 +216,15 @@ class Wizard:
         )
         blocks, ended, began = [], None, time.monotonic()
         try:
-            with control.listening():
-                for block in self.rig.run(schedule, earlier, at_s, show, control, model):
-                    blocks.append(block)
+            for block in self.rig.run(schedule, show, control, earlier, at_s, model):
+                blocks.append(block)
         except Aborted as e:
             ended = e
         self._used_s += time.monotonic() - began
         self._tested_s += ended.done_s if ended else schedule.duration_s - at_s
         print(file=sys.stderr)
         if blocks:
-            write_table(part, _table(np.vstack(blocks), part))
+            write_table(part, as_table(np.vstack(blocks), part))
         if ended is not None:
             self.at_s[name] = ended.done_s
             self._save()
@@ -528,7 +237,7 @@ class Wizard:
         self.at_s.pop(name, None)
         power = np.vstack(blocks)[:, INDEX["power_w"]]
         self.done[name] = {
-            "said": f"{_span(schedule.duration_s)} recorded",
+            "said": f"{span(schedule.duration_s)} recorded",
             "seconds": schedule.duration_s,
             "mean_w": float(np.nanmean(power)),
             "largest_w": float(np.nanmax(power)),
@@ -568,7 +277,8 @@ class Wizard:
             figures,
         )
         return {
-            "said": f"order {model.order}, temperatures to {figures['residual_rms_k']:.3f} K rms, expansion to "
+            "said": f"order {len(compensator.A_minus_I)} ({model.order} poles of the identified model, the rest for disturbing heat), "
+            f"temperatures to {figures['residual_rms_k']:.3f} K rms, expansion to "
             f"{figures['expansion_rms_um']:.3f} um rms of {_rms(last.error_um):.2f}",
             **figures,
             "grown_rms_um": _rms(last.error_um),
@@ -623,16 +333,30 @@ class Wizard:
     def changes(self, models: Path, gains: bool) -> list[str]:
         """What an acceptance would do, as lines."""
         lines = [f"install {self.folder / 'model.yaml'} as the current calibration of {models}/"]
-        if gains and "proposed" in self.done["pid"]:
+        if gains:
             present, proposed = (
                 tuning.Gains(g["kp"], g["ti_s"], g["td_s"], k)
                 for k, g in ((k, self.done["pid"][k]) for k in ("present", "proposed"))
             )
             lines.append(f"write into {self.settings.path}:\n{tuning.difference(present, proposed)}")
+        if not self._in_use(models):
+            now = self.settings.compensation.model or "not set"
+            lines.append(
+                f"set compensation.model in {self.settings.path} to {self._model_option(models)} (now {now})"
+            )
         return lines
 
+    def _in_use(self, models: Path) -> bool:
+        return Path(self.settings.compensation.model or ".").resolve() == models.resolve()
+
+    def _model_option(self, models: Path) -> str:
+        """The folder of calibrations as the configuration names it: relative to the configuration."""
+        return os.path.relpath(models.resolve(), Path(self.settings.path).resolve().parent)
+
     def accept(self, models: Path, gains: bool) -> None:
-        """Install the model, and the gains when asked. Raises InputError when the proof is no better than nothing."""
+        """Install the model, name it in the configuration, and write the gains when asked.
+
+        Raises InputError when the proof is no better than nothing."""
         if not self.done["proof"]["better"]:
             raise InputError(
                 f"{self.folder}: the proof shows no smaller error with the new model than without; nothing was installed"
@@ -649,17 +373,20 @@ class Wizard:
                 "proof_after_um": self.done["proof"]["after"],
             },
         )
-        if gains and "proposed" in self.done["pid"]:
+        if gains:
             g = self.done["pid"]["proposed"]
             tuning.write(Path(self.settings.path), tuning.Gains(g["kp"], g["ti_s"], g["td_s"], g["how"]))
-            self.fingerprint = self._fingerprint()
-            self._save()
-        self.say(f"{path} is current; older ones stay (`thermoctl model rollback`).")
-        if Path(self.settings.compensation.model or ".").resolve() not in (models.resolve(), path.resolve()):
-            self.say(
-                f"compensation.model is {self.settings.compensation.model or 'not set'}: set it to {models.resolve()} to use it, then "
-                "`thermoctl restart`"
-            )
+        if not self._in_use(models):
+            try:
+                values = {"model": self._model_option(models)}
+                tuning.write_values(Path(self.settings.path), "compensation", values)
+            except InputError as e:  # the model is installed; the person names it
+                self.say(str(e))
+        self.fingerprint = self._fingerprint()
+        self._save()
+        self.say(
+            f"{path} is current; older ones stay (`thermoctl model rollback`). `thermoctl restart` uses it."
+        )
 
 
 def _channel(signal_name: str) -> str:
@@ -686,23 +413,13 @@ def _for_people(said: str) -> str:
     return said.replace("+-", "±").replace(" um", " µm").replace(" deg", "°")
 
 
-def _span(s: float) -> str:
-    return (
-        f"{s:.0f} s"
-        if s < 120
-        else f"{s / 60:.0f} min"
-        if s < 7200
-        else f"{int(s // 3600)} h {s % 3600 / 60:.0f} min"
-    )
-
-
 def _progress_line(eta: Callable[[Progress], tuple[float, float]]) -> Callable[[Progress], None]:
     """A line that is written over on a terminal, one a tenth elsewhere."""
     told = [-1.0]
 
     def show(p: Progress) -> None:
         here, everything = eta(p)
-        line = f"   {p.percent:5.1f} %   {_span(here)} left of this test, {_span(everything)} of all"
+        line = f"   {p.percent:5.1f} %   {span(here)} left of this test, {span(everything)} of all"
         if sys.stderr.isatty():
             print(f"\r{line:78}", end="", file=sys.stderr, flush=True)
         elif p.percent - told[0] >= 10.0:
@@ -793,35 +510,26 @@ def _report(settings: Any, where: str, done: dict[str, dict[str, Any]]) -> str:
             ),
         )
     )
-    if "gain" in step:
-        fitted = tuning.SecondOrder(step["gain"], complex(*step["t1"]), complex(*step["t2"]), step["theta_s"])
-        fig, (a,) = axes()
-        ts = np.array(step["t"])
-        y = np.array(step["y"])
-        a.plot(1e3 * ts, y - y[ts < 0].mean(), ".", ms=2, color="#1b1f24", label="measured")
-        a.plot(
-            1e3 * ts,
-            np.where(ts > 0, fitted.step(ts) * STEP_DRIVE, 0.0),
-            color="#0b6bcb",
-            lw=1,
-            label="second order with dead time",
-        )
-        a.set(xlabel="time (ms)", ylabel="position (µm)")
-        fig.legend(
-            *a.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False, fontsize=8
-        )
-        rows = [
-            (k, g["kp"], g["ti_s"], g["td_s"], g["gain"], g["phase_deg"], g["how"])
-            for k, g in pid.items()
-            if isinstance(g, dict)
-        ]
-        sections.append(
-            (
-                "Step and PID",
-                figure(fig, f"Open-loop step of {STEP_DRIVE:g} of the drive. {_for_people(step['said'])}.")
-                + table(("gains", "kp", "ti, s", "td, s", "gain margin", "phase margin, °", "how"), rows),
+    fig, (a,) = axes()
+    a.plot(step["t"], step["measured_um"], ".", ms=2, color="#1b1f24", label="measured")
+    a.plot(step["t"], step["fitted_um"], color="#0b6bcb", lw=1, label="second order with dead time")
+    a.set(xlabel="time (s)", ylabel="position (µm)")
+    fig.legend(*a.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False, fontsize=8)
+    rows = [
+        (k, g["kp"], g["ti_s"], g["td_s"], g["gain"], g["phase_deg"], g["how"])
+        for k, g in pid.items()
+        if isinstance(g, dict)
+    ]
+    sections.append(
+        (
+            "Step and PID",
+            figure(
+                fig,
+                f"Short ramps of the setpoint, and the response fitted to drive and position. {_for_people(step['said'])}.",
             )
+            + table(("gains", "kp", "ti, s", "td, s", "gain margin", "phase margin, °", "how"), rows),
         )
+    )
     sections.append(
         (
             "Steps",
@@ -834,13 +542,13 @@ def _report(settings: Any, where: str, done: dict[str, dict[str, Any]]) -> str:
 
 
 def calibrate(
-    config: str, out: str | None, models: str, order: int, gains: bool, accept: bool, again: bool
+    config: str, out: str | None, models: str, order: int, gains: bool, accept: bool, again: bool, yes: bool
 ) -> int:
-    """The command: 0 when every step is done (and accepted, when asked), 1 when it was ended early or not accepted.
+    """The command: 0 when every step is done (and accepted, when asked), 1 when the person said no, 3 when a test ended early.
 
-    Raises InputError for a rig that cannot be calibrated."""
+    Raises InputError for a rig that cannot be calibrated, HardwareError for one that refuses."""
     settings = load_settings(config)
-    rig = rig_of(settings)
+    rig = drive.rig_of(settings)
     folder = Path(out or Path("calibration") / settings.rig.name)
     if again and (folder / "state.json").exists():
         for path in [folder / "state.json", *folder.glob("test_*.part.parquet")]:
@@ -855,8 +563,11 @@ def calibrate(
         order,
         lambda line: print(line, flush=True),
     )
-    if not wizard.run(control):
+    left = [t for n, t in wizard.tests.items() if n not in wizard.done]
+    if left and not drive.agreed(rig, left, yes):
         return 1
+    if not wizard.run(control):
+        return 3
     print("to accept it means to:\n" + "\n".join(f"- {line}" for line in wizard.changes(Path(models), gains)))
     if not accept and control.interactive:
         accept = (

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thermoctl.evaluate import chain, iso230, rigs
+from hal.backend import HardwareError
+from thermoctl.evaluate import chain, drive, iso230, rigs
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.recording.table import Table, read_table, write_table
 from thermoctl.settings import load_settings
@@ -18,7 +18,6 @@ from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError, suggest
 
 CUTOFF_HZ = 4.3e-4  # 1 / (2 pi 370 s), the paper's
-RELAY_DRIVE, RELAY_UM = 0.1, 0.5
 
 
 def _schedule(name: str, config: str) -> experiments.Schedule:
@@ -46,18 +45,25 @@ def spectrum_lines(t: np.ndarray, power: np.ndarray, cutoff_hz: float) -> list[s
 
 
 def experiment(
-    name: str, config: str, out: str | None, dry_run: bool, resume: bool, plant: str | None = None
+    name: str,
+    config: str,
+    out: str | None,
+    dry_run: bool,
+    resume: bool,
+    plant: str | None = None,
+    yes: bool = False,
 ) -> int:
-    """Run a test of experiments.yaml, or the one experiment of the file `name`, on the daemon that answers (its own back end, in real
-    time, under its protections), else on the simulated back end, faster than real time; an experiment of inputs also on a plant file in
-    the rig's place. What was recorded is kept when it ends early, and gone on with."""
-    from thermoctl.evaluate import calibrate
+    """Run a test of experiments.yaml, or the one experiment of the file `name`, and record it.
 
+    On the daemon that answers (its own back end, in real time, under its protections), else on the simulated back end, faster than
+    real time; an experiment of inputs also on a plant file in the rig's place. 1 when the person said no, 3 when it ended early:
+    what was recorded is kept, and gone on with."""
     if Path(name).suffix in (".yaml", ".yml"):
         inputs = _of_inputs(name)
         if dry_run or plant:
             return _on_plant(inputs, None if dry_run else plant, Path(out or f"{inputs.name}.csv"))
         schedule, name = inputs.schedule(), inputs.name
+        _check_predicted(inputs, load_settings(config))
     elif plant:
         raise InputError(
             f"'{name}' is a test of the actuator's setpoint; --plant takes the file of an experiment that lists inputs"
@@ -65,33 +71,57 @@ def experiment(
     else:
         schedule = _schedule(name, config)
     settings = load_settings(config)
-    t = np.arange(0, schedule.duration_s)
-    power = (schedule.at(t) / 250.0) ** 2 * 3.3
+    drive.within_limits(settings, [schedule])
     print(
-        f"{schedule.title}: {schedule.duration_s / 60:.0f} min, {len(schedule.commands())} moves, "
+        f"{schedule.title}: {drive.span(schedule.duration_s)}, {len(schedule.commands())} moves, "
         f"{schedule.setpoint_um.min():g} to {schedule.setpoint_um.max():g} um"
     )
-    print(f"about {power.mean():.2f} W on the mean, {power.max():.2f} W at most")
+    _say_power(settings, schedule)
+    if dry_run:
+        return 0
+    rig = drive.rig_of(settings)
+    if not drive.agreed(rig, [schedule], yes):
+        return 1
+    return _record(rig, schedule, Path(out or f"{name}.parquet"), resume)
+
+
+def _check_predicted(inputs: experiments.Inputs, settings: Any) -> None:
+    """Refuse an experiment that a diagnosis expects to leave the rig's protection. Raises InputError with the reading."""
+    p = settings.protection
+    for column, (low, high) in inputs.predicted.items():
+        channel = "position_um" if column == "position_raw_um" else column
+        top = min(p.high.get(channel, np.inf), p.coil_limit_c if channel == "coil_c" else np.inf)
+        bottom = p.low.get(channel, -np.inf)
+        if low < bottom or high > top:
+            raise InputError(
+                f"experiment '{inputs.name}': {column} would reach {low:.4g} to {high:.4g}, the protection of {settings.path} "
+                f"allows {bottom:g} to {top:g}"
+            )
+
+
+def _say_power(settings: Any, schedule: experiments.Schedule) -> None:
+    """The coil's power over the schedule, as far as the configuration tells it, and its spectrum."""
+    power, peak = drive.forecast(settings, schedule, 20.0)
+    if power is None:
+        print("power is not predicted: protection.resistance_ohm and flexure_um_per_a are not set")
+        return
+    print(f"about {power.mean():.2f} W on the mean, {power.max():.2f} W at most", end="")
+    print("" if peak is None else f"; the coil warms by {peak - 20.0:.1f} K")
     if np.ptp(power) > 0:
+        t = np.arange(len(power), dtype=float)
         print(
             f"{100 * experiments.share_below(t, power, CUTOFF_HZ):.0f} % of the alternating power below f_c = {CUTOFF_HZ:g} Hz:"
         )
         print("\n".join(spectrum_lines(t, power, CUTOFF_HZ)))
-    low, high = settings.control.setpoint_low_um, settings.control.setpoint_high_um
-    if schedule.setpoint_um.min() < low or schedule.setpoint_um.max() > high:
-        raise InputError(
-            f"{config}: the experiment's setpoints leave control.setpoint_low_um..setpoint_high_um ({low:g}..{high:g})"
-        )
-    if dry_run:
-        return 0
-    path = Path(out or f"{name}.parquet")
-    progress_path = path.with_name(
-        path.name + ".progress"
-    )  # how far the schedule came, beside what was recorded
-    rig = calibrate.rig_of(settings)
-    print(f"on {rig.where}")
+
+
+def _record(
+    rig: drive.SimulatedRig | drive.DaemonRig, schedule: experiments.Schedule, path: Path, resume: bool
+) -> int:
+    """Run a schedule and write what was recorded; beside it, while it is not at its end, how far it came. 3 when it ended early."""
+    progress_path = path.with_name(path.name + ".progress")
     earlier, at_s = None, 0.0
-    if resume and path.exists() and progress_path.exists() and isinstance(rig, calibrate.DaemonRig):
+    if resume and path.exists() and progress_path.exists() and isinstance(rig, drive.DaemonRig):
         earlier = rig.meanwhile(read_table(path))
         at_s = float(progress_path.read_text()) if earlier is not None else 0.0
         print(
@@ -99,7 +129,7 @@ def experiment(
             if earlier is not None
             else "begins anew: the daemon did not record without a gap since it was ended, and heat does not wait"
         )
-    control = calibrate.Control(sys.stdin.isatty() and sys.stderr.isatty())
+    control = drive.Control(sys.stdin.isatty() and sys.stderr.isatty())
     blocks: list[np.ndarray] = []
     done_s = [at_s]
 
@@ -111,31 +141,24 @@ def experiment(
     ended = ""
     try:
         with control.listening():
-            for block in rig.run(schedule, earlier, at_s, show, control):
+            for block in rig.run(schedule, show, control, earlier, at_s):
                 blocks.append(block)
     except experiments.Aborted as e:
         ended = e.reason
     if blocks:
         rows = np.vstack(blocks)
-        write_table(
-            path,
-            Table(
-                path.stem,
-                str(path),
-                rows[:, INDEX["t_s"]],
-                {n: rows[:, i] for n, i in INDEX.items() if n != "t_s"},
-            ),
-        )
+        write_table(path, drive.as_table(rows, path))
         print(f"{path}: {len(rows)} rows")
     if not ended:
         progress_path.unlink(missing_ok=True)
         return 0
     progress_path.write_text(f"{done_s[0]:.3f}\n")
     print(
-        f"ended after {done_s[0]:.0f} of {schedule.duration_s:.0f} s: {ended}; go on with --resume --out {path}",
+        f"ended after {done_s[0]:.0f} of {schedule.duration_s:.0f} s, the amplifier is disabled: {ended}; "
+        f"go on with --resume --out {path}",
         file=sys.stderr,
     )
-    return 1
+    return 3
 
 
 def _of_inputs(path: str) -> experiments.Inputs:
@@ -172,11 +195,11 @@ def _on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) ->
     return 0
 
 
-def record(experiment_file: Path, recording: Path, config: str, plant: str | None) -> None:
-    """Run an experiment file for `thermoctl diagnose --resolve`. Raises InputError where it does not come to its end."""
-    if experiment(str(experiment_file), config, str(recording), False, False, plant):
-        raise InputError(
-            f"{experiment_file}: the experiment ended early; what was recorded is in {recording}"
+def record(experiment_file: Path, recording: Path, config: str, plant: str | None, yes: bool = False) -> None:
+    """Run an experiment file for `thermoctl diagnose --resolve`. Raises HardwareError where it does not come to its end."""
+    if experiment(str(experiment_file), config, str(recording), False, False, plant, yes):
+        raise HardwareError(
+            f"{experiment_file}: the experiment did not come to its end; what was recorded is in {recording}"
         )
 
 
@@ -271,99 +294,23 @@ def model(action: str, models: str, name: str | None) -> int:
     return 0
 
 
-def _open_loop(
-    config: str, seconds: float, drive_at: Callable[[float, float], float], what: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """Drive the opened back end without the position loop: `drive_at`(s since the amplifier's second of power-up, position um) -> drive,
-    within control.output_limit. Returns (t s, position um). Real hardware is paced by the clock. The amplifier is off on every way out.
-    Raises InputError when the position leaves protection's range."""
-    from hal.backend import ROLE, make_backend
-    from thermoctl.daemon.clock import now_ns, sleep_until
-
-    settings = load_settings(config)
-    backend = make_backend(settings)
-    period, paced = settings.loop.period_s, settings.hal.backend == "devices"
-    limit, high = settings.control.output_limit, float(settings.protection.high.get("position_um", np.inf))
-    t, y = [], []
-    backend.open()
-    try:
-        begin = now_ns()
-        for k in range(round((1.0 + seconds) / period)):
-            now = (k + 1) * period
-            if paced:
-                now = sleep_until(begin + round(now * 1e9)) * 1e-9
-                since = now - begin * 1e-9 - 1.0
-            else:
-                since = now - 1.0
-            position = float(backend.read(now).value[ROLE["position_um"]])
-            if abs(position) > high:
-                raise InputError(
-                    f"{what} drove the position to {position:.0f} um, beyond {high:g} um; give a smaller drive"
-                )
-            if since >= 0:
-                t.append(since)
-                y.append(position)
-            backend.write(
-                float(np.clip(drive_at(since, position), -limit, limit)) if since >= 0 else 0.0, True
-            )
-    finally:
-        backend.write(0.0, False)
-        backend.close()
-    return np.array(t), np.array(y)
-
-
-def open_loop_step(
-    config: str, drive: float = 0.3, before_s: float = 0.05, after_s: float = 0.4
-) -> tuple[np.ndarray, np.ndarray]:
-    """Step of the drive without the position loop: (t from the step s, position um); see `_open_loop`."""
-    t, y = _open_loop(
-        config,
-        before_s + after_s,
-        lambda since, position: drive if since >= before_s else 0.0,
-        f"the step of {drive:g}",
-    )
-    return t - before_s, y
-
-
-def relay_test(
-    config: str, drive: float = 0.1, hysteresis_um: float = 0.5, seconds: float = 1.5
-) -> tuple[np.ndarray, np.ndarray]:
-    """Relay feedback (Astrom and Hagglund) about the first position: the drive is +-`drive` against the position, switched beyond
-    +-`hysteresis_um`: (t s, position um); see `_open_loop`."""
-    centre: list[float] = []
-    now = [drive]
-
-    def switch(since: float, position: float) -> float:
-        if not centre:
-            centre.append(position)
-        if abs(position - centre[0]) > hysteresis_um:
-            now[0] = -float(np.copysign(drive, position - centre[0]))
-        return now[0]
-
-    return _open_loop(config, seconds, switch, f"the relay of {drive:g}")
-
-
-def tune(config: str, method: str, write: bool) -> int:
-    """Propose gains; write them only when asked."""
+def tune(config: str, method: str, write: bool, yes: bool) -> int:
+    """Propose gains from the closed loop's answer to short setpoint ramps; write them only when asked. 1: the person said no."""
     settings = load_settings(config)
     c = settings.control
-    present = tuning.Gains(c.kp, c.ti_s, c.td_s, "present")
-    t, y = open_loop_step(config)
-    plant = tuning.fit_step(t, y, 0.3)
+    rig = drive.rig_of(settings)
+    schedule = drive.triangles(settings, rig.now()["compensated_um"])
+    if not drive.agreed(rig, [schedule], yes):
+        return 1
+    rows = drive.excite(rig, schedule, drive.Control(False))
     period, average = settings.loop.period_s, int(c.moving_average)
-    if method == "zn":
-        proposed = tuning.ziegler_nichols(plant)
-    elif method == "imc":
-        proposed = tuning.robust(plant, period, average)
-    else:
-        proposed = tuning.relay(*relay_test(config, RELAY_DRIVE, RELAY_UM), RELAY_DRIVE, RELAY_UM)
-    if "Ku" in proposed.figures:
-        print(
-            f"relay of {RELAY_DRIVE:g}: ultimate gain {proposed.figures['Ku']:.4g} per um, period {1e3 * proposed.figures['Tu_s']:.3g} ms"
-        )
+    t, u, y = (rows[:, INDEX[n]] for n in ("t_s", "drive", "position_raw_um"))
+    plant = tuning.fit_response(t, u, y, period)
+    present = tuning.Gains(c.kp, c.ti_s, c.td_s, "present")
+    proposed = tuning.ziegler_nichols(plant) if method == "zn" else tuning.robust(plant, period, average)
     k0, tau_d, tau_c = tuning.tangent(plant)
     print(
-        f"open-loop step: K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms, "
+        f"response: K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms, "
         f"residual {plant.residual:.2g} um"
     )
     for g in (present, proposed):
@@ -373,6 +320,10 @@ def tune(config: str, method: str, write: bool) -> int:
         )
     print(tuning.difference(present, proposed))
     if write:
+        if not m.stable:
+            raise InputError(
+                f"{config}: not written, the proposed gains make this loop unstable; take --method imc"
+            )
         tuning.write(Path(config), proposed)
         print(f"written to {config}; 'thermoctl reload' applies it")
     return 0

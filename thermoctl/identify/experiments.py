@@ -53,7 +53,8 @@ class Schedule:
 @dataclass(frozen=True)
 class Inputs:
     """What a rig's inputs do: {column: corners (K, 2) of seconds and value} on straight lines, ends at duration_s, read every
-    sample_s; `assumed`: columns that nobody drives, at the values they were taken to have."""
+    sample_s; `assumed`: columns that nobody drives, at the values they were taken to have; `predicted`: the lowest and highest
+    value of each reading that the diagnosis expects."""
 
     name: str
     title: str
@@ -61,6 +62,7 @@ class Inputs:
     assumed: dict[str, float]
     sample_s: float
     duration_s: float
+    predicted: dict[str, tuple[float, float]]
 
     def schedule(self) -> Schedule:
         """The same for the daemon. Raises InputError where it drives more than the setpoint."""
@@ -101,7 +103,7 @@ def _head(root: Node) -> dict[str, Node]:
 
 
 def _inputs(name: str, node: Node) -> Inputs:
-    e = _keys(node, f"experiment '{name}'", {"title", "inputs", "sample_s"}, {"assumed"})
+    e = _keys(node, f"experiment '{name}'", {"title", "inputs", "sample_s"}, {"assumed", "predicted"})
     if not isinstance(e["inputs"].value, dict) or not e["inputs"].value:
         raise e["inputs"].error("a mapping of columns with `corners` each was expected")
     corners = {}
@@ -126,6 +128,12 @@ def _inputs(name: str, node: Node) -> Inputs:
     assumed = e["assumed"].value if "assumed" in e else {}
     if not isinstance(assumed, dict):
         raise e["assumed"].error("a mapping of columns to numbers was expected")
+    predicted = {}
+    for column, entry in (e["predicted"].value if "predicted" in e else {}).items():
+        if not isinstance(entry.value, list) or len(entry.value) != 2:
+            raise entry.error(f"predicted '{column}': [lowest, highest] was expected")
+        low, high = (_number(v, -1e12, 1e12) for v in entry.value)
+        predicted[column] = (low, high)
     duration = max(ends.values())
     return Inputs(
         name,
@@ -134,6 +142,7 @@ def _inputs(name: str, node: Node) -> Inputs:
         {c: _number(v, -1e12, 1e12) for c, v in assumed.items()},
         _number(e["sample_s"], duration * 1e-7, duration),
         duration,
+        predicted,
     )
 
 

@@ -1,25 +1,29 @@
-"""PID tuning: proposals, never written by themselves.
+"""PID tuning: the response of position to drive, fitted to a recording of the closed loop, and gains proposed from it.
 
 PID, velocity form (41): D(s) = Kp (1 + 1/(Ti s) + Td s)
-Ziegler-Nichols from the open-loop step (Table I): Kp = 1.2 tau_c/(K0 tau_d), Ti = 2 tau_d, Td = 0.5 tau_d, with the tangent at the
-steepest point of the response. The tangent is drawn on a fitted second-order response with dead time, not on the samples: the
-steepest difference of noisy samples is too steep (0.15 um of noise: Kp 21 % low; fitted: 0.1 %).
-Relay (Astrom and Hagglund): Ku = 4 d/(pi sqrt(a^2 - e^2)), Kp = 0.6 Ku, Ti = 0.5 Tu, Td = 0.125 Tu
-Lambda / IMC (Rivera, Morari, Skogestad) for K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)): series form Kc = t1/(K0 (lambda + theta)),
-tI = t1, tD = t2 (half rule for what is faster than theta); parallel form Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI + tD)
+Response: K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)), by the direct method of closed-loop identification (Ljung, System Identification,
+2nd ed., section 13.5): recorded drive in, recorded position out, output error least squares. The loop answers a sample's noise one
+period later at the earliest, so white noise of the encoder does not bias the fit.
+Ziegler-Nichols (Table I): Kp = 1.2 tau_c/(K0 tau_d), Ti = 2 tau_d, Td = 0.5 tau_d, with the tangent at the steepest point of the
+fitted step response. The steepest difference of noisy samples would be too steep (0.15 um of noise: Kp 21 % low; fitted: 0.1 %).
+Lambda / IMC (Rivera, Morari, Skogestad): series form Kc = t1/(K0 (lambda + theta)), tI = t1, tD = t2 (half rule for what is faster
+than theta); parallel form Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI + tD)
 Margins: of the sampled loop L(e^jw) = D(z) G(z), G with a zero-order hold and the dead time, moving average included.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy import optimize
+from scipy import optimize, signal
 
 from thermoctl.yamlfile import InputError
+
+UNCERTAIN_DEG = (
+    5.0  # standard error of the response's phase near the crossover, above which no gains are proposed
+)
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,11 @@ class SecondOrder:
         y = 1 - (t1 * np.exp(-s / t1) - t2 * np.exp(-s / t2)) / (t1 - t2)
         return self.gain * np.real(y)
 
+    def response(self, drive: np.ndarray, period_s: float) -> np.ndarray:
+        """Positions (N,) from rest for drives (N,), each written after its position was read and held for `period_s`."""
+        impulse = np.diff(self.step(np.arange(len(drive) + 1) * period_s))
+        return np.concatenate(([0.0], signal.fftconvolve(drive, impulse)[: len(drive) - 1]))
+
     def frequency(self, w: np.ndarray) -> np.ndarray:
         """G(jw)."""
         s = 1j * w
@@ -58,43 +67,57 @@ class Gains:
     figures: dict = field(default_factory=dict)
 
 
-def fit_step(t_s: np.ndarray, y_um: np.ndarray, drive: float, at_s: float = 0.0) -> SecondOrder:
-    """Second order with dead time fitted to a step response by least squares: t_s (N,), y_um (N,), step of `drive` at `at_s`.
+def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s: float) -> SecondOrder:
+    """Fit the second order with dead time that gives positions y_um (N,) from drives (N,) at times t_s (N,).
 
-    Raises InputError when there is no response to be seen."""
-    t, y = np.asarray(t_s, float) - at_s, np.asarray(y_um, float)
-    before = y[t < 0]
-    y = y - (before.mean() if len(before) else y[0])
-    t, y = t[t >= 0], y[t >= 0]
-    if len(t) < 20:
-        raise InputError(f"{len(t)} samples after the step; at least 20 are needed")
-    final = y[-max(5, len(y) // 5) :].mean()
-    noise = np.std(np.diff(y[-max(10, len(y) // 5) :])) / np.sqrt(2)
-    if abs(final) < 5 * noise + 1e-12:
-        raise InputError(
-            f"the step moved the output by {final:.3g} um, its noise is {noise:.3g} um; give a larger step"
-        )
-    reach = t[np.argmax(np.abs(y) >= 0.632 * abs(final))] + (t[1] - t[0])
+    Row k holds the position read and the drive written in the same tick of `period_s`; a missing tick kept the drive before it.
+    Raises InputError when the recording does not determine the response."""
+    at = np.round((np.asarray(t_s) - t_s[0]) / period_s).astype(int)
+    n = int(at[-1]) + 1
+    if len(at) < 20:
+        raise InputError(f"{len(at)} samples; at least 20 are needed to fit the position's response")
+    u = np.asarray(drive, float)[np.searchsorted(at, np.arange(n), side="right") - 1]
+    u, y = u - u[0], np.asarray(y_um, float) - np.mean(y_um)
 
-    def model(p: np.ndarray) -> SecondOrder:
-        wn, zeta = np.exp(p[1]), np.exp(p[2])
+    def model(p: np.ndarray, gain: float = 1.0) -> SecondOrder:
+        wn, zeta = np.exp(p[0]), np.exp(p[1])
         root = np.sqrt(complex(zeta**2 - 1))
-        return SecondOrder(p[0] / drive, 1 / (wn * (zeta - root)), 1 / (wn * (zeta + root)), np.exp(p[3]))
+        return SecondOrder(gain, 1 / (wn * (zeta - root)), 1 / (wn * (zeta + root)), float(np.exp(p[2])))
 
-    best: Any = None
-    for zeta in (0.3, 1.01, 2.0):
-        for dead in (0.02, 0.2, 0.5):
-            start = [final, np.log(2 * max(zeta, 0.5) / reach), np.log(zeta), np.log(dead * reach)]
-            r = optimize.least_squares(
-                lambda p: model(p).step(t) * drive - y,
-                start,
-                max_nfev=100,
-                bounds=([-np.inf, -30, -4, np.log(1e-3 * reach)], [np.inf, 30, 4, np.log(reach * 1.5)]),
-            )
-            if best is None or r.cost < best.cost:
-                best = r
-    m = model(best.x)
-    return SecondOrder(float(m.gain), m.t1, m.t2, float(m.theta_s), float(np.sqrt(2 * best.cost / len(y))))
+    def unit_response(p: np.ndarray) -> np.ndarray:
+        x = model(p).response(u, period_s)[at]
+        return x - x.mean()
+
+    def residual(p: np.ndarray) -> np.ndarray:
+        x = unit_response(p)
+        return (x @ y) / max(x @ x, 1e-300) * x - y
+
+    starts = ((300.0, 0.3), (300.0, 1.5), (100.0, 3.0))  # (1/s, damping)
+    bounds = ([0.0, -4.0, np.log(0.02 * period_s)], [12.0, 4.0, np.log(200 * period_s)])
+    tries = [
+        optimize.least_squares(residual, np.log([wn, zeta, period_s]), bounds=bounds, max_nfev=60)
+        for wn, zeta in starts
+    ]
+    best = min(tries, key=lambda r: r.cost)
+    x = unit_response(best.x)
+    rms = float(np.sqrt(2 * best.cost / len(y)))
+    normal = best.jac.T @ best.jac
+    covariance = rms**2 * np.linalg.inv(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(3))
+    w = np.geomspace(0.1, 1 / period_s, 400)
+    phases = np.unwrap(np.angle(model(best.x).frequency(w)))
+    k = min(int(np.searchsorted(-phases, np.pi * 2 / 3)), len(w) - 1)
+    w = w[k : k + 1]  # where 60 degrees are left
+    slope = [
+        np.angle(model(best.x + d).frequency(w) / model(best.x - d).frequency(w))[0] / 2e-3
+        for d in 1e-3 * np.eye(3)
+    ]
+    uncertain_deg = float(np.degrees(np.sqrt(slope @ covariance @ slope)))
+    if not np.any(x) or uncertain_deg > UNCERTAIN_DEG:
+        raise InputError(
+            f"the position moved by {np.ptp(y):.3g} um with {rms:.2g} um of noise: its phase at {w[0] / (2 * np.pi):.3g} Hz is "
+            f"known to {uncertain_deg:.2g} deg only, {UNCERTAIN_DEG:g} were expected; raise control.setpoint_rate_um_s"
+        )
+    return replace(model(best.x, float(x @ y / (x @ x))), residual=rms)
 
 
 def tangent(model: SecondOrder) -> tuple[float, float, float]:
@@ -117,26 +140,6 @@ def ziegler_nichols(model: SecondOrder) -> Gains:
         "Ziegler-Nichols, step (Table I)",
         {"K0": k0, "tau_d_s": tau_d, "tau_c_s": tau_c},
     )
-
-
-def relay(t_s: np.ndarray, y_um: np.ndarray, amplitude: float, hysteresis_um: float = 0.0) -> Gains:
-    """From a relay test's oscillation: `amplitude` d of the drive. Raises InputError when it did not oscillate steadily."""
-    y = y_um - y_um.mean()
-    tail = slice(len(y) // 3, None)
-    t, y = np.asarray(t_s)[tail], y[tail]
-    up = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
-    if len(up) < 4:
-        raise InputError(
-            f"{max(len(up) - 1, 0)} whole oscillations in the last two thirds of the relay test; at least 3 are needed"
-        )
-    crossing = t[up] - y[up] * (t[up + 1] - t[up]) / (y[up + 1] - y[up])
-    periods = np.diff(crossing)
-    if periods.std() > 0.1 * periods.mean():
-        raise InputError("the relay's oscillation is not steady (its period varies by more than 10 %)")
-    a = np.median([np.ptp(y[i:j]) / 2 for i, j in zip(up[:-1], up[1:], strict=True)])
-    ku = 4 * amplitude / (np.pi * np.sqrt(max(a * a - hysteresis_um**2, 1e-300)))
-    tu = float(periods.mean())
-    return Gains(0.6 * ku, 0.5 * tu, 0.125 * tu, "relay", {"Ku": ku, "Tu_s": tu})
 
 
 def imc(model: SecondOrder, lambda_s: float | None = None) -> Gains:
@@ -234,30 +237,31 @@ def difference(present: Gains, proposed: Gains) -> str:
 
 
 def write(config: Path, proposed: Gains) -> None:
-    """Write kp, ti_s, td_s into the control section of a configuration, other lines untouched; on request only.
+    """Write kp, ti_s, td_s into the control section of a configuration; on request only. Raises InputError as `write_values`."""
+    numbers = {"kp": proposed.kp, "ti_s": proposed.ti_s, "td_s": proposed.td_s}
+    write_values(config, "control", {n: f"{v:.6g}" for n, v in numbers.items()})
 
-    Raises InputError when the section does not name all three on lines of their own."""
+
+def write_values(config: Path, section: str, values: dict[str, str]) -> None:
+    """Write values into a section of a configuration, other lines and all comments untouched.
+
+    Raises InputError when the section does not name each on a line of its own."""
     import os
     import re
 
     text = config.read_text(encoding="utf-8")
-    section = re.search(r"^control:.*\n((?:[ \t]+.*\n|\s*\n|#.*\n)*)", text, re.MULTILINE)
-    if section is None:
-        raise InputError(
-            f"{config}: no section 'control' with lines of its own; write kp, ti_s, td_s by hand"
-        )
-    body = section.group(1)
-    for name, value in (("kp", proposed.kp), ("ti_s", proposed.ti_s), ("td_s", proposed.td_s)):
-        body, n = re.subn(
-            rf"^([ \t]+{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$",
-            rf"\g<1>{value:.6g}\g<2>",
-            body,
-            flags=re.MULTILINE,
-        )
+    found = re.search(rf"^{section}:.*\n((?:[ \t]+.*\n|\s*\n|#.*\n)*)", text, re.MULTILINE)
+    by_hand = ", ".join(f"{n}: {v}" for n, v in values.items())
+    if found is None:
+        raise InputError(f"{config}: no section '{section}' with lines of its own; write by hand: {by_hand}")
+    body = found.group(1)
+    for name, value in values.items():
+        line = re.compile(rf"^([ \t]+{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$", re.MULTILINE)
+        body, n = line.subn(lambda m, value=value: f"{m[1]}{value}{m[2]}", body)  # type: ignore[misc]
         if n != 1:
             raise InputError(
-                f"{config}: control.{name} does not stand on a line of its own; write it by hand: {value:.6g}"
+                f"{config}: {section}.{name} does not stand on a line of its own; write by hand: {by_hand}"
             )
     temporary = config.with_name(f".{config.name}.writing")
-    temporary.write_text(text[: section.start(1)] + body + text[section.end(1) :], encoding="utf-8")
+    temporary.write_text(text[: found.start(1)] + body + text[found.end(1) :], encoding="utf-8")
     os.replace(temporary, config)
