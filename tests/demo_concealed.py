@@ -35,10 +35,11 @@ from tests.concealed.rig import Scene  # noqa: E402
 from thermoctl.diagnose import run as diagnosis  # noqa: E402
 from thermoctl.diagnose.prove import program  # noqa: E402
 from thermoctl.evaluate.iso230 import mean_and_two_s  # noqa: E402
+from thermoctl.identify.linearise import linearise  # noqa: E402
 from thermoctl.plant import load, save  # noqa: E402
-from thermoctl.plant.linearise import linearise  # noqa: E402
 from thermoctl.plant.refit import fit, updated  # noqa: E402
-from thermoctl.recording.table import read_table  # noqa: E402
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table  # noqa: E402
 from thermoctl.report import page  # noqa: E402
 from thermoctl.yamlfile import InputError  # noqa: E402
 
@@ -163,8 +164,8 @@ def at_time(plant: Any, t_s: float) -> Any:
 def unseen(plant_file: Path, recording: Path) -> dict[str, float]:
     """Free-run rms error of each output over its noise on a recording; its own start is estimated, nothing else."""
     plant = load(plant_file)
-    model = plant.compile(())
-    drive = model.drive(read_table(recording))
+    model = compile_plant(plant, ())
+    drive = model.excitation(read_table(recording))
     found = fit(model, [drive])
     noise = {
         o.name: float(np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12)))
@@ -188,8 +189,8 @@ def tell(story: Story, seed: int, out: Path) -> dict[str, Any]:
     result = diagnosis.diagnose(folder / "plant.yaml", [folder / "run_1.csv"], folder / "diagnosis")
     seconds = time.monotonic() - begun
     plant = load(folder / "plant.yaml")
-    model = plant.compile()
-    drives = [model.drive(read_table(folder / "run_1.csv"))]
+    model = compile_plant(plant)
+    drives = [model.excitation(read_table(folder / "run_1.csv"))]
     save(updated(plant, fit(model, drives), drives), folder / "refitted.yaml")
     files = {
         "as it came": folder / "plant.yaml",

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.language import from_plain, loads
+from thermoctl.plant import from_plain, loads
 from thermoctl.yamlfile import InputError
 
 GOOD = {

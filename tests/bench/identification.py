@@ -437,7 +437,7 @@ def measured_data() -> None:
     takes one record: without them, or with them before its own in one record, whichever turns out better for it on the held-out part.
     For information also the best order of each peer with the held-out part looked at, ours from the one record alone, and what the ratio
     would be over other stretches of the same length (moving-block bootstrap of the held-out part, 5 to 95 %)."""
-    from thermoctl.recording.table import read_table
+    from thermoctl.recording.files import read_table
 
     folder = Path(os.environ.get("THERMOCTL_RECORDINGS", "../shared/recordings"))
     if not folder.is_dir():

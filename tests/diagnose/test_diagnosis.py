@@ -14,7 +14,8 @@ from thermoctl.diagnose.effects import Rig, candidates, catalogue
 from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.heldout import prediction
 from thermoctl.plant import load
-from thermoctl.recording.table import read_table
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 
 HEATER = """
@@ -123,7 +124,7 @@ def test_natural_convection_is_named_placed_and_worth_it_on_unseen_data(tmp_path
     }
     # The extended plant runs in the simulator and gives the error that was reported.
     plant = load(tmp_path / "out" / "plant.yaml")
-    model = plant.compile()
+    model = compile_plant(plant)
     errors = np.concatenate(
         [
             read_table(tmp_path / f"run_{s}.csv").columns["temperature_1"]
@@ -206,13 +207,13 @@ def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
         header="t,heat,air_temperature,temperature_1,temperature_2,voltage",
     )
     plant, table = load(tmp_path / "plant.yaml"), read_table(run)
-    drive = plant.compile().drive(table)
+    drive = compile_plant(plant).excitation(table)
     lags = [
         c
         for c in candidates(Rig(plant, [drive], [table.columns]), {"sensor_lag": catalogue()["sensor_lag"]})
         if c.place.where == "voltage"
     ]
-    held, straight = (c.extend({"TAU": 0.2}).compile().simulate(table).y[:, 0] for c in lags)
+    held, straight = (compile_plant(c.extend({"TAU": 0.2})).simulate(table).y[:, 0] for c in lags)
     u, t = 3 * rows[:, 1], rows[:, 0]
     line = lsim(([1.0], [0.2, 1.0]), u, t, interp=True)[1] + u[0] * np.exp(-t / 0.2)
     stair = lsim(([1.0], [0.2, 1.0]), u, t, interp=False)[1] + u[0] * np.exp(-t / 0.2)

@@ -5,6 +5,7 @@ import pytest
 
 from thermoctl.diagnose.effects import Rig, candidates, catalogue
 from thermoctl.plant import load, save
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 PLANT = """format: thermoctl-plant/1
@@ -28,7 +29,7 @@ def test_heat_of_a_speed_is_offered_and_keeps_its_units(unit, tmp_path):
         t,
         {"heat": 1 + np.sin(t), "speed": np.cos(t), "air": np.full(100, 20.0), "housing_c": 20 + 0 * t},
     )
-    rig = Rig(plant, [plant.compile().drive(table)], [table.columns])
+    rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
     names = {"eddy_heating", "hysteresis_heating", "forced_convection"}
     found = [c for c in candidates(rig, catalogue()) if c.effect.name in names]
     assert {c.effect.name for c in found} == names
@@ -80,7 +81,7 @@ def test_every_entry_keeps_the_units_of_a_rig_that_moves_and_heats(tmp_path):
     table = Table(
         "run", "run", t, moving | {"position_read": 0 * t, "voltage": 0 * t, "coil_temperature": 20 + 0 * t}
     )
-    rig = Rig(plant, [plant.compile().drive(table)], [table.columns])
+    rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
     found = candidates(rig, catalogue())
     assert {"position_dependent_conductance", "cogging", "cubic_stiffness", "back_emf"} < {
         c.effect.name for c in found

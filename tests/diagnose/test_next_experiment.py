@@ -12,8 +12,10 @@ from thermoctl.diagnose import experiment, search
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.explain import Case
 from thermoctl.identify.experiments import load_experiments, load_inputs
-from thermoctl.plant.language import loads
-from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 BELIEF = """format: thermoctl-plant/1
@@ -45,7 +47,7 @@ def short_pulses():
 @pytest.fixture(scope="module")
 def undecided():
     """A case, and a diagnosis of it that two refitted explanations share; both stand for what a whole diagnosis would hold."""
-    table = loads(TRUTH).compile(()).measure(short_pulses(), seed=1)
+    table = compile_plant(loads(TRUTH), ()).measure(short_pulses(), seed=1)
     case = Case(loads(BELIEF), [table])
     base = case.explain(case.plant, [], [], iterations=40)
     entries = {
@@ -66,7 +68,7 @@ def test_proposal_stays_inside_the_limits_and_is_the_best_per_hour(undecided):
     entry, chosen = experiment.propose(case, found, limits=LIMITS)
     heat = np.array(entry["inputs"]["heat"])
     assert heat[:, 1].min() >= 0 and heat[:, 1].max() <= 20 and entry["inputs"]["air"] == [[0.0, 22.0]]
-    ahead = loads(TRUTH).compile(()).simulate(chosen.table(case.plant, 5.0)).y
+    ahead = compile_plant(loads(TRUTH), ()).simulate(chosen.table(case.plant, 5.0)).y
     assert ahead.min() > 15 and ahead.max() < 110
     assert entry["separates"][0]["sigmas"] > 3 and entry["bits"] > 0.6
     assert entry["bits_per_hour"] == pytest.approx(entry["bits"] / (entry["duration_s"] / 3600))
@@ -202,7 +204,7 @@ def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment
     """The whole way by the command line: ambiguous at 25 K; the rig in the experiment's place is simulated from the truth."""
     (tmp_path / "plant.yaml").write_text(BELIEF)
     (tmp_path / "truth.yaml").write_text(TRUTH)
-    write_table(tmp_path / "run_1.csv", loads(TRUTH).compile(()).measure(short_pulses(), seed=1))
+    write_table(tmp_path / "run_1.csv", compile_plant(loads(TRUTH), ()).measure(short_pulses(), seed=1))
     common = [
         "diagnose",
         "--plant",

@@ -9,7 +9,8 @@ from thermoctl.diagnose import run, screen, search
 from thermoctl.diagnose.effects import Rig, candidates, catalogue, shape_grid
 from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.locate import Suspect
-from thermoctl.plant.language import loads
+from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 STAGE = """format: thermoctl-plant/1
@@ -308,11 +309,13 @@ def motor():
             "air": 21 + np.sin(t / 700),
         },
     )
-    return Case(plant, [plant.compile().measure(table)])
+    return Case(plant, [compile_plant(plant).measure(table)])
 
 
 def offered(case, plant, name):
-    rig = Rig(plant, [plant.compile().drive(t) for t in case.tables], [t.columns for t in case.tables])
+    rig = Rig(
+        plant, [compile_plant(plant).excitation(t) for t in case.tables], [t.columns for t in case.tables]
+    )
     return {c.place.where: c for c in candidates(rig, entries(name))}
 
 

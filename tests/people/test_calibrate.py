@@ -18,7 +18,7 @@ from thermoctl.evaluate import calibrate
 from thermoctl.evaluate.calibrate import Control, DaemonRig
 from thermoctl.identify import modelfile
 from thermoctl.identify.experiments import Aborted, load_experiments
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.recording.writer import RecordingWriter
 from thermoctl.signals import INDEX
 

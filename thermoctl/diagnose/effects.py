@@ -21,7 +21,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Flow, Input, Node, Parameter, Plant
 from thermoctl.plant.refit import Belief
-from thermoctl.plant.simulate import Drive, Simulation
+from thermoctl.plant.simulate import Excitation, Simulation
 from thermoctl.plant.units import dimension
 from thermoctl.shipped import shipped
 
@@ -238,7 +238,9 @@ _READINGS = re.compile(
 class Rig:
     """A plant and its recordings as the catalogue sees them: which node is a temperature, what moves, what is air."""
 
-    def __init__(self, plant: Plant, drives: Sequence[Drive], columns: Sequence[Mapping[str, np.ndarray]]):
+    def __init__(
+        self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
+    ):
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
         # What an observer (observer.py) added is no physics that an effect could sit in.
         p = dataclasses.replace(

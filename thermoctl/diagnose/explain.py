@@ -30,7 +30,7 @@ from thermoctl.plant.refit import (
     report,
     updated,
 )
-from thermoctl.plant.simulate import Drive, SimulationError
+from thermoctl.plant.simulate import Excitation, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
@@ -80,8 +80,8 @@ class Case:
     ):
         self.plant, self.tables = plant, list(tables)
         self.progress = progress or (lambda text: None)
-        self.model = plant.compile()
-        self.drives = [self.model.drive(t) for t in self.tables]
+        self.model = compile_plant(plant)
+        self.drives = [self.model.excitation(t) for t in self.tables]
         counts = {
             o: sum(int(np.isfinite(d.y[:, j]).sum()) for d in self.drives)
             for j, o in enumerate(self.model.outputs)
@@ -111,9 +111,9 @@ class Case:
             1
         ]  # how far the plant's parameters lie from what was believed, in shares of their ranges
 
-    def drives_of(self, e: Explanation) -> list[Drive]:
+    def drives_of(self, e: Explanation) -> list[Excitation]:
         """The recordings as an explanation's plant reads them."""
-        return [e.fit.model.drive(t) for t in self.tables]
+        return [e.fit.model.excitation(t) for t in self.tables]
 
     def explain(
         self,
@@ -125,8 +125,8 @@ class Case:
         goal: float = np.inf,
     ) -> Explanation:
         """Refit a plant to all recordings and score it; `goal`: a cost that it does not go on for when that is out of reach."""
-        model = plant.compile()
-        drives = [model.drive(t) for t in self.tables]
+        model = compile_plant(plant)
+        drives = [model.excitation(t) for t in self.tables]
         found = fit(
             model,
             drives,
@@ -145,8 +145,8 @@ class Case:
         it is white, or where that fits visibly worse (what is missing is no colour)."""
         if e.white:
             return e
-        model = e.plant.compile()
-        drives = [model.drive(t) for t in self.tables]
+        model = compile_plant(e.plant)
+        drives = [model.excitation(t) for t in self.tables]
         try:
             found = fit(
                 model,
@@ -228,7 +228,7 @@ def noise_of(colours: Sequence[Colour]) -> tuple[Noise, ...]:
     return tuple(Noise(c.sigma, 0.0, c.ar, c.ma) for c in colours)
 
 
-def standard_errors(e: Explanation, drives: Sequence[Drive]) -> dict[str, float]:
+def standard_errors(e: Explanation, drives: Sequence[Excitation]) -> dict[str, float]:
     """Of each parameter of the effects: the Gauss-Newton one, or half the width over which the likelihood falls by two (-2 log by
     3.84) over 1.96 where that is wider: an onset, a threshold, the depth of a dead zone have no slope to go by."""
     problem = Problem(e.fit.model, drives, e.fit.noise, e.fit.beliefs)

@@ -12,7 +12,7 @@ from scipy.fft import dct
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Belief, fit, updated
-from thermoctl.plant.simulate import Drive, Model, SimulationError
+from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 UNDETERMINED = 20.0
@@ -47,12 +47,12 @@ def unseen_errors(
     """Free-run errors (N, outputs) on each fold's test data, the plant fitted to that fold's training data only."""
     out: list[np.ndarray] = []
     for train, test in folds(case, blocks):
-        model = plant.compile()
-        drives = [model.drive(t) for t in test]
+        model = compile_plant(plant)
+        drives = [model.excitation(t) for t in test]
         try:
             dx0: Sequence[np.ndarray | None] = [None] * len(test)
             if refit:
-                training = [model.drive(t) for t in train]
+                training = [model.excitation(t) for t in train]
                 found = fit(
                     model,
                     training,
@@ -76,7 +76,7 @@ def unseen_errors(
     return out
 
 
-def _but_for_start(case: Case, model: Model, d: Drive) -> np.ndarray:
+def _but_for_start(case: Case, model: Model, d: Excitation) -> np.ndarray:
     """Free-run error on a recording that took no part, less what its uncertain start explains at first order: where it began
     is no physics, and a free axis carries an error of its start to the end."""
     run = model.run(model.prepare(d), None, None, sensitivities=True)

@@ -43,7 +43,7 @@ from thermoctl.diagnose.search import (
 from thermoctl.plant import load, save
 from thermoctl.plant.refit import Noise
 from thermoctl.plant.simulate import SimulationError
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 
 NAME = 0.9  # one explanation is named alone from this probability on

@@ -11,6 +11,7 @@ import hashlib
 import os
 import re
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -65,9 +66,9 @@ def save_model(
     path: str | Path,
     model: CompensatorModel,
     rig: str,
-    recordings: list[str | Path] = (),
+    recordings: Sequence[str | Path] = (),
     figures: dict | None = None,
-) -> Path:  # type: ignore[assignment]
+) -> Path:
     """Write a calibration; the file appears whole or not at all. Raises InputError when it exists (a calibration is never
     overwritten) or the place cannot be written."""
     path = Path(path)
@@ -136,9 +137,9 @@ def install(
     folder: str | Path,
     model: CompensatorModel,
     rig: str,
-    recordings: list[str | Path] = (),
+    recordings: Sequence[str | Path] = (),
     figures: dict | None = None,
-) -> Path:  # type: ignore[assignment]
+) -> Path:
     """Save a calibration as the folder's newest and make it current; the one before stays for a roll back."""
     folder = Path(folder)
     number = 1 + max((int(p.stem.split("-")[0]) for p in folder.glob("[0-9]*-*.yaml")), default=0)

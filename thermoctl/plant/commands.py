@@ -1,4 +1,4 @@
-"""The commands simulate, refit, plant show, plant linearise and plant check."""
+"""The commands simulate, refit, plant show and plant check."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from rich.table import Table as Grid
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant.noise import coloured
 from thermoctl.plant.refit import Estimate, fit, report, updated
-from thermoctl.plant.simulate import Drive, Model, SimulationError
-from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
+from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 RENEWAL = 0.1  # how far, as a share of its range, a state may have strayed from the plant within a block
@@ -24,11 +25,11 @@ RECENT = 0.25  # share of a block from which its data count in full; older ones 
 def simulate(args: argparse.Namespace) -> int:
     """Free run, or predictions `--horizon` seconds ahead, on one recording or several; figures, file and plot."""
     plant = load(args.plant)
-    runs: list[tuple[Table, Drive, np.ndarray, np.ndarray]] = []
-    model = (_all_uncertain(plant) if args.horizon else plant).compile(() if args.horizon else None)
+    runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
+    model = compile_plant(_all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
     for path in args.recordings:
         table = read_table(path)
-        drive = model.drive(table)
+        drive = model.excitation(table)
         try:
             if args.horizon:
                 x, y = ahead(model, drive, args.horizon)
@@ -74,7 +75,7 @@ def _all_uncertain(plant: Plant) -> Plant:
     return dataclasses.replace(plant, nodes=nodes)
 
 
-def ahead(model: Model, drive: Drive, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
+def ahead(model: Model, drive: Excitation, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`: each block starts from the states that
     the data before it tell (an extended Kalman filter that takes a block at a time), so that a sample is
     predicted from data up to `horizon_s` older. The model must have every state uncertain and no active parameter."""
@@ -130,7 +131,7 @@ def ahead(model: Model, drive: Drive, horizon_s: float) -> tuple[np.ndarray, np.
     return x, y
 
 
-def _write(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y: np.ndarray) -> None:
+def _write(name: Path, model: Model, table: Table, drive: Excitation, x: np.ndarray, y: np.ndarray) -> None:
     columns = {f"{o.column}_simulated": y[:, j] for j, o in enumerate(model.plant.outputs.values())}
     columns |= {
         o.column: drive.y[:, j]
@@ -141,7 +142,7 @@ def _write(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, 
     write_table(name, Table(name.stem, str(name), table.t, columns))
 
 
-def _plot(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y: np.ndarray) -> None:
+def _plot(name: Path, model: Model, table: Table, drive: Excitation, x: np.ndarray, y: np.ndarray) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -167,10 +168,10 @@ def _plot(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y
 def refit(args: argparse.Namespace) -> int:
     """Refit a plant's parameters; write the plant; report estimates and the fit before and after."""
     plant = load(args.plant)
-    model = plant.compile()
+    model = compile_plant(plant)
     if not any(p.range for p in plant.parameters.values()):
         raise InputError(f"{plant.file}: no parameter has a 'range', so there is nothing to refit")
-    drives = [model.drive(read_table(r)) for r in args.recordings]
+    drives = [model.excitation(read_table(r)) for r in args.recordings]
     held = [read_table(r) for r in args.held_out or []]
     try:
         found = fit(model, drives, tries=args.tries)
@@ -227,8 +228,8 @@ def _estimates(plant: Plant, rows: list[Estimate]) -> Grid:
 
 def _errors(plant: Plant, table: Table) -> dict[str, float]:
     """Free-run rms error per output; uncertain initial states fitted, parameters held."""
-    model = plant.compile(())
-    drive = model.drive(table)
+    model = compile_plant(plant, ())
+    drive = model.excitation(table)
     if not np.isfinite(drive.y).any():
         return {o: float("nan") for o in plant.outputs}
     if model.uncertain:
@@ -253,33 +254,6 @@ def show(args: argparse.Namespace) -> int:
         console.print(f"[bold]{plant.title}[/bold]  ({plant.file})")
         for part in table(plant):
             console.print(part)
-    return 0
-
-
-def linearise(args: argparse.Namespace) -> int:
-    """The compensator's model file from a thermal plant."""
-    from thermoctl.identify.modelfile import save_model
-    from thermoctl.plant import linearise as room
-
-    plant = load(args.plant)
-    model = room.linearise(plant, args.period, args.sensor_period, args.kind, density=args.heat_density)
-    poles = model.meta["time_constants_s"]
-    print(
-        f"{plant.title}: order {len(model.A_minus_I)}, time constants {poles[0]:.4g} to {poles[-1]:.4g} s, "
-        f"coil gain {model.gain[0, 0]:.4g}"
-    )
-    if args.gains:
-        sequence = room.gains(
-            room.thermal(plant), args.sensor_period, args.samples, density=args.heat_density
-        )[:, :, 0]
-        t = np.arange(args.samples) * args.sensor_period
-        columns = {n: sequence[:, i] for i, n in enumerate(plant.nodes)}
-        write_table(args.gains, Table(Path(args.gains).stem, args.gains, t, columns))
-        print(args.gains)
-    if args.out:
-        if args.replace:
-            Path(args.out).unlink(missing_ok=True)
-        print(save_model(args.out, model, args.rig, [args.plant]))
     return 0
 
 

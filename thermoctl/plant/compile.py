@@ -443,20 +443,8 @@ def _typed(library: ctypes.CDLL) -> ctypes.CDLL:
     return library
 
 
-def compile_plant(plant: Plant, active: tuple[str, ...] | None = None):
-    """The plant as machine code, ready to simulate. `active`: the parameters to give sensitivities for (default: all
-    that have a range). Raises InputError for an unknown name or a missing compiler."""
-    from thermoctl.plant.simulate import Model
-
-    if active is None:
-        active = tuple(p.name for p in plant.parameters.values() if p.range)
-    for q in active:
-        if q not in plant.parameters:
-            raise InputError(f"{plant.file}: '{q}' is not a parameter")
-    return Model(plant, _code(plant, tuple(active)))
-
-
-def _code(plant: Plant, active: tuple[str, ...]) -> Code:
+def machine_code(plant: Plant, active: tuple[str, ...]) -> Code:
+    """Return the plant's machine code with sensitivities to `active`; plants of one structure share it."""
     identity = hashlib.sha256(repr((active, _structure(plant))).encode()).hexdigest()
     with _LOCK:
         found = _LOADED.get(identity)
@@ -480,4 +468,4 @@ def _structure(plant: Plant) -> Mapping:
     }
 
 
-__all__ = ["Code", "argument", "cache_directory", "compile_plant"]
+__all__ = ["Code", "argument", "cache_directory", "machine_code"]

@@ -8,23 +8,15 @@ the dicts back and `save` writes them. Every error is one line with file, line, 
 
 from __future__ import annotations
 
-import copy
-import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import yaml
+from typing import Any
 
 from thermoctl import yamlfile
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
 from thermoctl.yamlfile import suggest
-
-if TYPE_CHECKING:
-    from thermoctl.plant.simulate import Model
 
 FORMAT = "thermoctl-plant/1"
 MAX_ITEMS = 2_000  # inputs, nodes, ... of one file
@@ -171,54 +163,9 @@ class Plant:
             },
         }
 
-    def extended(self, change: Callable[[dict[str, Any]], None], file: str | None = None) -> Plant:
-        """The plant after `change` edited a copy of its plain dicts; checked anew, units included."""
-        data = copy.deepcopy(self.plain())
-        change(data)
-        return from_plain(data, file or self.file)
-
-    def compile(self, active: tuple[str, ...] | None = None) -> Model:
-        """Machine code with sensitivities to `active` parameters (default: those with a range)."""
-        from thermoctl.plant.compile import compile_plant
-
-        return compile_plant(self, active)
-
 
 def _scalar(e: Expr) -> str | float:
     return e.value if e.op == "num" else str(e)
-
-
-def load(path: str | Path) -> Plant:
-    """Read and check a plant file. Raises InputError."""
-    return _plant(yamlfile.load(path))
-
-
-def loads(text: str, file: str = "<text>") -> Plant:
-    """The same from a string."""
-    return _plant(yamlfile.loads(text, file))
-
-
-def from_plain(data: Mapping[str, Any], file: str = "<plant>") -> Plant:
-    """The same from plain dicts (no line numbers)."""
-
-    def node(value: Any) -> yamlfile.Node:
-        if isinstance(value, Mapping):
-            value = {str(k): node(v) for k, v in value.items()}
-        elif isinstance(value, (list, tuple)):
-            value = [node(v) for v in value]
-        return yamlfile.Node(value, file, 0, 0)
-
-    return _plant(node(data))
-
-
-def save(plant: Plant, path: str | Path, note: str = "") -> None:
-    """Write the plant file, whole or not at all; `note` goes to its head as comment."""
-    path = Path(path)
-    text = "".join(f"# {line}\n" for line in note.splitlines())
-    text += yaml.safe_dump(plant.plain(), sort_keys=False, allow_unicode=True, width=120)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
 
 
 # ---------------------------------------------------------------------------------------------------------- reading
@@ -251,7 +198,8 @@ def _mapping(node: yamlfile.Node, what: str, keys: tuple[str, ...]) -> dict[str,
     return node.value
 
 
-def _plant(root: yamlfile.Node) -> Plant:
+def parse(root: yamlfile.Node) -> Plant:
+    """Build a plant from a YAML document; names are checked here, units in `units.check_units`. Raises InputError."""
     top = _mapping(root, "a plant file", _KEYS[""])
     if "format" not in top or top["format"].value != FORMAT:
         raise (top.get("format") or root).error(
@@ -354,9 +302,6 @@ def _plant(root: yamlfile.Node) -> Plant:
     plant = Plant(title, inputs, parameters, nodes, flows, outputs, root.file)
     _check_names(plant, items)
     _check_use(plant, places)
-    from thermoctl.plant.units import check_units  # it knows Plant, so it is read late
-
-    check_units(plant)
     return plant
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from thermoctl.plant.refit import Fit, Noise, Problem
-from thermoctl.plant.simulate import Drive
+from thermoctl.plant.simulate import Excitation
 
 CLIP = 6.0  # residuals beyond this many robust sigmas count as so many
 MOST = 0.995  # largest correlation of neighbours
@@ -37,7 +37,7 @@ def innovations(phi: float, white: float, total: float) -> Noise:
     return Noise(float(np.sqrt(phi * white / theta)), ar=(1.0, -phi), ma=(1.0, -float(theta)))
 
 
-def coloured(found: Fit, drives: Sequence[Drive]) -> list[Noise]:
+def coloured(found: Fit, drives: Sequence[Excitation]) -> list[Noise]:
     """Each output's noise as AR(1) beside its quantisation, from the residuals of a fit to `drives`; channels of fewer than
     20 samples keep theirs."""
     problem = Problem(found.model, drives, found.noise)

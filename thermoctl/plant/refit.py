@@ -26,7 +26,7 @@ from scipy.signal import lfilter
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Parameter, Plant
-from thermoctl.plant.simulate import Drive, Model, SimulationError
+from thermoctl.plant.simulate import Excitation, Model, SimulationError
 from thermoctl.yamlfile import InputError
 
 HUBER = 4.0  # residuals beyond this many sigmas count linearly
@@ -116,7 +116,7 @@ class Scale:
         return float(value * self.span if self.log else self.span)
 
 
-def default_noise(plant: Plant, drives: Sequence[Drive] = ()) -> tuple[Noise, ...]:
+def default_noise(plant: Plant, drives: Sequence[Excitation] = ()) -> tuple[Noise, ...]:
     """The plant's own figures; a channel without any gets its second differences' (white part)."""
     out = []
     for j, o in enumerate(plant.outputs.values()):
@@ -131,7 +131,7 @@ def default_noise(plant: Plant, drives: Sequence[Drive] = ()) -> tuple[Noise, ..
     return tuple(out)
 
 
-def _rows(d: Drive, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _rows(d: Excitation, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Output j's measured samples, their correlation with the one before, and what each innovation is uncertain by."""
     dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
     index = np.flatnonzero(np.isfinite(d.y[:, j]))
@@ -147,7 +147,11 @@ class Problem:
     """Residuals and Jacobian of a model on several recordings, in the metric of the noise."""
 
     def __init__(
-        self, model: Model, drives: Sequence[Drive], noise: Sequence[Noise], beliefs: Sequence[Belief] = ()
+        self,
+        model: Model,
+        drives: Sequence[Excitation],
+        noise: Sequence[Noise],
+        beliefs: Sequence[Belief] = (),
     ):
         self.model, self.drives, self.noise = model, list(drives), tuple(noise)
         self.beliefs = tuple(b for b in beliefs if b.recording in {d.name for d in drives})
@@ -421,7 +425,7 @@ def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 def fit(
     model: Model,
-    drives: Sequence[Drive],
+    drives: Sequence[Excitation],
     noise: Sequence[Noise] | None = None,
     start: Mapping[str, float] | np.ndarray | None = None,
     iterations: int = 40,
@@ -614,7 +618,7 @@ class Estimate:
     recording: str | None = None
 
 
-def report(found: Fit, drives: Sequence[Drive] | None = None) -> list[Estimate]:
+def report(found: Fit, drives: Sequence[Excitation] | None = None) -> list[Estimate]:
     """Value, standard error and condition of each parameter, from the Gauss-Newton matrix at the fit."""
     n = sum(1 for q, _ in found.unknowns if q in found.model.active)
     residual = found.cost / max(found.samples - len(found.z), 1)
@@ -636,7 +640,7 @@ def report(found: Fit, drives: Sequence[Drive] | None = None) -> list[Estimate]:
     return out
 
 
-def updated(plant: Plant, found: Fit, drives: Sequence[Drive]) -> Plant:
+def updated(plant: Plant, found: Fit, drives: Sequence[Excitation]) -> Plant:
     """The plant with the fitted values written in (per recording where it says so)."""
     parameters = dict(plant.parameters)
     for q in found.model.active:

@@ -6,17 +6,14 @@ import ctypes
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.compile import Code
+from thermoctl.plant.compile import Code, machine_code
 from thermoctl.plant.language import Plant
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError, suggest
-
-if TYPE_CHECKING:
-    from thermoctl.recording.table import Table
 
 RTOL = 1e-7  # local error a step, as a share of each state's range
 JUMP_WIDTH = 1e-5  # half width of a smoothed jump, as a share of the range of its argument
@@ -28,7 +25,7 @@ class SimulationError(Exception):
 
 
 @dataclass
-class Drive:
+class Excitation:
     """What one recording gives to a plant: `t` (N,) seconds from its first sample, `u` (N, inputs) with gaps filled
     (held, or on a straight line for linear inputs), `y` (N, outputs) measured, NaN where missing, `first` the first
     recorded values, and the scales that a simulation on it uses."""
@@ -42,7 +39,7 @@ class Drive:
     scale: np.ndarray | None = None  # (nx,) range of each state
     width: np.ndarray | None = None  # (jumps,) half width of each smoothed jump
 
-    def part(self, start: int, stop: int) -> Drive:
+    def part(self, start: int, stop: int) -> Excitation:
         """The samples start..stop-1 (scales kept); time goes on counting from the recording's start."""
         return dataclasses.replace(self, t=self.t[start:stop], u=self.u[start:stop], y=self.y[start:stop])
 
@@ -98,7 +95,7 @@ class Model:
 
     # ------------------------------------------------------------------------------------------------------- inputs
 
-    def drive(self, table: Table) -> Drive:
+    def excitation(self, table: Table) -> Excitation:
         """The recording as this plant reads it. Raises InputError where an input's column is missing or empty."""
         t = np.ascontiguousarray(table.t - table.t[0], float)
         u = np.empty((len(t), len(self.code.inputs)))
@@ -121,7 +118,7 @@ class Model:
                 known = y[np.isfinite(y[:, j]), j]
                 if len(known):
                     first.setdefault(o.name, float(known[0]))
-        return Drive(table.name, t, u, y, first, linear)
+        return Excitation(table.name, t, u, y, first, linear)
 
     def vector(
         self, parameters: Mapping[str, float] | np.ndarray | None, recording: str | None = None
@@ -143,7 +140,7 @@ class Model:
             out[self.parameters.index(key)] = value
         return out
 
-    def _delayed_inputs(self, drive: Drive, p: np.ndarray) -> np.ndarray:
+    def _delayed_inputs(self, drive: Excitation, p: np.ndarray) -> np.ndarray:
         """u with the derived columns of delayed inputs: the mean of the held signal over each interval, t - seconds; and
         the slope of that by the seconds."""
         if not self.code.input_delays:
@@ -178,7 +175,7 @@ class Model:
         return np.ascontiguousarray(u)
 
     def start(
-        self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None = None
+        self, drive: Excitation, p: np.ndarray, dx0: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Initial states (nx,) and their sensitivities (nx, nq). `dx0`: shifts of the uncertain initial states."""
         values = {
@@ -208,7 +205,9 @@ class Model:
 
     # --------------------------------------------------------------------------------------------------- simulating
 
-    def prepare(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None = None) -> Drive:
+    def prepare(
+        self, drive: Excitation, parameters: Mapping[str, float] | np.ndarray | None = None
+    ) -> Excitation:
         """Set the drive's scales (ranges of states, widths of smoothed jumps) from trial runs at these parameters."""
         p = self.vector(parameters, drive.name)
         jumps = self.code.jumps
@@ -241,7 +240,7 @@ class Model:
                         width[i] = max(share * reach, 1e-15)
         return drive
 
-    def _signals(self, drive: Drive, p: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
+    def _signals(self, drive: Excitation, p: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
         u = self._delayed_inputs(drive, p)
         return {
             **dict(zip(self.code.inputs, u.T, strict=True)),
@@ -252,7 +251,7 @@ class Model:
 
     def run(
         self,
-        drive: Drive,
+        drive: Excitation,
         parameters: Mapping[str, float] | np.ndarray | None = None,
         dx0: np.ndarray | None = None,
         sensitivities: bool = False,
@@ -273,12 +272,12 @@ class Model:
         rtol: float = RTOL,
     ) -> Simulation:
         """Free run on a recording's inputs. Raises InputError, SimulationError."""
-        return self.run(self.drive(table), parameters, None, sensitivities, rtol)
+        return self.run(self.excitation(table), parameters, None, sensitivities, rtol)
 
     def measure(self, table: Table, seed: int = 0) -> Table:
         """The plant in the rig's place: a recording of the inputs in `table` and what the sensors make of the outputs, with their
         noise and their steps. Uncertain starts are drawn. Raises InputError, SimulationError."""
-        rng, drive = np.random.default_rng(seed), self.drive(table)
+        rng, drive = np.random.default_rng(seed), self.excitation(table)
         dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(
             size=len(self.uncertain)
         )
@@ -291,7 +290,7 @@ class Model:
 
     def _run(
         self,
-        drive: Drive,
+        drive: Excitation,
         p: np.ndarray,
         dx0: np.ndarray | None,
         sensitivities: bool,
@@ -345,7 +344,7 @@ class Model:
 
     def respond(
         self,
-        drive: Drive,
+        drive: Excitation,
         parameters: Mapping[str, float] | np.ndarray | None,
         dx0: np.ndarray | None,
         forces: Sequence[tuple[int, int]],
@@ -395,7 +394,7 @@ class Model:
 
     def _observe(
         self,
-        drive: Drive,
+        drive: Excitation,
         u: np.ndarray,
         p: np.ndarray,
         width: np.ndarray,
@@ -478,6 +477,19 @@ class Model:
         return Stepper(self, period_s, np.asarray(u0, float), parameters, dict(first or {}), rtol)
 
 
+def compile_plant(plant: Plant, active: tuple[str, ...] | None = None) -> Model:
+    """Compile a plant to machine code, ready to simulate.
+
+    `active`: parameters to compute sensitivities for; by default all that have a range.
+    Raises InputError for an unknown name or a missing C compiler."""
+    if active is None:
+        active = tuple(p.name for p in plant.parameters.values() if p.range)
+    for q in active:
+        if q not in plant.parameters:
+            raise InputError(f"{plant.file}: '{q}' is not a parameter")
+    return Model(plant, machine_code(plant, tuple(active)))
+
+
 def _filled(t: np.ndarray, column: np.ndarray, linear: bool, what: str) -> np.ndarray:
     good = np.isfinite(column)
     if good.all():
@@ -512,7 +524,7 @@ class Stepper:
         m = self.model
         self._p = m.vector(self.parameters)
         named = dict(zip(m.inputs, u0, strict=True))
-        drive = Drive(
+        drive = Excitation(
             "start",
             np.zeros(1),
             np.atleast_2d(np.asarray(u0, float)).copy(),
@@ -543,4 +555,4 @@ class Stepper:
         return self._y
 
 
-__all__ = ["Drive", "Model", "Simulation", "SimulationError", "Stepper"]
+__all__ = ["Excitation", "Model", "Simulation", "SimulationError", "Stepper", "compile_plant"]

@@ -15,8 +15,8 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from thermoctl.recording import formats
+from thermoctl.recording.files import read_table, to_arrow, whole_file
 from thermoctl.recording.stream import END, open_stream
-from thermoctl.recording.table import read_table, to_arrow, whole_file
 from thermoctl.signals import NAMES
 from thermoctl.yamlfile import InputError, suggest
 
