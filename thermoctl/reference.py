@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from thermoctl.cli import parser
 from thermoctl.control.faults import FAULTS, Fault
 from thermoctl.diagnose.effects import catalogue
 from thermoctl.settings import SECTIONS, options
@@ -152,8 +153,6 @@ def _numbers(*values: object) -> bool:
 
 def cli() -> str:
     """Every command's help."""
-    from thermoctl.cli import parser  # the one place beside `main` that looks at the commands
-
     os.environ["COLUMNS"] = "110"
     top = parser()
     pages: list[str] = []

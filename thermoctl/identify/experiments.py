@@ -19,6 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.control import arming
+from thermoctl.control.faults import FAULTS
+from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError, Node, load, suggest
 
 FORMAT = "thermoctl-experiments/1"
@@ -295,10 +298,6 @@ def run(
 
     Resumes at `start_s` of the schedule. Each block is given out before the next is computed, so an abort loses nothing.
     Raises Aborted when the law leaves ARMED (the fault bits are named) or `stop()` turns true."""
-    from thermoctl.control import arming
-    from thermoctl.control.faults import FAULTS
-    from thermoctl.signals import INDEX
-
     period = simulation.period_s
     waiting = [c for c in schedule.commands() if c[0] >= start_s]
     before = [c for c in schedule.commands() if c[0] < start_s]

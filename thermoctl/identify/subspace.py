@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
-from thermoctl.identify import kernels
+from thermoctl.identify import kernels, modal
 from thermoctl.identify.statespace import StateSpace, _c, _ridge
 from thermoctl.yamlfile import InputError
 
@@ -110,7 +110,7 @@ def _add_lags(sums: np.ndarray, z: np.ndarray, starts: int) -> None:
         products = np.empty((_ROWS * w, wide * w))
         for s in range(0, wide, _ROWS):
             n = min(_ROWS, wide - s)
-            if s + blocks * _ROWS + (n < _ROWS) * 0 <= len(z) and n == _ROWS:
+            if s + blocks * _ROWS <= len(z) and n == _ROWS:
                 other = z[s : s + blocks * _ROWS].reshape(blocks, _ROWS * w)
             else:
                 other = np.lib.stride_tricks.sliding_window_view(z[s:].ravel(), n * w)[:: _ROWS * w][:blocks]
@@ -188,7 +188,6 @@ def project(c: Correlations, weighting: str = "cva") -> Subspace:
     L = _factor(c)
     nu, np_ = c.i * c.m, c.i * (2 * c.m + c.l)
     past = L[nu:np_, :np_]
-    future = L[np_:, :np_]
     lff = L[np_:, nu:np_]  # Yf on Wp, after Uf
     if weighting in ("paper", "n4sid"):
         lww = past[:, nu:]
@@ -206,7 +205,6 @@ def project(c: Correlations, weighting: str = "cva") -> Subspace:
                 lff @ lff.T + L[np_:, np_:] @ L[np_:, np_:].T, lower=True, check_finite=False
             )
             oblique = linalg.solve_triangular(scale, lff, lower=True, check_finite=False)
-    del future
     if c.qr is None:
         values, vectors = linalg.eigh(oblique @ oblique.T, check_finite=False, driver="evd")
         s, left = np.sqrt(np.maximum(values[::-1], 0)), vectors[:, ::-1]
@@ -291,7 +289,7 @@ def input_matrix(
         impulse = np.zeros(N)
         impulse[0] = 1
         s[m * n :] = kernels.modal_states(values, impulse)
-        s[m * n :, 1:], s[m * n :, 0] = s[m * n :, 1:] * 1.0, 1.0
+        s[m * n :, 0] = 1.0
         s[m * n :, 1:] *= values[:, None]
     cols = np.tile(np.arange(n), m + (not rest))
     small = np.empty((2 * len(s), N))
@@ -345,8 +343,6 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
 def real_poles(model: StateSpace, u: np.ndarray, y: np.ndarray, rest: bool = True) -> StateSpace:
     """The model with every pole moved to the nearest admissible place of a heat network (real, between 0 and 1) and its
     residues fitted again by least squares: the start of the refinement in `modal`."""
-    from thermoctl.identify import modal
-
     tau = np.sort(model.time_constants_s[np.abs(model.poles) > 1e-3])
     tau = np.clip(tau, model.period_s, 2.5 * len(u) * model.period_s)
     blocks = modal.reduce((u, y), model.period_s, model.period_s)

@@ -12,6 +12,8 @@ Margins: of the sampled loop L(e^jw) = D(z) G(z), G with a zero-order hold and t
 
 from __future__ import annotations
 
+import os
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -237,9 +239,6 @@ def write(config: Path, proposed: Gains) -> None:
     """Write kp, ti_s, td_s into the control section of a configuration, other lines untouched; on request only.
 
     Raises InputError when the section does not name all three on lines of their own."""
-    import os
-    import re
-
     text = config.read_text(encoding="utf-8")
     section = re.search(r"^control:.*\n((?:[ \t]+.*\n|\s*\n|#.*\n)*)", text, re.MULTILINE)
     if section is None:

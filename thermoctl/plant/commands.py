@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table as Grid
 
 from thermoctl.plant import Plant, load, save
+from thermoctl.plant import show as drawing
 from thermoctl.plant.noise import coloured
 from thermoctl.plant.refit import Estimate, fit, report, updated
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
@@ -243,16 +244,14 @@ def _errors(plant: Plant, table: Table) -> dict[str, float]:
 
 def show(args: argparse.Namespace) -> int:
     """The plant's table, and its picture when --out is given."""
-    from thermoctl.plant.show import draw, table
-
     plant = load(args.plant)
     if args.out:
-        draw(plant, args.out)
+        drawing.draw(plant, args.out)
         print(args.out)
     else:
         console = Console()
         console.print(f"[bold]{plant.title}[/bold]  ({plant.file})")
-        for part in table(plant):
+        for part in drawing.table(plant):
             console.print(part)
     return 0
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pyarrow as pa
@@ -154,9 +155,7 @@ def _export_table(
     if kind == ".mcap":
         formats.write_mcap(out, table)
     elif kind == ".mf4":
-        from tempfile import TemporaryDirectory  # asammdf insists on its own suffix
-
-        with TemporaryDirectory(dir=Path(out).parent) as folder:
+        with TemporaryDirectory(dir=Path(out).parent) as folder:  # asammdf insists on its own suffix
             formats.write_mdf(f"{folder}/export.mf4", table)
             Path(folder, "export.mf4").replace(out)
     elif kind == ".csv":
