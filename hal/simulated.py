@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 
 from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample
-from hal.profile import Section
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
-from thermoctl.yamlfile import InputError, Node, suggest
+from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 MAX_CATCH_UP = (
     1000  # periods in one read; a clock that jumps further (suspend) moves the plant's time instead

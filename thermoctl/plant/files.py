@@ -11,7 +11,8 @@ from typing import Any
 import yaml
 
 from thermoctl import yamlfile
-from thermoctl.plant.language import Plant, parse
+from thermoctl.plant.language import Plant
+from thermoctl.plant.parse import parse
 from thermoctl.plant.units import check_units
 
 
