@@ -13,6 +13,7 @@ import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from thermoctl.cli import parser
 from thermoctl.control.faults import FAULTS, Fault
@@ -46,7 +47,7 @@ def _range(low: float, high: float) -> str:
     return f"up to {high:g}" if math.isinf(low) else f"{low:g} to {high:g}"
 
 
-def _default(field: dataclasses.Field) -> str:
+def _default(field: dataclasses.Field[Any]) -> str:
     if field.default is not dataclasses.MISSING:
         value = field.default
     elif field.default_factory is not dataclasses.MISSING:

@@ -18,11 +18,12 @@ with the sum of all gains: b_air = sum(b1 + b2). A free air regressor is not exc
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy import linalg, optimize, signal
 
-from thermoctl.identify import kernels  # type: ignore[attr-defined]
+from thermoctl.identify import kernels
 from thermoctl.yamlfile import InputError
 
 
@@ -36,7 +37,7 @@ class Expansion:
     period_s: float
     b_air: float = 0.0
     offset_um: float = 0.0
-    info: dict = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
 
     def predict(self, rises: np.ndarray, air: np.ndarray | None = None, start_um: float = 0.0) -> np.ndarray:
         """Free run yL (N,) on rises (N, M) and air (N,) degC; `start_um` is yL(0) without the offset."""
@@ -48,23 +49,10 @@ class Expansion:
         drive[0] = start_um
         return signal.lfilter([1.0], [1.0, -self.f1], drive) + self.offset_um
 
-    @property
-    def time_constant_s(self) -> float:
-        """-T / ln f1, s."""
-        return -self.period_s / np.log(self.f1) if 0 < self.f1 < 1 else 0.0
-
 
 def regressors(rises: np.ndarray) -> np.ndarray:
     """Rows [T(n-1), T(n)] (N, 2M) of (3); the first row repeats T(0)."""
     return np.hstack([np.vstack([rises[:1], rises[:-1]]), rises])
-
-
-def block_ls(rises: np.ndarray, y: np.ndarray, period_s: float) -> Expansion:
-    """Equation-error block least squares: the measured y in the regressor."""
-    _check(rises, y)
-    phi = np.hstack([regressors(rises)[:-1], y[:-1, None]])
-    theta = linalg.lstsq(phi, y[1:], cond=1e-10)[0]
-    return _from_theta(theta, period_s, {"method": "block least squares (equation error)"})
 
 
 def recursive(
@@ -273,7 +261,7 @@ class Bank:
         return np.vstack([self.r[k], np.column_stack([np.diag(np.sqrt(ridge)), np.zeros(p)])])
 
 
-def _from_theta(theta: np.ndarray, period_s: float, info: dict) -> Expansion:
+def _from_theta(theta: np.ndarray, period_s: float, info: dict[str, Any]) -> Expansion:
     m = (len(theta) - 1) // 2
     return Expansion(float(theta[-1]), theta[:m], theta[m : 2 * m], period_s, 0.0, 0.0, info)
 

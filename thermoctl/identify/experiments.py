@@ -11,11 +11,11 @@ gives a recording. It runs under all protections: a fault ends it, nothing recor
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import cycle, product
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
@@ -237,7 +237,7 @@ def design_pulses(
     return list(found[::2]), list(found[1::2])
 
 
-def _pulse_power(widths: tuple, gaps: tuple, f: np.ndarray) -> np.ndarray:
+def _pulse_power(widths: Sequence[float], gaps: Sequence[float], f: np.ndarray) -> np.ndarray:
     """|Fourier transform|^2 of rectangular pulses of height 1 at frequencies f."""
     total, t = np.zeros(len(f), complex), 0.0
     for w, g in zip(widths, gaps, strict=True):
@@ -286,15 +286,36 @@ class Aborted(Exception):
         self.reason, self.done_s = reason, done_s
 
 
+class ScheduleTarget(Protocol):
+    """What a schedule runs on: `daemon.simulate.Simulation`, or a rig of the same methods."""
+
+    @property
+    def row(self) -> np.ndarray:
+        """The newest record row."""
+
+    @property
+    def period_s(self) -> float:
+        """Period of a tick, s."""
+
+    def arm(self) -> object:
+        """Arm the law."""
+
+    def command(self, name: str, value: float) -> object:
+        """Give the law a command."""
+
+    def tick(self, count: int) -> np.ndarray:
+        """Advance `count` ticks; return the newest record row."""
+
+
 def run(
-    simulation: Any,
+    simulation: ScheduleTarget,
     schedule: Schedule,
     every: int = 100,
     start_s: float = 0.0,
     progress: Callable[[Progress], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[np.ndarray]:
-    """Run a schedule on a `daemon.simulate.Simulation` (armed here); yields blocks of record rows, every `every`-th tick.
+    """Run a schedule on a rig, which is armed first; yield blocks of record rows, every `every`-th tick.
 
     Resumes at `start_s` of the schedule. Each block is given out before the next is computed, so an abort loses nothing.
     Raises Aborted when the law leaves ARMED (the fault bits are named) or `stop()` turns true."""

@@ -19,10 +19,8 @@ All models are stable by construction.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import product
-from typing import Any
 
 import numpy as np
 from scipy import linalg, signal
@@ -66,15 +64,13 @@ def reduce(
     basis = gram_polynomials(q)
     if isinstance(chunks, tuple):
         chunks = [chunks]
-    u: Any = None
-    y: Any = None
-    count: Any = None
+    u = y = count = np.zeros(0)
     start = 0
     for cu, cy in chunks:
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T
         for k in range(0, len(cu), 100_000):  # small pieces: bounded memory whatever the caller's chunks are
             z = np.ascontiguousarray(np.hstack([cu[k : k + 100_000], cy[k : k + 100_000]]), dtype=float)
-            if u is None:
+            if not u.size:
                 u, y = np.zeros((64, cu.shape[1], len(basis))), np.zeros((64, cy.shape[1]))
                 count = np.zeros_like(y)
             m = cu.shape[1]
@@ -90,7 +86,7 @@ def reduce(
             kernels.block_moments(z, m, basis, u, y, count, start)
             start += len(z)
     blocks = start // q
-    if u is None or blocks < 20:
+    if blocks < 20:
         raise InputError(
             f"{start} samples of {period_s:g} s are {blocks} blocks of {q * period_s:g} s; at least 20 are needed"
         )
@@ -191,7 +187,7 @@ def _fit(
     Y = _whitened(Y, blocks, drift_s) * weight[:, None]
     lo, hi = np.log(bounds[0]), np.log(bounds[1])
 
-    def evaluate(x: np.ndarray) -> tuple:
+    def evaluate(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         F, D, owner = _responses(blocks, np.exp(x), rest)
         F, D = (_whitened(v, blocks, drift_s) * weight[:, None] for v in (F, D))
         Q, theta, r = _project(F, Y, ridge)
@@ -296,51 +292,3 @@ def identify(
         "block_s": block_s,
     }
     return modal(p, residues, free, blocks.period_s, info)
-
-
-def identify_validated(
-    u: np.ndarray,
-    y: np.ndarray,
-    period_s: float,
-    orders: Sequence[int] = (1, 2, 3, 4),
-    folds: Sequence[float] = (0.4, 0.6, 0.8),
-    ahead: float = 0.2,
-    block_s: float | None = None,
-    others: Sequence[tuple[np.ndarray, np.ndarray]] = (),
-) -> StateSpace:
-    """Model from one record u (N, m), y (N, l); order, kind of start (from equilibrium or not) and ridge by cross-validation.
-
-    From the first 40, 60 and 80 % of the record every candidate is identified and run free over the next 20 %: the one with the least
-    squared error of all is identified again from everything. `info` then has `validation`, {(order, rest, ridge): rms}. Nothing is centred:
-    a passive network at rest at 0 needs no offset, and a record's own mean is no equilibrium. `others`: whole recordings (u, y) of the same
-    rig, identified from together with this one wherever it is; all must then begin at rest. Raises InputError when no candidate can be
-    identified from the first part."""
-    n, block_s = len(u), block_s or period_s
-    known = [reduce(o, period_s, block_s) for o in others]
-    longest = max([n, *(len(o[0]) for o in others)]) * period_s
-
-    def fit(stop: int, order: int, rest: bool, ridge: float) -> StateSpace:
-        records = [*known, reduce((u[:stop], y[:stop]), period_s, block_s)]
-        return identify(records, order, rest, tau_range_s=(2 * block_s, longest), ridge=ridge)
-
-    errors: dict[tuple[int, bool, float], float] = {}
-    for choice in product(orders, (True,) if others else (True, False), (1e-7, 1e-2)):
-        total = 0.0
-        for part in folds:
-            start, stop = int(part * n), int((part + ahead) * n)
-            try:
-                m = fit(start, *choice)
-            except InputError:
-                total = np.inf
-                break
-            x0 = m.x0 if choice[1] else m.initial_state(u[:start], y[:start])
-            total += float(np.nanmean((m.simulate(u[:stop], x0)[start:] - y[start:stop]) ** 2))
-        if np.isfinite(total):
-            errors[choice] = float(np.sqrt(total / len(folds)))
-    if not errors:
-        raise InputError(f"{n} samples are too few to choose an order by cross-validation; give the order")
-    best = min(errors, key=errors.__getitem__)
-    model = fit(n, *best)
-    return replace(
-        model, info={**model.info, "order": best[0], "rest": best[1], "ridge": best[2], "validation": errors}
-    )

@@ -67,7 +67,7 @@ def save_model(
     model: CompensatorModel,
     rig: str,
     recordings: Sequence[str | Path] = (),
-    figures: dict | None = None,
+    figures: dict[str, Any] | None = None,
 ) -> Path:
     """Write a calibration; the file appears whole or not at all. Raises InputError when it exists (a calibration is never
     overwritten) or the place cannot be written."""
@@ -138,7 +138,7 @@ def install(
     model: CompensatorModel,
     rig: str,
     recordings: Sequence[str | Path] = (),
-    figures: dict | None = None,
+    figures: dict[str, Any] | None = None,
 ) -> Path:
     """Save a calibration as the folder's newest and make it current; the one before stays for a roll back."""
     folder = Path(folder)
@@ -212,7 +212,7 @@ def _plain(v: Any) -> Any:
     return v
 
 
-def _checksum(content: dict) -> str:
+def _checksum(content: dict[str, Any]) -> str:
     return hashlib.sha256(repr(_canonical(content)).encode()).hexdigest()
 
 

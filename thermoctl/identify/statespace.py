@@ -8,6 +8,7 @@ resampling: [[A, B], [0, I]] at one period is the exponential of [[F, G], [0, 0]
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -27,7 +28,7 @@ class StateSpace:
     c: np.ndarray
     period_s: float
     x0: np.ndarray
-    info: dict = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
 
     @property
     def order(self) -> int:
@@ -54,7 +55,7 @@ class StateSpace:
     def simulate(self, u: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
         """Free run: outputs (N, l) for inputs u (N, m), from x0 (default: rest)."""
         x0 = np.zeros(self.order) if x0 is None else x0
-        return kernels.simulate(*(_c(v) for v in (self.a, self.b, self.c)), _c(x0), _c(np.atleast_2d(u.T).T))
+        return kernels.simulate(_c(self.a), _c(self.b), _c(self.c), _c(x0), _c(np.atleast_2d(u.T).T))
 
     def initial_state(self, u: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Least-squares x0 (n,) so that a free run over u (N, m) meets y (N, l); NaN in y is left out."""
@@ -114,7 +115,7 @@ class StateSpace:
 
 
 def modal(
-    poles: np.ndarray, residues: np.ndarray, free: np.ndarray, period_s: float, info: dict
+    poles: np.ndarray, residues: np.ndarray, free: np.ndarray, period_s: float, info: dict[str, Any]
 ) -> StateSpace:
     """Smallest state space with real `poles` (K,), residues (K, l, m) (y = sum R_k s_k, s(n+1) = p s + u) and free decay
     amplitudes (K, l) of the initial state. A pole whose residue has rank r gets r states."""
@@ -131,12 +132,6 @@ def modal(
             b.append(right[k, : r.shape[1]])
             x0.append(right[k, -1] if np.any(w) else 0.0)
     return StateSpace(np.diag(a), np.array(b), np.array(c).T, period_s, np.array(x0), info)
-
-
-def fit_percent(y: np.ndarray, model: np.ndarray) -> np.ndarray:
-    """NRMSE fit of each column: 100 (1 - |y - model| / |y - mean|); NaN samples left out."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return 100 * (1 - np.sqrt(np.nansum((y - model) ** 2, 0) / np.nansum((y - np.nanmean(y, 0)) ** 2, 0)))
 
 
 def _c(v: np.ndarray) -> np.ndarray:

@@ -23,13 +23,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import linalg
 
 from thermoctl.identify import kernels, modal
 from thermoctl.identify.statespace import StateSpace, _c, _ridge
+from thermoctl.identify.statespace import modal as modal_form
 from thermoctl.yamlfile import InputError
 
 WEIGHTINGS = ("paper", "n4sid", "moesp", "cva")
@@ -60,10 +60,9 @@ def correlate(
     if isinstance(chunks, tuple):
         chunks = [chunks]
     lags = 2 * i
-    sums: Any = None
-    triangle: Any = None
-    head: Any = None
-    tail = np.empty((0, 0))
+    sums: np.ndarray | None = None
+    triangle: np.ndarray | None = None
+    head = tail = np.empty((0, 0))
     total = m = w = 0
     for cu, cy in chunks:
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T
@@ -95,7 +94,7 @@ def correlate(
     if sums is None or total < 2 * lags:
         raise InputError(f"{total} samples; subspace identification with i = {i} needs at least {2 * lags}")
     columns = total - lags + 1
-    if qr:
+    if triangle is not None:
         return Correlations(triangle.T @ triangle, i, m, w - m, columns, period_s, triangle)
     return Correlations(_gram(sums, head, tail, columns), i, m, w - m, columns, period_s)
 
@@ -351,7 +350,7 @@ def real_poles(model: StateSpace, u: np.ndarray, y: np.ndarray, rest: bool = Tru
     p = np.exp(-model.period_s / fit.tau)
     theta = fit.theta.reshape(len(tau), m + (not rest), -1)
     free = np.zeros((len(tau), theta.shape[2])) if rest else theta[:, m]
-    return modal.modal(
+    return modal_form(
         p,
         np.moveaxis(theta[:, :m], 1, 2) * (1 - p)[:, None, None],
         free,

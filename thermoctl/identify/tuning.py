@@ -57,7 +57,7 @@ class Gains:
     ti_s: float
     td_s: float
     how: str
-    figures: dict = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
 
 
 def fit_step(t_s: np.ndarray, y_um: np.ndarray, drive: float, at_s: float = 0.0) -> SecondOrder:

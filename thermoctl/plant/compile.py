@@ -20,7 +20,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -75,7 +75,7 @@ class Code:
         self.input_delays: dict[str, tuple[Expr, Expr]] = {}
         self.output_delays: dict[str, tuple[Expr, Expr]] = {}
 
-        def named(table: dict[str, tuple[Expr, Expr]], prefix: str):
+        def named(table: dict[str, tuple[Expr, Expr]], prefix: str) -> Callable[[Expr], Expr | None]:
             def change(e: Expr) -> Expr | None:
                 if e.op != "delay":
                     return None
@@ -457,7 +457,7 @@ def machine_code(plant: Plant, active: tuple[str, ...]) -> Code:
     return found
 
 
-def _structure(plant: Plant) -> Mapping:
+def _structure(plant: Plant) -> Mapping[str, object]:
     """What the code depends on: everything but values, ranges, units and noise."""
     return {
         "i": list(plant.inputs),

@@ -63,7 +63,7 @@ class Expr:
         return _text(self, 0)
 
 
-_INTERNED: dict[tuple, Expr] = {}
+_INTERNED: dict[tuple[str, tuple[int, ...], Any], Expr] = {}
 
 
 def make(op: str, *args: Expr, value: Any = None) -> Expr:
@@ -387,7 +387,7 @@ def _text(e: Expr, outer: int) -> str:
         text = text[:-2] if text.endswith(".0") else text
         return f"({text})" if e.value < 0 and outer > 2 else text
     if e.op == "name":
-        return e.value
+        return str(e.value)
     if e.op == "first":
         return f"first({e.value})"
     if e.op == "table":
@@ -512,7 +512,7 @@ def evaluate(
     return done[id(expr)]
 
 
-_NUMPY: dict[str, Callable] = {
+_NUMPY: dict[str, Callable[..., Any]] = {
     "+": np.add,
     "*": np.multiply,
     "/": np.divide,

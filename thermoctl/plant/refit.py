@@ -201,7 +201,7 @@ class Problem:
                 out.append(0.0)
         return np.array(out)
 
-    def heard(self, j: int, n: Noise) -> Problem:
+    def with_noise(self, j: int, n: Noise) -> Problem:
         """The same with another noise of output j."""
         other = copy.copy(self)
         other.noise = (*self.noise[:j], n, *self.noise[j + 1 :])

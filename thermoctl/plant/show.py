@@ -7,15 +7,20 @@ The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the d
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.table import Table
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.yamlfile import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
 
 def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, int, str, str]]]:
@@ -60,9 +65,11 @@ def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, in
     return vertices, edges
 
 
-def _outline(text: Any) -> np.ndarray:
+def _outline(text: Text) -> np.ndarray:
     """[[left, bottom], [right, top]] of a drawn text's box, in pixels."""
-    return text.get_bbox_patch().get_window_extent().get_points()
+    patch = text.get_bbox_patch()
+    assert patch is not None  # every text here is drawn with a box
+    return patch.get_window_extent().get_points()
 
 
 def _edge(box: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
@@ -116,7 +123,7 @@ def draw(plant: Plant, path: str | Path) -> None:
         raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
 
 
-def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Any:
+def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Figure:
     """The network as a matplotlib Figure of at most `widest` inches; nodes, flows and outputs named in `marked` stand out. Where it
     would be wider it is drawn closer, without the words on its lines."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -246,11 +253,10 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) ->
     return figure
 
 
-def table(plant: Plant) -> list:
+def table(plant: Plant) -> list[Table]:
     """The plant as rich tables: inputs, parameters, nodes, flows, outputs."""
-    from rich.table import Table
 
-    def make(title: str, heads: tuple[str, ...], rows: list[tuple]) -> Table:
+    def make(title: str, heads: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> Table:
         made = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
         for head in heads:
             right = head in ("low", "high", "noise", "step") or (head == "value" and title == "Parameters")

@@ -162,7 +162,7 @@ class Model:
                 at = drive.t - td
 
                 def integral(
-                    z: np.ndarray, area=area, s=s
+                    z: np.ndarray, area: np.ndarray = area, s: np.ndarray = s
                 ) -> np.ndarray:  # before the start the first value held
                     return np.where(z < drive.t[0], (z - drive.t[0]) * s[0], np.interp(z, drive.t, area))
 

@@ -8,9 +8,10 @@ multiplied by them fits anywhere too. Exponents are pure numbers.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from functools import cache
+from typing import Any
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
@@ -365,10 +366,10 @@ def _symbol(symbol: str) -> Dimension:
 
 
 @cache
-def _pint() -> tuple[Callable, tuple[type[Exception], ...]]:
+def _pint() -> tuple[Callable[[str], Mapping[str, Any]], tuple[type[Exception], ...]]:
     import pint
 
-    registry: pint.UnitRegistry = pint.UnitRegistry()
+    registry: pint.UnitRegistry[float] = pint.UnitRegistry()
     return registry.get_dimensionality, (
         pint.errors.UndefinedUnitError,
         pint.errors.DefinitionSyntaxError,

@@ -83,12 +83,3 @@ def open_stream(path: str | Path, columns: Iterable[str] | None = None) -> Strea
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
     return Stream(path, reader.schema, source, reader, fields, good_bytes=source.tell())
-
-
-def read_batches(
-    path: str | Path, columns: Iterable[str] | None = None
-) -> tuple[pa.Schema, list[pa.RecordBatch], bool]:
-    """(schema, every whole batch, whether the end mark was there). Raises InputError as open_stream does."""
-    stream = open_stream(path, columns)
-    batches = list(stream)
-    return stream.schema, batches, stream.whole

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -149,17 +149,41 @@ class Tier:
         )
 
 
+class Limits(Protocol):
+    """The settings that a writer reads: settings.RecordingSettings, or the same fields in a test."""
+
+    @property
+    def directory(self) -> str | Path:
+        """Folder of the recordings."""
+
+    @property
+    def file_mb(self) -> float:
+        """Size of a file after which the next begins, MB."""
+
+    @property
+    def file_s(self) -> float:
+        """Age of a file after which the next begins, s."""
+
+    @property
+    def budget_gb(self) -> float:
+        """Disk budget of the full rate, GB."""
+
+    @property
+    def tier_budget_gb(self) -> float:
+        """Disk budget of the 10 Hz tier, GB."""
+
+
 class RecordingWriter:
     """One recording: a full-rate file and its tier. When it is `full`, close it and open the next.
 
-    settings: directory, file_mb, file_s, budget_gb, tier_budget_gb (settings.RecordingSettings); metadata: what the
+    settings: folder, sizes and budgets; metadata: what the
     files say about themselves (configuration, model, law); log(text): told when the disk refuses, once, and when it is
     well again. `error` is what it refused last, '' when all is well.
     """
 
     def __init__(
         self,
-        settings: Any,
+        settings: Limits,
         metadata: Mapping[str, str],
         rig: str = "rig",
         log: Callable[[str], None] = print,

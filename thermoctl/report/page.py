@@ -7,7 +7,10 @@ import io
 import math
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _STYLE = """
 :root{color-scheme:light dark;--fg:#1b1f24;--bg:#fff;--soft:#5b6570;--line:#d5dae0;--mark:#0b6bcb;--tint:#f3f6f9;--bad:#b3261e;--good:#1a7f37}
@@ -44,15 +47,15 @@ def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str
     )
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = "") -> str:
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
     """An HTML table; numbers with four significant digits and to the right, words to the left, None as a dash."""
     rows = [list(row) for row in rows]
     words = [
-        any(isinstance(row[k], str) and not _NUMERIC.match(row[k]) for row in rows if k < len(row))
+        any(isinstance(v, str) and not _NUMERIC.match(v) for row in rows for v in row[k : k + 1])
         for k in range(len(head))
     ]
 
-    def line(cells: Sequence[Any], tag: str) -> str:
+    def line(cells: Sequence[object], tag: str) -> str:
         return (
             "<tr>"
             + "".join(
@@ -70,7 +73,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = "")
     )
 
 
-def cell(v: Any) -> str:
+def cell(v: object) -> str:
     """A number or a word as HTML: 4 significant digits, thousands apart, powers of ten as such."""
     if v is None or (isinstance(v, float) and math.isnan(v)):
         return "–"
@@ -92,7 +95,7 @@ def unit(name: str | None) -> str:
     return "" if text == "1" else text.replace("(unit_of_y)", "reading").replace("unit_of_y", "reading")
 
 
-def figure(fig: Any, caption: str = "") -> str:
+def figure(fig: Figure, caption: str = "") -> str:
     """A matplotlib figure as inline SVG with its caption; the figure is closed."""
     import matplotlib.pyplot as plt
 
