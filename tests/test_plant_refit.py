@@ -10,7 +10,7 @@ from thermoctl.diagnose.explain import occam
 from thermoctl.plant import expression as ex
 from thermoctl.plant import extended, loads
 from thermoctl.plant.noise import coloured, innovations
-from thermoctl.plant.refit import Belief, Problem, fit, report
+from thermoctl.plant.refit import Prior, Problem, fit, report
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
@@ -206,10 +206,8 @@ outputs: {y: {value: "A * u + B", unit: K, noise: 0.3}}
     y = 1.4 * u + 1.1 + rng.normal(0, 0.3, 12)
     model = compile_plant(line)
     drive = model.excitation(Table("a", "a", np.arange(12.0), {"u": u, "y": y}))
-    belief = Belief("a", ex.parse("((A - 1) / 0.2)**2 + ((B - A) / 0.5)**2"))
-    found = fit(
-        model, [drive], beliefs=[belief, Belief("another recording", ex.parse("A**2"))], tolerance=1e-9
-    )
+    belief = Prior("a", ex.parse("((A - 1) / 0.2)**2 + ((B - A) / 0.5)**2"))
+    found = fit(model, [drive], priors=[belief, Prior("another recording", ex.parse("A**2"))], tolerance=1e-9)
     m, X = np.array([1.0, 1.0]), np.column_stack([u, np.ones(12)])
     V = np.array([[0.04, 0.04], [0.04, 0.04 + 0.25]])
     P = np.linalg.inv(V) + X.T @ X / 0.09

@@ -20,7 +20,7 @@ from thermoctl.diagnose.screen import Direction
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import (
-    BELIEF_WEIGHT,
+    PRIOR_WEIGHT,
     Fit,
     Noise,
     Problem,
@@ -136,7 +136,7 @@ class Case:
             tries=tries,
             seconds=self.patience,
             goal=goal,
-            beliefs=[b for c in effects for b in c.beliefs(plant)],
+            priors=[b for c in effects for b in c.beliefs(plant)],
         )
         return self.scored(updated(plant, found, drives), effects, own, found)
 
@@ -149,12 +149,7 @@ class Case:
         drives = [model.excitation(t) for t in self.tables]
         try:
             found = fit(
-                model,
-                drives,
-                noise_of(e.colours),
-                iterations=15,
-                seconds=self.patience,
-                beliefs=e.fit.beliefs,
+                model, drives, noise_of(e.colours), iterations=15, seconds=self.patience, priors=e.fit.priors
             )
         except (SimulationError, np.linalg.LinAlgError):
             return e
@@ -231,7 +226,7 @@ def noise_of(colours: Sequence[Colour]) -> tuple[Noise, ...]:
 def standard_errors(e: Explanation, drives: Sequence[Excitation]) -> dict[str, float]:
     """Of each parameter of the effects: the Gauss-Newton one, or half the width over which the likelihood falls by two (-2 log by
     3.84) over 1.96 where that is wider: an onset, a threshold, the depth of a dead zone have no slope to go by."""
-    problem = Problem(e.fit.model, drives, e.fit.noise, e.fit.beliefs)
+    problem = Problem(e.fit.model, drives, e.fit.noise, e.fit.priors)
     problem.set_outlier_limits(e.fit.residuals)
     z = e.fit.z
     least, _, _, _ = problem.evaluate(z, False)
@@ -271,17 +266,17 @@ def standard_errors(e: Explanation, drives: Sequence[Excitation]) -> dict[str, f
 def occam(found: Fit, added: Set[str]) -> float:
     """The price of added parameters: Schwarz's log n each; of those that physics has a belief of Laplace's, log det of what is
     known of them by data and belief over what was believed."""
-    believed = {n for b in found.beliefs for n in ex.names(b.surprise)}
+    believed = {n for b in found.priors for n in ex.names(b.neg2_log)}
     price = float(
         sum(q in added and q not in believed for q, _ in found.unknowns) * np.log(max(found.samples, 2))
     )
     told = np.array([q in believed for q, _ in found.unknowns])
     if told.any():
-        floor = BELIEF_WEIGHT**2 * np.eye(int(told.sum()))
+        floor = PRIOR_WEIGHT**2 * np.eye(int(told.sum()))
         price += float(
             np.linalg.slogdet(found.hessian)[1]
             - np.linalg.slogdet(found.hessian[np.ix_(~told, ~told)])[1]
-            - np.linalg.slogdet(found.believed[np.ix_(told, told)] + floor)[1]
+            - np.linalg.slogdet(found.prior_hessian[np.ix_(told, told)] + floor)[1]
         )
     return price
 

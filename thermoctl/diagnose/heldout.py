@@ -11,7 +11,7 @@ from scipy.fft import dct
 
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Belief, fit, updated
+from thermoctl.plant.refit import Prior, fit, updated
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
@@ -42,7 +42,7 @@ def folds(case: Case, blocks: bool = False) -> list[tuple[list[Table], list[Tabl
 
 
 def unseen_errors(
-    case: Case, plant: Plant, refit: bool = True, blocks: bool = False, beliefs: Sequence[Belief] = ()
+    case: Case, plant: Plant, refit: bool = True, blocks: bool = False, beliefs: Sequence[Prior] = ()
 ) -> list[np.ndarray]:
     """Free-run errors (N, outputs) on each fold's test data, the plant fitted to that fold's training data only."""
     out: list[np.ndarray] = []
@@ -60,7 +60,7 @@ def unseen_errors(
                     iterations=15,
                     tolerance=1e-3,
                     seconds=case.patience,
-                    beliefs=beliefs,
+                    priors=beliefs,
                 )
                 model = Model(updated(plant, found, training), model.code)
                 if train[0].path == test[0].path:  # recordings, split: their starts took part
@@ -95,7 +95,7 @@ def errors_of(case: Case, e: Explanation, blocks: bool) -> list[np.ndarray]:
     """`unseen_errors` of an explanation, kept by the case: search, proof and report ask for the same ones."""
     key = (id(e.plant), blocks)
     if key not in case.unseen:
-        case.unseen[key] = (e.plant, unseen_errors(case, e.plant, blocks=blocks, beliefs=e.fit.beliefs))
+        case.unseen[key] = (e.plant, unseen_errors(case, e.plant, blocks=blocks, beliefs=e.fit.priors))
     return case.unseen[key][1]
 
 
