@@ -76,10 +76,10 @@ bench: install
 
 .PHONY: prove-refit refit-recordings
 prove-refit: install               # do 95 % intervals hold the truth? 100 truths a kind of rig and noise
-	nice -n 15 $(BIN)/python tests/prove_refit.py
+	nice -n 15 $(BIN)/python tests/plant/prove_refit.py
 
 refit-recordings: install          # every fit quoted for the naive plants of the real recordings, and ours
-	$(BIN)/python -m pytest -m slow -s tests/test_refit_recordings.py
+	$(BIN)/python -m pytest -m slow -s tests/plant/test_refit_recordings.py
 
 .PHONY: test-resolve
 test-resolve: install              # two explanations that look alike, decided by the experiment that was proposed
@@ -114,7 +114,7 @@ bench-diagnosis: install
 # Six and more effects concealed in rigs of the judge's own making: diagnosed, modelled, compensated; one page.
 .PHONY: demo-concealed
 demo-concealed: install
-	$(BIN)/python tests/demo_concealed.py
+	$(BIN)/python -m tests.concealed.demo
 
 .PHONY: hazards
 hazards: install                   # every hazard with its limit; the table of what was measured goes to docs/proof/hazards.md
@@ -126,7 +126,7 @@ walkthrough:                       # a new user's walk: a clean clone, every com
 
 .PHONY: test-scale
 test-scale: install                # a Dask scheduler and workers started by hand, one killed; diagnose over a folder of rigs
-	$(BIN)/python -m pytest -m slow tests/test_prove.py
+	$(BIN)/python -m pytest -m slow tests/diagnose/test_prove.py
 
 .PHONY: mutants
 mutants: install                   # protection and arming: every branch reached, every mutant of the source broken or explained

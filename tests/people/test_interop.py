@@ -13,7 +13,7 @@ from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples/heater"
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs/examples/heater"
 
 
 def write(path, t, columns):

@@ -20,7 +20,7 @@ from thermoctl.plant.refit import fit, updated
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table
 
-FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[2] / "shared/recordings"))
+FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[3] / "shared/recordings"))
 
 # recording, runs of the fit, run that is judged, what of it (share of the fit), {output: quoted}, who quotes it
 QUOTED = [

@@ -1,6 +1,6 @@
 """Parameter recovery: do 95 % intervals of a refit hold the truth in 90 to 98 % of random truths, by kind of rig and noise?
 
-    python tests/prove_refit.py [--truths 100] [--kind WORD]          (make prove-refit)
+    python tests/plant/prove_refit.py [--truths 100] [--kind WORD]          (make prove-refit)
 
 Each truth: every free parameter drawn inside its range, the recording simulated, noise and the sensor's steps added, and
 the plant with its own (wrong) beliefs refitted. Counted are parameters that the report calls 'ok'. White noise: the plant's
@@ -56,7 +56,7 @@ outputs: {level: {value: lower, unit: V, noise: 0.03}}""",
 }
 
 
-ACTUATOR = Path(__file__).parents[1] / "config/plants/actuator_thermal.yaml"
+ACTUATOR = Path(__file__).parents[2] / "config/plants/actuator_thermal.yaml"
 PHI = 0.8  # of the coloured noise
 
 

@@ -13,7 +13,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 
-PLANTS = Path(__file__).parents[1] / "config" / "plants"
+PLANTS = Path(__file__).parents[2] / "config" / "plants"
 ELECTRIC = ("u_integral", "i_coil", "velocity", "position")
 
 
