@@ -1,7 +1,9 @@
-"""The reference pages in docs/, written from the tables in the code: `python -m thermoctl.reference [--check]`.
+"""The reference pages in docs/, written from the tables in the code.
 
-docs/reference/{configuration,signals,faults,effects,cli}.md and docs/faults/NAME.md. With --check nothing is written;
-exit status 1 says which page is stale.
+`python -m thermoctl.reference [--check]`.
+
+docs/reference/{configuration,signals,faults,effects,cli}.md and docs/faults/NAME.md. With --check nothing is
+written; exit status 1 says which page is stale.
 """
 
 from __future__ import annotations
@@ -101,7 +103,7 @@ def signals() -> str:
 
 
 def faults() -> str:
-    """The table of faults."""
+    """Return the table of faults."""
     return (
         _HEAD
         + "# Faults\n\n"
@@ -115,7 +117,7 @@ def faults() -> str:
 
 
 def fault(f: Fault) -> str:
-    """The page of one fault."""
+    """Return the page of one fault."""
     return (
         f"{_HEAD}# {f.name}\n\n{f.meaning[0].upper()}{f.meaning[1:]}.\n\nThis is {_SEVERITY[f.severity]} Bit {f.bit} "
         f"of `fault_bits` (value {1 << f.bit}).\n\n## What to do\n\n{f.remedy[0].upper()}{f.remedy[1:]}.\n\nThen "
@@ -126,7 +128,7 @@ def fault(f: Fault) -> str:
 
 
 def effects() -> str:
-    """The catalogue of left-out physics."""
+    """Return the catalogue of left-out physics."""
     entries = catalogue().values()
     text = (
         _HEAD + "# Catalogue of left-out physics\n\nWhat `thermoctl diagnose` can name; one file each in "
@@ -179,7 +181,7 @@ def pages() -> dict[Path, str]:
 
 
 def stale(docs: Path = DOCS) -> list[str]:
-    """The pages that differ from what the code says, and pages of faults that there are no more."""
+    """Return the pages that differ from what the code says, and pages of faults that there are no more."""
     wanted = pages()
     wrong = [
         str(p) for p, text in wanted.items() if not (docs / p).is_file() or (docs / p).read_text() != text

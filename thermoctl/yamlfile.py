@@ -1,7 +1,7 @@
 """YAML with places: every value knows its file, line and column, and a duplicate key is an error.
 
-`load` gives a `Node`; a `Section` reads a mapping key by key and refuses the keys that nobody asked for. Only PyYAML's
-safe constructors are used.
+`load` gives a `Node`; a `Section` reads a mapping key by key and refuses the keys that nobody asked for. Only
+PyYAML's safe constructors are used.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class InputError(Exception):
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 1e-9 as a number (YAML 1.2) and takes no dates, no yes/no and no octal numbers."""
+    """SafeLoader that reads 1e-9 as a number (YAML 1.2); no dates, no yes/no, no octal numbers."""
 
 
 _Loader.yaml_implicit_resolvers = {}
@@ -44,8 +44,10 @@ for _tag, _regex, _first in (
 
 @dataclass(frozen=True)
 class Node:
-    """A YAML value with its place. `value` is a dict of str to Node, a list of Node, or a scalar
-    (str, int, float, bool, None); `line` and `column` count from 1."""
+    """A YAML value with its place.
+
+    `value` is a dict of str to Node, a list of Node, or a scalar (str, int, float, bool, None); `line` and
+    `column` count from 1."""
 
     value: Any
     file: str
@@ -58,7 +60,7 @@ class Node:
         return f"{self.file}:{self.line}:{self.column}"
 
     def plain(self) -> Any:
-        """The value without places: dicts, lists and scalars."""
+        """Return the value without places: dicts, lists and scalars."""
         if isinstance(self.value, dict):
             return {k: v.plain() for k, v in self.value.items()}
         if isinstance(self.value, list):
@@ -66,7 +68,7 @@ class Node:
         return self.value
 
     def error(self, message: str) -> InputError:
-        """An InputError that begins with the place; to be raised by the caller."""
+        """Return an InputError that begins with the place; to be raised by the caller."""
         return InputError(f"{self.place}: {message}".replace("\n", "\\n"))  # a name may hold anything
 
 
@@ -92,7 +94,7 @@ def load(path: str | Path) -> Node:
 
 
 def loads(text: str, file: str = "<text>") -> Node:
-    """The same from a string; `file` names it in messages."""
+    """Return the same from a string; `file` names it in messages."""
     loader = None
     try:
         loader = _Loader(text)
@@ -151,7 +153,8 @@ def _convert(node: yaml.Node, loader: _Loader, file: str, depth: int) -> Node:
 class Section:
     """A YAML mapping read key by key; `end()` refuses the keys that nobody asked for.
 
-    `what` names the mapping in errors; `of`, where given, names the item that its keys belong to ("noise of 'y'")."""
+    `what` names the mapping in errors; `of`, where given, names the item that its keys belong to ("noise of
+    'y'")."""
 
     def __init__(self, node: Node, what: str, of: str = "") -> None:
         if not isinstance(node.value, dict):
@@ -204,7 +207,9 @@ class Section:
         return float(default or 0.0) if node is None else number_of(node, self.label(key), low, high)
 
     def optional_number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float | None:
-        """Return the number of `key` within low..high, None where it is missing or empty. Raises InputError."""
+        """Return the number of `key` within low..high, None where it is missing or empty.
+
+        Raises InputError."""
         node = self.given(key)
         return None if node is None else number_of(node, self.label(key), low, high)
 

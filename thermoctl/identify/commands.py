@@ -15,7 +15,7 @@ from thermoctl.recording.table import Table
 
 
 def linearise(args: argparse.Namespace) -> int:
-    """The compensator's model file from a thermal plant."""
+    """Return the compensator's model file from a thermal plant."""
     plant = load(args.plant)
     model = thermal_model.linearise(
         plant, args.period, args.sensor_period, args.kind, density=args.heat_density

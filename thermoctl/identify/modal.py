@@ -1,7 +1,8 @@
 """Thermal models with real poles, from data of any length: reduce first, then separable least squares.
 
-A passive heat network (RC) has real poles, so its response to heat u is y(n) = sum_k R_k s_k(n) + sum_k W_k p_k^n with
-s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only the poles are searched.
+A passive heat network (RC) has real poles, so its response to heat u is y(n) = sum_k R_k s_k(n) + sum_k W_k
+p_k^n with s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only the poles are
+searched.
 
 1. One pass over the samples forms, for blocks of q samples, the mean of each output and the first r moments of each
    input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block, and both the block's end state and its
@@ -34,8 +35,10 @@ MOMENTS = 3
 
 @dataclass(frozen=True)
 class Blocks:
-    """Reduced data: `u` (J, m, r) input moments, `y` (J, l) output means (NaN: no sample), `weight` (J, l) samples in each
-    mean over the block's length, `q` samples per block, `period_s` of the samples, `basis` (r, q) the polynomials."""
+    """Recordings reduced to J blocks of `q` samples.
+
+    `u` (J, m, r) input moments, `y` (J, l) output means (NaN: no sample), `weight` (J, l) share of samples in
+    each mean, `period_s` of the samples, `basis` (r, q) the polynomials."""
 
     u: np.ndarray
     y: np.ndarray
@@ -46,7 +49,7 @@ class Blocks:
 
 
 def gram_polynomials(q: int, r: int = MOMENTS) -> np.ndarray:
-    """(r, q) orthonormal discrete polynomials of degree 0..r-1 on q equidistant places (fewer rows when q < r)."""
+    """Return orthonormal discrete polynomials (r, q) of degree 0..r-1 on q points; fewer when q < r."""
     r = min(r, q)
     vander = np.polynomial.legendre.legvander(np.linspace(-1, 1, q) if q > 1 else np.zeros(1), r - 1)
     return np.ascontiguousarray(np.linalg.qr(vander)[0].T)
@@ -57,9 +60,11 @@ def reduce(
     period_s: float,
     block_s: float = 10.0,
 ) -> Blocks:
-    """One pass over samples: `chunks` is (u (N, m), y (N, l)) or an iterable of such pieces; memory does not grow with N
-    beyond the blocks. A block without any sample of an output gives NaN there; a last, incomplete block is dropped.
-    Raises InputError when an input is missing or the data are shorter than 20 blocks."""
+    """One pass over samples: `chunks` is (u (N, m), y (N, l)) or an iterable of such pieces.
+
+    Memory does not grow with N beyond the blocks. A block without any sample of an output gives NaN there; a
+    last, incomplete block is dropped. Raises InputError when an input is missing or the data are shorter than
+    20 blocks."""
     q = max(1, round(block_s / period_s))
     basis = gram_polynomials(q)
     if isinstance(chunks, tuple):
@@ -98,13 +103,17 @@ def reduce(
 def _responses(
     records: list[Blocks], tau: np.ndarray, rest: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stacked `_response` of several recordings: the poles and residues are common, each starts on its own."""
+    """Stacked `_response` of several recordings.
+
+    The poles and residues are common, each starts on its own."""
     parts = [_response(b, tau, rest) for b in records]
     return np.vstack([f for f, _, _ in parts]), np.vstack([d for _, d, _ in parts]), parts[0][2]
 
 
 def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, float] | None) -> np.ndarray:
-    """Stacked rows (J, columns) through the drift's whitening filter, each recording on its own; as they are without `drift_s`."""
+    """Stacked rows (J, columns) through the drift's whitening filter, each recording on its own.
+
+    As they are without `drift_s`."""
     if drift_s is None:
         return rows
     forgotten, corner = (np.exp(-records[0].q * records[0].period_s / t) for t in drift_s)
@@ -162,7 +171,9 @@ class _Fit:
 
 
 def _project(F: np.ndarray, Y: np.ndarray, ridge: float = 1e-7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Q of F, the residue matrix and the residual; `ridge` of each column's norm keeps nearly equal poles harmless."""
+    """Q of F, the residue matrix and the residual.
+
+    `ridge` of each column's norm keeps nearly equal poles harmless."""
     n = F.shape[1]
     norm = np.linalg.norm(F, axis=0)
     norm[norm == 0] = 1
@@ -231,13 +242,13 @@ def identify(
     ridge: float = 1e-7,
     drift_s: tuple[float, float] | None = None,
 ) -> StateSpace:
-    """Model with `order` real poles per input (None: the least BIC of 1..10) from reduced data, at the blocks' sample period.
+    """Identify a model with `order` real poles per input from reduced data, at the blocks' sample period.
 
-    Several recordings (of one block length) are fitted together; they must begin at `rest`. `ridge` (of a column's norm) holds residues
-    that the data hardly tell small: for short records of a network that is not quite linear.
-    `rest`: the recording begins in thermal equilibrium (output rises are zero); otherwise every output's free decay is
-    estimated too. `drift_s`: see 4. above. Rows where an output is missing are left out for all outputs when the others are whole, else filled by
-    two rounds of the model's own output. Raises InputError when an output was never measured."""
+    `order` None: the least BIC of 1..10. Several recordings of one block length are fitted together; they
+    must begin at `rest`, in thermal equilibrium. Without `rest` the free decay of every output is estimated,
+    too. `ridge` (of a column's norm) keeps residues small that the data hardly determine: for short records
+    of a network that is not quite linear. `drift_s`: see 4. above. Missing outputs are filled by two
+    iterations of the model's own output. Raises InputError when an output was never measured."""
     records = [records] if isinstance(records, Blocks) else records
     blocks = replace(
         records[0],

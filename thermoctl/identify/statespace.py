@@ -2,7 +2,8 @@
 
 x(n+1) = A x(n) + B u(n),   y(n) = C x(n)                                    (31), (32) with D = 0
 output form: y(n+1) = alpha y(n) + beta u(n), alpha = C A C+, beta = C B      (33)
-resampling: [[A, B], [0, I]] at one period is the exponential of [[F, G], [0, 0]] T: its logarithm gives any other period
+resampling: [[A, B], [0, I]] at one period is the exponential of [[F, G], [0, 0]] T: its logarithm gives any
+other period
 """
 
 from __future__ import annotations
@@ -74,14 +75,18 @@ class StateSpace:
         return _ridge(columns[here], (y - free)[here][:, None], 1e-5)[:, 0]
 
     def output_form(self, tolerance: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
-        """alpha (l, l), beta (l, m) of (33). C is inverted with its singular values below `tolerance` of the largest left
-        out: order 12 always holds noise modes, cond(C) reached 3e5, and the plain inverse then amplifies them."""
+        """Return alpha (l, l), beta (l, m) of (33).
+
+        C is inverted with its singular values below `tolerance` of the largest left out: order 12 always
+        holds noise modes, cond(C) reached 3e5, and the plain inverse then amplifies them."""
         return self.c @ self.a @ np.linalg.pinv(self.c, rcond=tolerance), self.c @ self.b
 
     def resample(self, period_s: float) -> StateSpace:
-        """The same continuous system, inputs held, at another period. Exact (2e-15 in A - I from 10 s to 1 ms); a linear
-        scaling of A - I would be 25 % off. Identification itself runs at 1 to 10 s: at 1 ms a pole of 4000 s lies
-        2.5e-7 from 1, below what noise leaves of it. Raises InputError where no real logarithm exists."""
+        """Return the same continuous system, inputs held, at another period.
+
+        Exact (2e-15 in A - I from 10 s to 1 ms); a linear scaling of A - I would be 25 % off. Identification
+        itself runs at 1 to 10 s: at 1 ms a pole of 4000 s lies 2.5e-7 from 1, below what noise leaves of it.
+        Raises InputError where no real logarithm exists."""
         if period_s == self.period_s:
             return self
         bad = [p for p in self.poles if abs(p.imag) < 1e-12 and p.real <= 1e-12]
@@ -103,7 +108,9 @@ class StateSpace:
         return replace(self, a=new[:n, :n], b=new[:n, n:], period_s=period_s)
 
     def minus_identity(self, period_s: float) -> np.ndarray:
-        """A - I at a (short) period, formed without the subtraction from 1 that loses digits: the series of exp(F T) - I."""
+        """Return A - I at a (short) period, formed without the subtraction from 1 that loses digits.
+
+        The series of exp(F T) - I."""
         if self.poles.real.min() <= 0:
             self.resample(period_s)  # raises with the pole's name
         f = np.real(linalg.logm(self.a)) * (period_s / self.period_s)
@@ -117,8 +124,10 @@ class StateSpace:
 def modal(
     poles: np.ndarray, residues: np.ndarray, free: np.ndarray, period_s: float, info: dict[str, Any]
 ) -> StateSpace:
-    """Smallest state space with real `poles` (K,), residues (K, l, m) (y = sum R_k s_k, s(n+1) = p s + u) and free decay
-    amplitudes (K, l) of the initial state. A pole whose residue has rank r gets r states."""
+    """Return the smallest state space with these real poles (K,), residues and free decay.
+
+    residues (K, l, m): y = sum R_k s_k, s(n+1) = p s + u; `free` (K, l): amplitudes of the initial state's
+    decay. A pole whose residue has rank r gets r states."""
     a, b, c, x0 = [], [], [], []
     scale = max(np.abs(residues).max(), 1e-300)
     for p, r, w in zip(poles, residues, free, strict=True):

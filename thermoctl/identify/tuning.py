@@ -1,13 +1,14 @@
 """PID tuning: proposals, never written by themselves.
 
-PID, velocity form (41): D(s) = Kp (1 + 1/(Ti s) + Td s)
-Ziegler-Nichols from the open-loop step (Table I): Kp = 1.2 tau_c/(K0 tau_d), Ti = 2 tau_d, Td = 0.5 tau_d, with the tangent at the
-steepest point of the response. The tangent is drawn on a fitted second-order response with dead time, not on the samples: the
-steepest difference of noisy samples is too steep (0.15 um of noise: Kp 21 % low; fitted: 0.1 %).
-Relay (Astrom and Hagglund): Ku = 4 d/(pi sqrt(a^2 - e^2)), Kp = 0.6 Ku, Ti = 0.5 Tu, Td = 0.125 Tu
-Lambda / IMC (Rivera, Morari, Skogestad) for K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)): series form Kc = t1/(K0 (lambda + theta)),
-tI = t1, tD = t2 (half rule for what is faster than theta); parallel form Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI + tD)
-Margins: of the sampled loop L(e^jw) = D(z) G(z), G with a zero-order hold and the dead time, moving average included.
+PID, velocity form (41): D(s) = Kp (1 + 1/(Ti s) + Td s) Ziegler-Nichols from the open-loop step (Table I): Kp
+= 1.2 tau_c/(K0 tau_d), Ti = 2 tau_d, Td = 0.5 tau_d, with the tangent at the steepest point of the response.
+The tangent is drawn on a fitted second-order response with dead time, not on the samples: the steepest
+difference of noisy samples is too steep (0.15 um of noise: Kp 21 % low; fitted: 0.1 %).
+Relay (Astrom and Hagglund): Ku = 4 d/(pi sqrt(a^2 - e^2)), Kp = 0.6 Ku, Ti = 0.5 Tu, Td = 0.125 Tu Lambda /
+IMC (Rivera, Morari, Skogestad) for K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)): series form Kc = t1/(K0 (lambda +
+theta)), tI = t1, tD = t2 (half rule for what is faster than theta); parallel form Kp = Kc (1 + tD/tI), Ti =
+tI + tD, Td = tI tD/(tI + tD) Margins: of the sampled loop L(e^jw) = D(z) G(z), G with a zero-order hold and
+the dead time, moving average included.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from thermoctl.yamlfile import InputError
 
 @dataclass(frozen=True)
 class SecondOrder:
-    """K0 e^(-s theta) / ((t1 s + 1)(t2 s + 1)), or oscillating: `t1`, `t2` are then complex conjugate. Gain in um per unit of drive."""
+    """K0 e^(-s theta) / ((t1 s + 1)(t2 s + 1)), or oscillating: `t1`, `t2` are then complex conjugate.
+
+    Gain in um per unit of drive."""
 
     gain: float
     t1: complex
@@ -61,7 +64,9 @@ class Gains:
 
 
 def fit_step(t_s: np.ndarray, y_um: np.ndarray, drive: float, at_s: float = 0.0) -> SecondOrder:
-    """Second order with dead time fitted to a step response by least squares: t_s (N,), y_um (N,), step of `drive` at `at_s`.
+    """Second order with dead time fitted to a step response by least squares.
+
+    t_s (N,), y_um (N,), step of `drive` at `at_s`.
 
     Raises InputError when there is no response to be seen."""
     t, y = np.asarray(t_s, float) - at_s, np.asarray(y_um, float)
@@ -100,7 +105,9 @@ def fit_step(t_s: np.ndarray, y_um: np.ndarray, drive: float, at_s: float = 0.0)
 
 
 def tangent(model: SecondOrder) -> tuple[float, float, float]:
-    """(K0, tau_d, tau_c): the steepest tangent of the step response cuts 0 at tau_d and K0 at tau_d + tau_c."""
+    """Return (K0, tau_d, tau_c) of the step response's steepest tangent.
+
+    It cuts 0 at tau_d and K0 at tau_d + tau_c."""
     span = model.theta_s + 12 * max(abs(model.t1), abs(model.t2))
     t = np.linspace(0, span, 200_001)
     y = model.step(t) / model.gain
@@ -122,7 +129,9 @@ def ziegler_nichols(model: SecondOrder) -> Gains:
 
 
 def relay(t_s: np.ndarray, y_um: np.ndarray, amplitude: float, hysteresis_um: float = 0.0) -> Gains:
-    """From a relay test's oscillation: `amplitude` d of the drive. Raises InputError when it did not oscillate steadily."""
+    """From a relay test's oscillation: `amplitude` d of the drive.
+
+    Raises InputError when it did not oscillate steadily."""
     y = y_um - y_um.mean()
     tail = slice(len(y) // 3, None)
     t, y = np.asarray(t_s)[tail], y[tail]
@@ -159,7 +168,7 @@ def imc(model: SecondOrder, lambda_s: float | None = None) -> Gains:
 
 @dataclass(frozen=True)
 class Margins:
-    """Of the sampled loop: gain margin (factor), phase margin deg, delay margin s, and whether the closed loop is stable."""
+    """Margins of the sampled loop: gain (factor), phase deg, delay s; `stable`: of the closed loop."""
 
     gain: float
     phase_deg: float
@@ -169,7 +178,9 @@ class Margins:
 
 
 def margins(model: SecondOrder, gains: Gains, period_s: float, moving_average: int = 1) -> Margins:
-    """Margins of PID (41) at `period_s` on the model with a zero-order hold; the moving average of `moving_average` samples counted."""
+    """Margins of PID (41) at `period_s` on the model with a zero-order hold.
+
+    The moving average of `moving_average` samples counted."""
     w = np.geomspace(1e-2, np.pi / period_s, 40_000)
     z = np.exp(1j * w * period_s)
     k, ti, td, ts = gains.kp, gains.ti_s, gains.td_s, period_s
@@ -207,7 +218,9 @@ def _held(model: SecondOrder, w: np.ndarray, period_s: float) -> np.ndarray:
 def robust(
     model: SecondOrder, period_s: float, moving_average: int = 1, phase_deg: float = 45.0, gain: float = 2.0
 ) -> Gains:
-    """The fastest lambda tuning with at least these margins. Raises InputError when none up to 1000 dead times has them."""
+    """Return the fastest lambda tuning with at least these margins.
+
+    Raises InputError when none up to 1000 dead times has them."""
     for factor in np.geomspace(0.3, 1000, 60):
         g = imc(model, factor * max(model.theta_s, period_s))
         m = margins(model, g, period_s, moving_average)
@@ -223,7 +236,7 @@ def robust(
 
 
 def difference(present: Gains, proposed: Gains) -> str:
-    """The change as lines of text, for people; nothing is written."""
+    """Return the change as lines of text, for people; nothing is written."""
     rows = [
         ("kp", present.kp, proposed.kp),
         ("ti_s", present.ti_s, proposed.ti_s),
@@ -236,7 +249,9 @@ def difference(present: Gains, proposed: Gains) -> str:
 
 
 def write(config: Path, proposed: Gains) -> None:
-    """Write kp, ti_s, td_s into the control section of a configuration, other lines untouched; on request only.
+    """Write kp, ti_s, td_s into the control section of a configuration, other lines untouched.
+
+    On request only.
 
     Raises InputError when the section does not name all three on lines of their own."""
     text = config.read_text(encoding="utf-8")

@@ -24,7 +24,9 @@ RECENT = 0.25  # share of a block from which its data count in full; older ones 
 
 
 def simulate(args: argparse.Namespace) -> int:
-    """Free run, or predictions `--horizon` seconds ahead, on one recording or several; figures, file and plot."""
+    """Free run, or predictions `--horizon` seconds ahead, on one recording or several.
+
+    figures, file and plot."""
     plant = load(args.plant)
     runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
     model = compile_plant(_all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
@@ -77,9 +79,11 @@ def _all_uncertain(plant: Plant) -> Plant:
 
 
 def ahead(model: Model, drive: Excitation, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`: each block starts from the states that
-    the data before it tell (an extended Kalman filter that takes a block at a time), so that a sample is
-    predicted from data up to `horizon_s` older. The model must have every state uncertain and no active parameter."""
+    """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`.
+
+    Each block starts from the states that the data before it tell (an extended Kalman filter that takes a
+    block at a time), so that a sample is predicted from data up to `horizon_s` older. The model must have
+    every state uncertain and no active parameter."""
     if not model.states:
         run = model.run(drive)
         return run.x, run.y
@@ -243,7 +247,7 @@ def _errors(plant: Plant, table: Table) -> dict[str, float]:
 
 
 def show(args: argparse.Namespace) -> int:
-    """The plant's table, and its picture when --out is given."""
+    """Return the plant's table, and its picture when --out is given."""
     plant = load(args.plant)
     if args.out:
         drawing.draw(plant, args.out)

@@ -1,12 +1,12 @@
-"""Plants as machine code: C written from the expressions, built by the system's C compiler, kept in a cache on disk.
+"""Plants as machine code: C from the expressions, compiled, and cached on disk.
 
     dx/dt = (flows in - flows out) / storage = f(t, x, u, p),    y = g(t, x, u, p)
     S = d x / d q,  dS/dt = f_x S + f_q,  S(0) = d initial / d q,  q = (active parameters, uncertain initial states)
 
-C was chosen by measurement (`make bench`): a plant is ready in some tenths of a second, where numba needs seconds. A jump
-(sign, step, a comparison) whose argument moves with the state or with time is smoothed, tanh(z / width), so that it has a
-slope: over 1e-5 of the range of its argument for a state, over half a sampling interval for time. Arguments that hold
-between samples (recorded inputs) keep their true jumps.
+C was chosen by measurement (`make bench`): a plant is ready in some tenths of a second, where numba needs
+seconds. A jump (sign, step, a comparison) whose argument moves with the state or with time is smoothed,
+tanh(z / width), so that it has a slope: over 1e-5 of the range of its argument for a state, over half a
+sampling interval for time. Arguments that hold between samples (recorded inputs) keep their true jumps.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _LOADED: dict[str, Code] = {}
 
 
 def argument(jump: Expr) -> Expr:
-    """The expression whose sign a jump looks at."""
+    """Return the expression whose sign a jump looks at."""
     a = jump.args
     if jump.op in (">", ">="):
         return add(a[0], neg(a[1]))
@@ -110,7 +110,7 @@ class Code:
                 )
 
     def _widths(self) -> None:
-        """The jumps that are smoothed: by argument, 'state' or 'time'."""
+        """Return the jumps that are smoothed: by argument, 'state' or 'time'."""
         self.jumps: list[tuple[Expr, str]] = []
         roots = [*self.slopes, *self.values, *(d[0] for d in self.output_delays.values())]
         seen: set[int] = set()
@@ -129,7 +129,7 @@ class Code:
     # ------------------------------------------------------------------------------------------------- writing C
 
     def _by_parameter(self, e: Expr, q: str) -> Expr:
-        """d e / d parameter, also through the seconds of delayed inputs."""
+        """Return d e / d parameter, also through the seconds of delayed inputs."""
         total = derivative(e, q)
         used = ex.names(e)
         for d, (_, seconds) in self.input_delays.items():
@@ -288,8 +288,10 @@ def _ints(label: str, values: Iterable[int]) -> str:
 
 
 def _sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, int]:
-    """C for M = I - a J: factors without pivoting in minimum-degree order (Markowitz), and solves for one and for eight
-    right-hand sides. A small pivot is refused; the integrator then takes a smaller step. Returns (text, entries of M)."""
+    """Write C that factors M = I - a J and solves for one and for eight right-hand sides.
+
+    No pivoting, minimum-degree order (Markowitz). A small pivot is refused; the integrator then takes a
+    smaller step. Returns (text, entries of M)."""
     rows: list[set[int]] = [{i} for i in range(n)]
     for i, k in pattern:
         rows[i].add(k)
@@ -344,7 +346,7 @@ def _sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, int]:
 
 @cache
 def _compiler() -> tuple[list[str], str]:
-    """The C compiler's command and what identifies its result (version, processor)."""
+    """Return the C compiler's command and what identifies its result (version, processor)."""
     for candidate in (os.environ.get("CC"), "cc", "gcc", "clang"):
         if candidate and (path := shutil.which(candidate.split()[0])):
             version = subprocess.run([path, "--version"], capture_output=True, text=True).stdout.splitlines()[
@@ -420,7 +422,9 @@ def _build(work: Path, source: str) -> None:
 
 
 def _trim(folder: Path, keep: int = 2000, age_s: float = 86_400.0) -> None:
-    """Forget the oldest beyond `keep`, but none made within a day: another process may be about to load it."""
+    """Forget the oldest beyond `keep`, but none made within a day.
+
+    Another process may be about to load it."""
     made = []
     for path in folder.glob("*.so"):
         with contextlib.suppress(OSError):  # another process trims, too
@@ -458,7 +462,7 @@ def machine_code(plant: Plant, active: tuple[str, ...]) -> Code:
 
 
 def _structure(plant: Plant) -> Mapping[str, object]:
-    """What the code depends on: everything but values, ranges, units and noise."""
+    """Return all that the code depends on: not values, ranges, units or noise."""
     return {
         "i": list(plant.inputs),
         "p": list(plant.parameters),

@@ -2,8 +2,9 @@
 
     storage * d(node)/dt = sum(flows into) - sum(flows from)          outputs = what the sensors would read
 
-`load` reads a file, `from_plain` the same from plain dicts (a plant that the diagnosis extended), `Plant.plain` gives
-the dicts back and `save` writes them. Every error is one line with file, line, the name at fault and what is allowed.
+`load` reads a file, `from_plain` the same from plain dicts (a plant that the diagnosis extended),
+`Plant.plain` gives the dicts back and `save` writes them. Every error is one line with file, line, the name
+at fault and what is allowed.
 """
 
 from __future__ import annotations

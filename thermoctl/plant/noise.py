@@ -1,11 +1,14 @@
-"""The noise of each sensor measured on a fit's residuals: a first-order coloured part beside the steps of the sensor.
+"""The noise of each sensor measured on a fit's residuals.
+
+a first-order coloured part beside the steps of the sensor.
 
     e_k = a_k + w_k,   a_k = phi a_(k-1) + n_k,   var w = r = resolution^2 / 12 (known)
     as ARMA(1,1):  e_k = phi e_(k-1) + i_k - theta i_(k-1),   theta = b - sqrt(b^2 - 1),
                    b = (s^2 (1 - phi^2) + r (1 + phi^2)) / (2 phi r),   s^2 = var a,   var i = phi r / theta
 
-phi is found channel by channel by restricted maximum likelihood (Patterson & Thompson 1971): the fitted parameters have taken a
-part of the slow noise with them, which the residuals' plain correlation would miss, and intervals would come out too narrow:
+phi is found channel by channel by restricted maximum likelihood (Patterson & Thompson 1971): the fitted
+parameters have taken a part of the slow noise with them, which the residuals' plain correlation would miss,
+and intervals would come out too narrow:
 
     minimise  n log v + RSS / v + log |M|,   M = sum over channels of J' V^-1 J,   RSS after the parameters' answer -J M^-1 J' V^-1 e
 """
@@ -41,7 +44,9 @@ def innovations(phi: float, white: float, total: float) -> Noise:
 
 @dataclass(frozen=True)
 class _Moments:
-    """One channel's share of the restricted likelihood: J' V^-1 J (k, k), J' V^-1 e (k,), e' V^-1 e and log |V|."""
+    """One channel's share of the restricted likelihood.
+
+    J' V^-1 J (k, k), J' V^-1 e (k,), e' V^-1 e and log |V|."""
 
     gram: np.ndarray
     gradient: np.ndarray
@@ -98,7 +103,9 @@ class _Restricted:
         return sum(len(rows[j][0]) for rows in self.problem.rows)
 
     def _score(self, j: int, phi: float) -> tuple[float, Noise]:
-        """-2 log restricted likelihood of channel j at a correlation phi, and its noise; the size by three iterations."""
+        """-2 log restricted likelihood of channel j at a correlation phi, and its noise.
+
+        The size by three iterations."""
         output = list(self.found.model.plant.outputs.values())[j]
         white = (output.resolution or 0.0) ** 2 / 12
         residuals = np.concatenate([r[np.isfinite(r[:, j]), j] for r in self.found.residuals])

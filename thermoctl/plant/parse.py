@@ -1,7 +1,7 @@
 """A plant file's text to a `Plant`: keys, numbers, names and what each expression may read.
 
-Units are checked afterwards (units.py); files.py puts both together. Every error names file, line and column, the name at
-fault and what is allowed.
+Units are checked afterwards (units.py); files.py puts both together. Every error names file, line and column,
+the name at fault and what is allowed.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def parse(root: YamlNode) -> Plant:
 
 
 def _items(top: Section) -> Items:
-    """The entries of each section, under names that are valid and differ."""
+    """Return the entries of each section, under names that are valid and differ."""
     items: Items = {}
     section_of: dict[str, str] = {}
     for section in SECTIONS:
@@ -206,7 +206,9 @@ def _expression(s: Section, key: str) -> Expr:
 
 @dataclass(frozen=True)
 class _Place:
-    """An expression of the file and what may stand in it. `delays`: whether delay() may, and on what it may work."""
+    """An expression of the file and what may stand in it.
+
+    `delays`: whether delay() may, and on what it may work."""
 
     what: str
     expression: Expr

@@ -1,11 +1,12 @@
 """Refit of a plant's own parameters to recordings: bounded, weighted least squares on the free-run error.
 
-The cost is in residuals.py. Each step is Gauss-Newton with Levenberg's damping on the normal equations, plus half the
-geodesic acceleration (Transtrum & Sethna 2012, arXiv:1201.5885):
+The cost is in residuals.py. Each step is Gauss-Newton with Levenberg's damping on the normal equations, plus
+half the geodesic acceleration (Transtrum & Sethna 2012, arXiv:1201.5885):
 
     (J'J + l D) v = J' r,    (J'J + l D) a = J' d2r/dh2 along v,    z <- z + v + a/2        r = (measured - simulated) / s, J = -dr/dz
 
-A parameter that meets its bound is held there until the gradient leads back inside. Sensitivities are exact (compile.py).
+A parameter that meets its bound is held there until the gradient leads back inside. Sensitivities are exact
+(compile.py).
 """
 
 from __future__ import annotations
@@ -48,9 +49,10 @@ CORRELATED = 0.95
 class Fit:
     """The result of a refit.
 
-    `values` (recordings, parameters) in the model's order; `dx0` (recordings, uncertain states); `unknowns`: (name,
-    recording index or None); `z` their coordinates; `hessian` the Gauss-Newton matrix of the cost by `z`, whose inverse is
-    the covariance; `prior_hessian` the priors' share of it; `residuals`: (N, outputs) by recording, NaN where missing."""
+    `values` (recordings, parameters) in the model's order; `dx0` (recordings, uncertain states); `unknowns`:
+    (name, recording index or None); `z` their coordinates; `hessian` the Gauss-Newton matrix of the cost by
+    `z`, whose inverse is the covariance; `prior_hessian` the priors' share of it; `residuals`: (N, outputs)
+    by recording, NaN where missing."""
 
     model: Model
     values: np.ndarray
@@ -84,7 +86,10 @@ class Fit:
 
 @dataclass(frozen=True)
 class _Limits:
-    """When a descent ends: iterations, the least gain in cost, the clock of the thread, and a cost that must be in reach."""
+    """When a descent ends.
+
+    `tolerance`: least gain in cost; `deadline`: clock of the thread, s; `goal`: a cost that must stay in
+    reach."""
 
     iterations: int
     tolerance: float
@@ -108,9 +113,10 @@ def fit(
 ) -> Fit:
     """Fit the active parameters that have a range, and the uncertain initial states, to the recordings.
 
-    `tries`: random starts over the ranges besides `start`; the best KEPT_STARTS are followed. `seconds`: no iteration begins
-    after so much CPU time of this thread. `goal`: stop where this cost is more than STEPS_TO_GOAL steps away.
-    Raises SimulationError if no start can be simulated, InputError if there is nothing to compare."""
+    `tries`: random starts over the ranges besides `start`; the best KEPT_STARTS are followed. `seconds`: no
+    iteration begins after so much CPU time of this thread. `goal`: stop where this cost is more than
+    STEPS_TO_GOAL steps away. Raises SimulationError if no start can be simulated, InputError if there is
+    nothing to compare."""
     for d in excitations:
         if d.scale is None:
             model.prepare(d)
@@ -137,7 +143,7 @@ def fit(
 
 
 def _random_starts(problem: Problem, z0: np.ndarray, tries: int, seed: int) -> list[np.ndarray]:
-    """The starts of least cost among `tries` drawn over the ranges."""
+    """Return the starts of least cost among `tries` drawn over the ranges."""
     random = np.random.default_rng(seed)
     tried = []
     for _ in range(tries):
@@ -151,7 +157,9 @@ def _random_starts(problem: Problem, z0: np.ndarray, tries: int, seed: int) -> l
 
 
 def _follow(problem: Problem, z: np.ndarray, limits: _Limits, best: Fit | None) -> Fit | None:
-    """Descend from a start, setting the outlier limits anew; None where a few steps do not come below `best`."""
+    """Descend from a start, setting the outlier limits anew.
+
+    None where a few steps do not come below `best`."""
     problem.set_outlier_limits(problem.evaluate(z, False).residuals)
     if best is not None:
         z = _descend(problem, z, dataclasses.replace(limits, iterations=PREVIEW)).z
@@ -213,7 +221,9 @@ def _improve(
     kept: Sequence[Rows],
     tolerance: float,
 ) -> tuple[np.ndarray, float, float] | None:
-    """Return a point of less cost, its cost and the next damping; None if no damping up to the twelfth gives one."""
+    """Return a point of less cost, its cost and the next damping.
+
+    None if no damping up to the twelfth gives one."""
     for _ in range(12):
         step, left = _bounded_step(z, now, free, damping, bounds)
         predicted = float(2 * now.gradient @ step - step @ now.matrix @ step)
@@ -234,7 +244,7 @@ def _improve(
 def _bounded_step(
     z: np.ndarray, now: Evaluation, free: np.ndarray, damping: float, bounds: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The damped Gauss-Newton step within the bounds, and the unknowns that did not meet one."""
+    """Return the damped Gauss-Newton step within the bounds, and the unknowns that did not meet one."""
     low, high = bounds
     step, left = np.zeros_like(z), free
     for _ in range(
@@ -310,8 +320,9 @@ def _result(problem: Problem, z: np.ndarray, now: Evaluation, iterations: int) -
 class Estimate:
     """One parameter after a refit.
 
-    `state`: 'ok', 'at bound', 'dead' (the data are not sensitive to it) or 'flat' (they determine only a combination of
-    it with others). `trades_with`: the parameters whose estimates correlate with it above CORRELATED."""
+    `state`: 'ok', 'at bound', 'dead' (the data are not sensitive to it) or 'flat' (they determine only a
+    combination of it with others). `trades_with`: the parameters whose estimates correlate with it above
+    CORRELATED."""
 
     name: str
     value: float

@@ -3,9 +3,10 @@
     cost(z) = sum_k rho((e_k - phi e_(k-1)) / s) + sum (dx0 / initial_sigma)^2 + w sum (z - z_plant)^2 + sum of priors
     e = y - yhat(p, x0 + dx0),   s^2 = sigma^2 (1 - phi^2)   for each channel
 
-phi is the correlation of a channel's noise over one median sampling interval (AR(1)); rho is Huber's function, quadratic up to
-a limit and linear beyond. z is a parameter's coordinate in its range, 0 to 1, on a log scale where the range spans a factor of
-three or more. The small weight w keeps a parameter that the data do not determine at the plant's value.
+phi is the correlation of a channel's noise over one median sampling interval (AR(1)); rho is Huber's
+function, quadratic up to a limit and linear beyond. z is a parameter's coordinate in its range, 0 to 1, on a
+log scale where the range spans a factor of three or more. The small weight w keeps a parameter that the data
+do not determine at the plant's value.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ LOG_RATIO = 3.0  # a range that spans this factor is fitted on a log scale
 
 @dataclass(frozen=True)
 class Noise:
-    """One channel's noise: standard deviation `sigma`, and correlation `phi` over one median sampling interval.
+    """One channel's noise: standard deviation, and correlation `phi` over one sampling interval.
 
     With a whitening filter ar(z)/ma(z), `sigma` is the standard deviation of the innovations."""
 
@@ -75,7 +76,9 @@ class Scale:
 
 
 def default_noise(plant: Plant, excitations: Sequence[Excitation] = ()) -> tuple[Noise, ...]:
-    """Return the noise that the plant file states; where it states none, the white part of the second differences."""
+    """Return the noise that the plant file states.
+
+    Where it states none, the white part of the second differences."""
     out = []
     for j, o in enumerate(plant.outputs.values()):
         sigma = np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12))
@@ -90,7 +93,7 @@ def default_noise(plant: Plant, excitations: Sequence[Excitation] = ()) -> tuple
 
 
 def _rows(d: Excitation, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Output j's measured samples, each one's correlation with the sample before, and its innovation's sigma."""
+    """Return output j's measured samples, each one's correlation with the one before, and its sigma."""
     dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
     index = np.flatnonzero(np.isfinite(d.y[:, j]))
     gaps = np.diff(d.t[index]) / dt if len(index) > 1 else np.zeros(0)
@@ -105,7 +108,8 @@ def _rows(d: Excitation, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.n
 class Rows:
     """Whitened residuals of one output in one recording, and what a step needs of them.
 
-    `w` (M,) residuals, `weight` (M,) Huber's weights, `jac` (M, k) = -dw / (slope d unknowns), `slope` (k,)."""
+    `w` (M,) residuals, `weight` (M,) Huber's weights, `jac` (M, k) = -dw / (slope d unknowns), `slope` (k,).
+    """
 
     recording: int
     output: int
@@ -117,7 +121,7 @@ class Rows:
 
 
 class Evaluation(NamedTuple):
-    """The cost at a point, half its negative gradient, its Gauss-Newton matrix, and the raw residuals (N, ny) by recording."""
+    """Cost, half its negative gradient, Gauss-Newton matrix, and raw residuals (N, ny) by recording."""
 
     cost: float
     gradient: np.ndarray
@@ -149,7 +153,7 @@ class Problem:
             raise InputError("no recording has a column that an output of the plant reads; nothing to fit")
 
     def _number_unknowns(self) -> None:
-        """Number the unknowns: parameters with a range (per recording where stated), then uncertain initial states."""
+        """Give numbers to the parameters with a range, then to the uncertain initial states."""
         model, parameters = self.model, self.model.plant.parameters
         recordings = range(len(self.excitations))
         self.scales = {q: Scale(parameters[q]) for q in model.active if parameters[q].range}
@@ -197,7 +201,7 @@ class Problem:
         return other
 
     def unpack(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return values (recordings, parameters) and shifts of initial states (recordings, uncertain states)."""
+        """Return values (recordings, parameters) and shifts of initial states (recordings, states)."""
         values = np.array([self.model.vector(None, d.name) for d in self.excitations])
         dx0 = np.zeros((len(self.excitations), len(self.model.uncertain)))
         for r in range(len(self.excitations)):
@@ -213,7 +217,7 @@ class Problem:
         return values, dx0
 
     def whiten(self, r: int, j: int, e: np.ndarray) -> np.ndarray:
-        """Return whitened rows (M, ...) of errors (N, ...) of output j in recording r, missing samples dropped."""
+        """Return whitened rows (M, ...) of output j's errors (N, ...); missing samples are dropped."""
         index, phi, scale = self.rows[r][j]
         part = e if len(index) == len(e) else e[index]
         shape = (-1, *([1] * (part.ndim - 1)))
@@ -225,9 +229,12 @@ class Problem:
         return part / scale.reshape(shape)
 
     def set_outlier_limits(self, residuals: Sequence[np.ndarray]) -> bool:
-        """Set Huber's limit of each output from the spread of its residuals; True where one changed by more than a half.
+        """Set Huber's limit of each output from the spread of its residuals.
 
-        Residuals of missing physics must not count as outliers, nor what occurs in more than one sample of fifty."""
+        True where one changed by more than a half.
+
+        Residuals of missing physics must not count as outliers, nor what occurs in more than one sample of
+        fifty."""
         new = np.full(len(self.noise), HUBER)
         for j in range(len(self.noise)):
             w = np.concatenate([self.whiten(r, j, e[:, j]) for r, e in enumerate(residuals)])
@@ -292,7 +299,7 @@ class Problem:
         return Evaluation(cost, gradient, matrix + prior_matrix + np.diag(weight), residuals)
 
     def prior_terms(self, values: np.ndarray, derivatives: bool) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the priors' cost, half its negative gradient and half its second derivatives by the unknowns."""
+        """Return the priors' cost, half its negative gradient and half its second derivatives."""
         n = len(self.unknowns)
         cost, gradient, matrix = 0.0, np.zeros(n), np.zeros((n, n))
         for prior in self.priors:
@@ -313,7 +320,9 @@ class Problem:
         return cost, gradient, matrix
 
     def curvature(self, z: np.ndarray, step: np.ndarray, kept: Sequence[Rows]) -> np.ndarray:
-        """Return J' d2w/dh2 of the whitened residuals w(z + h step), by one more simulation. Raises SimulationError."""
+        """Return J' d2w/dh2 of the whitened residuals w(z + h step), by one more simulation.
+
+        Raises SimulationError."""
         values, dx0 = self.unpack(z + PROBE * step)
         errors = [
             d.y - self.model.run(d, values[r], dx0[r], buffers=self.buffers).y
@@ -328,7 +337,7 @@ class Problem:
         return out * (2 / PROBE)
 
     def _slopes(self, r: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The columns of recording r's sensitivities that are unknowns, the unknowns' numbers, and d q / d z."""
+        """Return which sensitivities of recording r are unknowns, their numbers, and d q / d z."""
         used = np.flatnonzero(self.columns[r] >= 0)
         active = self.model.active
         slopes = [
@@ -349,9 +358,10 @@ class Problem:
         weight: np.ndarray,
         jac: np.ndarray,
     ) -> Rows:
-        """Output j's rows in recording r from its whitened residuals, their weights and its sensitivities (N, k).
+        """Return output j's rows from its whitened residuals, their weights and sensitivities (N, k).
 
-        White noise of one size only scales the sensitivities: they are not copied, and a missing sample gets weight 0."""
+        White noise of one size only scales the sensitivities: they are not copied, and a missing sample gets
+        weight 0."""
         index, phi, _ = self.rows[r][j]
         noise, n = self.noise[j], len(jac)
         if len(noise.ar) > 1 or phi.any() or len(index) < (1 - DOWNDATE_SHARE) * n:

@@ -1,7 +1,8 @@
 """A plant as a picture (nodes, flows, outputs) and as a table.
 
-The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the distance in the graph, by majorisation
-(Gansner, Koren, North 2004). What enters from or leaves to the outside and what is read at a node are small satellites.
+The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the distance in the graph, by
+majorisation (Gansner, Koren, North 2004). What enters from or leaves to the outside and what is read at a
+node are small satellites.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ if TYPE_CHECKING:
 
 
 def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, int, str, str]]]:
-    """Vertices (kind, key, label) and edges (from, to, kind, label): one satellite for a node's inflows, one for its
-    outflows, one for its readings; a reading of several nodes is a vertex of its own."""
+    """Vertices (kind, key, label) and edges (from, to, kind, label).
+
+    One satellite for a node's inflows, one for its outflows, one for its readings; a reading of several nodes
+    is a vertex of its own."""
     vertices = [("node", n.name, f"{n.name}\n[{n.unit}]" if n.unit else n.name) for n in plant.nodes.values()]
     index = {n: i for i, n in enumerate(plant.nodes)}
     edges: list[tuple[int, int, str, str]] = []
@@ -73,7 +76,9 @@ def _outline(text: Text) -> np.ndarray:
 
 
 def _edge(box: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
-    """Where the line from `outside` (2,) to `inside` (2,) meets the box [[left, bottom], [right, top]] round the latter."""
+    """Return where the line from `outside` (2,) to `inside` (2,) meets the box round `inside`.
+
+    box: [[left, bottom], [right, top]]."""
     way = outside - inside
     room = np.where(way > 0, box[1] - inside, inside - box[0]) / np.maximum(np.abs(way), 1e-12)
     return inside + way * min(float(room.min()), 1.0)
@@ -113,7 +118,9 @@ def layout(count: int, edges: list[tuple[int, int, float]], rounds: int = 400) -
 
 
 def draw(plant: Plant, path: str | Path) -> None:
-    """Write the network as .svg, .png or .pdf. Raises InputError for another ending or a place that cannot be written."""
+    """Write the network as .svg, .png or .pdf.
+
+    Raises InputError for another ending or a place that cannot be written."""
     path = Path(path)
     if path.suffix.lower() not in (".svg", ".png", ".pdf"):
         raise InputError(f"{path}: a name that ends in .svg, .png or .pdf was expected")
@@ -124,8 +131,10 @@ def draw(plant: Plant, path: str | Path) -> None:
 
 
 def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Figure:
-    """The network as a matplotlib Figure of at most `widest` inches; nodes, flows and outputs named in `marked` stand out. Where it
-    would be wider it is drawn closer, without the words on its lines."""
+    """Return the network as a matplotlib Figure of at most `widest` inches.
+
+    nodes, flows and outputs named in `marked` stand out. Where it would be wider it is drawn closer, without
+    the words on its lines."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -254,7 +263,7 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) ->
 
 
 def table(plant: Plant) -> list[Table]:
-    """The plant as rich tables: inputs, parameters, nodes, flows, outputs."""
+    """Return the plant as rich tables: inputs, parameters, nodes, flows, outputs."""
 
     def make(title: str, heads: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> Table:
         made = Table(title=title, title_justify="left", title_style="bold", header_style="bold")

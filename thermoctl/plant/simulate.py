@@ -1,4 +1,7 @@
-"""Simulation of a compiled plant on a recording's inputs: free run, sensitivities, and one fixed period at a time."""
+"""Simulation of a compiled plant on a recording's inputs.
+
+Free run, sensitivities, and one fixed period at a time.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +29,11 @@ class SimulationError(Exception):
 
 @dataclass
 class Excitation:
-    """What one recording gives to a plant: `t` (N,) seconds from its first sample, `u` (N, inputs) with gaps filled
-    (held, or on a straight line for linear inputs), `y` (N, outputs) measured, NaN where missing, `first` the first
-    recorded values, and the scales that a simulation on it uses."""
+    """What one recording gives to a plant.
+
+    `t` (N,) seconds from its first sample, `u` (N, inputs) with gaps filled (held, or on a straight line for
+    linear inputs), `y` (N, outputs) measured, NaN where missing, `first` the first recorded values, and the
+    scales that a simulation on it uses."""
 
     name: str
     t: np.ndarray
@@ -40,14 +45,18 @@ class Excitation:
     width: np.ndarray | None = None  # (jumps,) half width of each smoothed jump
 
     def part(self, start: int, stop: int) -> Excitation:
-        """The samples start..stop-1 (scales kept); time goes on counting from the recording's start."""
+        """Return the samples start..stop-1 (scales kept).
+
+        Time goes on counting from the recording's start."""
         return dataclasses.replace(self, t=self.t[start:stop], u=self.u[start:stop], y=self.y[start:stop])
 
 
 @dataclass
 class Simulation:
-    """`x` (N, nx), `y` (N, ny) noise-free; with sensitivities `dx` (N, nx, nq) and `dy` (N, ny, nq) by q = (active
-    parameters, uncertain initial states)."""
+    """`x` (N, nx), `y` (N, ny) noise-free.
+
+    With sensitivities `dx` (N, nx, nq) and `dy` (N, ny, nq) by q = (active parameters, uncertain initial
+    states)."""
 
     t: np.ndarray
     x: np.ndarray
@@ -68,7 +77,9 @@ class _Forces(ctypes.Structure):
 
 
 def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]) -> np.ndarray:
-    """An array to fill. Touching new pages costs more than the arithmetic on them, so a caller may keep them."""
+    """Return an array to fill.
+
+    Touching new pages costs more than the arithmetic on them, so a caller may keep them."""
     if kept is None:
         return np.empty(shape)
     size = int(np.prod(shape))
@@ -96,7 +107,9 @@ class Model:
     # ------------------------------------------------------------------------------------------------------- inputs
 
     def excitation(self, table: Table) -> Excitation:
-        """The recording as this plant reads it. Raises InputError where an input's column is missing or empty."""
+        """Return the recording as this plant reads it.
+
+        Raises InputError where an input's column is missing or empty."""
         t = np.ascontiguousarray(table.t - table.t[0], float)
         u = np.empty((len(t), len(self.code.inputs)))
         linear = np.zeros(len(self.code.inputs), np.intc)
@@ -123,7 +136,7 @@ class Model:
     def vector(
         self, parameters: Mapping[str, float] | np.ndarray | None, recording: str | None = None
     ) -> np.ndarray:
-        """All parameters in order: the plant's values (those of the recording where it has its own), then changes."""
+        """Return all parameters in order: the plant's values, the recording's own first, then changes."""
         if isinstance(parameters, np.ndarray):
             return np.ascontiguousarray(parameters, float)
         out = np.array(
@@ -141,8 +154,9 @@ class Model:
         return out
 
     def _delayed_inputs(self, drive: Excitation, p: np.ndarray) -> np.ndarray:
-        """u with the derived columns of delayed inputs: the mean of the held signal over each interval, t - seconds; and
-        the slope of that by the seconds."""
+        """Return u with the derived columns of delayed inputs.
+
+        The mean of the held signal over each interval, t - seconds; and the slope of that by the seconds."""
         if not self.code.input_delays:
             return drive.u
         u = drive.u.copy()
@@ -177,7 +191,9 @@ class Model:
     def start(
         self, drive: Excitation, p: np.ndarray, dx0: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Initial states (nx,) and their sensitivities (nx, nq). `dx0`: shifts of the uncertain initial states."""
+        """Return initial states (nx,) and their sensitivities (nx, nq).
+
+        `dx0`: shifts of the uncertain initial states."""
         values = {
             **dict(zip(self.plant.inputs, drive.u[0], strict=False)),
             **dict(zip(self.parameters, p, strict=True)),
@@ -208,7 +224,7 @@ class Model:
     def prepare(
         self, drive: Excitation, parameters: Mapping[str, float] | np.ndarray | None = None
     ) -> Excitation:
-        """Set the drive's scales (ranges of states, widths of smoothed jumps) from trial runs at these parameters."""
+        """Set the scales of an excitation (ranges of states, widths of jumps) by trial runs."""
         p = self.vector(parameters, drive.name)
         jumps = self.code.jumps
         dt = float(np.median(np.diff(drive.t))) if len(drive.t) > 1 else 1.0
@@ -258,8 +274,11 @@ class Model:
         rtol: float = RTOL,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> Simulation:
-        """Free run on a drive. `buffers`: a dict that keeps the large arrays between runs (the next run with it changes
-        the states' slopes that the last one returned, and the outputs' of the last one on this drive). Raises SimulationError."""
+        """Free run on a drive.
+
+        `buffers`: a dict that keeps the large arrays between runs (the next run with it changes the states'
+        slopes that the last one returned, and the outputs' of the last one on this drive). Raises
+        SimulationError."""
         if drive.scale is None:
             self.prepare(drive, parameters)
         return self._run(drive, self.vector(parameters, drive.name), dx0, sensitivities, rtol, buffers)
@@ -275,8 +294,10 @@ class Model:
         return self.run(self.excitation(table), parameters, None, sensitivities, rtol)
 
     def measure(self, table: Table, seed: int = 0) -> Table:
-        """The plant in the rig's place: a recording of the inputs in `table` and what the sensors make of the outputs, with their
-        noise and their steps. Uncertain starts are drawn. Raises InputError, SimulationError."""
+        """Return the plant in the rig's place.
+
+        a recording of the inputs in `table` and what the sensors make of the outputs, with their noise and
+        their steps. Uncertain starts are drawn. Raises InputError, SimulationError."""
         rng, drive = np.random.default_rng(seed), self.excitation(table)
         dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(
             size=len(self.uncertain)
@@ -353,8 +374,10 @@ class Model:
         rtol: float = 1e-5,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> np.ndarray:
-        """The outputs' first-order response (N, ny, columns) to forces on dx/dt that the plant does not have. Entry e of
-        `forces` is (state, column) and has its values, per second, in q[:, e] (N, entries). `buffers`: as of `run`."""
+        """Return the outputs' first-order response (N, ny, columns) to forces on dx/dt beside the plant's.
+
+        Entry e of `forces` is (state, column); its values, per second, are q[:, e] of q (N, entries).
+        `buffers`: as of `run`."""
         lib, n, nx = self.code.library, len(drive.t), len(self.states)
         p = self.vector(parameters, drive.name)
         if drive.scale is None or drive.width is None:
@@ -437,7 +460,9 @@ class Model:
     def _shift(
         self, t: np.ndarray, g: np.ndarray, dg: np.ndarray | None, p: np.ndarray, own: int
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """The arguments of delays, seconds earlier: cubic between samples (Catmull-Rom slopes), held before the start."""
+        """Return the arguments of delays, seconds earlier.
+
+        Cubic between samples (Catmull-Rom slopes), held before the start."""
         known = dict(zip(self.parameters, p, strict=True))
         out, dout = np.empty_like(g), None if dg is None else np.empty_like(dg)
         for j, (_, seconds) in enumerate(self.code.output_delays.values()):
@@ -546,7 +571,9 @@ class Stepper:
         self._pointers = [_p(a) for a in (self._u, self._p, self._width)], [_p(a) for a in tail]
 
     def step(self, u: np.ndarray) -> np.ndarray:
-        """Advance one period with inputs `u` (nu,) held; returns the outputs (ny,), a view that the next step changes."""
+        """Advance one period with inputs `u` (nu,) held.
+
+        Returns the outputs (ny,), a view that the next step changes."""
         self._u[:] = u
         head, tail = self._pointers
         if self.model.code.library.advance_period(self.t, self.period_s, *head, self.rtol, *tail):

@@ -1,1 +1,1 @@
-"""Recordings: tables of numbers, written crash-safe, read in the formats that people bring, exported to more."""
+"""Recordings: tables of numbers, written crash-safe, read and exported in many formats."""

@@ -1,7 +1,7 @@
 """Reading and writing a `Table`, in the formats that people bring; the suffix of the file says which.
 
-A table has a time column `t` in seconds, strictly increasing, and any number of other columns; every cell is a number
-or missing (NaN). What is not that is refused with file and row, never repaired in silence.
+A table has a time column `t` in seconds, strictly increasing, and any number of other columns; every cell is
+a number or missing (NaN). What is not that is refused with file and row, never repaired in silence.
 """
 
 from __future__ import annotations
@@ -41,12 +41,14 @@ class _Raw:
 
 
 def read_table(path: str | Path, columns: Iterable[str] | None = None) -> Table:
-    """Read a recording; the suffix says the format (`FORMATS`). `columns` reads only those (beside the time).
+    """Read a recording; the suffix says the format (`FORMATS`).
 
-    The time column is `t`, in our own recordings `t_s`. Raises InputError with file and row (CSV: line) for a text
-    where a number belongs, an infinite value, a time that is missing, stands still or runs backwards, a ragged row, a
-    column named twice, no time column, no rows; and for a file that is too large, cut or not of its format.
-    """
+    `columns` reads only those (beside the time).
+
+    The time column is `t`, in our own recordings `t_s`. Raises InputError with file and row (CSV: line) for a
+    text where a number belongs, an infinite value, a time that is missing, stands still or runs backwards, a
+    ragged row, a column named twice, no time column, no rows; and for a file that is too large, cut or not of
+    its format."""
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
     if path.is_dir():
@@ -69,8 +71,8 @@ def read_table(path: str | Path, columns: Iterable[str] | None = None) -> Table:
 def write_table(path: str | Path, table: Table) -> None:
     """Write a table as .csv, .parquet or .arrow (IPC file); a missing sample becomes an empty cell.
 
-    The file appears whole or not at all. Raises InputError for another suffix or when the place cannot be written.
-    """
+    The file appears whole or not at all. Raises InputError for another suffix or when the place cannot be
+    written."""
     path = Path(path)
     kind = path.suffix.lower()
     if kind not in (".csv", ".parquet", ".arrow"):
@@ -95,7 +97,7 @@ def write_table(path: str | Path, table: Table) -> None:
 
 
 def to_arrow(table: Table) -> pa.Table:
-    """The table as Arrow: `t` first, float64, null where a sample is missing, `meta` as schema metadata."""
+    """Return the table as Arrow: `t` first, float64, null for a missing sample, `meta` as metadata."""
     arrays = {"t": table.t, **table.columns}
     arrow = pa.table(
         {k: pa.array(np.asarray(v, dtype=np.float64), from_pandas=True) for k, v in arrays.items()}
@@ -167,7 +169,7 @@ def _limit(path: Path, rows: int, columns: int) -> None:
 
 
 def _picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
-    """The time column and those asked for."""
+    """Return the time column and those asked for."""
     if want is None:
         return names
     for name in want:
@@ -323,7 +325,7 @@ def _read_parquet(path: Path, want: list[str] | None) -> _Raw:
 
 
 def _read_arrow(path: Path, want: list[str] | None) -> _Raw:
-    """An IPC file, or an IPC stream up to where it was cut (a recorder that lost power leaves one)."""
+    """Return an IPC file, or an IPC stream up to where it was cut (a recorder that lost power leaves one)."""
     with pa.memory_map(str(path)) as source:
         if source.size() >= 6 and source.read(6) == b"ARROW1":
             with pa.ipc.open_file(source) as f:

@@ -1,7 +1,7 @@
-"""History for a plot: any signal over hours or days, as the least, mean and largest value of each pixel's span.
+"""History for a plot: least, mean and largest value of a signal in each pixel's span.
 
-Long spans come from the 10 Hz tier, short ones (FULL_SPAN_S and less) from the full rate. Files that are complete are
-reduced to one second once and kept in memory, so that a day is drawn again in milliseconds.
+Long spans come from the 10 Hz tier, short ones (FULL_SPAN_S and less) from the full rate. Files that are
+complete are reduced to one second once and kept in memory, so that a day is drawn again in milliseconds.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ _CLOCK = "wall_s"
 
 @dataclass(frozen=True)
 class History:
-    """`t` (n,) seconds since 1970, the middle of each bucket that holds a sample; low, mean, high (n,) in the signal's
-    unit; `source` 'full' or 'tier'; `files` that were read."""
+    """`t` (n,) seconds since 1970, the middle of each bucket that holds a sample.
+
+    low, mean, high (n,) in the signal's unit; `source` 'full' or 'tier'; `files` that were read."""
 
     t: np.ndarray
     low: np.ndarray
@@ -39,10 +40,11 @@ class History:
 
 
 def history(directory: str | Path, signal: str, begin_s: float, end_s: float, points: int = 800) -> History:
-    """The signal from begin_s to end_s (seconds since 1970) in at most `points` buckets; empty where nothing is recorded.
+    """Return the signal from begin_s to end_s (seconds since 1970) in at most `points` buckets.
 
-    Raises InputError for an unknown signal, a span that is empty, or points out of 2..MAX_POINTS.
-    """
+    Empty where nothing is recorded.
+
+    Raises InputError for an unknown signal, a span that is empty, or points out of 2..MAX_POINTS."""
     if signal not in INDEX:
         raise InputError(f"history: no signal '{signal[:60]}'{suggest(signal, NAMES)}")
     if not (np.isfinite([begin_s, end_s]).all() and 0.0 <= begin_s < end_s <= 1e11):
@@ -70,8 +72,9 @@ def history(directory: str | Path, signal: str, begin_s: float, end_s: float, po
 
 
 def reduce(bucket: np.ndarray, low: np.ndarray, mean: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Samples of the same bucket number become one: (numbers, least, mean, largest). The clock may have stepped: the
-    buckets need not be in order."""
+    """Reduce samples of the same bucket number to (numbers, least, mean, largest).
+
+    The buckets need not be in order: the clock may have stepped."""
     if not len(bucket):
         return bucket, low, mean, high
     if (np.diff(bucket) < 0).any():
@@ -98,7 +101,7 @@ def _start_s(path: Path) -> float:
 
 
 def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Path]:
-    """The files that may hold a part of the span: a file lasts at most until it was written last."""
+    """Return the files that may hold a part of the span: a file lasts at most until it was written last."""
     try:
         paths = recording_files(directory, kind)
     except OSError:
@@ -114,7 +117,9 @@ def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Pa
 
 
 def _samples(path: Path, signal: str, kind: str, step_s: float) -> tuple[np.ndarray, ...]:
-    """(wall, low, mean, high) of one file, reduced to `step_s` (0: as recorded); a broken file gives nothing."""
+    """(wall, low, mean, high) of one file, reduced to `step_s` (0: as recorded).
+
+    a broken file gives nothing."""
     try:
         size = path.stat().st_size
         return _reduced(path, size, signal, kind, step_s) if step_s else _read(path, signal, kind)

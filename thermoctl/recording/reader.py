@@ -93,8 +93,10 @@ def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
 
 
 def recover(path: str | Path, out: str | Path) -> Info:
-    """Copy what is whole of a cut recording to `out` and end it properly, so that any Arrow reader opens it; returns
-    what the copy holds. Raises InputError when nothing can be read or `out` exists."""
+    """Copy the whole batches of a cut recording to `out` and end it properly.
+
+    Any Arrow reader opens the copy; its summary is returned. Raises InputError when nothing can be read or
+    `out` exists."""
     path, out = Path(path), Path(out)
     stream = open_stream(path)
     for _ in stream:
@@ -124,8 +126,8 @@ def export(
 ) -> int:
     """Write a recording as .parquet, .csv, .mf4 or .mcap; returns the rows written.
 
-    columns: only these (beside the time); begin_s, end_s: the part begin_s <= t < end_s. A recording of ours goes to
-    Parquet and CSV batch by batch, however long. Raises InputError."""
+    columns: only these (beside the time); begin_s, end_s: the part begin_s <= t < end_s. A recording of ours
+    goes to Parquet and CSV batch by batch, however long. Raises InputError."""
     path, out = Path(path), Path(out)
     kind = out.suffix.lower()
     if kind not in (".parquet", ".csv", ".mf4", ".mcap"):

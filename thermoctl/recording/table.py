@@ -12,10 +12,9 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Table:
-    """A recording: `t` (N,) float64 seconds as recorded, `columns` each (N,) float64, NaN where a sample is missing.
+    """A recording: time `t` (N,) in seconds and `columns`, each (N,) float64, NaN where missing.
 
-    `name` is the file's stem, `path` its path; `meta` holds what the file says about itself (configuration, model).
-    """
+    `name`: the file's stem; `path`: its path; `meta`: texts of the file (configuration, model)."""
 
     name: str
     path: str

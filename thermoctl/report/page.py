@@ -1,4 +1,4 @@
-"""The one look of all pages: self-contained HTML, no script and no request, light and dark, fit for printing."""
+"""The style of all pages: self-contained HTML without scripts, light and dark, fit for print."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _UNIT = re.compile(r"\b(degC|um|us|ohm)\b")
 
 
 def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str:
-    """A whole HTML page from (heading, HTML body) pairs; `note` stands under the title."""
+    """Return a whole HTML page from (heading, HTML body) pairs; `note` stands under the title."""
     parts = [f"<section><h2>{html.escape(h)}</h2>\n{body}\n</section>" if h else body for h, body in sections]
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
@@ -48,7 +48,7 @@ def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
-    """An HTML table; numbers with four significant digits and to the right, words to the left, None as a dash."""
+    """Return an HTML table; numbers are rounded and to the right, words to the left, None a dash."""
     rows = [list(row) for row in rows]
     words = [
         any(isinstance(v, str) and not _NUMERIC.match(v) for row in rows for v in row[k : k + 1])
@@ -74,7 +74,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = 
 
 
 def cell(v: object) -> str:
-    """A number or a word as HTML: 4 significant digits, thousands apart, powers of ten as such."""
+    """Return a number or a word as HTML: 4 significant digits, thousands apart, powers of ten as such."""
     if v is None or (isinstance(v, float) and math.isnan(v)):
         return "–"
     if not isinstance(v, float):
@@ -85,7 +85,7 @@ def cell(v: object) -> str:
 
 
 def unit(name: str | None) -> str:
-    """A unit as people write it: degC is °C, um is µm, no unit is nothing."""
+    """Return a unit as people write it: degC is °C, um is µm, no unit is nothing."""
     text = _UNIT.sub(lambda m: {"degC": "°C", "um": "µm", "us": "µs", "ohm": "Ω"}[m[0]], name or "")
     text = (
         re.sub(r"\*\*(2|3|4)(?![.\d])", lambda m: {"2": "²", "3": "³", "4": "⁴"}[m[1]], text)
@@ -96,7 +96,7 @@ def unit(name: str | None) -> str:
 
 
 def figure(fig: Figure, caption: str = "") -> str:
-    """A matplotlib figure as inline SVG with its caption; the figure is closed."""
+    """Return a matplotlib figure as inline SVG with its caption; the figure is closed."""
     import matplotlib.pyplot as plt
 
     for axis in fig.axes:
