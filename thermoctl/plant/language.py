@@ -92,70 +92,56 @@ class Plant:
     file: str = "<plant>"
 
     def plain(self) -> dict[str, Any]:
-        """Plain dicts and lists, as the file holds them; `from_plain` reads them back."""
-
-        def drop(**items: Any) -> dict[str, Any]:
-            return {k: v for k, v in items.items() if v is not None and v != {}}
-
-        return {
+        """Return plain dicts and lists, as the file holds them; `files.from_plain` reads them back."""
+        content: dict[str, Any] = {
             "format": FORMAT,
             "title": self.title,
-            "inputs": {
-                i.name: drop(
-                    unit=i.unit,
-                    column=None if i.column == i.name else i.column,
-                    between_samples="linear" if i.linear else None,
-                )
-                for i in self.inputs.values()
-            },
-            "parameters": {
-                p.name: drop(
-                    value=p.value,
-                    unit=p.unit,
-                    range=list(p.range) if p.range else None,
-                    per_recording=p.per_recording or None,
-                    values=dict(p.values),
-                )
-                for p in self.parameters.values()
-            },
-            **(
-                {
-                    "nodes": {
-                        n.name: drop(
-                            unit=n.unit,
-                            storage=_scalar(n.storage),
-                            initial=_scalar(n.initial),
-                            initial_sigma=n.initial_sigma,
-                        )
-                        for n in self.nodes.values()
-                    }
-                }
-                if self.nodes
-                else {}
-            ),
-            **(
-                {
-                    "flows": {
-                        f.name: drop(
-                            **{"from": f.source, "into": f.target}, rate=_scalar(f.rate), unit=f.unit
-                        )
-                        for f in self.flows.values()
-                    }
-                }
-                if self.flows
-                else {}
-            ),
-            "outputs": {
-                o.name: drop(
-                    value=_scalar(o.value),
-                    column=None if o.column == o.name else o.column,
-                    unit=o.unit,
-                    noise=o.noise,
-                    resolution=o.resolution,
-                )
-                for o in self.outputs.values()
-            },
+            "inputs": {i.name: _input(i) for i in self.inputs.values()},
+            "parameters": {p.name: _parameter(p) for p in self.parameters.values()},
+            "nodes": {n.name: _node(n) for n in self.nodes.values()},
+            "flows": {f.name: _flow(f) for f in self.flows.values()},
+            "outputs": {o.name: _output(o) for o in self.outputs.values()},
         }
+        return {k: v for k, v in content.items() if v or k not in ("nodes", "flows")}
+
+
+def _given(**items: Any) -> dict[str, Any]:
+    return {k.rstrip("_"): v for k, v in items.items() if v is not None and v != {}}
+
+
+def _input(i: Input) -> dict[str, Any]:
+    column = None if i.column == i.name else i.column
+    return _given(unit=i.unit, column=column, between_samples="linear" if i.linear else None)
+
+
+def _parameter(p: Parameter) -> dict[str, Any]:
+    return _given(
+        value=p.value,
+        unit=p.unit,
+        range=list(p.range) if p.range else None,
+        per_recording=p.per_recording or None,
+        values=dict(p.values),
+    )
+
+
+def _node(n: Node) -> dict[str, Any]:
+    return _given(
+        unit=n.unit, storage=_scalar(n.storage), initial=_scalar(n.initial), initial_sigma=n.initial_sigma
+    )
+
+
+def _flow(f: Flow) -> dict[str, Any]:
+    return _given(from_=f.source, into=f.target, rate=_scalar(f.rate), unit=f.unit)
+
+
+def _output(o: Output) -> dict[str, Any]:
+    return _given(
+        value=_scalar(o.value),
+        column=None if o.column == o.name else o.column,
+        unit=o.unit,
+        noise=o.noise,
+        resolution=o.resolution,
+    )
 
 
 def _scalar(e: Expr) -> str | float:

@@ -26,14 +26,14 @@ from thermoctl.plant.refit import Fit, Noise, Problem
 from thermoctl.plant.simulate import Excitation
 
 CLIP = 6.0  # residuals are clipped to this many robust standard deviations
-MAX_CORRELATION = 0.995  # of neighbouring samples
+MIN_CORRELATION, MAX_CORRELATION = 1e-3, 0.995  # of neighbouring samples; below: white noise
 MIN_SAMPLES = 20  # of a channel, below which its noise is not estimated
 
 
 def innovations(phi: float, white: float, total: float) -> Noise:
     """AR(1) with correlation phi of which `white` (a variance) of `total` is uncorrelated, as Noise."""
     coloured = max(total - white, 0.02 * total)
-    if phi < 1e-3:
+    if phi < MIN_CORRELATION:
         return Noise(float(np.sqrt(total)))
     if white < 1e-6 * total:
         return Noise(float(np.sqrt(total)), phi)

@@ -31,7 +31,9 @@ from thermoctl.plant.residuals import (
 )
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
 
-STEPS_TO_GOAL = 20.0  # give up where `goal` is further away than this many steps like each of the last three
+STEPS_TO_GOAL = 20.0  # a step is slow if `goal` is further away than this many like it
+SLOW_STEPS = 3  # give up after so many slow steps in a row
+AT_BOUND = 1e-6  # a parameter this near to its bound, as a share of its range, is reported at it
 MAX_ACCELERATION = 0.75  # use the geodesic acceleration only up to this share of the step
 MAX_SHIFT = 8.0  # of an uncertain initial state, in its standard deviations
 KEPT_STARTS = 2  # random starts that are followed
@@ -206,7 +208,7 @@ def _descend(problem: Problem, z: np.ndarray, limits: _Limits) -> Fit:
         kept.clear()
         now = problem.evaluate(z, True, kept)
         out_of_reach = out_of_reach + 1 if STEPS_TO_GOAL * gain < now.cost - limits.goal else 0
-        if gain < limits.tolerance * max(1.0, 1e-3 * now.cost) or out_of_reach >= 3:
+        if gain < limits.tolerance * max(1.0, 1e-3 * now.cost) or out_of_reach >= SLOW_STEPS:
             break
     return _result(problem, z, now, done)
 
@@ -291,9 +293,9 @@ def _result(problem: Problem, z: np.ndarray, now: Evaluation, iterations: int) -
     values, dx0 = problem.unpack(z)
     at_bound = {}
     for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
-        if z[k] <= 1e-6:
+        if z[k] <= AT_BOUND:
             at_bound[q] = "low"
-        elif z[k] >= 1 - 1e-6:
+        elif z[k] >= 1 - AT_BOUND:
             at_bound[q] = "high"
     return Fit(
         problem.model,

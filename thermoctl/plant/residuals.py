@@ -28,6 +28,7 @@ HUBER = 4.0  # residuals beyond this many standard deviations count linearly
 PRIOR_WEIGHT = 0.02  # moving a parameter over its whole range costs as much as one residual of 0.02 sigma
 PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
 DOWNDATE_SHARE = 0.25  # up to this share of down-weighted rows, their excess is subtracted from J'J
+MIN_DIFFERENCED = 4  # samples of a recording whose second differences are used
 LOG_RATIO = 3.0  # a range that spans this factor is fitted on a log scale
 
 
@@ -84,7 +85,9 @@ def default_noise(plant: Plant, excitations: Sequence[Excitation] = ()) -> tuple
         sigma = np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12))
         if sigma <= 0:
             parts = [d.y[np.isfinite(d.y[:, j]), j] for d in excitations]
-            second = np.concatenate([np.diff(y, 2) for y in parts if len(y) > 3] or [np.zeros(1)])
+            second = np.concatenate(
+                [np.diff(y, 2) for y in parts if len(y) >= MIN_DIFFERENCED] or [np.zeros(1)]
+            )
             sigma = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6)
             spread = max((float(np.ptp(y)) for y in parts if len(y)), default=1.0)
             sigma = max(sigma, 1e-4 * spread, 1e-12)

@@ -153,58 +153,60 @@ class Model:
             out[self.parameters.index(key)] = value
         return out
 
-    def _delayed_inputs(self, drive: Excitation, p: np.ndarray) -> np.ndarray:
+    def _delayed_inputs(self, excitation: Excitation, p: np.ndarray) -> np.ndarray:
         """Return u with the derived columns of delayed inputs.
 
         The mean of the held signal over each interval, t - seconds; and the slope of that by the seconds."""
         if not self.code.input_delays:
-            return drive.u
-        u = drive.u.copy()
+            return excitation.u
+        u = excitation.u.copy()
         known = dict(zip(self.parameters, p, strict=True))
         n = len(self.plant.inputs)
         columns = {i: u[:, j] for j, i in enumerate(self.plant.inputs)}
         for j, (signal, seconds) in enumerate(self.code.input_delays.values()):
-            s = np.broadcast_to(np.asarray(ex.evaluate(signal, columns), float), drive.t.shape)
+            s = np.broadcast_to(np.asarray(ex.evaluate(signal, columns), float), excitation.t.shape)
             td = max(float(ex.evaluate(seconds, known)), 0.0)
             if all(self.plant.inputs[i].linear for i in ex.names(signal)):
-                u[:, n + j] = np.interp(drive.t - td, drive.t, s)
-                slope = np.interp(drive.t - td + 1e-9, drive.t, s) - u[:, n + j]
+                u[:, n + j] = np.interp(excitation.t - td, excitation.t, s)
+                slope = np.interp(excitation.t - td + 1e-9, excitation.t, s) - u[:, n + j]
                 u[:, n + len(self.code.input_delays) + j] = -slope / 1e-9
-                drive.linear[n + j] = 1
+                excitation.linear[n + j] = 1
             else:
-                area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(drive.t))])
-                at = drive.t - td
+                area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(excitation.t))])
+                at = excitation.t - td
 
                 def integral(
                     z: np.ndarray, area: np.ndarray = area, s: np.ndarray = s
                 ) -> np.ndarray:  # before the start the first value held
-                    return np.where(z < drive.t[0], (z - drive.t[0]) * s[0], np.interp(z, drive.t, area))
+                    return np.where(
+                        z < excitation.t[0], (z - excitation.t[0]) * s[0], np.interp(z, excitation.t, area)
+                    )
 
-                dt = np.diff(drive.t)
+                dt = np.diff(excitation.t)
                 u[:-1, n + j] = np.diff(integral(at)) / dt
                 u[-1, n + j] = u[-2, n + j]
-                k = np.clip(np.searchsorted(drive.t, at, side="right") - 1, 0, len(s) - 1)
+                k = np.clip(np.searchsorted(excitation.t, at, side="right") - 1, 0, len(s) - 1)
                 u[:-1, n + len(self.code.input_delays) + j] = -np.diff(s[k]) / dt
                 u[-1, n + len(self.code.input_delays) + j] = 0.0
         return np.ascontiguousarray(u)
 
     def start(
-        self, drive: Excitation, p: np.ndarray, dx0: np.ndarray | None = None
+        self, excitation: Excitation, p: np.ndarray, dx0: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return initial states (nx,) and their sensitivities (nx, nq).
 
         `dx0`: shifts of the uncertain initial states."""
         values = {
-            **dict(zip(self.plant.inputs, drive.u[0], strict=False)),
+            **dict(zip(self.plant.inputs, excitation.u[0], strict=False)),
             **dict(zip(self.parameters, p, strict=True)),
         }
 
         def first(key: str) -> float:
-            if key not in drive.first:
+            if key not in excitation.first:
                 raise InputError(
-                    f"recording {drive.name}: first({key}) is asked for, but the recording has no value of it"
+                    f"recording {excitation.name}: first({key}) is asked for, but the recording has no value of it"
                 )
-            return drive.first[key]
+            return excitation.first[key]
 
         x0 = np.array([float(ex.evaluate(e, values, first)) for e in self._initial])
         s0 = np.zeros((len(self.states), len(self.unknowns)))
@@ -222,12 +224,12 @@ class Model:
     # --------------------------------------------------------------------------------------------------- simulating
 
     def prepare(
-        self, drive: Excitation, parameters: Mapping[str, float] | np.ndarray | None = None
+        self, excitation: Excitation, parameters: Mapping[str, float] | np.ndarray | None = None
     ) -> Excitation:
         """Set the scales of an excitation (ranges of states, widths of jumps) by trial runs."""
-        p = self.vector(parameters, drive.name)
+        p = self.vector(parameters, excitation.name)
         jumps = self.code.jumps
-        dt = float(np.median(np.diff(drive.t))) if len(drive.t) > 1 else 1.0
+        dt = float(np.median(np.diff(excitation.t))) if len(excitation.t) > 1 else 1.0
         width = np.ones(max(len(jumps), 1))
         for i, (z, kind) in enumerate(jumps):
             if kind == "time":
@@ -237,51 +239,57 @@ class Model:
                     else 1.0
                 )
                 width[i] = 0.5 * dt * max(abs(float(slope)), 1e-12)
-        drive.width = width
-        drive.scale = np.full(len(self.states), np.nan)
+        excitation.width = width
+        excitation.scale = np.full(len(self.states), np.nan)
         moving = any(kind == "state" for _, kind in jumps)
         for share in (1e-2, JUMP_WIDTH) if moving else (1.0,):
             try:
-                run = self._run(drive, p, None, False, 1e-5 if moving else 1e-4)
+                run = self._run(excitation, p, None, False, 1e-5 if moving else 1e-4)
                 x = run.x
             except SimulationError:
-                x = np.zeros((len(drive.t), len(self.states)))
+                x = np.zeros((len(excitation.t), len(self.states)))
             finite = np.where(np.isfinite(x), x, 0.0)
-            drive.scale = np.ptp(finite, axis=0) + 1e-6 * np.max(np.abs(finite), axis=0, initial=0.0) + 1e-12
+            excitation.scale = (
+                np.ptp(finite, axis=0) + 1e-6 * np.max(np.abs(finite), axis=0, initial=0.0) + 1e-12
+            )
             if moving:
-                values = self._signals(drive, p, finite)
+                values = self._signals(excitation, p, finite)
                 for i, (z, kind) in enumerate(jumps):
                     if kind == "state":
-                        reach = float(np.max(np.abs(np.broadcast_to(ex.evaluate(z, values), drive.t.shape))))
+                        reach = float(
+                            np.max(np.abs(np.broadcast_to(ex.evaluate(z, values), excitation.t.shape)))
+                        )
                         width[i] = max(share * reach, 1e-15)
-        return drive
+        return excitation
 
-    def _signals(self, drive: Excitation, p: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
-        u = self._delayed_inputs(drive, p)
+    def _signals(self, excitation: Excitation, p: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
+        u = self._delayed_inputs(excitation, p)
         return {
             **dict(zip(self.code.inputs, u.T, strict=True)),
             **dict(zip(self.parameters, p, strict=True)),
             **dict(zip(self.states, x.T, strict=True)),
-            "t": drive.t,
+            "t": excitation.t,
         }
 
     def run(
         self,
-        drive: Excitation,
+        excitation: Excitation,
         parameters: Mapping[str, float] | np.ndarray | None = None,
         dx0: np.ndarray | None = None,
         sensitivities: bool = False,
         rtol: float = RTOL,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> Simulation:
-        """Free run on a drive.
+        """Free run on a excitation.
 
         `buffers`: a dict that keeps the large arrays between runs (the next run with it changes the states'
-        slopes that the last one returned, and the outputs' of the last one on this drive). Raises
+        slopes that the last one returned, and the outputs' of the last one on this excitation). Raises
         SimulationError."""
-        if drive.scale is None:
-            self.prepare(drive, parameters)
-        return self._run(drive, self.vector(parameters, drive.name), dx0, sensitivities, rtol, buffers)
+        if excitation.scale is None:
+            self.prepare(excitation, parameters)
+        return self._run(
+            excitation, self.vector(parameters, excitation.name), dx0, sensitivities, rtol, buffers
+        )
 
     def simulate(
         self,
@@ -298,11 +306,11 @@ class Model:
 
         a recording of the inputs in `table` and what the sensors make of the outputs, with their noise and
         their steps. Uncertain starts are drawn. Raises InputError, SimulationError."""
-        rng, drive = np.random.default_rng(seed), self.excitation(table)
+        rng, excitation = np.random.default_rng(seed), self.excitation(table)
         dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(
             size=len(self.uncertain)
         )
-        y = self.run(drive, None, dx0).y
+        y = self.run(excitation, None, dx0).y
         columns = {i.column: table.columns[i.column] for i in self.plant.inputs.values()}
         for j, o in enumerate(self.plant.outputs.values()):
             read = y[:, j] + (o.noise or 0.0) * rng.normal(size=len(y))
@@ -311,36 +319,36 @@ class Model:
 
     def _run(
         self,
-        drive: Excitation,
+        excitation: Excitation,
         p: np.ndarray,
         dx0: np.ndarray | None,
         sensitivities: bool,
         rtol: float,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> Simulation:
-        lib, n, nx, nq = self.code.library, len(drive.t), len(self.states), len(self.unknowns)
-        u = self._delayed_inputs(drive, p)
-        width = drive.width if drive.width is not None else np.ones(1)
-        x0, s0 = self.start(drive, p, dx0)
+        lib, n, nx, nq = self.code.library, len(excitation.t), len(self.states), len(self.unknowns)
+        u = self._delayed_inputs(excitation, p)
+        width = excitation.width if excitation.width is not None else np.ones(1)
+        x0, s0 = self.start(excitation, p, dx0)
         x = np.empty((n, nx))
         dx = _buffer(buffers, "dx", (n, nx, nq)) if sensitivities else None
         info = np.zeros(2)
         if nx:
             if not np.all(np.isfinite(x0)):
                 raise SimulationError(
-                    f"{drive.name}: the start of '{self.states[int(np.argmin(np.isfinite(x0)))]}' is not finite"
+                    f"{excitation.name}: the start of '{self.states[int(np.argmin(np.isfinite(x0)))]}' is not finite"
                 )
             scale = (
-                drive.scale
-                if drive.scale is not None and np.all(np.isfinite(drive.scale))
+                excitation.scale
+                if excitation.scale is not None and np.all(np.isfinite(excitation.scale))
                 else np.abs(x0) + 1e-3
             )
             atol = rtol * scale
             failed = lib.integrate(
                 n,
-                _p(drive.t),
+                _p(excitation.t),
                 _p(u),
-                _p(drive.linear),
+                _p(excitation.linear),
                 _p(p),
                 _p(width),
                 _p(x0),
@@ -357,15 +365,15 @@ class Model:
             if failed:
                 at = max(failed - 1, 0)
                 raise SimulationError(
-                    f"{drive.name}: the simulation does not get beyond t = {drive.t[at]:.6g} s; states "
+                    f"{excitation.name}: the simulation does not get beyond t = {excitation.t[at]:.6g} s; states "
                     + ", ".join(f"{s} = {v:.3g}" for s, v in zip(self.states, x[at], strict=True))
                 )
-        y, dy = self._observe(drive, u, p, width, x, dx, nq, sensitivities, buffers)
-        return Simulation(drive.t, x, y, dx, dy, int(info[0]), int(info[1]))
+        y, dy = self._observe(excitation, u, p, width, x, dx, nq, sensitivities, buffers)
+        return Simulation(excitation.t, x, y, dx, dy, int(info[0]), int(info[1]))
 
     def respond(
         self,
-        drive: Excitation,
+        excitation: Excitation,
         parameters: Mapping[str, float] | np.ndarray | None,
         dx0: np.ndarray | None,
         forces: Sequence[tuple[int, int]],
@@ -378,27 +386,27 @@ class Model:
 
         Entry e of `forces` is (state, column); its values, per second, are q[:, e] of q (N, entries).
         `buffers`: as of `run`."""
-        lib, n, nx = self.code.library, len(drive.t), len(self.states)
-        p = self.vector(parameters, drive.name)
-        if drive.scale is None or drive.width is None:
-            self.prepare(drive, p)
-        assert drive.scale is not None and drive.width is not None
-        u = self._delayed_inputs(drive, p)
-        x0, _ = self.start(drive, p, dx0)
+        lib, n, nx = self.code.library, len(excitation.t), len(self.states)
+        p = self.vector(parameters, excitation.name)
+        if excitation.scale is None or excitation.width is None:
+            self.prepare(excitation, p)
+        assert excitation.scale is not None and excitation.width is not None
+        u = self._delayed_inputs(excitation, p)
+        x0, _ = self.start(excitation, p, dx0)
         rows = np.array([f[0] for f in forces], np.intc)
         cols = np.array([f[1] for f in forces], np.intc)
         q = np.ascontiguousarray(q, float)
         force = _Forces(len(rows), _p(rows), _p(cols), _p(q))
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
         dx = _buffer(buffers, "dx", (n, nx, columns))
-        atol = rtol * drive.scale
+        atol = rtol * excitation.scale
         if nx and lib.integrate(
             n,
-            _p(drive.t),
+            _p(excitation.t),
             _p(u),
-            _p(drive.linear),
+            _p(excitation.linear),
             _p(p),
-            _p(drive.width),
+            _p(excitation.width),
             _p(x0),
             _p(s0),
             columns,
@@ -410,14 +418,14 @@ class Model:
             _p(info),
             ctypes.addressof(force),
         ):
-            raise SimulationError(f"{drive.name}: the plant cannot be simulated")
-        _, dy = self._observe(drive, u, p, drive.width, x, dx, columns, True, buffers, 0)
+            raise SimulationError(f"{excitation.name}: the plant cannot be simulated")
+        _, dy = self._observe(excitation, u, p, excitation.width, x, dx, columns, True, buffers, 0)
         assert dy is not None
         return dy
 
     def _observe(
         self,
-        drive: Excitation,
+        excitation: Excitation,
         u: np.ndarray,
         p: np.ndarray,
         width: np.ndarray,
@@ -428,21 +436,34 @@ class Model:
         buffers: dict[str, np.ndarray] | None = None,
         own: int = 1,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        lib, n, ny, nd = self.code.library, len(drive.t), len(self.outputs), len(self.code.output_delays)
+        lib, n, ny, nd = self.code.library, len(excitation.t), len(self.outputs), len(self.code.output_delays)
         delayed = slopes = None
         if nd:
             g = np.empty((n, nd))
             dg = np.empty((n, nd, nq)) if sensitivities else None
             lib.observe(
-                1, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, None, None, _p(g), _p(dg), own
+                1,
+                n,
+                _p(excitation.t),
+                _p(u),
+                _p(p),
+                _p(width),
+                _p(x),
+                _p(dx),
+                nq,
+                None,
+                None,
+                _p(g),
+                _p(dg),
+                own,
             )
-            delayed, slopes = self._shift(drive.t, g, dg, p, own)
+            delayed, slopes = self._shift(excitation.t, g, dg, p, own)
         y = np.empty((n, ny))
-        dy = _buffer(buffers, f"dy {id(drive)}", (n, ny, nq)) if sensitivities else None
+        dy = _buffer(buffers, f"dy {id(excitation)}", (n, ny, nq)) if sensitivities else None
         lib.observe(
             0,
             n,
-            _p(drive.t),
+            _p(excitation.t),
             _p(u),
             _p(p),
             _p(width),
@@ -549,7 +570,7 @@ class Stepper:
         m = self.model
         self._p = m.vector(self.parameters)
         named = dict(zip(m.inputs, u0, strict=True))
-        drive = Excitation(
+        excitation = Excitation(
             "start",
             np.zeros(1),
             np.atleast_2d(np.asarray(u0, float)).copy(),
@@ -557,7 +578,7 @@ class Stepper:
             {**named, **self.first},
             np.zeros(len(m.inputs), np.intc),
         )
-        self.x, _ = m.start(drive, self._p)
+        self.x, _ = m.start(excitation, self._p)
         self.t = 0.0
         self._u = np.array(u0, float)
         self._y = np.empty(len(m.outputs))

@@ -105,7 +105,7 @@ def to_arrow(table: Table) -> pa.Table:
     return arrow.replace_schema_metadata(table.meta or None)
 
 
-class whole_file:
+class whole_file:  # noqa: N801 used as a function
     """A temporary file beside `path` that takes its name when the block ends well and vanishes otherwise."""
 
     def __init__(self, path: Path):
