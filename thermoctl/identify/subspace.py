@@ -334,8 +334,9 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
     z_next = (target @ q) @ q.T
     state = np.hstack([pin_i @ z_i, np.zeros((n, L.shape[1] - np_))])
     left = np.vstack([pin_less @ z_next, yf[:l]]) - np.vstack([a, c]) @ state
-    # (24) regressed on Uf, and (25), (26) linear in B (D = 0), solved together: min |left - N(B) Uf|. First K, then B from
-    # K without weights, is the same in exact arithmetic without noise and far worse with it (Uf of long pulses is nearly singular)
+    # (24) regressed on Uf, and (25), (26) linear in B (D = 0), solved together: min |left - N(B) Uf|. Solving for K
+    # first and for B from K without weights is the same without noise, and far worse with it: Uf of long pulses
+    # is nearly singular.
     nu_factor = uf[:, :nu]
     target = left[:, :nu]  # left, projected on Uf
     lag, lcg = a @ pin_i, c @ pin_i  # (n, i l), (l, i l)
@@ -428,7 +429,7 @@ def refine_prediction_error(
         closed = model.a - gain @ model.c
         x = kernels.simulate(_c(closed), _c(np.hstack([model.b, gain])), np.eye(n), _c(model.x0), uy)
         e = y - x @ model.c.T
-        # e depends on theta by -(dC x + C dx), dx(n+1) = (A - K C) dx + dA x + dB u + dK e - K dC x: one driven run per unknown
+        # de = -(dC x + C dx), dx(n+1) = (A - K C) dx + dA x + dB u + dK e - K dC x: one run for each unknown
         columns = []
         for k in range(n):
             columns.append(("a", k, k, x[:, k]))

@@ -126,7 +126,7 @@ class Code:
                     self.jumps.append((z, kind))
         self.jump_index = {id(z): i for i, (z, _) in enumerate(self.jumps)}
 
-    # ------------------------------------------------------------------------------------------------- writing C
+    # --------------------------------------------------------------------------------------------- writing C
 
     def _by_parameter(self, e: Expr, q: str) -> Expr:
         """Return d e / d parameter, also through the seconds of delayed inputs."""
@@ -341,7 +341,7 @@ def _sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, int]:
     )
 
 
-# ------------------------------------------------------------------------------------------------ building and loading
+# -------------------------------------------------------------------------------------- building and loading
 
 
 @cache
@@ -409,8 +409,8 @@ def _library(key: str, source: str) -> ctypes.CDLL:
 
 def _build(work: Path, source: str) -> None:
     (work / "plant.c").write_text(source)
-    # A large file is dominated by straight-line code that -O1 translates as well in a fraction of the time; a small one runs a
-    # tenth slower and is ready in less than half of the time, which a diagnosis with its many plants feels.
+    # -O1 translates a large file's straight-line code as well as -O3 in a fraction of the time. A small plant runs
+    # a tenth slower with -O1 and is ready in less than half of the time: a diagnosis compiles many.
     command = [("-O1" if a == "-O3" and not 10_000 < len(source) < 400_000 else a) for a in _compiler()[0]]
     done = subprocess.run(
         [*command, f"-I{_TEMPLATE.parent}", "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],

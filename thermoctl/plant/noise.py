@@ -10,7 +10,8 @@ phi is found channel by channel by restricted maximum likelihood (Patterson & Th
 parameters have taken a part of the slow noise with them, which the residuals' plain correlation would miss,
 and intervals would come out too narrow:
 
-    minimise  n log v + RSS / v + log |M|,   M = sum over channels of J' V^-1 J,   RSS after the parameters' answer -J M^-1 J' V^-1 e
+    minimise  n log v + RSS / v + log |M|,   M = sum over channels of J' V^-1 J,
+              RSS after the parameters' answer -J M^-1 J' V^-1 e
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ def _check_name(name: str, item: YamlNode, section: str) -> None:
         raise item.error(f"'{name}' is a word of the language and cannot name one of the {section}")
 
 
-# ------------------------------------------------------------------------------------------- one function a section
+# ------------------------------------------------------------------------------------ one function a section
 
 
 def _input(name: str, s: Section) -> Input:
@@ -201,7 +201,7 @@ def _expression(s: Section, key: str) -> Expr:
         raise node.error(f"{s.label(key)}: {e}") from None
 
 
-# -------------------------------------------------------------------------------------------------- names and their use
+# --------------------------------------------------------------------------------------- names and their use
 
 
 @dataclass(frozen=True)

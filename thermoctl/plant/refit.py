@@ -3,7 +3,8 @@
 The cost is in residuals.py. Each step is Gauss-Newton with Levenberg's damping on the normal equations, plus
 half the geodesic acceleration (Transtrum & Sethna 2012, arXiv:1201.5885):
 
-    (J'J + l D) v = J' r,    (J'J + l D) a = J' d2r/dh2 along v,    z <- z + v + a/2        r = (measured - simulated) / s, J = -dr/dz
+    (J'J + l D) v = J' r,    (J'J + l D) a = J' d2r/dh2 along v,    z <- z + v + a/2
+    r = (measured - simulated) / s,    J = -dr/dz
 
 A parameter that meets its bound is held there until the gradient leads back inside. Sensitivities are exact
 (compile.py).
@@ -315,7 +316,7 @@ def _result(problem: Problem, z: np.ndarray, now: Evaluation, iterations: int) -
     )
 
 
-# ------------------------------------------------------------------------------------------------------------ reports
+# --------------------------------------------------------------------------------------------------- reports
 
 
 @dataclass(frozen=True)

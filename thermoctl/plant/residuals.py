@@ -1,6 +1,7 @@
 """Residuals of a plant on recordings in the metric of their noise, with gradient and Gauss-Newton matrix.
 
-    cost(z) = sum_k rho((e_k - phi e_(k-1)) / s) + sum (dx0 / initial_sigma)^2 + w sum (z - z_plant)^2 + sum of priors
+    cost(z) = sum_k rho((e_k - phi e_(k-1)) / s) + sum (dx0 / initial_sigma)^2
+              + w sum (z - z_plant)^2 + sum of priors
     e = y - yhat(p, x0 + dx0),   s^2 = sigma^2 (1 - phi^2)   for each channel
 
 phi is the correlation of a channel's noise over one median sampling interval (AR(1)); rho is Huber's

@@ -139,8 +139,8 @@ def draw(plant: Plant, path: str | Path) -> None:
 def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Figure:
     """Return the network as a matplotlib Figure of at most `widest` inches.
 
-    Nodes, flows and outputs named in `marked` stand out. A network that would be wider is drawn closer, without
-    the words on its lines."""
+    Nodes, flows and outputs named in `marked` stand out. A network that would be wider is drawn closer,
+    without the words on its lines."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -178,7 +178,7 @@ _LINES = {"flow": ("#5a6b7b", "-"), "read": ("#1d6b3a", ":"), "uses": ("#9a86b8"
 
 
 def _places(vertices: list[Vertex], edges: list[Edge], widest: float) -> tuple[np.ndarray, float]:
-    """Return positions (vertices, 2), and by how much the figure must shrink to be at most `widest` inches."""
+    """Return positions (vertices, 2) and the share to which the figure shrinks to `widest` inches."""
     satellites = {"in", "out", "read"}
     readings = Counter(b for _, b, kind, _ in edges if kind == "read")
     lengths = []

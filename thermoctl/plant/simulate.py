@@ -104,7 +104,7 @@ class Model:
         self._initial = [n.initial for n in plant.nodes.values()]
         self._slots = [self.states.index(n) for n in self.uncertain]
 
-    # ------------------------------------------------------------------------------------------------------- inputs
+    # ------------------------------------------------------------------------------------------------ inputs
 
     def excitation(self, table: Table) -> Excitation:
         """Return the recording as this plant reads it.
@@ -221,7 +221,7 @@ class Model:
                 x0[slot] += dx0[c]
         return x0, s0
 
-    # --------------------------------------------------------------------------------------------------- simulating
+    # -------------------------------------------------------------------------------------------- simulating
 
     def prepare(
         self, excitation: Excitation, parameters: Mapping[str, float] | np.ndarray | None = None

@@ -23,7 +23,7 @@ from thermoctl.yamlfile import InputError
 Dimension = tuple[tuple[str, Fraction], ...]
 """Sorted (base unit, exponent) pairs; () is dimensionless. None stands for 'fits anywhere'."""
 
-# The symbols of most plant files, so that these need not wait for pint (half a second to import): kg m s A K mol cd.
+# The symbols of most plant files: with these nobody waits for pint, which takes half a second to import.
 _COMMON = {
     "1": "",
     "%": "",

@@ -180,7 +180,7 @@ def _picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
     return [n for n in names if n in want or n == _clock(names)]
 
 
-# ------------------------------------------------------------------------------------------------------------- CSV
+# ------------------------------------------------------------------------------------------------------- CSV
 def _read_csv(path: Path, want: list[str] | None) -> _Raw:
     if path.stat().st_size > MAX_CSV_BYTES:
         raise InputError(
@@ -282,7 +282,7 @@ def _slow_csv(path: Path, data: bytes, names: list[str]) -> dict[str, np.ndarray
     return dict(zip(names, np.array(values, dtype=np.float64).reshape(-1, len(names)).T.copy(), strict=True))
 
 
-# ---------------------------------------------------------------------------------------------------- Parquet, Arrow
+# -------------------------------------------------------------------------------------------- Parquet, Arrow
 def _numpy(column: pa.ChunkedArray) -> np.ndarray:
     return np.ascontiguousarray(column.to_numpy(), dtype=np.float64)
 
