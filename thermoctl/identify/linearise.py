@@ -23,7 +23,7 @@ from scipy.linalg import expm, solve_discrete_are
 from thermoctl.control.faults import TEMPERATURES
 from thermoctl.control.model import CompensatorModel
 from thermoctl.plant import expression as ex
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Output, Plant
 from thermoctl.yamlfile import InputError
 
 AIR, VOLTAGE, CURRENT, POWER, ERROR = "air_c", "voltage_v", "current_a", "power_w", "position_error_um"
@@ -46,11 +46,8 @@ class Thermal:
     variance: np.ndarray
 
 
-def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
-    """Return the plant's matrices at the temperature `at_c`.
-
-    Columns of its inputs and outputs must be the program's signals (air_c, voltage_v and current_a or
-    power_w, coil_c ... bracket_2_c, position_error_um). Raises InputError."""
+def _signals(plant: Plant) -> tuple[dict[str, str], dict[str, Output], tuple[str, ...]]:
+    """Return inputs and outputs by column, and the columns that give the power. Raises InputError."""
     inputs = {i.column: i.name for i in plant.inputs.values()}
     outputs = {o.column: o for o in plant.outputs.values()}
     powered = (VOLTAGE, CURRENT) if VOLTAGE in inputs else (POWER,)
@@ -66,6 +63,15 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
                 f"{plant.file}: no output for the column '{column}'; a compensator needs all twelve "
                 f"temperatures and {ERROR}"
             )
+    return inputs, outputs, powered
+
+
+def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
+    """Return the plant's matrices at the temperature `at_c`.
+
+    Columns of its inputs and outputs must be the program's signals (air_c, voltage_v and current_a or
+    power_w, coil_c ... bracket_2_c, position_error_um). Raises InputError."""
+    inputs, outputs, powered = _signals(plant)
     nodes = list(plant.nodes)  # those that are states: the rest stays where it was
     point: dict[str, float] = (
         {p.name: p.value for p in plant.parameters.values()}
