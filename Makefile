@@ -94,10 +94,10 @@ bench: develop                     # plants against scipy and CasADi
 
 .PHONY: prove-refit refit-recordings
 prove-refit: develop               # do 95 % intervals hold the truth? 100 truths a kind of rig and noise
-	nice -n 15 $(BIN)/python tests/prove_refit.py
+	nice -n 15 $(BIN)/python tests/plant/prove_refit.py
 
 refit-recordings: develop          # every fit quoted for the naive plants of the real recordings, and ours
-	$(BIN)/python -m pytest -m slow -s tests/test_refit_recordings.py
+	$(BIN)/python -m pytest -m slow -s tests/plant/test_refit_recordings.py
 
 .PHONY: test-resolve
 test-resolve: develop              # two explanations that look alike, decided by the experiment that was proposed
@@ -130,7 +130,7 @@ bench-diagnosis: develop           # the diagnosis beside its peers on the same 
 
 .PHONY: demo-concealed
 demo-concealed: develop            # six and more effects concealed in rigs of the judge's own making: diagnosed, modelled, compensated
-	$(BIN)/python tests/demo_concealed.py
+	$(BIN)/python -m tests.concealed.demo
 
 .PHONY: hazards
 hazards: develop                   # every hazard with its limit; the table of what was measured goes to docs/proof/hazards.md
@@ -146,7 +146,7 @@ walkthrough:                       # a new user's walk: a clean clone, every com
 
 .PHONY: test-scale
 test-scale: develop                # a Dask scheduler and workers started by hand, one killed; diagnose over a folder of rigs
-	$(BIN)/python -m pytest -m slow tests/test_prove.py
+	$(BIN)/python -m pytest -m slow tests/diagnose/test_prove.py
 
 .PHONY: mutants
 mutants: develop                   # protection and arming: every branch reached, every mutant of the source broken or explained

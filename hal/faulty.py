@@ -28,8 +28,7 @@ from typing import Any
 import numpy as np
 
 from hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Backend, Sample
-from hal.profile import Section
-from thermoctl.yamlfile import Node, suggest
+from thermoctl.yamlfile import Node, Section, suggest
 
 KINDS = (
     "drop",

@@ -23,7 +23,7 @@ from typing import Any
 from hal.backend import ROLES
 from hal.text_number import BASES, DECIMALS, takes_letters
 from thermoctl import yamlfile
-from thermoctl.yamlfile import InputError, Node, suggest
+from thermoctl.yamlfile import InputError, Node, Section, integer_of, kind_of, number_of, suggest
 
 FORMAT = "thermoctl-device/1"
 BUSES = ("serial-binary", "serial-lines", "can-dbc", "can-cia402", "modbus")
@@ -40,7 +40,6 @@ FIELD_TYPES = {
     "float64": "d",
 }
 CRCS = ("ccitt-false", "xmodem", "modbus", "none")
-_NAME = re.compile(r"[A-Za-z_]\w{0,59}$", re.ASCII)
 
 # A channel's unit must be convertible to its role's: role suffix -> {unit: (factor, offset)}.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
@@ -56,133 +55,9 @@ EXCLUSIVE = ("slcan:", "rtu:", "/")
 """What the ports begin with that one program can open once."""
 
 
-class Section:
-    """A YAML mapping read key by key; `end()` refuses the keys that nobody asked for."""
-
-    def __init__(self, node: Node, what: str) -> None:
-        if not isinstance(node.value, dict):
-            raise node.error(f"{what}: a mapping (key: value) was expected, found {_kind(node)}")
-        self.node, self.what, self.asked = node, what, set[str]()
-
-    def get(self, key: str, required: bool = True) -> Node | None:
-        """The value's node, or None; raises where a required key is missing."""
-        self.asked.add(key)
-        found = self.node.value.get(key)
-        if found is None and required:
-            raise self.node.error(f"{self.what}: '{key}' is missing")
-        return found
-
-    def text(self, key: str, default: str | None = None, choices: Iterable[str] = ()) -> str:
-        """The text of `key`, one of `choices` where there are any. Raises InputError with its place."""
-        node = self.get(key, default is None)
-        if node is None:
-            return default or ""
-        if not isinstance(node.value, str):
-            raise node.error(f"{key}: text was expected, found {_kind(node)}")
-        if choices and node.value not in choices:
-            raise node.error(
-                f"{key}: '{node.value}' is not one of {', '.join(choices)}{suggest(node.value, choices)}"
-            )
-        return node.value
-
-    def number(
-        self, key: str, default: float | None = None, low: float = -math.inf, high: float = math.inf
-    ) -> float:
-        """The number of `key` within low..high. Raises InputError with its place."""
-        node = self.get(key, default is None)
-        return float(default or 0.0) if node is None else _number(node, key, low, high)
-
-    def integer(self, key: str, default: int | None = None, low: int = 0, high: int = 2**32) -> int:
-        """A whole number; text like '0x6041' is hexadecimal."""
-        node = self.get(key, default is None)
-        return int(default or 0) if node is None else _integer(node, key, low, high)
-
-    def flag(self, key: str, default: bool) -> bool:
-        """True or false of `key`. Raises InputError with its place."""
-        node = self.get(key, False)
-        if node is None:
-            return default
-        if not isinstance(node.value, bool):
-            raise node.error(f"{key}: true or false was expected, found {_kind(node)}")
-        return node.value
-
-    def interval(self, key: str, default: tuple[float, float] = (-math.inf, math.inf)) -> tuple[float, float]:
-        """The pair [low, high] of `key`. Raises InputError with its place."""
-        node = self.get(key, False)
-        if node is None:
-            return default
-        if not isinstance(node.value, list) or len(node.value) != 2:
-            raise node.error(f"{key}: two numbers [low, high] were expected, found {_kind(node)}")
-        low, high = (_number(n, key) for n in node.value)
-        if not low < high:
-            raise node.error(f"{key}: [{low:g}, {high:g}] is empty; [low, high] with low < high was expected")
-        return low, high
-
-    def list(self, key: str, required: bool = True) -> list[Node]:
-        """The list of `key`, empty where it is not required and not there. Raises InputError with its place."""
-        node = self.get(key, required)
-        if node is None:
-            return []
-        if not isinstance(node.value, list):
-            raise node.error(f"{key}: a list was expected, found {_kind(node)}")
-        return node.value
-
-    def section(self, key: str, required: bool = True) -> Section | None:
-        """The mapping below `key`; None where it is not required and not there."""
-        node = self.get(key, required)
-        return None if node is None else Section(node, key)
-
-    def sections(self, key: str) -> dict[str, Section]:
-        """A mapping of names to mappings."""
-        inner = Section(_must(self.get(key)), key)
-        for name, node in inner.node.value.items():
-            if not _NAME.match(name):
-                raise node.error(f"{key}: '{name}' is no name (letters, digits and _)")
-        return {name: Section(node, name) for name, node in inner.node.value.items()}
-
-    def end(self) -> None:
-        """Raise where a key stands that is not known here."""
-        for key, node in self.node.value.items():
-            if key not in self.asked:
-                raise node.error(
-                    f"{self.what}: unknown key '{key}'{suggest(key, self.asked)}; "
-                    f"known here: {', '.join(sorted(self.asked))}"
-                )
-
-
 def _must(node: Node | None) -> Node:
     assert node is not None
     return node
-
-
-def _kind(node: Node) -> str:
-    v = node.value
-    if isinstance(v, dict | list):
-        return "a mapping" if isinstance(v, dict) else "a list"
-    return "nothing" if v is None else repr(v)
-
-
-def _number(node: Node, key: str, low: float = -math.inf, high: float = math.inf) -> float:
-    if (
-        isinstance(node.value, bool)
-        or not isinstance(node.value, int | float)
-        or not math.isfinite(node.value)
-    ):
-        raise node.error(f"{key}: a number was expected, found {_kind(node)}")
-    if not low <= node.value <= high:
-        raise node.error(f"{key}: {node.value:g} is outside {low:g} .. {high:g}")
-    return float(node.value)
-
-
-def _integer(node: Node, key: str, low: int = 0, high: int = 2**32) -> int:
-    value = node.value
-    if isinstance(value, str) and re.fullmatch(r"0x[0-9A-Fa-f]{1,8}", value):
-        value = int(value, 16)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise node.error(f"{key}: a whole number was expected, found {_kind(node)}")
-    if not low <= value <= high:
-        raise node.error(f"{key}: {value} is outside {low} .. {high}")
-    return value
 
 
 @dataclass(frozen=True)
@@ -463,7 +338,7 @@ def _named(s: Section, key: str, names: Iterable[str]) -> str:
 def _binary_frame(top: Section, folder: Path) -> BinaryFrame:
     s = top.section("frame")
     assert s is not None
-    sync = bytes(_integer(n, "sync", 0, 255) for n in s.list("sync"))
+    sync = bytes(integer_of(n, "sync", 0, 255) for n in s.list("sync"))
     if not 1 <= len(sync) <= 8:
         raise _must(s.get("sync")).error(f"sync: 1 to 8 bytes were expected, found {len(sync)}")
     fields: list[tuple[str, str]] = []
@@ -604,13 +479,13 @@ def _object(node: Node, key: str) -> Object:
     """An object: 0x6041, or 0x30D1:1 with the sub-index (decimal, or 0x.. in hexadecimal)."""
     found = re.fullmatch(r"(0x[0-9A-Fa-f]{4})(?::(0x[0-9A-Fa-f]{1,2}|\d{1,3}))?", str(node.value))
     if found is None and isinstance(node.value, int) and not isinstance(node.value, bool):
-        return _integer(node, key, 0x1000, 0xFFFF), 0
+        return integer_of(node, key, 0x1000, 0xFFFF), 0
     index, sub = (
         (int(found[1], 16), int(found[2] or "0", 0 if "x" in (found[2] or "") else 10)) if found else (0, 0)
     )
     if not 0x1000 <= index <= 0xFFFF or sub > 255:
         raise node.error(
-            f"{key}: an object as 0x6041, or 0x30D1:1 with its sub-index, was expected, found {_kind(node)}"
+            f"{key}: an object as 0x6041, or 0x30D1:1 with its sub-index, was expected, found {kind_of(node)}"
         )
     return index, sub
 
@@ -648,7 +523,7 @@ def _register(s: Section, spec: Modbus) -> Register:
         s.integer("register", high=65535),
         s.text("type", "int16", types),
         s.text("word_order", "big", ("big", "little")),
-        tuple(_number(n, "sentinels") for n in s.list("sentinels", False)),
+        tuple(number_of(n, "sentinels") for n in s.list("sentinels", False)),
     )
     if source.address + source.words > 65536 or source.words > spec.max_block:
         raise s.node.error(f"register: {source.words} registers from {source.address} do not fit")

@@ -17,7 +17,8 @@ import numpy as np
 
 from hal.backend import OK, ROLE, ROLES, STALE, Sample
 from hal.profile import role_units
-from thermoctl.recording.table import Table, read_table
+from thermoctl.recording.files import read_table
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError, suggest
 
 STALE_PERIODS = 5  # a channel is stale after so many of its usual periods without a sample

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample
-from hal.profile import Section
 from thermoctl.plant import load
-from thermoctl.yamlfile import InputError, Node, suggest
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 MAX_CATCH_UP = (
     1000  # periods in one read; a clock that jumps further (suspend) moves the plant's time instead
@@ -80,7 +80,7 @@ class PlantRig:
         """surroundings: the plant's inputs other than the drive; roles: output -> role where they differ in name.
         Raises InputError where the plant and these do not fit."""
         plant = load(path)
-        model = plant.compile(())
+        model = compile_plant(plant, ())
         if drive_input not in model.inputs:
             raise InputError(
                 f"{path}: no input '{drive_input}' to drive{suggest(drive_input, model.inputs)}; "

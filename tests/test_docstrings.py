@@ -13,7 +13,8 @@ def undocumented(path):
         for child in getattr(node, "body", ()):
             if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
                 name = f"{inside}{child.name}"
-                if not child.name.startswith("_") and ast.get_docstring(child) is None:
+                overload = any(isinstance(d, ast.Name) and d.id == "overload" for d in child.decorator_list)
+                if not (child.name.startswith("_") or overload) and ast.get_docstring(child) is None:
                     yield f"{path.relative_to(ROOT)}:{child.lineno} {name}"
                 if isinstance(child, ast.ClassDef) and not child.name.startswith("_"):
                     yield from look(child, f"{name}.")

@@ -78,6 +78,11 @@ def _plant_commands(sub: argparse._SubParsersAction) -> None:
 
         return run
 
+    def linearise(args: argparse.Namespace) -> int | None:
+        from thermoctl.identify import commands
+
+        return commands.linearise(args)
+
     plant = ("--plant", {"required": True, "metavar": "PLANT", "help": "the plant file"})
     recordings = (
         "recordings",
@@ -145,7 +150,7 @@ def _plant_commands(sub: argparse._SubParsersAction) -> None:
         own,
         "linearise",
         "make the compensator's model from a thermal plant",
-        to("linearise"),
+        linearise,
         ("plant", {"metavar": "PLANT"}),
         ("--out", {"metavar": "MODEL", "help": "the model file"}),
         ("--replace", {"action": "store_true", "help": "overwrite MODEL"}),

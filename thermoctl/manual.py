@@ -1,4 +1,4 @@
-"""The manual page and the shells' completions, written from the command line's own declaration, and their installation."""
+"""The manual page and the shell completions, made from the argument parser, and their installation."""
 
 from __future__ import annotations
 
@@ -112,7 +112,9 @@ def install(parser: argparse.ArgumentParser, root: str | Path = "/") -> list[Pat
 
 
 def uninstall(root: str | Path = "/") -> list[Path]:
-    """Remove what `install` wrote; the paths that were there. Raises InputError where one cannot be removed."""
+    """Remove what `install` wrote; the paths that were there.
+
+    Raises InputError where one cannot be removed."""
     there = [p for p in (Path(root, place) for place in PLACES.values()) if p.exists()]
     for path in there:
         try:
@@ -123,7 +125,7 @@ def uninstall(root: str | Path = "/") -> list[Path]:
 
 
 def manual(parser: argparse.ArgumentParser, action: str, root: str) -> int:
-    """The command: show, install or uninstall."""
+    """Return the command: show, install or uninstall."""
     if action == "show":
         os.write(1, manual_page(parser).encode())
         return 0

@@ -1,7 +1,9 @@
-"""The reference pages in docs/, written from the tables in the code: `python -m thermoctl.reference [--check]`.
+"""The reference pages in docs/, written from the tables in the code.
 
-docs/reference/{configuration,signals,faults,effects,cli,commands-that-act}.md and docs/faults/NAME.md. With --check nothing is written;
-exit status 1 says which page is stale.
+`python -m thermoctl.reference [--check]`.
+
+docs/reference/{configuration,signals,faults,effects,cli,commands-that-act}.md and docs/faults/NAME.md. With --check nothing is
+written; exit status 1 says which page is stale.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
+from thermoctl.cli import parser
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
 from thermoctl.control.remedies import REMEDIES
@@ -48,7 +52,7 @@ def _range(low: float, high: float) -> str:
     return f"up to {high:g}" if math.isinf(low) else f"{low:g} to {high:g}"
 
 
-def _default(field: dataclasses.Field) -> str:
+def _default(field: dataclasses.Field[Any]) -> str:
     if field.default is not dataclasses.MISSING:
         value = field.default
     elif field.default_factory is not dataclasses.MISSING:
@@ -102,7 +106,7 @@ def signals() -> str:
 
 
 def faults() -> str:
-    """The table of faults."""
+    """Return the table of faults."""
     return (
         _HEAD
         + "# Faults\n\n"
@@ -134,7 +138,7 @@ def commands_that_act() -> str:
 
 
 def fault(f: Fault) -> str:
-    """The page of one fault."""
+    """Return the page of one fault."""
     words = REMEDIES[f.name]
     channels = causes.channels_of(f.name)
     cause_of = sorted(n for n, after in causes.FOLLOWS.items() if f.name in after)
@@ -165,7 +169,7 @@ def _sentence(text: str) -> str:
 
 
 def effects() -> str:
-    """The catalogue of left-out physics."""
+    """Return the catalogue of left-out physics."""
     entries = catalogue().values()
     text = (
         _HEAD + "# Catalogue of left-out physics\n\nWhat `thermoctl diagnose` can name; one file each in "
@@ -193,8 +197,6 @@ def _numbers(*values: object) -> bool:
 
 def cli() -> str:
     """Every command's help."""
-    from thermoctl.cli import parser  # the one place beside `main` that looks at the commands
-
     os.environ["COLUMNS"] = "110"
     top = parser()
     pages: list[str] = []
@@ -220,7 +222,7 @@ def pages() -> dict[Path, str]:
 
 
 def stale(docs: Path = DOCS) -> list[str]:
-    """The pages that differ from what the code says, and pages of faults that there are no more."""
+    """Return the pages that differ from what the code says, and pages of faults that there are no more."""
     wanted = pages()
     wrong = [
         str(p) for p, text in wanted.items() if not (docs / p).is_file() or (docs / p).read_text() != text

@@ -99,12 +99,6 @@ class LoopSettings:
         restart=True,
         choices=("clock", "device", "tick"),
     )
-    overrun: str = option(
-        "what happens after a tick that took too long: skip the ticks it covered and keep the phase",
-        "skip",
-        restart=True,
-        choices=("skip",),
-    )
     reference: bool = option(
         "run an idle loop of the same clock beside it, for `thermoctl latency`", False, restart=True
     )

@@ -1,4 +1,7 @@
-"""Where the files lie that come with the program: beside the package in a checkout, under share/thermoctl where a wheel put them."""
+"""Where the files lie that come with the program.
+
+Beside the package in a checkout, under share/thermoctl where a wheel put them.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,6 @@ _CHECKOUT = Path(__file__).resolve().parents[1]
 
 
 def shipped(folder: str) -> Path:
-    """A folder of the distribution's, such as `config/effects` or `systemd`."""
+    """Return a folder of the distribution's, such as `config/effects` or `systemd`."""
     here = _CHECKOUT / folder
     return here if here.is_dir() else Path(sys.prefix) / "share/thermoctl" / folder

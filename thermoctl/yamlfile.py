@@ -1,29 +1,32 @@
 """YAML with places: every value knows its file, line and column, and a duplicate key is an error.
 
-The one reader of YAML in the program (configuration, plants, effects, profiles, models). PyYAML's safe constructors only.
+`load` gives a `Node`; a `Section` reads a mapping key by key and refuses the keys that nobody asked for. Only
+PyYAML's safe constructors are used.
 """
 
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 import yaml
 
 MAX_BYTES = 4_000_000  # a larger file is not one a person wrote
 MAX_DEPTH = 60
+MAX_NUMBER = 1e300  # squares of larger numbers overflow
 
 
 class InputError(Exception):
-    """Input that a person can mend. The message is one line: where, what, what was expected, what to do."""
+    """An error in the user's input. The message is one line: where, what, what was expected, what to do."""
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 1e-9 as a number (YAML 1.2) and takes no dates, no yes/no and no octal numbers."""
+    """SafeLoader that reads 1e-9 as a number (YAML 1.2); no dates, no yes/no, no octal numbers."""
 
 
 _Loader.yaml_implicit_resolvers = {}
@@ -41,8 +44,10 @@ for _tag, _regex, _first in (
 
 @dataclass(frozen=True)
 class Node:
-    """A YAML value with its place. `value` is a dict of str to Node, a list of Node, or a scalar
-    (str, int, float, bool, None); `line` and `column` count from 1."""
+    """A YAML value with its place.
+
+    `value` is a dict of str to Node, a list of Node, or a scalar (str, int, float, bool, None); `line` and
+    `column` count from 1."""
 
     value: Any
     file: str
@@ -55,7 +60,7 @@ class Node:
         return f"{self.file}:{self.line}:{self.column}"
 
     def plain(self) -> Any:
-        """The value without places: dicts, lists and scalars."""
+        """Return the value without places: dicts, lists and scalars."""
         if isinstance(self.value, dict):
             return {k: v.plain() for k, v in self.value.items()}
         if isinstance(self.value, list):
@@ -63,7 +68,7 @@ class Node:
         return self.value
 
     def error(self, message: str) -> InputError:
-        """An InputError that begins with the place; to be raised by the caller."""
+        """Return an InputError that begins with the place; to be raised by the caller."""
         return InputError(f"{self.place}: {message}".replace("\n", "\\n"))  # a name may hold anything
 
 
@@ -89,7 +94,7 @@ def load(path: str | Path) -> Node:
 
 
 def loads(text: str, file: str = "<text>") -> Node:
-    """The same from a string; `file` names it in messages."""
+    """Return the same from a string; `file` names it in messages."""
     loader = None
     try:
         loader = _Loader(text)
@@ -143,3 +148,165 @@ def _convert(node: yaml.Node, loader: _Loader, file: str, depth: int) -> Node:
         except (ValueError, yaml.YAMLError):
             raise InputError(f"{place}: '{node.value}' cannot be read as {kind}") from None
     raise InputError(f"{place}: the tag {node.tag} is not allowed here")
+
+
+class Section:
+    """A YAML mapping read key by key; `end()` refuses the keys that nobody asked for.
+
+    `what` names the mapping in errors; `of`, where given, names the item that its keys belong to ("noise of
+    'y'")."""
+
+    def __init__(self, node: Node, what: str, of: str = "") -> None:
+        if not isinstance(node.value, dict):
+            raise node.error(f"{what}: a mapping (key: value) was expected, found {kind_of(node)}")
+        self.node, self.what, self.of, self.asked = node, what, of, set[str]()
+
+    def label(self, key: str) -> str:
+        """Return the key as errors name it."""
+        return f"{key} of '{self.of}'" if self.of else key
+
+    @overload
+    def get(self, key: str, required: Literal[True] = True) -> Node: ...
+    @overload
+    def get(self, key: str, required: bool) -> Node | None: ...
+
+    def get(self, key: str, required: bool = True) -> Node | None:
+        """Return the value's node, or None. Raises InputError where a required key is missing."""
+        self.asked.add(key)
+        found: Node | None = self.node.value.get(key)
+        if found is None and required:
+            near = difflib.get_close_matches(key, [k for k in self.node.value if k not in self.asked], n=1)
+            hint = f"; is '{near[0]}' meant to be it?" if near else ""
+            raise self.node.error(f"{self.what}: '{key}' is missing{hint}")
+        return found
+
+    def given(self, key: str) -> Node | None:
+        """Return the value's node, or None where the key is missing or empty."""
+        node = self.get(key, False)
+        return None if node is None or node.value is None else node
+
+    def text(self, key: str, default: str | None = None, choices: Iterable[str] = ()) -> str:
+        """Return the text of `key`, one of `choices` where there are any. Raises InputError."""
+        node = self.get(key, default is None)
+        if node is None:
+            return default or ""
+        if not isinstance(node.value, str):
+            raise node.error(f"{self.label(key)}: text was expected, found {kind_of(node)}")
+        if choices and node.value not in choices:
+            raise node.error(
+                f"{self.label(key)}: '{node.value}' is not one of {', '.join(choices)}"
+                f"{suggest(node.value, choices)}"
+            )
+        return node.value
+
+    def number(
+        self, key: str, default: float | None = None, low: float = -math.inf, high: float = math.inf
+    ) -> float:
+        """Return the number of `key` within low..high. Raises InputError."""
+        node = self.get(key, default is None)
+        return float(default or 0.0) if node is None else number_of(node, self.label(key), low, high)
+
+    def optional_number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float | None:
+        """Return the number of `key` within low..high, None where it is missing or empty.
+
+        Raises InputError."""
+        node = self.given(key)
+        return None if node is None else number_of(node, self.label(key), low, high)
+
+    def integer(self, key: str, default: int | None = None, low: int = 0, high: int = 2**32) -> int:
+        """Return a whole number; text like '0x6041' is hexadecimal. Raises InputError."""
+        node = self.get(key, default is None)
+        return int(default or 0) if node is None else integer_of(node, self.label(key), low, high)
+
+    def flag(self, key: str, default: bool) -> bool:
+        """Return true or false of `key`. Raises InputError."""
+        node = self.get(key, False)
+        if node is None:
+            return default
+        if not isinstance(node.value, bool):
+            raise node.error(f"{self.label(key)}: true or false was expected, found {kind_of(node)}")
+        return node.value
+
+    def interval(self, key: str, default: tuple[float, float] = (-math.inf, math.inf)) -> tuple[float, float]:
+        """Return the pair [low, high] of `key`. Raises InputError."""
+        node = self.get(key, False)
+        if node is None:
+            return default
+        label = self.label(key)
+        if not isinstance(node.value, list) or len(node.value) != 2:
+            raise node.error(f"{label}: two numbers [low, high] were expected, found {kind_of(node)}")
+        low, high = (number_of(n, label) for n in node.value)
+        if not low < high:
+            raise node.error(
+                f"{label}: [{low:g}, {high:g}] is empty; [low, high] with low < high was expected"
+            )
+        return low, high
+
+    def list(self, key: str, required: bool = True) -> list[Node]:
+        """Return the list of `key`, empty where it is neither required nor there. Raises InputError."""
+        node = self.get(key, required)
+        if node is None:
+            return []
+        if not isinstance(node.value, list):
+            raise node.error(f"{self.label(key)}: a list was expected, found {kind_of(node)}")
+        return node.value
+
+    @overload
+    def section(self, key: str, required: Literal[True] = True) -> Section: ...
+    @overload
+    def section(self, key: str, required: bool) -> Section | None: ...
+
+    def section(self, key: str, required: bool = True) -> Section | None:
+        """Return the mapping below `key`, None where it is neither required nor there. Raises InputError."""
+        node = self.get(key, required)
+        return None if node is None else Section(node, key)
+
+    def sections(self, key: str) -> dict[str, Section]:
+        """Return the mapping of names to mappings below `key`. Raises InputError."""
+        inner = Section(self.get(key), key)
+        for name, node in inner.node.value.items():
+            if not _NAME.match(name):
+                raise node.error(f"{key}: '{name}' is no name (letters, digits and _)")
+        return {name: Section(node, name) for name, node in inner.node.value.items()}
+
+    def end(self) -> None:
+        """Raise InputError at a key that nobody asked for."""
+        for key, node in self.node.value.items():
+            if key not in self.asked:
+                raise node.error(
+                    f"{self.what}: unknown key '{key}'{suggest(key, self.asked)}; "
+                    f"known here: {', '.join(sorted(self.asked))}"
+                )
+
+
+_NAME = re.compile(r"[A-Za-z_]\w{0,59}$", re.ASCII)
+
+
+def kind_of(node: Node) -> str:
+    """Return what a node holds, in words for an error."""
+    v = node.value
+    if isinstance(v, dict | list):
+        return "a mapping" if isinstance(v, dict) else "a list"
+    return "nothing" if v is None else repr(v)[:80]
+
+
+def number_of(node: Node, label: str, low: float = -math.inf, high: float = math.inf) -> float:
+    """Return a node's number within low..high; `label` names it in the InputError."""
+    value = node.value
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
+        raise node.error(f"{label}: a number was expected, found {kind_of(node)}")
+    if not low <= value <= high:
+        raise node.error(f"{label}: {value:g} is outside {low:g} .. {high:g}")
+    return float(value)
+
+
+def integer_of(node: Node, label: str, low: int = 0, high: int = 2**32) -> int:
+    """Return a node's whole number within low..high; `label` names it in the InputError."""
+    value = node.value
+    if isinstance(value, str) and re.fullmatch(r"0x[0-9A-Fa-f]{1,8}", value):
+        value = int(value, 16)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise node.error(f"{label}: a whole number was expected, found {kind_of(node)}")
+    if not low <= value <= high:
+        raise node.error(f"{label}: {value} is outside {low} .. {high}")
+    return value

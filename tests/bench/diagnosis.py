@@ -44,7 +44,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant import load
 from thermoctl.plant.refit import report
 from thermoctl.plant.simulate import SimulationError
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 
 SHORT, MOST, LEVEL = 8, 3, 0.05
@@ -74,7 +74,7 @@ def rms(case: Case, errors: Sequence[np.ndarray]) -> dict[str, float]:
 
 def told(case: Case, base: Explanation, final: Explanation, suspect: str | None = None) -> dict[str, Any]:
     """A peer's result in the form of diagnosis.json. Peers give no probabilities: each finding counts as certain."""
-    drives = [final.fit.model.drive(t) for t in case.tables]
+    drives = [final.fit.model.excitation(t) for t in case.tables]
     estimates = {e.name: e for e in report(final.fit, drives)} if final.effects else {}
     findings = [
         {
@@ -182,7 +182,7 @@ def bic(job: prove.Job) -> dict[str, Any]:
 def latent(job: prove.Job) -> dict[str, Any]:
     """Unknown smooth inputs only."""
     case, base, _ = prepared(job)
-    drives = [base.fit.model.drive(t) for t in case.tables]
+    drives = [base.fit.model.excitation(t) for t in case.tables]
     for r, d in enumerate(drives):
         base.fit.model.prepare(d, base.fit.values[r])
     model = base.fit.model  # where a slope is another state alone (dx/dt = v) no physics can be missing
@@ -200,7 +200,7 @@ def sindy(job: prove.Job) -> dict[str, Any]:
     """Sparse regression of what the measured states' derivatives have beyond the plant's slopes."""
     case, base, entries = prepared(job)
     model = base.fit.model
-    drives = [model.drive(t) for t in case.tables]
+    drives = [model.excitation(t) for t in case.tables]
     rig = Rig(base.plant, drives, [t.columns for t in case.tables])
     metric = screen.Metric(base.fit, drives)
     known: list[dict[str, np.ndarray]] = []  # per recording: the derivatives of the states that are measured

@@ -24,6 +24,7 @@ from pathlib import Path  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy import linalg  # noqa: E402
 
+from tests.identify.peers import identify_validated, time_constant_s  # noqa: E402
 from thermoctl.identify import expansion, kernels, modal, subspace  # noqa: E402
 from thermoctl.identify.statespace import StateSpace  # noqa: E402
 from thermoctl.yamlfile import InputError  # noqa: E402
@@ -336,8 +337,8 @@ def output_error() -> None:
             held[name].append(float(np.sqrt(np.mean(e**2))))
         if seed == 0:
             print(
-                f"    time constant, truth 180 s: recursion (5) {m5.time_constant_s:.1f} s (bias of the equation error), "
-                f"output error {mo.time_constant_s:.0f} s, bank {bank.model().time_constant_s:.0f} s"
+                f"    time constant, truth 180 s: recursion (5) {time_constant_s(m5):.1f} s (bias of the equation error), "
+                f"output error {time_constant_s(mo):.0f} s, bank {time_constant_s(bank.model()):.0f} s"
             )
     r = {k: np.median(v) for k, v in held.items()}
     goal(
@@ -437,7 +438,7 @@ def measured_data() -> None:
     takes one record: without them, or with them before its own in one record, whichever turns out better for it on the held-out part.
     For information also the best order of each peer with the held-out part looked at, ours from the one record alone, and what the ratio
     would be over other stretches of the same length (moving-block bootstrap of the held-out part, 5 to 95 %)."""
-    from thermoctl.recording.table import read_table
+    from thermoctl.recording.files import read_table
 
     folder = Path(os.environ.get("THERMOCTL_RECORDINGS", "../shared/recordings"))
     if not folder.is_dir():
@@ -487,7 +488,7 @@ def measured_data() -> None:
         def mine(
             given: list, u=u, y=y, cut=cut, period=period, left=left, rms=rms
         ) -> tuple[StateSpace, np.ndarray]:
-            m = modal.identify_validated(u[:cut], y[:cut], period, others=given)
+            m = identify_validated(u[:cut], y[:cut], period, others=given)
             return m, left(m, cut, len(u), m.x0 if m.info["rest"] else None)
 
         model, e = mine([o[:2] for o in others])

@@ -16,8 +16,9 @@ import time
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from thermoctl.identify.linearise import thermal
 from thermoctl.plant import load
-from thermoctl.plant.linearise import thermal
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 RTOL = 1e-7
@@ -310,7 +311,7 @@ def law_and_plant(seconds):
     from thermoctl.settings import load_settings
 
     settings = load_settings("config/simulated.yaml")
-    model = load("config/plants/actuator.yaml").compile(())
+    model = compile_plant(load("config/plants/actuator.yaml"), ())
     stepper, u = model.stepper(1e-3, np.array([0.0, 22.0])), np.array([0.0, 22.0])
     value, fresh, status = (
         np.full(len(CHANNELS), 22.0),
@@ -355,20 +356,20 @@ def main():
     args = parser.parse_args()
     plant = load("config/plants/actuator_thermal.yaml")
     begin = time.perf_counter()
-    model = plant.compile()
+    model = compile_plant(plant)
     print(
         f"compiled (or from the cache) in {time.perf_counter() - begin:.2f} s; {len(model.active)} parameters, rtol {RTOL:g}"
     )
     table, part = course(args.samples), course(args.peer_samples)
     share = args.samples / args.peer_samples
-    drive, buffers = model.prepare(model.drive(table)), {}
+    drive, buffers = model.prepare(model.excitation(table)), {}
     ours, run = cpu(lambda: model.run(drive, rtol=RTOL), 5)
     ours_j, _ = cpu(lambda: model.run(drive, sensitivities=True, rtol=RTOL, buffers=buffers), 3)
     heat = thermal(plant)
     scipy_s, peer = cpu(lambda: scipy_run(heat, part), 1)
     scipy_j, differences = cpu(lambda: scipy_differences(plant, part), 1)
     exact = (
-        model.run(model.drive(part), sensitivities=True, rtol=RTOL)
+        model.run(model.excitation(part), sensitivities=True, rtol=RTOL)
         .dx[:, :, : len(model.active)]
         .transpose(2, 0, 1)
     )

@@ -20,7 +20,7 @@ from tests.concealed import generate, rigs_motion, rigs_tanks, rigs_thermal, sen
 from tests.concealed.judge import Judge, beyond, snr
 from tests.concealed.thermal import Network, Variant
 from thermoctl.plant import load
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 
 
 def test_thermal_truth_agrees_with_radau_on_the_same_volumes():

@@ -9,38 +9,16 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete, dlsim, lsim
 
+from tests.plants import SPRING_STAGE, TWO_BLOCKS
 from thermoctl.cli import main
 from thermoctl.diagnose.effects import Rig, candidates, catalogue
 from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.heldout import prediction
 from thermoctl.plant import load
-from thermoctl.recording.table import read_table
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 
-HEATER = """
-format: thermoctl-plant/1
-title: Two heated blocks
-inputs:
-  heat: {unit: W}
-  air: {unit: degC, column: air_temperature, between_samples: linear}
-parameters:
-  C_1: {value: 6, unit: J/K, range: [2, 14]}
-  C_2: {value: 6, unit: J/K, range: [2, 14]}
-  G_1: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
-  G_2: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
-  G_12: {value: 0.02, unit: W/K, range: [0.004, 0.08]}
-nodes:
-  one: {unit: degC, storage: C_1, initial: air, initial_sigma: 0.5}
-  two: {unit: degC, storage: C_2, initial: air, initial_sigma: 0.5}
-flows:
-  power: {into: one, rate: heat, unit: W}
-  between: {from: one, into: two, rate: G_12 * (one - two), unit: W}
-  loss_1: {from: one, rate: G_1 * (one - air), unit: W}
-  loss_2: {from: two, rate: G_2 * (two - air), unit: W}
-outputs:
-  temperature_1: {value: one, unit: degC, noise: 0.1}
-  temperature_2: {value: two, unit: degC, noise: 0.1}
-"""
 LEVELS = (0.0, 2.5, 0.8, 0.0, 1.6, 3.0, 0.0, 2.0)
 
 
@@ -54,7 +32,7 @@ def heater(
 ):
     """Two recordings of a two-block heater that has `extra` watts into its blocks, begins `start` above the air and whose first
     block's capacity is multiplied by `heavier(temperature)`; returns the plant's and their paths."""
-    (folder / "plant.yaml").write_text(HEATER)
+    (folder / "plant.yaml").write_text(TWO_BLOCKS)
     paths = [folder / "plant.yaml"]
     c, g, g12 = (5.2, 7.1), (0.062, 0.043), 0.026
     t = np.arange(0.0, 1600.0, 2.0)
@@ -123,7 +101,7 @@ def test_natural_convection_is_named_placed_and_worth_it_on_unseen_data(tmp_path
     }
     # The extended plant runs in the simulator and gives the error that was reported.
     plant = load(tmp_path / "out" / "plant.yaml")
-    model = plant.compile()
+    model = compile_plant(plant)
     errors = np.concatenate(
         [
             read_table(tmp_path / f"run_{s}.csv").columns["temperature_1"]
@@ -195,7 +173,7 @@ def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
     """A voltage over a resistance, read 0.2 s late, sampled every 2 s: held, the reading would be a whole sample late."""
     _, run, _ = heater(tmp_path)
     (tmp_path / "plant.yaml").write_text(
-        HEATER.replace("outputs:", "outputs:\n  voltage: {value: 3 * heat, unit: V, noise: 0.02}")
+        TWO_BLOCKS.replace("outputs:", "outputs:\n  voltage: {value: 3 * heat, unit: V, noise: 0.02}")
     )
     rows = np.loadtxt(run, delimiter=",", skiprows=1)
     np.savetxt(
@@ -206,13 +184,13 @@ def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
         header="t,heat,air_temperature,temperature_1,temperature_2,voltage",
     )
     plant, table = load(tmp_path / "plant.yaml"), read_table(run)
-    drive = plant.compile().drive(table)
+    drive = compile_plant(plant).excitation(table)
     lags = [
         c
         for c in candidates(Rig(plant, [drive], [table.columns]), {"sensor_lag": catalogue()["sensor_lag"]})
         if c.place.where == "voltage"
     ]
-    held, straight = (c.extend({"TAU": 0.2}).compile().simulate(table).y[:, 0] for c in lags)
+    held, straight = (compile_plant(c.extend({"TAU": 0.2})).simulate(table).y[:, 0] for c in lags)
     u, t = 3 * rows[:, 1], rows[:, 0]
     line = lsim(([1.0], [0.2, 1.0]), u, t, interp=True)[1] + u[0] * np.exp(-t / 0.2)
     stair = lsim(([1.0], [0.2, 1.0]), u, t, interp=False)[1] + u[0] * np.exp(-t / 0.2)
@@ -235,29 +213,8 @@ def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
     )
 
 
-STAGE = """
-format: thermoctl-plant/1
-title: Spring-guided stage
-inputs:
-  force: {unit: N}
-parameters:
-  stiffness: {value: 600, unit: N/m, range: [200, 1500]}
-  damping: {value: 30, unit: N*s/m, range: [8, 90]}
-nodes:
-  velocity: {unit: m/s, storage: 1.3, initial: 0}
-  position: {unit: m, storage: 1, initial: 0, initial_sigma: 0.001}
-flows:
-  drive: {into: velocity, rate: force, unit: N}
-  spring: {from: velocity, rate: stiffness * position, unit: N}
-  damper: {from: velocity, rate: damping * velocity, unit: N}
-  travel: {into: position, rate: velocity, unit: m/s}
-outputs:
-  encoder: {value: position, unit: m, noise: 2e-6}
-"""
-
-
 def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path):
-    (tmp_path / "plant.yaml").write_text(STAGE)
+    (tmp_path / "plant.yaml").write_text(SPRING_STAGE)
     t, period = np.arange(0.0, 20.0, 0.005), 0.25e-3
     paths = [tmp_path / "plant.yaml"]
     for seed in (1, 2):
@@ -294,7 +251,7 @@ def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path):
 
 def test_dry_friction_that_sticks_is_no_load(tmp_path):
     """A stage on springs comes to rest up to a micrometre beside where it would, and stays there: half a sensor's noise."""
-    (tmp_path / "plant.yaml").write_text(STAGE)
+    (tmp_path / "plant.yaml").write_text(SPRING_STAGE)
     paths, h, m, k, b, dry = [tmp_path / "plant.yaml"], 1e-4, 1.3, 640.0, 12.0, 8e-4
     for seed in (1, 2):
         rng = np.random.default_rng(seed)
@@ -377,7 +334,7 @@ def test_a_pump_that_is_clipped_is_the_actuators_entry(tmp_path):
 def test_what_one_recording_does_not_determine_is_proved_on_blocks_of_all(tmp_path):
     """Two heaters that go together in one recording and against each other in the other: neither tells their shares, both do."""
     text = (
-        HEATER.replace("  heat: {unit: W}", "  heat: {unit: W}\n  more: {unit: W}")
+        TWO_BLOCKS.replace("  heat: {unit: W}", "  heat: {unit: W}\n  more: {unit: W}")
         .replace("  G_12:", "  A: {value: 1, unit: '1', range: [0, 2]}\n  B: {unit: '1', BELIEF}\n  G_12:")
         .replace("rate: heat,", "rate: A * heat + B * more,")
     )
@@ -492,7 +449,7 @@ outputs:
         (lambda p: p[1].write_text(p[1].read_text().replace("heat,", "warmth,", 1)), "no column 'heat'"),
         (lambda p: p[1].write_text("\n".join(p[1].read_text().splitlines()[:12])), "too little data"),
         (lambda p: p[1].write_text(p[1].read_text().replace("\n2,", "\nx,", 1)), "run_1.csv"),
-        (lambda p: p[0].write_text(HEATER.replace("G_12 *", "G_13 *")), "G_13"),
+        (lambda p: p[0].write_text(TWO_BLOCKS.replace("G_12 *", "G_13 *")), "G_13"),
     ],
 )
 def test_unusable_input_is_one_line_and_leaves_nothing(tmp_path, capsys, spoil, words):

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from tests.plants import VOICE_COIL
 from thermoctl.diagnose.effects import Rig, candidates, catalogue
 from thermoctl.plant import load, save
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 PLANT = """format: thermoctl-plant/1
@@ -28,7 +30,7 @@ def test_heat_of_a_speed_is_offered_and_keeps_its_units(unit, tmp_path):
         t,
         {"heat": 1 + np.sin(t), "speed": np.cos(t), "air": np.full(100, 20.0), "housing_c": 20 + 0 * t},
     )
-    rig = Rig(plant, [plant.compile().drive(table)], [table.columns])
+    rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
     names = {"eddy_heating", "hysteresis_heating", "forced_convection"}
     found = [c for c in candidates(rig, catalogue()) if c.effect.name in names]
     assert {c.effect.name for c in found} == names
@@ -37,50 +39,15 @@ def test_heat_of_a_speed_is_offered_and_keeps_its_units(unit, tmp_path):
         assert c.own(c.effect.parameters[0].name) in load(tmp_path / "extended.yaml").parameters
 
 
-STAGE = """format: thermoctl-plant/1
-title: A voice coil that heats itself
-inputs: {current: {unit: A}, current_rate: {unit: A/s}, air: {unit: degC, between_samples: linear}}
-parameters:
-  gain: {value: 9, unit: N/A}
-  mass: {value: 0.6, unit: kg, range: [0.3, 1.2]}
-  stiffness: {value: 900, unit: N/m, range: [300, 2500]}
-  damping: {value: 7, unit: N*s/m, range: [1.5, 30]}
-  R: {value: 4, unit: ohm, range: [2.5, 6.5]}
-  L: {value: 0.004, unit: H, range: [0.001, 0.012]}
-  K_e: {value: 9, unit: V*s/m, range: [4, 18]}
-  C_coil: {value: 9, unit: J/K, range: [4, 20]}
-  C_core: {value: 40, unit: J/K, range: [20, 90]}
-  G_coil: {value: 0.35, unit: W/K, range: [0.12, 1]}
-  G_core: {value: 0.5, unit: W/K, range: [0.12, 2]}
-nodes:
-  velocity: {unit: m/s, storage: mass, initial: 0}
-  position: {unit: m, storage: 1, initial: 0}
-  coil: {unit: degC, storage: C_coil, initial: air}
-  core: {unit: degC, storage: C_core, initial: air}
-flows:
-  motor: {into: velocity, rate: gain * current, unit: N}
-  spring: {from: velocity, rate: stiffness * position, unit: N}
-  damper: {from: velocity, rate: damping * velocity, unit: N}
-  travel: {into: position, rate: velocity, unit: m/s}
-  joule: {into: coil, rate: R * current**2, unit: W}
-  coil_to_core: {from: coil, into: core, rate: G_coil * (coil - core), unit: W}
-  core_to_air: {from: core, rate: G_core * (core - air), unit: W}
-outputs:
-  position_read: {value: position, unit: m, noise: 1e-6}
-  voltage: {value: R * current + L * current_rate + K_e * velocity, unit: V, noise: 0.01}
-  coil_temperature: {value: coil, unit: degC, noise: 0.1}
-"""
-
-
 def test_every_entry_keeps_the_units_of_a_rig_that_moves_and_heats(tmp_path):
-    (tmp_path / "plant.yaml").write_text(STAGE)
+    (tmp_path / "plant.yaml").write_text(VOICE_COIL)
     plant = load(tmp_path / "plant.yaml")
     t = np.arange(0.0, 2.0, 0.002)
     moving = {"current": np.sin(9 * t), "current_rate": 9 * np.cos(9 * t), "air": 20 + 0.1 * t}
     table = Table(
         "run", "run", t, moving | {"position_read": 0 * t, "voltage": 0 * t, "coil_temperature": 20 + 0 * t}
     )
-    rig = Rig(plant, [plant.compile().drive(table)], [table.columns])
+    rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
     found = candidates(rig, catalogue())
     assert {"position_dependent_conductance", "cogging", "cubic_stiffness", "back_emf"} < {
         c.effect.name for c in found

@@ -11,6 +11,7 @@ from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.locate import rhythms, suspects, together
 from thermoctl.diagnose.remains import REMAINS, WHITE, metric_of, remains
 from thermoctl.plant import load
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 
@@ -103,7 +104,7 @@ def block(tmp_path):
                 t,
                 {"P": 6.0 * np.random.default_rng(k).integers(0, 2, 60).repeat(50), "air": 21 + 0 * t},
             )
-            table.columns["y"] = plant.compile(()).simulate(table).y[:, 0] + added(
+            table.columns["y"] = compile_plant(plant, ()).simulate(table).y[:, 0] + added(
                 t, np.random.default_rng(100 + k)
             )
             tables.append(table)

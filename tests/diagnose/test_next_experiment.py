@@ -13,8 +13,10 @@ from thermoctl.diagnose import experiment, search
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.explain import Case
 from thermoctl.identify.experiments import load_experiments, load_inputs
-from thermoctl.plant.language import loads
-from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 CONFIG = Path(__file__).resolve().parents[2] / "config/simulated.yaml"
@@ -51,7 +53,7 @@ def undecided():
 
 def shared_by_two(belief, truth, inputs):
     """A case, and a diagnosis of it that two refitted explanations share; both stand for what a whole diagnosis would hold."""
-    table = loads(truth).compile(()).measure(inputs, seed=1)
+    table = compile_plant(loads(truth), ()).measure(inputs, seed=1)
     case = Case(loads(belief), [table])
     base = case.explain(case.plant, [], [], iterations=40)
     entries = {
@@ -72,7 +74,7 @@ def test_proposal_stays_inside_the_limits_and_is_the_best_per_hour(undecided):
     entry, chosen = experiment.propose(case, found, limits=LIMITS)
     heat = np.array(entry["inputs"]["heat"])
     assert heat[:, 1].min() >= 0 and heat[:, 1].max() <= 20 and entry["inputs"]["air"] == [[0.0, 22.0]]
-    ahead = loads(TRUTH).compile(()).simulate(chosen.table(case.plant, 5.0)).y
+    ahead = compile_plant(loads(TRUTH), ()).simulate(chosen.table(case.plant, 5.0)).y
     assert ahead.min() > 15 and ahead.max() < 110
     assert entry["separates"][0]["sigmas"] > 3 and entry["bits"] > 0.6
     assert entry["bits_per_hour"] == pytest.approx(entry["bits"] / (entry["duration_s"] / 3600))
@@ -108,14 +110,14 @@ def test_a_hot_end_is_not_heated_beyond_what_was_recorded(tmp_path):
     (p,) = entry["predicted"].values()
     top = float(case.tables[0].columns["T_block"].max())
     assert top > 200 and p["high"] <= top and p["recorded"][1] == pytest.approx(top)
-    assert loads(HOT_TRUTH).compile(()).simulate(chosen.table(case.plant, 5.0)).y.max() <= top
+    assert compile_plant(loads(HOT_TRUTH), ()).simulate(chosen.table(case.plant, 5.0)).y.max() <= top
     full = Table(
         "full",
         "full",
         np.arange(600) * 5.0,
         {"heat": np.full(600, 60.0), "fan": np.zeros(600), "air": np.full(600, 22.0)},
     )
-    assert loads(HOT_TRUTH).compile(()).simulate(full).y.max() > top + 20, "the danger is there"
+    assert compile_plant(loads(HOT_TRUTH), ()).simulate(full).y.max() > top + 20, "the danger is there"
     experiment.write(tmp_path, case, entry, chosen)
     text = (tmp_path / "next_experiment.yaml").read_text()
     assert (
@@ -261,7 +263,7 @@ def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment
     """The whole way by the command line: ambiguous at 25 K; the rig in the experiment's place is simulated from the truth."""
     (tmp_path / "plant.yaml").write_text(BELIEF)
     (tmp_path / "truth.yaml").write_text(TRUTH)
-    write_table(tmp_path / "run_1.csv", loads(TRUTH).compile(()).measure(short_pulses(), seed=1))
+    write_table(tmp_path / "run_1.csv", compile_plant(loads(TRUTH), ()).measure(short_pulses(), seed=1))
     common = [
         "diagnose",
         "--plant",

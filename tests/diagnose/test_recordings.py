@@ -21,7 +21,8 @@ import pytest
 from thermoctl.cli import main
 from thermoctl.plant import load
 from thermoctl.plant.refit import fit, updated
-from thermoctl.recording.table import read_table, write_table
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table, write_table
 
 FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[3] / "shared" / "recordings"))
 OUT = Path(__file__).parents[2] / "build" / "recordings"
@@ -109,18 +110,18 @@ def _held_out(case: Real, out: Path, first: Path | None) -> tuple[dict[str, floa
         return result["held_out_refit_only"], result["held_out_after"]
     naive, extended = load(folder / "plant.yaml"), load(out / "plant.yaml")
     trained = [read_table(first)] if first else [read_table(folder / f"run_{r}.csv") for r in case.runs]
-    model = naive.compile()
-    drives = [model.drive(t) for t in trained]
+    model = compile_plant(naive)
+    drives = [model.excitation(t) for t in trained]
     naive = updated(naive, fit(model, drives, tries=20), drives)
     figures: list[dict[str, float]] = []
     for plant in (naive, extended):
-        model = plant.compile()
+        model = compile_plant(plant)
         errors = []
         for r in case.unseen or case.runs:
             table = read_table(folder / f"run_{r}.csv")
             if first is not None:  # the parameters of one recording hold for its rest, too
                 table = dataclasses.replace(table, name=first.stem)
-            drive = model.drive(table)
+            drive = model.excitation(table)
             e = drive.y - model.run(drive).y
             errors.append(e[drive.t >= case.share * drive.t[-1]] if first is not None else e)
         stacked = np.concatenate(errors)

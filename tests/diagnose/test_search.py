@@ -5,30 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tests.plants import FREE_CARRIAGE, ONE_BLOCK
 from thermoctl.diagnose import run, screen, search
 from thermoctl.diagnose.effects import Rig, candidates, catalogue, shape_grid
 from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.locate import Suspect
-from thermoctl.plant.language import loads
+from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
-
-STAGE = """format: thermoctl-plant/1
-title: Linear stage with a free carriage
-inputs:
-  force: {unit: N}
-parameters:
-  mass: {value: 59, unit: kg, range: [26, 106]}
-  damping: {value: 132, unit: N*s/m, range: [13, 528]}
-nodes:
-  velocity: {unit: m/s, storage: mass, initial: 0}
-  position: {unit: m, storage: 1, initial: 0, initial_sigma: 0.001}
-flows:
-  motor: {into: velocity, rate: force, unit: N}
-  damper: {from: velocity, rate: damping * velocity, unit: N}
-  travel: {into: position, rate: velocity, unit: m/s}
-outputs:
-  encoder: {value: position, unit: m, noise: 5e-6, resolution: 1e-5}
-"""
 
 
 def stage(seeds=(1, 2), idle=0.0, cogging=0.02, strength=0.006):
@@ -61,7 +45,7 @@ def entries(*names):
 @pytest.fixture(scope="module")
 def looked():
     """The stage's case, its refit and a first look in which hysteresis, cogging and a reading that steps competed."""
-    case = Case(loads(STAGE), stage())
+    case = Case(loads(FREE_CARRIAGE), stage())
     base = case.explain(case.plant, [], [])
     seen = search.look(case, base, entries("cogging", "backlash_hysteresis", "sensor_offset_step"))
     seen.finalists = search.compete(case, seen, search.finalists(seen.directions))
@@ -102,7 +86,7 @@ def test_an_effect_that_is_left_by_itself_keeps_those_that_competed_with_it(look
 
 def test_a_threshold_at_which_a_drive_jumps_is_found_from_a_start_far_away():
     """The cost has steps there and no slope: from 0.5 N a refit by slopes alone stays at 0.5 N."""
-    case = Case(loads(STAGE), stage(idle=0.8, cogging=0.0, strength=0.0))
+    case = Case(loads(FREE_CARRIAGE), stage(idle=0.8, cogging=0.0, strength=0.0))
     base = case.explain(case.plant, [], [])
     seen = search.look(case, base, entries("actuator_dead_zone"), draws=0)
     jump = next(d for d in seen.directions if d.candidate.variant)
@@ -113,7 +97,7 @@ def test_a_threshold_at_which_a_drive_jumps_is_found_from_a_start_far_away():
 
 def test_a_period_that_has_not_come_once_is_not_offered():
     """What bends once over the travel is no cogging, whatever it is."""
-    case = Case(loads(STAGE), stage())
+    case = Case(loads(FREE_CARRIAGE), stage())
     base = case.explain(case.plant, [], [])
     rig = Rig(base.plant, case.drives, [t.columns for t in case.tables])
     runs = [case.model.run(d) for d in case.drives]
@@ -190,24 +174,6 @@ def test_other_missing_physics_is_no_inflated_noise(monkeypatch):
     assert search.counts(case, seen, found, seen.entries)
 
 
-HEATER = """format: thermoctl-plant/1
-title: A heated block
-inputs:
-  heat: {unit: W}
-  air: {unit: degC, between_samples: linear}
-parameters:
-  C: {value: 6, unit: J/K, range: [2, 14]}
-  G: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
-nodes:
-  block: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}
-flows:
-  power: {into: block, rate: heat, unit: W}
-  loss: {from: block, rate: G * (block - air), unit: W}
-outputs:
-  temperature: {value: block, unit: degC, noise: 0.1}
-"""
-
-
 def heated():
     """Two recordings of a block that natural convection cools, too."""
     tables = []
@@ -228,13 +194,13 @@ def heated():
                 {"heat": heat, "air": air, "temperature": x + rng.normal(0, 0.1, len(t))},
             )
         )
-    return Case(loads(HEATER), tables)
+    return Case(loads(ONE_BLOCK), tables)
 
 
 def test_an_error_faster_than_a_block_of_rows_is_seen(monkeypatch):
     """A reading with an error of a fifth of its noise every half millimetre, which the stage passes in three samples."""
     truth = loads(
-        STAGE.replace("value: 59", "value: 44")
+        FREE_CARRIAGE.replace("value: 59", "value: 44")
         .replace("value: 132", "value: 82")
         .replace("{value: position,", "{value: position + 1e-6 * sin(2 * pi * position / 0.0005),")
     ).compile(())
@@ -248,7 +214,7 @@ def test_an_error_faster_than_a_block_of_rows_is_seen(monkeypatch):
                 seed=seed,
             )
         )
-    case = Case(loads(STAGE), tables)
+    case = Case(loads(FREE_CARRIAGE), tables)
     base = case.explain(case.plant, [], [])
     fine = search.look(case, base, entries("cyclic_error"))
     best = fine.directions[0]
@@ -262,7 +228,7 @@ def test_an_error_faster_than_a_block_of_rows_is_seen(monkeypatch):
 
 
 def test_a_sketch_keeps_what_directions_have_in_common():
-    case = Case(loads(STAGE), stage())
+    case = Case(loads(FREE_CARRIAGE), stage())
     metric = search.look(case, case.explain(case.plant, [], []), entries("constant_load"), draws=0).metric
     rows = np.random.default_rng(4).standard_normal((40 * screen.ROWS, 3))
     rows[:, 1] += 0.5 * rows[:, 0]
@@ -308,11 +274,13 @@ def motor():
             "air": 21 + np.sin(t / 700),
         },
     )
-    return Case(plant, [plant.compile().measure(table)])
+    return Case(plant, [compile_plant(plant).measure(table)])
 
 
 def offered(case, plant, name):
-    rig = Rig(plant, [plant.compile().drive(t) for t in case.tables], [t.columns for t in case.tables])
+    rig = Rig(
+        plant, [compile_plant(plant).excitation(t) for t in case.tables], [t.columns for t in case.tables]
+    )
     return {c.place.where: c for c in candidates(rig, entries(name))}
 
 

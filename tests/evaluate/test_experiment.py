@@ -13,7 +13,7 @@ from thermoctl.daemon.assemble import compensator
 from thermoctl.daemon.simulate import Simulation
 from thermoctl.identify import modelfile
 from thermoctl.identify.online import Tuner
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
@@ -166,8 +166,8 @@ def test_tune_names_the_shipped_loops_margins_and_keeps_an_unstable_proposal_out
 
 def test_a_wrong_expansion_is_tuned_while_the_reference_is_there(quick, monkeypatch):
     """In simulated time: the tuner takes the daemon's rows, waits for excitation, and installs a better calibration, which can be undone."""
+    from thermoctl.identify.linearise import linearise
     from thermoctl.plant import load
-    from thermoctl.plant.linearise import linearise
 
     right = linearise(load(_thermal(quick)), 0.001, 0.1, expansion_period_s=0.05)
     wrong = dataclasses.replace(

@@ -222,8 +222,9 @@ def _recording(suffix: str) -> tuple[Callable[[bytes], Any], list[bytes]]:
     import numpy as np
     import pyarrow as pa
 
+    from thermoctl.recording.files import read_table, write_table
     from thermoctl.recording.reader import info
-    from thermoctl.recording.table import Table, read_table, write_table
+    from thermoctl.recording.table import Table
 
     table = Table("a", "a", np.arange(40.0), {"x": np.sin(np.arange(40.0)), "y": np.full(40, np.nan)})
     path = FOLDER / f"seed{suffix if suffix != '.arrows' else '.arrow'}"

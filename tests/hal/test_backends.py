@@ -13,6 +13,7 @@ from hal.replay import ReplayBackend
 from tests.hal.conftest import CONFIG, make_settings
 from thermoctl import yamlfile
 from thermoctl.plant import load
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
@@ -46,7 +47,7 @@ def test_simulated_rig_is_deterministic_and_its_seed_counts(tmp_path):
 def test_simulated_rig_follows_the_plant(tmp_path):
     """Against an independent simulation of the same plant by scipy's view of the recording: Model.simulate."""
     values, _, _ = play(simulated(tmp_path), 1001)
-    model = load(CONFIG / "plants/actuator.yaml").compile()
+    model = compile_plant(load(CONFIG / "plants/actuator.yaml"))
     t = np.arange(1001) * 0.001
     table = Table("run", "run", t, {"drive": np.full(1001, 0.2), "air_c": np.full(1001, 22.0)})
     y = model.simulate(table).y

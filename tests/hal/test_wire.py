@@ -278,7 +278,7 @@ def test_control_socket_answers_nonsense_plainly(wire):
 
 
 def test_the_reference_is_recorded_with_a_time_that_the_daemon_shares(wire):
-    from thermoctl.recording.table import read_table
+    from thermoctl.recording.files import read_table
 
     path = wire.rig.run_dir / "reference.csv"
     begin = time.monotonic()

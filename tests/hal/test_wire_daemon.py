@@ -16,7 +16,7 @@ import pytest
 from hal.virtual.rig import tell
 from tests.hal.conftest import CONFIG, free_port
 from thermoctl.daemon.socket import ask
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
 

@@ -45,8 +45,8 @@ ROWS: list[Row] = []
 def quick_settings(folder: Path):
     """Configuration, plants and compensator model of the simulated rig with heat capacities QUICK times smaller: a
     thermal hour passes in 72 s of simulated time. Limits on thermal rates and slews follow."""
+    from thermoctl.identify.linearise import linearise
     from thermoctl.identify.modelfile import save_model
-    from thermoctl.plant.linearise import linearise
 
     for name in ("actuator", "actuator_thermal"):
         text = (ROOT / f"config/plants/{name}.yaml").read_text()

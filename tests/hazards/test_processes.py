@@ -16,7 +16,7 @@ import pytest
 from tests.daemon.process import LIMIT_S, Daemon, wait
 from tests.hazards.harness import ROOT, ROWS, Row
 from thermoctl.daemon.assemble import shared_name
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 
 pytestmark = pytest.mark.slow

@@ -6,7 +6,7 @@ import pytest
 from thermoctl.cli import main
 from thermoctl.evaluate.commands import record
 from thermoctl.identify.experiments import load_experiments, load_inputs
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 
 GOOD = """format: thermoctl-experiments/1

@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg, signal
 
+from tests.identify.peers import fit_percent, identify_validated
 from thermoctl.identify import modal, subspace
-from thermoctl.identify.statespace import StateSpace, fit_percent
+from thermoctl.identify.statespace import StateSpace
 from thermoctl.yamlfile import InputError
 
 TAU = np.array([20.0, 150.0, 900.0])
@@ -140,7 +141,7 @@ def test_other_recordings_of_a_rig_help_where_one_is_short():
     (u, y, read), others = record(40), [record(60)[::2], record(90)[::2]]
     errors = []
     for more in ((), others):
-        found = modal.identify_validated(u[:100], read[:100], 1.0, others=more)
+        found = identify_validated(u[:100], read[:100], 1.0, others=more)
         x0 = found.x0 if found.info["rest"] else found.initial_state(u[:100], read[:100])
         errors.append(np.sqrt(np.mean((found.simulate(u, x0)[100:] - y[100:]) ** 2)))
     assert found.info["rest"] and errors[1] < 0.7 * errors[0]

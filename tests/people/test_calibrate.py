@@ -18,7 +18,7 @@ from thermoctl.evaluate import drive
 from thermoctl.evaluate.drive import Control, DaemonRig
 from thermoctl.identify import modelfile
 from thermoctl.identify.experiments import Aborted, load_experiments
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.recording.writer import RecordingWriter
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX

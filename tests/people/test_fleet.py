@@ -9,7 +9,9 @@ import pytest
 from thermoctl.cli import main
 from thermoctl.diagnose.fleet import drift, judge, summarise
 from thermoctl.plant import load
-from thermoctl.recording import Table, write_table
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import write_table
+from thermoctl.recording.table import Table
 
 PLANT = """
 format: thermoctl-plant/1
@@ -35,7 +37,7 @@ MONTH_S = 30 * 86400.0
 def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("fleet")
     (root / "plant.yaml").write_text(PLANT)
-    model = load(root / "plant.yaml").compile(())
+    model = compile_plant(load(root / "plant.yaml"), ())
     random = np.random.default_rng(3)
     t = np.arange(0.0, 1800.0, 5.0)
     power = np.where((t // 300) % 2 == 0, 3.0, 0.5)

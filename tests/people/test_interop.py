@@ -10,9 +10,10 @@ import pytest
 
 from thermoctl.cli import main
 from thermoctl.plant import load
-from thermoctl.recording.table import read_table
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples/heater"
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs/examples/heater"
 
 
 def write(path, t, columns):
@@ -37,11 +38,11 @@ def write(path, t, columns):
 
 @pytest.mark.parametrize("suffix", [".parquet", ".mf4", ".tdms"])
 def test_a_foreign_recording_is_held_against_the_plant_as_a_csv_is(suffix, tmp_path, capsys):
-    model = load(EXAMPLE / "plant.yaml").compile()
+    model = compile_plant(load(EXAMPLE / "plant.yaml"))
     csv = read_table(EXAMPLE / "run_1.csv")
     path = tmp_path / f"run_1{suffix}"
     write(path, csv.t, csv.columns)
-    foreign, ours = (model.drive(t) for t in (read_table(path), csv))
+    foreign, ours = (model.excitation(t) for t in (read_table(path), csv))
     for name in ("t", "u", "y"):
         assert np.allclose(getattr(foreign, name), getattr(ours, name), rtol=0, atol=1e-9)
     said = []

@@ -10,7 +10,7 @@ import pytest
 from thermoctl.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
-spec = importlib.util.spec_from_file_location("make", ROOT / "examples/heater/make.py")
+spec = importlib.util.spec_from_file_location("make", ROOT / "docs/examples/heater/make.py")
 make = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(make)
 HEADER = "t,heat,air_temperature,temperature_1,temperature_2"
@@ -53,7 +53,7 @@ def test_a_diagnosis_reads_well(name, lamp_w, spoil, verdicts, tmp_path, browser
             [
                 "diagnose",
                 "--plant",
-                str(ROOT / "examples/heater/plant.yaml"),
+                str(ROOT / "docs/examples/heater/plant.yaml"),
                 *runs,
                 "--out",
                 str(tmp_path / "out"),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import thermoctl.recording.writer as writing
-from thermoctl.recording import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.writer import FULL, TIER, RecordingWriter, recording_files
 from thermoctl.signals import INDEX, SIGNALS

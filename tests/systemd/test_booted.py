@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from tests.systemd.container import ROOT, Container, may_raise_limits, missing
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing())]
 CONFIG = "/etc/thermoctl/rig.yaml"

@@ -55,9 +55,9 @@ def test_a_page(page, folder):
 
 
 def test_the_example_is_what_its_script_writes(tmp_path):
-    subprocess.run([sys.executable, ROOT / "examples/heater/make.py", tmp_path], check=True)
+    subprocess.run([sys.executable, ROOT / "docs/examples/heater/make.py", tmp_path], check=True)
     for name in ("run_1.csv", "run_2.csv"):
         there, here = (
-            np.loadtxt(p / name, delimiter=",", skiprows=1) for p in (ROOT / "examples/heater", tmp_path)
+            np.loadtxt(p / name, delimiter=",", skiprows=1) for p in (ROOT / "docs/examples/heater", tmp_path)
         )
         assert np.allclose(there, here, rtol=2e-4, atol=2e-3)

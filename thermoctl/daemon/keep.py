@@ -13,6 +13,7 @@ import json
 import os
 import time
 import zlib
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,14 @@ def _now_s() -> float:
 
 
 def _fingerprint(model: CompensatorModel) -> int:
-    arrays = (model.A_minus_I, model.B, model.C, model.gain, model.b1, model.b2)
-    return zlib.crc32(
-        b"".join(a.tobytes() for a in arrays) + f"{model.kind} {model.period_s} {model.f1}".encode()
-    )
+    """Return the CRC-32 of every field of the model but `meta`, which only describes it."""
+    crc = 0
+    for f in fields(model):
+        if f.name != "meta":
+            value = getattr(model, f.name)
+            content = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            crc = zlib.crc32(f.name.encode() + content, crc)
+    return crc
 
 
 def save(path: Path, model: CompensatorModel, state: np.ndarray) -> bool:

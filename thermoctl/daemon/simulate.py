@@ -179,7 +179,8 @@ def trapezoids(settings: Any, hours: float, compensate: bool, out: str | None = 
         f"{2 * error.std():.3f} um, largest {np.abs(error).max():.3f} um"
     )
     if out:
-        from thermoctl.recording.table import Table, write_table
+        from thermoctl.recording.files import write_table
+        from thermoctl.recording.table import Table
 
         columns = {s.name: np.ascontiguousarray(rows[:, i]) for i, s in enumerate(SIGNALS) if s.name != "t_s"}
         write_table(out, Table(name="simulated", path=out, t=rows[:, INDEX["t_s"]].copy(), columns=columns))

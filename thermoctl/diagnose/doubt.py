@@ -12,7 +12,7 @@ import numpy as np
 
 from thermoctl.diagnose.screen import Metric
 from thermoctl.plant.refit import Fit, Noise
-from thermoctl.plant.simulate import Drive
+from thermoctl.plant.simulate import Excitation
 from thermoctl.recording.table import Table
 
 STILL = 6.0  # an output whose whole spread is below this many sigmas of its noise does not move
@@ -20,7 +20,7 @@ FOLLOWS = 0.3  # share of an output's variation that a plant of the right rig le
 BOUNDS = 0.5  # share of the parameters at their bounds from which the rig is doubted
 
 
-def still(drives: Sequence[Drive], noise: Sequence[Noise]) -> str | None:
+def still(drives: Sequence[Excitation], noise: Sequence[Noise]) -> str | None:
     """No input moves and no output does: nothing of the plant is excited."""
     if any(np.ptp(d.u[:, j]) > 0 for d in drives for j in range(d.u.shape[1])):
         return None

@@ -20,8 +20,8 @@ from thermoctl import yamlfile
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Flow, Input, Node, Parameter, Plant
-from thermoctl.plant.refit import Belief
-from thermoctl.plant.simulate import Drive, Simulation
+from thermoctl.plant.refit import Prior
+from thermoctl.plant.simulate import Excitation, Simulation
 from thermoctl.plant.units import dimension
 from thermoctl.shipped import shipped
 
@@ -238,7 +238,9 @@ _READINGS = re.compile(
 class Rig:
     """A plant and its recordings as the catalogue sees them: which node is a temperature, what moves, what is air."""
 
-    def __init__(self, plant: Plant, drives: Sequence[Drive], columns: Sequence[Mapping[str, np.ndarray]]):
+    def __init__(
+        self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
+    ):
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
         # What an observer (observer.py) added is no physics that an effect could sit in.
         p = dataclasses.replace(
@@ -594,7 +596,7 @@ class Candidate:
             i in self.rig.moving_inputs and not inputs[i].linear for i in ex.names(y)
         )
 
-    def beliefs(self, plant: Plant) -> list[Belief]:
+    def beliefs(self, plant: Plant) -> list[Prior]:
         """What physics says of the effect's parameters in `plant`, for each recording."""
         if self.effect.prior is None:
             return []
@@ -615,7 +617,7 @@ class Candidate:
             def told(e: Expr, known: Mapping[str, Expr] = known) -> Expr | None:
                 return known.get(str(e.value)) if e.op == "name" else None
 
-            out.append(Belief(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, told))))
+            out.append(Prior(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, told))))
         return out
 
     def surprise(self, plant: Plant) -> float:
@@ -624,10 +626,10 @@ class Candidate:
         for b in self.beliefs(plant):
             total += float(
                 ex.evaluate(
-                    b.surprise,
+                    b.neg2_log,
                     {
                         n: plant.parameters[n].values.get(b.recording, plant.parameters[n].value)
-                        for n in ex.names(b.surprise)
+                        for n in ex.names(b.neg2_log)
                     },
                 )
             )

@@ -32,9 +32,10 @@ import numpy as np
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Scale
-from thermoctl.plant.simulate import Model, SimulationError
+from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.plant.units import dimension
-from thermoctl.recording.table import Table, write_table
+from thermoctl.recording.files import write_table
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 if TYPE_CHECKING:
@@ -299,7 +300,7 @@ class _Believer:
 
 
 def _believer(e: Explanation, free: Callable[[Plant], Plant]) -> _Believer:
-    model = free(e.plant).compile()
+    model = compile_plant(free(e.plant))
     found = e.fit
     inflate = max(found.cost / max(found.samples - len(found.z), 1), 1.0)
     covariance = np.linalg.pinv(found.hessian, hermitian=True) * inflate
@@ -326,7 +327,7 @@ def _believer(e: Explanation, free: Callable[[Plant], Plant]) -> _Believer:
 def _predict(b: _Believer, table: Table) -> tuple[np.ndarray, np.ndarray] | None:
     """Readings and states of an experiment (N, ny + nx) and what they are uncertain by (N, ny + nx, z); None where it fails."""
     try:
-        run = b.model.run(b.model.drive(table), sensitivities=True, rtol=1e-5)
+        run = b.model.run(b.model.excitation(table), sensitivities=True, rtol=1e-5)
     except (SimulationError, InputError):
         return None
     assert run.dy is not None and run.dx is not None

@@ -20,7 +20,7 @@ from thermoctl.diagnose.screen import Direction
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import (
-    BELIEF_WEIGHT,
+    PRIOR_WEIGHT,
     Fit,
     Noise,
     Problem,
@@ -30,7 +30,7 @@ from thermoctl.plant.refit import (
     report,
     updated,
 )
-from thermoctl.plant.simulate import Drive, SimulationError
+from thermoctl.plant.simulate import Excitation, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
@@ -80,8 +80,8 @@ class Case:
     ):
         self.plant, self.tables = plant, list(tables)
         self.progress = progress or (lambda text: None)
-        self.model = plant.compile()
-        self.drives = [self.model.drive(t) for t in self.tables]
+        self.model = compile_plant(plant)
+        self.drives = [self.model.excitation(t) for t in self.tables]
         counts = {
             o: sum(int(np.isfinite(d.y[:, j]).sum()) for d in self.drives)
             for j, o in enumerate(self.model.outputs)
@@ -111,9 +111,9 @@ class Case:
             1
         ]  # how far the plant's parameters lie from what was believed, in shares of their ranges
 
-    def drives_of(self, e: Explanation) -> list[Drive]:
+    def drives_of(self, e: Explanation) -> list[Excitation]:
         """The recordings as an explanation's plant reads them."""
-        return [e.fit.model.drive(t) for t in self.tables]
+        return [e.fit.model.excitation(t) for t in self.tables]
 
     def explain(
         self,
@@ -125,8 +125,8 @@ class Case:
         goal: float = np.inf,
     ) -> Explanation:
         """Refit a plant to all recordings and score it; `goal`: a cost that it does not go on for when that is out of reach."""
-        model = plant.compile()
-        drives = [model.drive(t) for t in self.tables]
+        model = compile_plant(plant)
+        drives = [model.excitation(t) for t in self.tables]
         found = fit(
             model,
             drives,
@@ -136,7 +136,7 @@ class Case:
             tries=tries,
             seconds=self.patience,
             goal=goal,
-            beliefs=[b for c in effects for b in c.beliefs(plant)],
+            priors=[b for c in effects for b in c.beliefs(plant)],
         )
         return self.scored(updated(plant, found, drives), effects, own, found)
 
@@ -145,16 +145,11 @@ class Case:
         it is white, or where that fits visibly worse (what is missing is no colour)."""
         if e.white:
             return e
-        model = e.plant.compile()
-        drives = [model.drive(t) for t in self.tables]
+        model = compile_plant(e.plant)
+        drives = [model.excitation(t) for t in self.tables]
         try:
             found = fit(
-                model,
-                drives,
-                noise_of(e.colours),
-                iterations=15,
-                seconds=self.patience,
-                beliefs=e.fit.beliefs,
+                model, drives, noise_of(e.colours), iterations=15, seconds=self.patience, priors=e.fit.priors
             )
         except (SimulationError, np.linalg.LinAlgError):
             return e
@@ -228,10 +223,10 @@ def noise_of(colours: Sequence[Colour]) -> tuple[Noise, ...]:
     return tuple(Noise(c.sigma, 0.0, c.ar, c.ma) for c in colours)
 
 
-def standard_errors(e: Explanation, drives: Sequence[Drive]) -> dict[str, float]:
+def standard_errors(e: Explanation, drives: Sequence[Excitation]) -> dict[str, float]:
     """Of each parameter of the effects: the Gauss-Newton one, or half the width over which the likelihood falls by two (-2 log by
     3.84) over 1.96 where that is wider: an onset, a threshold, the depth of a dead zone have no slope to go by."""
-    problem = Problem(e.fit.model, drives, e.fit.noise, e.fit.beliefs)
+    problem = Problem(e.fit.model, drives, e.fit.noise, e.fit.priors)
     problem.set_outlier_limits(e.fit.residuals)
     z = e.fit.z
     least, _, _, _ = problem.evaluate(z, False)
@@ -271,17 +266,17 @@ def standard_errors(e: Explanation, drives: Sequence[Drive]) -> dict[str, float]
 def occam(found: Fit, added: Set[str]) -> float:
     """The price of added parameters: Schwarz's log n each; of those that physics has a belief of Laplace's, log det of what is
     known of them by data and belief over what was believed."""
-    believed = {n for b in found.beliefs for n in ex.names(b.surprise)}
+    believed = {n for b in found.priors for n in ex.names(b.neg2_log)}
     price = float(
         sum(q in added and q not in believed for q, _ in found.unknowns) * np.log(max(found.samples, 2))
     )
     told = np.array([q in believed for q, _ in found.unknowns])
     if told.any():
-        floor = BELIEF_WEIGHT**2 * np.eye(int(told.sum()))
+        floor = PRIOR_WEIGHT**2 * np.eye(int(told.sum()))
         price += float(
             np.linalg.slogdet(found.hessian)[1]
             - np.linalg.slogdet(found.hessian[np.ix_(~told, ~told)])[1]
-            - np.linalg.slogdet(found.believed[np.ix_(told, told)] + floor)[1]
+            - np.linalg.slogdet(found.prior_hessian[np.ix_(told, told)] + floor)[1]
         )
     return price
 

@@ -25,8 +25,9 @@ import numpy as np
 from thermoctl.control import faults
 from thermoctl.plant import load
 from thermoctl.plant.refit import fit, report
-from thermoctl.plant.simulate import SimulationError
-from thermoctl.recording.table import Table, read_table
+from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.recording.files import read_table
+from thermoctl.recording.table import Table
 from thermoctl.recording.writer import NAME, TIER
 from thermoctl.yamlfile import InputError, suggest
 
@@ -157,7 +158,7 @@ def _thinned(table: Table) -> Table:
 
 def _model(summary: Summary, table: Table, plant_path: str, names: tuple[str, ...]) -> Summary:
     plant = load(plant_path)
-    asis = fit(plant.compile(()), [plant.compile(()).drive(table)])
+    asis = fit(compile_plant(plant, ()), [compile_plant(plant, ()).excitation(table)])
     noise = dict(zip(asis.model.outputs, asis.noise, strict=True))
     ratios = {o: r / noise[o].sigma for o, r in asis.rms().items() if math.isfinite(r)}
     if not ratios:
@@ -165,8 +166,8 @@ def _model(summary: Summary, table: Table, plant_path: str, names: tuple[str, ..
     worst = max(ratios, key=lambda o: ratios[o])
     estimates, after = {}, math.nan
     if names:
-        model = plant.compile(names)
-        drive = model.drive(table)
+        model = compile_plant(plant, names)
+        drive = model.excitation(table)
         found = fit(model, [drive])
         estimates = {e.name: (e.value, e.sd) for e in report(found, [drive])}
         after = max(r / noise[o].sigma for o, r in found.rms().items() if math.isfinite(r))

@@ -11,8 +11,8 @@ from scipy.fft import dct
 
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Belief, fit, updated
-from thermoctl.plant.simulate import Drive, Model, SimulationError
+from thermoctl.plant.refit import Prior, fit, updated
+from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 UNDETERMINED = 20.0
@@ -42,17 +42,17 @@ def folds(case: Case, blocks: bool = False) -> list[tuple[list[Table], list[Tabl
 
 
 def unseen_errors(
-    case: Case, plant: Plant, refit: bool = True, blocks: bool = False, beliefs: Sequence[Belief] = ()
+    case: Case, plant: Plant, refit: bool = True, blocks: bool = False, beliefs: Sequence[Prior] = ()
 ) -> list[np.ndarray]:
     """Free-run errors (N, outputs) on each fold's test data, the plant fitted to that fold's training data only."""
     out: list[np.ndarray] = []
     for train, test in folds(case, blocks):
-        model = plant.compile()
-        drives = [model.drive(t) for t in test]
+        model = compile_plant(plant)
+        drives = [model.excitation(t) for t in test]
         try:
             dx0: Sequence[np.ndarray | None] = [None] * len(test)
             if refit:
-                training = [model.drive(t) for t in train]
+                training = [model.excitation(t) for t in train]
                 found = fit(
                     model,
                     training,
@@ -60,7 +60,7 @@ def unseen_errors(
                     iterations=15,
                     tolerance=1e-3,
                     seconds=case.patience,
-                    beliefs=beliefs,
+                    priors=beliefs,
                 )
                 model = Model(updated(plant, found, training), model.code)
                 if train[0].path == test[0].path:  # recordings, split: their starts took part
@@ -76,7 +76,7 @@ def unseen_errors(
     return out
 
 
-def _but_for_start(case: Case, model: Model, d: Drive) -> np.ndarray:
+def _but_for_start(case: Case, model: Model, d: Excitation) -> np.ndarray:
     """Free-run error on a recording that took no part, less what its uncertain start explains at first order: where it began
     is no physics, and a free axis carries an error of its start to the end."""
     run = model.run(model.prepare(d), None, None, sensitivities=True)
@@ -95,7 +95,7 @@ def errors_of(case: Case, e: Explanation, blocks: bool) -> list[np.ndarray]:
     """`unseen_errors` of an explanation, kept by the case: search, proof and report ask for the same ones."""
     key = (id(e.plant), blocks)
     if key not in case.unseen:
-        case.unseen[key] = (e.plant, unseen_errors(case, e.plant, blocks=blocks, beliefs=e.fit.beliefs))
+        case.unseen[key] = (e.plant, unseen_errors(case, e.plant, blocks=blocks, beliefs=e.fit.priors))
     return case.unseen[key][1]
 
 

@@ -16,7 +16,8 @@ import numpy as np
 from thermoctl.daemon.assemble import compensator
 from thermoctl.daemon.misfit import Alarm, Misfit
 from thermoctl.plant.language import Plant
-from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.table import Table
 from thermoctl.recording.writer import TIER, recording_files
 from thermoctl.yamlfile import InputError
 

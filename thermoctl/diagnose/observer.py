@@ -20,13 +20,13 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
 from thermoctl.plant.language import Flow, Input, Plant
 from thermoctl.plant.refit import Noise
-from thermoctl.plant.simulate import Drive, Model
+from thermoctl.plant.simulate import Excitation, Model
 
 SEEN, CORRECT = "seen_", "correct_"
 
 
 def follows(
-    plant: Plant, model: Model, drives: Sequence[Drive], noise: Sequence[Noise], trust: float
+    plant: Plant, model: Model, drives: Sequence[Excitation], noise: Sequence[Noise], trust: float
 ) -> Plant | None:
     """The plant with an observer. `trust`: process noise as a share of the slopes' own size (a larger one follows the
     recording more closely). None where the recordings do not suffice for one (an output is missing, no stable gain)."""

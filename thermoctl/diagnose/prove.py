@@ -232,7 +232,7 @@ def _outcome(job: Job, out: Path) -> tuple[dict[str, Any] | None, dict[str, Any]
 
 
 def _duration(job: Job) -> float | None:
-    from thermoctl.recording.table import read_table
+    from thermoctl.recording.files import read_table
 
     try:
         t = read_table(job.recordings[0], columns=["t"]).t

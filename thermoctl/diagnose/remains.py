@@ -26,7 +26,7 @@ UNLIKE_COLOUR, MOST = (
 
 def metric_of(case: Case, e: Explanation, colours: Sequence[Colour] | None) -> Metric:
     """The rows of an explanation's residual, in the metric of colours, one a channel, or in white noise's."""
-    drives = [e.fit.model.drive(t) for t in case.tables]
+    drives = [e.fit.model.excitation(t) for t in case.tables]
     for r, d in enumerate(drives):
         e.fit.model.prepare(d, e.fit.values[r])
     return Metric(dataclasses.replace(e.fit, noise=noise_of(colours)) if colours else e.fit, drives)

@@ -44,7 +44,7 @@ from thermoctl.diagnose.search import (
 from thermoctl.plant import load, save
 from thermoctl.plant.refit import Noise
 from thermoctl.plant.simulate import SimulationError
-from thermoctl.recording.table import read_table
+from thermoctl.recording.files import read_table
 from thermoctl.signals import NAMES
 from thermoctl.yamlfile import InputError
 

@@ -23,7 +23,7 @@ from thermoctl.diagnose.effects import STRAIGHT, Candidate, Rig, shape_grid
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
-from thermoctl.plant.simulate import Drive, Simulation
+from thermoctl.plant.simulate import Excitation, Simulation
 
 ROWS = 8_000  # rows of the screening, all recordings together
 FINE_ROWS = 64_000  # of what moves: it passes a pattern's period, or turns, within a block's time
@@ -68,7 +68,7 @@ def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
 class Metric:
     """Whitened, blocked rows of a fit: the residual, the basis of the plant's own parameters and how to bring more in."""
 
-    def __init__(self, fitted: Fit, drives: Sequence[Drive], rows: int = ROWS):
+    def __init__(self, fitted: Fit, drives: Sequence[Excitation], rows: int = ROWS):
         self.fit, self.drives, self.model = fitted, list(drives), fitted.model
         self.problem = Problem(self.model, drives, fitted.noise)
         self.blocks = max(1, int(np.ceil(self.problem.samples / rows)))

@@ -21,7 +21,7 @@ from thermoctl.diagnose.heldout import prediction
 from thermoctl.diagnose.remains import energy, remains, smooth
 from thermoctl.diagnose.screen import FINE_ROWS, ROWS, Direction, Metric, log_p, screen, sharpened
 from thermoctl.plant.language import Parameter, Plant
-from thermoctl.plant.simulate import Drive, SimulationError
+from thermoctl.plant.simulate import Excitation, SimulationError, compile_plant
 from thermoctl.yamlfile import InputError
 
 PATIENCE_S = 60.0  # CPU seconds of a diagnosis beyond which it looks at fewer pairs and runners-up,
@@ -114,7 +114,7 @@ def sticking(direction: Direction) -> Direction | None:
     return dataclasses.replace(direction, start={**direction.start, **start}) if start else None
 
 
-def extend(base: Plant, direction: Direction, drives: Sequence[Drive]) -> tuple[Plant, dict[str, str]]:
+def extend(base: Plant, direction: Direction, drives: Sequence[Excitation]) -> tuple[Plant, dict[str, str]]:
     """The plant with a screened effect at its starting values, and the plant's names of the effect's parameters."""
     duration = max(float(d.t[-1]) for d in drives)
     ranges = ranges_of(direction, duration)
@@ -165,7 +165,7 @@ def look(
     """Screen the catalogue from an explanation, at the places of the plant as it came: what was left out is the rig's, not that of a
     part which another effect assumed. `coloured`: in the metric of the residual's own colour."""
     model = base.fit.model
-    drives = [model.drive(t) for t in case.tables]
+    drives = [model.excitation(t) for t in case.tables]
     for d in drives:
         model.prepare(d, base.fit.values[drives.index(d)])
     rig = Rig(base.plant, drives, [t.columns for t in case.tables])
@@ -590,8 +590,10 @@ def following(
     in the free run, the same under the observer, its rivals there)."""
     case.progress("looking again with the plant held to the recording")
     for trust in (0.01, 0.1):
-        model = base.plant.compile()
-        plant = observer.follows(base.plant, model, [model.drive(t) for t in case.tables], case.noise, trust)
+        model = compile_plant(base.plant)
+        plant = observer.follows(
+            base.plant, model, [model.excitation(t) for t in case.tables], case.noise, trust
+        )
         if plant is None:
             return None
         try:

@@ -29,7 +29,7 @@ from thermoctl.evaluate.drive import Control, DaemonRig, SimulatedRig, as_table,
 from thermoctl.evaluate.iso230 import mean_and_two_s
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
-from thermoctl.recording.table import read_table, write_table
+from thermoctl.recording.files import read_table, write_table
 from thermoctl.report.page import figure, page, table
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX, POINTS

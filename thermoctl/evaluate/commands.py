@@ -12,7 +12,9 @@ import numpy as np
 from hal.backend import HardwareError
 from thermoctl.evaluate import chain, drive, iso230, rigs
 from thermoctl.identify import experiments, modelfile, tuning
-from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.table import Table
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError, suggest
@@ -188,7 +190,9 @@ def _on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) ->
             f"experiment '{inputs.name}' says nothing of {', '.join(sorted(unsaid))}, which {plant_file} reads"
         )
     try:
-        write_table(path, plant.compile(()).measure(Table(path.stem, str(path), t, columns), seed=len(t)))
+        write_table(
+            path, compile_plant(plant, ()).measure(Table(path.stem, str(path), t, columns), seed=len(t))
+        )
     except SimulationError as e:
         raise InputError(f"{plant_file}: {e}") from None
     print(f"{path}: {len(t)} rows")

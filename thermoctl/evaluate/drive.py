@@ -28,7 +28,8 @@ from thermoctl.control.law import COPPER_1_K
 from thermoctl.control.model import CompensatorModel
 from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
-from thermoctl.recording.table import Table, read_table
+from thermoctl.recording.files import read_table
+from thermoctl.recording.table import Table
 from thermoctl.signals import INDEX, NAMES, POINTS
 from thermoctl.yamlfile import InputError
 

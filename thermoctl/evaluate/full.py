@@ -17,6 +17,8 @@ from thermoctl.control.model import CompensatorModel
 from thermoctl.evaluate import chain, rigs
 from thermoctl.evaluate.iso230 import mean_and_two_s
 from thermoctl.identify import experiments
+from thermoctl.plant import extended
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.signals import INDEX, NAMES, POINTS
 
@@ -82,7 +84,7 @@ def scaled_truth(plant_file: str | Path, path: Path) -> Path:
         for k, factor in rigs.PAPER_SCALE.items():
             data["parameters"][k]["value"] *= factor
 
-    plant.save(p.extended(change), path)
+    plant.save(extended(p, change), path)
     return path.resolve()  # settings read a relative path from their own file's folder
 
 
@@ -108,7 +110,7 @@ def still(
         "air": chain.smooth_air(test.air_c),
         **{f"heat_{b}": np.zeros(n) for b in rigs.HEATED},
     }
-    model = rigs.quasi_static(p).compile()
+    model = compile_plant(rigs.quasi_static(p))
     sim = model.simulate(Table("still", "still", np.arange(n, dtype=float), columns))
     names = list(model.outputs)
     true_c = sim.y[:, [names.index(f"{q}_c") for q in POINTS]]

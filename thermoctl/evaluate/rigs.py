@@ -20,6 +20,7 @@ from scipy.signal import lfilter
 from thermoctl.identify import kernels
 from thermoctl.identify.experiments import Schedule
 from thermoctl.plant import Plant, from_plain
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.signals import POINTS
 
@@ -157,7 +158,7 @@ class Rig:
         self.air_k, self.bench, self.heat_w = tuple(air * v for v in AIR_K), bench, heat * HEAT_W
         p = {k: v.value for k, v in plant.parameters.items()}
         self.electrical = {k: p[k] for k in ("k_flexure", "k_T", "b_eddy")}
-        self.model = hidden_masses(quasi_static(plant)).compile()
+        self.model = compile_plant(hidden_masses(quasi_static(plant)))
         rng = np.random.default_rng([seed, 1])
         spread = {"C_": 0.08, "G_": 0.15, "H_": 0.15, "a_": 0.10, "N_": 0.15}
         self.base = {

@@ -11,24 +11,28 @@ ridge            thermometers are noisy: gains g multiply their noise (quantisat
                  minimises the expected squared error *with such inputs*: 25 nearly collinear parameters need that.
 The time constant itself cannot be told with so many parameters; the prediction can.
 
-The output moves with the bodies' absolute temperatures, the models speak of rises above the air. T_abs = rise + air, so air enters
-with the sum of all gains: b_air = sum(b1 + b2). A free air regressor is not excited in two hours.
+The output moves with the bodies' absolute temperatures, the models speak of rises above the air. T_abs = rise
++ air, so air enters with the sum of all gains: b_air = sum(b1 + b2). A free air regressor is not excited in
+two hours.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy import linalg, optimize, signal
 
-from thermoctl.identify import kernels  # type: ignore[attr-defined]
+from thermoctl.identify import kernels
 from thermoctl.yamlfile import InputError
 
 
 @dataclass(frozen=True)
 class Expansion:
-    """f1, b1 (M,) for T(n-1), b2 (M,) for T(n), um per K; b_air for air - air(0), um/K; offset_um added to the output."""
+    """f1, b1 (M,) for T(n-1), b2 (M,) for T(n), um per K; b_air for air - air(0), um/K.
+
+    offset_um added to the output."""
 
     f1: float
     b1: np.ndarray
@@ -36,7 +40,7 @@ class Expansion:
     period_s: float
     b_air: float = 0.0
     offset_um: float = 0.0
-    info: dict = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
 
     def predict(self, rises: np.ndarray, air: np.ndarray | None = None, start_um: float = 0.0) -> np.ndarray:
         """Free run yL (N,) on rises (N, M) and air (N,) degC; `start_um` is yL(0) without the offset."""
@@ -48,23 +52,10 @@ class Expansion:
         drive[0] = start_um
         return signal.lfilter([1.0], [1.0, -self.f1], drive) + self.offset_um
 
-    @property
-    def time_constant_s(self) -> float:
-        """-T / ln f1, s."""
-        return -self.period_s / np.log(self.f1) if 0 < self.f1 < 1 else 0.0
-
 
 def regressors(rises: np.ndarray) -> np.ndarray:
     """Rows [T(n-1), T(n)] (N, 2M) of (3); the first row repeats T(0)."""
     return np.hstack([np.vstack([rises[:1], rises[:-1]]), rises])
-
-
-def block_ls(rises: np.ndarray, y: np.ndarray, period_s: float) -> Expansion:
-    """Equation-error block least squares: the measured y in the regressor."""
-    _check(rises, y)
-    phi = np.hstack([regressors(rises)[:-1], y[:-1, None]])
-    theta = linalg.lstsq(phi, y[1:], cond=1e-10)[0]
-    return _from_theta(theta, period_s, {"method": "block least squares (equation error)"})
 
 
 def recursive(
@@ -75,8 +66,10 @@ def recursive(
     q0: float = 1e6,
     own_output: bool = False,
 ) -> Expansion:
-    """The paper's recursion (5) with weight lambda and Q(0) = q0 I; `own_output` puts the model's own past output in the
-    regressor as (3) is written, else the measured one (which is what equals the block solution)."""
+    """Return the paper's recursion (5) with weight lambda and Q(0) = q0 I.
+
+    `own_output` puts the model's own past output in the regressor as (3) is written, else the measured one
+    (which is what equals the block solution)."""
     _check(rises, y)
     phi = np.ascontiguousarray(regressors(rises)[:-1])
     p = phi.shape[1] + 1
@@ -100,12 +93,13 @@ def output_error(
     lags: int = 2,
     output_step_um: float = 0.0,
 ) -> Expansion:
-    """True output error: search over f1 and ridge least squares. rises (N, M) K, y (N,) um (NaN: not measured there), or lists of
-    recordings, each with an offset and a start of its own. `air` (N,) degC ties b_air to the sum of the gains.
+    """Fit the expansion by output error: search over f1, ridge least squares for the gains.
 
-    `input_sigma_k`: error of the inputs the model will be driven by (quantisation included), per input or one for all;
-    `output_step_um`: the encoder's step, whose variance floors what a fit may explain; lags 1 uses T(n) alone.
-    The offset and start returned are those of the last recording."""
+    rises (N, M) K, y (N,) um (NaN: not measured), or lists of recordings, each with an offset and a start of
+    its own. `air` (N,) degC ties b_air to the sum of the gains. `lags` 1 uses T(n) alone.
+    `input_sigma_k`: error of the inputs that the model will be driven by (quantisation included), one for all
+    or one each. `output_step_um`: the encoder's step; its variance is the least that a fit may leave.
+    The returned offset and start are those of the last recording."""
     many = [rises] if isinstance(rises, np.ndarray) else rises
     ys = [y] if isinstance(y, np.ndarray) else y
     airs = [None] * len(many) if air is None else [air] if isinstance(air, np.ndarray) else air
@@ -170,10 +164,12 @@ def output_error(
 
 
 class Bank:
-    """Online output error: fixed poles, each with a square-root RLS on inputs filtered by it; the best pole is used.
+    """Online output error: fixed poles, each with a square-root RLS on inputs filtered by it.
 
-    Call `update(rises (K, M), y (K,))` with new samples in time order (NaN in y where the reference is absent); `model()`
-    gives the present Expansion. About 0.7 us a sample and pole for 12 temperatures."""
+    The best pole is used.
+
+    Call `update(rises (K, M), y (K,))` with new samples in time order (NaN in y where the reference is
+    absent); `model()` gives the present Expansion. About 0.7 us a sample and pole for 12 temperatures."""
 
     def __init__(
         self,
@@ -216,8 +212,10 @@ class Bank:
         self.samples += len(rises)
 
     def model(self) -> Expansion:
-        """The Expansion of the pole with the least criterion so far: squared error and, as in `output_error`, the ridge that the
-        inputs' error asks for, laid under each triangle."""
+        """Return the Expansion of the pole with the least criterion so far.
+
+        Squared error and, as in `output_error`, the ridge that the inputs' error asks for, laid under each
+        triangle."""
         m, p = self.inputs, self.r.shape[1]
         best = (np.inf, 0, np.zeros(p))
         for k in range(len(self.poles)):
@@ -240,8 +238,9 @@ class Bank:
         )
 
     def bounded(self, low: np.ndarray, high: np.ndarray) -> Expansion:
-        """The best Expansion of one lag whose static gains (M,) um/K lie within low..high: collinear gains that the data do not tell apart
-        are settled inside the bounds, not cut off at them."""
+        """Return the best Expansion of one lag whose static gains (M,) um/K lie within low..high.
+
+        Collinear gains that the data do not tell apart are settled inside the bounds, not cut off at them."""
         m = self.inputs
         free = np.full(2, np.inf)
         best = (np.inf, 0, np.zeros(m + 2))
@@ -266,14 +265,16 @@ class Bank:
         )
 
     def _rows(self, k: int) -> np.ndarray:
-        """The triangle of pole k over the ridge that the inputs' error asks for; the last column is the right-hand side."""
+        """Return the triangle of pole k over the ridge that the inputs' error asks for.
+
+        The last column is the right-hand side."""
         count = self.samples if self.weight == 1 else (1 - self.weight**self.samples) / (1 - self.weight)
         f, p = self.poles[k], self.r.shape[1]
         ridge = np.append(np.tile(self.sigma2, 2) * (1 - f) / (1 + f) * count, [0, 0])
         return np.vstack([self.r[k], np.column_stack([np.diag(np.sqrt(ridge)), np.zeros(p)])])
 
 
-def _from_theta(theta: np.ndarray, period_s: float, info: dict) -> Expansion:
+def _from_theta(theta: np.ndarray, period_s: float, info: dict[str, Any]) -> Expansion:
     m = (len(theta) - 1) // 2
     return Expansion(float(theta[-1]), theta[:m], theta[m : 2 * m], period_s, 0.0, 0.0, info)
 

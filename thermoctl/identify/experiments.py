@@ -1,24 +1,28 @@
 """Experiments: what the setpoint, or any rig's inputs, do over time, as data from a file.
 
-An experiment is made of `parts` (what the setpoint does) or lists `inputs`: a recording's column with its corners each. One
-whose only input is setpoint_um is a schedule like any other and runs on the daemon's own tick; another rig's is run by a person
-from the CSV beside it, or on a plant file in its place.
+An experiment is made of `parts` (what the setpoint does) or lists `inputs`: a recording's column with its
+corners each. One whose only input is setpoint_um is a schedule like any other and runs on the daemon's own
+tick; another rig's is run by a person from the CSV beside it, or on a plant file in its place.
 
-A schedule is a list of (seconds, um) corners, joined by straight lines; the law's own rate limiter makes the ramps. Running it
-gives a recording. It runs under all protections: a fault ends it, nothing recorded is lost, and it can be resumed where it stood.
+A schedule is a list of (seconds, um) corners, joined by straight lines; the law's own rate limiter makes the
+ramps. Running it gives a recording. It runs under all protections: a fault ends it, nothing recorded is lost,
+and it can be resumed where it stood.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import cycle, product
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
+from thermoctl.control import arming
+from thermoctl.control.faults import FAULTS
+from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError, Node, load, suggest
 
 FORMAT = "thermoctl-experiments/1"
@@ -52,8 +56,10 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a rig's inputs do: {column: corners (K, 2) of seconds and value} on straight lines, ends at duration_s, read every
-    sample_s; `assumed`: columns that nobody drives, at the values they were taken to have; `predicted`: the lowest and highest
+    """An experiment that drives inputs of a rig.
+
+    `corners`: column to (K, 2) of seconds and value, joined by straight lines up to duration_s and sampled
+    every sample_s. `assumed`: the values of the columns that nobody drives. `predicted`: the lowest and highest
     value of each reading that the diagnosis expects."""
 
     name: str
@@ -65,7 +71,7 @@ class Inputs:
     predicted: dict[str, tuple[float, float]]
 
     def schedule(self) -> Schedule:
-        """The same for the daemon. Raises InputError where it drives more than the setpoint."""
+        """Return the same for the daemon. Raises InputError where it drives more than the setpoint."""
         if set(self.corners) != {SETPOINT}:
             raise InputError(
                 f"experiment '{self.name}' drives {', '.join(self.corners)}; the daemon commands {SETPOINT} only. Run it "
@@ -75,7 +81,7 @@ class Inputs:
         return Schedule(self.name, self.title, t, v, self.duration_s)
 
     def columns(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Times (N,) every sample_s, and each column over them."""
+        """Return times (N,) every sample_s, and each column over them."""
         t = np.arange(int(np.floor(self.duration_s / self.sample_s + 1e-9)) + 1) * self.sample_s
         return t, {
             **{n: np.full(len(t), v) for n, v in self.assumed.items()},
@@ -84,7 +90,7 @@ class Inputs:
 
 
 def load_inputs(path: str | Path) -> dict[str, Inputs]:
-    """The experiments of a file that list inputs. Raises InputError with the line of a wrong entry."""
+    """Return the experiments of a file that list inputs. Raises InputError with the line of a wrong entry."""
     return {
         n: _inputs(n, node)
         for n, node in _head(load(path)).items()
@@ -93,7 +99,7 @@ def load_inputs(path: str | Path) -> dict[str, Inputs]:
 
 
 def _head(root: Node) -> dict[str, Node]:
-    """The file's experiments, its keys and format checked."""
+    """Return the file's experiments, its keys and format checked."""
     top = _keys(root, "the file", {"format", "experiments"}, {"rate_um_s"})
     if top["format"].value != FORMAT:
         raise top["format"].error(f"'{FORMAT}' was expected")
@@ -147,7 +153,9 @@ def _inputs(name: str, node: Node) -> Inputs:
 
 
 def load_experiments(path: str | Path) -> dict[str, Schedule]:
-    """What the setpoint does in each experiment of a file. Raises InputError with the line of a wrong entry."""
+    """Read the schedules of an experiment file by name.
+
+    Raises InputError with the line of a wrong entry."""
     root = load(path)
     entries = _head(root)
     out = {}
@@ -221,10 +229,10 @@ def _hold(corners: list[tuple[float, float]], seconds: float, value: float, rate
 def design_pulses(
     count: int, active_s: float, cutoff_hz: float, least_s: float
 ) -> tuple[list[float], list[float]]:
-    """Widths and gaps of `count` power pulses that fill `active_s`, none shorter than `least_s`, with the largest part of their
-    alternating power below `cutoff_hz` spread over the band: maximises the geometric mean of power over four bands below it.
+    """Return widths and gaps of `count` power pulses that fill `active_s`, none shorter than `least_s`.
 
-    Raises InputError when they do not fit."""
+    They put the largest part of their alternating power below `cutoff_hz`, spread over the band: the
+    geometric mean of the power in four bands is maximised. Raises InputError when they do not fit."""
     unit = active_s / (4 * count)
     lengths = [v for v in (0.5 * unit, unit, 1.5 * unit, 2 * unit, 3 * unit, 4 * unit) if v >= least_s]
     best, found = -np.inf, None
@@ -243,7 +251,7 @@ def design_pulses(
     return list(found[::2]), list(found[1::2])
 
 
-def _pulse_power(widths: tuple, gaps: tuple, f: np.ndarray) -> np.ndarray:
+def _pulse_power(widths: Sequence[float], gaps: Sequence[float], f: np.ndarray) -> np.ndarray:
     """|Fourier transform|^2 of rectangular pulses of height 1 at frequencies f."""
     total, t = np.zeros(len(f), complex), 0.0
     for w, g in zip(widths, gaps, strict=True):
@@ -253,7 +261,9 @@ def _pulse_power(widths: tuple, gaps: tuple, f: np.ndarray) -> np.ndarray:
 
 
 def spectrum(t_s: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One-sided power spectrum (f Hz, density) of an equidistant signal, its mean removed, padded fourfold."""
+    """Return the one-sided power spectrum (f Hz, density) of an equidistant signal.
+
+    The mean is removed and the signal padded fourfold."""
     n, dt = len(power), t_s[1] - t_s[0]
     x = np.fft.rfft(power - power.mean(), 4 * n)
     return np.fft.rfftfreq(4 * n, dt), np.abs(x) ** 2 * dt / n * 2
@@ -267,7 +277,7 @@ def share_below(t_s: np.ndarray, power: np.ndarray, cutoff_hz: float) -> float:
 
 @dataclass
 class Progress:
-    """How far a run is: simulated or real seconds done of duration, wall seconds used, and the estimate of what is left."""
+    """Progress of a run: seconds done of duration, wall seconds used, and an estimate of the rest."""
 
     done_s: float
     duration_s: float
@@ -292,22 +302,40 @@ class Aborted(Exception):
         self.reason, self.done_s = reason, done_s
 
 
+class ScheduleTarget(Protocol):
+    """What a schedule runs on: `daemon.simulate.Simulation`, or a rig of the same methods."""
+
+    @property
+    def row(self) -> np.ndarray:
+        """The newest record row."""
+
+    @property
+    def period_s(self) -> float:
+        """Period of a tick, s."""
+
+    def arm(self) -> object:
+        """Arm the law."""
+
+    def command(self, name: str, value: float) -> object:
+        """Give the law a command."""
+
+    def tick(self, count: int) -> np.ndarray:
+        """Advance `count` ticks; return the newest record row."""
+
+
 def run(
-    simulation: Any,
+    simulation: ScheduleTarget,
     schedule: Schedule,
     every: int = 100,
     start_s: float = 0.0,
     progress: Callable[[Progress], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[np.ndarray]:
-    """Run a schedule on a `daemon.simulate.Simulation` (armed here); yields blocks of record rows, every `every`-th tick.
+    """Run a schedule on a rig, which is armed first; yield blocks of record rows, every `every`-th tick.
 
-    Resumes at `start_s` of the schedule. Each block is given out before the next is computed, so an abort loses nothing.
-    Raises Aborted when the law leaves ARMED (the fault bits are named) or `stop()` turns true."""
-    from thermoctl.control import arming
-    from thermoctl.control.faults import FAULTS
-    from thermoctl.signals import INDEX
-
+    Resumes at `start_s` of the schedule. Each block is given out before the next is computed, so an abort
+    loses nothing. Raises Aborted when the law leaves ARMED (the fault bits are named) or `stop()` turns true.
+    """
     period = simulation.period_s
     waiting = [c for c in schedule.commands() if c[0] >= start_s]
     before = [c for c in schedule.commands() if c[0] < start_s]

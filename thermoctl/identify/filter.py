@@ -1,4 +1,4 @@
-"""Temperature estimators: the paper's modified Kalman filter, and a Kalman filter with the same one sensor.
+"""Temperature estimators: the paper's modified Kalman filter, and a steady Kalman filter.
 
 MKF    output as state (33), scalar gain of the coil's row (34), (35), mapped to the other points by zeta:
        zeta = [1, sigma_2/sigma_1 ...], sigma_j = cov(e_1, e_j) over the identification test's error    (36), (37)
@@ -31,7 +31,9 @@ def sensor_variance(step_k: float, noise_k: float) -> float:
 
 @dataclass(frozen=True)
 class Mkf:
-    """alpha (M, M), beta (M, 1), zeta (M,), R_w and R_v K^2; sigma_1 K^2 (the coil's error variance) for the table."""
+    """alpha (M, M), beta (M, 1), zeta (M,), R_w and R_v K^2.
+
+    sigma_1 K^2 (the coil's error variance) for the table."""
 
     alpha: np.ndarray
     beta: np.ndarray
@@ -44,7 +46,9 @@ class Mkf:
     def run(
         self, power_w: np.ndarray, coil_k: np.ndarray, start_k: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Filtered rises (N, M) and gains (N,) for power (N,) and coil rises (N,), NaN where no reading came."""
+        """Return filtered rises (N, M) and gains (N,) for power (N,) and coil rises (N,).
+
+        NaN in the coil's rises: no reading came."""
         start = np.zeros(len(self.alpha)) if start_k is None else start_k
         return kernels.mkf_run(
             _c(self.alpha),
@@ -59,7 +63,9 @@ class Mkf:
 
 
 def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: float) -> Mkf:
-    """The paper's filter from the identification test u (N, 1) W, y (N, M) K sampled as the model, to run at `period_s`."""
+    """Identify the paper's filter from its test, to run at `period_s`.
+
+    u (N, 1) W and y (N, M) K are sampled as the model."""
     e = y - model.simulate(u, model.x0)
     e = e[np.isfinite(e).all(1)]
     centred = e - e.mean(0)
@@ -79,14 +85,18 @@ def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: f
 
 
 def with_air(model: StateSpace) -> StateSpace:
-    """The model with d(air)/dt (K/s) as second input: over one period every rise falls by the air's rise, C b = -1 K."""
+    """Return the model with d(air)/dt (K/s) as second input.
+
+    Over one period every rise falls by the air's rise, C b = -1 K."""
     b = -np.linalg.pinv(model.c, rcond=1e-3) @ np.ones(len(model.c)) * model.period_s
     return replace(model, b=np.column_stack([model.b[:, 0], b]))
 
 
 @dataclass(frozen=True)
 class Kalman:
-    """Steady filter: `model` with inputs [power W, d(air)/dt K/s], gain (n, s) for `sensors`, covariance p (n, n) K^2."""
+    """Steady Kalman filter: gain (n, s) for `sensors`, error covariance p (n, n) K^2.
+
+    The inputs of `model` are power W and d(air)/dt K/s."""
 
     model: StateSpace
     gain: np.ndarray
@@ -113,7 +123,9 @@ class Kalman:
 
 
 def disturbed(model: StateSpace, tau_s: float = 3600.0) -> StateSpace:
-    """The model with one disturbance state: outside heat per body (the same K/s everywhere), forgotten over `tau_s`."""
+    """Return the model with one disturbance state.
+
+    Outside heat per body (the same K/s everywhere), forgotten over `tau_s`."""
     n, m = model.b.shape
     into = np.linalg.pinv(model.c, rcond=1e-3) @ np.ones(len(model.c)) * model.period_s
     a = np.zeros((n + 1, n + 1))
@@ -128,7 +140,9 @@ def disturbed(model: StateSpace, tau_s: float = 3600.0) -> StateSpace:
 
 
 def process_noise(model: StateSpace, variances: np.ndarray) -> np.ndarray:
-    """Q (n, n) per period from [power error W^2, drift (K/s)^2, outside heat K^2 each body, disturbance state (K/s)^2]."""
+    """Return Q (n, n) per period from the variances of its four sources.
+
+    power error W^2, drift (K/s)^2, outside heat K^2 of each body, disturbance state (K/s)^2."""
     n = model.order
     disturbance = int(not model.c[:, -1].any())
     k = n - disturbance
@@ -160,7 +174,9 @@ def steady(model: StateSpace, variances: np.ndarray, r_v: float, sensors: tuple[
 
 @dataclass(frozen=True)
 class Record:
-    """One calibration recording at the filter's period: power (N,) W, air_rate (N,) K/s, rises (N, M) K (NaN: no reading)."""
+    """One calibration recording at the filter's period.
+
+    power (N,) W, air_rate (N,) K/s, rises (N, M) K (NaN: no reading)."""
 
     power_w: np.ndarray
     air_rate: np.ndarray
@@ -175,10 +191,11 @@ def tune(
     smooth: int = 30,
     weights: np.ndarray | None = None,
 ) -> tuple[Kalman, np.ndarray]:
-    """The filter whose `sensors` estimate all points best over the calibration: (filter, variances).
+    """Return the filter whose `sensors` estimate all points best over the calibration: (filter, variances).
 
-    The error is averaged over `smooth` samples, so that thermometer noise of the judged points does not count. `weights` (M,)
-    judge the points (default: alike). A weak prior on the logarithms keeps a variance that the data do not speak of where it is."""
+    The error is averaged over `smooth` samples, so that thermometer noise of the judged points does not
+    count. `weights` (M,) judge the points (default: alike). A weak prior on the logarithms keeps a variance
+    that the data do not speak of where it is."""
     base = np.array([np.log(1e-2), np.log(1e-10), np.log(1e-6), np.log(1e-13)])
     used = 4 if not model.c[:, -1].any() else 3
     w = np.ones(len(model.c)) if weights is None else weights / np.sqrt(np.mean(weights**2))
@@ -222,8 +239,8 @@ def choose_sensors(
 ) -> list[tuple[tuple[int, ...], float]]:
     """For k = 1..`most` sensors the set with the least standard error of the position: [(sensors, um)].
 
-    gains_um_k (M,): static position gain of each point. Forward choice with exchange until nothing improves; k = 1, 2 are
-    exhaustive. `must` are always in (the embedded coil sensor)."""
+    gains_um_k (M,): static position gain of each point. Forward choice with exchange until nothing improves;
+    k = 1, 2 are exhaustive. `must` are always in (the embedded coil sensor)."""
     m = len(model.c)
     out = []
 

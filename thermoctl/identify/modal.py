@@ -1,7 +1,8 @@
 """Thermal models with real poles, from data of any length: reduce first, then separable least squares.
 
-A passive heat network (RC) has real poles, so its response to heat u is y(n) = sum_k R_k s_k(n) + sum_k W_k p_k^n with
-s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only the poles are searched.
+A passive heat network (RC) has real poles, so its response to heat u is y(n) = sum_k R_k s_k(n) + sum_k W_k
+p_k^n with s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only the poles are
+searched.
 
 1. One pass over the samples forms, for blocks of q samples, the mean of each output and the first r moments of each
    input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block, and both the block's end state and its
@@ -19,10 +20,8 @@ All models are stable by construction.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import product
-from typing import Any
 
 import numpy as np
 from scipy import linalg, signal
@@ -36,8 +35,10 @@ MOMENTS = 3
 
 @dataclass(frozen=True)
 class Blocks:
-    """Reduced data: `u` (J, m, r) input moments, `y` (J, l) output means (NaN: no sample), `weight` (J, l) samples in each
-    mean over the block's length, `q` samples per block, `period_s` of the samples, `basis` (r, q) the polynomials."""
+    """Recordings reduced to J blocks of `q` samples.
+
+    `u` (J, m, r) input moments, `y` (J, l) output means (NaN: no sample), `weight` (J, l) share of samples in
+    each mean, `period_s` of the samples, `basis` (r, q) the polynomials."""
 
     u: np.ndarray
     y: np.ndarray
@@ -48,7 +49,7 @@ class Blocks:
 
 
 def gram_polynomials(q: int, r: int = MOMENTS) -> np.ndarray:
-    """(r, q) orthonormal discrete polynomials of degree 0..r-1 on q equidistant places (fewer rows when q < r)."""
+    """Return orthonormal discrete polynomials (r, q) of degree 0..r-1 on q points; fewer when q < r."""
     r = min(r, q)
     vander = np.polynomial.legendre.legvander(np.linspace(-1, 1, q) if q > 1 else np.zeros(1), r - 1)
     return np.ascontiguousarray(np.linalg.qr(vander)[0].T)
@@ -59,22 +60,22 @@ def reduce(
     period_s: float,
     block_s: float = 10.0,
 ) -> Blocks:
-    """One pass over samples: `chunks` is (u (N, m), y (N, l)) or an iterable of such pieces; memory does not grow with N
-    beyond the blocks. A block without any sample of an output gives NaN there; a last, incomplete block is dropped.
-    Raises InputError when an input is missing or the data are shorter than 20 blocks."""
+    """One pass over samples: `chunks` is (u (N, m), y (N, l)) or an iterable of such pieces.
+
+    Memory does not grow with N beyond the blocks. A block without any sample of an output gives NaN there; a
+    last, incomplete block is dropped. Raises InputError when an input is missing or the data are shorter than
+    20 blocks."""
     q = max(1, round(block_s / period_s))
     basis = gram_polynomials(q)
     if isinstance(chunks, tuple):
         chunks = [chunks]
-    u: Any = None
-    y: Any = None
-    count: Any = None
+    u = y = count = np.zeros(0)
     start = 0
     for cu, cy in chunks:
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T
         for k in range(0, len(cu), 100_000):  # small pieces: bounded memory whatever the caller's chunks are
             z = np.ascontiguousarray(np.hstack([cu[k : k + 100_000], cy[k : k + 100_000]]), dtype=float)
-            if u is None:
+            if not u.size:
                 u, y = np.zeros((64, cu.shape[1], len(basis))), np.zeros((64, cy.shape[1]))
                 count = np.zeros_like(y)
             m = cu.shape[1]
@@ -90,7 +91,7 @@ def reduce(
             kernels.block_moments(z, m, basis, u, y, count, start)
             start += len(z)
     blocks = start // q
-    if u is None or blocks < 20:
+    if blocks < 20:
         raise InputError(
             f"{start} samples of {period_s:g} s are {blocks} blocks of {q * period_s:g} s; at least 20 are needed"
         )
@@ -102,13 +103,17 @@ def reduce(
 def _responses(
     records: list[Blocks], tau: np.ndarray, rest: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stacked `_response` of several recordings: the poles and residues are common, each starts on its own."""
+    """Stacked `_response` of several recordings.
+
+    The poles and residues are common, each starts on its own."""
     parts = [_response(b, tau, rest) for b in records]
     return np.vstack([f for f, _, _ in parts]), np.vstack([d for _, d, _ in parts]), parts[0][2]
 
 
 def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, float] | None) -> np.ndarray:
-    """Stacked rows (J, columns) through the drift's whitening filter, each recording on its own; as they are without `drift_s`."""
+    """Stacked rows (J, columns) through the drift's whitening filter, each recording on its own.
+
+    As they are without `drift_s`."""
     if drift_s is None:
         return rows
     forgotten, corner = (np.exp(-records[0].q * records[0].period_s / t) for t in drift_s)
@@ -166,7 +171,9 @@ class _Fit:
 
 
 def _project(F: np.ndarray, Y: np.ndarray, ridge: float = 1e-7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Q of F, the residue matrix and the residual; `ridge` of each column's norm keeps nearly equal poles harmless."""
+    """Q of F, the residue matrix and the residual.
+
+    `ridge` of each column's norm keeps nearly equal poles harmless."""
     n = F.shape[1]
     norm = np.linalg.norm(F, axis=0)
     norm[norm == 0] = 1
@@ -191,7 +198,7 @@ def _fit(
     Y = _whitened(Y, blocks, drift_s) * weight[:, None]
     lo, hi = np.log(bounds[0]), np.log(bounds[1])
 
-    def evaluate(x: np.ndarray) -> tuple:
+    def evaluate(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         F, D, owner = _responses(blocks, np.exp(x), rest)
         F, D = (_whitened(v, blocks, drift_s) * weight[:, None] for v in (F, D))
         Q, theta, r = _project(F, Y, ridge)
@@ -235,13 +242,13 @@ def identify(
     ridge: float = 1e-7,
     drift_s: tuple[float, float] | None = None,
 ) -> StateSpace:
-    """Model with `order` real poles per input (None: the least BIC of 1..10) from reduced data, at the blocks' sample period.
+    """Identify a model with `order` real poles per input from reduced data, at the blocks' sample period.
 
-    Several recordings (of one block length) are fitted together; they must begin at `rest`. `ridge` (of a column's norm) holds residues
-    that the data hardly tell small: for short records of a network that is not quite linear.
-    `rest`: the recording begins in thermal equilibrium (output rises are zero); otherwise every output's free decay is
-    estimated too. `drift_s`: see 4. above. Rows where an output is missing are left out for all outputs when the others are whole, else filled by
-    two rounds of the model's own output. Raises InputError when an output was never measured."""
+    `order` None: the least BIC of 1..10. Several recordings of one block length are fitted together; they
+    must begin at `rest`, in thermal equilibrium. Without `rest` the free decay of every output is estimated,
+    too. `ridge` (of a column's norm) keeps residues small that the data hardly determine: for short records
+    of a network that is not quite linear. `drift_s`: see 4. above. Missing outputs are filled by two
+    iterations of the model's own output. Raises InputError when an output was never measured."""
     records = [records] if isinstance(records, Blocks) else records
     blocks = replace(
         records[0],
@@ -296,51 +303,3 @@ def identify(
         "block_s": block_s,
     }
     return modal(p, residues, free, blocks.period_s, info)
-
-
-def identify_validated(
-    u: np.ndarray,
-    y: np.ndarray,
-    period_s: float,
-    orders: Sequence[int] = (1, 2, 3, 4),
-    folds: Sequence[float] = (0.4, 0.6, 0.8),
-    ahead: float = 0.2,
-    block_s: float | None = None,
-    others: Sequence[tuple[np.ndarray, np.ndarray]] = (),
-) -> StateSpace:
-    """Model from one record u (N, m), y (N, l); order, kind of start (from equilibrium or not) and ridge by cross-validation.
-
-    From the first 40, 60 and 80 % of the record every candidate is identified and run free over the next 20 %: the one with the least
-    squared error of all is identified again from everything. `info` then has `validation`, {(order, rest, ridge): rms}. Nothing is centred:
-    a passive network at rest at 0 needs no offset, and a record's own mean is no equilibrium. `others`: whole recordings (u, y) of the same
-    rig, identified from together with this one wherever it is; all must then begin at rest. Raises InputError when no candidate can be
-    identified from the first part."""
-    n, block_s = len(u), block_s or period_s
-    known = [reduce(o, period_s, block_s) for o in others]
-    longest = max([n, *(len(o[0]) for o in others)]) * period_s
-
-    def fit(stop: int, order: int, rest: bool, ridge: float) -> StateSpace:
-        records = [*known, reduce((u[:stop], y[:stop]), period_s, block_s)]
-        return identify(records, order, rest, tau_range_s=(2 * block_s, longest), ridge=ridge)
-
-    errors: dict[tuple[int, bool, float], float] = {}
-    for choice in product(orders, (True,) if others else (True, False), (1e-7, 1e-2)):
-        total = 0.0
-        for part in folds:
-            start, stop = int(part * n), int((part + ahead) * n)
-            try:
-                m = fit(start, *choice)
-            except InputError:
-                total = np.inf
-                break
-            x0 = m.x0 if choice[1] else m.initial_state(u[:start], y[:start])
-            total += float(np.nanmean((m.simulate(u[:stop], x0)[start:] - y[start:stop]) ** 2))
-        if np.isfinite(total):
-            errors[choice] = float(np.sqrt(total / len(folds)))
-    if not errors:
-        raise InputError(f"{n} samples are too few to choose an order by cross-validation; give the order")
-    best = min(errors, key=errors.__getitem__)
-    model = fit(n, *best)
-    return replace(
-        model, info={**model.info, "order": best[0], "rest": best[1], "ridge": best[2], "validation": errors}
-    )

@@ -1,9 +1,8 @@
-"""Calibrations on disk: one YAML file per calibration in a machine-owned folder, never the user's own files.
+"""Calibrations on disk: one YAML file each, in a folder that only the program writes.
 
-A file holds the compensator's coefficients with units and sampling, what they were made from (SHA-256 of each recording), the fit's
-figures, the rig's name and date. `current` in the folder names the one in use; older ones stay for a roll back.
-A file is refused when its own checksum, its shape, its rig or its date do not fit.
-"""
+A file holds the compensator's coefficients with units and sampling, the SHA-256 of each recording that they
+were made from, the fit's figures, the rig's name and the date. `current` in the folder names the one in use;
+older ones stay for a roll back. A file is refused when its checksum, its shape or its rig do not fit."""
 
 from __future__ import annotations
 
@@ -44,7 +43,9 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}")
 
 @dataclass(frozen=True)
 class Calibration:
-    """A model with what it came from: rig name, `created` (UTC), fingerprints {file name: sha256}, figures {name: number}."""
+    """A model with what it came from.
+
+    Rig name, `created` (UTC), fingerprints {file name: sha256}, figures {name: number}."""
 
     model: CompensatorModel
     rig: str
@@ -67,10 +68,11 @@ def save_model(
     model: CompensatorModel,
     rig: str,
     recordings: Sequence[str | Path] = (),
-    figures: dict | None = None,
+    figures: dict[str, Any] | None = None,
 ) -> Path:
-    """Write a calibration; the file appears whole or not at all. Raises InputError when it exists (a calibration is never
-    overwritten) or the place cannot be written."""
+    """Write a calibration; the file appears whole or not at all.
+
+    Raises InputError when it exists (a calibration is never overwritten) or the place cannot be written."""
     path = Path(path)
     if path.exists():
         raise InputError(f"{path}: exists; calibrations are never overwritten, choose another name")
@@ -98,8 +100,10 @@ def save_model(
 
 
 def load_calibration(path: str | Path, rig: str | None = None) -> Calibration:
-    """Read a calibration (a file, or a folder: its current one). Raises InputError for another format, a wrong checksum, missing
-    or extra entries, numbers that do not fit together, and for a rig of another name."""
+    """Read a calibration (a file, or a folder: its current one).
+
+    Raises InputError for another format, a wrong checksum, missing or extra entries, numbers that do not fit
+    together, and for a rig of another name."""
     path = Path(path)
     if path.is_dir():
         path = current(path)
@@ -129,7 +133,9 @@ def load_calibration(path: str | Path, rig: str | None = None) -> Calibration:
 
 
 def load_model(path: str | Path, rig: str | None = None) -> CompensatorModel:
-    """The compensator's model of a calibration; what the daemon calls. Raises as `load_calibration`."""
+    """Return the compensator's model of a calibration; what the daemon calls.
+
+    Raises as `load_calibration`."""
     return load_calibration(path, rig).model
 
 
@@ -138,7 +144,7 @@ def install(
     model: CompensatorModel,
     rig: str,
     recordings: Sequence[str | Path] = (),
-    figures: dict | None = None,
+    figures: dict[str, Any] | None = None,
 ) -> Path:
     """Save a calibration as the folder's newest and make it current; the one before stays for a roll back."""
     folder = Path(folder)
@@ -151,7 +157,7 @@ def install(
 
 
 def current(folder: str | Path) -> Path:
-    """The calibration in use in a folder. Raises InputError when there is none."""
+    """Return the calibration in use in a folder. Raises InputError when there is none."""
     marker = Path(folder) / "current"
     try:
         name = marker.read_text(encoding="utf-8").strip()
@@ -170,7 +176,9 @@ def history(folder: str | Path) -> list[Path]:
 
 
 def roll_back(folder: str | Path, name: str | None = None) -> Path:
-    """Make an older calibration current: `name`, or the one before the present. It is read and checked first."""
+    """Make an older calibration current: `name`, or the one before the present.
+
+    It is read and checked first."""
     files = history(folder)
     now = current(folder)
     if name is None:
@@ -212,7 +220,7 @@ def _plain(v: Any) -> Any:
     return v
 
 
-def _checksum(content: dict) -> str:
+def _checksum(content: dict[str, Any]) -> str:
     return hashlib.sha256(repr(_canonical(content)).encode()).hexdigest()
 
 

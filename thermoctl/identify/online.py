@@ -1,10 +1,11 @@
 """Tuning the expansion model while a reference encoder is present.
 
-Nothing is learnt before the rig has moved through what it shall be good for: samples are counted in buckets of coil temperature and of its
-trend (warming, cooling); progress is the part of the buckets that are full. The newest samples (`hold_s`) are kept back from the bank of
-output-error estimators, which is fed the older ones; its proposal is taken only where it explains what was kept back better. Static gains
-stay within bounds round the calibrated ones, also after many tunings: a tuned model carries the gains of the calibration it came from. Every
-change is a calibration of its own (`modelfile.install`), so it can be rolled back.
+Nothing is learnt before the rig has moved through what it shall be good for: samples are counted in buckets
+of coil temperature and of its trend (warming, cooling); progress is the part of the buckets that are full.
+The newest samples (`hold_s`) are kept back from the bank of output-error estimators, which is fed the older
+ones; its proposal is taken only where it explains what was kept back better. Static gains stay within bounds
+round the calibrated ones, also after many tunings: a tuned model carries the gains of the calibration it came
+from. Every change is a calibration of its own (`modelfile.install`), so it can be rolled back.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from thermoctl.identify.expansion import Bank, Expansion
 class Tuner:
     """Feed `update` with estimated rises and the reference; ask `progress` and `proposal`.
 
-    buckets: coil temperature rises K between which samples are sought; `full` samples fill one; `clip` bounds the change of each gain as a
-    part of the largest calibrated gain; the newest `hold_s` seconds are the test."""
+    buckets: coil temperature rises K between which samples are sought; `full` samples fill one; `clip` bounds
+    the change of each gain as a part of the largest calibrated gain; the newest `hold_s` seconds are the
+    test."""
 
     def __init__(
         self,
@@ -43,8 +45,10 @@ class Tuner:
         self.slow = 0.0
 
     def update(self, rises_k: np.ndarray, error_um: float, air_k: float = 0.0) -> None:
-        """One sample at the expansion model's period: estimated rises (12,), the measured position error (NaN: no reference), and how much
-        warmer than at the start the air is (the bodies' own temperatures are what expands them)."""
+        """One sample at the expansion model's period.
+
+        Estimated rises (12,), the measured position error (NaN: no reference), and how much warmer than at
+        the start the air is (the bodies' own temperatures are what expands them)."""
         coil = float(rises_k[0])
         if self.last_coil is not None:
             self.slow += 0.02 * ((coil - self.last_coil) - self.slow)
@@ -95,7 +99,9 @@ class Tuner:
         ), f"{after:.3g} um against {before:.3g} um"
 
     def _error(self, e: Expansion) -> float:
-        """Standard error over what was kept back, um; where it began (state and offset) is fitted."""
+        """Return the standard error over what was kept back, um.
+
+        Where it began (state and offset) is fitted."""
         drive = np.array([r for r, _ in self.recent])
         y = np.array([v for _, v in self.recent])
         n = np.arange(len(y))
@@ -108,6 +114,6 @@ class Tuner:
 
 
 def calibrated_gains(model: CompensatorModel) -> np.ndarray:
-    """Static gains (12,) um/K of the calibration a model came from, tuned since or not."""
+    """Return the static gains (12,) um/K of the calibration a model came from, tuned since or not."""
     known = model.meta.get("calibrated_gains_um_k")
     return np.array(known, dtype=float) if known is not None else (model.b1 + model.b2) / (1 - model.f1)

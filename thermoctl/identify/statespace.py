@@ -2,12 +2,14 @@
 
 x(n+1) = A x(n) + B u(n),   y(n) = C x(n)                                    (31), (32) with D = 0
 output form: y(n+1) = alpha y(n) + beta u(n), alpha = C A C+, beta = C B      (33)
-resampling: [[A, B], [0, I]] at one period is the exponential of [[F, G], [0, 0]] T: its logarithm gives any other period
+resampling: [[A, B], [0, I]] at one period is the exponential of [[F, G], [0, 0]] T: its logarithm gives any
+other period
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -27,7 +29,7 @@ class StateSpace:
     c: np.ndarray
     period_s: float
     x0: np.ndarray
-    info: dict = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
 
     @property
     def order(self) -> int:
@@ -54,7 +56,7 @@ class StateSpace:
     def simulate(self, u: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
         """Free run: outputs (N, l) for inputs u (N, m), from x0 (default: rest)."""
         x0 = np.zeros(self.order) if x0 is None else x0
-        return kernels.simulate(*(_c(v) for v in (self.a, self.b, self.c)), _c(x0), _c(np.atleast_2d(u.T).T))
+        return kernels.simulate(_c(self.a), _c(self.b), _c(self.c), _c(x0), _c(np.atleast_2d(u.T).T))
 
     def initial_state(self, u: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Least-squares x0 (n,) so that a free run over u (N, m) meets y (N, l); NaN in y is left out."""
@@ -73,14 +75,18 @@ class StateSpace:
         return _ridge(columns[here], (y - free)[here][:, None], 1e-5)[:, 0]
 
     def output_form(self, tolerance: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
-        """alpha (l, l), beta (l, m) of (33). C is inverted with its singular values below `tolerance` of the largest left
-        out: order 12 always holds noise modes, cond(C) reached 3e5, and the plain inverse then amplifies them."""
+        """Return alpha (l, l), beta (l, m) of (33).
+
+        C is inverted with its singular values below `tolerance` of the largest left out: order 12 always
+        holds noise modes, cond(C) reached 3e5, and the plain inverse then amplifies them."""
         return self.c @ self.a @ np.linalg.pinv(self.c, rcond=tolerance), self.c @ self.b
 
     def resample(self, period_s: float) -> StateSpace:
-        """The same continuous system, inputs held, at another period. Exact (2e-15 in A - I from 10 s to 1 ms); a linear
-        scaling of A - I would be 25 % off. Identification itself runs at 1 to 10 s: at 1 ms a pole of 4000 s lies
-        2.5e-7 from 1, below what noise leaves of it. Raises InputError where no real logarithm exists."""
+        """Return the same continuous system, inputs held, at another period.
+
+        Exact (2e-15 in A - I from 10 s to 1 ms); a linear scaling of A - I would be 25 % off. Identification
+        itself runs at 1 to 10 s: at 1 ms a pole of 4000 s lies 2.5e-7 from 1, below what noise leaves of it.
+        Raises InputError where no real logarithm exists."""
         if period_s == self.period_s:
             return self
         bad = [p for p in self.poles if abs(p.imag) < 1e-12 and p.real <= 1e-12]
@@ -102,7 +108,9 @@ class StateSpace:
         return replace(self, a=new[:n, :n], b=new[:n, n:], period_s=period_s)
 
     def minus_identity(self, period_s: float) -> np.ndarray:
-        """A - I at a (short) period, formed without the subtraction from 1 that loses digits: the series of exp(F T) - I."""
+        """Return A - I at a (short) period, formed without the subtraction from 1 that loses digits.
+
+        The series of exp(F T) - I."""
         if self.poles.real.min() <= 0:
             self.resample(period_s)  # raises with the pole's name
         f = np.real(linalg.logm(self.a)) * (period_s / self.period_s)
@@ -114,10 +122,12 @@ class StateSpace:
 
 
 def modal(
-    poles: np.ndarray, residues: np.ndarray, free: np.ndarray, period_s: float, info: dict
+    poles: np.ndarray, residues: np.ndarray, free: np.ndarray, period_s: float, info: dict[str, Any]
 ) -> StateSpace:
-    """Smallest state space with real `poles` (K,), residues (K, l, m) (y = sum R_k s_k, s(n+1) = p s + u) and free decay
-    amplitudes (K, l) of the initial state. A pole whose residue has rank r gets r states."""
+    """Return the smallest state space with these real poles (K,), residues and free decay.
+
+    residues (K, l, m): y = sum R_k s_k, s(n+1) = p s + u; `free` (K, l): amplitudes of the initial state's
+    decay. A pole whose residue has rank r gets r states."""
     a, b, c, x0 = [], [], [], []
     scale = max(np.abs(residues).max(), 1e-300)
     for p, r, w in zip(poles, residues, free, strict=True):
@@ -131,12 +141,6 @@ def modal(
             b.append(right[k, : r.shape[1]])
             x0.append(right[k, -1] if np.any(w) else 0.0)
     return StateSpace(np.diag(a), np.array(b), np.array(c).T, period_s, np.array(x0), info)
-
-
-def fit_percent(y: np.ndarray, model: np.ndarray) -> np.ndarray:
-    """NRMSE fit of each column: 100 (1 - |y - model| / |y - mean|); NaN samples left out."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return 100 * (1 - np.sqrt(np.nansum((y - model) ** 2, 0) / np.nansum((y - np.nanmean(y, 0)) ** 2, 0)))
 
 
 def _c(v: np.ndarray) -> np.ndarray:

@@ -13,23 +13,23 @@ the paper's B (`paper`)   Z_i = Yf / [Wp; Uf], Z_{i+1} = Yf- / [Wp+; Uf-]       
 our B and x(0)            simulation least squares: y(n) = C A^n x0 + sum C A^(n-1-k) B u(k) is linear in B and x0; in modal
                           form its normal matrix is (C'C) o (S'S), S the modal states: no simulation per unknown.
 
-The Hankel matrix H is never formed. Only its Gram matrix H H' is needed, whose entries are lag correlations; every block
-follows from its upper left neighbour: G[s+1, t+1] = G[s, t] + z(s+N) z(t+N)' - z(s) z(t)'. They accumulate in one pass over
-the data, in bounded memory. H = L Q then has L from the Cholesky factor; where that breaks (noise-free data), from a
-blocked QR that carries only the triangle.
+The Hankel matrix H is never formed. Only its Gram matrix H H' is needed, whose entries are lag correlations;
+every block follows from its upper left neighbour: G[s+1, t+1] = G[s, t] + z(s+N) z(t+N)' - z(s) z(t)'. They
+accumulate in one pass over the data, in bounded memory. H = L Q then has L from the Cholesky factor; where
+that breaks (noise-free data), from a blocked QR that carries only the triangle.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import linalg
 
-from thermoctl.identify import kernels
+from thermoctl.identify import kernels, modal
 from thermoctl.identify.statespace import StateSpace, _c, _ridge
+from thermoctl.identify.statespace import modal as modal_form
 from thermoctl.yamlfile import InputError
 
 WEIGHTINGS = ("paper", "n4sid", "moesp", "cva")
@@ -38,7 +38,9 @@ _ROWS = 10  # samples per row of the blocked correlation: a wide product runs at
 
 @dataclass(frozen=True)
 class Correlations:
-    """The Gram matrix of the block Hankel matrix, rows [z(n); ...; z(n+2i-1)], z = [u; y] of m + l entries."""
+    """Gram matrix of the block Hankel matrix.
+
+    Its rows are [z(n); ...; z(n+2i-1)], z = [u; y] of m + l entries."""
 
     gram: np.ndarray
     i: int
@@ -55,15 +57,16 @@ def correlate(
     i: int = 20,
     qr: bool = False,
 ) -> Correlations:
-    """One pass over (u (N, m), y (N, l)) or pieces of it. `qr` carries the triangle of a blocked QR instead (40 times the
-    work, for data without noise). Raises InputError for a missing sample or fewer than 4i samples."""
+    """One pass over (u (N, m), y (N, l)) or pieces of it.
+
+    `qr` carries the triangle of a blocked QR instead (40 times the work, for data without noise). Raises
+    InputError for a missing sample or fewer than 4i samples."""
     if isinstance(chunks, tuple):
         chunks = [chunks]
     lags = 2 * i
-    sums: Any = None
-    triangle: Any = None
-    head: Any = None
-    tail = np.empty((0, 0))
+    sums: np.ndarray | None = None
+    triangle: np.ndarray | None = None
+    head = tail = np.empty((0, 0))
     total = m = w = 0
     for cu, cy in chunks:
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T
@@ -95,7 +98,7 @@ def correlate(
     if sums is None or total < 2 * lags:
         raise InputError(f"{total} samples; subspace identification with i = {i} needs at least {2 * lags}")
     columns = total - lags + 1
-    if qr:
+    if triangle is not None:
         return Correlations(triangle.T @ triangle, i, m, w - m, columns, period_s, triangle)
     return Correlations(_gram(sums, head, tail, columns), i, m, w - m, columns, period_s)
 
@@ -110,7 +113,7 @@ def _add_lags(sums: np.ndarray, z: np.ndarray, starts: int) -> None:
         products = np.empty((_ROWS * w, wide * w))
         for s in range(0, wide, _ROWS):
             n = min(_ROWS, wide - s)
-            if s + blocks * _ROWS + (n < _ROWS) * 0 <= len(z) and n == _ROWS:
+            if s + blocks * _ROWS <= len(z) and n == _ROWS:
                 other = z[s : s + blocks * _ROWS].reshape(blocks, _ROWS * w)
             else:
                 other = np.lib.stride_tricks.sliding_window_view(z[s:].ravel(), n * w)[:: _ROWS * w][:blocks]
@@ -126,7 +129,9 @@ def _add_lags(sums: np.ndarray, z: np.ndarray, starts: int) -> None:
 
 
 def _gram(sums: np.ndarray, head: np.ndarray, tail: np.ndarray, columns: int) -> np.ndarray:
-    """The whole Gram matrix from its first block row. `tail` are the lags - 1 samples after the last start."""
+    """Return the whole Gram matrix from its first block row.
+
+    `tail` are the lags - 1 samples after the last start."""
     lags, w, _ = sums.shape
     g = np.empty((lags, w, lags, w))
     g[0] = sums.transpose(1, 0, 2)
@@ -172,7 +177,7 @@ def _factor(c: Correlations) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Subspace:
-    """What the projection gave: singular values (descending), left vectors already unweighted, and the factor."""
+    """Result of the projection: singular values (descending), unweighted left vectors, factor."""
 
     singular_values: np.ndarray
     left: np.ndarray
@@ -188,7 +193,6 @@ def project(c: Correlations, weighting: str = "cva") -> Subspace:
     L = _factor(c)
     nu, np_ = c.i * c.m, c.i * (2 * c.m + c.l)
     past = L[nu:np_, :np_]
-    future = L[np_:, :np_]
     lff = L[np_:, nu:np_]  # Yf on Wp, after Uf
     if weighting in ("paper", "n4sid"):
         lww = past[:, nu:]
@@ -206,7 +210,6 @@ def project(c: Correlations, weighting: str = "cva") -> Subspace:
                 lff @ lff.T + L[np_:, np_:] @ L[np_:, np_:].T, lower=True, check_finite=False
             )
             oblique = linalg.solve_triangular(scale, lff, lower=True, check_finite=False)
-    del future
     if c.qr is None:
         values, vectors = linalg.eigh(oblique @ oblique.T, check_finite=False, driver="evd")
         s, left = np.sqrt(np.maximum(values[::-1], 0)), vectors[:, ::-1]
@@ -235,8 +238,9 @@ def identify(
 ) -> StateSpace:
     """Model of `order` (None: by the singular values) from u (N, m), y (N, l).
 
-    weighting `paper`: A, C from W1 = W2 = I and B from (26), as printed; it may be unstable. Else A is made stable and B, x(0)
-    come from simulation least squares (`rest`: x(0) = 0 is not assumed, it is estimated, unless True)."""
+    weighting `paper`: A, C from W1 = W2 = I and B from (26), as printed; it may be unstable. Else A is made
+    stable and B, x(0) come from simulation least squares (`rest`: x(0) = 0 is not assumed, it is estimated,
+    unless True)."""
     u, y = np.atleast_2d(u.T).T, np.atleast_2d(y.T).T
     c = correlate((u, y), period_s, i)
     sub = project(c, weighting)
@@ -256,7 +260,9 @@ def identify(
 
 
 def shift(sub: Subspace, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """A (n, n) and C (l, n) from the extended observability matrix (13), (20). Raises InputError when n is too large."""
+    """Return a (n, n) and C (l, n) from the extended observability matrix (13), (20).
+
+    Raises InputError when n is too large."""
     l, i = sub.correlations.l, sub.correlations.i  # noqa: E741
     if n >= (i - 1) * l or n > len(sub.singular_values):
         raise InputError(f"order {n} with i = {i} and {l} outputs; at most {(i - 1) * l - 1} is possible")
@@ -265,7 +271,9 @@ def shift(sub: Subspace, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stabilise(a: np.ndarray, margin: float = 1e-6) -> np.ndarray:
-    """A with eigenvalues outside the unit circle reflected into it (1/conj) and none nearer to it than `margin`."""
+    """Return A with its unstable eigenvalues reflected into the unit circle (1/conj).
+
+    None is left nearer to the circle than `margin`."""
     values, vectors = np.linalg.eig(a)
     size = np.abs(values)
     if size.max() < 1 - margin:
@@ -291,7 +299,7 @@ def input_matrix(
         impulse = np.zeros(N)
         impulse[0] = 1
         s[m * n :] = kernels.modal_states(values, impulse)
-        s[m * n :, 1:], s[m * n :, 0] = s[m * n :, 1:] * 1.0, 1.0
+        s[m * n :, 0] = 1.0
         s[m * n :, 1:] *= values[:, None]
     cols = np.tile(np.arange(n), m + (not rest))
     small = np.empty((2 * len(s), N))
@@ -326,8 +334,9 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
     z_next = (target @ q) @ q.T
     state = np.hstack([pin_i @ z_i, np.zeros((n, L.shape[1] - np_))])
     left = np.vstack([pin_less @ z_next, yf[:l]]) - np.vstack([a, c]) @ state
-    # (24) regressed on Uf, and (25), (26) linear in B (D = 0), solved together: min |left - N(B) Uf|. First K, then B from
-    # K without weights, is the same in exact arithmetic without noise and far worse with it (Uf of long pulses is nearly singular)
+    # (24) regressed on Uf, and (25), (26) linear in B (D = 0), solved together: min |left - N(B) Uf|. Solving for K
+    # first and for B from K without weights is the same without noise, and far worse with it: Uf of long pulses
+    # is nearly singular.
     nu_factor = uf[:, :nu]
     target = left[:, :nu]  # left, projected on Uf
     lag, lcg = a @ pin_i, c @ pin_i  # (n, i l), (l, i l)
@@ -343,10 +352,10 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
 
 
 def real_poles(model: StateSpace, u: np.ndarray, y: np.ndarray, rest: bool = True) -> StateSpace:
-    """The model with every pole moved to the nearest admissible place of a heat network (real, between 0 and 1) and its
-    residues fitted again by least squares: the start of the refinement in `modal`."""
-    from thermoctl.identify import modal
+    """Return the model with every pole moved to the nearest real value between 0 and 1.
 
+    A heat network admits no others. The residues are fitted again by least squares. The result starts the
+    refinement in `modal`."""
     tau = np.sort(model.time_constants_s[np.abs(model.poles) > 1e-3])
     tau = np.clip(tau, model.period_s, 2.5 * len(u) * model.period_s)
     blocks = modal.reduce((u, y), model.period_s, model.period_s)
@@ -355,7 +364,7 @@ def real_poles(model: StateSpace, u: np.ndarray, y: np.ndarray, rest: bool = Tru
     p = np.exp(-model.period_s / fit.tau)
     theta = fit.theta.reshape(len(tau), m + (not rest), -1)
     free = np.zeros((len(tau), theta.shape[2])) if rest else theta[:, m]
-    return modal.modal(
+    return modal_form(
         p,
         np.moveaxis(theta[:, :m], 1, 2) * (1 - p)[:, None, None],
         free,
@@ -374,7 +383,9 @@ def innovations(model: StateSpace, u: np.ndarray, y: np.ndarray, gain: np.ndarra
 
 
 def prediction_gain(model: StateSpace, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Start for K (n, l) of (6): process noise from the slow part of the residual, sensor noise from its differences."""
+    """Estimate a start for K (n, l) of (6).
+
+    Process noise comes from the slow part of the residual, sensor noise from its differences."""
     e = y - model.simulate(u, model.x0)
     white = np.diff(e, 2, axis=0)
     r = white.T @ white / len(white) / 6
@@ -392,8 +403,9 @@ def refine_prediction_error(
 ) -> tuple[StateSpace, np.ndarray]:
     """Prediction-error refinement of C, B, K and the (real) poles by Gauss-Newton: (model, K (n, l)).
 
-    The model must be diagonal (from `modal` or `real_poles`). Minimises the whitened innovations' sum of squares; a step
-    that would leave the stable region or raise the cost is halved. Returns the start unchanged where nothing improves."""
+    The model must be diagonal (from `modal` or `real_poles`). Minimises the whitened innovations' sum of
+    squares; a step that would leave the stable region or raise the cost is halved. Returns the start
+    unchanged where nothing improves."""
     if np.abs(model.a - np.diag(np.diag(model.a))).max() > 1e-12:
         raise InputError("prediction-error refinement starts from a model with real poles (diagonal A)")
     n, m = model.b.shape
@@ -417,7 +429,7 @@ def refine_prediction_error(
         closed = model.a - gain @ model.c
         x = kernels.simulate(_c(closed), _c(np.hstack([model.b, gain])), np.eye(n), _c(model.x0), uy)
         e = y - x @ model.c.T
-        # e depends on theta by -(dC x + C dx), dx(n+1) = (A - K C) dx + dA x + dB u + dK e - K dC x: one driven run per unknown
+        # de = -(dC x + C dx), dx(n+1) = (A - K C) dx + dA x + dB u + dK e - K dC x: one run for each unknown
         columns = []
         for k in range(n):
             columns.append(("a", k, k, x[:, k]))

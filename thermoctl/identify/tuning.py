@@ -13,6 +13,8 @@ Margins: of the sampled loop L(e^jw) = D(z) G(z), G with a zero-order hold and t
 
 from __future__ import annotations
 
+import os
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -28,7 +30,9 @@ UNCERTAIN_DEG = (
 
 @dataclass(frozen=True)
 class SecondOrder:
-    """K0 e^(-s theta) / ((t1 s + 1)(t2 s + 1)), or oscillating: `t1`, `t2` are then complex conjugate. Gain in um per unit of drive."""
+    """K0 e^(-s theta) / ((t1 s + 1)(t2 s + 1)), or oscillating: `t1`, `t2` are then complex conjugate.
+
+    Gain in um per unit of drive."""
 
     gain: float
     t1: complex
@@ -64,7 +68,7 @@ class Gains:
     ti_s: float
     td_s: float
     how: str
-    figures: dict = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
 
 
 def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s: float) -> SecondOrder:
@@ -121,7 +125,9 @@ def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s:
 
 
 def tangent(model: SecondOrder) -> tuple[float, float, float]:
-    """(K0, tau_d, tau_c): the steepest tangent of the step response cuts 0 at tau_d and K0 at tau_d + tau_c."""
+    """Return (K0, tau_d, tau_c) of the step response's steepest tangent.
+
+    It cuts 0 at tau_d and K0 at tau_d + tau_c."""
     span = model.theta_s + 12 * max(abs(model.t1), abs(model.t2))
     t = np.linspace(0, span, 200_001)
     y = model.step(t) / model.gain
@@ -160,7 +166,7 @@ def imc(model: SecondOrder, lambda_s: float | None = None) -> Gains:
 
 @dataclass(frozen=True)
 class Margins:
-    """Of the sampled loop: gain margin (factor), phase margin deg, delay margin s, and whether the closed loop is stable."""
+    """Margins of the sampled loop: gain (factor), phase deg, delay s; `stable`: of the closed loop."""
 
     gain: float
     phase_deg: float
@@ -170,7 +176,9 @@ class Margins:
 
 
 def margins(model: SecondOrder, gains: Gains, period_s: float, moving_average: int = 1) -> Margins:
-    """Margins of PID (41) at `period_s` on the model with a zero-order hold; the moving average of `moving_average` samples counted."""
+    """Margins of PID (41) at `period_s` on the model with a zero-order hold.
+
+    The moving average of `moving_average` samples counted."""
     w = np.geomspace(1e-2, np.pi / period_s, 40_000)
     z = np.exp(1j * w * period_s)
     k, ti, td, ts = gains.kp, gains.ti_s, gains.td_s, period_s
@@ -208,7 +216,9 @@ def _held(model: SecondOrder, w: np.ndarray, period_s: float) -> np.ndarray:
 def robust(
     model: SecondOrder, period_s: float, moving_average: int = 1, phase_deg: float = 45.0, gain: float = 2.0
 ) -> Gains:
-    """The fastest lambda tuning with at least these margins. Raises InputError when none up to 1000 dead times has them."""
+    """Return the fastest lambda tuning with at least these margins.
+
+    Raises InputError when none up to 1000 dead times has them."""
     for factor in np.geomspace(0.3, 1000, 60):
         g = imc(model, factor * max(model.theta_s, period_s))
         m = margins(model, g, period_s, moving_average)
@@ -224,7 +234,7 @@ def robust(
 
 
 def difference(present: Gains, proposed: Gains) -> str:
-    """The change as lines of text, for people; nothing is written."""
+    """Return the change as lines of text, for people; nothing is written."""
     rows = [
         ("kp", present.kp, proposed.kp),
         ("ti_s", present.ti_s, proposed.ti_s),
@@ -246,9 +256,6 @@ def write_values(config: Path, section: str, values: dict[str, str]) -> None:
     """Write values into a section of a configuration, other lines and all comments untouched.
 
     Raises InputError when the section does not name each on a line of its own."""
-    import os
-    import re
-
     text = config.read_text(encoding="utf-8")
     found = re.search(rf"^{section}:.*\n((?:[ \t]+.*\n|\s*\n|#.*\n)*)", text, re.MULTILINE)
     by_hand = ", ".join(f"{n}: {v}" for n, v in values.items())
@@ -257,7 +264,7 @@ def write_values(config: Path, section: str, values: dict[str, str]) -> None:
     body = found.group(1)
     for name, value in values.items():
         line = re.compile(rf"^([ \t]+{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$", re.MULTILINE)
-        body, n = line.subn(lambda m, value=value: f"{m[1]}{value}{m[2]}", body)  # type: ignore[misc]
+        body, n = line.subn(lambda m, value=value: f"{m[1]}{value}{m[2]}", body)
         if n != 1:
             raise InputError(
                 f"{config}: {section}.{name} does not stand on a line of its own; write by hand: {by_hand}"

@@ -1,4 +1,4 @@
-"""The commands simulate, refit, plant show, plant linearise and plant check."""
+"""The commands simulate, refit, plant show and plant check."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from rich.console import Console
 from rich.table import Table as Grid
 
 from thermoctl.plant import Plant, load, save
+from thermoctl.plant import show as drawing
 from thermoctl.plant.noise import coloured
 from thermoctl.plant.refit import Estimate, fit, report, updated
-from thermoctl.plant.simulate import Drive, Model, SimulationError
-from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
+from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 RENEWAL = 0.1  # how far, as a share of its range, a state may have strayed from the plant within a block
@@ -22,22 +24,24 @@ RECENT = 0.25  # share of a block from which its data count in full; older ones 
 
 
 def simulate(args: argparse.Namespace) -> int:
-    """Free run, or predictions `--horizon` seconds ahead, on one recording or several; figures, file and plot."""
+    """Free run, or predictions `--horizon` seconds ahead, on one recording or several.
+
+    figures, file and plot."""
     plant = load(args.plant)
-    runs: list[tuple[Table, Drive, np.ndarray, np.ndarray]] = []
-    model = (_all_uncertain(plant) if args.horizon else plant).compile(() if args.horizon else None)
+    runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
+    model = compile_plant(_all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
     for path in args.recordings:
         table = read_table(path)
-        drive = model.drive(table)
+        excitation = model.excitation(table)
         try:
             if args.horizon:
-                x, y = ahead(model, drive, args.horizon)
+                x, y = ahead(model, excitation, args.horizon)
             else:
-                run = model.run(drive)
+                run = model.run(excitation)
                 x, y = run.x, run.y
         except SimulationError as e:
             raise InputError(f"{path}: {e}") from None
-        runs.append((table, drive, x, y))
+        runs.append((table, excitation, x, y))
         grid = Grid(
             title=f"{path}: " + (f"up to {args.horizon:g} s ahead" if args.horizon else "free run"),
             title_justify="left",
@@ -45,9 +49,9 @@ def simulate(args: argparse.Namespace) -> int:
         for head in ("output", "samples", "rms error", "largest", "share of the range"):
             grid.add_column(head, justify="left" if head == "output" else "right")
         for j, o in enumerate(plant.outputs.values()):
-            error = (drive.y[:, j] - y[:, j])[np.isfinite(drive.y[:, j])]
+            error = (excitation.y[:, j] - y[:, j])[np.isfinite(excitation.y[:, j])]
             if len(error):
-                spread = np.ptp(drive.y[np.isfinite(drive.y[:, j]), j])
+                spread = np.ptp(excitation.y[np.isfinite(excitation.y[:, j]), j])
                 rms = float(np.sqrt(np.mean(error**2)))
                 grid.add_row(
                     o.name,
@@ -60,9 +64,9 @@ def simulate(args: argparse.Namespace) -> int:
                 grid.add_row(o.name, "0", "not measured", "", "")
         Console().print(grid)
     for file, write in ((args.out, _write), (args.plot, _plot)):
-        for table, drive, x, y in runs if file else ():
+        for table, excitation, x, y in runs if file else ():
             name = Path(file) if len(runs) == 1 else Path(file).with_stem(f"{Path(file).stem}_{table.name}")
-            write(name, model, table, drive, x, y)
+            write(name, model, table, excitation, x, y)
             print(name)
     return 0
 
@@ -74,39 +78,41 @@ def _all_uncertain(plant: Plant) -> Plant:
     return dataclasses.replace(plant, nodes=nodes)
 
 
-def ahead(model: Model, drive: Drive, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`: each block starts from the states that
-    the data before it tell (an extended Kalman filter that takes a block at a time), so that a sample is
-    predicted from data up to `horizon_s` older. The model must have every state uncertain and no active parameter."""
+def ahead(model: Model, excitation: Excitation, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`.
+
+    Each block starts from the states that the data before it tell (an extended Kalman filter that takes a
+    block at a time), so that a sample is predicted from data up to `horizon_s` older. The model must have
+    every state uncertain and no active parameter."""
     if not model.states:
-        run = model.run(drive)
+        run = model.run(excitation)
         return run.x, run.y
-    if drive.scale is None:
-        model.prepare(drive)
-    p = model.vector(None, drive.name)
+    if excitation.scale is None:
+        model.prepare(excitation)
+    p = model.vector(None, excitation.name)
     noise = np.array(
         [
             np.hypot(o.noise or 0.0, (o.resolution or 0.0) / 12**0.5)
-            or 1e-3 * np.nanstd(drive.y[:, j])
+            or 1e-3 * np.nanstd(excitation.y[:, j])
             or 1e-9
             for j, o in enumerate(model.plant.outputs.values())
         ]
     )
-    scale = np.asarray(drive.scale)
+    scale = np.asarray(excitation.scale)
     x, y = (
-        np.full((len(drive.t), len(model.states)), np.nan),
-        np.full((len(drive.t), len(model.outputs)), np.nan),
+        np.full((len(excitation.t), len(model.states)), np.nan),
+        np.full((len(excitation.t), len(model.outputs)), np.nan),
     )
-    state, _ = model.start(drive, p)
+    state, _ = model.start(excitation, p)
     root = np.array([n.initial_sigma or 1.0 for n in model.plant.nodes.values()])
     information = np.diag(1 / np.minimum(root, np.maximum(scale, 1e-12)) ** 2)
     begin = 0
-    while begin < len(drive.t) - 1:
+    while begin < len(excitation.t) - 1:
         stop = min(
-            max(int(np.searchsorted(drive.t, drive.t[begin] + horizon_s, side="right")), begin + 2),
-            len(drive.t),
+            max(int(np.searchsorted(excitation.t, excitation.t[begin] + horizon_s, side="right")), begin + 2),
+            len(excitation.t),
         )
-        block = drive.part(begin, stop)
+        block = excitation.part(begin, stop)
         base, _ = model.start(block, p)
         run = model.run(block, p, state - base, sensitivities=True)
         assert run.dx is not None and run.dy is not None
@@ -130,10 +136,12 @@ def ahead(model: Model, drive: Drive, horizon_s: float) -> tuple[np.ndarray, np.
     return x, y
 
 
-def _write(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y: np.ndarray) -> None:
+def _write(
+    name: Path, model: Model, table: Table, excitation: Excitation, x: np.ndarray, y: np.ndarray
+) -> None:
     columns = {f"{o.column}_simulated": y[:, j] for j, o in enumerate(model.plant.outputs.values())}
     columns |= {
-        o.column: drive.y[:, j]
+        o.column: excitation.y[:, j]
         for j, o in enumerate(model.plant.outputs.values())
         if o.column in table.columns
     }
@@ -141,7 +149,9 @@ def _write(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, 
     write_table(name, Table(name.stem, str(name), table.t, columns))
 
 
-def _plot(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y: np.ndarray) -> None:
+def _plot(
+    name: Path, model: Model, table: Table, excitation: Excitation, x: np.ndarray, y: np.ndarray
+) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -150,9 +160,9 @@ def _plot(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y
     FigureCanvasAgg(figure)
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
     for j, (axes, o) in enumerate(zip(panels, model.plant.outputs.values(), strict=True)):
-        seen = np.isfinite(drive.y[:, j])
-        axes.plot(drive.t[seen], drive.y[seen, j], ".", ms=2, color="#7a8894", label="measured")
-        axes.plot(drive.t, y[:, j], lw=1.1, color="#c2410c", label="simulated")
+        seen = np.isfinite(excitation.y[:, j])
+        axes.plot(excitation.t[seen], excitation.y[seen, j], ".", ms=2, color="#7a8894", label="measured")
+        axes.plot(excitation.t, y[:, j], lw=1.1, color="#c2410c", label="simulated")
         axes.set_ylabel(f"{o.name}\n[{o.unit or '?'}]", fontsize=8)
         axes.grid(alpha=0.3)
     panels[0].legend(loc="upper right", fontsize=8)
@@ -167,25 +177,25 @@ def _plot(name: Path, model: Model, table: Table, drive: Drive, x: np.ndarray, y
 def refit(args: argparse.Namespace) -> int:
     """Refit a plant's parameters; write the plant; report estimates and the fit before and after."""
     plant = load(args.plant)
-    model = plant.compile()
+    model = compile_plant(plant)
     if not any(p.range for p in plant.parameters.values()):
         raise InputError(f"{plant.file}: no parameter has a 'range', so there is nothing to refit")
-    drives = [model.drive(read_table(r)) for r in args.recordings]
+    excitations = [model.excitation(read_table(r)) for r in args.recordings]
     held = [read_table(r) for r in args.held_out or []]
     try:
-        found = fit(model, drives, tries=args.tries)
+        found = fit(model, excitations, tries=args.tries)
         if args.noise == "ar1":
-            found = fit(model, drives, coloured(found, drives), start=found.z)
-        for d in drives:
+            found = fit(model, excitations, coloured(found, excitations), start=found.z)
+        for d in excitations:
             d.scale = None
-        fitted = updated(plant, found, drives)
+        fitted = updated(plant, found, excitations)
         if args.out:
             save(
                 fitted,
                 args.out,
                 f"refitted by thermoctl to {', '.join(Path(r).name for r in args.recordings)}",
             )
-        Console().print(_estimates(plant, report(found, drives)))
+        Console().print(_estimates(plant, report(found, excitations)))
         grid = Grid(title="rms error", title_justify="left")
         for head in ("recording", "took part", "output", "before", "after"):
             grid.add_column(head, justify="right" if head in ("before", "after") else "left")
@@ -227,13 +237,13 @@ def _estimates(plant: Plant, rows: list[Estimate]) -> Grid:
 
 def _errors(plant: Plant, table: Table) -> dict[str, float]:
     """Free-run rms error per output; uncertain initial states fitted, parameters held."""
-    model = plant.compile(())
-    drive = model.drive(table)
-    if not np.isfinite(drive.y).any():
+    model = compile_plant(plant, ())
+    excitation = model.excitation(table)
+    if not np.isfinite(excitation.y).any():
         return {o: float("nan") for o in plant.outputs}
     if model.uncertain:
-        return fit(model, [drive]).rms()
-    e = drive.y - model.run(drive).y
+        return fit(model, [excitation]).rms()
+    e = excitation.y - model.run(excitation).y
     return {
         o: float(np.sqrt(np.nanmean(e[:, j] ** 2))) if np.isfinite(e[:, j]).any() else float("nan")
         for j, o in enumerate(plant.outputs)
@@ -241,45 +251,16 @@ def _errors(plant: Plant, table: Table) -> dict[str, float]:
 
 
 def show(args: argparse.Namespace) -> int:
-    """The plant's table, and its picture when --out is given."""
-    from thermoctl.plant.show import draw, table
-
+    """Return the plant's table, and its picture when --out is given."""
     plant = load(args.plant)
     if args.out:
-        draw(plant, args.out)
+        drawing.draw(plant, args.out)
         print(args.out)
     else:
         console = Console()
         console.print(f"[bold]{plant.title}[/bold]  ({plant.file})")
-        for part in table(plant):
+        for part in drawing.table(plant):
             console.print(part)
-    return 0
-
-
-def linearise(args: argparse.Namespace) -> int:
-    """The compensator's model file from a thermal plant."""
-    from thermoctl.identify.modelfile import save_model
-    from thermoctl.plant import linearise as room
-
-    plant = load(args.plant)
-    model = room.linearise(plant, args.period, args.sensor_period, args.kind, density=args.heat_density)
-    poles = model.meta["time_constants_s"]
-    print(
-        f"{plant.title}: order {len(model.A_minus_I)}, time constants {poles[0]:.4g} to {poles[-1]:.4g} s, "
-        f"coil gain {model.gain[0, 0]:.4g}"
-    )
-    if args.gains:
-        sequence = room.gains(
-            room.thermal(plant), args.sensor_period, args.samples, density=args.heat_density
-        )[:, :, 0]
-        t = np.arange(args.samples) * args.sensor_period
-        columns = {n: sequence[:, i] for i, n in enumerate(plant.nodes)}
-        write_table(args.gains, Table(Path(args.gains).stem, args.gains, t, columns))
-        print(args.gains)
-    if args.out:
-        if args.replace:
-            Path(args.out).unlink(missing_ok=True)
-        print(save_model(args.out, model, args.rig, [args.plant]))
     return 0
 
 

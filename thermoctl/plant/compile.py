@@ -1,12 +1,12 @@
-"""Plants as machine code: C written from the expressions, built by the system's C compiler, kept in a cache on disk.
+"""Plants as machine code: C from the expressions, compiled, and cached on disk.
 
     dx/dt = (flows in - flows out) / storage = f(t, x, u, p),    y = g(t, x, u, p)
     S = d x / d q,  dS/dt = f_x S + f_q,  S(0) = d initial / d q,  q = (active parameters, uncertain initial states)
 
-C was chosen by measurement (`make bench`): a plant is ready in some tenths of a second, where numba needs seconds. A jump
-(sign, step, a comparison) whose argument moves with the state or with time is smoothed, tanh(z / width), so that it has a
-slope: over 1e-5 of the range of its argument for a state, over half a sampling interval for time. Arguments that hold
-between samples (recorded inputs) keep their true jumps.
+C was chosen by measurement (`make bench`): a plant is ready in some tenths of a second, where numba needs
+seconds. A jump (sign, step, a comparison) whose argument moves with the state or with time is smoothed,
+tanh(z / width), so that it has a slope: over 1e-5 of the range of its argument for a state, over half a
+sampling interval for time. Arguments that hold between samples (recorded inputs) keep their true jumps.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -36,7 +36,7 @@ _LOADED: dict[str, Code] = {}
 
 
 def argument(jump: Expr) -> Expr:
-    """The expression whose sign a jump looks at."""
+    """Return the expression whose sign a jump looks at."""
     a = jump.args
     if jump.op in (">", ">="):
         return add(a[0], neg(a[1]))
@@ -75,7 +75,7 @@ class Code:
         self.input_delays: dict[str, tuple[Expr, Expr]] = {}
         self.output_delays: dict[str, tuple[Expr, Expr]] = {}
 
-        def named(table: dict[str, tuple[Expr, Expr]], prefix: str):
+        def named(table: dict[str, tuple[Expr, Expr]], prefix: str) -> Callable[[Expr], Expr | None]:
             def change(e: Expr) -> Expr | None:
                 if e.op != "delay":
                     return None
@@ -110,7 +110,7 @@ class Code:
                 )
 
     def _widths(self) -> None:
-        """The jumps that are smoothed: by argument, 'state' or 'time'."""
+        """Return the jumps that are smoothed: by argument, 'state' or 'time'."""
         self.jumps: list[tuple[Expr, str]] = []
         roots = [*self.slopes, *self.values, *(d[0] for d in self.output_delays.values())]
         seen: set[int] = set()
@@ -126,10 +126,10 @@ class Code:
                     self.jumps.append((z, kind))
         self.jump_index = {id(z): i for i, (z, _) in enumerate(self.jumps)}
 
-    # ------------------------------------------------------------------------------------------------- writing C
+    # --------------------------------------------------------------------------------------------- writing C
 
     def _by_parameter(self, e: Expr, q: str) -> Expr:
-        """d e / d parameter, also through the seconds of delayed inputs."""
+        """Return d e / d parameter, also through the seconds of delayed inputs."""
         total = derivative(e, q)
         used = ex.names(e)
         for d, (_, seconds) in self.input_delays.items():
@@ -288,8 +288,10 @@ def _ints(label: str, values: Iterable[int]) -> str:
 
 
 def _sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, int]:
-    """C for M = I - a J: factors without pivoting in minimum-degree order (Markowitz), and solves for one and for eight
-    right-hand sides. A small pivot is refused; the integrator then takes a smaller step. Returns (text, entries of M)."""
+    """Write C that factors M = I - a J and solves for one and for eight right-hand sides.
+
+    No pivoting, minimum-degree order (Markowitz). A small pivot is refused; the integrator then takes a
+    smaller step. Returns (text, entries of M)."""
     rows: list[set[int]] = [{i} for i in range(n)]
     for i, k in pattern:
         rows[i].add(k)
@@ -339,12 +341,12 @@ def _sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, int]:
     )
 
 
-# ------------------------------------------------------------------------------------------------ building and loading
+# -------------------------------------------------------------------------------------- building and loading
 
 
 @cache
 def _compiler() -> tuple[list[str], str]:
-    """The C compiler's command and what identifies its result (version, processor)."""
+    """Return the C compiler's command and what identifies its result (version, processor)."""
     for candidate in (os.environ.get("CC"), "cc", "gcc", "clang"):
         if candidate and (path := shutil.which(candidate.split()[0])):
             version = subprocess.run([path, "--version"], capture_output=True, text=True).stdout.splitlines()[
@@ -407,8 +409,8 @@ def _library(key: str, source: str) -> ctypes.CDLL:
 
 def _build(work: Path, source: str) -> None:
     (work / "plant.c").write_text(source)
-    # A large file is dominated by straight-line code that -O1 translates as well in a fraction of the time; a small one runs a
-    # tenth slower and is ready in less than half of the time, which a diagnosis with its many plants feels.
+    # -O1 translates a large file's straight-line code as well as -O3 in a fraction of the time. A small plant runs
+    # a tenth slower with -O1 and is ready in less than half of the time: a diagnosis compiles many.
     command = [("-O1" if a == "-O3" and not 10_000 < len(source) < 400_000 else a) for a in _compiler()[0]]
     done = subprocess.run(
         [*command, f"-I{_TEMPLATE.parent}", "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],
@@ -420,7 +422,9 @@ def _build(work: Path, source: str) -> None:
 
 
 def _trim(folder: Path, keep: int = 2000, age_s: float = 86_400.0) -> None:
-    """Forget the oldest beyond `keep`, but none made within a day: another process may be about to load it."""
+    """Forget the oldest beyond `keep`, but none made within a day.
+
+    Another process may be about to load it."""
     made = []
     for path in folder.glob("*.so"):
         with contextlib.suppress(OSError):  # another process trims, too
@@ -443,20 +447,8 @@ def _typed(library: ctypes.CDLL) -> ctypes.CDLL:
     return library
 
 
-def compile_plant(plant: Plant, active: tuple[str, ...] | None = None):
-    """The plant as machine code, ready to simulate. `active`: the parameters to give sensitivities for (default: all
-    that have a range). Raises InputError for an unknown name or a missing compiler."""
-    from thermoctl.plant.simulate import Model
-
-    if active is None:
-        active = tuple(p.name for p in plant.parameters.values() if p.range)
-    for q in active:
-        if q not in plant.parameters:
-            raise InputError(f"{plant.file}: '{q}' is not a parameter")
-    return Model(plant, _code(plant, tuple(active)))
-
-
-def _code(plant: Plant, active: tuple[str, ...]) -> Code:
+def machine_code(plant: Plant, active: tuple[str, ...]) -> Code:
+    """Return the plant's machine code with sensitivities to `active`; plants of one structure share it."""
     identity = hashlib.sha256(repr((active, _structure(plant))).encode()).hexdigest()
     with _LOCK:
         found = _LOADED.get(identity)
@@ -469,8 +461,8 @@ def _code(plant: Plant, active: tuple[str, ...]) -> Code:
     return found
 
 
-def _structure(plant: Plant) -> Mapping:
-    """What the code depends on: everything but values, ranges, units and noise."""
+def _structure(plant: Plant) -> Mapping[str, object]:
+    """Return all that the code depends on: not values, ranges, units or noise."""
     return {
         "i": list(plant.inputs),
         "p": list(plant.parameters),
@@ -480,4 +472,4 @@ def _structure(plant: Plant) -> Mapping:
     }
 
 
-__all__ = ["Code", "argument", "cache_directory", "compile_plant"]
+__all__ = ["Code", "argument", "cache_directory", "machine_code"]

@@ -1,7 +1,9 @@
-"""Expressions of the plant language: read without eval, differentiated exactly, evaluated with numpy or written as C.
+"""Expressions of the plant language.
 
-An expression is a graph of interned nodes (the same sub-expression is the same object), so that derivatives share
-their parts and the generated C computes each part once.
+Read without eval, differentiated exactly, evaluated with numpy or written as C.
+
+An expression is a graph of interned nodes (the same sub-expression is the same object), so that derivatives
+share their parts and the generated C computes each part once.
 """
 
 from __future__ import annotations
@@ -50,10 +52,13 @@ class ExpressionError(ValueError):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Expr:
-    """One node. `op` is 'num' (value), 'name' (value), '+', '*', '/', '**', 'neg', a comparison, a function's name,
-    'table' (args: x, then the x points, then the y points; value = number of points), 'delay' (args: expression,
-    seconds), 'first' (value: name), or, in derivatives only, 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope', 'bump'
-    (slope of a smoothed step), 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed)."""
+    """One node.
+
+    `op` is 'num' (value), 'name' (value), '+', '*', '/', '**', 'neg', a comparison, a function's name,
+    'table' (args: x, then the x points, then the y points; value = number of points), 'delay' (args:
+    expression, seconds), 'first' (value: name), or, in derivatives only, 'dpow' (a**(b-1), 0 where a <= 0),
+    'table_slope', 'bump' (slope of a smoothed step), 'side' (1 or -1) and 'le' (1 where a <= b, never
+    smoothed)."""
 
     op: str
     args: tuple[Expr, ...] = ()
@@ -63,11 +68,11 @@ class Expr:
         return _text(self, 0)
 
 
-_INTERNED: dict[tuple, Expr] = {}
+_INTERNED: dict[tuple[str, tuple[int, ...], Any], Expr] = {}
 
 
 def make(op: str, *args: Expr, value: Any = None) -> Expr:
-    """The one node of this operation and these arguments."""
+    """Return the one node of this operation and these arguments."""
     key = (op, tuple(map(id, args)), value)
     found = _INTERNED.get(key)
     if found is None:
@@ -79,12 +84,12 @@ def make(op: str, *args: Expr, value: Any = None) -> Expr:
 
 
 def num(value: float) -> Expr:
-    """A number."""
+    """Return a number."""
     return make("num", value=float(value))
 
 
 def name(value: str) -> Expr:
-    """A name."""
+    """Return a name."""
     return make("name", value=value)
 
 
@@ -92,7 +97,7 @@ ZERO, ONE = num(0.0), num(1.0)
 
 
 def add(a: Expr, b: Expr) -> Expr:
-    """a + b, simplified."""
+    """Return a + b, simplified."""
     if a is ZERO:
         return b
     if b is ZERO:
@@ -103,14 +108,14 @@ def add(a: Expr, b: Expr) -> Expr:
 
 
 def neg(a: Expr) -> Expr:
-    """-a, simplified."""
+    """Return -a, simplified."""
     if a.op == "num":
         return num(-a.value)
     return a.args[0] if a.op == "neg" else make("neg", a)
 
 
 def mul(a: Expr, b: Expr) -> Expr:
-    """a * b, simplified."""
+    """Return a * b, simplified."""
     if a is ZERO or b is ZERO:
         return ZERO
     if a is ONE:
@@ -123,7 +128,7 @@ def mul(a: Expr, b: Expr) -> Expr:
 
 
 def div(a: Expr, b: Expr) -> Expr:
-    """a / b, simplified."""
+    """Return a / b, simplified."""
     if a is ZERO and not (b.op == "num" and b.value == 0):
         return ZERO
     if b is ONE:
@@ -134,7 +139,7 @@ def div(a: Expr, b: Expr) -> Expr:
 
 
 def power(a: Expr, b: Expr) -> Expr:
-    """a ** b, simplified."""
+    """Return a ** b, simplified."""
     if b is ONE:
         return a
     if b is ZERO:
@@ -149,7 +154,7 @@ def power(a: Expr, b: Expr) -> Expr:
     return make("**", a, b)
 
 
-# ---------------------------------------------------------------------------------------------------------- reading
+# --------------------------------------------------------------------------------------------------- reading
 
 
 def parse(text: str | int | float) -> Expr:
@@ -333,7 +338,7 @@ class _Reader:
         return items
 
 
-# ---------------------------------------------------------------------------------------------------------- looking
+# --------------------------------------------------------------------------------------------------- looking
 
 
 @lru_cache(maxsize=20_000)
@@ -354,12 +359,12 @@ def walk(expr: Expr) -> tuple[Expr, ...]:
 
 @lru_cache(maxsize=100_000)
 def names(expr: Expr) -> frozenset[str]:
-    """The names an expression reads (those inside first() are not among them)."""
+    """Return the names an expression reads (those inside first() are not among them)."""
     return frozenset(n.value for n in walk(expr) if n.op == "name")
 
 
 def substitute(expr: Expr, change: Callable[[Expr], Expr | None]) -> Expr:
-    """A copy in which each node for which `change` returns something is replaced by it (bottom up)."""
+    """Return a copy in which each node for which `change` returns something is replaced by it (bottom up)."""
     done: dict[int, Expr] = {}
     for node in walk(expr):
         rebuilt = node
@@ -387,7 +392,7 @@ def _text(e: Expr, outer: int) -> str:
         text = text[:-2] if text.endswith(".0") else text
         return f"({text})" if e.value < 0 and outer > 2 else text
     if e.op == "name":
-        return e.value
+        return str(e.value)
     if e.op == "first":
         return f"first({e.value})"
     if e.op == "table":
@@ -414,12 +419,14 @@ def _text(e: Expr, outer: int) -> str:
     return f"({text})" if p < outer else text
 
 
-# ------------------------------------------------------------------------------------------------------ derivatives
+# ----------------------------------------------------------------------------------------------- derivatives
 
 
 @lru_cache(maxsize=50_000)
 def derivative(expr: Expr, by: str) -> Expr:
-    """d expr / d name, exact; kinks (abs, min, max, table) take one side, jumps the slope of their smooth form."""
+    """Return d expr / d name, exact.
+
+    kinks (abs, min, max, table) take one side, jumps the slope of their smooth form."""
     done: dict[int, Expr] = {}
     for node in walk(expr):
         done[id(node)] = _derive(node, by, done)
@@ -494,7 +501,7 @@ def _whole(e: Expr) -> bool:
     return e.op == "num" and e.value == int(e.value) and e.value >= 1
 
 
-# --------------------------------------------------------------------------------------------- evaluating with numpy
+# ------------------------------------------------------------------------------------- evaluating with numpy
 
 
 def evaluate(
@@ -503,8 +510,10 @@ def evaluate(
     first: Callable[[str], float] | None = None,
     width: Callable[[Expr], float] | None = None,
 ) -> Any:
-    """The value with numpy. `values`: name to number or array; `first(name)` serves first(); `width(argument)` is the
-    half width over which a jump is smoothed (0: a true jump)."""
+    """Return the value with numpy.
+
+    `values`: name to number or array; `first(name)` serves first(); `width(argument)` is the half width over
+    which a jump is smoothed (0: a true jump)."""
     done: dict[int, Any] = {}
     with np.errstate(all="ignore"):
         for e in walk(expr):
@@ -512,7 +521,7 @@ def evaluate(
     return done[id(expr)]
 
 
-_NUMPY: dict[str, Callable] = {
+_NUMPY: dict[str, Callable[..., Any]] = {
     "+": np.add,
     "*": np.multiply,
     "/": np.divide,

@@ -1,29 +1,43 @@
 """A plant as a picture (nodes, flows, outputs) and as a table.
 
-The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the distance in the graph, by majorisation
-(Gansner, Koren, North 2004). What enters from or leaves to the outside and what is read at a node are small satellites.
+The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the distance in the graph, by
+majorisation (Gansner, Koren, North 2004). What enters from or leaves to the outside and what is read at a
+node are small satellites.
 """
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.table import Table
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.yamlfile import InputError
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
-def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, int, str, str]]]:
-    """Vertices (kind, key, label) and edges (from, to, kind, label): one satellite for a node's inflows, one for its
-    outflows, one for its readings; a reading of several nodes is a vertex of its own."""
+
+Vertex = tuple[str, str, str]
+Edge = tuple[int, int, str, str]
+
+
+def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
+    """Vertices (kind, key, label) and edges (from, to, kind, label).
+
+    One satellite for a node's inflows, one for its outflows, one for its readings; a reading of several nodes
+    is a vertex of its own."""
     vertices = [("node", n.name, f"{n.name}\n[{n.unit}]" if n.unit else n.name) for n in plant.nodes.values()]
     index = {n: i for i, n in enumerate(plant.nodes)}
-    edges: list[tuple[int, int, str, str]] = []
+    edges: list[Edge] = []
     outside: dict[tuple[str, str], list[str]] = {}
     for f in plant.flows.values():
         if f.source and f.target:
@@ -60,13 +74,17 @@ def _graph(plant: Plant) -> tuple[list[tuple[str, str, str]], list[tuple[int, in
     return vertices, edges
 
 
-def _outline(text: Any) -> np.ndarray:
+def _outline(text: Text) -> np.ndarray:
     """[[left, bottom], [right, top]] of a drawn text's box, in pixels."""
-    return text.get_bbox_patch().get_window_extent().get_points()
+    patch = text.get_bbox_patch()
+    assert patch is not None  # every text here is drawn with a box
+    return patch.get_window_extent().get_points()
 
 
 def _edge(box: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
-    """Where the line from `outside` (2,) to `inside` (2,) meets the box [[left, bottom], [right, top]] round the latter."""
+    """Return where the line from `outside` (2,) to `inside` (2,) meets the box round `inside`.
+
+    box: [[left, bottom], [right, top]]."""
     way = outside - inside
     room = np.where(way > 0, box[1] - inside, inside - box[0]) / np.maximum(np.abs(way), 1e-12)
     return inside + way * min(float(room.min()), 1.0)
@@ -106,7 +124,9 @@ def layout(count: int, edges: list[tuple[int, int, float]], rounds: int = 400) -
 
 
 def draw(plant: Plant, path: str | Path) -> None:
-    """Write the network as .svg, .png or .pdf. Raises InputError for another ending or a place that cannot be written."""
+    """Write the network as .svg, .png or .pdf.
+
+    Raises InputError for another ending or a place that cannot be written."""
     path = Path(path)
     if path.suffix.lower() not in (".svg", ".png", ".pdf"):
         raise InputError(f"{path}: a name that ends in .svg, .png or .pdf was expected")
@@ -116,141 +136,123 @@ def draw(plant: Plant, path: str | Path) -> None:
         raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
 
 
-def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Any:
-    """The network as a matplotlib Figure of at most `widest` inches; nodes, flows and outputs named in `marked` stand out. Where it
-    would be wider it is drawn closer, without the words on its lines."""
+def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Figure:
+    """Return the network as a matplotlib Figure of at most `widest` inches.
+
+    Nodes, flows and outputs named in `marked` stand out. A network that would be wider is drawn closer,
+    without the words on its lines."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     vertices, edges = _graph(plant)
-    near = {"in", "out", "read"}
-    lengths = [
-        (
-            a,
-            b,
-            0.75
-            if {vertices[a][0], vertices[b][0]} & near and kind == "flow"
-            else 0.85
-            if kind == "read"
-            else 1.6,
-        )
-        for a, b, kind, _ in edges
-    ]
-    several: dict[int, int] = {}
-    for _, b, kind, _ in edges:
-        if kind == "read":
-            several[b] = several.get(b, 0) + 1
-    lengths = [(a, b, 2.2) if several.get(b, 0) > 1 else (a, b, q) for a, b, q in lengths]
-    x = layout(len(vertices), lengths)
+    x, closer = _places(vertices, edges, widest)
     span = np.maximum(np.ptp(x, axis=0), 0.5) if len(x) else np.ones(2)
-    closer = min(1.0, widest / (2.0 + 1.75 * span[0]))
-    if closer < 0.9:  # the words keep their size: what hangs on a node needs more room beside it
-        x = layout(len(vertices), [(a, b, q * 1.45 if q < 1.0 else q) for a, b, q in lengths])
-        span = np.ptp(x, axis=0)
-    figure = Figure(
-        figsize=(
-            float(np.clip(2.0 + 1.75 * span[0], 6, min(40, widest))),
-            float(np.clip(1.6 + 1.3 * span[1] * closer**0.5, 3.5, 32)),
-        )
-    )
+    width = float(np.clip(2.0 + 1.75 * span[0], 6, min(40, widest)))
+    figure = Figure(figsize=(width, float(np.clip(1.6 + 1.3 * span[1] * closer**0.5, 3.5, 32))))
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.92))
     axes.set_axis_off()
-    style = {
-        "node": ("#1b3a5c", "#dce8f5", 9.5),
-        "in": ("#9c3d00", "#fde8d9", 8),
-        "out": ("#4a5560", "#eceff1", 8),
-        "read": ("#1d6b3a", "#e2f3e6", 8),
-    }
-    colours = {"flow": "#5a6b7b", "read": "#1d6b3a", "uses": "#9a86b8"}
-    boxes = {}
-    for i, (kind, key, label) in enumerate(vertices):
-        edge, face, size = style[kind]
-        if key in marked if kind == "node" else not set(label.split("\n")).isdisjoint(marked):
-            edge, face = "#b3261e", "#ffdad6"
-        boxes[i] = axes.text(
-            x[i, 0],
-            x[i, 1],
-            label,
-            ha="center",
-            va="center",
-            fontsize=size,
-            color=edge,
-            zorder=3,
-            bbox={
-                "boxstyle": "round,pad=0.35" if kind == "node" else "round,pad=0.2",
-                "fc": face,
-                "ec": edge,
-                "lw": 1.2 if kind == "node" else 0.6,
-            },
-        )
+    boxes = [_box(axes, at, vertex, marked) for at, vertex in zip(x, vertices, strict=True)]
     margin = 0.45
     axes.set_xlim(x[:, 0].min() - margin, x[:, 0].max() + margin)
     axes.set_ylim(x[:, 1].min() - margin, x[:, 1].max() + margin)
     figure.canvas.draw()  # gives the boxes their sizes, at which the arrows end
-    sizes = {i: axes.transData.inverted().transform(_outline(q)) for i, q in boxes.items()}
+    sizes = [axes.transData.inverted().transform(_outline(q)) for q in boxes]
     for a, b, kind, label in edges:
-        line = {
-            "arrowstyle": "-" if kind == "read" else "-|>",
-            "color": colours[kind],
-            "mutation_scale": 13,
-            "shrinkA": 0,
-            "shrinkB": 0,
-            "lw": 1.3 if kind == "flow" else 0.8,
-            "ls": {"flow": "-", "read": ":", "uses": "--"}[kind],
-        }
-        axes.annotate(
-            "",
-            xy=(*_edge(sizes[b], x[b], x[a]),),
-            xytext=(*_edge(sizes[a], x[a], x[b]),),
-            arrowprops=line,
-            zorder=1,
-        )
-        if label and closer > 0.9:
-            middle = (x[a] + x[b]) / 2
-            broken = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
-            axes.text(
-                middle[0],
-                middle[1],
-                broken,
-                fontsize=6.5,
-                color="#5a6b7b",
-                ha="center",
-                va="center",
-                zorder=2,
-                bbox={"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85},
-            )
-    room = figure.get_figwidth() * 9.5 - (
-        45 if figure.get_figwidth() >= 11 else 0
-    )  # letters of the title in a line
-    figure.text(
-        0.02, 0.995, textwrap.fill(plant.title, max(int(room), 20)), fontsize=12, weight="bold", va="top"
-    )
-    words = {
-        "node": "stored quantity",
-        "in": "flow from outside",
-        "out": "flow to outside",
-        "read": "reading",
-    }
-    for k, (kind, word) in enumerate(words.items()):
-        at = 1.0 - 1.215 / figure.get_figwidth() * (4 - k)
-        figure.text(
-            at,
-            0.025 if figure.get_figwidth() < 11 else 0.965,
-            word,
-            fontsize=8,
-            color=style[kind][0],
-            va="center",
-            bbox={"boxstyle": "round,pad=0.25", "fc": style[kind][1], "ec": style[kind][0], "lw": 0.6},
-        )
+        _arrow(axes, _edge(sizes[a], x[a], x[b]), _edge(sizes[b], x[b], x[a]), kind)
+        if label and closer > CLOSE:
+            _line_words(axes, (x[a] + x[b]) / 2, label)
+    _title_and_legend(figure, plant.title)
     return figure
 
 
-def table(plant: Plant) -> list:
-    """The plant as rich tables: inputs, parameters, nodes, flows, outputs."""
-    from rich.table import Table
+CLOSE = 0.9  # below this share of the natural size the lines have no words
+WIDE_IN = 11.0  # from this width on the legend stands beside the title
+_STYLE = {  # edge, face, font size, word of the legend
+    "node": ("#1b3a5c", "#dce8f5", 9.5, "stored quantity"),
+    "in": ("#9c3d00", "#fde8d9", 8, "flow from outside"),
+    "out": ("#4a5560", "#eceff1", 8, "flow to outside"),
+    "read": ("#1d6b3a", "#e2f3e6", 8, "reading"),
+}
+_LINES = {"flow": ("#5a6b7b", "-"), "read": ("#1d6b3a", ":"), "uses": ("#9a86b8", "--")}
 
-    def make(title: str, heads: tuple[str, ...], rows: list[tuple]) -> Table:
+
+def _places(vertices: list[Vertex], edges: list[Edge], widest: float) -> tuple[np.ndarray, float]:
+    """Return positions (vertices, 2) and the share to which the figure shrinks to `widest` inches."""
+    satellites = {"in", "out", "read"}
+    readings = Counter(b for _, b, kind, _ in edges if kind == "read")
+    lengths = []
+    for a, b, kind, _ in edges:
+        if readings[b] > 1:
+            length = 2.2
+        elif kind == "flow" and {vertices[a][0], vertices[b][0]} & satellites:
+            length = 0.75
+        else:
+            length = 0.85 if kind == "read" else 1.6
+        lengths.append((a, b, length))
+    x = layout(len(vertices), lengths)
+    span = np.maximum(np.ptp(x, axis=0), 0.5) if len(x) else np.ones(2)
+    closer = min(1.0, widest / (2.0 + 1.75 * span[0]))
+    if closer < CLOSE:  # the words keep their size: a satellite needs more room beside its node
+        x = layout(len(vertices), [(a, b, q * 1.45 if q < 1.0 else q) for a, b, q in lengths])
+    return x, closer
+
+
+def _box(axes: Axes, at: np.ndarray, vertex: Vertex, marked: Collection[str]) -> Text:
+    kind, key, label = vertex
+    edge, face, size, _ = _STYLE[kind]
+    if key in marked if kind == "node" else not set(label.split("\n")).isdisjoint(marked):
+        edge, face = "#b3261e", "#ffdad6"
+    shape = {
+        "boxstyle": "round,pad=0.35" if kind == "node" else "round,pad=0.2",
+        "fc": face,
+        "ec": edge,
+        "lw": 1.2 if kind == "node" else 0.6,
+    }
+    return axes.text(
+        at[0], at[1], label, ha="center", va="center", fontsize=size, color=edge, zorder=3, bbox=shape
+    )
+
+
+def _arrow(axes: Axes, start: np.ndarray, end: np.ndarray, kind: str) -> None:
+    colour, dashes = _LINES[kind]
+    line = {
+        "arrowstyle": "-" if kind == "read" else "-|>",
+        "color": colour,
+        "mutation_scale": 13,
+        "shrinkA": 0,
+        "shrinkB": 0,
+        "lw": 1.3 if kind == "flow" else 0.8,
+        "ls": dashes,
+    }
+    axes.annotate("", xy=(end[0], end[1]), xytext=(start[0], start[1]), arrowprops=line, zorder=1)
+
+
+def _line_words(axes: Axes, at: np.ndarray, label: str) -> None:
+    words = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
+    box = {"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85}
+    axes.text(
+        at[0], at[1], words, fontsize=6.5, color="#5a6b7b", ha="center", va="center", zorder=2, bbox=box
+    )
+
+
+def _title_and_legend(figure: Figure, title: str) -> None:
+    width = figure.get_figwidth()
+    letters = width * 9.5 - (45 if width >= WIDE_IN else 0)
+    figure.text(
+        0.02, 0.995, textwrap.fill(title, max(int(letters), 20)), fontsize=12, weight="bold", va="top"
+    )
+    for k, (edge, face, _, word) in enumerate(_STYLE.values()):
+        box = {"boxstyle": "round,pad=0.25", "fc": face, "ec": edge, "lw": 0.6}
+        at = 1.0 - 1.215 / width * (4 - k)
+        height = 0.025 if width < WIDE_IN else 0.965
+        figure.text(at, height, word, fontsize=8, color=edge, va="center", bbox=box)
+
+
+def table(plant: Plant) -> list[Table]:
+    """Return the plant as rich tables: inputs, parameters, nodes, flows, outputs."""
+
+    def make(title: str, heads: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> Table:
         made = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
         for head in heads:
             right = head in ("low", "high", "noise", "step") or (head == "value" and title == "Parameters")

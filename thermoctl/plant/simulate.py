@@ -1,4 +1,7 @@
-"""Simulation of a compiled plant on a recording's inputs: free run, sensitivities, and one fixed period at a time."""
+"""Simulation of a compiled plant on a recording's inputs.
+
+Free run, sensitivities, and one fixed period at a time.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,14 @@ import ctypes
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.compile import Code
+from thermoctl.plant.compile import Code, machine_code
 from thermoctl.plant.language import Plant
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError, suggest
-
-if TYPE_CHECKING:
-    from thermoctl.recording.table import Table
 
 RTOL = 1e-7  # local error a step, as a share of each state's range
 JUMP_WIDTH = 1e-5  # half width of a smoothed jump, as a share of the range of its argument
@@ -28,10 +28,12 @@ class SimulationError(Exception):
 
 
 @dataclass
-class Drive:
-    """What one recording gives to a plant: `t` (N,) seconds from its first sample, `u` (N, inputs) with gaps filled
-    (held, or on a straight line for linear inputs), `y` (N, outputs) measured, NaN where missing, `first` the first
-    recorded values, and the scales that a simulation on it uses."""
+class Excitation:
+    """What one recording gives to a plant.
+
+    `t` (N,) seconds from its first sample, `u` (N, inputs) with gaps filled (held, or on a straight line for
+    linear inputs), `y` (N, outputs) measured, NaN where missing, `first` the first recorded values, and the
+    scales that a simulation on it uses."""
 
     name: str
     t: np.ndarray
@@ -42,15 +44,19 @@ class Drive:
     scale: np.ndarray | None = None  # (nx,) range of each state
     width: np.ndarray | None = None  # (jumps,) half width of each smoothed jump
 
-    def part(self, start: int, stop: int) -> Drive:
-        """The samples start..stop-1 (scales kept); time goes on counting from the recording's start."""
+    def part(self, start: int, stop: int) -> Excitation:
+        """Return the samples start..stop-1 (scales kept).
+
+        Time goes on counting from the recording's start."""
         return dataclasses.replace(self, t=self.t[start:stop], u=self.u[start:stop], y=self.y[start:stop])
 
 
 @dataclass
 class Simulation:
-    """`x` (N, nx), `y` (N, ny) noise-free; with sensitivities `dx` (N, nx, nq) and `dy` (N, ny, nq) by q = (active
-    parameters, uncertain initial states)."""
+    """`x` (N, nx), `y` (N, ny) noise-free.
+
+    With sensitivities `dx` (N, nx, nq) and `dy` (N, ny, nq) by q = (active parameters, uncertain initial
+    states)."""
 
     t: np.ndarray
     x: np.ndarray
@@ -71,7 +77,9 @@ class _Forces(ctypes.Structure):
 
 
 def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]) -> np.ndarray:
-    """An array to fill. Touching new pages costs more than the arithmetic on them, so a caller may keep them."""
+    """Return an array to fill.
+
+    Touching new pages costs more than the arithmetic on them, so a caller may keep them."""
     if kept is None:
         return np.empty(shape)
     size = int(np.prod(shape))
@@ -96,10 +104,12 @@ class Model:
         self._initial = [n.initial for n in plant.nodes.values()]
         self._slots = [self.states.index(n) for n in self.uncertain]
 
-    # ------------------------------------------------------------------------------------------------------- inputs
+    # ------------------------------------------------------------------------------------------------ inputs
 
-    def drive(self, table: Table) -> Drive:
-        """The recording as this plant reads it. Raises InputError where an input's column is missing or empty."""
+    def excitation(self, table: Table) -> Excitation:
+        """Return the recording as this plant reads it.
+
+        Raises InputError where an input's column is missing or empty."""
         t = np.ascontiguousarray(table.t - table.t[0], float)
         u = np.empty((len(t), len(self.code.inputs)))
         linear = np.zeros(len(self.code.inputs), np.intc)
@@ -121,12 +131,12 @@ class Model:
                 known = y[np.isfinite(y[:, j]), j]
                 if len(known):
                     first.setdefault(o.name, float(known[0]))
-        return Drive(table.name, t, u, y, first, linear)
+        return Excitation(table.name, t, u, y, first, linear)
 
     def vector(
         self, parameters: Mapping[str, float] | np.ndarray | None, recording: str | None = None
     ) -> np.ndarray:
-        """All parameters in order: the plant's values (those of the recording where it has its own), then changes."""
+        """Return all parameters in order: the plant's values, the recording's own first, then changes."""
         if isinstance(parameters, np.ndarray):
             return np.ascontiguousarray(parameters, float)
         out = np.array(
@@ -143,55 +153,60 @@ class Model:
             out[self.parameters.index(key)] = value
         return out
 
-    def _delayed_inputs(self, drive: Drive, p: np.ndarray) -> np.ndarray:
-        """u with the derived columns of delayed inputs: the mean of the held signal over each interval, t - seconds; and
-        the slope of that by the seconds."""
+    def _delayed_inputs(self, excitation: Excitation, p: np.ndarray) -> np.ndarray:
+        """Return u with the derived columns of delayed inputs.
+
+        The mean of the held signal over each interval, t - seconds; and the slope of that by the seconds."""
         if not self.code.input_delays:
-            return drive.u
-        u = drive.u.copy()
+            return excitation.u
+        u = excitation.u.copy()
         known = dict(zip(self.parameters, p, strict=True))
         n = len(self.plant.inputs)
         columns = {i: u[:, j] for j, i in enumerate(self.plant.inputs)}
         for j, (signal, seconds) in enumerate(self.code.input_delays.values()):
-            s = np.broadcast_to(np.asarray(ex.evaluate(signal, columns), float), drive.t.shape)
+            s = np.broadcast_to(np.asarray(ex.evaluate(signal, columns), float), excitation.t.shape)
             td = max(float(ex.evaluate(seconds, known)), 0.0)
             if all(self.plant.inputs[i].linear for i in ex.names(signal)):
-                u[:, n + j] = np.interp(drive.t - td, drive.t, s)
-                slope = np.interp(drive.t - td + 1e-9, drive.t, s) - u[:, n + j]
+                u[:, n + j] = np.interp(excitation.t - td, excitation.t, s)
+                slope = np.interp(excitation.t - td + 1e-9, excitation.t, s) - u[:, n + j]
                 u[:, n + len(self.code.input_delays) + j] = -slope / 1e-9
-                drive.linear[n + j] = 1
+                excitation.linear[n + j] = 1
             else:
-                area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(drive.t))])
-                at = drive.t - td
+                area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(excitation.t))])
+                at = excitation.t - td
 
                 def integral(
-                    z: np.ndarray, area=area, s=s
+                    z: np.ndarray, area: np.ndarray = area, s: np.ndarray = s
                 ) -> np.ndarray:  # before the start the first value held
-                    return np.where(z < drive.t[0], (z - drive.t[0]) * s[0], np.interp(z, drive.t, area))
+                    return np.where(
+                        z < excitation.t[0], (z - excitation.t[0]) * s[0], np.interp(z, excitation.t, area)
+                    )
 
-                dt = np.diff(drive.t)
+                dt = np.diff(excitation.t)
                 u[:-1, n + j] = np.diff(integral(at)) / dt
                 u[-1, n + j] = u[-2, n + j]
-                k = np.clip(np.searchsorted(drive.t, at, side="right") - 1, 0, len(s) - 1)
+                k = np.clip(np.searchsorted(excitation.t, at, side="right") - 1, 0, len(s) - 1)
                 u[:-1, n + len(self.code.input_delays) + j] = -np.diff(s[k]) / dt
                 u[-1, n + len(self.code.input_delays) + j] = 0.0
         return np.ascontiguousarray(u)
 
     def start(
-        self, drive: Drive, p: np.ndarray, dx0: np.ndarray | None = None
+        self, excitation: Excitation, p: np.ndarray, dx0: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Initial states (nx,) and their sensitivities (nx, nq). `dx0`: shifts of the uncertain initial states."""
+        """Return initial states (nx,) and their sensitivities (nx, nq).
+
+        `dx0`: shifts of the uncertain initial states."""
         values = {
-            **dict(zip(self.plant.inputs, drive.u[0], strict=False)),
+            **dict(zip(self.plant.inputs, excitation.u[0], strict=False)),
             **dict(zip(self.parameters, p, strict=True)),
         }
 
         def first(key: str) -> float:
-            if key not in drive.first:
+            if key not in excitation.first:
                 raise InputError(
-                    f"recording {drive.name}: first({key}) is asked for, but the recording has no value of it"
+                    f"recording {excitation.name}: first({key}) is asked for, but the recording has no value of it"
                 )
-            return drive.first[key]
+            return excitation.first[key]
 
         x0 = np.array([float(ex.evaluate(e, values, first)) for e in self._initial])
         s0 = np.zeros((len(self.states), len(self.unknowns)))
@@ -206,13 +221,15 @@ class Model:
                 x0[slot] += dx0[c]
         return x0, s0
 
-    # --------------------------------------------------------------------------------------------------- simulating
+    # -------------------------------------------------------------------------------------------- simulating
 
-    def prepare(self, drive: Drive, parameters: Mapping[str, float] | np.ndarray | None = None) -> Drive:
-        """Set the drive's scales (ranges of states, widths of smoothed jumps) from trial runs at these parameters."""
-        p = self.vector(parameters, drive.name)
+    def prepare(
+        self, excitation: Excitation, parameters: Mapping[str, float] | np.ndarray | None = None
+    ) -> Excitation:
+        """Set the scales of an excitation (ranges of states, widths of jumps) by trial runs."""
+        p = self.vector(parameters, excitation.name)
         jumps = self.code.jumps
-        dt = float(np.median(np.diff(drive.t))) if len(drive.t) > 1 else 1.0
+        dt = float(np.median(np.diff(excitation.t))) if len(excitation.t) > 1 else 1.0
         width = np.ones(max(len(jumps), 1))
         for i, (z, kind) in enumerate(jumps):
             if kind == "time":
@@ -222,48 +239,57 @@ class Model:
                     else 1.0
                 )
                 width[i] = 0.5 * dt * max(abs(float(slope)), 1e-12)
-        drive.width = width
-        drive.scale = np.full(len(self.states), np.nan)
+        excitation.width = width
+        excitation.scale = np.full(len(self.states), np.nan)
         moving = any(kind == "state" for _, kind in jumps)
         for share in (1e-2, JUMP_WIDTH) if moving else (1.0,):
             try:
-                run = self._run(drive, p, None, False, 1e-5 if moving else 1e-4)
+                run = self._run(excitation, p, None, False, 1e-5 if moving else 1e-4)
                 x = run.x
             except SimulationError:
-                x = np.zeros((len(drive.t), len(self.states)))
+                x = np.zeros((len(excitation.t), len(self.states)))
             finite = np.where(np.isfinite(x), x, 0.0)
-            drive.scale = np.ptp(finite, axis=0) + 1e-6 * np.max(np.abs(finite), axis=0, initial=0.0) + 1e-12
+            excitation.scale = (
+                np.ptp(finite, axis=0) + 1e-6 * np.max(np.abs(finite), axis=0, initial=0.0) + 1e-12
+            )
             if moving:
-                values = self._signals(drive, p, finite)
+                values = self._signals(excitation, p, finite)
                 for i, (z, kind) in enumerate(jumps):
                     if kind == "state":
-                        reach = float(np.max(np.abs(np.broadcast_to(ex.evaluate(z, values), drive.t.shape))))
+                        reach = float(
+                            np.max(np.abs(np.broadcast_to(ex.evaluate(z, values), excitation.t.shape)))
+                        )
                         width[i] = max(share * reach, 1e-15)
-        return drive
+        return excitation
 
-    def _signals(self, drive: Drive, p: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
-        u = self._delayed_inputs(drive, p)
+    def _signals(self, excitation: Excitation, p: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
+        u = self._delayed_inputs(excitation, p)
         return {
             **dict(zip(self.code.inputs, u.T, strict=True)),
             **dict(zip(self.parameters, p, strict=True)),
             **dict(zip(self.states, x.T, strict=True)),
-            "t": drive.t,
+            "t": excitation.t,
         }
 
     def run(
         self,
-        drive: Drive,
+        excitation: Excitation,
         parameters: Mapping[str, float] | np.ndarray | None = None,
         dx0: np.ndarray | None = None,
         sensitivities: bool = False,
         rtol: float = RTOL,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> Simulation:
-        """Free run on a drive. `buffers`: a dict that keeps the large arrays between runs (the next run with it changes
-        the states' slopes that the last one returned, and the outputs' of the last one on this drive). Raises SimulationError."""
-        if drive.scale is None:
-            self.prepare(drive, parameters)
-        return self._run(drive, self.vector(parameters, drive.name), dx0, sensitivities, rtol, buffers)
+        """Free run on a excitation.
+
+        `buffers`: a dict that keeps the large arrays between runs (the next run with it changes the states'
+        slopes that the last one returned, and the outputs' of the last one on this excitation). Raises
+        SimulationError."""
+        if excitation.scale is None:
+            self.prepare(excitation, parameters)
+        return self._run(
+            excitation, self.vector(parameters, excitation.name), dx0, sensitivities, rtol, buffers
+        )
 
     def simulate(
         self,
@@ -273,16 +299,18 @@ class Model:
         rtol: float = RTOL,
     ) -> Simulation:
         """Free run on a recording's inputs. Raises InputError, SimulationError."""
-        return self.run(self.drive(table), parameters, None, sensitivities, rtol)
+        return self.run(self.excitation(table), parameters, None, sensitivities, rtol)
 
     def measure(self, table: Table, seed: int = 0) -> Table:
-        """The plant in the rig's place: a recording of the inputs in `table` and what the sensors make of the outputs, with their
-        noise and their steps. Uncertain starts are drawn. Raises InputError, SimulationError."""
-        rng, drive = np.random.default_rng(seed), self.drive(table)
+        """Return the plant in the rig's place.
+
+        a recording of the inputs in `table` and what the sensors make of the outputs, with their noise and
+        their steps. Uncertain starts are drawn. Raises InputError, SimulationError."""
+        rng, excitation = np.random.default_rng(seed), self.excitation(table)
         dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(
             size=len(self.uncertain)
         )
-        y = self.run(drive, None, dx0).y
+        y = self.run(excitation, None, dx0).y
         columns = {i.column: table.columns[i.column] for i in self.plant.inputs.values()}
         for j, o in enumerate(self.plant.outputs.values()):
             read = y[:, j] + (o.noise or 0.0) * rng.normal(size=len(y))
@@ -291,36 +319,36 @@ class Model:
 
     def _run(
         self,
-        drive: Drive,
+        excitation: Excitation,
         p: np.ndarray,
         dx0: np.ndarray | None,
         sensitivities: bool,
         rtol: float,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> Simulation:
-        lib, n, nx, nq = self.code.library, len(drive.t), len(self.states), len(self.unknowns)
-        u = self._delayed_inputs(drive, p)
-        width = drive.width if drive.width is not None else np.ones(1)
-        x0, s0 = self.start(drive, p, dx0)
+        lib, n, nx, nq = self.code.library, len(excitation.t), len(self.states), len(self.unknowns)
+        u = self._delayed_inputs(excitation, p)
+        width = excitation.width if excitation.width is not None else np.ones(1)
+        x0, s0 = self.start(excitation, p, dx0)
         x = np.empty((n, nx))
         dx = _buffer(buffers, "dx", (n, nx, nq)) if sensitivities else None
         info = np.zeros(2)
         if nx:
             if not np.all(np.isfinite(x0)):
                 raise SimulationError(
-                    f"{drive.name}: the start of '{self.states[int(np.argmin(np.isfinite(x0)))]}' is not finite"
+                    f"{excitation.name}: the start of '{self.states[int(np.argmin(np.isfinite(x0)))]}' is not finite"
                 )
             scale = (
-                drive.scale
-                if drive.scale is not None and np.all(np.isfinite(drive.scale))
+                excitation.scale
+                if excitation.scale is not None and np.all(np.isfinite(excitation.scale))
                 else np.abs(x0) + 1e-3
             )
             atol = rtol * scale
             failed = lib.integrate(
                 n,
-                _p(drive.t),
+                _p(excitation.t),
                 _p(u),
-                _p(drive.linear),
+                _p(excitation.linear),
                 _p(p),
                 _p(width),
                 _p(x0),
@@ -337,15 +365,15 @@ class Model:
             if failed:
                 at = max(failed - 1, 0)
                 raise SimulationError(
-                    f"{drive.name}: the simulation does not get beyond t = {drive.t[at]:.6g} s; states "
+                    f"{excitation.name}: the simulation does not get beyond t = {excitation.t[at]:.6g} s; states "
                     + ", ".join(f"{s} = {v:.3g}" for s, v in zip(self.states, x[at], strict=True))
                 )
-        y, dy = self._observe(drive, u, p, width, x, dx, nq, sensitivities, buffers)
-        return Simulation(drive.t, x, y, dx, dy, int(info[0]), int(info[1]))
+        y, dy = self._observe(excitation, u, p, width, x, dx, nq, sensitivities, buffers)
+        return Simulation(excitation.t, x, y, dx, dy, int(info[0]), int(info[1]))
 
     def respond(
         self,
-        drive: Drive,
+        excitation: Excitation,
         parameters: Mapping[str, float] | np.ndarray | None,
         dx0: np.ndarray | None,
         forces: Sequence[tuple[int, int]],
@@ -354,29 +382,31 @@ class Model:
         rtol: float = 1e-5,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> np.ndarray:
-        """The outputs' first-order response (N, ny, columns) to forces on dx/dt that the plant does not have. Entry e of
-        `forces` is (state, column) and has its values, per second, in q[:, e] (N, entries). `buffers`: as of `run`."""
-        lib, n, nx = self.code.library, len(drive.t), len(self.states)
-        p = self.vector(parameters, drive.name)
-        if drive.scale is None or drive.width is None:
-            self.prepare(drive, p)
-        assert drive.scale is not None and drive.width is not None
-        u = self._delayed_inputs(drive, p)
-        x0, _ = self.start(drive, p, dx0)
+        """Return the outputs' first-order response (N, ny, columns) to forces on dx/dt beside the plant's.
+
+        Entry e of `forces` is (state, column); its values, per second, are q[:, e] of q (N, entries).
+        `buffers`: as of `run`."""
+        lib, n, nx = self.code.library, len(excitation.t), len(self.states)
+        p = self.vector(parameters, excitation.name)
+        if excitation.scale is None or excitation.width is None:
+            self.prepare(excitation, p)
+        assert excitation.scale is not None and excitation.width is not None
+        u = self._delayed_inputs(excitation, p)
+        x0, _ = self.start(excitation, p, dx0)
         rows = np.array([f[0] for f in forces], np.intc)
         cols = np.array([f[1] for f in forces], np.intc)
         q = np.ascontiguousarray(q, float)
         force = _Forces(len(rows), _p(rows), _p(cols), _p(q))
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
         dx = _buffer(buffers, "dx", (n, nx, columns))
-        atol = rtol * drive.scale
+        atol = rtol * excitation.scale
         if nx and lib.integrate(
             n,
-            _p(drive.t),
+            _p(excitation.t),
             _p(u),
-            _p(drive.linear),
+            _p(excitation.linear),
             _p(p),
-            _p(drive.width),
+            _p(excitation.width),
             _p(x0),
             _p(s0),
             columns,
@@ -388,14 +418,14 @@ class Model:
             _p(info),
             ctypes.addressof(force),
         ):
-            raise SimulationError(f"{drive.name}: the plant cannot be simulated")
-        _, dy = self._observe(drive, u, p, drive.width, x, dx, columns, True, buffers, 0)
+            raise SimulationError(f"{excitation.name}: the plant cannot be simulated")
+        _, dy = self._observe(excitation, u, p, excitation.width, x, dx, columns, True, buffers, 0)
         assert dy is not None
         return dy
 
     def _observe(
         self,
-        drive: Drive,
+        excitation: Excitation,
         u: np.ndarray,
         p: np.ndarray,
         width: np.ndarray,
@@ -406,21 +436,34 @@ class Model:
         buffers: dict[str, np.ndarray] | None = None,
         own: int = 1,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        lib, n, ny, nd = self.code.library, len(drive.t), len(self.outputs), len(self.code.output_delays)
+        lib, n, ny, nd = self.code.library, len(excitation.t), len(self.outputs), len(self.code.output_delays)
         delayed = slopes = None
         if nd:
             g = np.empty((n, nd))
             dg = np.empty((n, nd, nq)) if sensitivities else None
             lib.observe(
-                1, n, _p(drive.t), _p(u), _p(p), _p(width), _p(x), _p(dx), nq, None, None, _p(g), _p(dg), own
+                1,
+                n,
+                _p(excitation.t),
+                _p(u),
+                _p(p),
+                _p(width),
+                _p(x),
+                _p(dx),
+                nq,
+                None,
+                None,
+                _p(g),
+                _p(dg),
+                own,
             )
-            delayed, slopes = self._shift(drive.t, g, dg, p, own)
+            delayed, slopes = self._shift(excitation.t, g, dg, p, own)
         y = np.empty((n, ny))
-        dy = _buffer(buffers, f"dy {id(drive)}", (n, ny, nq)) if sensitivities else None
+        dy = _buffer(buffers, f"dy {id(excitation)}", (n, ny, nq)) if sensitivities else None
         lib.observe(
             0,
             n,
-            _p(drive.t),
+            _p(excitation.t),
             _p(u),
             _p(p),
             _p(width),
@@ -438,7 +481,9 @@ class Model:
     def _shift(
         self, t: np.ndarray, g: np.ndarray, dg: np.ndarray | None, p: np.ndarray, own: int
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """The arguments of delays, seconds earlier: cubic between samples (Catmull-Rom slopes), held before the start."""
+        """Return the arguments of delays, seconds earlier.
+
+        Cubic between samples (Catmull-Rom slopes), held before the start."""
         known = dict(zip(self.parameters, p, strict=True))
         out, dout = np.empty_like(g), None if dg is None else np.empty_like(dg)
         for j, (_, seconds) in enumerate(self.code.output_delays.values()):
@@ -478,6 +523,19 @@ class Model:
         return Stepper(self, period_s, np.asarray(u0, float), parameters, dict(first or {}), rtol)
 
 
+def compile_plant(plant: Plant, active: tuple[str, ...] | None = None) -> Model:
+    """Compile a plant to machine code, ready to simulate.
+
+    `active`: parameters to compute sensitivities for; by default all that have a range.
+    Raises InputError for an unknown name or a missing C compiler."""
+    if active is None:
+        active = tuple(p.name for p in plant.parameters.values() if p.range)
+    for q in active:
+        if q not in plant.parameters:
+            raise InputError(f"{plant.file}: '{q}' is not a parameter")
+    return Model(plant, machine_code(plant, tuple(active)))
+
+
 def _filled(t: np.ndarray, column: np.ndarray, linear: bool, what: str) -> np.ndarray:
     good = np.isfinite(column)
     if good.all():
@@ -512,7 +570,7 @@ class Stepper:
         m = self.model
         self._p = m.vector(self.parameters)
         named = dict(zip(m.inputs, u0, strict=True))
-        drive = Drive(
+        excitation = Excitation(
             "start",
             np.zeros(1),
             np.atleast_2d(np.asarray(u0, float)).copy(),
@@ -520,7 +578,7 @@ class Stepper:
             {**named, **self.first},
             np.zeros(len(m.inputs), np.intc),
         )
-        self.x, _ = m.start(drive, self._p)
+        self.x, _ = m.start(excitation, self._p)
         self.t = 0.0
         self._u = np.array(u0, float)
         self._y = np.empty(len(m.outputs))
@@ -534,7 +592,9 @@ class Stepper:
         self._pointers = [_p(a) for a in (self._u, self._p, self._width)], [_p(a) for a in tail]
 
     def step(self, u: np.ndarray) -> np.ndarray:
-        """Advance one period with inputs `u` (nu,) held; returns the outputs (ny,), a view that the next step changes."""
+        """Advance one period with inputs `u` (nu,) held.
+
+        Returns the outputs (ny,), a view that the next step changes."""
         self._u[:] = u
         head, tail = self._pointers
         if self.model.code.library.advance_period(self.t, self.period_s, *head, self.rtol, *tail):
@@ -543,4 +603,4 @@ class Stepper:
         return self._y
 
 
-__all__ = ["Drive", "Model", "Simulation", "SimulationError", "Stepper"]
+__all__ = ["Excitation", "Model", "Simulation", "SimulationError", "Stepper", "compile_plant"]

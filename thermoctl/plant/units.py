@@ -1,16 +1,19 @@
-"""The unit check of a plant, by dimension: m and um are alike, degC counts as K, % and 1 are dimensionless.
+"""The unit check of a plant, by dimension.
 
-A flow's unit must follow from its node (storage times node per second), an expression's from its names. Two things fit
-anywhere: a bare number, which takes whatever dimension its place asks for, and a name whose unit is not given; what is
-multiplied by them fits anywhere too. Exponents are pure numbers.
+m and um are alike, degC counts as K, % and 1 are dimensionless.
+
+A flow's unit must follow from its node (storage times node per second), an expression's from its names. Two
+things fit anywhere: a bare number, which takes whatever dimension its place asks for, and a name whose unit
+is not given; what is multiplied by them fits anywhere too. Exponents are pure numbers.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from functools import cache
+from typing import Any
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
@@ -20,7 +23,7 @@ from thermoctl.yamlfile import InputError
 Dimension = tuple[tuple[str, Fraction], ...]
 """Sorted (base unit, exponent) pairs; () is dimensionless. None stands for 'fits anywhere'."""
 
-# The symbols of most plant files, so that these need not wait for pint (half a second to import): kg m s A K mol cd.
+# The symbols of most plant files: with these nobody waits for pint, which takes half a second to import.
 _COMMON = {
     "1": "",
     "%": "",
@@ -91,7 +94,7 @@ _MAX_LENGTH, _MAX_EXPONENT = 100, 100
 
 
 def check_units(plant: Plant) -> None:
-    """Raises InputError (file:line, both dimensions) at the first unit or expression that does not fit."""
+    """Raise InputError (file:line, both dimensions) at the first unit or expression that does not fit."""
     units: dict[str, Dimension | None] = {"t": (("s", Fraction(1)),)}
     readings: dict[str, Dimension | None] = {}
     named: list[Input | Parameter | Node] = [
@@ -156,7 +159,7 @@ class _Check:
         self.known: dict[int, Dimension | None] = {}
 
     def place(self, e: Expr, what: str, line: int, expected: Dimension | None, why: str) -> Dimension | None:
-        """The dimension of an expression that must be `expected`."""
+        """Return the dimension of an expression that must be `expected`."""
         given = self.expression(e, what, line)
         if given is not None and expected is not None and given != expected:
             raise InputError(
@@ -166,7 +169,9 @@ class _Check:
         return given if given is not None else expected
 
     def expression(self, root: Expr, what: str, line: int) -> Dimension | None:
-        """The dimension of an expression, None where it fits anywhere. Raises InputError where its parts do not agree."""
+        """Return the dimension of an expression, None where it fits anywhere.
+
+        Raises InputError where its parts do not agree."""
         for e in ex.walk(root):
             if id(e) not in self.known:
                 try:
@@ -251,7 +256,7 @@ def _raised(base: Dimension, exponent: float) -> Dimension:
 
 
 def _text(d: Dimension) -> str:
-    """kg m2 s-3 and the like, with the derived unit where there is one."""
+    """Return kg m2 s-3 and the like, with the derived unit where there is one."""
     order = {b: i for i, b in enumerate(_BASES.values())}
     written = " ".join(
         f"{base}{'' if q == 1 else q if q.denominator == 1 else f'^({q})'}"
@@ -276,7 +281,9 @@ def _declared(plant: Plant, what: str, unit: str | None, line: int) -> Dimension
 
 @cache
 def dimension(unit: str) -> Dimension:
-    """The dimension of a unit as pint writes it: 'W/K', 'kW/m^2', 'V**0.5/s', '%', 'N*s/m'. Raises ValueError."""
+    """Return the dimension of a unit as pint writes it: 'W/K', 'kW/m^2', 'V**0.5/s', '%', 'N*s/m'.
+
+    Raises ValueError."""
     if len(unit) > _MAX_LENGTH:
         raise ValueError(f"'{unit[:20]}...' is longer than {_MAX_LENGTH} letters")
     tokens, at = [], 0
@@ -365,10 +372,10 @@ def _symbol(symbol: str) -> Dimension:
 
 
 @cache
-def _pint() -> tuple[Callable, tuple[type[Exception], ...]]:
+def _pint() -> tuple[Callable[[str], Mapping[str, Any]], tuple[type[Exception], ...]]:
     import pint
 
-    registry: pint.UnitRegistry = pint.UnitRegistry()
+    registry: pint.UnitRegistry[float] = pint.UnitRegistry()
     return registry.get_dimensionality, (
         pint.errors.UndefinedUnitError,
         pint.errors.DefinitionSyntaxError,

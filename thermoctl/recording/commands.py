@@ -65,7 +65,7 @@ def list_recordings(args: argparse.Namespace) -> int:
 
 
 def show_info(args: argparse.Namespace) -> int:
-    """What one recording holds."""
+    """Print the contents of one recording."""
     i = info(args.file)
     if args.json:
         print(json.dumps({k: None if v != v else v for k, v in dataclasses.asdict(i).items()}, indent=1))
@@ -88,7 +88,7 @@ def show_info(args: argparse.Namespace) -> int:
 
 
 def export_recording(args: argparse.Namespace) -> int:
-    """A recording in another format."""
+    """Return a recording in another format."""
     rows = export(
         args.file, args.out, args.columns.split(",") if args.columns else None, args.begin, args.end
     )
@@ -97,7 +97,7 @@ def export_recording(args: argparse.Namespace) -> int:
 
 
 def recover_recording(args: argparse.Namespace) -> int:
-    """A closed copy of a cut recording."""
+    """Return a closed copy of a cut recording."""
     path = Path(args.file)
     i = recover(path, args.out or path.with_name(path.stem + ".recovered.arrows"))
     print(

@@ -1,7 +1,7 @@
 """Recordings of other programs: MDF4 (asammdf) and TDMS (npTDMS) read, MDF4 and MCAP (mcap) written.
 
-The libraries are an extra, `pip install 'thermoctl[formats]'`. Channels of several rates are laid on the union of their
-times: a slow channel then has most of its cells empty, as in any recording.
+The libraries are an extra, `pip install 'thermoctl[formats]'`. Channels of several rates are laid on the
+union of their times: a slow channel then has most of its cells empty, as in any recording.
 """
 
 from __future__ import annotations
@@ -78,8 +78,12 @@ def read_mdf(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_tdms(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a TDMS file by channel name, with `t` from the waveform properties or from a channel `t` of the same
-    group. A name that several groups use becomes group_channel. Raises InputError."""
+    """Read the columns of a TDMS file by channel name, with `t`.
+
+    Raises InputError.
+
+    `t` comes from the waveform properties or from a channel `t` of the same group. A name that several groups
+    use becomes group_channel."""
     nptdms = _library("nptdms", path)
     path.stat()
     try:
@@ -129,8 +133,9 @@ def write_mdf(path: str, table: Table) -> None:
 
 
 def write_mcap(path: str, table: Table) -> None:
-    """MCAP with one JSON message a row on /thermoctl (Foxglove and PlotJuggler plot its fields); a missing sample is
-    left out of its message. Log time is `wall_s` where it is recorded, else `t`."""
+    """MCAP with one JSON message a row on /thermoctl (Foxglove and PlotJuggler plot its fields).
+
+    a missing sample is left out of its message. Log time is `wall_s` where it is recorded, else `t`."""
     writer_module = _library("mcap.writer", Path(path))
     clock = table.columns.get("wall_s", table.t - min(table.t[0], 0.0))
     names, values = ["t", *table.columns], np.column_stack([table.t, *table.columns.values()])

@@ -1,4 +1,4 @@
-"""History for a plot: any signal over hours or days, as the least, mean and largest value of each pixel's span.
+"""History for a plot: least, mean and largest value of a signal in each pixel's span.
 
 Only recordings of one rig are drawn, by the name in their metadata; those without a name belong to no rig. A reading that was
 stale or in error is no sample.
@@ -30,8 +30,9 @@ _CLOCK, _STATUS = "wall_s", "status_bits"
 
 @dataclass(frozen=True)
 class History:
-    """`t` (n,) seconds since 1970, the middle of each bucket that holds a sample; low, mean, high (n,) in the signal's
-    unit; `source` 'full' or 'tier'; `files` that were read."""
+    """`t` (n,) seconds since 1970, the middle of each bucket that holds a sample.
+
+    low, mean, high (n,) in the signal's unit; `source` 'full' or 'tier'; `files` that were read."""
 
     t: np.ndarray
     low: np.ndarray
@@ -50,12 +51,13 @@ def history(
     points: int = 800,
     invalid: Callable[[np.ndarray, str], np.ndarray] | None = None,
 ) -> History:
-    """The rig's signal from begin_s to end_s (seconds since 1970) in at most `points` buckets; empty where nothing is recorded.
+    """Return the rig's signal from begin_s to end_s (seconds since 1970) in at most `points` buckets.
 
     invalid(status_bits, signal) says which samples are none (daemon.readings.invalid); None takes all.
 
-    Raises InputError for an unknown signal, a span that is empty, or points out of 2..MAX_POINTS.
-    """
+    Empty where nothing is recorded.
+
+    Raises InputError for an unknown signal, a span that is empty, or points out of 2..MAX_POINTS."""
     if signal not in INDEX:
         raise InputError(f"history: no signal '{signal[:60]}'{suggest(signal, NAMES)}")
     if not (np.isfinite([begin_s, end_s]).all() and 0.0 <= begin_s < end_s <= 1e11):
@@ -83,8 +85,9 @@ def history(
 
 
 def reduce(bucket: np.ndarray, low: np.ndarray, mean: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Samples of the same bucket number become one: (numbers, least, mean, largest). The clock may have stepped: the
-    buckets need not be in order."""
+    """Reduce samples of the same bucket number to (numbers, least, mean, largest).
+
+    The buckets need not be in order: the clock may have stepped."""
     if not len(bucket):
         return bucket, low, mean, high
     if (np.diff(bucket) < 0).any():
@@ -111,7 +114,7 @@ def _start_s(path: Path) -> float:
 
 
 def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Path]:
-    """The files that may hold a part of the span: a file lasts at most until it was written last."""
+    """Return the files that may hold a part of the span: a file lasts at most until it was written last."""
     try:
         paths = recording_files(directory, kind)
     except OSError:
@@ -127,7 +130,7 @@ def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Pa
 
 
 def rig_of(path: Path) -> str:
-    """The rig that a recording's metadata names; '' where it names none or cannot be read."""
+    """Return the rig that a recording's metadata names; '' where it names none or cannot be read."""
     try:
         return _rig_of(path, path.stat().st_ino)
     except (InputError, OSError):

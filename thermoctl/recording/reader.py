@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pyarrow as pa
@@ -15,8 +16,8 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from thermoctl.recording import formats
+from thermoctl.recording.files import read_table, to_arrow, whole_file
 from thermoctl.recording.stream import END, open_stream
-from thermoctl.recording.table import read_table, to_arrow, whole_file
 from thermoctl.signals import NAMES
 from thermoctl.yamlfile import InputError, suggest
 
@@ -92,8 +93,10 @@ def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
 
 
 def recover(path: str | Path, out: str | Path) -> Info:
-    """Copy what is whole of a cut recording to `out` and end it properly, so that any Arrow reader opens it; returns
-    what the copy holds. Raises InputError when nothing can be read or `out` exists."""
+    """Copy the whole batches of a cut recording to `out` and end it properly.
+
+    Any Arrow reader opens the copy; its summary is returned. Raises InputError when nothing can be read or
+    `out` exists."""
     path, out = Path(path), Path(out)
     stream = open_stream(path)
     for _ in stream:
@@ -123,8 +126,8 @@ def export(
 ) -> int:
     """Write a recording as .parquet, .csv, .mf4 or .mcap; returns the rows written.
 
-    columns: only these (beside the time); begin_s, end_s: the part begin_s <= t < end_s. A recording of ours goes to
-    Parquet and CSV batch by batch, however long. Raises InputError."""
+    columns: only these (beside the time); begin_s, end_s: the part begin_s <= t < end_s. A recording of ours
+    goes to Parquet and CSV batch by batch, however long. Raises InputError."""
     path, out = Path(path), Path(out)
     kind = out.suffix.lower()
     if kind not in (".parquet", ".csv", ".mf4", ".mcap"):
@@ -154,9 +157,7 @@ def _export_table(
     if kind == ".mcap":
         formats.write_mcap(out, table)
     elif kind == ".mf4":
-        from tempfile import TemporaryDirectory  # asammdf insists on its own suffix
-
-        with TemporaryDirectory(dir=Path(out).parent) as folder:
+        with TemporaryDirectory(dir=Path(out).parent) as folder:  # asammdf insists on its own suffix
             formats.write_mdf(f"{folder}/export.mf4", table)
             Path(folder, "export.mf4").replace(out)
     elif kind == ".csv":

@@ -1,10 +1,10 @@
 """Reading an Arrow IPC stream that may end anywhere.
 
-A stream is a schema message, one message a batch, and an end mark (ff ff ff ff 00 00 00 00). A recorder that is killed
-leaves no end mark and perhaps half a message: everything before it is whole, because each message carries its length.
-After a power cut a file system may also give back a message whose end is zeros, which Arrow reads as numbers: our
-batches carry a CRC-32 of every column (`crc32`, in the schema's order), and a batch that does not agree with it is not
-there.
+A stream is a schema message, one message a batch, and an end mark (ff ff ff ff 00 00 00 00). A recorder that
+is killed leaves no end mark and perhaps half a message: everything before it is whole, because each message
+carries its length. After a power cut a file system may also give back a message whose end is zeros, which
+Arrow reads as numbers: our batches carry a CRC-32 of every column (`crc32`, in the schema's order), and a
+batch that does not agree with it is not there.
 """
 
 from __future__ import annotations
@@ -30,8 +30,10 @@ def checksums(batch: pa.RecordBatch) -> bytes:
 
 @dataclass
 class Stream:
-    """An open stream: iterate for its batches. After that `good_bytes` is where the last whole message ends and
-    `whole` says whether the end mark was there (else the writer was killed, or is still writing)."""
+    """An open stream: iterate for its batches.
+
+    After that `good_bytes` is where the last whole message ends and `whole` says whether the end mark was
+    there (else the writer was killed, or is still writing)."""
 
     path: Path
     schema: pa.Schema
@@ -61,7 +63,9 @@ class Stream:
 
 
 def open_stream(path: str | Path, columns: Iterable[str] | None = None) -> Stream:
-    """Open a stream, decoding `columns` only (None: all). Raises InputError when not even the schema is there."""
+    """Open a stream, decoding `columns` only (None: all).
+
+    Raises InputError when not even the schema is there."""
     path = Path(path)
     try:
         source = pa.memory_map(str(path))
@@ -83,12 +87,3 @@ def open_stream(path: str | Path, columns: Iterable[str] | None = None) -> Strea
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
     return Stream(path, reader.schema, source, reader, fields, good_bytes=source.tell())
-
-
-def read_batches(
-    path: str | Path, columns: Iterable[str] | None = None
-) -> tuple[pa.Schema, list[pa.RecordBatch], bool]:
-    """(schema, every whole batch, whether the end mark was there). Raises InputError as open_stream does."""
-    stream = open_stream(path, columns)
-    batches = list(stream)
-    return stream.schema, batches, stream.whole

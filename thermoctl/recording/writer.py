@@ -1,11 +1,12 @@
-"""Writing a recording: every tick at full rate, and a 10 Hz tier of min, mean and max that is kept for months.
+"""Write a recording: every tick, and a 10 Hz tier of min, mean and max that is kept longer.
 
-Each is an Arrow IPC stream with zstd. A batch goes to the disk, synced, every half second: a power cut loses what came
-after the last one, and what stands before opens (stream.py). Files are named after the rig and the moment they begin,
-`rig-20261121T043000.123Z.arrows` and `.10hz.arrows`; the oldest ones go when the disk budget is used up.
+Each is an Arrow IPC stream with zstd. A batch goes to the disk, synced, every half second: a power cut loses
+what came after the last one, and what stands before opens (stream.py). Files are named after the rig and the
+moment they begin, `rig-20261121T043000.123Z.arrows` and `.10hz.arrows`; the oldest ones go when the disk
+budget is used up.
 
-Nothing here raises because of a disk: what could not be written is counted as lost and said once, and the next file is
-tried some seconds later. The daemon goes on.
+Nothing here raises because of a disk: what could not be written is counted as lost and said once, and the
+next file is tried some seconds later. The daemon goes on.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -102,7 +103,9 @@ def _write_all(fd: int, data: bytes) -> None:
 
 
 class Tier:
-    """min, mean and max over each tenth of a second; words of bits (`*_bits`) are or-ed. NaN is a missing sample."""
+    """min, mean and max over each tenth of a second; words of bits (`*_bits`) are or-ed.
+
+    NaN is a missing sample."""
 
     def __init__(self, signals: Sequence[Signal]):
         names = [s.name for s in signals]
@@ -122,7 +125,9 @@ class Tier:
         self._open = np.empty((0, len(names)))
 
     def add(self, rows: np.ndarray, last: bool = False) -> np.ndarray:
-        """Rows (k, signals) in, finished rows (m, len(self.signals)) out; `last` finishes the one under way."""
+        """Rows (k, signals) in, finished rows (m, len(self.signals)) out.
+
+        `last` finishes the one under way."""
         rows = np.concatenate((self._open, rows))
         bins = np.floor(rows[:, self.clock] * TIER_HZ + 1e-6)
         ends = np.flatnonzero(np.diff(bins)) + 1
@@ -149,17 +154,42 @@ class Tier:
         )
 
 
-class RecordingWriter:
-    """One recording: a full-rate file and its tier. When it is `full`, close it and open the next.
+class Limits(Protocol):
+    """The settings that a writer reads: settings.RecordingSettings, or the same fields in a test."""
 
-    settings: directory, file_mb, file_s, budget_gb, tier_budget_gb (settings.RecordingSettings); metadata: what the
-    files say about themselves (configuration, model, law); log(text): told when the disk refuses, once, and when it is
-    well again. `error` is what it refused last, '' when all is well.
-    """
+    @property
+    def directory(self) -> str | Path:
+        """Folder of the recordings."""
+
+    @property
+    def file_mb(self) -> float:
+        """Size of a file after which the next begins, MB."""
+
+    @property
+    def file_s(self) -> float:
+        """Age of a file after which the next begins, s."""
+
+    @property
+    def budget_gb(self) -> float:
+        """Disk budget of the full rate, GB."""
+
+    @property
+    def tier_budget_gb(self) -> float:
+        """Disk budget of the 10 Hz tier, GB."""
+
+
+class RecordingWriter:
+    """One recording: a full-rate file and its tier.
+
+    When it is `full`, close it and open the next.
+
+    settings: folder, sizes and budgets; metadata: what the files say about themselves (configuration, model,
+    law); log(text): told when the disk refuses, once, and when it is well again. `error` is what it refused
+    last, '' when all is well."""
 
     def __init__(
         self,
-        settings: Any,
+        settings: Limits,
         metadata: Mapping[str, str],
         rig: str = "rig",
         log: Callable[[str], None] = print,
@@ -309,7 +339,9 @@ def recording_files(directory: Path, kind: str) -> list[Path]:
 
 
 def prune(directory: Path, kind: str, budget: float, keep: Path | None, at_most: int | None = None) -> int:
-    """Delete the oldest files of a kind until they fit `budget` bytes (never `keep`, `at_most` so many); how many."""
+    """Delete the oldest files of a kind until they fit `budget` bytes (never `keep`, `at_most` so many).
+
+    How many."""
     sizes = {}
     for p in recording_files(directory, kind):
         try:

@@ -1,4 +1,4 @@
-"""The one look of all pages: self-contained HTML, no script and no request, light and dark, fit for printing."""
+"""The style of all pages: self-contained HTML without scripts, light and dark, fit for print."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import io
 import math
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _STYLE = """
 :root{color-scheme:light dark;--fg:#1b1f24;--bg:#fff;--soft:#5b6570;--line:#d5dae0;--mark:#0b6bcb;--tint:#f3f6f9;--bad:#b3261e;--good:#1a7f37}
@@ -33,7 +36,7 @@ _UNIT = re.compile(r"\b(degC|um|us|ohm)\b")
 
 
 def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str:
-    """A whole HTML page from (heading, HTML body) pairs; `note` stands under the title."""
+    """Return a whole HTML page from (heading, HTML body) pairs; `note` stands under the title."""
     parts = [f"<section><h2>{html.escape(h)}</h2>\n{body}\n</section>" if h else body for h, body in sections]
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
@@ -44,15 +47,15 @@ def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str
     )
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = "") -> str:
-    """An HTML table; numbers with four significant digits and to the right, words to the left, None as a dash."""
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
+    """Return an HTML table; numbers are rounded and to the right, words to the left, None a dash."""
     rows = [list(row) for row in rows]
     words = [
-        any(isinstance(row[k], str) and not _NUMERIC.match(row[k]) for row in rows if k < len(row))
+        any(isinstance(v, str) and not _NUMERIC.match(v) for row in rows for v in row[k : k + 1])
         for k in range(len(head))
     ]
 
-    def line(cells: Sequence[Any], tag: str) -> str:
+    def line(cells: Sequence[object], tag: str) -> str:
         return (
             "<tr>"
             + "".join(
@@ -70,8 +73,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = "")
     )
 
 
-def cell(v: Any) -> str:
-    """A number or a word as HTML: 4 significant digits, thousands apart, powers of ten as such."""
+def cell(v: object) -> str:
+    """Return a number or a word as HTML: 4 significant digits, thousands apart, powers of ten as such."""
     if v is None or (isinstance(v, float) and math.isnan(v)):
         return "–"
     if not isinstance(v, float):
@@ -82,7 +85,7 @@ def cell(v: Any) -> str:
 
 
 def unit(name: str | None) -> str:
-    """A unit as people write it: degC is °C, um is µm, no unit is nothing."""
+    """Return a unit as people write it: degC is °C, um is µm, no unit is nothing."""
     text = _UNIT.sub(lambda m: {"degC": "°C", "um": "µm", "us": "µs", "ohm": "Ω"}[m[0]], name or "")
     text = (
         re.sub(r"\*\*(2|3|4)(?![.\d])", lambda m: {"2": "²", "3": "³", "4": "⁴"}[m[1]], text)
@@ -92,8 +95,8 @@ def unit(name: str | None) -> str:
     return "" if text == "1" else text.replace("(unit_of_y)", "reading").replace("unit_of_y", "reading")
 
 
-def figure(fig: Any, caption: str = "") -> str:
-    """A matplotlib figure as inline SVG with its caption; the figure is closed."""
+def figure(fig: Figure, caption: str = "") -> str:
+    """Return a matplotlib figure as inline SVG with its caption; the figure is closed."""
     import matplotlib.pyplot as plt
 
     for axis in fig.axes:

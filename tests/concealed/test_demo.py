@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from tests.concealed import generate, sensors
+from tests.concealed import demo, generate, sensors
 from tests.concealed.thermal import Variant
 from thermoctl.plant import load
 
 
-@pytest.fixture(scope="module")
-def demo():
-    spec = importlib.util.spec_from_file_location(
-        "demo_concealed", Path(__file__).parent / "demo_concealed.py"
-    )
-    module = importlib.util.module_from_spec(spec)
-    import sys
-
-    sys.modules["demo_concealed"] = module  # its dataclass looks for its module there
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_a_plant_with_the_true_values_compensates_the_true_growth(demo, tmp_path):
+def test_a_plant_with_the_true_values_compensates_the_true_growth(tmp_path):
     """Finite volumes of the judge, lumped bodies of the plant, nothing concealed: the compensator takes off all but a few percent."""
     for attempt in range(50):
         rng = np.random.default_rng(attempt)
@@ -54,7 +38,7 @@ def test_a_plant_with_the_true_values_compensates_the_true_growth(demo, tmp_path
     assert np.std(left) < 0.1 * np.std(free)
 
 
-def test_at_time_takes_a_step_that_has_happened(demo, tmp_path):
+def test_at_time_takes_a_step_that_has_happened(tmp_path):
     plant = tmp_path / "plant.yaml"
     plant.write_text(
         """format: thermoctl-plant/1
@@ -72,7 +56,7 @@ outputs: {y: {value: body, unit: degC}}
     assert float(ex.evaluate(late, {"G": 2.0, "T0": 100.0, "body": 30.0, "air": 20.0})) == pytest.approx(5.0)
 
 
-def test_every_story_has_a_place_in_its_family(demo):
+def test_every_story_has_a_place_in_its_family():
     held = generate.holders()
     assert len({s.effect for s in demo.STORIES}) >= 6
     for story in demo.STORIES:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.language import from_plain, loads
+from thermoctl.plant import from_plain, loads
 from thermoctl.yamlfile import InputError
 
 GOOD = {
@@ -97,6 +97,45 @@ def test_wrong_file_gives_its_one_error(path, value, words):
     message = str(e.value)
     assert message.startswith("bad.yaml:") and "\n" not in message and len(message) < 1000
     assert words in message, message
+
+
+FILE = """\
+format: thermoctl-plant/1
+inputs: {P: {unti: W}}
+parameters: {C: {value: many}, G: {valeu: 1}}
+nodes: {T: {storage: C, initial: 0, initial_sigma: -1}}
+flows: {heat: {into: U, rate: P}}
+outputs: {y: {value: T, column: 3}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("inputs", "p.yaml:2:20: input 'P': unknown key 'unti' (did you mean 'unit'?); known here: "),
+        ("parameters", "p.yaml:3:25: value of 'C': a number was expected, found 'many'"),
+        ("parameters: G", "p.yaml:3:35: parameter 'G': 'value' is missing; is 'valeu' meant to be it?"),
+        ("nodes", "p.yaml:4:52: initial_sigma of 'T': -1 is outside 0 .. inf"),
+        ("flows", "p.yaml:5:22: flow 'heat': 'U' is not a node; nodes are T"),
+        ("outputs", "p.yaml:6:33: column of 'y': a column's name was expected, found 3"),
+    ],
+)
+def test_an_error_names_file_line_and_column(section, message):
+    """The wrong entry of `section` is kept, those of the others are put right."""
+    text = FILE
+    right = {
+        "inputs": ("unti", "unit"),
+        "parameters": ("many", "1.00"),
+        "parameters: G": ("valeu", "value"),
+        "nodes": ("-1", "1"),
+        "flows": ("U,", "T,"),
+        "outputs": ("column: 3", "column: z"),
+    }
+    for name, (old, new) in right.items():
+        text = text if name == section else text.replace(old, new)
+    with pytest.raises(InputError) as e:
+        loads(text, "p.yaml")
+    assert str(e.value).startswith(message)
 
 
 NAMES = st.sampled_from(["T", "air", "P", "C", "G", "t", "pi"])

@@ -1,5 +1,5 @@
 """Writes run_1.csv and run_2.csv: two heated blocks simulated by scipy alone, with a lamp on the second block for 400 s that
-plant.yaml knows nothing of, other parameters than plant.yaml's, and noise. `python examples/heater/make.py [FOLDER]`"""
+plant.yaml knows nothing of, other parameters than plant.yaml's, and noise. `python docs/examples/heater/make.py [FOLDER]`"""
 
 import sys
 from pathlib import Path

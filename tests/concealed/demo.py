@@ -1,6 +1,6 @@
 """From concealed physics to a smaller error: the whole chain on rigs whose truth the program does not share.
 
-    python tests/demo_concealed.py [--out DIR] [--only NAMES] [--seed S]          (make demo-concealed)
+    python -m tests.concealed.demo [--out DIR] [--only NAMES] [--seed S]          (make demo-concealed)
 
 For each effect below, none of which is told to the program:
 1 conceal      a rig of tests/concealed (finite volumes or split steps, own noise) gets the effect at SIGMAS sigmas after an honest
@@ -27,20 +27,19 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from tests.concealed import generate, sensors  # noqa: E402
-from tests.concealed.judge import snr  # noqa: E402
-from tests.concealed.rig import Scene  # noqa: E402
-from thermoctl.diagnose import run as diagnosis  # noqa: E402
-from thermoctl.diagnose.prove import program  # noqa: E402
-from thermoctl.evaluate.iso230 import mean_and_two_s  # noqa: E402
-from thermoctl.plant import load, save  # noqa: E402
-from thermoctl.plant.linearise import linearise  # noqa: E402
-from thermoctl.plant.refit import fit, updated  # noqa: E402
-from thermoctl.recording.table import read_table  # noqa: E402
-from thermoctl.report import page  # noqa: E402
-from thermoctl.yamlfile import InputError  # noqa: E402
+from tests.concealed import generate, sensors
+from tests.concealed.judge import snr
+from tests.concealed.rig import Scene
+from thermoctl.diagnose import run as diagnosis
+from thermoctl.diagnose.prove import program
+from thermoctl.evaluate.iso230 import mean_and_two_s
+from thermoctl.identify.linearise import linearise
+from thermoctl.plant import load, save
+from thermoctl.plant.refit import fit, updated
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table
+from thermoctl.report import page
+from thermoctl.yamlfile import InputError
 
 SIGMAS = 120.0
 LATE = 1e9  # seconds: the joint is as it is after the recordings
@@ -163,8 +162,8 @@ def at_time(plant: Any, t_s: float) -> Any:
 def unseen(plant_file: Path, recording: Path) -> dict[str, float]:
     """Free-run rms error of each output over its noise on a recording; its own start is estimated, nothing else."""
     plant = load(plant_file)
-    model = plant.compile(())
-    drive = model.drive(read_table(recording))
+    model = compile_plant(plant, ())
+    drive = model.excitation(read_table(recording))
     found = fit(model, [drive])
     noise = {
         o.name: float(np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12)))
@@ -188,8 +187,8 @@ def tell(story: Story, seed: int, out: Path) -> dict[str, Any]:
     result = diagnosis.diagnose(folder / "plant.yaml", [folder / "run_1.csv"], folder / "diagnosis")
     seconds = time.monotonic() - begun
     plant = load(folder / "plant.yaml")
-    model = plant.compile()
-    drives = [model.drive(read_table(folder / "run_1.csv"))]
+    model = compile_plant(plant)
+    drives = [model.excitation(read_table(folder / "run_1.csv"))]
     save(updated(plant, fit(model, drives), drives), folder / "refitted.yaml")
     files = {
         "as it came": folder / "plant.yaml",

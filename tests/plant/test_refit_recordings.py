@@ -17,9 +17,10 @@ import pytest
 
 from thermoctl.plant import load
 from thermoctl.plant.refit import fit, updated
-from thermoctl.recording.table import read_table
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table
 
-FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[2] / "shared/recordings"))
+FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[3] / "shared/recordings"))
 
 # recording, runs of the fit, run that is judged, what of it (share of the fit), {output: quoted}, who quotes it
 QUOTED = [
@@ -53,14 +54,14 @@ def part(table, start, stop):
 
 def errors(folder, runs, judged, how):
     """({output: rms}, {output: rms with the start as the file has it}) of a refit on `runs`, on what is judged."""
-    model = load(folder / "plant.yaml").compile()
+    model = compile_plant(load(folder / "plant.yaml"))
     tables = [read_table(folder / f"run_{k}.csv") for k in runs]
-    whole = model.drive(read_table(folder / f"run_{judged}.csv"))
+    whole = model.excitation(read_table(folder / f"run_{judged}.csv"))
     skip = round(how * len(whole.t)) if isinstance(how, float) else 0
-    drives = [model.drive(part(t, 0, skip or len(t.t))) for t in tables]
+    drives = [model.excitation(part(t, 0, skip or len(t.t))) for t in tables]
     found = fit(model, drives, tries=10)
     plant = updated(model.plant, found, drives)
-    fixed = plant.compile(())
+    fixed = compile_plant(plant, ())
     started = (
         found.dx0[0 if skip else runs.index(judged)] if skip or judged in runs else None
     )  # its start took part
@@ -120,8 +121,8 @@ PLANTS = sorted([*FOLDER.glob("*/plant*.yaml"), *CASES.glob("*/plant.yaml")])
 @pytest.mark.parametrize("path", PLANTS, ids=lambda p: f"{p.parent.name}/{p.name}")
 def test_every_plant_loads_simulates_and_refits(path):
     """On all its recordings at once; a refit never fits worse than the belief, and stays inside the ranges."""
-    model = load(path).compile()
-    drives = [model.drive(read_table(p)) for p in sorted(path.parent.glob("run_*.csv"))]
+    model = compile_plant(load(path))
+    drives = [model.excitation(read_table(p)) for p in sorted(path.parent.glob("run_*.csv"))]
     runs = [model.run(d) for d in drives]
     assert all(
         np.isfinite(run.y).all() and run.y.shape == d.y.shape for run, d in zip(runs, drives, strict=True)

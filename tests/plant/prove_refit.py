@@ -1,6 +1,6 @@
 """Parameter recovery: do 95 % intervals of a refit hold the truth in 90 to 98 % of random truths, by kind of rig and noise?
 
-    python tests/prove_refit.py [--truths 100] [--kind WORD]          (make prove-refit)
+    python tests/plant/prove_refit.py [--truths 100] [--kind WORD]          (make prove-refit)
 
 Each truth: every free parameter drawn inside its range, the recording simulated, noise and the sensor's steps added, and
 the plant with its own (wrong) beliefs refitted. Counted are parameters that the report calls 'ok'. White noise: the plant's
@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from thermoctl.plant.language import load, loads
+from thermoctl.plant import load, loads
 from thermoctl.plant.noise import coloured
 from thermoctl.plant.refit import Scale, fit, report
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 HEAD = "format: thermoctl-plant/1\n"
@@ -56,7 +56,7 @@ outputs: {level: {value: lower, unit: V, noise: 0.03}}""",
 }
 
 
-ACTUATOR = Path(__file__).parents[1] / "config/plants/actuator_thermal.yaml"
+ACTUATOR = Path(__file__).parents[2] / "config/plants/actuator_thermal.yaml"
 PHI = 0.8  # of the coloured noise
 
 
@@ -77,7 +77,7 @@ def one(plant, model, rng, colour, **size):
     """(inside, counted) of one random truth, or None where the truth cannot be simulated."""
     free = {p.name: p for p in plant.parameters.values() if p.range}
     truth = {q: Scale(p).value(rng.uniform(0.15, 0.85)) for q, p in free.items()}
-    drive = model.drive(recording(rng, **size))
+    drive = model.excitation(recording(rng, **size))
     dx0 = np.array([plant.nodes[n].initial_sigma for n in model.uncertain]) * rng.normal(
         size=len(model.uncertain)
     )
@@ -110,7 +110,7 @@ def main():
     for kind, (plant, size) in kinds.items():
         if args.kind not in kind:
             continue
-        model = plant.compile()
+        model = compile_plant(plant)
         for colour in (False, True):
             begin = time.process_time()
             results = [

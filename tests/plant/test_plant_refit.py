@@ -8,10 +8,12 @@ from scipy.stats import multivariate_normal
 from thermoctl.cli import main
 from thermoctl.diagnose.explain import occam
 from thermoctl.plant import expression as ex
-from thermoctl.plant.language import loads
+from thermoctl.plant import extended, loads
 from thermoctl.plant.noise import coloured, innovations
-from thermoctl.plant.refit import Belief, Problem, fit, report
-from thermoctl.recording.table import Table, write_table
+from thermoctl.plant.refit import Prior, Problem, fit, report
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import write_table
+from thermoctl.recording.table import Table
 
 BLOCK = """format: thermoctl-plant/1
 inputs: {P: {unit: W}, air: {unit: degC}}
@@ -33,18 +35,18 @@ def recorded(truth, n=900, name="a", seed=1, noise=0.1, phi=0.0, step=None):
     table = Table(name, name, t, {"P": 6.0 * rng.integers(0, 2, n // 50).repeat(50), "air": np.full(n, 21.0)})
     white = rng.normal(0, noise * np.sqrt(1 - phi**2), n)
     white[0] /= np.sqrt(1 - phi**2)
-    y = truth.compile(()).simulate(table).y[:, 0] + lfilter([1.0], [1.0, -phi], white)
+    y = compile_plant(truth, ()).simulate(table).y[:, 0] + lfilter([1.0], [1.0, -phi], white)
     table.columns["y"] = np.round(y / step) * step if step else y
     return table
 
 
 def judged(believed, table):
-    model = believed.compile()
-    return {e.name: e for e in report(fit(model, [model.drive(table)]))}
+    model = compile_plant(believed)
+    return {e.name: e for e in report(fit(model, [model.excitation(table)]))}
 
 
-TRUTH = plant().extended(
-    lambda d: (d["parameters"]["C"].update(value=46.0), d["parameters"]["G"].update(value=0.31))
+TRUTH = extended(
+    plant(), lambda d: (d["parameters"]["C"].update(value=46.0), d["parameters"]["G"].update(value=0.31))
 )
 
 
@@ -66,7 +68,7 @@ def test_a_parameter_that_the_data_do_not_feel_is_dead():
 
 
 def test_a_parameter_pressed_against_its_range_is_at_bound():
-    narrow = plant().extended(lambda d: d["parameters"]["G"].update(range=[0.4, 1.0]))
+    narrow = extended(plant(), lambda d: d["parameters"]["G"].update(range=[0.4, 1.0]))
     found = judged(narrow, recorded(TRUTH))
     assert found["G"].state == "at bound" and found["G"].value == pytest.approx(0.4)
 
@@ -119,10 +121,10 @@ def test_outliers_hardly_move_a_fit():
 def test_noise_is_measured_with_its_colour_beside_the_sensors_steps(phi, step):
     """Correlation of neighbours of the coloured part alone, on the mean of six recordings; AR(1) comes with its own sampling error."""
     believed = plant(noise=f"noise: 0.1{f', resolution: {step}' if step else ''}")
-    model = believed.compile()
+    model = compile_plant(believed)
     measured = []
     for seed in range(6):
-        drive = model.drive(recorded(TRUTH, seed=seed, phi=phi, step=step))
+        drive = model.excitation(recorded(TRUTH, seed=seed, phi=phi, step=step))
         (noise,) = coloured(fit(model, [drive]), [drive])
         measured.append(noise.phi if len(noise.ar) == 1 else -noise.ar[1])
     assert np.mean(measured) == pytest.approx(phi, abs=0.06 if phi < 0.9 else 0.03)
@@ -163,14 +165,15 @@ outputs: {y: {value: T, unit: degC, noise: 0.02}}
 def test_parameters_that_trade_along_a_curve_are_followed_in_fewer_steps(monkeypatch):
     """Two bodies that nobody measures behind the one that is: from eight starts, the same fit as by straight steps and sooner."""
     believed, slopes = loads(CHAIN), []
-    truth = believed.extended(
+    truth = extended(
+        believed,
         lambda d: [
             d["parameters"][q].update(value=v)
             for q, v in (("C", 12.0), ("D", 40.0), ("E", 90.0), ("K", 0.8), ("L", 1.5), ("G", 0.3))
-        ]
+        ],
     )
     table = recorded(truth, n=3000, noise=0.02)
-    model = believed.compile()
+    model = compile_plant(believed)
     evaluate = Problem.evaluate
 
     def counted(self, z, jacobian, *more):
@@ -179,10 +182,10 @@ def test_parameters_that_trade_along_a_curve_are_followed_in_fewer_steps(monkeyp
 
     monkeypatch.setattr(Problem, "evaluate", counted)
     for bent in (0.75, 0.0):
-        monkeypatch.setattr("thermoctl.plant.refit.BENT", bent)
+        monkeypatch.setattr("thermoctl.plant.refit.MAX_ACCELERATION", bent)
         slopes.append(0)
         costs = [
-            fit(model, [model.drive(table)], start=np.random.default_rng(k).uniform(0.35, 0.65, 6)).cost
+            fit(model, [model.excitation(table)], start=np.random.default_rng(k).uniform(0.35, 0.65, 6)).cost
             for k in range(8)
         ]
         assert max(costs) < min(costs) + 1 and costs[0] == pytest.approx(3000, rel=0.1)
@@ -201,12 +204,10 @@ outputs: {y: {value: "A * u + B", unit: K, noise: 0.3}}
     rng = np.random.default_rng(4)
     u = rng.normal(0, 1, 12)
     y = 1.4 * u + 1.1 + rng.normal(0, 0.3, 12)
-    model = line.compile()
-    drive = model.drive(Table("a", "a", np.arange(12.0), {"u": u, "y": y}))
-    belief = Belief("a", ex.parse("((A - 1) / 0.2)**2 + ((B - A) / 0.5)**2"))
-    found = fit(
-        model, [drive], beliefs=[belief, Belief("another recording", ex.parse("A**2"))], tolerance=1e-9
-    )
+    model = compile_plant(line)
+    drive = model.excitation(Table("a", "a", np.arange(12.0), {"u": u, "y": y}))
+    belief = Prior("a", ex.parse("((A - 1) / 0.2)**2 + ((B - A) / 0.5)**2"))
+    found = fit(model, [drive], priors=[belief, Prior("another recording", ex.parse("A**2"))], tolerance=1e-9)
     m, X = np.array([1.0, 1.0]), np.column_stack([u, np.ones(12)])
     V = np.array([[0.04, 0.04], [0.04, 0.04 + 0.25]])
     P = np.linalg.inv(V) + X.T @ X / 0.09

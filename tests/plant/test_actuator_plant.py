@@ -11,8 +11,9 @@ from scipy.linalg import expm
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
+from thermoctl.plant.simulate import compile_plant
 
-PLANTS = Path(__file__).parents[1] / "config" / "plants"
+PLANTS = Path(__file__).parents[2] / "config" / "plants"
 ELECTRIC = ("u_integral", "i_coil", "velocity", "position")
 
 
@@ -108,7 +109,7 @@ def test_encoder_does_not_see_the_growth(plant):
 @pytest.mark.parametrize("name", ["actuator", "actuator_truth"])
 def test_fast_stepper_agrees_with_fine_steps(name):
     """A step of the drive beyond the supply's limit and back: the exponential stepper against itself at 1/50 of the period."""
-    model = load(PLANTS / f"{name}.yaml").compile(())
+    model = compile_plant(load(PLANTS / f"{name}.yaml"), ())
     u = np.array([0.0, 22.0])
     coarse, fine = model.stepper(1e-3, u), model.stepper(2e-5, u, rtol=1e-9)
     for k in range(300):

@@ -1,13 +1,16 @@
-"""The compensator's model from a thermal plant: what identification finds from data, computed from physics instead.
+"""The compensator's model from a thermal plant.
+
+What identification finds from data, computed from physics instead.
 
 Rises above the air r = T - air of a plant that is linear in its temperatures:
     dr/dt = A r + b P - 1 d(air)/dt,     readings y = C r,     growth of the output e = a . r + (sum a)(air - air at start)
 At the loop's period h, in delta form so that nothing is lost near 1:
     A_h - I = A Phi,  B_h = Phi [b, -1],  Phi = integral of exp(A s) over 0..h
 and, where C is square, in the coordinates of the readings: alpha = C A_h C^-1, beta = C B_h (33).
-Process noise: a heat of unknown course into every body, white with density q (W^2 s), which stands for what the plant
-does not hold; measurement noise: the thermocouple's noise and its step. The steady Kalman gain solves the discrete Riccati
-equation at the sensor's period; `gains` gives the time-varying one from an uncertain start.
+Process noise: a heat of unknown course into every body, white with density q (W^2 s), which stands for what
+the plant does not hold; measurement noise: the thermocouple's noise and its step. The steady Kalman gain
+solves the discrete Riccati equation at the sensor's period; `gains` gives the time-varying one from an
+uncertain start.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from scipy.linalg import expm, solve_discrete_are
 from thermoctl.control.faults import TEMPERATURES
 from thermoctl.control.model import CompensatorModel
 from thermoctl.plant import expression as ex
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Output, Plant
 from thermoctl.yamlfile import InputError
 
 AIR, VOLTAGE, CURRENT, POWER, ERROR = "air_c", "voltage_v", "current_a", "power_w", "position_error_um"
@@ -29,8 +32,10 @@ HEAT_DENSITY = 0.05  # W^2 s: 0.03 W of unknown heat in each body over a minute
 
 @dataclass(frozen=True)
 class Thermal:
-    """A plant's heat in continuous time: A (n, n) 1/s, b (n,) K/J, C (12, n), a (n,) um/K, air_um_k, capacity (n,) J/K,
-    variance (12,) of the readings, K^2."""
+    """A plant's heat in continuous time.
+
+    A (n, n) 1/s, b (n,) K/J, C (12, n), a (n,) um/K, air_um_k, capacity (n,) J/K, variance (12,) of the
+    readings, K^2."""
 
     A: np.ndarray
     b: np.ndarray
@@ -41,9 +46,8 @@ class Thermal:
     variance: np.ndarray
 
 
-def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
-    """The plant's matrices at the temperature `at_c`. Columns of its inputs and outputs must be the program's signals
-    (air_c, voltage_v and current_a or power_w, coil_c ... bracket_2_c, position_error_um). Raises InputError."""
+def _signals(plant: Plant) -> tuple[dict[str, str], dict[str, Output], tuple[str, ...]]:
+    """Return inputs and outputs by column, and the columns that give the power. Raises InputError."""
     inputs = {i.column: i.name for i in plant.inputs.values()}
     outputs = {o.column: o for o in plant.outputs.values()}
     powered = (VOLTAGE, CURRENT) if VOLTAGE in inputs else (POWER,)
@@ -59,6 +63,15 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
                 f"{plant.file}: no output for the column '{column}'; a compensator needs all twelve "
                 f"temperatures and {ERROR}"
             )
+    return inputs, outputs, powered
+
+
+def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
+    """Return the plant's matrices at the temperature `at_c`.
+
+    Columns of its inputs and outputs must be the program's signals (air_c, voltage_v and current_a or
+    power_w, coil_c ... bracket_2_c, position_error_um). Raises InputError."""
+    inputs, outputs, powered = _signals(plant)
     nodes = list(plant.nodes)  # those that are states: the rest stays where it was
     point: dict[str, float] = (
         {p.name: p.value for p in plant.parameters.values()}
@@ -124,7 +137,9 @@ def gains(
     start_sd_k: float = 0.5,
     density: float = HEAT_DENSITY,
 ) -> np.ndarray:
-    """The time-varying Kalman gain (29), (30): (samples, n, s), from rises that are uncertain by `start_sd_k` at the start."""
+    """Return the time-varying Kalman gain (29), (30).
+
+    (samples, n, s), from rises that are uncertain by `start_sd_k` at the start."""
     step, _, noise = discrete(model, sensor_period_s, density)
     A, C, R = np.eye(len(step)) + step, model.C[list(sensors)], np.diag(model.variance[list(sensors)])
     P = np.eye(len(A)) * start_sd_k**2
@@ -145,8 +160,10 @@ def linearise(
     density: float = HEAT_DENSITY,
     expansion_period_s: float = 1.0,
 ) -> CompensatorModel:
-    """The compensator's model of a thermal plant; `kind` 'kalman' (steady gain) or 'mkf' (scalar recursion with a map
-    zeta = covariance of the steady filter's errors with the coil's). Raises InputError."""
+    """Return the compensator's model of a thermal plant.
+
+    `kind` 'kalman' (steady gain) or 'mkf' (scalar recursion with a map zeta = covariance of the steady
+    filter's errors with the coil's). Raises InputError."""
     model = thermal(plant)
     step, B, _ = discrete(model, period_s, density)
     slow, _, noise = discrete(model, sensor_period_s, density)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermoctl.plant.language import loads
+from thermoctl.plant import loads
 from thermoctl.plant.units import _COMMON, dimension
 from thermoctl.yamlfile import InputError
 

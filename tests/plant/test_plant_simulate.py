@@ -7,7 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.language import loads
+from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
@@ -118,14 +119,14 @@ def test_free_run_agrees_with_radau_to_1e_6_of_the_range(kind):
     plant, table = loads(HEAD + PLANTS[kind], kind), recording(n=24)
     values = {p.name: p.value for p in plant.parameters.values()}
     reference = radau(plant, table, values)
-    run = plant.compile().simulate(table, rtol=1e-9)
+    run = compile_plant(plant).simulate(table, rtol=1e-9)
     assert np.all(np.abs(run.y - reference) <= 1e-6 * np.ptp(reference, axis=0))
 
 
 @pytest.mark.parametrize("kind", PLANTS)
 def test_default_tolerance_is_within_1e_5_of_the_range(kind):
     plant, table = loads(HEAD + PLANTS[kind], kind), recording()
-    model = plant.compile()
+    model = compile_plant(plant)
     fine, usual = model.simulate(table, rtol=1e-10), model.simulate(table)
     assert np.all(np.abs(usual.y - fine.y) <= 1e-5 * np.ptp(fine.y, axis=0))
 
@@ -134,7 +135,7 @@ def test_default_tolerance_is_within_1e_5_of_the_range(kind):
 def test_sensitivities_are_the_slopes_of_the_fine_simulation(kind):
     """Against central differences of runs at rtol 1e-12 (whose agreement with Radau the test above shows)."""
     plant, table = loads(HEAD + PLANTS[kind], kind), recording(n=80)
-    model = plant.compile()
+    model = compile_plant(plant)
     run = model.simulate(table, sensitivities=True, rtol=1e-9)
     for c, name in enumerate(model.active):
         p = plant.parameters[name].value
@@ -153,7 +154,7 @@ nodes: {T: {storage: C, initial: air}}
 flows: {heat: {into: T, rate: "delay(P, TD)"}, out: {from: T, rate: 0.5 * (T - air)}}
 outputs: {y: {value: T}, late: {value: "delay(T, TD)"}}"""
     )
-    model = loads(text).compile()
+    model = compile_plant(loads(text))
     t = np.arange(0, 60, 0.25)
     table = Table("d", "d.csv", t, {"P": np.sin(t / 5) ** 2 * 4, "air": np.full(len(t), 20.0)})
     run = model.simulate(table, sensitivities=True)
@@ -172,7 +173,7 @@ def test_static_plant_has_no_states():
         + "inputs: {P: {unit: V}}\nparameters: {a: {value: 2, range: [0, 9]}}\noutputs: {y: {value: a * P**2}}"
     )
     table = Table("s", "s.csv", np.arange(4.0), {"P": np.array([1.0, 2.0, np.nan, 3.0])})
-    run = plant.compile().simulate(table, sensitivities=True)
+    run = compile_plant(plant).simulate(table, sensitivities=True)
     assert run.y[:, 0].tolist() == [2, 8, 8, 18] and run.dy[:, 0, 0].tolist() == [1, 4, 4, 9]
 
 
@@ -187,4 +188,4 @@ def test_a_delay_within_a_delay_is_refused_also_where_an_effect_makes_it():
     )
     nested = dataclasses.replace(plant, outputs={"v": dataclasses.replace(plant.outputs["v"], value=late)})
     with pytest.raises(InputError, match="within a delay"):
-        nested.compile()
+        compile_plant(nested)

@@ -5,11 +5,13 @@ import pytest
 from scipy.linalg import expm
 
 from thermoctl.cli import main
+from thermoctl.identify.linearise import discrete, gains, linearise, thermal
 from thermoctl.identify.modelfile import load_model
-from thermoctl.plant import load
-from thermoctl.plant.linearise import discrete, gains, linearise, thermal
+from thermoctl.plant import extended, load
 from thermoctl.plant.show import layout
-from thermoctl.recording.table import Table, read_table, write_table
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 THERMAL = "config/plants/actuator_thermal.yaml"
@@ -33,7 +35,7 @@ def remembering(plant):
         d["flows"]["kept"] = {"into": "memory", "rate": 0.0}
         d["outputs"]["position_error_um"]["value"] += " + (bracket_2 - memory) * a_bracket_1"
 
-    return plant.extended(add)
+    return extended(plant, add)
 
 
 @pytest.mark.parametrize("also", [lambda plant: plant, remembering], ids=["shipped", "remembering"])
@@ -43,7 +45,7 @@ def test_model_predicts_what_the_plant_does(plant, also):
     model, n, step = linearise(plant, period_s=1.0, expansion_period_s=1.0), 3600, 1.0
     t = np.arange(n) * step
     current, air = 0.8 * ((t // 300) % 2), 22 + t / 1800
-    run = plant.compile(()).simulate(
+    run = compile_plant(plant, ()).simulate(
         Table("x", "x", t, {"voltage_v": 5 * current, "current_a": current, "air_c": air})
     )
     x, rises = np.zeros(12), []
@@ -157,9 +159,9 @@ def block(tmp_path):
         table = Table(
             name, name, t, {"P": 6.0 * rng.integers(0, 2, 12).repeat(50), "air": np.full(600, 21.0)}
         )
-        table.columns["y"] = plant.compile().simulate(table, {"C": 46.0, "G": 0.31}).y[:, 0] + rng.normal(
-            0, 0.1, 600
-        )
+        table.columns["y"] = compile_plant(plant).simulate(table, {"C": 46.0, "G": 0.31}).y[
+            :, 0
+        ] + rng.normal(0, 0.1, 600)
         write_table(tmp_path / f"{name}.csv", table)
     return tmp_path
 

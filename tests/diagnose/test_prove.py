@@ -540,7 +540,7 @@ def test_bench_counts_a_peer_by_the_same_scoring(tmp_path, capsys):
     """A peer on two cases with nothing missing: what it says is scored, kept, and not computed again."""
     import importlib.util
 
-    path = Path(__file__).parent / "bench" / "diagnosis.py"
+    path = Path(__file__).parents[1] / "bench" / "diagnosis.py"
     spec = importlib.util.spec_from_file_location("bench_diagnosis", path)
     bench = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(bench)

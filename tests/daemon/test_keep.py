@@ -1,0 +1,34 @@
+"""Kept estimates are taken up only by the model that made them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from thermoctl.control.model import CompensatorModel, zero_model
+from thermoctl.daemon import keep
+
+ONE = dataclasses.replace(zero_model(), kind="kalman")
+TWO = dataclasses.replace(ONE, gain=np.zeros((1, 2)), sensors=(0, 1))
+FIELDS = [f.name for f in dataclasses.fields(CompensatorModel) if f.name != "meta"]
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_a_warm_start_refuses_the_estimates_of_another_model(tmp_path, field):
+    """b_air, offset_um, sensors, R_w, R_v, expansion_period_s and air_filter_s were not looked at before."""
+    model = TWO if field == "sensors" else ONE
+    value = getattr(model, field)
+    other = {"kind": "mkf", "sensors": (0, 2)}.get(
+        field, value + 0.25 if field not in ("kind", "sensors") else None
+    )
+    path = tmp_path / "kept.state"
+    state = np.arange(5.0)
+    assert keep.save(path, model, state)
+    assert np.array_equal(keep.load(path, model)[0], state)
+    assert keep.load(path, dataclasses.replace(model, **{field: other}))[2] == "of another model"
+
+
+def test_a_model_that_differs_in_its_notes_alone_is_the_same(tmp_path):
+    path = tmp_path / "kept.state"
+    keep.save(path, ONE, np.arange(5.0))
+    assert keep.load(path, dataclasses.replace(ONE, meta={"made_from": "another day"}))[0] is not None

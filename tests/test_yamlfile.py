@@ -1,0 +1,72 @@
+"""`Section`, the one typed reader of mappings: values come out typed, each mistake with its place and what was expected."""
+
+import math
+
+import pytest
+
+from thermoctl.yamlfile import InputError, Section, loads
+
+TEXT = """\
+name: pump
+mode: fast
+gain: 2.5
+count: 0x10
+on: true
+span: [1, 4]
+items: [a, b]
+inner: {depth: 3}
+empty:
+"""
+
+
+def section(text: str = TEXT) -> Section:
+    return Section(loads(text, "f.yaml"), "a pump")
+
+
+def test_values_are_typed():
+    s = section()
+    assert (s.text("name"), s.text("mode", choices=("slow", "fast")), s.text("other", "x")) == (
+        "pump",
+        "fast",
+        "x",
+    )
+    assert (s.number("gain"), s.number("absent", 1.0), s.optional_number("empty")) == (2.5, 1.0, None)
+    assert (s.integer("count"), s.flag("on", False), s.flag("off", True)) == (16, True, True)
+    assert s.interval("span") == (1.0, 4.0) and s.interval("none") == (-math.inf, math.inf)
+    assert [n.value for n in s.list("items")] == ["a", "b"] and s.list("nothing", False) == []
+    assert s.section("inner").number("depth") == 3.0 and s.section("absent", False) is None
+    assert s.given("empty") is None
+    s.end()
+
+
+@pytest.mark.parametrize(
+    ("read", "message"),
+    [
+        (lambda s: s.text("gain"), "f.yaml:3:7: gain: text was expected, found 2.5"),
+        (
+            lambda s: s.text("mode", choices=("slow", "fats")),
+            "f.yaml:2:7: mode: 'fast' is not one of slow, fats (did",
+        ),
+        (lambda s: s.number("name"), "f.yaml:1:7: name: a number was expected, found 'pump'"),
+        (lambda s: s.number("on"), "f.yaml:5:5: on: a number was expected, found True"),
+        (lambda s: s.number("gain", high=2), "f.yaml:3:7: gain: 2.5 is outside -inf .. 2"),
+        (lambda s: s.integer("gain"), "f.yaml:3:7: gain: a whole number was expected, found 2.5"),
+        (lambda s: s.flag("gain", True), "f.yaml:3:7: gain: true or false was expected, found 2.5"),
+        (lambda s: s.interval("items"), "f.yaml:7:9: items: a number was expected, found 'a'"),
+        (lambda s: s.list("gain"), "f.yaml:3:7: gain: a list was expected, found 2.5"),
+        (lambda s: s.section("gain"), "f.yaml:3:7: gain: a mapping (key: value) was expected, found 2.5"),
+        (lambda s: s.get("nmae"), "f.yaml:1:1: a pump: 'nmae' is missing; is 'name' meant to be it?"),
+        (lambda s: s.get("zzz"), "f.yaml:1:1: a pump: 'zzz' is missing"),
+        (lambda s: (s.text("name"), s.end()), "f.yaml:2:7: a pump: unknown key 'mode'; known here: name"),
+    ],
+)
+def test_each_mistake_has_its_place(read, message):
+    with pytest.raises(InputError) as e:
+        read(section())
+    assert str(e.value).startswith(message)
+
+
+@pytest.mark.parametrize("number", [".inf", "-.inf", ".nan", "1e300"])
+def test_a_number_is_finite(number):
+    with pytest.raises(InputError, match="a number was expected"):
+        section(f"gain: {number}").number("gain")

@@ -1,0 +1,62 @@
+"""Plant files: `load` is parse, then check the units. The one place where the two are put together."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from thermoctl import yamlfile
+from thermoctl.plant.language import Plant
+from thermoctl.plant.parse import parse
+from thermoctl.plant.units import check_units
+
+
+def load(path: str | Path) -> Plant:
+    """Read and check a plant file. Raises InputError."""
+    return _checked(yamlfile.load(path))
+
+
+def loads(text: str, file: str = "<text>") -> Plant:
+    """Read and check a plant from a string; `file` names it in errors. Raises InputError."""
+    return _checked(yamlfile.loads(text, file))
+
+
+def from_plain(data: Mapping[str, Any], file: str = "<plant>") -> Plant:
+    """Build and check a plant from plain dicts, which have no line numbers. Raises InputError."""
+
+    def node(value: Any) -> yamlfile.Node:
+        if isinstance(value, Mapping):
+            value = {str(k): node(v) for k, v in value.items()}
+        elif isinstance(value, (list, tuple)):
+            value = [node(v) for v in value]
+        return yamlfile.Node(value, file, 0, 0)
+
+    return _checked(node(data))
+
+
+def extended(plant: Plant, change: Callable[[dict[str, Any]], None], file: str | None = None) -> Plant:
+    """Return the plant after `change` edited a copy of its plain dicts. Raises InputError."""
+    data = copy.deepcopy(plant.plain())
+    change(data)
+    return from_plain(data, file or plant.file)
+
+
+def save(plant: Plant, path: str | Path, note: str = "") -> None:
+    """Write the plant file, whole or not at all; `note` becomes a comment at its head."""
+    path = Path(path)
+    text = "".join(f"# {line}\n" for line in note.splitlines())
+    text += yaml.safe_dump(plant.plain(), sort_keys=False, allow_unicode=True, width=120)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _checked(root: yamlfile.Node) -> Plant:
+    plant = parse(root)
+    check_units(plant)
+    return plant

@@ -1,0 +1,393 @@
+"""Residuals of a plant on recordings in the metric of their noise, with gradient and Gauss-Newton matrix.
+
+    cost(z) = sum_k rho((e_k - phi e_(k-1)) / s) + sum (dx0 / initial_sigma)^2
+              + w sum (z - z_plant)^2 + sum of priors
+    e = y - yhat(p, x0 + dx0),   s^2 = sigma^2 (1 - phi^2)   for each channel
+
+phi is the correlation of a channel's noise over one median sampling interval (AR(1)); rho is Huber's
+function, quadratic up to a limit and linear beyond. z is a parameter's coordinate in its range, 0 to 1, on a
+log scale where the range spans a factor of three or more. The small weight w keeps a parameter that the data
+do not determine at the plant's value.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Parameter, Plant
+from thermoctl.plant.simulate import Excitation, Model, SimulationError
+from thermoctl.yamlfile import InputError
+
+HUBER = 4.0  # residuals beyond this many standard deviations count linearly
+PRIOR_WEIGHT = 0.02  # moving a parameter over its whole range costs as much as one residual of 0.02 sigma
+PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
+DOWNDATE_SHARE = 0.25  # up to this share of down-weighted rows, their excess is subtracted from J'J
+MIN_DIFFERENCED = 4  # samples of a recording whose second differences are used
+LOG_RATIO = 3.0  # a range that spans this factor is fitted on a log scale
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One channel's noise: standard deviation, and correlation `phi` over one sampling interval.
+
+    With a whitening filter ar(z)/ma(z), `sigma` is the standard deviation of the innovations."""
+
+    sigma: float
+    phi: float = 0.0
+    ar: tuple[float, ...] = (1.0,)
+    ma: tuple[float, ...] = (1.0,)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """-2 log of a prior density: an expression of the parameters' values in `recording`, nowhere concave."""
+
+    recording: str
+    neg2_log: ex.Expr
+
+
+class Scale:
+    """The coordinate z in [0, 1] of a parameter in its range."""
+
+    def __init__(self, p: Parameter):
+        assert p.range is not None
+        self.low, self.high = p.range
+        self.log = self.low > 0 and self.high >= LOG_RATIO * self.low
+        self.span = np.log(self.high / self.low) if self.log else self.high - self.low
+
+    def z(self, value: float) -> float:
+        """Return the coordinate of a value."""
+        return float(np.log(value / self.low) / self.span if self.log else (value - self.low) / self.span)
+
+    def value(self, z: float) -> float:
+        """Return the value at a coordinate; beyond 0 and 1 the end of the range."""
+        inside = min(max(z, 0.0), 1.0)
+        raw = self.low * np.exp(inside * self.span) if self.log else self.low + inside * self.span
+        return float(min(max(raw, self.low), self.high))
+
+    def slope(self, value: float) -> float:
+        """Return d value / d z."""
+        return float(value * self.span if self.log else self.span)
+
+
+def default_noise(plant: Plant, excitations: Sequence[Excitation] = ()) -> tuple[Noise, ...]:
+    """Return the noise that the plant file states.
+
+    Where it states none, the white part of the second differences."""
+    out = []
+    for j, o in enumerate(plant.outputs.values()):
+        sigma = np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12))
+        if sigma <= 0:
+            parts = [d.y[np.isfinite(d.y[:, j]), j] for d in excitations]
+            second = np.concatenate(
+                [np.diff(y, 2) for y in parts if len(y) >= MIN_DIFFERENCED] or [np.zeros(1)]
+            )
+            sigma = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6)
+            spread = max((float(np.ptp(y)) for y in parts if len(y)), default=1.0)
+            sigma = max(sigma, 1e-4 * spread, 1e-12)
+        out.append(Noise(float(sigma)))
+    return tuple(out)
+
+
+def _rows(d: Excitation, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return output j's measured samples, each one's correlation with the one before, and its sigma."""
+    dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
+    index = np.flatnonzero(np.isfinite(d.y[:, j]))
+    gaps = np.diff(d.t[index]) / dt if len(index) > 1 else np.zeros(0)
+    phi = n.phi ** np.clip(gaps, 0.0, 1e4) if n.phi > 0 else np.zeros(len(gaps))
+    scale = np.full(len(index), n.sigma)
+    if len(index):
+        scale[1:] = n.sigma * np.sqrt(np.maximum(1 - phi**2, 1e-9))
+    return index, phi, scale
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Whitened residuals of one output in one recording, and what a step needs of them.
+
+    `w` (M,) residuals, `weight` (M,) Huber's weights, `jac` (M, k) = -dw / (slope d unknowns), `slope` (k,).
+    """
+
+    recording: int
+    output: int
+    unknowns: np.ndarray
+    slope: np.ndarray
+    jac: np.ndarray
+    w: np.ndarray
+    weight: np.ndarray
+
+
+class Evaluation(NamedTuple):
+    """Cost, half its negative gradient, Gauss-Newton matrix, and raw residuals (N, ny) by recording."""
+
+    cost: float
+    gradient: np.ndarray
+    matrix: np.ndarray
+    residuals: list[np.ndarray]
+
+
+class Problem:
+    """Residuals and Jacobian of a model on several recordings, in the metric of the noise."""
+
+    def __init__(
+        self,
+        model: Model,
+        excitations: Sequence[Excitation],
+        noise: Sequence[Noise],
+        priors: Sequence[Prior] = (),
+    ):
+        self.model, self.excitations, self.noise = model, list(excitations), tuple(noise)
+        self.priors = tuple(p for p in priors if p.recording in {d.name for d in excitations})
+        if not excitations:
+            raise InputError("no recording to fit")
+        self._number_unknowns()
+        self.z_plant = self.start({})
+        self.buffers: dict[str, np.ndarray] = {}
+        self.huber = np.full(len(self.noise), HUBER)
+        self.rows = [[_rows(d, j, n) for j, n in enumerate(self.noise)] for d in excitations]
+        self.samples = sum(len(e[0]) for entry in self.rows for e in entry)
+        if self.samples == 0:
+            raise InputError("no recording has a column that an output of the plant reads; nothing to fit")
+
+    def _number_unknowns(self) -> None:
+        """Give numbers to the parameters with a range, then to the uncertain initial states."""
+        model, parameters = self.model, self.model.plant.parameters
+        recordings = range(len(self.excitations))
+        self.scales = {q: Scale(parameters[q]) for q in model.active if parameters[q].range}
+        self.unknowns: list[tuple[str, int | None]] = []
+        self.columns = np.full((len(recordings), len(model.unknowns)), -1)
+        for c, q in enumerate(model.active):
+            if q not in self.scales:
+                continue
+            if parameters[q].per_recording:
+                for r in recordings:
+                    self.columns[r, c] = len(self.unknowns)
+                    self.unknowns.append((q, r))
+            else:
+                self.columns[:, c] = len(self.unknowns)
+                self.unknowns.append((q, None))
+        self.n_parameters = len(self.unknowns)
+        self.sigma0 = []
+        for c, s in enumerate(model.uncertain):
+            for r in recordings:
+                self.columns[r, len(model.active) + c] = len(self.unknowns)
+                self.unknowns.append((f"{s} at the start", r))
+                self.sigma0.append(model.plant.nodes[s].initial_sigma or 1.0)
+
+    def start(self, changes: Mapping[str, float]) -> np.ndarray:
+        """Return the unknowns (scaled) at the plant's values, with changes."""
+        out = []
+        for q, r in self.unknowns:
+            if q in self.scales:
+                p = self.model.plant.parameters[q]
+                own = p.values.get(self.excitations[r].name, p.value) if r is not None else p.value
+                scale = self.scales[q]
+                out.append(scale.z(min(max(changes.get(q, own), scale.low), scale.high)))
+            else:
+                out.append(0.0)
+        return np.array(out)
+
+    def with_noise(self, j: int, n: Noise) -> Problem:
+        """Return the same problem with another noise of output j."""
+        other = copy.copy(self)
+        other.noise = (*self.noise[:j], n, *self.noise[j + 1 :])
+        other.rows = [
+            [_rows(d, j, n) if k == j else q for k, q in enumerate(rows)]
+            for d, rows in zip(self.excitations, self.rows, strict=True)
+        ]
+        return other
+
+    def unpack(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return values (recordings, parameters) and shifts of initial states (recordings, states)."""
+        values = np.array([self.model.vector(None, d.name) for d in self.excitations])
+        dx0 = np.zeros((len(self.excitations), len(self.model.uncertain)))
+        for r in range(len(self.excitations)):
+            for c in range(self.columns.shape[1]):
+                k = self.columns[r, c]
+                if k < 0:
+                    continue
+                if c < len(self.model.active):
+                    q = self.model.active[c]
+                    values[r, self.model.parameters.index(q)] = self.scales[q].value(z[k])
+                else:
+                    dx0[r, c - len(self.model.active)] = z[k] * self.sigma0[k - self.n_parameters]
+        return values, dx0
+
+    def whiten(self, r: int, j: int, e: np.ndarray) -> np.ndarray:
+        """Return whitened rows (M, ...) of output j's errors (N, ...); missing samples are dropped."""
+        index, phi, scale = self.rows[r][j]
+        part = e if len(index) == len(e) else e[index]
+        shape = (-1, *([1] * (part.ndim - 1)))
+        noise = self.noise[j]
+        if len(noise.ar) > 1 and len(index) > 1:
+            return lfilter(noise.ar, noise.ma, part, axis=0) / noise.sigma
+        if len(index) > 1 and phi.any():
+            part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
+        return part / scale.reshape(shape)
+
+    def set_outlier_limits(self, residuals: Sequence[np.ndarray]) -> bool:
+        """Set Huber's limit of each output from the spread of its residuals.
+
+        True where one changed by more than a half.
+
+        Residuals of missing physics must not count as outliers, nor what occurs in more than one sample of
+        fifty."""
+        new = np.full(len(self.noise), HUBER)
+        for j in range(len(self.noise)):
+            w = np.concatenate([self.whiten(r, j, e[:, j]) for r, e in enumerate(residuals)])
+            if len(w):
+                middle, high = np.quantile(np.abs(w), [0.5, 0.98])
+                new[j] = max(HUBER * max(1.0, 1.4826 * float(middle)), float(high))
+        changed = bool(np.any((new > 1.5 * self.huber) | (new < self.huber / 1.5)))
+        self.huber = new
+        return changed
+
+    def prior(self) -> np.ndarray:
+        """Return the weight of each unknown's default prior (its entry in the Gauss-Newton matrix)."""
+        return np.concatenate(
+            [np.full(self.n_parameters, PRIOR_WEIGHT**2), np.ones(len(self.unknowns) - self.n_parameters)]
+        )
+
+    def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the unknowns (k,) of recording r and the outputs' slopes by them (N, ny, k)."""
+        values, dx0 = self.unpack(z)
+        run = self.model.run(self.excitations[r], values[r], dx0[r], sensitivities=True)
+        used, k, slope = self._slopes(r, values[r])
+        assert run.dy is not None
+        return k, run.dy[:, :, used] * slope
+
+    def evaluate(self, z: np.ndarray, jacobian: bool, keep: list[Rows] | None = None) -> Evaluation:
+        """Evaluate the cost, with `jacobian` its derivatives, too. Raises SimulationError.
+
+        The rows that `curvature` needs are appended to `keep`."""
+        values, dx0 = self.unpack(z)
+        cost, gradient, matrix = 0.0, np.zeros(len(z)), np.zeros((len(z), len(z)))
+        residuals = []
+        for r, d in enumerate(self.excitations):
+            run = self.model.run(d, values[r], dx0[r], sensitivities=jacobian, buffers=self.buffers)
+            if not np.all(np.isfinite(run.y)):
+                raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
+            e = d.y - run.y
+            residuals.append(e)
+            used, k, slope = self._slopes(r, values[r])
+            part_gradient, part_matrix = np.zeros(len(k)), np.zeros((len(k), len(k)))
+            for j in range(len(self.noise)):
+                if not len(self.rows[r][j][0]):
+                    continue
+                w = self.whiten(r, j, e[:, j])
+                size, limit = np.abs(w), self.huber[j]
+                cost += float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
+                if run.dy is None:
+                    continue
+                weight = np.where(size <= limit, 1.0, limit / np.maximum(size, limit))
+                dy = run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used]
+                rows = self._weighted(r, j, k, slope, w, weight, dy)
+                if keep is not None:
+                    keep.append(rows)
+                part_gradient += rows.slope * (rows.jac.T @ (rows.weight * rows.w))
+                part_matrix += _gram(rows.jac, rows.weight) * np.outer(rows.slope, rows.slope)
+            if jacobian:
+                np.add.at(gradient, k, part_gradient)
+                matrix[np.ix_(k, k)] += part_matrix
+        prior_cost, prior_gradient, prior_matrix = self.prior_terms(values, jacobian)
+        weight, distance = self.prior(), z - self.z_plant
+        cost = cost + prior_cost + float(np.sum(weight * distance**2))
+        gradient = gradient + prior_gradient - weight * distance
+        return Evaluation(cost, gradient, matrix + prior_matrix + np.diag(weight), residuals)
+
+    def prior_terms(self, values: np.ndarray, derivatives: bool) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the priors' cost, half its negative gradient and half its second derivatives."""
+        n = len(self.unknowns)
+        cost, gradient, matrix = 0.0, np.zeros(n), np.zeros((n, n))
+        for prior in self.priors:
+            r = next(r for r, d in enumerate(self.excitations) if d.name == prior.recording)
+            known = dict(zip(self.model.parameters, map(float, values[r]), strict=True))
+            cost += float(ex.evaluate(prior.neg2_log, known))
+            used = [
+                (q, self.columns[r, c], self.scales[q].slope(known[q]))
+                for c, q in enumerate(self.model.active)
+                if derivatives and self.columns[r, c] >= 0 and q in ex.names(prior.neg2_log)
+            ]
+            for q, k, slope in used:
+                first = ex.derivative(prior.neg2_log, q)
+                gradient[k] -= 0.5 * slope * float(ex.evaluate(first, known))
+                for q2, k2, slope2 in used:
+                    second = float(ex.evaluate(ex.derivative(first, q2), known))
+                    matrix[k, k2] += 0.5 * slope * slope2 * second
+        return cost, gradient, matrix
+
+    def curvature(self, z: np.ndarray, step: np.ndarray, kept: Sequence[Rows]) -> np.ndarray:
+        """Return J' d2w/dh2 of the whitened residuals w(z + h step), by one more simulation.
+
+        Raises SimulationError."""
+        values, dx0 = self.unpack(z + PROBE * step)
+        errors = [
+            d.y - self.model.run(d, values[r], dx0[r], buffers=self.buffers).y
+            for r, d in enumerate(self.excitations)
+        ]
+        out = np.zeros(len(z))
+        for rows in kept:
+            r, j = rows.recording, rows.output
+            moved = self._spread(r, j, self.whiten(r, j, errors[r][:, j]), len(rows.w))
+            second = (moved - rows.w) / PROBE + rows.jac @ (rows.slope * step[rows.unknowns])
+            np.add.at(out, rows.unknowns, rows.slope * (rows.jac.T @ (rows.weight * second)))
+        return out * (2 / PROBE)
+
+    def _slopes(self, r: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return which sensitivities of recording r are unknowns, their numbers, and d q / d z."""
+        used = np.flatnonzero(self.columns[r] >= 0)
+        active = self.model.active
+        slopes = [
+            self.scales[active[c]].slope(values[self.model.parameters.index(active[c])])
+            if c < len(active)
+            else self.sigma0[self.columns[r, c] - self.n_parameters]
+            for c in used
+        ]
+        return used, self.columns[r, used], np.array(slopes)
+
+    def _weighted(
+        self,
+        r: int,
+        j: int,
+        k: np.ndarray,
+        slope: np.ndarray,
+        w: np.ndarray,
+        weight: np.ndarray,
+        jac: np.ndarray,
+    ) -> Rows:
+        """Return output j's rows from its whitened residuals, their weights and sensitivities (N, k).
+
+        White noise of one size only scales the sensitivities: they are not copied, and a missing sample gets
+        weight 0."""
+        index, phi, _ = self.rows[r][j]
+        noise, n = self.noise[j], len(jac)
+        if len(noise.ar) > 1 or phi.any() or len(index) < (1 - DOWNDATE_SHARE) * n:
+            return Rows(r, j, k, slope, self.whiten(r, j, jac), w, weight)
+        return Rows(
+            r, j, k, slope / noise.sigma, jac, self._spread(r, j, w, n), self._spread(r, j, weight, n)
+        )
+
+    def _spread(self, r: int, j: int, w: np.ndarray, n: int) -> np.ndarray:
+        """Values (M,) of output j's measured samples as `n` rows, 0 where a sample is missing."""
+        if len(w) == n:
+            return w
+        out = np.zeros(n)
+        out[self.rows[r][j][0]] = w
+        return out
+
+
+def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Weighted normal matrix J'WJ. If few rows are down-weighted, compute J'J and subtract their excess."""
+    lowered = np.flatnonzero(weight != 1.0)
+    if len(lowered) > DOWNDATE_SHARE * len(jac):
+        jac = jac * np.sqrt(weight)[:, None]
+        lowered = lowered[:0]
+    few = jac[lowered] * np.sqrt(1.0 - weight[lowered])[:, None]
+    return jac.T @ jac - few.T @ few

@@ -1,0 +1,369 @@
+"""Reading and writing a `Table`, in the formats that people bring; the suffix of the file says which.
+
+A table has a time column `t` in seconds, strictly increasing, and any number of other columns; every cell is
+a number or missing (NaN). What is not that is refused with file and row, never repaired in silence.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from thermoctl.recording import formats
+from thermoctl.recording.stream import open_stream
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError, suggest
+
+MAX_CELLS = 250_000_000  # 2 GB of float64; a longer recording is read a few columns or hours at a time
+MAX_CSV_BYTES = 4_000_000_000
+_MISSING = ["", "NaN", "nan", "NAN"]
+_COMMENT = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """What a reader gives: the columns by name (t among them) and how to name a data row (counted from 0)."""
+
+    columns: dict[str, np.ndarray]
+    meta: dict[str, str]
+    place: Callable[[int], str]
+
+
+def read_table(path: str | Path, columns: Iterable[str] | None = None) -> Table:
+    """Read a recording; the suffix says the format (`FORMATS`).
+
+    `columns` reads only those (beside the time).
+
+    The time column is `t`, in our own recordings `t_s`. Raises InputError with file and row (CSV: line) for a
+    text where a number belongs, an infinite value, a time that is missing, stands still or runs backwards, a
+    ragged row, a column named twice, no time column, no rows; and for a file that is too large, cut or not of
+    its format."""
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if path.is_dir():
+        raise InputError(f"{path}: a folder; one recording file ({FORMATS}) was expected")
+    if reader is None:
+        raise InputError(f"{path}: the format '{path.suffix}' is not known; {FORMATS} are")
+    want = None if columns is None else list(dict.fromkeys(columns))
+    try:
+        return _checked(path, reader(path, want))
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
+    except pa.ArrowException as e:
+        raise InputError(f"{path}: not a whole {path.suffix[1:]} file: {str(e).splitlines()[0]}") from None
+    except UnicodeDecodeError:
+        raise InputError(
+            f"{path}: not a whole {path.suffix[1:]} file: a name of a column is not text"
+        ) from None
+
+
+def write_table(path: str | Path, table: Table) -> None:
+    """Write a table as .csv, .parquet or .arrow (IPC file); a missing sample becomes an empty cell.
+
+    The file appears whole or not at all. Raises InputError for another suffix or when the place cannot be
+    written."""
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in (".csv", ".parquet", ".arrow"):
+        raise InputError(f"{path}: a table is written as .csv, .parquet or .arrow, not '{path.suffix}'")
+    arrow = to_arrow(table)
+    try:
+        with whole_file(path) as temporary:
+            if kind == ".csv":
+                pa.csv.write_csv(arrow, temporary, pa.csv.WriteOptions(quoting_style="needed"))
+            elif kind == ".parquet":
+                pa.parquet.write_table(arrow, temporary, compression="zstd")
+            else:
+                with (
+                    pa.OSFile(temporary, "wb") as f,
+                    pa.ipc.new_file(
+                        f, arrow.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")
+                    ) as writer,
+                ):
+                    writer.write_table(arrow)
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+
+
+def to_arrow(table: Table) -> pa.Table:
+    """Return the table as Arrow: `t` first, float64, null for a missing sample, `meta` as metadata."""
+    arrays = {"t": table.t, **table.columns}
+    arrow = pa.table(
+        {k: pa.array(np.asarray(v, dtype=np.float64), from_pandas=True) for k, v in arrays.items()}
+    )
+    return arrow.replace_schema_metadata(table.meta or None)
+
+
+class whole_file:  # noqa: N801 used as a function
+    """A temporary file beside `path` that takes its name when the block ends well and vanishes otherwise."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __enter__(self) -> str:
+        fd, self.temporary = tempfile.mkstemp(prefix=f".{self.path.name}.", dir=self.path.parent)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.fchmod(fd, 0o666 & ~umask)
+        os.close(fd)
+        return self.temporary
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            os.replace(self.temporary, self.path)
+        else:
+            os.unlink(self.temporary)
+
+
+def _checked(path: Path, raw: _Raw) -> Table:
+    columns = dict(raw.columns)
+    clock = _clock(columns)
+    if clock is None:
+        raise InputError(
+            f"{path}: no column 't' (time in seconds); the columns are {', '.join(columns) or 'none'}"
+        )
+    t = columns[clock] if clock == "t_s" else columns.pop("t")
+    if len(t) == 0:
+        raise InputError(f"{path}: no rows; at least one sample was expected")
+    for name, values in (("t", t), *columns.items()):
+        bad = np.isinf(values) if name != "t" else ~np.isfinite(values)
+        if bad.any():
+            row = int(bad.argmax())
+            what = "the time is missing" if np.isnan(values[row]) else "an infinite value"
+            raise InputError(
+                f"{raw.place(row)}: column '{name}': {what}; a finite number was expected"
+                + ("" if name == "t" else " (leave the cell empty where a sample is missing)")
+            )
+    still = np.diff(t) <= 0
+    if still.any():
+        row = int(still.argmax()) + 1
+        what = "stands twice" if t[row] == t[row - 1] else f"runs backwards from {t[row - 1]:.17g}"
+        raise InputError(
+            f"{raw.place(row)}: the time {t[row]:.17g} {what}; strictly increasing seconds were expected"
+        )
+    return Table(path.stem, str(path), t, columns, raw.meta)
+
+
+def _clock(names: Iterable[str]) -> str | None:
+    names = set(names)
+    return "t" if "t" in names else "t_s" if "t_s" in names else None
+
+
+def _limit(path: Path, rows: int, columns: int) -> None:
+    if rows * columns > MAX_CELLS:
+        raise InputError(
+            f"{path}: {rows} rows x {columns} columns; at most {MAX_CELLS} cells are read at once: "
+            "name fewer columns or cut the recording (thermoctl recordings export --from --to)"
+        )
+
+
+def _picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
+    """Return the time column and those asked for."""
+    if want is None:
+        return names
+    for name in want:
+        if name not in names:
+            raise InputError(
+                f"{path}: no column '{name}'{suggest(name, names)}; the columns are {', '.join(names)}"
+            )
+    return [n for n in names if n in want or n == _clock(names)]
+
+
+# ------------------------------------------------------------------------------------------------------- CSV
+def _read_csv(path: Path, want: list[str] | None) -> _Raw:
+    if path.stat().st_size > MAX_CSV_BYTES:
+        raise InputError(
+            f"{path}: {path.stat().st_size} bytes; a CSV file of at most {MAX_CSV_BYTES} was expected "
+            "(convert it to Parquet)"
+        )
+    data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    bare = _COMMENT.sub(b"", data) if b"#" in data else data
+    bare = bare.lstrip(b"\r\n")
+    head, _, body = bare.partition(b"\n")
+    names = _header(path, head)
+    columns = None
+    if body.strip():
+        chosen = _picked(path, names, want)
+        _limit(path, body.count(b"\n"), len(chosen))
+        try:
+            arrow = pa.csv.read_csv(
+                pa.BufferReader(body),
+                pa.csv.ReadOptions(column_names=names),
+                convert_options=pa.csv.ConvertOptions(
+                    column_types=dict.fromkeys(names, pa.float64()), null_values=_MISSING, check_utf8=False
+                ),
+            )
+            columns = {n: _numpy(arrow[n]) for n in chosen}
+        except pa.ArrowInvalid:
+            columns = None  # the exact place, or what Arrow refuses and Python reads: below
+    if columns is None:
+        columns = _slow_csv(path, data, names)
+        columns = {n: columns[n] for n in _picked(path, names, want)}
+    return _Raw(columns, {}, lambda row: f"{path}:{_csv_line(data, row)}")
+
+
+def _header(path: Path, head: bytes) -> list[str]:
+    if not head.strip():
+        raise InputError(f"{path}: the file is empty; a header line with the column names was expected")
+    try:
+        names = [n.strip() for n in next(csv.reader([head.decode("utf-8")], strict=True))]
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(
+            f"{path}: the header line is not text; a CSV file with the column names first was expected"
+        ) from None
+    for i, name in enumerate(names):
+        if not name:
+            raise InputError(f"{path}: column {i + 1} of {len(names)} has no name in the header")
+        if name in names[:i]:
+            raise InputError(f"{path}: the column '{name}' stands twice in the header")
+    if len(names) == 1 and _clock(names) is None and re.search(r"[;\t|]", names[0]):
+        raise InputError(
+            f"{path}: the header has no comma ('{names[0][:60]}'); comma-separated columns were expected"
+        )
+    return names
+
+
+def _csv_rows(data: bytes) -> Iterable[tuple[int, list[str]]]:
+    """(line counted from 1, cells) of the header and each row, without comments and empty lines."""
+    lines = io.StringIO(data.decode("utf-8", errors="replace"), newline="")
+    number = 0
+
+    def counted() -> Iterable[str]:
+        nonlocal number
+        for line in lines:
+            number += 1
+            if line.strip("\r\n") and not line.lstrip(" \t").startswith("#"):
+                yield line
+
+    for cells in csv.reader(counted()):
+        yield number, cells
+
+
+def _csv_line(data: bytes, row: int) -> int:
+    for i, (line, _) in enumerate(_csv_rows(data)):
+        if i == row + 1:
+            return line
+    return row + 2
+
+
+def _slow_csv(path: Path, data: bytes, names: list[str]) -> dict[str, np.ndarray]:
+    """Cell by cell, for the exact place of what is wrong."""
+    values: list[list[float]] = []
+    for i, (line, cells) in enumerate(_csv_rows(data)):
+        if i == 0:
+            continue
+        if len(cells) != len(names):
+            raise InputError(
+                f"{path}:{line}: {len(cells)} cells; {len(names)} as in the header were expected"
+            )
+        numbers = []
+        for name, cell in zip(names, cells, strict=True):
+            try:
+                if "_" in cell:
+                    raise ValueError
+                numbers.append(float(cell) if cell.strip() else np.nan)
+            except ValueError:
+                raise InputError(
+                    f"{path}:{line}: column '{name}': '{cell[:40]}' stands where a number belongs "
+                    "(leave the cell empty where a sample is missing)"
+                ) from None
+        values.append(numbers)
+    return dict(zip(names, np.array(values, dtype=np.float64).reshape(-1, len(names)).T.copy(), strict=True))
+
+
+# -------------------------------------------------------------------------------------------- Parquet, Arrow
+def _numpy(column: pa.ChunkedArray) -> np.ndarray:
+    return np.ascontiguousarray(column.to_numpy(), dtype=np.float64)
+
+
+def _from_arrow(path: Path, arrow: pa.Table, want: list[str] | None) -> _Raw:
+    names = arrow.column_names
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise InputError(f"{path}: the column '{name}' stands twice")
+    columns = {}
+    for name in _picked(path, names, want):
+        column, kind = arrow[name], arrow.schema.field(name).type
+        if not (
+            pa.types.is_integer(kind)
+            or pa.types.is_floating(kind)
+            or pa.types.is_boolean(kind)
+            or pa.types.is_decimal(kind)
+            or pa.types.is_null(kind)
+        ):
+            row, value = next(((i, v.as_py()) for i, v in enumerate(column) if v.is_valid), (0, None))
+            raise InputError(
+                f"{path}: row {row + 1}: column '{name}': {str(value)[:40]!r} ({kind}) stands where a "
+                "number belongs" + (" (seconds)" if name == "t" else "")
+            )
+        columns[name] = _numpy(column.cast(pa.float64(), safe=False))
+    meta = {
+        k.decode(errors="replace"): v.decode(errors="replace")
+        for k, v in (arrow.schema.metadata or {}).items()
+        if k not in (b"pandas", b"ARROW:schema")
+    }
+    return _Raw(columns, meta, lambda row: f"{path}: row {row + 1}")
+
+
+def _read_parquet(path: Path, want: list[str] | None) -> _Raw:
+    with pa.parquet.ParquetFile(path) as f:
+        names = f.schema_arrow.names
+        chosen = _picked(path, names, want)
+        _limit(path, f.metadata.num_rows, len(chosen))
+        return _from_arrow(path, f.read(columns=chosen) if len(set(names)) == len(names) else f.read(), want)
+
+
+def _read_arrow(path: Path, want: list[str] | None) -> _Raw:
+    """Return an IPC file, or an IPC stream up to where it was cut (a recorder that lost power leaves one)."""
+    with pa.memory_map(str(path)) as source:
+        if source.size() >= 6 and source.read(6) == b"ARROW1":
+            with pa.ipc.open_file(source) as f:
+                rows = sum(f.get_batch(i).num_rows for i in range(f.num_record_batches))
+                _limit(path, rows, len(_picked(path, f.schema.names, want)))
+                return _from_arrow(path, f.read_all(), want)
+    stream = open_stream(path, want and [*want, "t", "t_s"])
+    batches, rows = [], 0
+    for batch in stream:
+        rows += batch.num_rows
+        _limit(path, rows, batch.num_columns)
+        batches.append(batch)
+    schema = stream.schema
+    return _from_arrow(path, pa.Table.from_batches(batches, schema), want)
+
+
+def _read_mdf(path: Path, want: list[str] | None) -> _Raw:
+    return _foreign(path, formats.read_mdf(path), want)
+
+
+def _read_tdms(path: Path, want: list[str] | None) -> _Raw:
+    return _foreign(path, formats.read_tdms(path), want)
+
+
+def _foreign(path: Path, columns: dict[str, np.ndarray], want: list[str] | None) -> _Raw:
+    return _Raw(
+        {n: columns[n] for n in _picked(path, list(columns), want)}, {}, lambda row: f"{path}: row {row + 1}"
+    )
+
+
+_READERS: dict[str, Callable[[Path, list[str] | None], _Raw]] = {
+    ".csv": _read_csv,
+    ".parquet": _read_parquet,
+    ".arrow": _read_arrow,
+    ".arrows": _read_arrow,
+    ".feather": _read_arrow,
+    ".mf4": _read_mdf,
+    ".mdf": _read_mdf,
+    ".tdms": _read_tdms,
+}
+FORMATS = ", ".join(_READERS)
