@@ -164,3 +164,10 @@ fuzz: install                      # FUZZ_S seconds for each that reads bytes fr
 	-$(BIN)/python -m pip install --quiet --editable '.[fuzz]'
 	if $(BIN)/python -c "import atheris" 2>/dev/null; then for target in $(TARGETS); do \
 		$(BIN)/python -m tests.fuzz.targets $$target --atheris --seconds $(FUZZ_S) || exit 1; done; fi
+
+.PHONY: scenarios armed-hour
+scenarios: install                 # every fault scenario at the wire, twice, idle and loaded (about 20 minutes); docs/proof/scenarios.md
+	$(BIN)/python -m tests.scenarios.run --page docs/proof/scenarios.md
+
+armed-hour: install                # both rigs armed for an hour of real time on slow, lossy Modbus; docs/proof/armed-hour.md
+	$(BIN)/python -m tests.scenarios.armed_hour --page docs/proof/armed-hour.md
