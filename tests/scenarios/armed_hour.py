@@ -107,7 +107,7 @@ def _watch(rigs: Rigs, seconds: float) -> tuple[bool, str]:
         slips = daemon.ask("status").get("slips")
         lines.append(
             f"| {name} | {(time.monotonic() - begin) / 60:.1f} min | {seen['asked']} | {seen['lost']} | {moves} | {slips} | {stood} | "
-            f"{', '.join(sorted(warned[name])) or 'none'} | {'**' + wrong + '**' if wrong else 'driven throughout'} |"
+            f"{', '.join(sorted(warned[name])) or 'none'} | {'**' + wrong + '**' if wrong else 'no other trip' if stood else 'driven throughout'} |"
         )
     return not wrong, "\n".join(lines)
 
