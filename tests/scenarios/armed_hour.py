@@ -133,7 +133,7 @@ def main() -> int:
             f"{1 / LOSS:.0f} is lost. Limits are those of config/wire.yaml. Readings of these devices may be {STALE_S:g} s old, "
             "since two slow answers and a lost one take that long. The stage moves every 20 s. The coil is watched behind "
             f"the wire every millisecond. Where the machine stood still (the emulators fell silent, or loop_late) the rig is armed "
-            "again and this is counted.\n\n{head}{lines}\n"
+            f"again and this is counted.\n\n{head}{lines}\n"
         )
     return 0 if good else 1
 
