@@ -181,3 +181,10 @@ fuzz: develop                      # drivers behind their ports for an hour's fr
 	-$(call listed,p['project']['optional-dependencies']['fuzz']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	if $(BIN)/python -c "import atheris" 2>/dev/null; then for target in $(TARGETS); do \
 		$(BIN)/python -m tests.fuzz.targets $$target --atheris --seconds $(FUZZ_S) || exit 1; done; fi
+
+.PHONY: scenarios armed-hour
+scenarios: install                 # every fault scenario at the wire, twice, idle and loaded (about 20 minutes); docs/proof/scenarios.md
+	$(BIN)/python -m tests.scenarios.run --page docs/proof/scenarios.md
+
+armed-hour: install                # both rigs armed for an hour of real time on slow, lossy Modbus; docs/proof/armed-hour.md
+	$(BIN)/python -m tests.scenarios.armed_hour --page docs/proof/armed-hour.md

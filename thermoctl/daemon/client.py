@@ -74,6 +74,8 @@ def status(config: str, as_json: bool = False) -> int:
         f"busy {answer['busy_us']:.0f} us"
     )
     print("\n".join([*fault_lines(answer["faults"]), *value_lines(answer)]))
+    for line in answer.get("slow", ()):
+        print(line)
     if answer.get("tuning_percent") is not None:
         print(f"tuning of the expansion model: {answer['tuning_percent']:.0f} % of the excitation seen")
     if answer["recorder"]["lost"]:
@@ -160,6 +162,7 @@ def doctor(config: str, seconds: float = 2.0) -> int:
 
     Then what of the machine decides how late a tick may come, with remedies (docs/how-to/real-time.md); that is advice."""
     from hal.backend import OK, ROLES, STATUS_NAMES, HardwareError, make_backend
+    from thermoctl.daemon.arrival import expected_hz, slow
     from thermoctl.daemon.doctor import real_time_checks
     from thermoctl.daemon.loop import become_real_time
     from thermoctl.signals import SIGNALS
@@ -171,12 +174,14 @@ def doctor(config: str, seconds: float = 2.0) -> int:
     units = {s.name: s.unit for s in SIGNALS}
     try:
         backend.open()
-        counts = dict.fromkeys(ROLES, 0)
+        counts, looks = dict.fromkeys(ROLES, 0), 0
+        expected = expected_hz(settings)
         begin = now = time.monotonic()
         while now < begin + seconds:
             sample = backend.read(now)
             for role, fresh in zip(ROLES, sample.fresh, strict=True):
                 counts[role] += int(fresh)
+            looks += 1
             backend.write(0.0, False)  # a drive answers to its SYNC; it stays disabled
             time.sleep(settings.loop.period_s)
             now = time.monotonic()
@@ -188,7 +193,8 @@ def doctor(config: str, seconds: float = 2.0) -> int:
                 continue
             bad += sample.status[k] != OK
             unit = units.get("position_raw_um" if role == "position_um" else role, "")
-            problem = f"   {backend.problem(role)}" if sample.status[k] != OK else ""
+            said = backend.problem(role) or slow(role, counts[role] / seconds, expected, looks / seconds)
+            problem = f"   {said}" if said else ""
             print(
                 f"{role:24}{sample.value[k]:14.4f} {unit:8}{state:8}{counts[role] / seconds:7.1f} Hz{problem}"
             )

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.control import arming, faults
-from thermoctl.daemon import readings
+from thermoctl.daemon import arrival, readings
 from thermoctl.daemon.loop import RELOAD
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
 from thermoctl.signals import INDEX, POINTS, SIGNALS
@@ -158,6 +158,7 @@ class Commands:
     ):
         self.shared, self.settings, self.started = shared, settings, settings
         self.reload_settings, self.log = reload_settings, log
+        self.expected_hz = arrival.expected_hz(settings)
 
     def answer(self, line: bytes, peer: str) -> dict[str, Any]:
         """The answer to one request line; never raises for what a client sent."""
@@ -169,7 +170,8 @@ class Commands:
             return {"ok": False, "error": f"not a request: {e}"}
         name = request["command"]
         if name == "status":
-            return {"ok": True, **status(self.shared)}
+            slow = arrival.slow_readings(self.shared, self.expected_hz)
+            return {"ok": True, **status(self.shared), "slow": slow}
         if name == "latency":
             return {"ok": True, **latency(self.shared, self.settings.loop.period_s)}
         if name == "signals":

@@ -1,0 +1,54 @@
+"""How many readings a second arrive, against `rate_hz` of the devices' profiles.
+
+A sensor that sends at a tenth of its rate passes every check of age that a slow machine needs. Its readings are then
+older than the control loop and the limits on jumps assume, so `thermoctl doctor` and `thermoctl status` compare both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from thermoctl.control.faults import CHANNELS
+from thermoctl.daemon.shared import Shared
+from thermoctl.signals import INDEX
+
+SLOW_SHARE = 0.5  # of rate_hz: below it a reading is called slow; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3
+LOOK_ROWS = 4000  # ticks of the record that `status` counts over
+FEWEST = 10  # readings that must have been due in that time
+
+
+def expected_hz(settings: Any) -> dict[str, float]:
+    """The profile's rate of each role, Hz; empty for back ends without devices. Raises InputError."""
+    if settings.hal.backend != "devices":
+        return {}
+    from hal.devices import make_devices
+
+    return {b.role: b.channel.rate_hz for d in make_devices(settings) for b in d.binding.bounds}
+
+
+def slow(role: str, found_hz: float, expected: Mapping[str, float], looks_hz: float) -> str:
+    """What to say where `role` arrives too slowly, else ''. looks_hz: how often it was looked for; more cannot be seen."""
+    due_hz = min(expected.get(role, 0.0), looks_hz)
+    if found_hz >= SLOW_SHARE * due_hz:
+        return ""
+    return (
+        f"slow, {found_hz:.3g} of {expected[role]:.4g} Hz arrive: set the device faster, "
+        "or rate_hz in its profile to what it can do"
+    )
+
+
+def slow_readings(shared: Shared, expected: Mapping[str, float]) -> list[str]:
+    """A line for each reading that arrived too slowly in the last LOOK_ROWS ticks and is not lost altogether."""
+    rows, _, _ = shared.ring.read(max(0, shared.ring.head - LOOK_ROWS))
+    if len(rows) < 2:
+        return []
+    seconds = rows[-1, INDEX["t_s"]] - rows[0, INDEX["t_s"]]
+    fresh, status = (rows[:, INDEX[name]].astype("i8") for name in ("fresh_bits", "status_bits"))
+    lines = []
+    for c, role in enumerate(CHANNELS):
+        if role in expected and expected[role] * seconds >= FEWEST and not (status >> 2 * c & 3).any():
+            found_hz = (fresh >> c & 1).sum() / seconds
+            if said := slow(role, found_hz, expected, len(rows) / seconds):
+                lines.append(f"{role}: {said}")
+    return lines
