@@ -519,10 +519,11 @@ def _together(settings: Settings, root: Node) -> None:
             raise place("protection", "high").error(
                 f"protection.high.{name} must be above protection.low.{name}"
             )
-    for name in ("supply_v", "amplifier_state", "amplifier_fault"):
+    for name in ("amplifier_state", "amplifier_fault"):
         if name in protection.frozen_s:
             raise place("protection", "frozen_s").error(
-                f"protection.frozen_s.{name}: what an amplifier reports stands still when all is well; take it out"
+                f"protection.frozen_s.{name}: it stands still when all is well; supply_v, an analogue reading of the same "
+                "frame, shows that the amplifier repeats an old one"
             )
     needed = {"simulated": "plant", "devices": "devices", "replay": "recording"}[hal.backend]
     if not getattr(hal, needed):

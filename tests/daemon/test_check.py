@@ -48,7 +48,7 @@ def test_check_says_where_the_power_is_unknown(config, capsys, pairs, lacks):
 @pytest.mark.parametrize(
     "old,new,message",
     [
-        ("frozen_s: {", "frozen_s: {supply_v: 1, ", "protection.frozen_s.supply_v"),
+        ("frozen_s: {", "frozen_s: {amplifier_state: 1, ", "protection.frozen_s.amplifier_state"),
         ("state: amplifier_state, ", "", "a drive needs its status word"),
     ],
 )

@@ -309,7 +309,7 @@ class Law:
         self.compensate_on, self.bound_um, self.slew_um_s = p.compensate > 0.0, p.bound_um, p.slew_um_s
         self.low, self.high, self.rate = p.low.copy(), p.high.copy(), p.rate.copy()
         self.stale_s, self.frozen_s, self.required = p.stale_s.copy(), p.frozen_s.copy(), p.required.copy()
-        self.frozen_s[_SUPPLY:] = np.inf  # an amplifier's words stand still when all is well
+        self.frozen_s[_AMPLIFIER_STATE:] = np.inf  # an amplifier's words stand still when all is well
         self.following_um, self.following_limit_s = p.following_um, p.following_s
         self.coil_limit_c = p.coil_limit_c
         self.coil_rate_limit, self.coil_rate_time_s = p.coil_rate_k_s, p.coil_rate_time_s
@@ -471,6 +471,8 @@ class Law:
                 kind = _K_ERROR
                 while self.verdict[c] > 1.0 + kind:
                     kind += 1
+                if kind == _K_FROZEN and c >= _SUPPLY:  # an amplifier that repeats an old answer gives no new one;
+                    kind = _K_STALE  # the bit of amplifier_frozen is amplifier_stopped's
                 bit = one << (self.group[c] * _KINDS + kind)
                 self.faults |= bit
                 if self.required[c] > 0.0:
