@@ -471,7 +471,9 @@ class Law:
                 kind = _K_ERROR
                 while self.verdict[c] > 1.0 + kind:
                     kind += 1
-                if kind == _K_FROZEN and c >= _SUPPLY:  # an amplifier that repeats an old answer gives no new one;
+                if (
+                    kind == _K_FROZEN and c >= _SUPPLY
+                ):  # an amplifier that repeats an old answer gives no new one;
                     kind = _K_STALE  # the bit of amplifier_frozen is amplifier_stopped's
                 bit = one << (self.group[c] * _KINDS + kind)
                 self.faults |= bit
