@@ -23,6 +23,10 @@ from hal.profile import CRCS, FIELD_TYPES
 EXTENDED = 0x80000000
 """Bit 31 of an identifier: it has 29 bits. An 11-bit identifier of the same number is another one."""
 
+cdef extern from "<sys/ioctl.h>" nogil:
+    unsigned long FIONREAD
+    int ioctl(int fd, unsigned long request, int *number)
+
 cdef extern from "<poll.h>" nogil:
     cdef struct pollfd:
         int fd
@@ -84,8 +88,15 @@ cpdef bint wait_readable(int fd, int64_t until_ns) except -1:
 
 
 cdef int _read(int fd, uint8_t *to, int size) except -1:
-    """Bytes that have arrived, 0 when none has. Raises OSError when the other end is gone."""
-    cdef int got = <int>c_read(fd, to, size)
+    """Bytes that have arrived, 0 when none has. Raises OSError when the other end is gone.
+
+    A terminal is asked first: to read an empty one waits, even without blocking, for the kernel's worker that moves
+    bytes to it. On a busy machine that worker comes tens of milliseconds late, and the tick with it.
+    """
+    cdef int there = 1, got
+    if ioctl(fd, FIONREAD, &there) == 0 and there == 0:
+        return 0
+    got = <int>c_read(fd, to, size)
     if got > 0:
         return got
     if got < 0 and (c_errno == EAGAIN or c_errno == EINTR):

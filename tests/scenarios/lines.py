@@ -7,9 +7,12 @@ encoders cannot hide one in our decoders.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pty
 import socket
+import struct
+import termios
 import tty
 from pathlib import Path
 
@@ -33,6 +36,12 @@ def modbus_crc(data: bytes) -> bytes:
     for byte in data:
         crc = crc >> 8 ^ _TABLE[(crc ^ byte) & 0xFF]
     return bytes((crc & 0xFF, crc >> 8))
+
+
+def waiting(fd: int) -> int:
+    """Bytes that can be read from a terminal. To read or select an empty one waits for a worker of the kernel, which a
+    busy machine runs tens of milliseconds late."""
+    return int(struct.unpack("i", fcntl.ioctl(fd, termios.FIONREAD, bytes(4)))[0])
 
 
 class Pty:
@@ -62,7 +71,7 @@ class Pty:
 
     def read(self) -> bytes:
         """What has arrived; nothing while nobody has the port open."""
-        if self.fd < 0:
+        if self.fd < 0 or not waiting(self.fd):
             return b""
         try:
             return os.read(self.fd, 4096)
@@ -74,6 +83,25 @@ class Pty:
         if self.fd >= 0 and data:
             with contextlib.suppress(OSError):
                 os.write(self.fd, data)
+
+
+class Canary:
+    """A terminal with both ends here: how late its bytes come is how late the kernel moves those of the others."""
+
+    def __init__(self) -> None:
+        self.master, self.slave = pty.openpty()
+        tty.setraw(self.slave)
+        self.sent_s = -1.0
+
+    def late_s(self, now_s: float) -> float:
+        """Age of the byte that has not yet come, 0 without one; the next one is sent when it has."""
+        if self.sent_s >= 0.0 and not waiting(self.slave):
+            return now_s - self.sent_s
+        if self.sent_s >= 0.0:
+            os.read(self.slave, 1)
+        os.write(self.master, b".")
+        self.sent_s = now_s
+        return 0.0
 
 
 class TcpPort:
