@@ -21,12 +21,15 @@ import numpy as np
 
 from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample
 from thermoctl.plant import load
+from thermoctl.plant.language import SensorNoise
+from thermoctl.plant.sensor import SlowError
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 MAX_CATCH_UP = (
     1000  # periods in one read; a clock that jumps further (suspend) moves the plant's time instead
 )
+SLOWEST_S = 3600.0  # longest time constant of a simulated 1/f error: below 1/h it is part of the offset
 _STATE = ROLE["amplifier_state"]
 EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
 
@@ -121,7 +124,13 @@ class PlantRig:
                 f"(outputs: {', '.join(model.outputs)})"
             )
         outputs = [plant.outputs[n] for n in model.outputs]
-        self._noise = [o.noise or 0.0 for o in outputs] + [s.noise for _, s in self._surroundings]
+        self._noise = [o.noise.white if isinstance(o.noise, SensorNoise) else o.noise or 0.0 for o in outputs]
+        self._noise += [s.noise for _, s in self._surroundings]
+        self._slow = {
+            i: SlowError(o.noise, period_s, SLOWEST_S, np.random.default_rng([seed, i]))
+            for i, o in enumerate(outputs)
+            if isinstance(o.noise, SensorNoise)
+        }
         self._resolution = [o.resolution or 0.0 for o in outputs] + [
             s.resolution for _, s in self._surroundings
         ]
@@ -157,6 +166,8 @@ class PlantRig:
         """What sensor number i makes of a true value: noise added, rounded to its resolution."""
         if self._noise[i]:
             value += self._noise[i] * self._draw()
+        if i in self._slow:
+            value += self._slow[i].at(self.stepper.t)
         step = self._resolution[i]
         return round(value / step) * step if step else value
 

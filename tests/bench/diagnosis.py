@@ -360,9 +360,9 @@ def placed(job: prove.Job, answer: Mapping[str, Any], row: scoring.Row, suspect:
 def noise_of(job: prove.Job) -> dict[str, float]:
     """What the truth would leave, for answers that do not tell: the sensors' noise as the plant file has it."""
     return {
-        o.name: float(np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12)))
+        o.name: float(np.hypot(o.noise_sd, (o.resolution or 0.0) / np.sqrt(12)))
         for o in load(job.plant).outputs.values()
-        if o.noise
+        if o.noise_sd
     }
 
 

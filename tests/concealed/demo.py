@@ -166,7 +166,7 @@ def unseen(plant_file: Path, recording: Path) -> dict[str, float]:
     drive = model.excitation(read_table(recording))
     found = fit(model, [drive])
     noise = {
-        o.name: float(np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12)))
+        o.name: float(np.hypot(o.noise_sd, (o.resolution or 0.0) / np.sqrt(12)))
         for o in plant.outputs.values()
     }
     return {o: r / noise[o] for o, r in found.rms().items() if np.isfinite(r) and noise[o]}

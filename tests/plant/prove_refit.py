@@ -89,7 +89,7 @@ def one(plant, model, rng, colour, **size):
     for j, o in enumerate(plant.outputs.values()):
         white = rng.normal(size=len(clean))
         white[0] /= np.sqrt(1 - phi**2)
-        y = clean[:, j] + o.noise * np.sqrt(1 - phi**2) * lfilter([1.0], [1.0, -phi], white)
+        y = clean[:, j] + o.noise_sd * np.sqrt(1 - phi**2) * lfilter([1.0], [1.0, -phi], white)
         drive.y[:, j] = np.round(y / o.resolution) * o.resolution if o.resolution else y
     drive.scale = None
     found = fit(model, [drive])

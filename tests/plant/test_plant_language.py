@@ -85,7 +85,7 @@ def test_good_file_survives_a_round_trip():
         (("flows", "T"), {"from": "T", "rate": "G * (T - air)"}, "T"),  # a name used twice
         (("nodes", "sin"), {"storage": 1, "initial": 0}, "sin"),
         (("nodes", "2x"), {"storage": 1, "initial": 0}, "name"),
-        (("nodes", "T", "storage"), "air * C", "storage"),
+        (("nodes", "T", "storage"), "t * C", "storage"),
         (("nodes", "T", "initial"), "T", "initial"),
         (("outputs", "y", "noise"), "some", "noise"),
         (("flows",), [1, 2], "flows"),

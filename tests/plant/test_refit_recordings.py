@@ -70,7 +70,9 @@ def errors(folder, runs, judged, how):
     for shift in (dx0, None):
         e = (
             whole.y
-            - fixed.run(fixed.prepare(fixed.drive(read_table(folder / f"run_{judged}.csv"))), None, shift).y
+            - fixed.run(
+                fixed.prepare(fixed.excitation(read_table(folder / f"run_{judged}.csv"))), None, shift
+            ).y
         )[skip:]
         both.append(dict(zip(model.outputs, np.sqrt(np.nanmean(e**2, axis=0)), strict=True)))
     return both

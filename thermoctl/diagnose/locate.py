@@ -361,7 +361,8 @@ def missing_flow(metric: Metric, node: str, signals: dict[str, list[np.ndarray]]
     for r, d in enumerate(metric.drives):
         known = dict(zip(metric.model.parameters, map(float, metric.fit.values[r]), strict=True))
         mean_x = dict(zip(metric.model.states, metric.runs[r].x.mean(axis=0), strict=True))
-        c = float(ex.evaluate(storage, {**known, **mean_x}))
+        mean_u = dict(zip(metric.model.inputs, d.u.mean(axis=0), strict=False))
+        c = float(ex.evaluate(storage, {**known, **mean_u, **mean_x}))
         edges = np.linspace(d.t[0], d.t[-1], FINE)
         part = q[r * FINE : (r + 1) * FINE] * c
         times.append(edges)

@@ -119,7 +119,7 @@ def still(
 
     def read(y: np.ndarray, name: str) -> np.ndarray:
         o = p.outputs[name]
-        return np.round((y + (o.noise or 0.0) * rng.standard_normal(y.shape)) / (o.resolution or 1e-9)) * (
+        return np.round((y + o.noise_sd * rng.standard_normal(y.shape)) / (o.resolution or 1e-9)) * (
             o.resolution or 1e-9
         )
 

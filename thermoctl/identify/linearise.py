@@ -111,7 +111,7 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
     a = values([ex.derivative(growth, n) for n in nodes], point)
     air = float(a.sum()) + float(ex.evaluate(ex.derivative(growth, inputs[AIR]), point))
     variance = np.array(
-        [(outputs[c].noise or 0.0) ** 2 + (outputs[c].resolution or 0.0) ** 2 / 12 for c in TEMPERATURES]
+        [outputs[c].noise_sd ** 2 + (outputs[c].resolution or 0.0) ** 2 / 12 for c in TEMPERATURES]
     )
     capacity = values(capacities, point)
     return Thermal(A, one_watt - rest, C, a, air, capacity, np.where(variance > 0, variance, 1e-4))

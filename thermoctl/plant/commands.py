@@ -92,7 +92,7 @@ def ahead(model: Model, excitation: Excitation, horizon_s: float) -> tuple[np.nd
     p = model.vector(None, excitation.name)
     noise = np.array(
         [
-            np.hypot(o.noise or 0.0, (o.resolution or 0.0) / 12**0.5)
+            np.hypot(o.noise_sd, (o.resolution or 0.0) / 12**0.5)
             or 1e-3 * np.nanstd(excitation.y[:, j])
             or 1e-9
             for j, o in enumerate(model.plant.outputs.values())

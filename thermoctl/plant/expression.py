@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -162,6 +163,8 @@ def parse(text: str | int | float) -> Expr:
     if isinstance(text, bool) or not isinstance(text, (str, int, float)):
         raise ExpressionError(f"an expression was expected, not {text!r}")
     if not isinstance(text, str):
+        if not abs(text) <= sys.float_info.max:
+            raise ExpressionError(f"the number {str(text)[:12]} is too large or not a number")
         return num(text)
     if len(text) > MAX_LENGTH:
         raise ExpressionError(f"an expression of {len(text)} characters; at most {MAX_LENGTH} are read")
@@ -188,6 +191,8 @@ def parse(text: str | int | float) -> Expr:
     for _ in range(MAX_LEVELS):
         level = [a for e in level for a in e.args]
         if not level:
+            if any(e.op == "num" and not math.isfinite(e.value) for e in walk(result)):
+                raise ExpressionError("a sum or product of numbers in it is too large")
             return result
     raise ExpressionError(f"more than {MAX_LEVELS} terms or factors in a row: put some of them in brackets")
 
@@ -413,9 +418,8 @@ def _text(e: Expr, outer: int) -> str:
     elif e.op == "**":
         text = f"{_text(e.args[0], p + 1)}**{_text(e.args[1], p)}"
     else:
-        right = p if e.op in ("+", "*") else p + 1
         left = p + 1 if e.op in COMPARISONS else p  # a comparison of a comparison needs its brackets
-        text = f"{_text(e.args[0], left)} {e.op} {_text(e.args[1], right)}"
+        text = f"{_text(e.args[0], left)} {e.op} {_text(e.args[1], p + 1)}"
     return f"({text})" if p < outer else text
 
 

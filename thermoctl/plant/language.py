@@ -9,13 +9,57 @@ at fault and what is allowed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from thermoctl.plant.expression import Expr
 
 FORMAT = "thermoctl-plant/1"
+ROLES = (
+    "ambient",
+    "temperature",
+    "position",
+    "velocity",
+    "current",
+    "voltage",
+    "setpoint",
+    "level",
+    "time_of_day",
+)
+"""What a quantity may be, where its unit does not say."""
+FLICKER_DECADES = 4  # 20 000 samples: from one over the recording's length to half the sampling rate
+
+
+def _place() -> Any:
+    """Return the field 'line:column' of an item's entry in its file, for messages; it takes no part in ==."""
+    return field(default="0:0", compare=False)
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """A sensor's random error in its unit: a white part, and a slow part of first order or 1/f.
+
+    `white` and `drift` are standard deviations and `time` is the time constant of `drift` in seconds.
+    `flicker` is the standard deviation of the 1/f part over one decade of frequency. `sd` is the standard
+    deviation of the logarithm of all of them: how well the noise is known."""
+
+    white: float
+    drift: float | None = None
+    time: float | None = None
+    flicker: float | None = None
+    sd: float | None = None
+
+    def __str__(self) -> str:
+        slow = f", drift {self.drift:g} over {self.time:g} s" if self.drift is not None else ""
+        slow += f", flicker {self.flicker:g}" if self.flicker is not None else ""
+        return f"{self.white:g}{slow}"
+
+    @property
+    def total(self) -> float:
+        """Return the standard deviation of all parts together, the 1/f part over FLICKER_DECADES."""
+        return math.hypot(self.white, self.drift or 0.0, (self.flicker or 0.0) * math.sqrt(FLICKER_DECADES))
 
 
 @dataclass(frozen=True)
@@ -26,7 +70,8 @@ class Input:
     unit: str | None = None
     column: str = ""
     linear: bool = False
-    line: int = 0
+    role: str | None = None
+    at: str = _place()
 
 
 @dataclass(frozen=True)
@@ -39,7 +84,7 @@ class Parameter:
     range: tuple[float, float] | None = None
     per_recording: bool = False
     values: Mapping[str, float] = field(default_factory=dict)
-    line: int = 0
+    at: str = _place()
 
 
 @dataclass(frozen=True)
@@ -51,7 +96,8 @@ class Node:
     initial: Expr
     unit: str | None = None
     initial_sigma: float | None = None
-    line: int = 0
+    role: str | None = None
+    at: str = _place()
 
 
 @dataclass(frozen=True)
@@ -63,20 +109,26 @@ class Flow:
     source: str | None = None
     target: str | None = None
     unit: str | None = None
-    line: int = 0
+    at: str = _place()
 
 
 @dataclass(frozen=True)
 class Output:
-    """What a sensor would read; `noise` is its random error's standard deviation, `resolution` its step."""
+    """What a sensor would read; `noise` is its random error (a number: white), `resolution` its step."""
 
     name: str
     value: Expr
     unit: str | None = None
     column: str = ""
-    noise: float | None = None
+    noise: float | SensorNoise | None = None
     resolution: float | None = None
-    line: int = 0
+    role: str | None = None
+    at: str = _place()
+
+    @property
+    def noise_sd(self) -> float:
+        """Return the total standard deviation of the random error, in `unit`; 0 where none is stated."""
+        return self.noise.total if isinstance(self.noise, SensorNoise) else self.noise or 0.0
 
 
 @dataclass(frozen=True)
@@ -89,7 +141,7 @@ class Plant:
     nodes: Mapping[str, Node]
     flows: Mapping[str, Flow]
     outputs: Mapping[str, Output]
-    file: str = "<plant>"
+    file: str = field(default="<plant>", compare=False)
 
     def plain(self) -> dict[str, Any]:
         """Return plain dicts and lists, as the file holds them; `files.from_plain` reads them back."""
@@ -111,7 +163,8 @@ def _given(**items: Any) -> dict[str, Any]:
 
 def _input(i: Input) -> dict[str, Any]:
     column = None if i.column == i.name else i.column
-    return _given(unit=i.unit, column=column, between_samples="linear" if i.linear else None)
+    between = "linear" if i.linear else None
+    return _given(unit=i.unit, column=column, between_samples=between, role=i.role)
 
 
 def _parameter(p: Parameter) -> dict[str, Any]:
@@ -126,7 +179,11 @@ def _parameter(p: Parameter) -> dict[str, Any]:
 
 def _node(n: Node) -> dict[str, Any]:
     return _given(
-        unit=n.unit, storage=_scalar(n.storage), initial=_scalar(n.initial), initial_sigma=n.initial_sigma
+        unit=n.unit,
+        storage=_scalar(n.storage),
+        initial=_scalar(n.initial),
+        initial_sigma=n.initial_sigma,
+        role=n.role,
     )
 
 
@@ -139,8 +196,9 @@ def _output(o: Output) -> dict[str, Any]:
         value=_scalar(o.value),
         column=None if o.column == o.name else o.column,
         unit=o.unit,
-        noise=o.noise,
+        noise=_given(**asdict(o.noise)) if isinstance(o.noise, SensorNoise) else o.noise,
         resolution=o.resolution,
+        role=o.role,
     )
 
 

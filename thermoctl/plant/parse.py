@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
-from thermoctl.plant.language import FORMAT, Flow, Input, Node, Output, Parameter, Plant
+from thermoctl.plant.language import FORMAT, ROLES, Flow, Input, Node, Output, Parameter, Plant, SensorNoise
 from thermoctl.yamlfile import Node as YamlNode
 from thermoctl.yamlfile import Section, kind_of, number_of, suggest
 
@@ -32,6 +32,8 @@ def parse(root: YamlNode) -> Plant:
     if form is None or form.value != FORMAT:
         raise (form or root).error(f"'format: {FORMAT}' was expected at the head of a plant file")
     title = top.given("title")
+    if title is not None and isinstance(title.value, (dict, list)):
+        raise title.error(f"title: text was expected, found {kind_of(title)}")
     if top.get("outputs", False) is None:
         raise root.error("no 'outputs': a plant without outputs cannot be compared with a recording")
     items = _items(top)
@@ -95,7 +97,7 @@ def _check_name(name: str, item: YamlNode, section: str) -> None:
 
 def _input(name: str, s: Section) -> Input:
     between = s.text("between_samples", "hold", ("hold", "linear"))
-    found = Input(name, _unit(s), _column(s, name), between == "linear", s.node.line)
+    found = Input(name, _unit(s), _column(s, name), between == "linear", _role(s), _at(s))
     s.end()
     return found
 
@@ -116,7 +118,7 @@ def _parameter(name: str, s: Section) -> Parameter:
                 f"values of '{name}' must map recordings to numbers, and needs per_recording: true"
             )
         values = {recording: number_of(v, f"values of '{name}'") for recording, v in node.value.items()}
-    found = Parameter(name, value, _unit(s), limits, per_recording, values, s.node.line)
+    found = Parameter(name, value, _unit(s), limits, per_recording, values, _at(s))
     s.end()
     return found
 
@@ -128,7 +130,8 @@ def _node(name: str, s: Section) -> Node:
         _expression(s, "initial"),
         _unit(s),
         s.optional_number("initial_sigma", low=0.0),
-        s.node.line,
+        _role(s),
+        _at(s),
     )
     s.end()
     return found
@@ -142,7 +145,7 @@ def _flow(name: str, s: Section, nodes: Iterable[str]) -> Flow:
         raise s.node.error(f"flow '{name}' has neither 'from' nor 'into'; one node at least was expected")
     if source == target:
         raise s.node.error(f"flow '{name}' leads from '{source}' to itself")
-    found = Flow(name, rate, source, target, _unit(s), s.node.line)
+    found = Flow(name, rate, source, target, _unit(s), _at(s))
     s.end()
     return found
 
@@ -165,12 +168,39 @@ def _output(name: str, s: Section) -> Output:
         _expression(s, "value"),
         _unit(s),
         _column(s, name),
-        s.optional_number("noise", low=0.0),
+        _noise(s),
         s.optional_number("resolution", low=0.0),
-        s.node.line,
+        _role(s),
+        _at(s),
     )
     s.end()
     return found
+
+
+def _noise(s: Section) -> float | SensorNoise | None:
+    node = s.given("noise")
+    if node is None or not isinstance(node.value, dict):
+        return s.optional_number("noise", low=0.0)
+    parts = Section(node, s.label("noise"), of=f"noise of {s.of}")
+    white = parts.number("white", low=0.0)
+    drift = time = flicker = None
+    if "flicker" in node.value:
+        flicker = parts.number("flicker", low=0.0)
+    elif "drift" in node.value or "time" in node.value:
+        drift, time = parts.number("drift", low=0.0), parts.number("time", low=0.0)
+        if time == 0:
+            raise parts.get("time").error(f"{parts.label('time')}: a time constant above 0 s was expected")
+    found = SensorNoise(white, drift, time, flicker, parts.optional_number("sd", low=0.0))
+    parts.end()
+    return found
+
+
+def _role(s: Section) -> str | None:
+    return s.text("role", "", ROLES) or None
+
+
+def _at(s: Section) -> str:
+    return f"{s.node.line}:{s.node.column}"
 
 
 def _unit(s: Section) -> str | None:
@@ -229,7 +259,7 @@ def _places(plant: Plant, items: Items) -> list[_Place]:
 
     found = []
     for n in plant.nodes.values():
-        found.append(place("nodes", n.name, "storage", n.storage, parameters | nodes))
+        found.append(place("nodes", n.name, "storage", n.storage, parameters | inputs | nodes))
         found.append(place("nodes", n.name, "initial", n.initial, inputs | parameters, "first"))
     found += [place("flows", f.name, "rate", f.rate, everything, "inputs") for f in plant.flows.values()]
     found += [place("outputs", o.name, "value", o.value, everything, "all") for o in plant.outputs.values()]

@@ -83,7 +83,7 @@ def default_noise(plant: Plant, excitations: Sequence[Excitation] = ()) -> tuple
     Where it states none, the white part of the second differences."""
     out = []
     for j, o in enumerate(plant.outputs.values()):
-        sigma = np.hypot(o.noise or 0.0, (o.resolution or 0.0) / np.sqrt(12))
+        sigma = np.hypot(o.noise_sd, (o.resolution or 0.0) / np.sqrt(12))
         if sigma <= 0:
             parts = [d.y[np.isfinite(d.y[:, j]), j] for d in excitations]
             second = np.concatenate(

@@ -15,6 +15,7 @@ import numpy as np
 from thermoctl.plant import expression as ex
 from thermoctl.plant.compile import Code, machine_code
 from thermoctl.plant.language import Plant
+from thermoctl.plant.sensor import error
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError, suggest
 
@@ -302,10 +303,9 @@ class Model:
         return self.run(self.excitation(table), parameters, None, sensitivities, rtol)
 
     def measure(self, table: Table, seed: int = 0) -> Table:
-        """Return the plant in the rig's place.
+        """Return a simulated recording: the inputs of `table` and the readings of the sensors.
 
-        a recording of the inputs in `table` and what the sensors make of the outputs, with their noise and
-        their steps. Uncertain starts are drawn. Raises InputError, SimulationError."""
+        Noise, steps of resolution and uncertain initial values are drawn. Raises InputError, SimulationError."""
         rng, excitation = np.random.default_rng(seed), self.excitation(table)
         dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(
             size=len(self.uncertain)
@@ -313,7 +313,7 @@ class Model:
         y = self.run(excitation, None, dx0).y
         columns = {i.column: table.columns[i.column] for i in self.plant.inputs.values()}
         for j, o in enumerate(self.plant.outputs.values()):
-            read = y[:, j] + (o.noise or 0.0) * rng.normal(size=len(y))
+            read = y[:, j] + error(o.noise, excitation.t, rng)
             columns[o.column] = np.round(read / o.resolution) * o.resolution if o.resolution else read
         return dataclasses.replace(table, columns=columns)
 

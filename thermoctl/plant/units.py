@@ -103,15 +103,15 @@ def check_units(plant: Plant) -> None:
         *plant.nodes.values(),
     ]
     for item in named:
-        units[item.name] = readings[item.name] = _declared(plant, item.name, item.unit, item.line)
+        units[item.name] = readings[item.name] = _declared(plant, item.name, item.unit, item.at)
     for output in plant.outputs.values():
-        readings[output.name] = _declared(plant, output.name, output.unit, output.line)
+        readings[output.name] = _declared(plant, output.name, output.unit, output.at)
     check = _Check(plant, units, readings)
     second = (("s", Fraction(1)),)
     rates: dict[str, tuple[Dimension, str]] = {}
     for node in plant.nodes.values():
-        storage = check.expression(node.storage, f"storage of '{node.name}'", node.line)
-        check.place(node.initial, f"initial of '{node.name}'", node.line, units[node.name], f"{node.unit}")
+        storage = check.expression(node.storage, f"storage of '{node.name}'", node.at)
+        check.place(node.initial, f"initial of '{node.name}'", node.at, units[node.name], f"{node.unit}")
         if storage is not None and units[node.name] is not None:
             rates[node.name] = (
                 _times(_times(storage, units[node.name] or ()), second, -1),
@@ -119,14 +119,14 @@ def check_units(plant: Plant) -> None:
             )
     for flow in plant.flows.values():
         what = f"flow '{flow.name}'"
-        unit = _declared(plant, what, flow.unit, flow.line)
+        unit = _declared(plant, what, flow.unit, flow.at)
         for end in filter(None, (flow.source, flow.target)):
             # A storage that is a bare number takes its dimension from the first flow that has one.
             if unit is not None:
                 expected, why = rates.setdefault(end, (unit, f"as the other flows of node '{end}'"))
                 if expected != unit:
                     raise InputError(
-                        f"{plant.file}:{flow.line}: {what} has unit {flow.unit} [{_text(unit)}]; "
+                        f"{plant.file}:{flow.at}: {what} has unit {flow.unit} [{_text(unit)}]; "
                         f"{_text(expected)} was expected {why}"
                     )
         expected_rate, why = (
@@ -134,18 +134,18 @@ def check_units(plant: Plant) -> None:
             if unit is not None
             else next((rates[end] for end in (flow.source, flow.target) if end in rates), (None, ""))
         )
-        given = check.place(flow.rate, f"rate of '{flow.name}'", flow.line, expected_rate, why)
+        given = check.place(flow.rate, f"rate of '{flow.name}'", flow.at, expected_rate, why)
         for end in filter(None, (flow.source, flow.target)):
             if unit is None and given is not None:
                 expected, why = rates.setdefault(end, (given, f"as the other flows of node '{end}'"))
                 if expected != given:
                     raise InputError(
-                        f"{plant.file}:{flow.line}: rate of '{flow.name}' is [{_text(given)}]; "
+                        f"{plant.file}:{flow.at}: rate of '{flow.name}' is [{_text(given)}]; "
                         f"{_text(expected)} was expected {why}"
                     )
     for output in plant.outputs.values():
         check.place(
-            output.value, f"value of '{output.name}'", output.line, readings[output.name], f"{output.unit}"
+            output.value, f"value of '{output.name}'", output.at, readings[output.name], f"{output.unit}"
         )
 
 
@@ -158,17 +158,17 @@ class _Check:
         self.plant, self.units, self.readings = plant, units, readings
         self.known: dict[int, Dimension | None] = {}
 
-    def place(self, e: Expr, what: str, line: int, expected: Dimension | None, why: str) -> Dimension | None:
+    def place(self, e: Expr, what: str, at: str, expected: Dimension | None, why: str) -> Dimension | None:
         """Return the dimension of an expression that must be `expected`."""
-        given = self.expression(e, what, line)
+        given = self.expression(e, what, at)
         if given is not None and expected is not None and given != expected:
             raise InputError(
-                f"{self.plant.file}:{line}: {what}: '{_short(e)}' is [{_text(given)}], but its place asks for "
+                f"{self.plant.file}:{at}: {what}: '{_short(e)}' is [{_text(given)}], but its place asks for "
                 f"[{_text(expected)}] ({why})"
             )
         return given if given is not None else expected
 
-    def expression(self, root: Expr, what: str, line: int) -> Dimension | None:
+    def expression(self, root: Expr, what: str, at: str) -> Dimension | None:
         """Return the dimension of an expression, None where it fits anywhere.
 
         Raises InputError where its parts do not agree."""
@@ -177,7 +177,7 @@ class _Check:
                 try:
                     self.known[id(e)] = self._of(e, [self.known[id(a)] for a in e.args])
                 except ValueError as error:
-                    raise InputError(f"{self.plant.file}:{line}: {what}: in '{_short(e)}' {error}") from None
+                    raise InputError(f"{self.plant.file}:{at}: {what}: in '{_short(e)}' {error}") from None
         return self.known[id(root)]
 
     def _of(self, e: Expr, a: list[Dimension | None]) -> Dimension | None:
@@ -270,13 +270,13 @@ def _short(e: Expr) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _declared(plant: Plant, what: str, unit: str | None, line: int) -> Dimension | None:
+def _declared(plant: Plant, what: str, unit: str | None, at: str) -> Dimension | None:
     if unit is None:
         return None
     try:
         return dimension(unit)
     except ValueError as error:
-        raise InputError(f"{plant.file}:{line}: unit of {what}: {error}") from None
+        raise InputError(f"{plant.file}:{at}: unit of {what}: {error}") from None
 
 
 @cache
