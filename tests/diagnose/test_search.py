@@ -199,11 +199,14 @@ def heated():
 
 def test_an_error_faster_than_a_block_of_rows_is_seen(monkeypatch):
     """A reading with an error of a fifth of its noise every half millimetre, which the stage passes in three samples."""
-    truth = loads(
-        FREE_CARRIAGE.replace("value: 59", "value: 44")
-        .replace("value: 132", "value: 82")
-        .replace("{value: position,", "{value: position + 1e-6 * sin(2 * pi * position / 0.0005),")
-    ).compile(())
+    truth = compile_plant(
+        loads(
+            FREE_CARRIAGE.replace("value: 59", "value: 44")
+            .replace("value: 132", "value: 82")
+            .replace("{value: position,", "{value: position + 1e-6 * sin(2 * pi * position / 0.0005),")
+        ),
+        (),
+    )
     tables = []
     for seed in (1, 2):
         t = np.arange(12000) * 0.002

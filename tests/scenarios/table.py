@@ -148,7 +148,7 @@ BAD = (
 )
 
 UNNOTICED = (
-    Scenario("drive's TPDO frozen", "A", (("A.drive.tpdo", "frozen"),), WARNS, faults=("amplifier_frozen", "amplifier_stale"),
+    Scenario("drive's TPDO frozen", "A", (("A.drive.tpdo", "frozen"),), WARNS, faults=("amplifier_stale",),
              watch_s=DRIVE_FROZEN_S + 0.5, bad="not noticed"),
     Scenario("half the current at 20 um", "A", (("A.drive.gain", 0.5),), TRIPS, 2 * AGREE_S + METER_S + SLACK_S,
              ("amplifier_not_following",), setpoint_um=20.0, bad="not noticed"),

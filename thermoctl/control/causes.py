@@ -68,7 +68,7 @@ FOLLOWS: dict[str, set[str]] = {
 for _name in _of(*GROUPS):  # the same reading's other kinds, found later
     _group, _kind = _name.rsplit("_", 1)
     FOLLOWS[_name] = FOLLOWS.get(_name, set()) | {
-        f"{_group}_{k}" for k in KINDS if KINDS.index(k) > KINDS.index(_kind)
+        f"{_group}_{k}" for k in KINDS if KINDS.index(k) > KINDS.index(_kind) and f"{_group}_{k}" in BIT
     }
 
 LATE_MAY_CAUSE = FOLLOWS["loop_late"]
