@@ -19,7 +19,7 @@ The contract
 - `now_s` is seconds on one clock that every process shares (CLOCK_MONOTONIC, `time.monotonic()`) for real devices; the
   simulated and replayed back ends take any clock, so they run faster than real time when the caller's clock does.
 
-The sample: arrays over ROLES (index by `ROLE[name]`), all of length len(ROLES)
+The sample: arrays over ROLES (thermoctl/channels.py; index by `ROLE[name]`), all of length len(ROLES)
 - `value`   float64, in the role's unit; the last valid reading, NaN before the first one.
 - `time_s`  float64, when that reading was taken (clock of `now_s`); -inf before the first one.
 - `fresh`   bool, True when a reading arrived that earlier `read` calls had not shown.
@@ -47,41 +47,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-TEMPERATURES = (
-    "coil_c",
-    "bobbin_c",
-    "inner_magnet_c",
-    "outer_magnet_c",
-    "inner_stator_c",
-    "outer_stator_c",
-    "stator_connector_c",
-    "bobbin_connector_c",
-    "shaft_1_c",
-    "shaft_2_c",
-    "bracket_1_c",
-    "bracket_2_c",
-)
-"""The twelve measured temperatures in the paper's order, degC."""
+from thermoctl import channels
 
-ROLES = (
-    "position_um",
-    "output_reference_um",
-    "voltage_v",
-    "current_a",
-    "air_c",
-    *TEMPERATURES,
-    "supply_v",
-    "amplifier_state",
-    "amplifier_fault",
-)
-"""What a channel can be to the controller. `voltage_v` and `current_a` are the coil's; `supply_v` the amplifier's DC
-link; `amplifier_state` one of AMP_*; `amplifier_fault` the error code (CiA-402 object 0x603F, 0 healthy)."""
-
-ROLE = {name: i for i, name in enumerate(ROLES)}
-OK, STALE, ERROR, ABSENT = 0, 1, 2, 3
-STATUS_NAMES = ("OK", "STALE", "ERROR", "ABSENT")
-AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_QUICK_STOP = 0.0, 1.0, 2.0, 3.0, 4.0
-"""amplifier_state: starting up or lost; powered and not driving; driving; fault of its own; stopped by its quick stop."""
+ROLES, ROLE = channels.CHANNELS, channels.INDEX
+"""What a channel can be to the controller, and each one's place in the arrays of a sample."""
+OK, STALE, ERROR, ABSENT = channels.OK, channels.STALE, channels.ERROR, channels.ABSENT
+STATUS_NAMES = channels.STATUS_NAMES
+AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED = channels.AMP_OFFLINE, channels.AMP_DISABLED, channels.AMP_ENABLED
+AMP_FAULT, AMP_QUICK_STOP = channels.AMP_FAULT, channels.AMP_QUICK_STOP
 
 
 class HardwareError(Exception):

@@ -23,7 +23,7 @@ from thermoctl.control.faults import FAULTS, Fault
 from thermoctl.control.remedies import REMEDIES
 from thermoctl.diagnose.effects import catalogue
 from thermoctl.settings import SECTIONS, options
-from thermoctl.signals import SIGNALS
+from thermoctl.signals import FAULT_WORD_BITS, SIGNALS
 from thermoctl.which_rig import ACTS
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
@@ -97,7 +97,7 @@ def signals() -> str:
     return (
         _HEAD
         + "# Signals\n\nOne record row a tick, in this order, float64. A recording's 10 Hz tier holds the "
-        "mean under the same name and `_min` and `_max` beside it; words of bits (`*_bits`) are or-ed.\n\n"
+        "mean under the same name and `_min` and `_max` beside it; words of bits are or-ed.\n\n"
         + _table(
             ("signal", "unit", "plausible", "meaning"),
             ((f"`{s.name}`", s.unit, _range(s.low, s.high), s.meaning) for s in SIGNALS),
@@ -141,10 +141,12 @@ def fault(f: Fault) -> str:
     """Return the page of one fault."""
     words = REMEDIES[f.name]
     channels = causes.channels_of(f.name)
+    second, place = divmod(f.bit, FAULT_WORD_BITS)
+    word = "fault_bits_2" if second else "fault_bits"
     cause_of = sorted(n for n, after in causes.FOLLOWS.items() if f.name in after)
     return (
-        f"{_HEAD}# {f.name}\n\n{_sentence(f.meaning)}\n\nThis is {_SEVERITY[f.severity]} Bit {f.bit} "
-        f"of `fault_bits` (value {1 << f.bit})."
+        f"{_HEAD}# {f.name}\n\n{_sentence(f.meaning)}\n\nThis is {_SEVERITY[f.severity]} Bit {place} "
+        f"of `{word}` (value {1 << place})."
         + (
             f" Channels: {', '.join(f'`{c}`' for c in channels)}; a warning where none of those at fault is in "
             "`protection.required`."

@@ -11,38 +11,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
-POINTS = (
-    "coil",
-    "bobbin",
-    "inner_magnet",
-    "outer_magnet",
-    "inner_stator",
-    "outer_stator",
-    "stator_connector",
-    "bobbin_connector",
-    "shaft_1",
-    "shaft_2",
-    "bracket_1",
-    "bracket_2",
-)
-"""The twelve temperature points, in the paper's order."""
+import numpy as np
+
+from thermoctl.channels import POINTS, STATUS_NAMES, TABLE
+
+FAULT_WORD_BITS = 53
+"""Bits of `fault_bits`: a float64 holds so many exactly. The faults from this bit on are in `fault_bits_2`."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """One column of the record: `unit` as pint reads it ('1' for a number), `low`..`high` what is plausible."""
+    """One column of the record: `unit` as pint reads it ('1' for a number), plausible values from `low` to `high`.
+
+    `bits`: a word of bits, to be or-ed where rows are merged. `before`: its value in every recording made before the
+    signal existed; None where no value can be known.
+    """
 
     name: str
     unit: str
     meaning: str
     low: float = -inf
     high: float = inf
-
-
-def _points(suffix: str, meaning: str) -> tuple[Signal, ...]:
-    return tuple(
-        Signal(f"{p}{suffix}", "degC", f"{p.replace('_', ' ')}: {meaning}", -40.0, 200.0) for p in POINTS
-    )
+    bits: bool = False
+    before: float | None = None
 
 
 SIGNALS: tuple[Signal, ...] = (
@@ -57,32 +48,39 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("dt_s", "s", "measured time since the tick before", 0.0, 1.0),
     Signal("command", "1", "command taken in this tick: 0 none, 1 arm, 2 disarm, 3 setpoint", 0.0, 3.0),
     Signal("command_value", "1", "the command's value: the setpoint in um"),
-    Signal("external_bits", "1", "fault bits raised outside the law", 0.0),
-    Signal("position_raw_um", "um", "position encoder"),
+    Signal("external_bits", "1", "fault bits raised outside the law", 0.0, bits=True),
+    *(Signal(c.signal, c.unit, c.meaning, c.low, c.high) for c in TABLE),
+    Signal("fresh_bits", "1", "bit c: channel c had a new reading in this tick", 0.0, bits=True),
     Signal(
-        "output_reference_um",
-        "um",
-        "second encoder at the output, for proof only; the controller does not use it",
+        "status_bits",
+        "1",
+        "two bits a channel: " + ", ".join(f"{k} {name}" for k, name in enumerate(STATUS_NAMES)),
+        0.0,
+        bits=True,
     ),
-    Signal("voltage_v", "V", "coil voltage"),
-    Signal("current_a", "A", "coil current"),
-    Signal("air_c", "degC", "chamber air", -40.0, 80.0),
-    *_points("_c", "measured"),
-    Signal("supply_v", "V", "the amplifier's supply", 0.0),
-    Signal("amplifier_state", "1", "0 offline, 1 disabled, 2 enabled, 3 fault, 4 quick stop", 0.0, 4.0),
-    Signal("amplifier_fault", "1", "the amplifier's own error code; 0 none", 0.0),
-    Signal("fresh_bits", "1", "bit c: channel c had a new reading in this tick", 0.0),
-    Signal("status_bits", "1", "two bits a channel: 0 OK, 1 stale, 2 error, 3 absent", 0.0),
     Signal(
         "delay_bits",
         "1",
         "four bits a temperature, air first: age of a new reading when it arrived, 25 ms each, at most 15",
         0.0,
+        bits=True,
     ),
     # What the law gave.
     Signal("state", "1", "0 OFF, 1 SAFE, 2 READY, 3 ARMED, 4 FAULT", 0.0, 4.0),
     Signal(
-        "fault_bits", "1", "standing faults, and those that led to FAULT; bits as in control/faults.py", 0.0
+        "fault_bits",
+        "1",
+        "active faults, and those that led to FAULT; bits as in control/faults.py",
+        0.0,
+        bits=True,
+    ),
+    Signal(
+        "fault_bits_2",
+        "1",
+        f"the same for the faults from bit {FAULT_WORD_BITS} on, which is bit 0 of this word",
+        0.0,
+        bits=True,
+        before=0.0,
     ),
     Signal("setpoint_um", "um", "where the output shall be"),
     Signal("reference_um", "um", "the setpoint after its rate limiter"),
@@ -97,7 +95,7 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("enable", "1", "1 while the amplifier is enabled", 0.0, 1.0),
     Signal("power_w", "W", "electrical power of the coil as the estimator uses it"),
     Signal("air_rate_k_s", "K/s", "rate of the low-passed air temperature"),
-    *_points("_est_c", "estimated"),
+    *(Signal(f"{p}_est_c", "degC", f"{p.replace('_', ' ')}: estimated", -40.0, 200.0) for p in POINTS),
     Signal("innovation_c", "K", "last measured minus estimated coil temperature"),
     Signal("kalman_gain", "1", "gain of the last correction", 0.0, 1.0),
     Signal("position_age_s", "s", "time since the last frame of the position encoder", 0.0),
@@ -107,3 +105,22 @@ SIGNALS: tuple[Signal, ...] = (
 
 NAMES = tuple(s.name for s in SIGNALS)
 INDEX = {name: i for i, name in enumerate(NAMES)}
+OUTPUTS = NAMES[INDEX["state"] :]
+"""What the law gives in a tick."""
+BIT_WORDS = frozenset(s.name for s in SIGNALS if s.bits)
+
+
+def fault_word(row: np.ndarray) -> int:
+    """Return the fault bits of a record row, both words joined."""
+    return int(row[INDEX["fault_bits"]]) | int(row[INDEX["fault_bits_2"]]) << FAULT_WORD_BITS
+
+
+def join_fault_words(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the fault bits (uint64) of the columns `fault_bits` and `fault_bits_2`; NaN counts as no fault."""
+    words = [np.nan_to_num(column).astype(np.uint64) for column in (low, high)]
+    return words[0] | words[1] << np.uint64(FAULT_WORD_BITS)
+
+
+def fault_words(rows: np.ndarray) -> np.ndarray:
+    """Return the fault bits (uint64) of record rows (n, signals)."""
+    return join_fault_words(rows[:, INDEX["fault_bits"]], rows[:, INDEX["fault_bits_2"]])

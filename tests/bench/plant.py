@@ -304,8 +304,8 @@ def closed_loop(seconds):
 def law_and_plant(seconds):
     """The law (estimator, compensation, PID, protection) closed over the whole actuator, nothing between them: CPU seconds
     of `seconds`, how long the plant alone takes, and the position where the setpoint was 50 um."""
+    from thermoctl.channels import CHANNELS
     from thermoctl.control import arming
-    from thermoctl.control.faults import CHANNELS
     from thermoctl.control.law import Law
     from thermoctl.daemon.assemble import compensator, law_parameters
     from thermoctl.settings import load_settings

@@ -14,12 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from tests.limits import OFF
+from thermoctl.channels import CHANNELS, INDEX, TABLE, TEMPERATURES
 from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel, Parameters
 
 P = 2.0**-10  # period, s
 AIR = 22.0
-AT = {name: i for i, name in enumerate(faults.CHANNELS)}
+AT = INDEX
 REQUIRED = ("position_um", "voltage_v", "current_a", "air_c", "coil_c")
 SCENARIOS: list[Callable[[Any], None]] = []
 
@@ -30,7 +32,7 @@ def scenario(function):
 
 
 def channels(default, **given):
-    array = np.full(len(faults.CHANNELS), float(default))
+    array = np.full(len(CHANNELS), float(default))
     for name, number in given.items():
         array[AT[name]] = number
     return array
@@ -63,13 +65,13 @@ class Bench:
     def __init__(self, module, model_=None, **changes):
         required = channels(0, **dict.fromkeys(REQUIRED, 1))
         self.parameters = replace(
-            Parameters(kp=0.0, ti_s=1.0, td_s=0.0, output_limit=4.0, required=required), **changes
+            Parameters(kp=0.0, ti_s=1.0, td_s=0.0, output_limit=4.0, required=required, **OFF), **changes
         )
         self.module, self.law = module, module.Law(model_ or model(), self.parameters, P)
         self.value = channels(np.nan, position_um=8.0, voltage_v=0.0, current_a=0.0, air_c=AIR, coil_c=AIR)
         self.status = np.where(np.isnan(self.value), 3, 0).astype(np.uint8)
         self.fresh = (self.status == 0).astype(np.uint8)
-        self.delay = np.zeros(len(faults.CHANNELS), dtype=np.uint8)
+        self.delay = np.zeros(len(CHANNELS), dtype=np.uint8)
         self.law.bind(self.value, self.fresh, self.status, self.delay)
 
     def set(self, **values):
@@ -124,13 +126,13 @@ class Bench:
 
 
 # ---- readings ---------------------------------------------------------------------------------------------------------------
-GROUP = {name: faults.GROUPS[faults.GROUP_OF_CHANNEL[i]] for name, i in AT.items()}
+GROUP = {c.role: c.group for c in TABLE}
 
 
 @scenario
 def each_channel_has_its_bits(module):
     """error, stale, range of each channel in its own group's bit; required ones trip, others warn."""
-    for name in faults.CHANNELS:
+    for name in CHANNELS:
         for kind, status in (("error", 2), ("stale", 1), ("range", 0)):
             bench = Bench(module, high=channels(1e3)).armed().set(**{name: 2e3})
             bench.status[AT[name]], bench.fresh[AT[name]] = status, status == 0
@@ -180,7 +182,7 @@ def rate_to_the_bit(module):
     bench.set(position_um=10.5).tick(dt=0.0).safe("position_rate")
 
 
-THERMAL = ("air_c", *faults.TEMPERATURES)
+THERMAL = ("air_c", *TEMPERATURES)
 
 
 @scenario
@@ -1241,7 +1243,7 @@ def outputs_say_what_is(module):
         and out["power_w"] == 1.5
     )
     assert out["position_age_s"] == law.age[0] and out["coil_age_s"] == law.age[AT["coil_c"]]
-    assert [out[n[:-2] + "_est_c"] for n in faults.TEMPERATURES] == [law.T[m] + law.air_c for m in range(12)]
+    assert [out[n[:-2] + "_est_c"] for n in TEMPERATURES] == [law.T[m] + law.air_c for m in range(12)]
     law.v = 9.0
     law.protect(arming.NONE, 0)
     assert law.drive == 4.0 and law.control_v == 9.0

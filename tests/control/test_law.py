@@ -9,18 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.limits import OFF
+from thermoctl.channels import CHANNELS
 from thermoctl.control import arming, faults, law
 from thermoctl.control.law import AIR_READINGS, OUTPUTS, Law
 from thermoctl.control.model import CompensatorModel, Parameters, zero_model
 
-INDEX = {name: i for i, name in enumerate(faults.CHANNELS)}
+INDEX = {name: i for i, name in enumerate(CHANNELS)}
 OUT = {name: i for i, name in enumerate(OUTPUTS)}
 REQUIRED = ("position_um", "voltage_v", "current_a", "coil_c")
 AMBIENT = 22.0
 
 
 def channels(default, **given):
-    array = np.full(len(faults.CHANNELS), float(default))
+    array = np.full(len(CHANNELS), float(default))
     for name, number in given.items():
         array[INDEX[name]] = number
     return array
@@ -29,7 +31,7 @@ def channels(default, **given):
 def parameters(**changes):
     required = channels(0, **dict.fromkeys(REQUIRED, 1))
     return replace(
-        Parameters(kp=0.02, ti_s=0.004, td_s=0.001, output_limit=5.0, required=required), **changes
+        Parameters(kp=0.02, ti_s=0.004, td_s=0.001, output_limit=5.0, required=required, **OFF), **changes
     )
 
 
@@ -530,7 +532,7 @@ def test_outside_faults_trip():
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from(faults.CHANNELS),
+            st.sampled_from(CHANNELS),
             st.floats(allow_nan=True, allow_infinity=True),
             st.sampled_from([0, 0, 0, 1, 2, 3]),
             st.sampled_from(range(4)),

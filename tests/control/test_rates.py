@@ -8,11 +8,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.limits import OFF
+from thermoctl.channels import CHANNELS
 from thermoctl.control import arming, faults
 from thermoctl.control.law import WARM_UP_TICKS, Law
 from thermoctl.control.model import Parameters, zero_model
 
-P, AIR, COIL = 0.001, faults.CHANNELS.index("air_c"), faults.CHANNELS.index("coil_c")
+P, AIR, COIL = 0.001, CHANNELS.index("air_c"), CHANNELS.index("coil_c")
 LIMIT = {AIR: 5.0, COIL: 20.0}  # K/s
 
 
@@ -20,11 +22,11 @@ class Bench:
     """An armed law whose air and coil readings arrive when `deliver` says so."""
 
     def __init__(self, start=24.0):
-        n = len(faults.CHANNELS)
+        n = len(CHANNELS)
         rate, required = np.full(n, np.inf), np.zeros(n)
         for c, limit in LIMIT.items():
             rate[c], required[c] = limit, 1.0
-        self.law = Law(zero_model(P), Parameters(0.0, 1.0, 0.0, 1.0, rate=rate, required=required), P)
+        self.law = Law(zero_model(P), Parameters(0.0, 1.0, 0.0, 1.0, rate=rate, required=required, **OFF), P)
         self.value, self.fresh = np.zeros(n), np.zeros(n, np.uint8)
         self.status, self.delay = np.full(n, 3, np.uint8), np.zeros(n, np.uint8)
         self.law.bind(self.value, self.fresh, self.status, self.delay)

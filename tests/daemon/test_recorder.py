@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.daemon.conftest import make_model
+from tests.limits import OFF
 from thermoctl.control.model import Parameters, zero_model
 from thermoctl.daemon.misfit import BLOCK_S, Misfit
 from thermoctl.daemon.recorder import Recorder
@@ -98,7 +99,7 @@ def test_a_watch_that_fails_loses_no_row():
         recorder = Recorder(
             shared,
             make_model(),
-            Parameters(kp=0.0, ti_s=1.0, td_s=0.0, output_limit=1.0),
+            Parameters(kp=0.0, ti_s=1.0, td_s=0.0, output_limit=1.0, **OFF),
             1e-3,
             lambda law: writer,
             lambda event, **more: told.append(event),

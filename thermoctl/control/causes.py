@@ -17,10 +17,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from thermoctl.control.faults import BIT, BY_NAME, CHANNELS, GROUP_OF_CHANNEL, GROUPS, KINDS
+from thermoctl.channels import GROUPS, TABLE
+from thermoctl.control.faults import BIT, BY_NAME, KINDS
 
 WITHIN_S, BEFORE_S, TOGETHER_S = 5.0, 1.0, 0.15
-READING_BITS = len(GROUPS) * len(KINDS)
 
 
 def _of(*groups: str) -> set[str]:
@@ -92,14 +92,12 @@ class Standing:
 
 def channels_of(name: str) -> tuple[str, ...]:
     """The channels that share this reading's fault; () for another fault."""
-    if BIT[name] >= READING_BITS:
-        return ()
-    group = BIT[name] // len(KINDS)
-    return tuple(c for c, g in zip(CHANNELS, GROUP_OF_CHANNEL, strict=True) if g == group)
+    group = BY_NAME[name].group
+    return tuple(c.role for c in TABLE if group and c.group == group)
 
 
 def _lost(name: str) -> bool:
-    return BIT[name] < READING_BITS and name.endswith(("_error", "_stale"))
+    return BY_NAME[name].kind in ("error", "stale")
 
 
 def follows(fault: Standing, cause: Standing) -> bool:
@@ -147,4 +145,4 @@ def _reach(name: str) -> int:
 def severity_of(name: str, trips: int) -> str:
     """A reading's fault is a warning unless its channel is required."""
     severity = BY_NAME[name].severity
-    return "warning" if BIT[name] < READING_BITS and not _trips(name, trips) else severity
+    return "warning" if BY_NAME[name].group and not _trips(name, trips) else severity

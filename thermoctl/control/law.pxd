@@ -1,53 +1,66 @@
-# C types for law.py; see there.
+# C types for law.py; see there. What stands between "generated" and "end" is written by `python -m thermoctl.control.typed`.
 cimport cython
 from libc.stdint cimport uint8_t
 
 ctypedef unsigned long long bits_t
 
-cdef int _OK, _STALE, _ERROR, _ABSENT, _NONE, _SETPOINT, _OFF, _ARMED, _FAULT, _COMMANDS, _WARM_UP, _N, _M
-cdef const uint8_t[::1] _NEXT
-cdef int _POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL, _SUPPLY
-cdef int _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT
-cdef int _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS
-cdef int _B_FOLLOWING, _B_HOT, _B_HOT_MODEL, _B_HEATING, _B_DISAGREES, _B_POWER, _B_STUCK, _B_BOUND, _B_SLEWING
-cdef int _B_SATURATED, _B_AMPLIFIER, _B_STOPPED, _B_NOT_FOLLOWING, _B_LATE, _B_NOT_FINITE
-cdef int _B_ELECTRICAL, _B_DISPLACED, _B_MONITORED
+# generated: the constants of law.py
+cdef int _WARM_UP, _OK, _STALE, _ERROR, _ABSENT, _NONE, _SETPOINT, _OFF, _ARMED, _FAULT, _COMMANDS, _N, _M
+cdef int _POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL, _AMPLIFIER_STATE, _THERMAL, _THERMAL_END
+cdef int _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT, _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS
+cdef int _B_FOLLOWING, _B_HOT, _B_HOT_MODEL, _B_HEATING, _B_DISAGREES, _B_POWER, _B_STUCK, _B_BOUND
+cdef int _B_SLEWING, _B_SATURATED, _B_AMPLIFIER, _B_STOPPED, _B_NOT_FOLLOWING, _B_LATE, _B_NOT_FINITE
+cdef int _B_ELECTRICAL, _B_DISPLACED, _B_MONITORED, _WORD_BITS, _O_STATE, _O_FAULTS, _O_FAULTS_2, _O_SETPOINT
+cdef int _O_REFERENCE, _O_POSITION, _O_COMPENSATED, _O_COMPENSATION, _O_EXPANSION, _O_CONTROL, _O_DRIVE
+cdef int _O_ENABLE, _O_POWER, _O_AIR_RATE, _O_ESTIMATES, _O_INNOVATION, _O_GAIN, _O_POSITION_AGE, _O_COIL_AGE
+cdef bits_t _TRIP_OTHERS, _CRITICAL, _WORD
 cdef double _GAP_S, _RESUME_C, _COPPER, _AIR_READINGS, _THERMAL_S, _DELAY_S, _NAN
-cdef bits_t _TRIP_OTHERS, _CRITICAL
+cdef const uint8_t[::1] _NEXT, _READING_BIT
+# end
 
 cdef bint finite(double value) noexcept nogil
 cdef double clip(double value, double low, double high) noexcept nogil
 
+cdef class Typed:
+    # generated: the fields of Parameters
+    cdef public double kp, ti_s, td_s, output_limit, setpoint_rate_um_s, setpoint_low_um, setpoint_high_um
+    cdef public double moving_average, compensate, bound_um, slew_um_s, following_um, following_s
+    cdef public double coil_limit_c, coil_rate_k_s, coil_rate_time_s, innovation_limit_c, innovation_time_s
+    cdef public double power_limit_w, power_time_s, idle_current_a, idle_power_w, idle_s, saturation_s
+    cdef public double amplifier_s, late_s, agree_time_s, drift_limit_c, monitored_limit_c, resistance_ohm
+    cdef public double resistance_tolerance, resistance_v, current_per_drive, current_tolerance_a
+    cdef public double flexure_um_per_a, position_tolerance_um, reference_tolerance_um, order_limit_c
+    cdef public double[::1] low, high, rate, stale_s, frozen_s, required
+    # end
+
 cdef class Law:
     cdef readonly object model, parameters, outputs
+    cdef Typed p
     cdef int n, sensors_used, average_length
-    cdef bint mkf, compensate_on, hold, expands, reports, enabled, powered
+    cdef bint mkf, hold, expands, reports, enabled, powered
     cdef double[:, ::1] A, B, C, K
     cdef readonly double correction_step_s
-    cdef double[::1] b1, b2, dx, e, low, high, rate, stale_s, frozen_s, required, out
-    cdef int[::1] sensors, group, predicts
+    cdef double[::1] b1, b2, dx, e, out
+    cdef int[::1] sensors, predicts
     cdef double[::1] value
     cdef uint8_t[::1] fresh, status, delay
     cdef double b_air, f1, offset_um, expansion_period_s, R_w, R_v, air_filter_s, model_period_s, a1a1, first_gain
     cdef readonly double period_s, dt
-    cdef double kp, ti_s, td_s, output_limit, setpoint_rate_um_s, setpoint_low_um, setpoint_high_um, bound_um, slew_um_s
-    cdef double following_um, following_limit_s, coil_limit_c, coil_rate_limit, coil_rate_time_s, innovation_limit_c
-    cdef double innovation_time_s, power_limit_w, power_time_s, idle_current_a, idle_power_w, idle_limit_s
-    cdef double saturation_limit_s, amplifier_limit_s, late_s, agree_time_s, drift_limit_c, monitored_limit_c
-    cdef double resistance_ohm, resistance_tolerance, resistance_v, current_per_drive, current_tolerance_a
-    cdef double flexure_um_per_a, position_tolerance_um, reference_tolerance_um, order_limit_c
     cdef bits_t faults, trips
-    # the state: what snapshot() holds
+    cdef public double control_v
+    # generated: the state that snapshot() holds
     cdef public long long state, tick, average_at, averaged
     cdef public bits_t latched
-    cdef public double v, eps1, d1, setpoint_um, reference_um, position_um, compensated_um, compensation_um, expansion_um
-    cdef public double power_w, air_c, air_start_c, air_rate_k_s, air_known, innovation_c, innovation_mean_c, kalman_gain, P
-    cdef public double corrected, primed, expansion_before_um, expansion_after_um, phase_s, coil_slow_c, coil_rate_k_s
-    cdef public double coil_elapsed_s, power_mean_w, following_s, idle_s, saturation_s, amplifier_s, enable, drive
-    cdef public double control_v
-    cdef public double air_started, resumed, model_error_c, ohm_v, ohm_scale_v, current_error_a, displaced_um
-    cdef public double position_zero_um, zeroed, reference_error_um, reference_zero_um, reference_zeroed, exchanged, driving
-    cdef public double[::1] x, T, T_before, average, age, since_s, suspect, last, same_s, seen, verdict, corrections, apart_c
+    cdef public double v, eps1, d1, setpoint_um, reference_um, position_um, compensated_um, compensation_um
+    cdef public double expansion_um, power_w, air_c, air_start_c, air_known, air_rate_k_s, innovation_c
+    cdef public double innovation_mean_c, kalman_gain, P, corrected, primed, expansion_before_um
+    cdef public double expansion_after_um, phase_s, coil_slow_c, coil_rate_k_s, coil_elapsed_s, power_mean_w
+    cdef public double following_s, idle_s, saturation_s, amplifier_s, enable, drive, air_started, resumed
+    cdef public double model_error_c, ohm_v, ohm_scale_v, current_error_a, displaced_um, position_zero_um
+    cdef public double zeroed, reference_error_um, reference_zero_um, reference_zeroed, exchanged, driving
+    cdef public double[::1] x, T, T_before, average, age, since_s, suspect, last, same_s, seen, verdict
+    cdef public double[::1] corrections, apart_c
+    # end
 
     cpdef bind(self, double[::1] value, uint8_t[::1] fresh, uint8_t[::1] status, uint8_t[::1] delay=*)
     cpdef step(self, double dt, int command=*, double command_value=*, bits_t external=*)
@@ -85,5 +98,5 @@ cdef class Law:
     cdef void _correct(self) noexcept
     @cython.locals(before=cython.longlong, known=cython.int, started=cython.bint, tripped=cython.bint, critical=cython.bint)
     cdef _arm(self, int command)
-    @cython.locals(o='double[::1]', m=cython.int)
+    @cython.locals(o='double[::1]', bits=bits_t, m=cython.int)
     cdef void _report(self) noexcept

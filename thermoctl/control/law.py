@@ -49,33 +49,27 @@ An amplifier that was enabled since and is no more trips at once. One that still
 from __future__ import annotations
 
 from array import array
+from dataclasses import fields
 
 import numpy as np
 
-from thermoctl.control import arming, faults
-from thermoctl.control.model import CompensatorModel, Parameters
-
-OUTPUTS = (
-    "state",
-    "fault_bits",
-    "setpoint_um",
-    "reference_um",
-    "position_um",
-    "compensated_um",
-    "compensation_um",
-    "expansion_um",
-    "control_v",
-    "drive",
-    "enable",
-    "power_w",
-    "air_rate_k_s",
-    *(name.removesuffix("_c") + "_est_c" for name in faults.TEMPERATURES),
-    "innovation_c",
-    "kalman_gain",
-    "position_age_s",
-    "coil_age_s",
+from thermoctl.channels import (
+    ABSENT,
+    AMP_ENABLED,
+    AMP_FAULT,
+    CHANNELS,
+    CODES,
+    ERROR,
+    INDEX,
+    OK,
+    POINTS,
+    STALE,
+    TEMPERATURES,
+    THERMAL,
 )
-"""What a tick gives, in the order of `Law.outputs`; each is an attribute of the law, too (the estimates apart)."""
+from thermoctl.control import arming, faults
+from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters
+from thermoctl.signals import FAULT_WORD_BITS, OUTPUTS
 
 MAX_AVERAGE = 64
 WARM_UP_TICKS = 100
@@ -92,13 +86,27 @@ COMPILED = not __file__.endswith(".py")
 """False when this module runs interpreted: right for coverage, a hundred times too slow for a rig."""
 
 # Constants that the compiler turns into C numbers (typed in law.pxd).
-_OK, _STALE, _ERROR, _ABSENT = 0, 1, 2, 3  # status of a reading, as the back ends give it
+_OK, _STALE, _ERROR, _ABSENT = OK, STALE, ERROR, ABSENT
 _NONE, _SETPOINT, _OFF, _ARMED, _FAULT = arming.NONE, arming.SETPOINT, arming.OFF, arming.ARMED, arming.FAULT
 _NEXT, _COMMANDS = arming.TABLE, len(arming.COMMANDS)
-_N, _M = len(faults.CHANNELS), len(faults.TEMPERATURES)
-_POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL = 0, 1, 2, 3, 4, 5
-_SUPPLY, _AMPLIFIER_STATE, _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT = 17, 18, 2, 3
-_K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN, _KINDS = 0, 1, 2, 3, 4, 5
+_N, _M = len(CHANNELS), len(TEMPERATURES)
+_POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL, _AMPLIFIER_STATE = (
+    INDEX[role]
+    for role in (
+        "position_um",
+        "output_reference_um",
+        "voltage_v",
+        "current_a",
+        "air_c",
+        "coil_c",
+        "amplifier_state",
+    )
+)
+_THERMAL, _THERMAL_END = INDEX[THERMAL[0]], INDEX[THERMAL[-1]] + 1
+_AMPLIFIER_ENABLED, _AMPLIFIER_FAULT = int(AMP_ENABLED), int(AMP_FAULT)
+_K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN = range(len(faults.KINDS))
+_KINDS = len(faults.KINDS)
+_READING_BIT = bytes(faults.reading_bit(c, kind) for c in range(_N) for kind in range(_KINDS))
 _B_FOLLOWING = faults.BIT["following_error"]
 _B_HOT, _B_HOT_MODEL = faults.BIT["coil_overtemperature"], faults.BIT["coil_overtemperature_model"]
 _B_HEATING, _B_DISAGREES = faults.BIT["coil_heating_rate"], faults.BIT["coil_disagrees"]
@@ -110,10 +118,20 @@ _B_NOT_FOLLOWING, _B_LATE = faults.BIT["amplifier_not_following"], faults.BIT["l
 _B_NOT_FINITE = faults.BIT["not_finite"]
 _B_ELECTRICAL, _B_DISPLACED = faults.BIT["electrical_disagrees"], faults.BIT["position_disagrees"]
 _B_MONITORED = faults.BIT["monitored_disagrees"]
-_TRIP_OTHERS = (
-    faults.mask("fault", "critical") >> (len(faults.GROUPS) * _KINDS) << (len(faults.GROUPS) * _KINDS)
-) | 1 << faults.BIT["amplifier_stopped"]
+_TRIP_OTHERS = faults.mask(
+    "fault", "critical", readings=False
+)  # a reading's fault trips where it is required
 _CRITICAL = faults.mask("critical")
+_WORD_BITS, _WORD = FAULT_WORD_BITS, (1 << FAULT_WORD_BITS) - 1
+_O = {name: i for i, name in enumerate(OUTPUTS)}
+_O_STATE, _O_FAULTS, _O_FAULTS_2 = _O["state"], _O["fault_bits"], _O["fault_bits_2"]
+_O_SETPOINT, _O_REFERENCE, _O_POSITION = _O["setpoint_um"], _O["reference_um"], _O["position_um"]
+_O_COMPENSATED, _O_COMPENSATION = _O["compensated_um"], _O["compensation_um"]
+_O_EXPANSION, _O_CONTROL, _O_DRIVE = _O["expansion_um"], _O["control_v"], _O["drive"]
+_O_ENABLE, _O_POWER, _O_AIR_RATE = _O["enable"], _O["power_w"], _O["air_rate_k_s"]
+_O_ESTIMATES = _O[f"{POINTS[0]}_est_c"]
+_O_INNOVATION, _O_GAIN = _O["innovation_c"], _O["kalman_gain"]
+_O_POSITION_AGE, _O_COIL_AGE = _O["position_age_s"], _O["coil_age_s"]
 
 _SCALARS = (
     "state",
@@ -221,6 +239,15 @@ def clip(value, low, high):
     return high if value > high else value
 
 
+class Typed:
+    """The numbers of Parameters, by the same names, with C types: the fields in law.pxd are generated."""
+
+    def __init__(self, parameters: Parameters):
+        for f in fields(parameters):
+            value = getattr(parameters, f.name)
+            setattr(self, f.name, value.copy() if f.name in BY_CHANNEL else value)
+
+
 class Law:
     """The state of the law and its four stages, called in order once per tick; `step` calls all four.
 
@@ -254,7 +281,6 @@ class Law:
         )
         self.dx, self.e = np.zeros(self.n), np.zeros(_M)
         self.corrections, self.apart_c = np.zeros(self.n), np.zeros(_M)
-        self.group = array("i", faults.GROUP_OF_CHANNEL)
         self.x, self.T, self.T_before = np.zeros(self.n), np.zeros(_M), np.zeros(_M)
         self.average = np.zeros(MAX_AVERAGE)
         self.age, self.last, self.same_s = np.zeros(_N), np.zeros(_N), np.zeros(_N)
@@ -297,39 +323,14 @@ class Law:
 
     def configure(self, parameters: Parameters):
         """Take new gains and limits, all at once, between two ticks; the state stays."""
-        p = self.parameters = parameters
-        self.kp, self.ti_s, self.td_s, self.output_limit = p.kp, p.ti_s, p.td_s, p.output_limit
-        self.setpoint_rate_um_s = p.setpoint_rate_um_s
-        self.setpoint_low_um, self.setpoint_high_um = p.setpoint_low_um, p.setpoint_high_um
-        length = int(min(max(p.moving_average, 1), MAX_AVERAGE))
+        self.parameters, self.p = parameters, Typed(parameters)
+        for role in CODES:  # a state or an error number does not change while all is well
+            self.p.frozen_s[INDEX[role]] = np.inf
+        length = int(min(max(parameters.moving_average, 1), MAX_AVERAGE))
         if self.tick > 0 and length != self.average_length:
             self.average = np.full(MAX_AVERAGE, self.position_um)  # the filter restarts at its own output
             self.average_at, self.averaged = 0, length
         self.average_length = length
-        self.compensate_on, self.bound_um, self.slew_um_s = p.compensate > 0.0, p.bound_um, p.slew_um_s
-        self.low, self.high, self.rate = p.low.copy(), p.high.copy(), p.rate.copy()
-        self.stale_s, self.frozen_s, self.required = p.stale_s.copy(), p.frozen_s.copy(), p.required.copy()
-        self.frozen_s[_AMPLIFIER_STATE:] = np.inf  # an amplifier's words stand still when all is well
-        self.following_um, self.following_limit_s = p.following_um, p.following_s
-        self.coil_limit_c = p.coil_limit_c
-        self.coil_rate_limit, self.coil_rate_time_s = p.coil_rate_k_s, p.coil_rate_time_s
-        self.innovation_limit_c, self.innovation_time_s = p.innovation_limit_c, p.innovation_time_s
-        self.power_limit_w, self.power_time_s = p.power_limit_w, p.power_time_s
-        self.idle_current_a, self.idle_power_w, self.idle_limit_s = p.idle_current_a, p.idle_power_w, p.idle_s
-        self.saturation_limit_s, self.amplifier_limit_s, self.late_s = p.saturation_s, p.amplifier_s, p.late_s
-        self.agree_time_s, self.drift_limit_c, self.monitored_limit_c = (
-            p.agree_time_s,
-            p.drift_limit_c,
-            p.monitored_limit_c,
-        )
-        self.resistance_ohm, self.resistance_tolerance, self.resistance_v = (
-            p.resistance_ohm,
-            p.resistance_tolerance,
-            p.resistance_v,
-        )
-        self.current_per_drive, self.current_tolerance_a = p.current_per_drive, p.current_tolerance_a
-        self.flexure_um_per_a, self.position_tolerance_um = p.flexure_um_per_a, p.position_tolerance_um
-        self.reference_tolerance_um, self.order_limit_c = p.reference_tolerance_um, p.order_limit_c
 
     def snapshot(self) -> np.ndarray:
         """The whole state as one float64 vector, for replay and for a warm restart."""
@@ -455,7 +456,7 @@ class Law:
             self.age[c] += self.dt
             self.since_s[c] += self.dt
             status = self.status[c]
-            if status == _ABSENT and self.required[c] == 0.0:
+            if status == _ABSENT and self.p.required[c] == 0.0:
                 self.verdict[c] = 1.0 + _K_ERROR
                 continue
             if status in (_ERROR, _ABSENT):
@@ -465,23 +466,19 @@ class Law:
             elif self.fresh[c]:
                 self._judge_reading(c, self.value[c])
                 self.age[c] = 0.0
-            elif self.age[c] > self.stale_s[c] or (self.seen[c] == 0.0 and self.verdict[c] == 0.0):
+            elif self.age[c] > self.p.stale_s[c] or (self.seen[c] == 0.0 and self.verdict[c] == 0.0):
                 self.verdict[c] = 1.0 + _K_STALE
             if self.verdict[c] > 0.0:
                 kind = _K_ERROR
                 while self.verdict[c] > 1.0 + kind:
                     kind += 1
-                if (
-                    kind == _K_FROZEN and c >= _SUPPLY
-                ):  # an amplifier that repeats an old answer gives no new one;
-                    kind = _K_STALE  # the bit of amplifier_frozen is amplifier_stopped's
-                bit = one << (self.group[c] * _KINDS + kind)
+                bit = one << _READING_BIT[c * _KINDS + kind]
                 self.faults |= bit
-                if self.required[c] > 0.0:
+                if self.p.required[c] > 0.0:
                     self.trips |= bit
                     if c in (_VOLTAGE, _CURRENT, _AIR, _COIL):
                         self.hold = 1
-        if dt > self.late_s:
+        if dt > self.p.late_s:
             self.faults |= one << _B_LATE
         self.reports = self.status[_AMPLIFIER_STATE] == _OK
         self.enabled = self.reports and self.value[_AMPLIFIER_STATE] == _AMPLIFIER_ENABLED
@@ -490,10 +487,10 @@ class Law:
         """Range, rate and liveness of a new reading; `last` and `since_s` are of the newest one that was believed."""
         late = _DELAY_S * self.delay[c]
         elapsed = max(self.since_s[c] - late, self.period_s)
-        thermal = _AIR <= c < _SUPPLY
-        allowed = self.rate[c] * (max(elapsed, _THERMAL_S) if thermal else elapsed)
+        thermal = _THERMAL <= c < _THERMAL_END
+        allowed = self.p.rate[c] * (max(elapsed, _THERMAL_S) if thermal else elapsed)
         jumped = self.seen[c] > 0.0 and abs(value - self.last[c]) > allowed
-        if not (self.low[c] <= value <= self.high[c]) or not finite(value):
+        if not (self.p.low[c] <= value <= self.p.high[c]) or not finite(value):
             self.verdict[c] = 1.0 + _K_RANGE
         elif jumped and thermal and self.suspect[c] == 0.0:
             self.suspect[c] = 1.0  # one reading proves no jump: the next one decides
@@ -505,7 +502,7 @@ class Law:
             if jumped:
                 self.verdict[c] = 1.0 + _K_RATE
             else:
-                self.verdict[c] = 1.0 + _K_FROZEN if self.same_s[c] > self.frozen_s[c] else 0.0
+                self.verdict[c] = 1.0 + _K_FROZEN if self.same_s[c] > self.p.frozen_s[c] else 0.0
             self.last[c] = value
             self.seen[c] = 1.0
             self.suspect[c] = 0.0
@@ -517,7 +514,7 @@ class Law:
         Without a voltage meter the power is R I^2. `powered`: some power can be known; else its output is NaN.
         """
         self.powered = self.status[_CURRENT] != _ABSENT and (
-            self.status[_VOLTAGE] != _ABSENT or self.resistance_ohm > 0.0
+            self.status[_VOLTAGE] != _ABSENT or self.p.resistance_ohm > 0.0
         )
         if self.verdict[_VOLTAGE] == 0.0 and self.verdict[_CURRENT] == 0.0:
             self.power_w = self.last[_VOLTAGE] * self.last[_CURRENT]
@@ -525,7 +522,7 @@ class Law:
             self.power_w = self._resistance() * self.last[_CURRENT] * self.last[_CURRENT]
         elif self.enable == 0.0:
             self.power_w = 0.0
-        self.power_mean_w += (self.power_w - self.power_mean_w) * min(1.0, self.dt / self.power_time_s)
+        self.power_mean_w += (self.power_w - self.power_mean_w) * min(1.0, self.dt / self.p.power_time_s)
         self.air_rate_k_s = 0.0
         if self.verdict[_AIR] == 0.0:
             if self.air_known == 0.0:
@@ -542,7 +539,7 @@ class Law:
             s = self.T[0] + self.air_c
         elif self.verdict[_COIL] == 0.0:
             s = self.last[_COIL]
-        return self.resistance_ohm * (1.0 + _COPPER * (s - 20.0))
+        return self.p.resistance_ohm * (1.0 + _COPPER * (s - 20.0))
 
     def _start_air(self, value):
         """The air's low-pass starts at its first reading; the first one of all is where the expansion counts from."""
@@ -602,10 +599,10 @@ class Law:
             self._predict_corrections(elapsed)
             self.innovation_c = self.e[0]
             self.innovation_mean_c += (self.e[0] - self.innovation_mean_c) * min(
-                1.0, elapsed / self.innovation_time_s
+                1.0, elapsed / self.p.innovation_time_s
             )
-            self.coil_rate_k_s = (self.value[_COIL] - self.coil_slow_c) / self.coil_rate_time_s
-            self.coil_slow_c += self.coil_rate_k_s * min(elapsed, self.coil_rate_time_s)
+            self.coil_rate_k_s = (self.value[_COIL] - self.coil_slow_c) / self.p.coil_rate_time_s
+            self.coil_slow_c += self.coil_rate_k_s * min(elapsed, self.p.coil_rate_time_s)
         gain = 1.0
         if self.mkf:
             if not coil_new:
@@ -667,14 +664,16 @@ class Law:
             + part * (self.expansion_after_um - self.expansion_before_um)
             + self.offset_um
         )
-        target = self.expansion_um if self.compensate_on else 0.0
-        if not (abs(target) <= self.bound_um):  # also when it is not a number
+        target = self.expansion_um if self.p.compensate > 0.0 else 0.0
+        if not (abs(target) <= self.p.bound_um):  # also when it is not a number
             self.faults |= one << _B_BOUND
-            target = clip(target, -self.bound_um, self.bound_um) if finite(target) else self.compensation_um
+            target = (
+                clip(target, -self.p.bound_um, self.p.bound_um) if finite(target) else self.compensation_um
+            )
         if self.hold:
             return
         if self.state == _ARMED:
-            step = self.slew_um_s * self.dt
+            step = self.p.slew_um_s * self.dt
             if abs(target - self.compensation_um) > 2.0 * step:
                 self.faults |= one << _B_SLEWING
             target = clip(target, self.compensation_um - step, self.compensation_um + step)
@@ -704,20 +703,20 @@ class Law:
         else:
             if command == _SETPOINT and finite(command_value):
                 self.setpoint_um = command_value
-            self.setpoint_um = clip(self.setpoint_um, self.setpoint_low_um, self.setpoint_high_um)
+            self.setpoint_um = clip(self.setpoint_um, self.p.setpoint_low_um, self.p.setpoint_high_um)
         if self.state != _ARMED or (self.reports and not self.enabled):
             self.reference_um = self.compensated_um
             self.v = self.eps1 = self.d1 = 0.0
             return
-        step = self.setpoint_rate_um_s * self.dt
+        step = self.p.setpoint_rate_um_s * self.dt
         self.reference_um = clip(self.setpoint_um, self.reference_um - step, self.reference_um + step)
         eps = self.reference_um - self.compensated_um
         change = eps - self.eps1
         d = change / self.dt if self.dt > 0.0 else 0.0
         self.v = clip(
-            self.v + self.kp * (change + self.dt / self.ti_s * eps + self.td_s * (d - self.d1)),
-            -self.output_limit,
-            self.output_limit,
+            self.v + self.p.kp * (change + self.dt / self.p.ti_s * eps + self.p.td_s * (d - self.d1)),
+            -self.p.output_limit,
+            self.p.output_limit,
         )
         self.eps1, self.d1 = eps, d
 
@@ -728,33 +727,33 @@ class Law:
         one = 1
         found = external
         if self.state == _ARMED:
-            self.following_s = self.following_s + self.dt if abs(self.eps1) > self.following_um else 0.0
-            if self.following_s > self.following_limit_s or abs(self.eps1) > 2.0 * self.following_um:
+            self.following_s = self.following_s + self.dt if abs(self.eps1) > self.p.following_um else 0.0
+            if self.following_s > self.p.following_s or abs(self.eps1) > 2.0 * self.p.following_um:
                 found |= one << _B_FOLLOWING
-            self.saturation_s = self.saturation_s + self.dt if abs(self.v) >= self.output_limit else 0.0
-            if self.saturation_s > self.saturation_limit_s:
+            self.saturation_s = self.saturation_s + self.dt if abs(self.v) >= self.p.output_limit else 0.0
+            if self.saturation_s > self.p.saturation_s:
                 found |= one << _B_SATURATED
             self.idle_s = 0.0
         else:
             self.following_s = self.saturation_s = 0.0
             driven = (
-                self.verdict[_CURRENT] == 0.0 and abs(self.last[_CURRENT]) > self.idle_current_a
-            ) or abs(self.power_w) > self.idle_power_w
+                self.verdict[_CURRENT] == 0.0 and abs(self.last[_CURRENT]) > self.p.idle_current_a
+            ) or abs(self.power_w) > self.p.idle_power_w
             self.idle_s = self.idle_s + self.dt if driven else 0.0
-            if self.idle_s > self.idle_limit_s:
+            if self.idle_s > self.p.idle_s:
                 found |= one << _B_STUCK
-        if self.verdict[_COIL] == 0.0 and self.last[_COIL] > self.coil_limit_c:
+        if self.verdict[_COIL] == 0.0 and self.last[_COIL] > self.p.coil_limit_c:
             found |= one << _B_HOT
-        if self.T[0] + self.air_c > self.coil_limit_c:
+        if self.T[0] + self.air_c > self.p.coil_limit_c:
             found |= one << _B_HOT_MODEL
-        if self.coil_rate_k_s > self.coil_rate_limit:
+        if self.coil_rate_k_s > self.p.coil_rate_k_s:
             found |= one << _B_HEATING
         if self.predicts[0] and (
-            abs(self.innovation_mean_c) > self.innovation_limit_c
-            or abs(self.model_error_c) > self.drift_limit_c
+            abs(self.innovation_mean_c) > self.p.innovation_limit_c
+            or abs(self.model_error_c) > self.p.drift_limit_c
         ):
             found |= one << _B_DISAGREES
-        if self.power_mean_w > self.power_limit_w:
+        if self.power_mean_w > self.p.power_limit_w:
             found |= one << _B_POWER
         if not (
             finite(self.v)
@@ -772,7 +771,7 @@ class Law:
         self._arm(command)
         self.control_v = self.v
         self.enable = 1.0 if self.state == _ARMED and finite(self.v) else 0.0
-        self.drive = clip(self.v, -self.output_limit, self.output_limit) if self.enable > 0.0 else 0.0
+        self.drive = clip(self.v, -self.p.output_limit, self.p.output_limit) if self.enable > 0.0 else 0.0
         self._report()
 
     def _watch_amplifier(self):
@@ -789,13 +788,13 @@ class Law:
             self.driving = 1.0
         waits = self.reports and self.enabled != told and self.driving == 0.0
         self.amplifier_s = self.amplifier_s + self.dt if waits else 0.0
-        if self.amplifier_s > self.amplifier_limit_s:
+        if self.amplifier_s > self.p.amplifier_s:
             self.faults |= one << _B_NOT_FOLLOWING
 
     def _agree(self):
         """Readings against each other, low-passed; `drive` is still what was asked for one tick ago."""
         one = 1
-        part = min(1.0, self.dt / self.agree_time_s)
+        part = min(1.0, self.dt / self.p.agree_time_s)
         current = self.verdict[_CURRENT] == 0.0
         amperes = self.last[_CURRENT] if current else 0.0
         estimated = (
@@ -804,37 +803,37 @@ class Law:
         if (
             current
             and self.verdict[_VOLTAGE] == 0.0
-            and self.resistance_ohm > 0.0
+            and self.p.resistance_ohm > 0.0
             and (estimated or self.verdict[_COIL] == 0.0)
         ):
             s = self._resistance() * amperes
             self.ohm_v += part * (self.last[_VOLTAGE] - s - self.ohm_v)
             self.ohm_scale_v += part * (max(abs(self.last[_VOLTAGE]), abs(s)) - self.ohm_scale_v)
-            if abs(self.ohm_v) > self.resistance_tolerance * self.ohm_scale_v + self.resistance_v:
+            if abs(self.ohm_v) > self.p.resistance_tolerance * self.ohm_scale_v + self.p.resistance_v:
                 self.faults |= one << _B_ELECTRICAL
-        if self.state != _ARMED or not current or self.current_per_drive == 0.0:
+        if self.state != _ARMED or not current or self.p.current_per_drive == 0.0:
             self.current_error_a = 0.0
         else:
             self.current_error_a += part * (
-                amperes - self.current_per_drive * self.drive - self.current_error_a
+                amperes - self.p.current_per_drive * self.drive - self.current_error_a
             )
-            if abs(self.current_error_a) > self.current_tolerance_a:
+            if abs(self.current_error_a) > self.p.current_tolerance_a:
                 self.faults |= one << _B_NOT_FOLLOWING
-        if current and self.verdict[_POSITION] == 0.0 and self.flexure_um_per_a != 0.0:
-            s = self.last[_POSITION] - self.flexure_um_per_a * amperes
+        if current and self.verdict[_POSITION] == 0.0 and self.p.flexure_um_per_a != 0.0:
+            s = self.last[_POSITION] - self.p.flexure_um_per_a * amperes
             if self.zeroed == 0.0:
                 self.position_zero_um = s
                 self.zeroed = 1.0 if self.state != _OFF else 0.0
             self.displaced_um += part * (s - self.position_zero_um - self.displaced_um)
-            if abs(self.displaced_um) > self.position_tolerance_um:
+            if abs(self.displaced_um) > self.p.position_tolerance_um:
                 self.faults |= one << _B_DISPLACED
         if self.corrected == 0.0:
             return
-        part = min(1.0, self.dt / self.innovation_time_s)
+        part = min(1.0, self.dt / self.p.innovation_time_s)
         for m in range(_M):
             if self.verdict[_COIL + m] == 0.0 and self.predicts[m]:
                 self.apart_c[m] += part * (self.last[_COIL + m] - self.air_c - self.T[m] - self.apart_c[m])
-                if m > 0 and abs(self.apart_c[m]) > self.monitored_limit_c:
+                if m > 0 and abs(self.apart_c[m]) > self.p.monitored_limit_c:
                     self.faults |= one << _B_MONITORED
         if self.fresh[_COIL]:
             self._compare_order()
@@ -845,9 +844,9 @@ class Law:
             if self.reference_zeroed == 0.0:
                 self.reference_zero_um = s
                 self.reference_zeroed = 1.0 if self.state != _OFF else 0.0
-            part = min(1.0, self.dt / self.agree_time_s)
+            part = min(1.0, self.dt / self.p.agree_time_s)
             self.reference_error_um += part * (s - self.reference_zero_um - self.reference_error_um)
-            if abs(self.reference_error_um) > self.reference_tolerance_um:
+            if abs(self.reference_error_um) > self.p.reference_tolerance_um:
                 self.faults |= one << _B_MONITORED
 
     def _compare_order(self):
@@ -862,7 +861,9 @@ class Law:
                     and self.verdict[_COIL + k] == 0.0
                 ):
                     s = self.T[m] - self.T[k]
-                    if (s + self.apart_c[m] - self.apart_c[k]) * s < -self.order_limit_c * self.order_limit_c:
+                    if (
+                        s + self.apart_c[m] - self.apart_c[k]
+                    ) * s < -self.p.order_limit_c * self.p.order_limit_c:
                         self.exchanged = 1.0
 
     def _arm(self, command):
@@ -883,25 +884,27 @@ class Law:
     def _report(self):
         """Fill `outputs` in the order of OUTPUTS."""
         o = self.out
-        o[0] = self.state
-        o[1] = self.faults | self.latched
-        o[2] = self.setpoint_um
-        o[3] = self.reference_um
-        o[4] = self.position_um
-        o[5] = self.compensated_um
-        o[6] = self.compensation_um
-        o[7] = self.expansion_um
-        o[8] = self.control_v
-        o[9] = self.drive
-        o[10] = self.enable
-        o[11] = self.power_w if self.powered else _NAN
-        o[12] = self.air_rate_k_s
+        bits = self.faults | self.latched
+        o[_O_STATE] = self.state
+        o[_O_FAULTS] = bits & _WORD
+        o[_O_FAULTS_2] = bits >> _WORD_BITS
+        o[_O_SETPOINT] = self.setpoint_um
+        o[_O_REFERENCE] = self.reference_um
+        o[_O_POSITION] = self.position_um
+        o[_O_COMPENSATED] = self.compensated_um
+        o[_O_COMPENSATION] = self.compensation_um
+        o[_O_EXPANSION] = self.expansion_um
+        o[_O_CONTROL] = self.control_v
+        o[_O_DRIVE] = self.drive
+        o[_O_ENABLE] = self.enable
+        o[_O_POWER] = self.power_w if self.powered else _NAN
+        o[_O_AIR_RATE] = self.air_rate_k_s
         for m in range(_M):
-            o[13 + m] = self.T[m] + self.air_c
-        o[25] = self.innovation_c
-        o[26] = self.kalman_gain
-        o[27] = self.age[_POSITION]
-        o[28] = self.age[_COIL]
+            o[_O_ESTIMATES + m] = self.T[m] + self.air_c
+        o[_O_INNOVATION] = self.innovation_c
+        o[_O_GAIN] = self.kalman_gain
+        o[_O_POSITION_AGE] = self.age[_POSITION]
+        o[_O_COIL_AGE] = self.age[_COIL]
 
     @property
     def fault_bits(self) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from thermoctl.control.faults import CHANNELS
+from thermoctl.channels import CHANNELS
 from thermoctl.daemon.shared import Shared
 from thermoctl.signals import INDEX
 

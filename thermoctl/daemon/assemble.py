@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from hal.profile import bind
-from thermoctl.control.faults import CHANNELS
-from thermoctl.control.model import CompensatorModel, Parameters, zero_model
+from thermoctl.channels import CHANNELS
+from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters, zero_model
 from thermoctl.settings import RigSettings
 from thermoctl.yamlfile import InputError, load
 
@@ -20,39 +20,18 @@ UNNAMED = RigSettings().name
 
 def law_parameters(settings: Any) -> Parameters:
     """Gains, limits and protection of `settings` as the law takes them. Raises InputError for an unknown channel."""
-    control, compensation, protection = settings.control, settings.compensation, settings.protection
-    taken = {f.name for f in fields(Parameters)}
-    numbers = {
-        name: getattr(protection, name)
-        for name in vars(protection)
-        if name in taken and isinstance(getattr(protection, name), int | float)
+    given: dict[str, Any] = vars(settings.control) | vars(settings.compensation) | vars(settings.protection)
+    given |= {
+        "compensate": settings.compensation.enable,
+        "required": dict.fromkeys(settings.protection.required, 1.0),
     }
-    arrays: dict[str, Any] = {
-        name: _by_channel(getattr(protection, name), default, f"protection.{name}")
-        for name, default in (
-            ("low", -np.inf),
-            ("high", np.inf),
-            ("rate", np.inf),
-            ("stale_s", np.inf),
-            ("frozen_s", np.inf),
-        )
-    }
-    required = dict.fromkeys(protection.required, 1.0)
     return Parameters(
-        kp=control.kp,
-        ti_s=control.ti_s,
-        td_s=control.td_s,
-        output_limit=control.output_limit,
-        setpoint_rate_um_s=control.setpoint_rate_um_s,
-        setpoint_low_um=control.setpoint_low_um,
-        setpoint_high_um=control.setpoint_high_um,
-        moving_average=float(control.moving_average),
-        compensate=float(compensation.enable),
-        bound_um=compensation.bound_um,
-        slew_um_s=compensation.slew_um_s,
-        required=_by_channel(required, 0.0, "protection.required"),
-        **arrays,
-        **numbers,
+        **{
+            f.name: _by_channel(given[f.name], BY_CHANNEL[f.name], f"protection.{f.name}")
+            if f.name in BY_CHANNEL
+            else float(given[f.name])
+            for f in fields(Parameters)
+        }
     )
 
 

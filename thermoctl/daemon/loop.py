@@ -22,6 +22,7 @@ import numpy as np
 
 from hal.backend import ABSENT
 from hal.devices import DevicesBackend
+from thermoctl.channels import CHANNELS, THERMAL
 from thermoctl.control import arming, faults
 from thermoctl.control.law import DELAY_S, Law
 from thermoctl.control.model import CompensatorModel, Parameters
@@ -41,9 +42,9 @@ _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = (
     SUSPEND_EVERY,
     SUSPEND_NS,
 )  # numbers of C, by loop.pxd
-_AIR, _SUPPLY = faults.CHANNELS.index("air_c"), faults.CHANNELS.index("supply_v")
+_THERMAL, _THERMAL_END = CHANNELS.index(THERMAL[0]), CHANNELS.index(THERMAL[-1]) + 1
 _DELAY_S, _LATEST = DELAY_S, 15
-_N, _OFF, _STATE, _CODE = len(faults.CHANNELS), arming.OFF, INDEX["state"], INDEX["amplifier_fault"]
+_N, _OFF, _STATE, _CODE = len(CHANNELS), arming.OFF, INDEX["state"], INDEX["amplifier_fault"]
 _ABSENT = ABSENT
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
 
@@ -74,7 +75,7 @@ class Rig:
         self.reading: Any = None
         self.row = self._head = np.zeros(len(SIGNALS))
         self.record = Record(self.row, _HEAD)
-        self._delay = np.zeros(len(faults.CHANNELS), np.uint8)
+        self._delay = np.zeros(len(CHANNELS), np.uint8)
         self.remarks: Any = remarks
         self.said = [(0.0, "")] * _N
         self._status = np.zeros(_N, np.uint8)
@@ -112,7 +113,7 @@ class Rig:
             self.law.bind(reading.value, fresh, reading.status, self._delay)
             self.record.bind(reading.value, fresh, reading.status, self._delay, self.law.outputs)
             self._status = reading.status
-        for c in range(_AIR, _SUPPLY):
+        for c in range(_THERMAL, _THERMAL_END):
             if self._fresh[c]:  # temperatures come from slow buses: when was each one read?
                 age = (now_s - self._time_s[c]) / _DELAY_S
                 self._delay[c] = 0 if age < 0.0 else _LATEST if age >= _LATEST else int(age)
@@ -182,7 +183,7 @@ class Rig:
         verdict = self.law.verdict[c]
         if self._status[c] == _ABSENT or (verdict == 0.0 and self.said[c][0] == 0.0):
             return
-        words = self.backend.problem(faults.CHANNELS[c]) if verdict > 0.0 and self._status[c] else ""
+        words = self.backend.problem(CHANNELS[c]) if verdict > 0.0 and self._status[c] else ""
         if (verdict, words) == self.said[c]:
             return
         self.said[c] = (verdict, words)

@@ -16,7 +16,7 @@ import numpy as np
 from thermoctl.control import arming, faults
 from thermoctl.daemon.readings import readings, valid
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared
-from thermoctl.signals import INDEX, POINTS, SIGNALS
+from thermoctl.signals import BIT_WORDS, INDEX, POINTS, SIGNALS, fault_word
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BUCKETS_US = (10, 20, 50, 100, 200, 500, 1000, 2000, 4096)
@@ -27,12 +27,9 @@ _ELSEWHERE = {
     "lateness_us",
     "busy_us",
     "state",
-    "fault_bits",
-    "fresh_bits",
-    "status_bits",
+    *BIT_WORDS,
     "command",
     "command_value",
-    "external_bits",
     *(f"{p}{end}" for p in POINTS for end in ("_c", "_est_c")),
 }
 
@@ -52,7 +49,7 @@ def metrics(shared: Shared | None) -> str:
         return "\n".join(lines) + "\n"
     found = readings(shared, row)
     row = np.array([v if valid(n, found) else math.nan for n, v in zip(INDEX, row, strict=True)])
-    state, bits = int(row[INDEX["state"]]), int(row[INDEX["fault_bits"]])
+    state, bits = int(row[INDEX["state"]]), fault_word(row)
     family(
         "thermoctl_state",
         "gauge",

@@ -14,16 +14,14 @@ from typing import Any
 import numpy as np
 
 from hal.drive_errors import describe
+from thermoctl.channels import CHANNELS, SIGNAL, STATUS_NAMES
 from thermoctl.control import causes, faults
 from thermoctl.daemon.ring import CODE, CODE_S, TRIPS
 from thermoctl.daemon.shared import Shared
-from thermoctl.signals import INDEX
+from thermoctl.signals import INDEX, fault_word
 
-STATUS = ("OK", "STALE", "ERROR", "ABSENT")
-COLUMN = {role: "position_raw_um" if role == "position_um" else role for role in faults.CHANNELS}
-"""Each channel's signal in the record."""
 SOURCES: dict[str, tuple[str, ...]] = {
-    **{signal: (role,) for role, signal in COLUMN.items()},
+    **{signal: (role,) for role, signal in SIGNAL.items()},
     "position_um": ("position_um",),
     "compensated_um": ("position_um",),
     "power_w": ("voltage_v", "current_a"),
@@ -37,7 +35,7 @@ LATE_REMEDY = "docs/how-to/real-time.md: stop what burns the processor beside th
 
 def verdict(status_bits: int, kind: float, channel: int) -> str:
     """State of a channel: OK, ABSENT, or what is wrong by the device or by the law (ERROR STALE RANGE RATE FROZEN)."""
-    state = STATUS[status_bits >> (2 * channel) & 3]
+    state = STATUS_NAMES[status_bits >> (2 * channel) & 3]
     if state == "OK" and kind > 0.0:
         return faults.KINDS[int(kind) - 1].upper()
     return state
@@ -48,9 +46,9 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
     its time (seconds since 1970), which stays when the channel is well again."""
     bits, found = int(row[INDEX["status_bits"]]), {}
     begin_s = row[INDEX["wall_s"]] - row[INDEX["t_s"]]
-    for c, role in enumerate(faults.CHANNELS):
+    for c, role in enumerate(CHANNELS):
         state = verdict(bits, shared.areas["verdicts"][c], c)
-        last = _or_none(row[INDEX[COLUMN[role]]])
+        last = _or_none(row[INDEX[SIGNAL[role]]])
         said = shared.remarks.get(c) or (0, math.nan, "")
         found[role] = {
             "value": last if state == "OK" else None,
@@ -65,7 +63,7 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
 
 def valid(name: str, found: Mapping[str, Mapping[str, Any]]) -> bool:
     """Whether a signal's number may be shown as one: every channel it comes from is well."""
-    allowed = ("OK",) if name in COLUMN.values() else ("OK", "ABSENT")
+    allowed = ("OK",) if name in SIGNAL.values() else ("OK", "ABSENT")
     return all(found[role]["state"] in allowed for role in SOURCES.get(name, ()))
 
 
@@ -79,7 +77,7 @@ def invalid(status_bits: np.ndarray, name: str) -> np.ndarray:
     """Which of these rows' words of status say that a channel of this signal is stale or in error."""
     bits, bad = np.nan_to_num(status_bits).astype(np.int64), np.zeros(len(status_bits), bool)
     for role in SOURCES.get(name, ()):
-        state = bits >> (2 * faults.CHANNELS.index(role)) & 3
+        state = bits >> (2 * CHANNELS.index(role)) & 3
         bad |= (state == 1) | (state == 2)
     return bad
 
@@ -94,15 +92,20 @@ def drive_code(shared: Shared, row: np.ndarray) -> dict[str, Any] | None:
     return {"code": int(code), "text": describe(code), "wall_s": float(wall_s), "stands": bool(now)}
 
 
-def standing_faults(shared: Shared, row: np.ndarray, found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Standing and latched faults, the cause first and what follows behind it (control/causes.py); [] while it starts."""
+def standing_faults(
+    shared: Shared, row: np.ndarray, found: Mapping[str, Any], also: int = 0
+) -> list[dict[str, Any]]:
+    """Active and latched faults, the cause first and its consequences behind it (control/causes.py); [] while OFF.
+
+    also: bits of further faults to list, which are gone again in this row.
+    """
     if row[INDEX["state"]] == 0.0:
         return []
     trips, onsets = int(shared.areas["remark_numbers"][TRIPS]), shared.areas["onsets"]
     begin_s = row[INDEX["wall_s"]] - row[INDEX["t_s"]]
     standing = [
         causes.Standing(f.name, float(onsets[f.bit, 0]), int(onsets[f.bit, 1]), float(onsets[f.bit, 2]))
-        for f in faults.decode(row[INDEX["fault_bits"]])
+        for f in faults.decode(fault_word(row) | also)
     ]
     code = drive_code(shared, row)
     return [

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.control.model import CompensatorModel, Parameters
+from thermoctl.control import faults
+from thermoctl.control.model import ARRAYS, PLAIN, CompensatorModel, Parameters
 from thermoctl.daemon.misfit import Misfit
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, RUN_S, Shared
 from thermoctl.signals import INDEX
@@ -26,19 +27,6 @@ from thermoctl.signals import INDEX
 INTERVAL_S = 0.1
 LAW_VERSION = 2  # of the law's inputs, state and arithmetic: a replay is bit for bit only within one
 _TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
-_ARRAYS = ("A_minus_I", "B", "C", "gain", "b1", "b2")
-_NUMBERS = (
-    "kind",
-    "period_s",
-    "R_w",
-    "R_v",
-    "f1",
-    "expansion_period_s",
-    "sensors",
-    "b_air",
-    "offset_um",
-    "air_filter_s",
-)
 
 
 def encode(array: np.ndarray) -> str:
@@ -69,10 +57,10 @@ def law_metadata(
             "state": None if state is None else encode(state),
             "parameters": encode(parameters.pack()),
             "model": {
-                **{name: getattr(model, name) for name in _NUMBERS},
+                **{name: getattr(model, name) for name in PLAIN},
                 **{
                     name: {"shape": getattr(model, name).shape, "values": encode(getattr(model, name))}
-                    for name in _ARRAYS
+                    for name in ARRAYS
                 },
             },
         }
@@ -85,8 +73,8 @@ def read_law_metadata(text: str) -> dict[str, Any]:
     if found["version"] != LAW_VERSION:
         raise ValueError(f"law version {found['version']}, this program has version {LAW_VERSION}")
     m = found["model"]
-    values: dict[str, Any] = {name: m[name] for name in _NUMBERS} | {"sensors": tuple(m["sensors"])}
-    values |= {name: decode(m[name]["values"]).reshape(m[name]["shape"]) for name in _ARRAYS}
+    values: dict[str, Any] = {name: m[name] for name in PLAIN if name in m} | {"sensors": tuple(m["sensors"])}
+    values |= {name: decode(m[name]["values"]).reshape(m[name]["shape"]) for name in ARRAYS if name in m}
     model = CompensatorModel(**values)
     return {
         **found,
@@ -203,7 +191,7 @@ def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Re
     run = datetime.fromtimestamp(float(shared.counters[RUN_S]), UTC).strftime("%Y%m%dT%H%M%SZ")
 
     def open_writer(law: str) -> RecordingWriter:
-        metadata = {"rig": rig, "run": run, "config": config, "law": law}
+        metadata = {"rig": rig, "run": run, "config": config, "law": law, "faults": json.dumps(faults.NAMES)}
         return RecordingWriter(settings.recording, metadata, rig, lambda text: log("recorder", what=text))
 
     return Recorder(

@@ -13,9 +13,10 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-cdef enum:
-    FIRST_DELAYED = 4           # the channels whose delay is recorded: air_c and the twelve temperatures; 13 x 4 bits
-    DELAYED = 13                # are exact in a float64
+from thermoctl.channels import INDEX, THERMAL
+
+# The channels whose delay is recorded, air_c and the twelve temperatures: 13 x 4 bits are exact in a float64.
+cdef int FIRST_DELAYED = INDEX[THERMAL[0]], DELAYED = len(THERMAL)
 
 cdef extern from *:
     """
@@ -203,7 +204,7 @@ LATE_FOR_S = 1.0    # ... for so long after
 
 
 cdef class Remarks:
-    """What the loop says beside the row, in shared memory. Channels are faults.CHANNELS.
+    """What the loop says beside the row, in shared memory. Channels are channels.CHANNELS.
 
     ages, verdicts float64 (channels,): of every tick, as in the law;  numbers float64 (3,): TRIPS, CODE, CODE_S;
     onsets float64 (64, 3): t_s and tick of each fault bit's onset, longest tick of the second before where late, s, else 0;

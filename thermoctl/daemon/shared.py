@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.control.faults import CHANNELS
+from thermoctl.channels import CHANNELS
 from thermoctl.control.model import NAMES
 from thermoctl.daemon.ring import Box, Histogram, Mailbox, Remarks, Ring
 from thermoctl.signals import SIGNALS

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from hal.backend import make_backend
-from thermoctl.control import arming
+from thermoctl.control import arming, faults
 from thermoctl.control.model import NAMES, CompensatorModel, Parameters
 from thermoctl.daemon.assemble import compensator, law_parameters
 from thermoctl.daemon.loop import RELOAD, Rig
 from thermoctl.daemon.ring import Box, Mailbox
-from thermoctl.signals import INDEX, SIGNALS
+from thermoctl.signals import INDEX, SIGNALS, fault_word
 
 COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reload": RELOAD}
 
@@ -93,7 +93,7 @@ class Simulation:
         if not self.until(lambda row: row[state] == arming.READY, limit_s):
             raise RuntimeError(
                 f"not READY within {limit_s} s: state {arming.STATES[int(self.row[state])]}, faults "
-                f"{int(self.row[INDEX['fault_bits']]):#x}"
+                f"{', '.join(f.name for f in faults.decode(fault_word(self.row))) or 'none'}"
             )
         self.command("arm")
         self.tick()

@@ -22,7 +22,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from thermoctl.control import arming, faults
+from thermoctl.channels import CHANNELS, STATUS_NAMES
+from thermoctl.control import arming
 from thermoctl.daemon import arrival, readings
 from thermoctl.daemon.loop import RELOAD
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
@@ -113,10 +114,7 @@ def settled(now: dict[str, Any]) -> bool:
 
 def channel_states(status_bits: int) -> dict[str, str]:
     """Each channel's reading: OK, STALE, ERROR or ABSENT, from the signal status_bits."""
-    return {
-        name: ("OK", "STALE", "ERROR", "ABSENT")[status_bits >> (2 * c) & 3]
-        for c, name in enumerate(faults.CHANNELS)
-    }
+    return {name: STATUS_NAMES[status_bits >> (2 * c) & 3] for c, name in enumerate(CHANNELS)}
 
 
 def latency(shared: Shared, period_s: float) -> dict[str, Any]:

@@ -31,6 +31,7 @@ import numpy as np
 import structlog
 
 from hal.backend import HardwareError, disable_amplifier, make_backend, slow_devices
+from thermoctl.channels import CHANNELS
 from thermoctl.control import arming, faults
 from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep, readings
@@ -38,7 +39,7 @@ from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.lock import hold
 from thermoctl.daemon.shared import BEATS, LOOP_PID, RESUMED, WARNINGS, Shared
-from thermoctl.signals import INDEX
+from thermoctl.signals import INDEX, fault_words
 from thermoctl.yamlfile import InputError
 
 HANG_S = 15.0  # a helper that did no round for so long is killed and started again
@@ -283,9 +284,9 @@ class _Watcher:
 
     def __init__(self, shared: Shared, log: Log):
         self.shared, self.log = shared, log
-        self.position, self.before = 0, (float(arming.OFF), 0.0)
+        self.position, self.before = 0, (arming.OFF, 0)
         self.told: dict[str, float] = {}
-        self.changes = [0] * len(faults.CHANNELS)
+        self.changes = [0] * len(CHANNELS)
         self.code: Any = None
 
     def look(self) -> None:
@@ -293,9 +294,10 @@ class _Watcher:
         if not len(rows):
             return
         self._devices(rows[-1])
-        pairs = rows[:, [INDEX["state"], INDEX["fault_bits"]]]
-        pairs[pairs[:, 0] == arming.OFF, 1] = 0.0
-        changed = np.flatnonzero((np.diff(np.vstack([self.before, pairs]), axis=0) != 0).any(axis=1))
+        states = rows[:, INDEX["state"]].astype(np.uint64)
+        pairs = np.column_stack((states, np.where(states == arming.OFF, np.uint64(0), fault_words(rows))))
+        known = np.vstack((np.array([self.before], np.uint64), pairs))
+        changed = np.flatnonzero((known[1:] != known[:-1]).any(axis=1))
         new = 0
         for k in changed[:20]:
             state, bits = pairs[k]
@@ -309,15 +311,13 @@ class _Watcher:
                 )
                 self.told.clear()
             new |= int(bits) & ~int(before_bits)
-        self.before = (pairs[-1, 0], pairs[-1, 1])
+        self.before = (int(pairs[-1, 0]), int(pairs[-1, 1]))
         if new:
             self._faults(rows[-1], new)
 
     def _faults(self, row: np.ndarray, new: int) -> None:
         """Those of `new`, causes first, also where they are gone again by now."""
-        row = row.copy()
-        row[INDEX["fault_bits"]] = float(int(row[INDEX["fault_bits"]]) | new)
-        for f in readings.standing_faults(self.shared, row, readings.readings(self.shared, row)):
+        for f in readings.standing_faults(self.shared, row, readings.readings(self.shared, row), new):
             name = f["name"]
             if not new >> faults.BIT[name] & 1 or f["t_s"] - self.told.get(name, -np.inf) < TELL_AGAIN_S:
                 continue
@@ -338,7 +338,7 @@ class _Watcher:
         """New lines of the devices, and the drive's error code; a channel's again only after TELL_AGAIN_S."""
         if row[INDEX["state"]] == arming.OFF:
             return
-        for c, role in enumerate(faults.CHANNELS):
+        for c, role in enumerate(CHANNELS):
             said = self.shared.remarks.get(c)
             if said is None or said[0] == self.changes[c]:
                 continue

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.control.faults import CHANNELS
+from thermoctl.channels import CHANNELS
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.shared import TUNING, Shared
 from thermoctl.identify import modelfile

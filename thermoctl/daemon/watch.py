@@ -24,7 +24,7 @@ from thermoctl.daemon.assemble import compensator, shared_name
 from thermoctl.daemon.readings import hide_invalid
 from thermoctl.daemon.shared import Shared
 from thermoctl.daemon.socket import latency, status
-from thermoctl.signals import INDEX
+from thermoctl.signals import INDEX, fault_words
 from thermoctl.yamlfile import InputError
 
 BEFORE_S, AFTER_S = 2.0, 2.0  # of a capture
@@ -53,8 +53,8 @@ RANGED = (
 """Signals of which a frame says the least and largest value since the frame before."""
 LATENESS_EDGES_US = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
-_T, _WALL, _BITS = INDEX["t_s"], INDEX["wall_s"], INDEX["fault_bits"]
-_TRIPS = faults.mask("fault", "critical")
+_T, _WALL = INDEX["t_s"], INDEX["wall_s"]
+_TRIPS = np.uint64(faults.mask("fault", "critical"))
 
 
 @dataclass
@@ -240,8 +240,8 @@ class Watch:
                 after = rows[rows[:, _T] <= capture.t_s + AFTER_S]
                 capture.rows = np.concatenate((capture.rows, after))
                 capture.whole = len(after) < len(rows)
-        bits = np.where(rows[:, INDEX["state"]] == arming.OFF, 0, rows[:, _BITS].astype(np.int64) & _TRIPS)
-        before = np.concatenate((bits[:1] if self._bits is None else [self._bits], bits[:-1]))
+        bits = np.where(rows[:, INDEX["state"]] == arming.OFF, np.uint64(0), fault_words(rows) & _TRIPS)
+        before = np.concatenate((bits[:1] if self._bits is None else [np.uint64(self._bits)], bits[:-1]))
         for k in np.flatnonzero(bits & ~before):
             names = [f.name for f in faults.decode(int(bits[k] & ~before[k]))]
             self._begin_capture(rows, int(k), names)

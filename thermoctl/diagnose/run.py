@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.control.faults import CHANNELS
+from thermoctl.channels import CHANNELS
 from thermoctl.diagnose import doubt, experiment, locate
 from thermoctl.diagnose.effects import CATALOGUE, Rig, catalogue
 from thermoctl.diagnose.evidence import LARGE, white_sigma

@@ -30,7 +30,7 @@ from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
-from thermoctl.signals import INDEX, NAMES, POINTS
+from thermoctl.signals import INDEX, NAMES, POINTS, fault_word
 from thermoctl.yamlfile import InputError
 
 EVERY_S = 0.1  # between the rows that are kept
@@ -355,7 +355,7 @@ def _rig_answers() -> Iterator[None]:
 
 def _causes(row: np.ndarray) -> str:
     """The faults of a record row that trip, with their remedies; none: somebody disarmed it."""
-    found = [f for f in faults.decode(row[INDEX["fault_bits"]]) if f.severity != "warning"]
+    found = [f for f in faults.decode(fault_word(row)) if f.severity != "warning"]
     return "; ".join(f"{f.name}: {f.meaning} -> {f.remedy}" for f in found) or "somebody disarmed it"
 
 

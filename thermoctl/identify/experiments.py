@@ -20,9 +20,8 @@ from typing import Protocol
 
 import numpy as np
 
-from thermoctl.control import arming
-from thermoctl.control.faults import FAULTS
-from thermoctl.signals import INDEX
+from thermoctl.control import arming, faults
+from thermoctl.signals import INDEX, fault_word
 from thermoctl.yamlfile import InputError, Node, load, suggest
 
 FORMAT = "thermoctl-experiments/1"
@@ -342,7 +341,7 @@ def run(
     waiting = ([(start_s, *before[-1][1:])] if before else []) + waiting
     ticks = round((schedule.duration_s - start_s) / period)
     block, began, nxt, k = [], time.monotonic(), 0, 0
-    state, bits = INDEX["state"], INDEX["fault_bits"]
+    state = INDEX["state"]
     if simulation.row[state] != arming.ARMED:
         simulation.arm()
     while k < ticks:
@@ -367,7 +366,7 @@ def run(
         if row[state] != arming.ARMED:
             if block:
                 yield np.array(block)
-            standing = [f.name for f in FAULTS if int(row[bits]) >> f.bit & 1]
+            standing = [f.name for f in faults.decode(fault_word(row))]
             raise Aborted(
                 f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", start_s + k * period
             )

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from thermoctl.control.faults import TEMPERATURES
+from thermoctl.channels import TEMPERATURES
 from thermoctl.control.model import CompensatorModel
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Output, Plant

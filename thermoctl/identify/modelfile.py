@@ -19,25 +19,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from thermoctl.control.model import CompensatorModel
+from thermoctl.control.model import UNITS, CompensatorModel
 from thermoctl.yamlfile import InputError, Node, load
 
 FORMAT = "thermoctl-model/1"
-UNITS = {
-    "period_s": "s",
-    "A_minus_I": "1 per period",
-    "B": "K per W, K per (K/s)",
-    "C": "K",
-    "gain": "K/K",
-    "R_w": "K^2",
-    "R_v": "K^2",
-    "b1": "um/K",
-    "b2": "um/K",
-    "b_air": "um/K",
-    "offset_um": "um",
-    "expansion_period_s": "s",
-    "air_filter_s": "s",
-}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}")
 
 

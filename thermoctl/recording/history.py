@@ -19,7 +19,7 @@ import numpy as np
 
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.writer import FULL, NAME, TIER, recording_files
-from thermoctl.signals import INDEX, NAMES
+from thermoctl.signals import BIT_WORDS, INDEX, NAMES
 from thermoctl.yamlfile import InputError, suggest
 
 FULL_SPAN_S = 60.0  # at and below this the full rate is shown
@@ -171,7 +171,7 @@ def _reduced(
 
 
 def _read(path: Path, signal: str, kind: str, invalid: Invalid) -> tuple[np.ndarray, ...]:
-    ranged = kind == TIER and not signal.endswith("_bits") and signal != "t_s"
+    ranged = kind == TIER and signal not in BIT_WORDS and signal != "t_s"
     names = [f"{signal}_min", signal, f"{signal}_max"] if ranged else [signal] * 3
     wanted = {_CLOCK, _STATUS, *names}
     batches = [

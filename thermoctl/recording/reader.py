@@ -18,7 +18,7 @@ import pyarrow.parquet
 from thermoctl.recording import formats
 from thermoctl.recording.files import read_table, to_arrow, whole_file
 from thermoctl.recording.stream import END, open_stream
-from thermoctl.signals import NAMES
+from thermoctl.signals import NAMES, SIGNALS
 from thermoctl.yamlfile import InputError, suggest
 
 
@@ -83,13 +83,15 @@ def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
     table = read_table(path)
     if "10 Hz" in table.meta.get("tier", ""):
         raise InputError(f"{path}: no full-rate recording but its 10 Hz tier; a replay needs every tick")
-    missing = [n for n in NAMES if n not in table.columns]
+    before = {s.name: s.before for s in SIGNALS if s.before is not None}
+    columns = {n: np.full(len(table), number) for n, number in before.items()} | dict(table.columns)
+    missing = [n for n in NAMES if n not in columns]
     if missing:
         raise InputError(
             f"{path}: no full-rate recording of this version: {', '.join(missing[:3])} "
             f"{'is' if len(missing) == 1 else 'are'} missing; replay it with the version that recorded it"
         )
-    return np.column_stack([table.columns[n] for n in NAMES]), table.meta.get("law", "")
+    return np.column_stack([columns[n] for n in NAMES]), table.meta.get("law", "")
 
 
 def recover(path: str | Path, out: str | Path) -> Info:

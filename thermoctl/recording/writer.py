@@ -110,7 +110,7 @@ class Tier:
     def __init__(self, signals: Sequence[Signal]):
         names = [s.name for s in signals]
         self.clock = names.index("t_s")
-        self.bits = [i for i, n in enumerate(names) if n.endswith("_bits")]
+        self.bits = [i for i, s in enumerate(signals) if s.bits]
         self.ranged = [i for i in range(len(names)) if i != self.clock and i not in self.bits]
         self.signals = (
             signals[self.clock],

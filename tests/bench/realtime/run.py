@@ -445,7 +445,7 @@ def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
 
 def readings(ticks: int, seed: int = 7) -> dict[str, np.ndarray]:
     """Readings of a warm day in the paper's motion, with the encoder's missing frames and now and then a bad reading."""
-    from thermoctl.control.faults import CHANNELS
+    from thermoctl.channels import CHANNELS
 
     rng = np.random.default_rng(seed)
     n = len(CHANNELS)

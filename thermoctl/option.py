@@ -1,0 +1,39 @@
+"""One row of the configuration's table: a dataclass field with unit, range, default and meaning."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Option:
+    """Properties of one option besides its type and default."""
+
+    unit: str
+    low: float
+    high: float
+    restart: bool
+    meaning: str
+    choices: tuple[str, ...] = ()
+
+
+def option(
+    meaning: str,
+    default: Any = dataclasses.MISSING,
+    unit: str = "",
+    low: float = -math.inf,
+    high: float = math.inf,
+    restart: bool = False,
+    choices: tuple[str, ...] = (),
+    factory: Any = dataclasses.MISSING,
+) -> Any:
+    """Return the dataclass field of one option; without default or factory the option must be given."""
+    return field(
+        default=default,
+        default_factory=factory,
+        kw_only=True,
+        metadata={"option": Option(unit, low, high, restart, meaning, choices)},
+    )
