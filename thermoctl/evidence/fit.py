@@ -27,7 +27,7 @@ from thermoctl.plant.simulate import Drive, SimulationError
 BELIEF = 0.3  # standard deviation of the plant's parameters round their beliefs, as a share of their ranges
 UNIFORM = 12.0  # precision of a uniform prior over 0..1
 DECADES = 4.0  # over which the order of magnitude of an effect's size is unknown
-WHITE, ROUGH = 15, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
+WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
 ROUNDS = 15  # of Gauss and Newton's steps
 LENGTHS = 1.0, 0.3, 0.1  # of a step that are tried
 FAR = 8.0  # standard deviations that a start may be off
@@ -74,6 +74,18 @@ class Fitted:
     average: Averaged
     powers: tuple[np.ndarray, ...]
     sd: Mapping[str, float]  # of the effects' parameters
+    rough_plant: Plant
+    rough: Fit  # refit in white noise, whose free run is closest to the data: extensions start there
+
+    @property
+    def absent(self) -> bool:
+        """Did the refit take an effect away again? Then the hypothesis is that without it."""
+        return any(
+            p.amplitude and np.isclose(self.plant.parameters[e.own[p.name]].value, p.null, rtol=0, atol=1e-9 + 1e-3 * self.sd[e.own[p.name]])
+            for e in self.hypothesis.effects
+            for p in e.candidate.effect.parameters
+            if p.name in e.own and e.own[p.name] in self.sd
+        )
 
     @property
     def log_evidence(self) -> float:
@@ -114,6 +126,11 @@ class Posterior:
             raise SimulationError("the simulation gives values that are not numbers")
         return out
 
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Between which the unknowns lie."""
+        n, m = self.problem.n_parameters, len(self.problem.unknowns)
+        return np.concatenate([np.zeros(n), np.full(m - n, -FAR)]), np.concatenate([np.ones(n), np.full(m - n, FAR)])
+
     def prior(self, z: np.ndarray) -> float:
         """-1/2 of the quadratic terms of the prior and of physics' own beliefs."""
         values, _ = self.problem.unpack(z)
@@ -141,9 +158,7 @@ class Posterior:
     def climb(self, z: np.ndarray, goal: float) -> tuple[np.ndarray, Averaged, list[np.ndarray], np.ndarray, list[np.ndarray]]:
         """The maximum near z: z, likelihood, powers, H and errors there. A log posterior of `goal` that is out of reach is not
         climbed for."""
-        n = self.problem.n_parameters
-        low = np.concatenate([np.zeros(n), np.full(len(z) - n, -FAR)])
-        high = np.concatenate([np.ones(n), np.full(len(z) - n, FAR)])
+        low, high = self.bounds()
         errors = self.errors(z)
         rows = self.rows(errors)
         now, powers = self.likelihood(rows)
@@ -219,11 +234,11 @@ def fitted(
             posterior.model, posterior.drives, case.noise, iterations=WHITE, tolerance=ROUGH, beliefs=posterior.problem.beliefs
         )
     z, average, powers, matrix, errors = posterior.climb(start.z, best - HOPELESS)
-    return _weighed(case, posterior, z, average, powers, matrix, errors)
+    return _weighed(case, posterior, z, average, powers, matrix, errors, start)
 
 
 def _weighed(
-    case: Case, posterior: Posterior, z: np.ndarray, average: Averaged, powers: list[np.ndarray], matrix: np.ndarray, errors: list[np.ndarray]
+    case: Case, posterior: Posterior, z: np.ndarray, average: Averaged, powers: list[np.ndarray], matrix: np.ndarray, errors: list[np.ndarray], rough: Fit
 ) -> Fitted:
     """Laplace's evidence at the maximum."""
     problem = posterior.problem
@@ -231,21 +246,36 @@ def _weighed(
     confined = matrix + np.diag(np.where(np.arange(len(z)) < problem.n_parameters, UNIFORM, 0.0))  # a range has a width
     inverse = np.linalg.pinv(confined, hermitian=True)
     sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
-    log_prior = posterior.prior(z) + 0.5 * float(np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi))))
     names: dict[str, float] = {}
     for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
         slope = problem.scales[q].slope(float(values[0, posterior.model.parameters.index(q)]))
         if q not in case.plant.parameters:
             names[q] = max(names.get(q, 0.0), float(sd[k] * slope))
-        if k in posterior.amplitudes and posterior.amplitudes[k][0].effect.prior is None:
-            log_prior += _size(posterior.amplitudes[k][1], float(values[0, posterior.model.parameters.index(q)]), float(sd[k] * slope)) + np.log(slope)
+    log_prior = log_density(posterior, z, names)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
     at_bound = {q: "low" if z[k] <= 1e-6 else "high" for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]) if z[k] <= 1e-6 or z[k] >= 1 - 1e-6}
     found = Fit(
         posterior.model, values, dx0, -2 * average.log_likelihood, problem.unknowns, z, matrix, errors, case.noise, 0, problem.samples, at_bound, problem.beliefs
     )
     plant = refit.updated(posterior.plant, found, posterior.drives)
-    return Fitted(Hypothesis(tuple(posterior.effects)), plant, found, average.log_likelihood, float(log_prior), volume, average, tuple(powers), names)
+    return Fitted(Hypothesis(tuple(posterior.effects)), plant, found, average.log_likelihood, float(log_prior), volume, average, tuple(powers), names, refit.updated(posterior.plant, rough, posterior.drives), rough)
+
+
+def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
+    """log p(z): Gaussians, uniform shapes, and the effects' sizes, which are not measured more finely than `sd`."""
+    values, _ = posterior.problem.unpack(z)
+    out = posterior.prior(z) + 0.5 * float(np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi))))
+    for k, (c, p) in posterior.amplitudes.items():
+        q = posterior.problem.unknowns[k][0]
+        if c.effect.prior is None:
+            value = float(values[0, posterior.model.parameters.index(q)])
+            out += _size(p, value, sd[q]) + np.log(posterior.problem.scales[q].slope(value))
+    return out
+
+
+def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
+    """log p(D | z) + log p(z) at any z, with the sizes' scales of a fitted hypothesis: what `log_evidence` integrates."""
+    return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(posterior, z, found.sd)
 
 
 def _gaussian(posterior: Posterior) -> np.ndarray:

@@ -24,9 +24,10 @@ from scipy.special import logsumexp
 from thermoctl.evidence.coordinates import Channel
 
 STATED = 1.0  # standard deviation of log c^2: a stated noise is wrong by a factor of 1.6 in one case of three
-STEPS, CLOSE = 30, 1e-3  # of Newton's method for log c^2, and the step that ends it
-SIZES = 10.0 ** np.arange(-1.0, 3.1, 0.5)  # a: variance of the slow part over that of the white part
-CORNERS = 6  # tau: from one sampling interval to a quarter of the recording
+STEPS, CLOSE = 15, 3e-3  # of Newton's method for log c^2, and the step that ends it
+SIZES = 10.0 ** np.arange(-0.9, 3.1, 0.65)  # a: variance of the slow part over that of the white part
+CORNERS = 4  # tau: from one sampling interval to a quarter of the recording
+RARE = 0.7  # nats that a slow part's standard deviation costs in units of the white part's: most are no larger than that
 PLAIN, FIRST_ORDER = 0.4, 0.45  # prior of white noise, and of white noise with a first-order part; the rest is 1/f
 UNLIKELY = 1e-4  # posterior of a cell that a small step need not look at
 LOG_2PI = float(np.log(2 * np.pi))
@@ -64,7 +65,7 @@ def grid(channels: Sequence[Channel], positions: Sequence[int], sigma: float) ->
         np.concatenate([first_order(c.frequency, c.interval, tau) for c in channels])
         for tau in np.geomspace(interval, 0.25 * span, CORNERS)
     ]
-    rare = -0.5 * np.log1p(SIZES)  # a slow part much larger than the white one is rarer
+    rare = -RARE * np.sqrt(SIZES)
     rare -= logsumexp(rare)
     slow, weight = [np.ones(len(shapes[0]))], [np.log(PLAIN)]
     for shape in shapes:

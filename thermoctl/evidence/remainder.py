@@ -20,7 +20,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Drive, Model
 
-SHARES = 10.0 ** np.arange(-3.0, 0.6, 0.5)  # eta
+SHARES = 10.0 ** np.arange(-3.0, 0.1, 0.5)  # eta
+SMALL = 0.02  # mean of eta's exponential prior: what nobody will name is a few per cent of what flows
 CORNERS = 4  # tau', from two samples to a quarter of the longest recording
 ABSENT = 0.5  # prior of no remainder
 DRAWS = 8  # random forces a node
@@ -107,8 +108,9 @@ def remainder(
     intervals = [float(np.median(np.diff(d.t))) for d in drives]
     taus = np.geomspace(2 * min(intervals), 0.25 * span, CORNERS)
     share, corner = np.meshgrid(SHARES if nodes else SHARES[:0], taus, indexing="ij")
-    cells = share.size
-    prior = np.concatenate([[np.log(ABSENT if cells else 1.0)], np.full(cells, np.log((1 - ABSENT) / max(cells, 1)))])
+    size = np.log(1 - ABSENT) - share.ravel() / SMALL
+    size -= np.log(len(taus)) + np.log(np.exp(-SHARES / SMALL).sum())
+    prior = np.concatenate([[np.log(ABSENT)], size]) if nodes else np.zeros(1)
     return Remainder(
         nodes,
         [white[k] for k in range(len(coordinates.channels))],

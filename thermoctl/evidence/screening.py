@@ -26,7 +26,7 @@ class Rows(Metric):
 
     def __init__(self, case: Case, fitted: Fitted, most: int, share: float):
         """`share`: of the remainder that counts as noise, too."""
-        self.fit, self.model = fitted.fit, fitted.fit.model
+        self.fit, self.model = fitted.rough, fitted.rough.model
         self.drives = [self.model.drive(t) for t in case.tables]
         self.problem = Problem(self.model, self.drives, case.noise)
         for d, values in zip(self.drives, self.fit.values, strict=True):
@@ -98,7 +98,7 @@ def screened(case: Case, fitted: Fitted, share: float = 0.0) -> Screened:
     case.budget.screenings_done += 1
     moving = bool(Structure(case.plant, [], []).velocities) if case.plant.nodes else False
     metric = Rows(case, fitted, MOVING_ROWS if moving else ROWS, share)
-    rig = Structure(fitted.plant, metric.drives, [t.columns for t in case.tables])
+    rig = Structure(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (case.plant.nodes.keys() | case.plant.flows.keys())
     found = [c for c in candidates(rig, case.catalogue) if c.key not in fitted.hypothesis.keys and not c.place.parts() & added]
     draws = np.random.default_rng(1).standard_normal((len(metric.sketch(metric.residual[:, None])), DRAWS))

@@ -98,6 +98,7 @@ def extensions(
             continue
         leader = max(w.fitted.log_likelihood for w in [*tried.values(), *out])
         found = [f for d in starts(looked, direction) if (f := _refitted(case, parent, d, looked, leader)) is not None]
+        found = [f for f in found if not f.absent]
         if found:
             best = max(found, key=lambda f: f.log_evidence)
             out.append(Weighed(best, odds(best.hypothesis.effects, where, limits)))
@@ -113,7 +114,7 @@ def starts(looked: Screened, direction: Direction) -> list[Direction]:
 
 def _refitted(case: Case, parent: Weighed, direction: Direction, looked: Screened, leader: float) -> Fitted | None:
     try:
-        plant, own = extend(parent.fitted.plant, direction, looked.metric.drives)
+        plant, own = extend(parent.fitted.rough_plant, direction, looked.metric.drives)
         return fitted(case, plant, (*parent.fitted.hypothesis.effects, Placed(direction.candidate, own)), None, leader)
     except (SimulationError, InputError, np.linalg.LinAlgError):
         return None
