@@ -7,9 +7,9 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
-from thermoctl.diagnose.effects import Candidate, catalogue, candidates
-from thermoctl.diagnose.search import extend
+from thermoctl.diagnose.effects import Candidate, candidates, catalogue
 from thermoctl.diagnose.screen import Direction
+from thermoctl.diagnose.search import extend
 from thermoctl.evidence.case import Budget, case
 from thermoctl.evidence.fit import Placed, Posterior, evidence_at, fitted
 from thermoctl.evidence.roles import Structure
@@ -52,13 +52,17 @@ PROBLEMS = {
 }
 
 
-def _recording(plant, truth: np.ndarray, seed: int, slow: float, inputs: dict[str, np.ndarray], t: np.ndarray) -> Table:
+def _recording(
+    plant, truth: np.ndarray, seed: int, slow: float, inputs: dict[str, np.ndarray], t: np.ndarray
+) -> Table:
     rng = np.random.default_rng(seed)
     noise = next(iter(plant.outputs.values())).noise
     coloured = np.zeros(len(t))
     for k in range(1, len(t)):
         coloured[k] = 0.95 * coloured[k - 1] + slow * np.sqrt(1 - 0.95**2) * rng.standard_normal()
-    return Table("run", "run.csv", t, {**inputs, "reading": truth + noise * rng.standard_normal(len(t)) + coloured})
+    return Table(
+        "run", "run.csv", t, {**inputs, "reading": truth + noise * rng.standard_normal(len(t)) + coloured}
+    )
 
 
 def _candidate(rig: Structure, effect: str) -> Candidate:

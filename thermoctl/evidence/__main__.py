@@ -19,9 +19,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = argparse.ArgumentParser(prog="python -m thermoctl.evidence", description=__doc__)
     p.add_argument("--plant", metavar="FILE", help="plant file")
     p.add_argument("--out", metavar="DIR", help="for diagnosis.json and plant.yaml")
-    p.add_argument("--held-out", metavar="REC", action="append", default=[], help="recording that takes no part in any choice")
-    p.add_argument("--effects", metavar="DIR", action="append", default=[], help="further folder of catalogue entries")
-    p.add_argument("--explain", metavar="DIR", help="print in ten lines why the diagnosis in DIR came out as it did")
+    p.add_argument(
+        "--held-out",
+        metavar="REC",
+        action="append",
+        default=[],
+        help="recording that takes no part in any choice",
+    )
+    p.add_argument(
+        "--effects", metavar="DIR", action="append", default=[], help="further folder of catalogue entries"
+    )
+    p.add_argument(
+        "--explain", metavar="DIR", help="print in ten lines why the diagnosis in DIR came out as it did"
+    )
     p.add_argument("recordings", metavar="REC", nargs="*")
     args = p.parse_args(argv)
     try:
@@ -29,8 +39,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(explain(json.loads((Path(args.explain) / "diagnosis.json").read_text())))
             return 0
         if not (args.plant and args.out and args.recordings):
-            raise InputError("--plant FILE, --out DIR and at least one recording were expected (or --explain DIR)")
-        print(words(write(args.plant, args.recordings, args.out, [Path(e) for e in args.effects], args.held_out)))
+            raise InputError(
+                "--plant FILE, --out DIR and at least one recording were expected (or --explain DIR)"
+            )
+        print(
+            words(
+                write(args.plant, args.recordings, args.out, [Path(e) for e in args.effects], args.held_out)
+            )
+        )
     except InputError as e:
         print(f"thermoctl: {e}", file=sys.stderr)
         return 2

@@ -77,7 +77,8 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
     drives = [model.drive(t) for t in tables]
     coordinates = Coordinates(drives)
     outputs = [
-        tuple(k for k, c in enumerate(coordinates.channels) if c.output == j) for j in range(len(model.outputs))
+        tuple(k for k, c in enumerate(coordinates.channels) if c.output == j)
+        for j in range(len(model.outputs))
     ]
     measured = [(j, ks) for j, ks in enumerate(outputs) if ks]
     forces = remainder(model, drives, null.values, null.dx0, coordinates, set(motions(plant).values()))

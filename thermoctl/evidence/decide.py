@@ -62,11 +62,23 @@ def weigh(scores: Mapping[frozenset[Key], float], limits: Limits) -> Posterior:
 
 
 ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
-    ("nothing is supported and the residual is the sensors' noise", lambda f, q: f.something < q.name and f.over_noise <= q.clean, "consistent"),
+    (
+        "nothing is supported and the residual is the sensors' noise",
+        lambda f, q: f.something < q.name and f.over_noise <= q.clean,
+        "consistent",
+    ),
     ("nothing is supported and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
-    ("the findings do not predict held-out data better than a refit", lambda f, q: f.worth > 1, "unexplained"),
+    (
+        "the findings do not predict held-out data better than a refit",
+        lambda f, q: f.worth > 1,
+        "unexplained",
+    ),
     ("findings are supported, none of several alike for sure", lambda f, q: not f.named, "ambiguous"),
-    ("findings are supported and the residual is the sensors' noise", lambda f, q: f.over_noise <= q.clean, "explained"),
+    (
+        "findings are supported and the residual is the sensors' noise",
+        lambda f, q: f.over_noise <= q.clean,
+        "explained",
+    ),
     ("findings are supported and a remainder stays beside them", lambda f, q: True, "partly_explained"),
 )
 

@@ -24,5 +24,8 @@ def explain(found: Mapping[str, Any]) -> str:
         )
     rest = len(found["hypotheses"]) - SHOWN
     if rest > 0:
-        lines.append(f"and {rest} more in diagnosis.json" + ("; the budget of refits ended the search" if found["truncated"] else ""))
+        lines.append(
+            f"and {rest} more in diagnosis.json"
+            + ("; the budget of refits ended the search" if found["truncated"] else "")
+        )
     return "\n".join(lines)

@@ -24,6 +24,7 @@ from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem, Scale
 from thermoctl.plant.simulate import Drive, SimulationError
 
+SIGNIFICANT = 2.0  # standard deviations
 BELIEF = 0.3  # standard deviation of the plant's parameters round their beliefs, as a share of their ranges
 UNIFORM = 12.0  # precision of a uniform prior over 0..1
 DECADES = 4.0  # over which the order of magnitude of an effect's size is unknown
@@ -79,18 +80,26 @@ class Fitted:
 
     @property
     def absent(self) -> bool:
-        """Did the refit take an effect away again? Then the hypothesis is that without it."""
-        return any(
-            p.amplitude and np.isclose(self.plant.parameters[e.own[p.name]].value, p.null, rtol=0, atol=1e-9 + 1e-3 * self.sd[e.own[p.name]])
-            for e in self.hypothesis.effects
-            for p in e.candidate.effect.parameters
-            if p.name in e.own and e.own[p.name] in self.sd
-        )
+        """Is a part of an effect not significant? Then the simpler hypothesis, without that part, stands for this one."""
+        return any(_insignificant(self, e) for e in self.hypothesis.effects)
 
     @property
     def log_evidence(self) -> float:
         """log p(D | h)"""
         return self.log_likelihood + self.log_prior + self.volume
+
+
+def _insignificant(f: Fitted, e: Placed) -> bool:
+    """Is a size of the effect within SIGNIFICANT standard deviations of none, or a lag or delay that is all there is at its least?"""
+    sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
+    if e.candidate.effect.prior is not None:
+        return False
+    if not sizes:
+        return any(f.fit.at_bound.get(n) == "low" for n in e.own.values())
+    return any(
+        abs(f.plant.parameters[e.own[p.name]].value - p.null) < SIGNIFICANT * f.sd[e.own[p.name]]
+        for p in sizes
+    )
 
 
 class Posterior:
@@ -113,7 +122,9 @@ class Posterior:
         c: Coordinates = self.case.coordinates
         return [c.transform(k, e[k.recording][:, k.output]) for k in c.channels]
 
-    def likelihood(self, rows: Sequence[np.ndarray], likely: Likely | None = None) -> tuple[Averaged, list[np.ndarray]]:
+    def likelihood(
+        self, rows: Sequence[np.ndarray], likely: Likely | None = None
+    ) -> tuple[Averaged, list[np.ndarray]]:
         """The averaged likelihood of residuals' rows (over likely cells only), and their powers."""
         powers = self.case.coordinates.powers(rows)
         return averaged(self.case.grids, powers, self.case.cells, self.case.remainder.prior, likely), powers
@@ -129,14 +140,21 @@ class Posterior:
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Between which the unknowns lie."""
         n, m = self.problem.n_parameters, len(self.problem.unknowns)
-        return np.concatenate([np.zeros(n), np.full(m - n, -FAR)]), np.concatenate([np.ones(n), np.full(m - n, FAR)])
+        return np.concatenate([np.zeros(n), np.full(m - n, -FAR)]), np.concatenate(
+            [np.ones(n), np.full(m - n, FAR)]
+        )
 
     def prior(self, z: np.ndarray) -> float:
         """-1/2 of the quadratic terms of the prior and of physics' own beliefs."""
         values, _ = self.problem.unpack(z)
-        return -0.5 * float(self.precision @ (z - self.mean) ** 2) - 0.5 * self.problem.believed(values, False)[0]
+        return (
+            -0.5 * float(self.precision @ (z - self.mean) ** 2)
+            - 0.5 * self.problem.believed(values, False)[0]
+        )
 
-    def slope(self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def slope(
+        self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Gradient of the log posterior, and minus its second derivative."""
         n = len(z)
         gradient, matrix = np.zeros(n), np.zeros((n, n))
@@ -155,7 +173,9 @@ class Posterior:
         _, push, bend = self.problem.believed(values, True)
         return gradient - self.precision * (z - self.mean) - push, matrix + np.diag(self.precision) + bend
 
-    def climb(self, z: np.ndarray, goal: float) -> tuple[np.ndarray, Averaged, list[np.ndarray], np.ndarray, list[np.ndarray]]:
+    def climb(
+        self, z: np.ndarray, goal: float
+    ) -> tuple[np.ndarray, Averaged, list[np.ndarray], np.ndarray, list[np.ndarray]]:
         """The maximum near z: z, likelihood, powers, H and errors there. A log posterior of `goal` that is out of reach is not
         climbed for."""
         low, high = self.bounds()
@@ -184,7 +204,9 @@ class Posterior:
         return z, now, powers, matrix, errors
 
 
-def _step(z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _step(
+    z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
     """Newton's step inside the box: what meets a wall stays there."""
     free = ~(((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0)))
     step = np.zeros_like(z)
@@ -194,8 +216,12 @@ def _step(z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarr
             break
         rest = np.flatnonzero(~free)
         right = gradient[index] - matrix[np.ix_(index, rest)] @ step[rest]
-        step[index] = np.linalg.solve(matrix[np.ix_(index, index)] + 1e-9 * np.diag(np.diag(matrix)[index]), right)
-        out = index[(z[index] + step[index] < low[index] - 1e-12) | (z[index] + step[index] > high[index] + 1e-12)]
+        step[index] = np.linalg.solve(
+            matrix[np.ix_(index, index)] + 1e-9 * np.diag(np.diag(matrix)[index]), right
+        )
+        out = index[
+            (z[index] + step[index] < low[index] - 1e-12) | (z[index] + step[index] > high[index] + 1e-12)
+        ]
         if not len(out):
             break
         step[out] = np.clip(z[out] + step[out], low[out], high[out]) - z[out]
@@ -203,10 +229,17 @@ def _step(z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarr
     return step
 
 
-def _priors(case: Case, problem: Problem, effects: Sequence[Placed]) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
+def _priors(
+    case: Case, problem: Problem, effects: Sequence[Placed]
+) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
     """Which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian."""
     mean, precision = problem.belief.copy(), np.ones(len(problem.unknowns))
-    own = {e.own[p.name]: (e.candidate, p) for e in effects for p in e.candidate.effect.parameters if p.name in e.own}
+    own = {
+        e.own[p.name]: (e.candidate, p)
+        for e in effects
+        for p in e.candidate.effect.parameters
+        if p.name in e.own
+    }
     sizes = {}
     for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
         precision[k] = BELIEF**-2
@@ -231,19 +264,33 @@ def fitted(
     posterior = Posterior(case, plant, effects)
     if start is None:
         start = refit.fit(
-            posterior.model, posterior.drives, case.noise, iterations=WHITE, tolerance=ROUGH, beliefs=posterior.problem.beliefs
+            posterior.model,
+            posterior.drives,
+            case.noise,
+            iterations=WHITE,
+            tolerance=ROUGH,
+            beliefs=posterior.problem.beliefs,
         )
     z, average, powers, matrix, errors = posterior.climb(start.z, best - HOPELESS)
     return _weighed(case, posterior, z, average, powers, matrix, errors, start)
 
 
 def _weighed(
-    case: Case, posterior: Posterior, z: np.ndarray, average: Averaged, powers: list[np.ndarray], matrix: np.ndarray, errors: list[np.ndarray], rough: Fit
+    case: Case,
+    posterior: Posterior,
+    z: np.ndarray,
+    average: Averaged,
+    powers: list[np.ndarray],
+    matrix: np.ndarray,
+    errors: list[np.ndarray],
+    rough: Fit,
 ) -> Fitted:
     """Laplace's evidence at the maximum."""
     problem = posterior.problem
     values, dx0 = problem.unpack(z)
-    confined = matrix + np.diag(np.where(np.arange(len(z)) < problem.n_parameters, UNIFORM, 0.0))  # a range has a width
+    confined = matrix + np.diag(
+        np.where(np.arange(len(z)) < problem.n_parameters, UNIFORM, 0.0)
+    )  # a range has a width
     inverse = np.linalg.pinv(confined, hermitian=True)
     sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     names: dict[str, float] = {}
@@ -253,18 +300,48 @@ def _weighed(
             names[q] = max(names.get(q, 0.0), float(sd[k] * slope))
     log_prior = log_density(posterior, z, names)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
-    at_bound = {q: "low" if z[k] <= 1e-6 else "high" for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]) if z[k] <= 1e-6 or z[k] >= 1 - 1e-6}
+    at_bound = {
+        q: "low" if z[k] <= 1e-6 else "high"
+        for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters])
+        if z[k] <= 1e-6 or z[k] >= 1 - 1e-6
+    }
     found = Fit(
-        posterior.model, values, dx0, -2 * average.log_likelihood, problem.unknowns, z, matrix, errors, case.noise, 0, problem.samples, at_bound, problem.beliefs
+        posterior.model,
+        values,
+        dx0,
+        -2 * average.log_likelihood,
+        problem.unknowns,
+        z,
+        matrix,
+        errors,
+        case.noise,
+        0,
+        problem.samples,
+        at_bound,
+        problem.beliefs,
     )
     plant = refit.updated(posterior.plant, found, posterior.drives)
-    return Fitted(Hypothesis(tuple(posterior.effects)), plant, found, average.log_likelihood, float(log_prior), volume, average, tuple(powers), names, refit.updated(posterior.plant, rough, posterior.drives), rough)
+    return Fitted(
+        Hypothesis(tuple(posterior.effects)),
+        plant,
+        found,
+        average.log_likelihood,
+        float(log_prior),
+        volume,
+        average,
+        tuple(powers),
+        names,
+        refit.updated(posterior.plant, rough, posterior.drives),
+        rough,
+    )
 
 
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
     """log p(z): Gaussians, uniform shapes, and the effects' sizes, which are not measured more finely than `sd`."""
     values, _ = posterior.problem.unpack(z)
-    out = posterior.prior(z) + 0.5 * float(np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi))))
+    out = posterior.prior(z) + 0.5 * float(
+        np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi)))
+    )
     for k, (c, p) in posterior.amplitudes.items():
         q = posterior.problem.unknowns[k][0]
         if c.effect.prior is None:
@@ -275,7 +352,9 @@ def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) ->
 
 def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
     """log p(D | z) + log p(z) at any z, with the sizes' scales of a fitted hypothesis: what `log_evidence` integrates."""
-    return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(posterior, z, found.sd)
+    return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(
+        posterior, z, found.sd
+    )
 
 
 def _gaussian(posterior: Posterior) -> np.ndarray:
@@ -294,7 +373,11 @@ def _size(p: EffectParameter, value: float, sd: float) -> float:
 def with_values(plant: Plant, values: Mapping[str, float]) -> Plant:
     """The plant with other values of some parameters."""
     return dataclasses.replace(
-        plant, parameters={k: dataclasses.replace(p, value=values[k]) if k in values else p for k, p in plant.parameters.items()}
+        plant,
+        parameters={
+            k: dataclasses.replace(p, value=values[k]) if k in values else p
+            for k, p in plant.parameters.items()
+        },
     )
 
 

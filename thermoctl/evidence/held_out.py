@@ -32,7 +32,11 @@ class Worth:
     @property
     def share_closed(self) -> float | None:
         """Share of the misfit's energy, relative to each output's, that the findings close."""
-        pairs = [(self.refit_only[o], self.after[o]) for o in self.after if self.refit_only.get(o, 0) > 0 and np.isfinite(self.after[o])]
+        pairs = [
+            (self.refit_only[o], self.after[o])
+            for o in self.after
+            if self.refit_only.get(o, 0) > 0 and np.isfinite(self.after[o])
+        ]
         return float(np.mean([1 - (b / a) ** 2 for a, b in pairs])) if pairs else None
 
 
@@ -105,5 +109,6 @@ def _masked(table: Table, measured: set[str], parity: int) -> Table:
     span = (table.t - table.t[0]) / max(float(table.t[-1] - table.t[0]), 1e-300)
     keep = np.minimum(span * BLOCKS, BLOCKS - 1).astype(int) % 2 == parity
     return dataclasses.replace(
-        table, columns={k: np.where(keep, v, np.nan) if k in measured else v for k, v in table.columns.items()}
+        table,
+        columns={k: np.where(keep, v, np.nan) if k in measured else v for k, v in table.columns.items()},
     )

@@ -32,7 +32,9 @@ def limits() -> Limits:
     known = {f.name for f in fields(Limits)}
     for key, node in root.value.items():
         if key not in known:
-            raise node.error(f"unknown number '{key}'; known are {', '.join(sorted(known))}{yamlfile.suggest(key, known)}")
+            raise node.error(
+                f"unknown number '{key}'; known are {', '.join(sorted(known))}{yamlfile.suggest(key, known)}"
+            )
     values = {key: node.plain()["value"] for key, node in root.value.items()}
     for key in known - values.keys():
         raise root.error(f"the number '{key}' is missing")

@@ -28,7 +28,10 @@ STEPS, CLOSE = 15, 3e-3  # of Newton's method for log c^2, and the step that end
 SIZES = 10.0 ** np.arange(-0.9, 3.1, 0.65)  # a: variance of the slow part over that of the white part
 CORNERS = 4  # tau: from one sampling interval to a quarter of the recording
 RARE = 0.7  # nats that a slow part's standard deviation costs in units of the white part's: most are no larger than that
-PLAIN, FIRST_ORDER = 0.4, 0.45  # prior of white noise, and of white noise with a first-order part; the rest is 1/f
+PLAIN, FIRST_ORDER = (
+    0.4,
+    0.45,
+)  # prior of white noise, and of white noise with a first-order part; the rest is 1/f
 UNLIKELY = 1e-4  # posterior of a cell that a small step need not look at
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -110,9 +113,13 @@ def averaged(
     if likely is not None:
         remainder, prior = [q[likely.remainder] for q in remainder], prior[likely.remainder]
         grids = [
-            dataclasses.replace(g, slow=g.slow[c], weight=g.weight[c]) for g, c in zip(grids, likely.noise, strict=True)
+            dataclasses.replace(g, slow=g.slow[c], weight=g.weight[c])
+            for g, c in zip(grids, likely.noise, strict=True)
         ]
-    parts = [_output(g, np.concatenate([powers[k] for k in g.channels]), q) for g, q in zip(grids, remainder, strict=True)]
+    parts = [
+        _output(g, np.concatenate([powers[k] for k in g.channels]), q)
+        for g, q in zip(grids, remainder, strict=True)
+    ]
     by_cell = prior + sum(logsumexp(score, axis=1) for score, _, _ in parts)
     total = float(logsumexp(by_cell))
     cells = np.exp(by_cell - total)
@@ -137,7 +144,9 @@ def _output(g: Grid, power: np.ndarray, remainder: np.ndarray) -> tuple[np.ndarr
     slow, extra = g.variance * g.slow[None], remainder[:, None, :]
     fast = slice(len(g.count) // 2, None)  # most rows, and least of what is slow
     rows = g.count[fast].sum()
-    level = max(float(power[fast].sum()) / rows / g.variance, 1e-9) / ((g.slow[:, fast] * g.count[fast]).sum(axis=1) / rows)
+    level = max(float(power[fast].sum()) / rows / g.variance, 1e-9) / (
+        (g.slow[:, fast] * g.count[fast]).sum(axis=1) / rows
+    )
     u = np.tile(np.log(level), (extra.shape[0], 1))
     for _ in range(STEPS):
         own = np.exp(u)[:, :, None] * slow

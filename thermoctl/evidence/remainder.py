@@ -39,7 +39,9 @@ class Remainder:
     prior: np.ndarray
     intervals: list[float]  # of the recordings
 
-    def cells(self, coordinates: Coordinates, outputs: Sequence[Sequence[int]], only: int | None = None) -> list[np.ndarray]:
+    def cells(
+        self, coordinates: Coordinates, outputs: Sequence[Sequence[int]], only: int | None = None
+    ) -> list[np.ndarray]:
         """(cells, bands) of each output, whose channels are given; of all nodes' forces, or of one node's only."""
         out = []
         for positions in outputs:
@@ -60,7 +62,9 @@ def gross_flow(plant: Plant, node: str, values: dict[str, np.ndarray | float], n
     out = np.zeros(n)
     for f in plant.flows.values():
         if node in (f.source, f.target):
-            out = np.maximum(out, np.abs(np.broadcast_to(np.asarray(ex.evaluate(f.rate, values), float), (n,))))
+            out = np.maximum(
+                out, np.abs(np.broadcast_to(np.asarray(ex.evaluate(f.rate, values), float), (n,)))
+            )
     return out
 
 
@@ -76,21 +80,46 @@ def signals(model: Model, d: Drive, values: np.ndarray, x: np.ndarray) -> dict[s
 
 
 def remainder(
-    model: Model, drives: Sequence[Drive], values: np.ndarray, dx0: np.ndarray, coordinates: Coordinates, skip: set[str]
+    model: Model,
+    drives: Sequence[Drive],
+    values: np.ndarray,
+    dx0: np.ndarray,
+    coordinates: Coordinates,
+    skip: set[str],
 ) -> Remainder:
     """The responses at these parameters (recordings, parameters); `skip`: nodes that store nothing (a position)."""
-    nodes = tuple(n for n in model.plant.nodes if n not in skip and any(n in (f.source, f.target) for f in model.plant.flows.values()))
+    nodes = tuple(
+        n
+        for n in model.plant.nodes
+        if n not in skip and any(n in (f.source, f.target) for f in model.plant.flows.values())
+    )
     white: dict[int, np.ndarray] = {}
     random = np.random.default_rng(23)
-    trajectories = [signals(model, d, values[r], model.run(d, values[r], dx0[r]).x) for r, d in enumerate(drives)]
+    trajectories = [
+        signals(model, d, values[r], model.run(d, values[r], dx0[r]).x) for r, d in enumerate(drives)
+    ]
     size = [
-        float(np.sqrt(np.mean(np.concatenate([gross_flow(model.plant, n, s, len(d.t)) for s, d in zip(trajectories, drives, strict=True)]) ** 2)))
+        float(
+            np.sqrt(
+                np.mean(
+                    np.concatenate(
+                        [
+                            gross_flow(model.plant, n, s, len(d.t))
+                            for s, d in zip(trajectories, drives, strict=True)
+                        ]
+                    )
+                    ** 2
+                )
+            )
+        )
         for n in nodes
     ]
     for r, d in enumerate(drives):
         forces, q = [], []
         for i, n in enumerate(nodes):
-            storage = np.broadcast_to(np.asarray(ex.evaluate(model.plant.nodes[n].storage, trajectories[r]), float), d.t.shape)
+            storage = np.broadcast_to(
+                np.asarray(ex.evaluate(model.plant.nodes[n].storage, trajectories[r]), float), d.t.shape
+            )
             for k in range(DRAWS):
                 forces.append((model.states.index(n), i * DRAWS + k))
                 q.append(random.standard_normal(len(d.t)) * size[i] / storage)

@@ -50,7 +50,11 @@ class Diagnosis:
         supported = self.decision.verdict in ("explained", "partly_explained")
         if self.decision.verdict == "ambiguous":
             return self.best.hypothesis.effects
-        return tuple(e for e in self.best.hypothesis.effects if e.key in self.decision.named) if supported else ()
+        return (
+            tuple(e for e in self.best.hypothesis.effects if e.key in self.decision.named)
+            if supported
+            else ()
+        )
 
 
 def contract(d: Diagnosis) -> dict[str, Any]:
@@ -64,7 +68,9 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             "verdict": d.decision.verdict,
             "findings": [_finding(d, e) for e in shown],
             "alternatives": [
-                {"effect": e, "where": w, "probability": round(p, 4)} for (e, w), p in d.decision.alternatives if (e, w) not in keys
+                {"effect": e, "where": w, "probability": round(p, 4)}
+                for (e, w), p in d.decision.alternatives
+                if (e, w) not in keys
             ],
             "mismatch": _mismatch(d),
             "remainder": {
@@ -83,7 +89,9 @@ def contract(d: Diagnosis) -> dict[str, Any]:
                 "after": (d.best if shown else d.null).fit.rms(),
                 "held_out_refit_only": d.worth.refit_only,
                 "held_out_after": d.worth.after,
-                "held_out": "recordings " + ", ".join(d.worth.names) if d.worth.reserved else "cross-validated: too few recordings to set one aside",
+                "held_out": "recordings " + ", ".join(d.worth.names)
+                if d.worth.reserved
+                else "cross-validated: too few recordings to set one aside",
             },
             "next_experiment": None,
             "decision": {"row": d.decision.row, **d.decision.numbers},
@@ -97,7 +105,11 @@ def contract(d: Diagnosis) -> dict[str, Any]:
 def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
     plant = d.best.plant
     values = {n: plant.parameters[n] for n in e.own.values()}
-    ends = {p.shape: plant.parameters[e.own[p.name]].value for p in e.candidate.effect.parameters if p.name in e.own and p.shape}
+    ends = {
+        p.shape: plant.parameters[e.own[p.name]].value
+        for p in e.candidate.effect.parameters
+        if p.name in e.own and p.shape
+    }
     last = max(float(t.t[-1] - t.t[0]) for t in d.case.tables)
     first = ends.get("onset", ends.get("start"))
     equation = _equation(d.case.plant, plant, e)
@@ -108,7 +120,9 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
         "when": None if first is None else [[first, min(ends.get("end", last), last)]],
         "probability": round(d.posterior.effects.get(e.key, 0.0), 4),
         "equation": equation,
-        "parameters": {n: {"value": p.value, "sd": d.best.sd.get(n, 0.0), "unit": p.unit} for n, p in values.items()},
+        "parameters": {
+            n: {"value": p.value, "sd": d.best.sd.get(n, 0.0), "unit": p.unit} for n, p in values.items()
+        },
         "summary": f"{e.candidate.effect.title} at {e.key[1]}: {equation} with {figures}.",
     }
 
@@ -124,7 +138,11 @@ def _equation(before: Plant, after: Plant, e: Placed) -> str:
             return str(o.value)
     for n in after.nodes.values():
         if ex.names(n.storage) & mine:
-            return str(after.outputs[e.candidate.place.output].value) if e.candidate.place.output else str(n.storage)
+            return (
+                str(after.outputs[e.candidate.place.output].value)
+                if e.candidate.place.output
+                else str(n.storage)
+            )
     return e.candidate.effect.title
 
 
@@ -143,7 +161,11 @@ def _mismatch(d: Diagnosis) -> list[dict[str, Any]]:
 def _before(d: Diagnosis) -> dict[str, float]:
     model = d.case.plant.compile()
     errors = np.concatenate([x.y - model.run(x).y for x in d.case.drives(model)])
-    return {o: float(np.sqrt(np.nanmean(errors[:, j] ** 2))) for j, o in enumerate(model.outputs) if np.isfinite(errors[:, j]).any()}
+    return {
+        o: float(np.sqrt(np.nanmean(errors[:, j] ** 2)))
+        for j, o in enumerate(model.outputs)
+        if np.isfinite(errors[:, j]).any()
+    }
 
 
 def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
@@ -166,12 +188,21 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
 def words(found: Mapping[str, Any]) -> str:
     """The result in a few sentences, by size."""
     fit, lines = found["fit"], []
-    worst = max(fit["refit_only"], key=lambda o: fit["refit_only"][o] / max(fit["after"].get(o, 1e-300), 1e-300)) if fit["refit_only"] else None
-    names = " and ".join(f"{f['effect'].replace('_', ' ')} at {f['where']} (probability {f['probability']:.2f})" for f in found["findings"])
+    worst = (
+        max(fit["refit_only"], key=lambda o: fit["refit_only"][o] / max(fit["after"].get(o, 1e-300), 1e-300))
+        if fit["refit_only"]
+        else None
+    )
+    names = " and ".join(
+        f"{f['effect'].replace('_', ' ')} at {f['where']} (probability {f['probability']:.2f})"
+        for f in found["findings"]
+    )
     if names:
         start = "Found" if found["verdict"] != "ambiguous" else "Something is missing, most likely"
         lines.append(f"{start}: {names}.")
-        lines.append(f"The error of {worst} falls from {fit['before'][worst]:.3g} (refit alone: {fit['refit_only'][worst]:.3g}) to {fit['after'][worst]:.3g}.")
+        lines.append(
+            f"The error of {worst} falls from {fit['before'][worst]:.3g} (refit alone: {fit['refit_only'][worst]:.3g}) to {fit['after'][worst]:.3g}."
+        )
     elif found["verdict"] == "consistent":
         lines.append("The recordings agree with the plant within its sensors' noise: nothing is missing.")
     else:

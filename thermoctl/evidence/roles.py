@@ -46,7 +46,10 @@ class Structure(Rig):
 
     def _coolest(self) -> str | None:
         """The temperature that a loss of heat is counted from: an input, or else a parameter."""
-        kinds = (self.heat_inputs, [p.name for p in self.physics.parameters.values() if p.unit in TEMPERATURE])
+        kinds = (
+            self.heat_inputs,
+            [p.name for p in self.physics.parameters.values() if p.unit in TEMPERATURE],
+        )
         for known in kinds:
             for f in self.physics.flows.values():
                 ends = {e for e in (f.source, f.target) if e in self.temperatures}

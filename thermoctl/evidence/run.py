@@ -10,7 +10,6 @@ from typing import Any
 from thermoctl.diagnose.effects import CATALOGUE, Effect, catalogue
 from thermoctl.evidence.case import Budget, case
 from thermoctl.evidence.decide import Facts, decide, weigh
-from thermoctl.evidence.fit import Fitted
 from thermoctl.evidence.held_out import split, worth
 from thermoctl.evidence.limits import Limits, limits
 from thermoctl.evidence.result import Diagnosis, contract
@@ -22,31 +21,32 @@ from thermoctl.recording.table import Table, read_table
 
 
 def diagnose(
-    plant: Plant, tables: Sequence[Table], entries: Mapping[str, Effect], numbers: Limits, held_out: Sequence[Table] = ()
+    plant: Plant,
+    tables: Sequence[Table],
+    entries: Mapping[str, Effect],
+    numbers: Limits,
+    held_out: Sequence[Table] = (),
 ) -> Diagnosis:
     """What is missing from a plant, by recordings. Raises InputError."""
     chosen_on, reserve = split(tables, held_out)
     known = case(plant, chosen_on, entries, Budget(numbers.fits, numbers.fits))
     searched = search(known, numbers)
     posterior = weigh({w.fitted.hypothesis.keys: w.score for w in searched.tried}, numbers)
-    best, null = searched.tried[0].fitted, next(w.fitted for w in searched.tried if not w.fitted.hypothesis.effects)
+    best, null = (
+        searched.tried[0].fitted,
+        next(w.fitted for w in searched.tried if not w.fitted.hypothesis.effects),
+    )
     after, before = left(known, best), left(known, null)
     value = worth(known, null, best, reserve)
     facts = Facts(
         posterior.something,
-        tuple(e.key for e in best.hypothesis.effects if posterior.effects[e.key] >= numbers.name and significant(e, best)),
+        tuple(e.key for e in best.hypothesis.effects if posterior.effects[e.key] >= numbers.name),
         max(after.over_noise.values()),
         max(before.over_noise.values()),
         _ratio(value.after, value.refit_only) if best.hypothesis.effects else 1.0,
     )
-    return Diagnosis(known, searched, posterior, best, after, before, value, decide(posterior, facts, numbers))
-
-
-def significant(effect: Any, f: Fitted) -> bool:
-    """Is some size of the effect more than two standard deviations from where the effect is absent?"""
-    sizes = [p for p in effect.candidate.effect.parameters if p.name in effect.own]
-    return any(
-        abs(f.plant.parameters[effect.own[p.name]].value - p.null) > 2 * f.sd.get(effect.own[p.name], 0.0) for p in sizes
+    return Diagnosis(
+        known, searched, posterior, best, after, before, value, decide(posterior, facts, numbers)
     )
 
 
@@ -57,7 +57,11 @@ def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:
 
 
 def write(
-    plant_file: str | Path, recordings: Sequence[str | Path], out: str | Path, folders: Sequence[Path] = (), held_out: Sequence[str | Path] = ()
+    plant_file: str | Path,
+    recordings: Sequence[str | Path],
+    out: str | Path,
+    folders: Sequence[Path] = (),
+    held_out: Sequence[str | Path] = (),
 ) -> dict[str, Any]:
     """Diagnose files and write diagnosis.json and plant.yaml into a folder. Raises InputError."""
     found = diagnose(

@@ -39,7 +39,9 @@ class Rows(Metric):
             run = self.model.run(d, self.fit.values[r], self.fit.dx0[r], sensitivities=True)
             self.runs.append(Simulation(run.t, run.x, run.y))
             columns.append(run.dy)
-        residual = [self.rows(r, d.y - run.y) for r, (d, run) in enumerate(zip(self.drives, self.runs, strict=True))]
+        residual = [
+            self.rows(r, d.y - run.y) for r, (d, run) in enumerate(zip(self.drives, self.runs, strict=True))
+        ]
         basis = np.zeros((sum(map(len, residual)), len(self.problem.unknowns)))
         at = 0
         for r, dy in enumerate(columns):
@@ -99,8 +101,14 @@ def screened(case: Case, fitted: Fitted, share: float = 0.0) -> Screened:
     moving = bool(Structure(case.plant, [], []).velocities) if case.plant.nodes else False
     metric = Rows(case, fitted, MOVING_ROWS if moving else ROWS, share)
     rig = Structure(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
-    added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (case.plant.nodes.keys() | case.plant.flows.keys())
-    found = [c for c in candidates(rig, case.catalogue) if c.key not in fitted.hypothesis.keys and not c.place.parts() & added]
+    added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
+        case.plant.nodes.keys() | case.plant.flows.keys()
+    )
+    found = [
+        c
+        for c in candidates(rig, case.catalogue)
+        if c.key not in fitted.hypothesis.keys and not c.place.parts() & added
+    ]
     draws = np.random.default_rng(1).standard_normal((len(metric.sketch(metric.residual[:, None])), DRAWS))
     ranked, chance = screen(metric, rig, found, draws)
     return Screened(metric, rig, ranked, _p_any(ranked, chance))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,11 +14,16 @@ from thermoctl.diagnose.search import extend, finalists, sticking
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.fit import Fitted, Placed, fitted
 from thermoctl.evidence.limits import Limits
+from thermoctl.evidence.roles import Structure
 from thermoctl.evidence.screening import Screened, places, screened
+from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.yamlfile import InputError
 
 EVENTS = ("onsets", "windows")  # shapes that happen at one moment
+PAIR = 2
+ALIKE = 0.999  # cosine of two directions, above which they are one
+START = 10.0  # times that a start which nobody measured is less certain than the catalogue says
 
 
 @dataclass(frozen=True)
@@ -54,8 +60,12 @@ def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limit
 
 def _class(c: Candidate, limits: Limits) -> float:
     """Odds of an entry's class against constant physics."""
-    event = any(kind in EVENTS for kind in c.effect.shapes.values()) or any(p.per_recording for p in c.effect.parameters)
-    return (limits.rare if event else 1.0) * (limits.rare if c.place.input and c.effect.where != "drive" else 1.0)
+    event = any(kind in EVENTS for kind in c.effect.shapes.values()) or any(
+        p.per_recording for p in c.effect.parameters
+    )
+    return (limits.rare if event else 1.0) * (
+        limits.rare if c.place.input and c.effect.where != "drive" else 1.0
+    )
 
 
 def search(case: Case, limits: Limits) -> Searched:
@@ -90,14 +100,19 @@ def extensions(
     limits: Limits,
     tried: Mapping[frozenset[tuple[str, str]], Weighed],
 ) -> list[Weighed]:
-    """The parent with each direction of the shortlist, refitted."""
-    out = []
-    for direction in finalists(looked.directions, limits.shortlist):
-        keys = parent.fitted.hypothesis.keys | {direction.candidate.key}
+    """The parent with each direction of the shortlist, and with each pair that explains more than its parts, refitted."""
+    out: list[Weighed] = []
+    singles = [(d,) for d in finalists(looked.directions, limits.shortlist)]
+    for added in [*singles, *pairs(looked.directions, limits)]:
+        keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
         if keys in tried or case.budget.spent:
             continue
         leader = max(w.fitted.log_likelihood for w in [*tried.values(), *out])
-        found = [f for d in starts(looked, direction) if (f := _refitted(case, parent, d, looked, leader)) is not None]
+        found = [
+            f
+            for start in starts(looked, added)
+            if (f := _refitted(case, parent, start, looked, leader)) is not None
+        ]
         found = [f for f in found if not f.absent]
         if found:
             best = max(found, key=lambda f: f.log_evidence)
@@ -105,16 +120,59 @@ def extensions(
     return out
 
 
-def starts(looked: Screened, direction: Direction) -> list[Direction]:
-    """The starting points that a direction's shape asks for."""
-    first = sharpened(looked.metric, looked.rig, direction)
-    stuck = sticking(first)
-    return [first, *([stuck] if stuck else [])]
+def pairs(directions: Sequence[Direction], limits: Limits) -> list[tuple[Direction, ...]]:
+    """The pairs of constant physics that together explain far more than one by one: what the plant's own parameters imitate
+    alone, they may not imitate together."""
+    best: dict[tuple[str, str], Direction] = {}
+    for d in directions:
+        if (
+            d.vector is not None
+            and d.gain > 0
+            and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values())
+        ):
+            best.setdefault(d.candidate.key, d)
+    kept = list(best.values())
+    if len(kept) < PAIR:
+        return []
+    v = np.stack([d.vector for d in kept]).astype(float)
+    g = np.sqrt([d.gain for d in kept])
+    c = np.clip(v @ v.T, -ALIKE, ALIKE)
+    joint = (g[:, None] ** 2 + g[None] ** 2 - 2 * c * np.outer(g, g)) / (1 - c**2)
+    extra = np.triu(joint - np.maximum.outer(g**2, g**2), 1)
+    order = np.argsort(-extra, axis=None)[: limits.shortlist // PAIR]
+    found = [np.unravel_index(k, extra.shape) for k in order]
+    return [(kept[a], kept[b]) for a, b in found if extra[a, b] > max(g[a], g[b]) ** 2]
 
 
-def _refitted(case: Case, parent: Weighed, direction: Direction, looked: Screened, leader: float) -> Fitted | None:
+def starts(looked: Screened, added: Sequence[Direction]) -> list[tuple[Direction, ...]]:
+    """The starting points that the directions' shapes ask for."""
+    first = tuple(sharpened(looked.metric, looked.rig, d) for d in added)
+    stuck = tuple(sticking(d) or d for d in first)
+    return [first, *([stuck] if stuck != first else [])]
+
+
+def _refitted(
+    case: Case, parent: Weighed, added: Sequence[Direction], looked: Screened, leader: float
+) -> Fitted | None:
+    effects, plant = parent.fitted.hypothesis.effects, parent.fitted.rough_plant
+    drives = looked.metric.drives
     try:
-        plant, own = extend(parent.fitted.rough_plant, direction, looked.metric.drives)
-        return fitted(case, plant, (*parent.fitted.hypothesis.effects, Placed(direction.candidate, own)), None, leader)
+        for d in added:
+            rig = Structure(plant, drives, [t.columns for t in case.tables])
+            d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
+            plant, own = extend(plant, d, drives)
+            effects = (*effects, Placed(d.candidate, own))
+        return fitted(case, free_starts(case.plant, plant), effects, None, leader)
     except (SimulationError, InputError, np.linalg.LinAlgError):
         return None
+
+
+def free_starts(before: Plant, after: Plant) -> Plant:
+    """The plant with bodies that an effect brought starting anywhere near: what nobody measured need not rest at the start."""
+    nodes = {
+        n.name: n
+        if n.name in before.nodes or not n.initial_sigma
+        else dataclasses.replace(n, initial_sigma=START * n.initial_sigma)
+        for n in after.nodes.values()
+    }
+    return dataclasses.replace(after, nodes=nodes)

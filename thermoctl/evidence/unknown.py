@@ -40,7 +40,11 @@ def left(case: Case, f: Fitted) -> Left:
         over[name] = float(np.sqrt(power / own))
     scores, shares = [], []
     for i in range(-1, len(case.remainder.nodes)):
-        cells = case.cells if i < 0 else case.remainder.cells(case.coordinates, [g.channels for g in case.grids], i)
+        cells = (
+            case.cells
+            if i < 0
+            else case.remainder.cells(case.coordinates, [g.channels for g in case.grids], i)
+        )
         if i < 0:
             cells = tuple(c[:1] for c in cells)
         prior = case.remainder.prior[:1] * 0.0 if i < 0 else np.full(len(cells[0]), -np.log(len(cells[0])))
@@ -51,4 +55,11 @@ def left(case: Case, f: Fitted) -> Left:
     best = int(order[0])
     rest = float(logsumexp([scores[k] for k in order[1:]])) if len(order) > 1 else -np.inf
     node = case.remainder.nodes[best - 1] if best else None
-    return Left(rms, noise, over, node, scores[best] - rest if np.isfinite(rest) else 0.0, min(shares[best], float(SHARES[-1])))
+    return Left(
+        rms,
+        noise,
+        over,
+        node,
+        scores[best] - rest if np.isfinite(rest) else 0.0,
+        min(shares[best], float(SHARES[-1])),
+    )
