@@ -27,6 +27,7 @@ from thermoctl.plant.simulate import Drive, SimulationError
 SIGNIFICANT = 2.0  # standard deviations
 BELIEF = 0.3  # standard deviation of the plant's parameters round their beliefs, as a share of their ranges
 UNIFORM = 12.0  # precision of a uniform prior over 0..1
+PERIODS = 15.0  # times the range that a refit gives a period that it could have had (logarithms)
 DECADES = 4.0  # over which the order of magnitude of an effect's size is unknown
 WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
 ROUNDS = 15  # of Gauss and Newton's steps
@@ -288,9 +289,9 @@ def _weighed(
     """Laplace's evidence at the maximum."""
     problem = posterior.problem
     values, dx0 = problem.unpack(z)
-    confined = matrix + np.diag(
-        np.where(np.arange(len(z)) < problem.n_parameters, UNIFORM, 0.0)
-    )  # a range has a width
+    own = np.ones(len(z), bool)
+    own[_gaussian(posterior)] = False
+    confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
     inverse = np.linalg.pinv(confined, hermitian=True)
     sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     names: dict[str, float] = {}
@@ -347,7 +348,8 @@ def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) ->
         if c.effect.prior is None:
             value = float(values[0, posterior.model.parameters.index(q)])
             out += _size(p, value, sd[q]) + np.log(posterior.problem.scales[q].slope(value))
-    return out
+    periods = sum(kind == "periods" for e in posterior.effects for kind in e.candidate.effect.shapes.values())
+    return out - periods * float(np.log(PERIODS))
 
 
 def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
