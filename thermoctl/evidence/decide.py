@@ -28,13 +28,14 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Facts:
-    """All that a verdict depends on. `significant`: named effects whose size is more than two standard deviations; `over_noise`:
-    the largest residual over its sensor's noise; `worth`: held-out error over that of a refit alone."""
+    """All that a verdict depends on. `named`: effects whose own probability is high enough; `over_noise`: the largest residual
+    over its sensor's noise; `closed`: share of the refitted plant's misfit that the findings close; `worth`: held-out error over
+    that of a refit alone."""
 
     something: float
     named: tuple[Key, ...]
     over_noise: float
-    before_over_noise: float
+    closed: float
     worth: float
 
 
@@ -68,12 +69,13 @@ ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
         "consistent",
     ),
     ("nothing is supported and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
+    ("the findings predict held-out data worse than a refit alone", lambda f, q: f.worth > 1, "unexplained"),
     (
-        "the findings do not predict held-out data better than a refit",
-        lambda f, q: f.worth > 1,
+        "a remainder stays that is larger than what the findings close",
+        lambda f, q: f.over_noise > q.clean and f.closed < q.closed,
         "unexplained",
     ),
-    ("findings are supported, none of several alike for sure", lambda f, q: not f.named, "ambiguous"),
+    ("something is supported, but no effect for sure", lambda f, q: not f.named, "ambiguous"),
     (
         "findings are supported and the residual is the sensors' noise",
         lambda f, q: f.over_noise <= q.clean,
@@ -89,6 +91,7 @@ def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
     numbers = {
         "something": facts.something,
         "over_noise": facts.over_noise,
+        "closed": facts.closed,
         "worth": facts.worth,
         **{f"{e} at {w}": posterior.effects[e, w] for e, w in facts.named},
     }

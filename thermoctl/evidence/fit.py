@@ -93,6 +93,8 @@ class Fitted:
 def _insignificant(f: Fitted, e: Placed) -> bool:
     """Is a size of the effect within SIGNIFICANT standard deviations of none, or a lag or delay that is all there is at its least?"""
     sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
+    if not set(e.own.values()) <= f.plant.parameters.keys():
+        return True  # another effect took its place
     if e.candidate.effect.prior is not None:
         return False
     if not sizes:

@@ -13,7 +13,6 @@ class Limits:
     """Meanings and provenance: config/diagnosis.yaml."""
 
     beam: int
-    screened: int
     shortlist: int
     effects: int
     fits: int
@@ -24,6 +23,7 @@ class Limits:
     set: float
     temperature: float
     clean: float
+    closed: float
 
 
 def limits() -> Limits:

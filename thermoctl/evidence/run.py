@@ -14,7 +14,7 @@ from thermoctl.evidence.held_out import split, worth
 from thermoctl.evidence.limits import Limits, limits
 from thermoctl.evidence.result import Diagnosis, contract
 from thermoctl.evidence.search import search
-from thermoctl.evidence.unknown import left
+from thermoctl.evidence.unknown import Left, left
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant, save
 from thermoctl.recording.table import Table, read_table
@@ -38,16 +38,19 @@ def diagnose(
     )
     after, before = left(known, best), left(known, null)
     value = worth(known, null, best, reserve)
-    facts = Facts(
-        posterior.something,
-        tuple(e.key for e in best.hypothesis.effects if posterior.effects[e.key] >= numbers.name),
-        max(after.over_noise.values()),
-        max(before.over_noise.values()),
-        _ratio(value.after, value.refit_only) if best.hypothesis.effects else 1.0,
-    )
+    named = tuple(e.key for e in best.hypothesis.effects if posterior.effects[e.key] >= numbers.name)
+    ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects else 1.0
+    facts = Facts(posterior.something, named, max(after.over_noise.values()), closed(before, after), ratio)
     return Diagnosis(
         known, searched, posterior, best, after, before, value, decide(posterior, facts, numbers)
     )
+
+
+def closed(before: Left, after: Left) -> float:
+    """Share of the misfit's energy beyond the sensors' noise that is gone, each output in units of its noise."""
+    was = sum((before.rms[o] / before.noise[o]) ** 2 for o in before.rms)
+    now = sum((after.rms[o] / before.noise[o]) ** 2 for o in after.rms)
+    return 1 - now / was if was > 0 else 1.0
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:

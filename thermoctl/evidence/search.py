@@ -76,7 +76,7 @@ def search(case: Case, limits: Limits) -> Searched:
     beam, p_null, seen = [null], 1.0, set()
     for _ in range(limits.effects):
         best = beam[0].score
-        for parent in beam[: limits.screened]:
+        for parent in beam[: limits.beam // PAIR]:
             if parent.fitted.hypothesis.keys in seen:
                 continue
             seen.add(parent.fitted.hypothesis.keys)
@@ -103,7 +103,7 @@ def extensions(
     """The parent with each direction of the shortlist, and with each pair that explains more than its parts, refitted."""
     out: list[Weighed] = []
     singles = [(d,) for d in finalists(looked.directions, limits.shortlist)]
-    for added in [*singles, *pairs(looked.directions, limits)]:
+    for added in [*singles, *pairs(looked, limits)]:
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
         if keys in tried or case.budget.spent:
             continue
@@ -120,28 +120,46 @@ def extensions(
     return out
 
 
-def pairs(directions: Sequence[Direction], limits: Limits) -> list[tuple[Direction, ...]]:
-    """The pairs of constant physics that together explain far more than one by one: what the plant's own parameters imitate
-    alone, they may not imitate together."""
+def pairs(looked: Screened, limits: Limits) -> list[tuple[Direction, ...]]:
+    """The pairs of constant physics that together explain far more than one by one, at their joint sizes: what the plant's own
+    parameters imitate alone, they may not imitate together."""
     best: dict[tuple[str, str], Direction] = {}
-    for d in directions:
-        if (
-            d.vector is not None
-            and d.gain > 0
-            and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values())
-        ):
+    for d in looked.directions:
+        if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values()):
             best.setdefault(d.candidate.key, d)
     kept = list(best.values())
     if len(kept) < PAIR:
         return []
     v = np.stack([d.vector for d in kept]).astype(float)
-    g = np.sqrt([d.gain for d in kept])
+    g = np.maximum(v @ looked.metric.residual, np.finfo(float).tiny)
     c = np.clip(v @ v.T, -ALIKE, ALIKE)
-    joint = (g[:, None] ** 2 + g[None] ** 2 - 2 * c * np.outer(g, g)) / (1 - c**2)
-    extra = np.triu(joint - np.maximum.outer(g**2, g**2), 1)
-    order = np.argsort(-extra, axis=None)[: limits.shortlist // PAIR]
-    found = [np.unravel_index(k, extra.shape) for k in order]
-    return [(kept[a], kept[b]) for a, b in found if extra[a, b] > max(g[a], g[b]) ** 2]
+    first = (g[:, None] - c * g[None]) / (
+        1 - c**2
+    )  # size of the first beside the second, along its unit vector
+    joint = g[:, None] * first + g[None] * first.T
+    alone = np.array([d.gain for d in kept])
+    extra = np.triu(joint - np.maximum.outer(alone, alone), 1)
+    out: list[tuple[Direction, ...]] = []
+    for k in np.argsort(-extra, axis=None):
+        a, b = np.unravel_index(k, extra.shape)
+        if len(out) >= limits.shortlist // PAIR or extra[a, b] <= max(alone[a], alone[b]):
+            break
+        pair = (resized(kept[a], first[a, b] / g[a]), resized(kept[b], first[b, a] / g[b]))
+        if all(d is not None for d in pair):
+            out.append(tuple(d for d in pair if d is not None))
+    return out
+
+
+def resized(d: Direction, factor: float) -> Direction | None:
+    """The direction at a multiple of its size; None where physics does not allow that."""
+    start = dict(d.start)
+    for p in d.candidate.effect.parameters:
+        if p.amplitude:
+            start[p.name] = p.null + factor * (start[p.name] - p.null)
+            low, high = d.candidate.bounds(p)
+            if not low <= start[p.name] <= high:
+                return None
+    return dataclasses.replace(d, start=start)
 
 
 def starts(looked: Screened, added: Sequence[Direction]) -> list[tuple[Direction, ...]]:

@@ -29,12 +29,12 @@ class Left:
 def left(case: Case, f: Fitted) -> Left:
     """Measure what a fitted hypothesis leaves, and locate it."""
     rms, noise, over = {}, {}, {}
-    for g in case.grids:
+    for g, sensor in zip(case.grids, f.average.sensor, strict=True):
         name = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) / g.count.sum()
-        fast = slice(len(g.count) // 2, None)
-        level = float(np.concatenate([f.powers[k] for k in g.channels])[fast].sum() / g.count[fast].sum())
-        own = max(min(level, power), g.variance)
+        own = max(
+            float(sensor.min()), g.variance
+        )  # the white part; a slow part that is not stated is no sensor's
         rms[name] = float(np.sqrt(max(power - own, 0.0)))
         noise[name] = float(np.sqrt(own))
         over[name] = float(np.sqrt(power / own))
