@@ -2,14 +2,14 @@
 
 A force of unit variance, white from sample to sample, at node i gives output j the variance F_ij(b) in band b: measured on the
 plant linearised along its own trajectory (`Model.respond`), by the mean of a few fixed random draws. A slow force (first order,
-time constant tau') and its size eta, a share of the node's gross flow, scale it:
+time constant tau') and its size eta, a share of the node's typical flow, scale it:
 
     V_j(b) = eta^2 sum_i F_ij(b) S_b(tau')          eta = 0: no remainder
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Drive, Model
 
-SHARES = 10.0 ** np.arange(-3.0, 0.1, 0.5)  # eta
+SHARES = 10.0 ** np.arange(-3.5, 0.1, 0.5)  # eta
 SMALL = 0.02  # mean of eta's exponential prior: what nobody will name is a few per cent of what flows
 CORNERS = 4  # tau', from two samples to a quarter of the longest recording
 ABSENT = 0.5  # prior of no remainder
@@ -57,15 +57,16 @@ class Remainder:
         return out
 
 
-def gross_flow(plant: Plant, node: str, values: dict[str, np.ndarray | float], n: int) -> np.ndarray:
-    """The largest flow at a node over time (N,)."""
-    out = np.zeros(n)
+def typical_flow(plant: Plant, node: str, values: Sequence[Mapping[str, np.ndarray | float]]) -> float:
+    """Geometric mean of the root-mean-square flows at a node over all recordings: a large force that only stores and returns
+    energy says little of what may be missing beside it."""
+    logs = []
     for f in plant.flows.values():
         if node in (f.source, f.target):
-            out = np.maximum(
-                out, np.abs(np.broadcast_to(np.asarray(ex.evaluate(f.rate, values), float), (n,)))
-            )
-    return out
+            square = [float(np.mean(np.asarray(ex.evaluate(f.rate, v), float) ** 2)) for v in values]
+            if np.mean(square) > 0:
+                logs.append(0.5 * np.log(np.mean(square)))
+    return float(np.exp(np.mean(logs))) if logs else 0.0
 
 
 def signals(model: Model, d: Drive, values: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
@@ -98,22 +99,7 @@ def remainder(
     trajectories = [
         signals(model, d, values[r], model.run(d, values[r], dx0[r]).x) for r, d in enumerate(drives)
     ]
-    size = [
-        float(
-            np.sqrt(
-                np.mean(
-                    np.concatenate(
-                        [
-                            gross_flow(model.plant, n, s, len(d.t))
-                            for s, d in zip(trajectories, drives, strict=True)
-                        ]
-                    )
-                    ** 2
-                )
-            )
-        )
-        for n in nodes
-    ]
+    size = [typical_flow(model.plant, n, trajectories) for n in nodes]
     for r, d in enumerate(drives):
         forces, q = [], []
         for i, n in enumerate(nodes):

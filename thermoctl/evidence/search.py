@@ -10,7 +10,7 @@ import numpy as np
 
 from thermoctl.diagnose.effects import Candidate
 from thermoctl.diagnose.screen import Direction, sharpened
-from thermoctl.diagnose.search import extend, finalists, sticking
+from thermoctl.diagnose.search import extend, finalists, sticking, weaker
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.fit import Fitted, Placed, fitted
 from thermoctl.evidence.limits import Limits
@@ -108,12 +108,7 @@ def extensions(
         if keys in tried or case.budget.spent:
             continue
         leader = max(w.fitted.log_likelihood for w in [*tried.values(), *out])
-        found = [
-            f
-            for start in starts(looked, added)
-            if (f := _refitted(case, parent, start, looked, leader)) is not None
-        ]
-        found = [f for f in found if not f.absent]
+        found = [f for f in _followed(case, parent, looked, added, leader) if not f.absent]
         if found:
             best = max(found, key=lambda f: f.log_evidence)
             out.append(Weighed(best, odds(best.hypothesis.effects, where, limits)))
@@ -162,11 +157,19 @@ def resized(d: Direction, factor: float) -> Direction | None:
     return dataclasses.replace(d, start=start)
 
 
-def starts(looked: Screened, added: Sequence[Direction]) -> list[tuple[Direction, ...]]:
-    """The starting points that the directions' shapes ask for."""
+def _followed(
+    case: Case, parent: Weighed, looked: Screened, added: Sequence[Direction], leader: float
+) -> list[Fitted]:
+    """The refits from the starting points that the directions' shapes ask for; from nearer to nothing where the first steps went
+    astray and fit worse than without the effect."""
     first = tuple(sharpened(looked.metric, looked.rig, d) for d in added)
     stuck = tuple(sticking(d) or d for d in first)
-    return [first, *([stuck] if stuck != first else [])]
+    found = [_refitted(case, parent, first, looked, leader)]
+    if stuck != first:
+        found.append(_refitted(case, parent, stuck, looked, leader))
+    if all(f is None or f.rough.cost > parent.fitted.rough.cost for f in found):
+        found.append(_refitted(case, parent, tuple(weaker(d) for d in first), looked, leader))
+    return [f for f in found if f is not None]
 
 
 def _refitted(

@@ -16,7 +16,7 @@ from thermoctl.evidence.remainder import SHARES
 @dataclass(frozen=True)
 class Left:
     """The residual beside the sensors' noise. `rms`, `over_noise`: by output; `node`: where forces explain it best, None where
-    errors of the sensors do; `log_odds`: of that node against the second best; `share`: of the node's gross flow."""
+    errors of the sensors do; `log_odds`: of that node against the second best; `share`: of the node's typical flow."""
 
     rms: dict[str, float]
     noise: dict[str, float]
