@@ -259,10 +259,10 @@ def _priors(
 
 
 def fitted(
-    case: Case, plant: Plant, effects: Sequence[Placed], start: Fit | None = None, best: float = -np.inf
+    case: Case, plant: Plant, effects: Sequence[Placed], start: Fit | None = None, best: Fitted | None = None
 ) -> Fitted:
-    """Refit a plant that holds these effects and take its log evidence; `best`: that of the best hypothesis so far. Raises
-    SimulationError."""
+    """Refit a plant that holds these effects and take its log evidence; what stays far from the best hypothesis so far is not
+    followed to its end. Raises SimulationError."""
     case.budget.fits_done += 1
     posterior = Posterior(case, plant, effects)
     if start is None:
@@ -272,9 +272,11 @@ def fitted(
             case.noise,
             iterations=WHITE,
             tolerance=ROUGH,
+            goal=best.rough.cost if best else np.inf,
             beliefs=posterior.problem.beliefs,
         )
-    z, average, powers, matrix, errors = posterior.climb(start.z, best - HOPELESS)
+    goal = best.log_likelihood - HOPELESS if best else -np.inf
+    z, average, powers, matrix, errors = posterior.climb(start.z, goal)
     return _weighed(case, posterior, z, average, powers, matrix, errors, start)
 
 

@@ -78,7 +78,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
                 "rms": d.left.rms,
                 "over_noise": d.left.over_noise,
                 "node": d.left.node,
-                "follows": [],
+                "follows": d.left.follows,
                 "law": None,
             }
             if remainder

@@ -17,7 +17,7 @@ from thermoctl.evidence.roles import Structure
 from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
 
-ROWS, MOVING_ROWS = 8_000, 32_000  # of all outputs in all recordings; what moves needs the finer ones
+ROWS, MOVING_ROWS = 6_000, 16_000  # of all outputs in all recordings; what moves needs the finer ones
 DRAWS = 100  # of noise, for the chance of the best direction
 
 

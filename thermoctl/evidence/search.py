@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.diagnose.effects import Candidate
+from thermoctl.diagnose.effects import PLACES, Candidate
 from thermoctl.diagnose.screen import Direction, sharpened
 from thermoctl.diagnose.search import extend, finalists, sticking, weaker
 from thermoctl.evidence.case import Case
@@ -16,6 +16,7 @@ from thermoctl.evidence.fit import Fitted, Placed, fitted
 from thermoctl.evidence.limits import Limits
 from thermoctl.evidence.roles import Structure
 from thermoctl.evidence.screening import Screened, places, screened
+from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.yamlfile import InputError
@@ -76,7 +77,7 @@ def search(case: Case, limits: Limits) -> Searched:
     beam, p_null, seen = [null], 1.0, set()
     for _ in range(limits.effects):
         best = beam[0].score
-        for parent in beam[: limits.beam // PAIR]:
+        for parent in beam:
             if parent.fitted.hypothesis.keys in seen:
                 continue
             seen.add(parent.fitted.hypothesis.keys)
@@ -86,10 +87,41 @@ def search(case: Case, limits: Limits) -> Searched:
             if looked.p_any < limits.alpha:
                 for w in extensions(case, parent, looked, where, limits, tried):
                     tried[w.fitted.hypothesis.keys] = w
-        beam = sorted(tried.values(), key=lambda w: -w.score)[: limits.beam]
-        if beam[0].score <= best or case.budget.spent:
+        beam = leaders(list(tried.values()), limits)
+        new = any(w.fitted.hypothesis.keys not in seen for w in beam)
+        if (beam[0].score <= best and not new) or case.budget.spent:
             break
     return Searched(tuple(sorted(tried.values(), key=lambda w: -w.score)), case.budget.spent, p_null)
+
+
+def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
+    """The beam: by score and by free-run error in turn, since a remainder may absorb for a while what a later effect explains."""
+    ranked = [sorted(tried, key=lambda w: -w.score), sorted(tried, key=lambda w: w.fitted.rough.cost)]
+    out: dict[frozenset[tuple[str, str]], Weighed] = {}
+    for pair in zip(*ranked, strict=True):
+        for w in pair:
+            out.setdefault(w.fitted.hypothesis.keys, w)
+    return list(out.values())[: limits.beam]
+
+
+def relabels(c: Candidate) -> bool:
+    """Does the entry only say in another way what the plant, or a simpler entry at the same place, says already?"""
+    if c.effect.where == "bending_pair":
+        return any(_free_member(c, side) for side in ("TA", "TB"))
+    displaced = PLACES["displacement"](c.rig)
+    return (
+        c.effect.where == "sensor"
+        and "tau" in c.effect.shapes
+        and any(p.output == c.place.output for p in displaced)
+    )
+
+
+def _free_member(c: Candidate, side: str) -> bool:
+    """Does the displacement hold this side's temperature already, with a coefficient that a refit moves?"""
+    now = ex.substitute(c.place.symbols["y"], lambda e: e.args[0] if e.op == "delay" else None)
+    slope = ex.derivative(now, str(c.place.symbols[side].value))
+    parameters = c.rig.plant.parameters
+    return any(n in parameters and parameters[n].range for n in ex.names(slope))
 
 
 def extensions(
@@ -102,12 +134,13 @@ def extensions(
 ) -> list[Weighed]:
     """The parent with each direction of the shortlist, and with each pair that explains more than its parts, refitted."""
     out: list[Weighed] = []
-    singles = [(d,) for d in finalists(looked.directions, limits.shortlist)]
-    for added in [*singles, *pairs(looked, limits)]:
+    kept = [d for d in looked.directions if not relabels(d.candidate)]
+    singles = [(d,) for d in finalists(kept, limits.shortlist)]
+    for added in [*singles, *pairs(kept, looked, limits)]:
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
         if keys in tried or case.budget.spent:
             continue
-        leader = max(w.fitted.log_likelihood for w in [*tried.values(), *out])
+        leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
         found = [f for f in _followed(case, parent, looked, added, leader) if not f.absent]
         if found:
             best = max(found, key=lambda f: f.log_evidence)
@@ -115,11 +148,11 @@ def extensions(
     return out
 
 
-def pairs(looked: Screened, limits: Limits) -> list[tuple[Direction, ...]]:
+def pairs(directions: Sequence[Direction], looked: Screened, limits: Limits) -> list[tuple[Direction, ...]]:
     """The pairs of constant physics that together explain far more than one by one, at their joint sizes: what the plant's own
     parameters imitate alone, they may not imitate together."""
     best: dict[tuple[str, str], Direction] = {}
-    for d in looked.directions:
+    for d in directions:
         if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values()):
             best.setdefault(d.candidate.key, d)
     kept = list(best.values())
@@ -158,14 +191,14 @@ def resized(d: Direction, factor: float) -> Direction | None:
 
 
 def _followed(
-    case: Case, parent: Weighed, looked: Screened, added: Sequence[Direction], leader: float
+    case: Case, parent: Weighed, looked: Screened, added: Sequence[Direction], leader: Fitted
 ) -> list[Fitted]:
     """The refits from the starting points that the directions' shapes ask for; from nearer to nothing where the first steps went
     astray and fit worse than without the effect."""
     first = tuple(sharpened(looked.metric, looked.rig, d) for d in added)
     stuck = tuple(sticking(d) or d for d in first)
     found = [_refitted(case, parent, first, looked, leader)]
-    if stuck != first:
+    if stuck != first and max(d.gain for d in first) > looked.directions[0].gain / PAIR:
         found.append(_refitted(case, parent, stuck, looked, leader))
     if all(f is None or f.rough.cost > parent.fitted.rough.cost for f in found):
         found.append(_refitted(case, parent, tuple(weaker(d) for d in first), looked, leader))
@@ -173,7 +206,7 @@ def _followed(
 
 
 def _refitted(
-    case: Case, parent: Weighed, added: Sequence[Direction], looked: Screened, leader: float
+    case: Case, parent: Weighed, added: Sequence[Direction], looked: Screened, leader: Fitted
 ) -> Fitted | None:
     effects, plant = parent.fitted.hypothesis.effects, parent.fitted.rough_plant
     drives = looked.metric.drives
