@@ -88,8 +88,7 @@ def search(case: Case, limits: Limits) -> Searched:
                 for w in extensions(case, parent, looked, where, limits, tried):
                     tried[w.fitted.hypothesis.keys] = w
         beam = leaders(list(tried.values()), limits)
-        new = any(w.fitted.hypothesis.keys not in seen for w in beam)
-        if (beam[0].score <= best and not new) or case.budget.spent:
+        if beam[0].score <= best or case.budget.spent:
             break
     return Searched(tuple(sorted(tried.values(), key=lambda w: -w.score)), case.budget.spent, p_null)
 
