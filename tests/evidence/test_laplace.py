@@ -1,0 +1,108 @@
+"""Laplace's log evidence against importance sampling of the same posterior, on small problems."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_t
+
+from thermoctl.diagnose.effects import Candidate, candidates, catalogue
+from thermoctl.diagnose.screen import Direction
+from thermoctl.diagnose.search import extend
+from thermoctl.evidence.case import Budget, case
+from thermoctl.evidence.fit import Placed, Posterior, evidence_at, fitted
+from thermoctl.evidence.roles import Structure
+from thermoctl.plant.language import loads
+from thermoctl.recording.table import Table
+
+HEATER = """
+format: thermoctl-plant/1
+title: one block
+inputs: {heat: {unit: W}, air: {unit: degC}}
+parameters:
+  C: {value: 40, unit: J/K, range: [20, 80]}
+  G: {value: 0.3, unit: W/K, range: [0.1, 1]}
+nodes: {block: {unit: degC, storage: C, initial: air, initial_sigma: 0.3}}
+flows:
+  power: {into: block, rate: heat, unit: W}
+  loss: {from: block, rate: G * (block - air), unit: W}
+outputs: {reading: {value: block, unit: degC, noise: 0.1}}
+"""
+AXIS = """
+format: thermoctl-plant/1
+title: one axis
+inputs: {force: {unit: N}}
+parameters:
+  M: {value: 1, unit: kg, range: [0.5, 2]}
+  D: {value: 2, unit: N*s/m, range: [0.5, 8]}
+nodes: {speed: {unit: m/s, storage: M, initial: 0}}
+flows:
+  motor: {into: speed, rate: force, unit: N}
+  damper: {from: speed, rate: D * speed, unit: N}
+outputs: {reading: {value: speed, unit: m/s, noise: 0.01}}
+"""
+PROBLEMS = {
+    "linear": (HEATER, None, None, 0.0),
+    "gain": (HEATER, "sensor_gain", {"A": 1.03}, 0.0),
+    "lag": (HEATER, "sensor_lag", {"TAU": 12.0}, 0.0),
+    "onset": (HEATER, "conductance_step", {"A": 0.2, "T0": 900.0}, 0.0),
+    "friction": (AXIS, "coulomb_friction", {"F": 0.3, "W": 0.002}, 0.0),
+    "two noises": (HEATER, "radiation", {"E": 2e-10}, 0.08),
+}
+
+
+def _recording(
+    plant, truth: np.ndarray, seed: int, slow: float, inputs: dict[str, np.ndarray], t: np.ndarray
+) -> Table:
+    rng = np.random.default_rng(seed)
+    noise = next(iter(plant.outputs.values())).noise
+    coloured = np.zeros(len(t))
+    for k in range(1, len(t)):
+        coloured[k] = 0.95 * coloured[k - 1] + slow * np.sqrt(1 - 0.95**2) * rng.standard_normal()
+    return Table(
+        "run", "run.csv", t, {**inputs, "reading": truth + noise * rng.standard_normal(len(t)) + coloured}
+    )
+
+
+def _candidate(rig: Structure, effect: str) -> Candidate:
+    return next(c for c in candidates(rig, catalogue()) if c.effect.name == effect)
+
+
+def _extended(plant, table: Table, effect: str, values: dict[str, float]):
+    drive = plant.compile().drive(table)
+    rig = Structure(plant, [drive], [table.columns])
+    c = _candidate(rig, effect)
+    shape = {p.shape: values[p.name] for p in c.effect.parameters if p.shape}
+    return extend(plant, Direction(c, shape, 100.0, 1, values), [drive]), c
+
+
+@pytest.mark.parametrize("name", list(PROBLEMS))
+def test_laplace_agrees_with_importance_sampling(name):
+    text, effect, values, slow = PROBLEMS[name]
+    plant = loads(text)
+    if text is HEATER:
+        t = np.arange(0.0, 1800.0, 6.0)
+        inputs = {"heat": np.where(t % 900 < 450, 12.0, 3.0), "air": np.full(len(t), 21.0)}
+    else:
+        t = np.arange(0.0, 3.0, 0.01)
+        inputs = {"force": 3 * np.sin(2 * np.pi * t) + np.sin(9.1 * t)}
+    table = _recording(plant, np.zeros(len(t)), 0, 0.0, inputs, t)
+    model, effects = plant, ()
+    if effect:
+        (model, own), c = _extended(plant, table, effect, values)
+        effects = (Placed(c, own),)
+    truth = model.compile().simulate(table).y[:, 0]
+    table = _recording(plant, truth, 3, slow, inputs, t)
+    known = case(plant, [table], catalogue(), Budget(9, 9))
+    found = fitted(known, model, effects)
+
+    posterior = Posterior(known, model, effects)
+    spread = np.linalg.inv(found.fit.hessian + 1e-9 * np.eye(len(found.fit.z)))
+    draw = multivariate_t(found.fit.z, 1.5 * spread, df=6, seed=5)
+    z = draw.rvs(300).reshape(300, -1)
+    low, high = posterior.bounds()
+    inside = np.all((z >= low) & (z <= high), axis=1)
+    weight = [evidence_at(posterior, q, found) - draw.logpdf(q) for q in z[inside]]
+    sampled = float(logsumexp(weight) - np.log(len(z)))
+    assert found.log_evidence == pytest.approx(sampled, abs=1.0)

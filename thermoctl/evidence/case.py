@@ -1,0 +1,120 @@
+"""The recordings that take part in the choice, and the plant as it came."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from thermoctl.diagnose.effects import Effect
+from thermoctl.evidence.coordinates import Coordinates
+from thermoctl.evidence.noise import Grid, grid
+from thermoctl.evidence.remainder import Remainder, remainder
+from thermoctl.evidence.roles import motions
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Fit, Noise, default_noise, fit
+from thermoctl.plant.simulate import Drive, Model
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+LEAST = 40  # measured values of one output, below which nothing is decided
+OUTLIER = 6.0  # robust standard deviations from the median of five neighbours
+
+
+@dataclass
+class Budget:
+    """Refits and screenings done so far, and how many there may be: counted, never timed."""
+
+    fits: int
+    screenings: int
+    fits_done: int = 0
+    screenings_done: int = 0
+
+    @property
+    def spent(self) -> bool:
+        """Is there nothing left for another refit?"""
+        return self.fits_done >= self.fits
+
+
+@dataclass(frozen=True)
+class Case:
+    """Everything that hypotheses are compared on. `remainder` and `grids` stay those of the plant as it came, refitted."""
+
+    plant: Plant
+    tables: tuple[Table, ...]
+    catalogue: Mapping[str, Effect]
+    noise: tuple[Noise, ...]
+    null: Fit
+    coordinates: Coordinates
+    outputs: tuple[tuple[int, ...], ...]  # per measured output its channels
+    grids: tuple[Grid, ...]
+    remainder: Remainder
+    cells: tuple[np.ndarray, ...]
+    budget: Budget
+    notes: list[str] = field(default_factory=list)
+
+    def drives(self, model: Model) -> list[Drive]:
+        """The recordings as a model reads them."""
+        return [model.drive(t) for t in self.tables]
+
+
+def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect], budget: Budget) -> Case:
+    """Refit the plant as it came, drop single outliers, measure how forces at its nodes reach its outputs. Raises InputError."""
+    model = plant.compile()
+    drives = [model.drive(t) for t in tables]
+    counts = [sum(int(np.isfinite(d.y[:, j]).sum()) for d in drives) for j in range(len(model.outputs))]
+    if max(counts, default=0) < LEAST:
+        raise InputError(
+            f"{', '.join(t.path for t in tables)}: too little data: at most {max(counts, default=0)} measured values of one "
+            f"output ({', '.join(o.column for o in plant.outputs.values())}); {LEAST} or more are needed"
+        )
+    noise = default_noise(plant, drives)
+    null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2)
+    tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
+    drives = [model.drive(t) for t in tables]
+    coordinates = Coordinates(drives)
+    outputs = [
+        tuple(k for k, c in enumerate(coordinates.channels) if c.output == j)
+        for j in range(len(model.outputs))
+    ]
+    measured = [(j, ks) for j, ks in enumerate(outputs) if ks]
+    forces = remainder(model, drives, null.values, null.dx0, coordinates, set(motions(plant).values()))
+    return Case(
+        plant,
+        tuple(tables),
+        catalogue,
+        noise,
+        null,
+        coordinates,
+        tuple(ks for _, ks in measured),
+        tuple(grid([coordinates.channels[k] for k in ks], ks, noise[j].sigma) for j, ks in measured),
+        forces,
+        tuple(forces.cells(coordinates, [ks for _, ks in measured])),
+        budget,
+        [f"{dropped} single outliers were left out"] if dropped else [],
+    )
+
+
+def _without_outliers(
+    tables: Sequence[Table], plant: Plant, residuals: Sequence[np.ndarray], noise: Sequence[Noise]
+) -> tuple[list[Table], int]:
+    """The recordings without cells whose residual lies far from its neighbours', and how many those are."""
+    out, dropped = [], 0
+    for t, e in zip(tables, residuals, strict=True):
+        columns = dict(t.columns)
+        for j, o in enumerate(plant.outputs.values()):
+            index = np.flatnonzero(np.isfinite(e[:, j]))
+            if len(index) < LEAST:
+                continue
+            away = e[index, j] - median_filter(e[index, j], 5)
+            limit = OUTLIER * max(1.4826 * float(np.median(np.abs(away))), noise[j].sigma)
+            odd = index[np.abs(away) > limit]
+            if len(odd) and len(odd) < 0.02 * len(index):
+                columns[o.column] = columns[o.column].copy()
+                columns[o.column][odd] = np.nan
+                dropped += len(odd)
+        out.append(dataclasses.replace(t, columns=columns))
+    return out, dropped

@@ -1,0 +1,94 @@
+"""Residuals in frequency: the orthonormal DCT-II of each output's measured samples in each recording.
+
+There a stationary noise is nearly independent from row to row, with its spectral density as variance (Whittle's
+likelihood); a random walk is, too. Missing samples are left out: what remains counts as one sequence, exact for white noise.
+
+    R = DCT(e),   log p(e | V) = -1/2 sum_k (log 2 pi V_k + R_k^2 / V_k)
+
+Noise models differ only in V, which is smooth: only the power of R in bands of rows is needed to compare them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import dct
+
+from thermoctl.plant.simulate import Drive
+
+SINGLE = 6  # lowest rows that are bands of their own
+WIDTH = 1.19  # of a band: a quarter of an octave
+FEWEST = 8  # samples of an output in a recording, below which it says nothing
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One output in one recording: which samples were measured, and the bands of its rows."""
+
+    recording: int
+    output: int
+    index: np.ndarray  # measured samples
+    block: int  # samples that are averaged before the transform
+    band: np.ndarray  # (rows,) the band of each row
+    count: np.ndarray  # (bands,) rows in each
+    frequency: np.ndarray  # (bands,) 1/s, of a band's middle
+    interval: float  # s, between measured samples
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(self.band)
+
+
+def channel(d: Drive, r: int, j: int, most: int | None = None) -> Channel | None:
+    """Output j of recording r; at most about `most` rows (the lowest). None where too little was measured."""
+    index = np.flatnonzero(np.isfinite(d.y[:, j]))
+    if len(index) < FEWEST:
+        return None
+    block = max(1, len(index) // (2 * most)) if most else 1
+    n = len(index) // block
+    rows = min(n, most or n)
+    edges = list(range(min(SINGLE, rows)))
+    while edges[-1] < rows:
+        edges.append(max(edges[-1] + 1, int(edges[-1] * WIDTH)))
+    edges[-1] = rows
+    count = np.diff(edges)
+    middle = 0.5 * (np.array(edges[:-1]) + np.array(edges[1:]) - 1)
+    span = float(d.t[index[-1]] - d.t[index[0]]) * n * block / max(len(index) - 1, 1)
+    return Channel(
+        r,
+        j,
+        index,
+        block,
+        np.repeat(np.arange(len(count)), count),
+        count,
+        np.maximum(middle, 0.5) / (2 * span),
+        span / (n * block),
+    )
+
+
+class Coordinates:
+    """The rows of all outputs in all recordings."""
+
+    def __init__(self, drives: Sequence[Drive], most: int | None = None):
+        found = (channel(d, r, j, most) for r, d in enumerate(drives) for j in range(d.y.shape[1]))
+        self.channels = [c for c in found if c is not None]
+        self.recordings = len(drives)
+
+    def of(self, recording: int) -> list[Channel]:
+        """The channels of one recording."""
+        return [c for c in self.channels if c.recording == recording]
+
+    def transform(self, c: Channel, e: np.ndarray) -> np.ndarray:
+        """(N, ...) values of a channel's output at all samples as its rows (rows, ...)."""
+        part = e if len(c.index) == len(e) else e[c.index]
+        if c.block > 1:
+            whole = len(part) // c.block * c.block
+            part = part[:whole].reshape(-1, c.block, *part.shape[1:]).sum(axis=1) / np.sqrt(c.block)
+        return dct(part, axis=0, norm="ortho")[: c.rows]
+
+    def powers(self, rows: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Sum of squares of each channel's rows (rows,) in its bands (bands,)."""
+        return [np.bincount(c.band, x * x) for c, x in zip(self.channels, rows, strict=True)]

@@ -1,0 +1,110 @@
+"""From posterior, remainder and worth to a verdict: a pure function and a table of rows, of which the first that holds decides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from thermoctl.evidence.limits import Limits
+
+Key = tuple[str, str]  # (effect, where)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Probabilities over the hypotheses tried (by their effects), and of each effect over all hypotheses that hold it."""
+
+    hypotheses: Mapping[frozenset[Key], float]
+    effects: Mapping[Key, float]
+
+    @property
+    def something(self) -> float:
+        """Probability that some effect is there."""
+        return 1.0 - self.hypotheses.get(frozenset(), 0.0)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """All that a verdict depends on. `named`: effects whose own probability is high enough; `over_noise`: the largest residual
+    over its sensor's noise; `closed`: share of the refitted plant's misfit that the findings close; `worth`: held-out error over
+    that of a refit alone."""
+
+    something: float
+    named: tuple[Key, ...]
+    over_noise: float
+    closed: float
+    worth: float
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The verdict, the effects that are named, the set of alternatives, and the row that fired with its numbers."""
+
+    verdict: str
+    named: tuple[Key, ...]
+    alternatives: tuple[tuple[Key, float], ...]
+    row: str
+    numbers: Mapping[str, float]
+
+
+def weigh(scores: Mapping[frozenset[Key], float], limits: Limits) -> Posterior:
+    """Posterior of hypotheses from their log evidence and prior odds, at the calibrated temperature."""
+    values = np.array(list(scores.values())) / limits.temperature
+    p = np.exp(values - logsumexp(values))
+    hypotheses = dict(zip(scores, map(float, p), strict=True))
+    effects: dict[Key, float] = {}
+    for keys, q in hypotheses.items():
+        for key in keys:
+            effects[key] = effects.get(key, 0.0) + q
+    return Posterior(hypotheses, effects)
+
+
+ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
+    (
+        "nothing is supported and the residual is the sensors' noise",
+        lambda f, q: f.something < q.name and f.over_noise <= q.clean,
+        "consistent",
+    ),
+    ("nothing is supported and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
+    ("the findings predict held-out data worse than a refit alone", lambda f, q: f.worth > 1, "unexplained"),
+    (
+        "a remainder stays that is larger than what the findings close",
+        lambda f, q: f.over_noise > q.clean and f.closed < q.closed,
+        "unexplained",
+    ),
+    ("something is supported, but no effect for sure", lambda f, q: not f.named, "ambiguous"),
+    (
+        "findings are supported and the residual is the sensors' noise",
+        lambda f, q: f.over_noise <= q.clean,
+        "explained",
+    ),
+    ("findings are supported and a remainder stays beside them", lambda f, q: True, "partly_explained"),
+)
+
+
+def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
+    """The first row that holds."""
+    row, verdict = next((text, verdict) for text, holds, verdict in ROWS if holds(facts, limits))
+    numbers = {
+        "something": facts.something,
+        "over_noise": facts.over_noise,
+        "closed": facts.closed,
+        "worth": facts.worth,
+        **{f"{e} at {w}": posterior.effects[e, w] for e, w in facts.named},
+    }
+    named = facts.named if verdict in ("explained", "partly_explained") else ()
+    return Decision(verdict, named, alternatives(posterior, named, limits), row, numbers)
+
+
+def alternatives(posterior: Posterior, named: Sequence[Key], limits: Limits) -> tuple[tuple[Key, float], ...]:
+    """The effects beside the named ones in the likeliest hypotheses that together hold the set's probability."""
+    total, found = 0.0, set()
+    for keys, p in sorted(posterior.hypotheses.items(), key=lambda item: (-item[1], sorted(item[0]))):
+        if total >= limits.set:
+            break
+        total += p
+        found |= keys
+    return tuple(sorted(((k, posterior.effects[k]) for k in found - set(named)), key=lambda x: (-x[1], x[0])))

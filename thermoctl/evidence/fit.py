@@ -1,0 +1,395 @@
+"""A hypothesis refitted, and its log evidence by Laplace's method.
+
+    log p(D | h) ~ log p(D | z^) + log p(z^) + k/2 log 2 pi - 1/2 log |H|,    H = J' E[1/V] J + prior's precision
+
+z: the plant's parameters in their ranges (0..1, logarithmic where the range spans a factor of three), its starts in their standard
+deviations, the effects' parameters in theirs. log p(D | z) is averaged over noise and remainder (noise.py); its maximum is found by
+Gauss and Newton's steps with the expected weights E[1/V], which are its exact gradient.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.diagnose.effects import Candidate, EffectParameter
+from thermoctl.evidence.case import Case
+from thermoctl.evidence.coordinates import Coordinates
+from thermoctl.evidence.noise import Averaged, Likely, averaged
+from thermoctl.plant import refit
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Fit, Problem, Scale
+from thermoctl.plant.simulate import Drive, SimulationError
+
+SIGNIFICANT = 2.0  # standard deviations
+BELIEF = 0.3  # standard deviation of the plant's parameters round their beliefs, as a share of their ranges
+UNIFORM = 12.0  # precision of a uniform prior over 0..1
+PERIODS = 15.0  # times the range that a refit gives a period that it could have had (logarithms)
+DECADES = 4.0  # over which the order of magnitude of an effect's size is unknown
+WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
+ROUNDS = 15  # of Gauss and Newton's steps
+LENGTHS = 1.0, 0.3, 0.1  # of a step that are tried
+FAR = 8.0  # standard deviations that a start may be off
+HOPELESS = 50.0  # nats below the best hypothesis that a refit stays with all its steps still to come
+ENOUGH = 0.05  # gain in the log posterior, below which no further step is taken
+LOG_2PI = float(np.log(2 * np.pi))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An effect at a place: what a result names, and how it is laid over the plant."""
+
+    candidate: Candidate
+    own: Mapping[str, str]  # its parameter: the plant's name
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """(effect, where)"""
+        return self.candidate.key
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What is assumed missing: placed effects, by what a result names. The remainder is in all of them."""
+
+    effects: tuple[Placed, ...] = ()
+
+    @property
+    def keys(self) -> frozenset[tuple[str, str]]:
+        """The (effect, where) of each."""
+        return frozenset(e.key for e in self.effects)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A hypothesis after its refit."""
+
+    hypothesis: Hypothesis
+    plant: Plant
+    fit: Fit
+    log_likelihood: float
+    log_prior: float
+    volume: float  # k/2 log 2 pi - 1/2 log |H|
+    average: Averaged
+    powers: tuple[np.ndarray, ...]
+    sd: Mapping[str, float]  # of the effects' parameters
+    rough_plant: Plant
+    rough: Fit  # refit in white noise, whose free run is closest to the data: extensions start there
+
+    @property
+    def absent(self) -> bool:
+        """Is a part of an effect not significant? Then the simpler hypothesis, without that part, stands for this one."""
+        return any(_insignificant(self, e) for e in self.hypothesis.effects)
+
+    @property
+    def log_evidence(self) -> float:
+        """log p(D | h)"""
+        return self.log_likelihood + self.log_prior + self.volume
+
+
+def _insignificant(f: Fitted, e: Placed) -> bool:
+    """Is a size of the effect within SIGNIFICANT standard deviations of none, or a lag or delay that is all there is at its least?"""
+    sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
+    if not set(e.own.values()) <= f.plant.parameters.keys():
+        return True  # another effect took its place
+    if e.candidate.effect.prior is not None:
+        return False
+    if not sizes:
+        return any(f.fit.at_bound.get(n) == "low" for n in e.own.values())
+    return any(
+        abs(f.plant.parameters[e.own[p.name]].value - p.null) < SIGNIFICANT * f.sd[e.own[p.name]]
+        for p in sizes
+    )
+
+
+class Posterior:
+    """The log posterior of one hypothesis' parameters, and its Gauss-Newton steps."""
+
+    def __init__(self, case: Case, plant: Plant, effects: Sequence[Placed]):
+        self.case, self.plant, self.effects = case, plant, effects
+        self.model = plant.compile()
+        self.drives = case.drives(self.model)
+        for d in self.drives:
+            self.model.prepare(d)
+        self.problem = Problem(self.model, self.drives, case.noise)
+        self.amplitudes, mean, precision = _priors(case, self.problem, effects)
+        self.mean, self.precision = mean, precision
+        beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
+        self.problem.beliefs = tuple(beliefs)
+
+    def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """(N, outputs, ...) of each recording as rows of each channel."""
+        c: Coordinates = self.case.coordinates
+        return [c.transform(k, e[k.recording][:, k.output]) for k in c.channels]
+
+    def likelihood(
+        self, rows: Sequence[np.ndarray], likely: Likely | None = None
+    ) -> tuple[Averaged, list[np.ndarray]]:
+        """The averaged likelihood of residuals' rows (over likely cells only), and their powers."""
+        powers = self.case.coordinates.powers(rows)
+        return averaged(self.case.grids, powers, self.case.cells, self.case.remainder.prior, likely), powers
+
+    def errors(self, z: np.ndarray) -> list[np.ndarray]:
+        """Free-run errors. Raises SimulationError."""
+        values, dx0 = self.problem.unpack(z)
+        out = [d.y - self.model.run(d, values[r], dx0[r]).y for r, d in enumerate(self.drives)]
+        if not all(np.isfinite(e[np.isfinite(d.y)]).all() for e, d in zip(out, self.drives, strict=True)):
+            raise SimulationError("the simulation gives values that are not numbers")
+        return out
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Between which the unknowns lie."""
+        n, m = self.problem.n_parameters, len(self.problem.unknowns)
+        return np.concatenate([np.zeros(n), np.full(m - n, -FAR)]), np.concatenate(
+            [np.ones(n), np.full(m - n, FAR)]
+        )
+
+    def prior(self, z: np.ndarray) -> float:
+        """-1/2 of the quadratic terms of the prior and of physics' own beliefs."""
+        values, _ = self.problem.unpack(z)
+        return (
+            -0.5 * float(self.precision @ (z - self.mean) ** 2)
+            - 0.5 * self.problem.believed(values, False)[0]
+        )
+
+    def slope(
+        self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient of the log posterior, and minus its second derivative."""
+        n = len(z)
+        gradient, matrix = np.zeros(n), np.zeros((n, n))
+        channels = self.case.coordinates.channels
+        for r in range(len(self.drives)):
+            unknown, jac = self.problem.jacobian(z, r)
+            for k, c in enumerate(channels):
+                if c.recording != r:
+                    continue
+                j = self.case.coordinates.transform(c, jac[:, c.output])
+                w = np.sqrt(inverse[k][c.band])
+                j *= w[:, None]
+                gradient[unknown] += j.T @ (w * rows[k])
+                matrix[np.ix_(unknown, unknown)] += j.T @ j
+        values, _ = self.problem.unpack(z)
+        _, push, bend = self.problem.believed(values, True)
+        return gradient - self.precision * (z - self.mean) - push, matrix + np.diag(self.precision) + bend
+
+    def climb(
+        self, z: np.ndarray, goal: float
+    ) -> tuple[np.ndarray, Averaged, list[np.ndarray], np.ndarray, list[np.ndarray]]:
+        """The maximum near z: z, likelihood, powers, H and errors there. A log posterior of `goal` that is out of reach is not
+        climbed for."""
+        low, high = self.bounds()
+        errors = self.errors(z)
+        rows = self.rows(errors)
+        now, powers = self.likelihood(rows)
+        gradient, matrix = self.slope(z, rows, now.inverse)
+        for left in range(ROUNDS, 0, -1):
+            base = self.likelihood(rows, now.likely)[0].log_likelihood + self.prior(z)
+            step, gained = _step(z, gradient, matrix, low, high), 0.0
+            for length in LENGTHS:
+                trial = np.clip(z + length * step, low, high)
+                try:
+                    e = self.errors(trial)
+                except SimulationError:
+                    continue
+                trial_rows = self.rows(e)
+                gained = self.likelihood(trial_rows, now.likely)[0].log_likelihood + self.prior(trial) - base
+                if gained > 0:
+                    z, errors, rows = trial, e, trial_rows
+                    now, powers = self.likelihood(rows)
+                    gradient, matrix = self.slope(z, rows, now.inverse)
+                    break
+            if gained < ENOUGH or now.log_likelihood + left * gained < goal:
+                break
+        return z, now, powers, matrix, errors
+
+
+def _step(
+    z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Newton's step inside the box: what meets a wall stays there."""
+    free = ~(((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0)))
+    step = np.zeros_like(z)
+    for _ in range(len(z)):
+        index = np.flatnonzero(free)
+        if not len(index):
+            break
+        rest = np.flatnonzero(~free)
+        right = gradient[index] - matrix[np.ix_(index, rest)] @ step[rest]
+        step[index] = np.linalg.solve(
+            matrix[np.ix_(index, index)] + 1e-9 * np.diag(np.diag(matrix)[index]), right
+        )
+        out = index[
+            (z[index] + step[index] < low[index] - 1e-12) | (z[index] + step[index] > high[index] + 1e-12)
+        ]
+        if not len(out):
+            break
+        step[out] = np.clip(z[out] + step[out], low[out], high[out]) - z[out]
+        free[out] = False
+    return step
+
+
+def _priors(
+    case: Case, problem: Problem, effects: Sequence[Placed]
+) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
+    """Which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian."""
+    mean, precision = problem.belief.copy(), np.ones(len(problem.unknowns))
+    own = {
+        e.own[p.name]: (e.candidate, p)
+        for e in effects
+        for p in e.candidate.effect.parameters
+        if p.name in e.own
+    }
+    sizes = {}
+    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
+        precision[k] = BELIEF**-2
+        if q in own:
+            c, p = own[q]
+            mean[k], precision[k] = 0.5, 1e-6 if c.effect.prior is not None else 1e-4
+            if p.amplitude:
+                sizes[k] = own[q]
+        elif q in case.plant.parameters:
+            p = case.plant.parameters[q]
+            assert p.range is not None
+            mean[k] = problem.scales[q].z(p.value)
+    return sizes, mean, precision
+
+
+def fitted(
+    case: Case, plant: Plant, effects: Sequence[Placed], start: Fit | None = None, best: Fitted | None = None
+) -> Fitted:
+    """Refit a plant that holds these effects and take its log evidence; what stays far from the best hypothesis so far is not
+    followed to its end. Raises SimulationError."""
+    case.budget.fits_done += 1
+    posterior = Posterior(case, plant, effects)
+    if start is None:
+        start = refit.fit(
+            posterior.model,
+            posterior.drives,
+            case.noise,
+            iterations=WHITE,
+            tolerance=ROUGH,
+            goal=best.rough.cost if best else np.inf,
+            beliefs=posterior.problem.beliefs,
+        )
+    goal = best.log_likelihood - HOPELESS if best else -np.inf
+    z, average, powers, matrix, errors = posterior.climb(start.z, goal)
+    return _weighed(case, posterior, z, average, powers, matrix, errors, start)
+
+
+def _weighed(
+    case: Case,
+    posterior: Posterior,
+    z: np.ndarray,
+    average: Averaged,
+    powers: list[np.ndarray],
+    matrix: np.ndarray,
+    errors: list[np.ndarray],
+    rough: Fit,
+) -> Fitted:
+    """Laplace's evidence at the maximum."""
+    problem = posterior.problem
+    values, dx0 = problem.unpack(z)
+    own = np.ones(len(z), bool)
+    own[_gaussian(posterior)] = False
+    confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
+    inverse = np.linalg.pinv(confined, hermitian=True)
+    sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    names: dict[str, float] = {}
+    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
+        slope = problem.scales[q].slope(float(values[0, posterior.model.parameters.index(q)]))
+        if q not in case.plant.parameters:
+            names[q] = max(names.get(q, 0.0), float(sd[k] * slope))
+    log_prior = log_density(posterior, z, names)
+    volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
+    at_bound = {
+        q: "low" if z[k] <= 1e-6 else "high"
+        for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters])
+        if z[k] <= 1e-6 or z[k] >= 1 - 1e-6
+    }
+    found = Fit(
+        posterior.model,
+        values,
+        dx0,
+        -2 * average.log_likelihood,
+        problem.unknowns,
+        z,
+        matrix,
+        errors,
+        case.noise,
+        0,
+        problem.samples,
+        at_bound,
+        problem.beliefs,
+    )
+    plant = refit.updated(posterior.plant, found, posterior.drives)
+    return Fitted(
+        Hypothesis(tuple(posterior.effects)),
+        plant,
+        found,
+        average.log_likelihood,
+        float(log_prior),
+        volume,
+        average,
+        tuple(powers),
+        names,
+        refit.updated(posterior.plant, rough, posterior.drives),
+        rough,
+    )
+
+
+def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
+    """log p(z): Gaussians, uniform shapes, and the effects' sizes, which are not measured more finely than `sd`."""
+    values, _ = posterior.problem.unpack(z)
+    out = posterior.prior(z) + 0.5 * float(
+        np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi)))
+    )
+    for k, (c, p) in posterior.amplitudes.items():
+        q = posterior.problem.unknowns[k][0]
+        if c.effect.prior is None:
+            value = float(values[0, posterior.model.parameters.index(q)])
+            out += _size(p, value, sd[q]) + np.log(posterior.problem.scales[q].slope(value))
+    periods = sum(kind == "periods" for e in posterior.effects for kind in e.candidate.effect.shapes.values())
+    return out - periods * float(np.log(PERIODS))
+
+
+def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
+    """log p(D | z) + log p(z) at any z, with the sizes' scales of a fitted hypothesis: what `log_evidence` integrates."""
+    return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(
+        posterior, z, found.sd
+    )
+
+
+def _gaussian(posterior: Posterior) -> np.ndarray:
+    """The unknowns whose prior is a Gaussian (those of effects have their own)."""
+    names = {n for e in posterior.effects for n in e.own.values()}
+    return np.array([k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names], int)
+
+
+def _size(p: EffectParameter, value: float, sd: float) -> float:
+    """Log density of an effect's size: its order of magnitude is unknown over DECADES decades, and it is not measured more
+    finely than its standard deviation."""
+    one_sided = p.low >= p.null or p.high <= p.null
+    return -float(np.log(np.log(10.0) * DECADES * (1 if one_sided else 2) * np.hypot(value - p.null, sd)))
+
+
+def with_values(plant: Plant, values: Mapping[str, float]) -> Plant:
+    """The plant with other values of some parameters."""
+    return dataclasses.replace(
+        plant,
+        parameters={
+            k: dataclasses.replace(p, value=values[k]) if k in values else p
+            for k, p in plant.parameters.items()
+        },
+    )
+
+
+def drives_of(case: Case, f: Fitted) -> list[Drive]:
+    """The recordings as a fitted hypothesis' plant reads them."""
+    return [f.fit.model.drive(t) for t in case.tables]
+
+
+__all__ = ["Fitted", "Hypothesis", "Placed", "Scale", "fitted"]

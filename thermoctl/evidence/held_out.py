@@ -1,0 +1,114 @@
+"""What a hypothesis is worth on data that took no part in any choice: measured once, after all choices."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.evidence.case import Case
+from thermoctl.evidence.fit import Fitted
+from thermoctl.plant import refit
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import Model, SimulationError
+from thermoctl.recording.table import Table
+
+ENOUGH = 3  # recordings, from which the last one is set aside
+BLOCKS = 16  # of recordings that are too few: fitted to every other one, checked on the rest
+
+
+@dataclass(frozen=True)
+class Worth:
+    """Root-mean-square errors per output of the plant refitted and with the findings. `reserved`: on recordings set aside;
+    otherwise cross-validated, on data that did take part in the choice."""
+
+    refit_only: dict[str, float]
+    after: dict[str, float]
+    reserved: bool
+    names: tuple[str, ...]
+
+    @property
+    def share_closed(self) -> float | None:
+        """Share of the misfit's energy, relative to each output's, that the findings close."""
+        pairs = [
+            (self.refit_only[o], self.after[o])
+            for o in self.after
+            if self.refit_only.get(o, 0) > 0 and np.isfinite(self.after[o])
+        ]
+        return float(np.mean([1 - (b / a) ** 2 for a, b in pairs])) if pairs else None
+
+
+def split(tables: Sequence[Table], held_out: Sequence[Table]) -> tuple[list[Table], list[Table]]:
+    """The recordings to choose on, and those set aside."""
+    if held_out or len(tables) < ENOUGH:
+        return list(tables), list(held_out)
+    return list(tables[:-1]), list(tables[-1:])
+
+
+def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> Worth:
+    """Errors on the reserve; without one, on every other block, the plants refitted to the rest."""
+    if reserve:
+        return Worth(
+            _rms([_errors(case, null.plant, t) for t in reserve], null.fit.model),
+            _rms([_errors(case, best.plant, t) for t in reserve], null.fit.model),
+            True,
+            tuple(t.name for t in reserve),
+        )
+    return Worth(_crossed(case, null), _crossed(case, best), False, ())
+
+
+def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:
+    joined = np.concatenate(errors)
+    return {
+        o: float(np.sqrt(np.nanmean(joined[:, j] ** 2)))
+        for j, o in enumerate(model.outputs)
+        if np.isfinite(joined[:, j]).any()
+    }
+
+
+def _errors(case: Case, plant: Plant, table: Table) -> np.ndarray:
+    """Free-run errors on a recording that took no part, less what its uncertain start explains."""
+    model = plant.compile()
+    d = model.prepare(model.drive(table))
+    try:
+        run = model.run(d, None, None, sensitivities=True)
+    except SimulationError:
+        return np.full_like(d.y, np.nan)
+    assert run.dy is not None
+    error, good = d.y - run.y, np.isfinite(d.y)
+    if not model.uncertain:
+        return error
+    scale = np.array([n.sigma for n in case.noise])
+    start = run.dy[:, :, len(model.active) :]
+    prior = np.array([model.plant.nodes[n].initial_sigma or 1.0 for n in model.uncertain])
+    rows, rest = (start / scale[None, :, None])[good] * prior, (error / scale)[good]
+    return error - start @ (np.linalg.solve(rows.T @ rows + np.eye(len(prior)), rows.T @ rest) * prior)
+
+
+def _crossed(case: Case, f: Fitted) -> dict[str, float]:
+    """Errors on each half of the blocks, the plant refitted to the other half."""
+    measured = {o.column for o in case.plant.outputs.values()}
+    errors = []
+    for parity in (0, 1):
+        train = [_masked(t, measured, parity) for t in case.tables]
+        model = f.plant.compile()
+        drives = [model.drive(t) for t in train]
+        try:
+            found = refit.fit(model, drives, case.noise, iterations=10, tolerance=1e-3, beliefs=f.fit.beliefs)
+            for r, t in enumerate(case.tables):
+                d = model.drive(_masked(t, measured, 1 - parity))
+                errors.append(d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y)
+        except SimulationError:
+            errors += [np.full((len(t), len(model.outputs)), np.nan) for t in case.tables]
+    return _rms(errors, f.fit.model)
+
+
+def _masked(table: Table, measured: set[str], parity: int) -> Table:
+    span = (table.t - table.t[0]) / max(float(table.t[-1] - table.t[0]), 1e-300)
+    keep = np.minimum(span * BLOCKS, BLOCKS - 1).astype(int) % 2 == parity
+    return dataclasses.replace(
+        table,
+        columns={k: np.where(keep, v, np.nan) if k in measured else v for k, v in table.columns.items()},
+    )

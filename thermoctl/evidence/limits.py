@@ -1,0 +1,41 @@
+"""The numbers by which a diagnosis decides, from config/diagnosis.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from thermoctl import yamlfile
+from thermoctl.shipped import shipped
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Meanings and provenance: config/diagnosis.yaml."""
+
+    beam: int
+    shortlist: int
+    effects: int
+    fits: int
+    alpha: float
+    missing: float
+    rare: float
+    name: float
+    set: float
+    temperature: float
+    clean: float
+    closed: float
+
+
+def limits() -> Limits:
+    """Read the shipped numbers. Raises InputError where one is missing or not known."""
+    root = yamlfile.load(shipped("config") / "diagnosis.yaml")
+    known = {f.name for f in fields(Limits)}
+    for key, node in root.value.items():
+        if key not in known:
+            raise node.error(
+                f"unknown number '{key}'; known are {', '.join(sorted(known))}{yamlfile.suggest(key, known)}"
+            )
+    values = {key: node.plain()["value"] for key, node in root.value.items()}
+    for key in known - values.keys():
+        raise root.error(f"the number '{key}' is missing")
+    return Limits(**values)

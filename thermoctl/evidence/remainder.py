@@ -1,0 +1,136 @@
+"""The remainder: small random forces at every node that stores something, in every hypothesis.
+
+A force of unit variance, white from sample to sample, at node i gives output j the variance F_ij(b) in band b: measured on the
+plant linearised along its own trajectory (`Model.respond`), by the mean of a few fixed random draws. A slow force (first order,
+time constant tau') and its size eta, a share of the node's typical flow, scale it:
+
+    V_j(b) = eta^2 sum_i F_ij(b) S_b(tau')          eta = 0: no remainder
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.evidence.coordinates import Coordinates
+from thermoctl.evidence.noise import first_order
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import Drive, Model
+
+SHARES = 10.0 ** np.arange(-3.5, 0.1, 0.5)  # eta
+SMALL = 0.02  # mean of eta's exponential prior: what nobody will name is a few per cent of what flows
+CORNERS = 4  # tau', from two samples to a quarter of the longest recording
+ABSENT = 0.5  # prior of no remainder
+DRAWS = 8  # random forces a node
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """Variance of each output by cell (eta, tau') over the bands of its recordings, by node. `share`, `corner`: of each cell; the
+    first cell is no remainder."""
+
+    nodes: tuple[str, ...]
+    white: list[np.ndarray]  # per channel (nodes, bands)
+    share: np.ndarray
+    corner: np.ndarray
+    prior: np.ndarray
+    intervals: list[float]  # of the recordings
+
+    def cells(
+        self, coordinates: Coordinates, outputs: Sequence[Sequence[int]], only: int | None = None
+    ) -> list[np.ndarray]:
+        """(cells, bands) of each output, whose channels are given; of all nodes' forces, or of one node's only."""
+        out = []
+        for positions in outputs:
+            parts = []
+            for k in positions:
+                c = coordinates.channels[k]
+                white = self.white[k].sum(axis=0) if only is None else self.white[k][only]
+                rows = [np.zeros(len(c.count))]
+                for eta, tau in zip(self.share[1:], self.corner[1:], strict=True):
+                    rows.append(eta**2 * white * first_order(c.frequency, self.intervals[c.recording], tau))
+                parts.append(np.array(rows))
+            out.append(np.concatenate(parts, axis=1))
+        return out
+
+
+def typical_flow(plant: Plant, node: str, values: Sequence[Mapping[str, np.ndarray | float]]) -> float:
+    """Geometric mean of the root-mean-square flows at a node over all recordings: a large force that only stores and returns
+    energy says little of what may be missing beside it."""
+    logs = []
+    for f in plant.flows.values():
+        if node in (f.source, f.target):
+            square = [float(np.mean(np.asarray(ex.evaluate(f.rate, v), float) ** 2)) for v in values]
+            if np.mean(square) > 0:
+                logs.append(0.5 * np.log(np.mean(square)))
+    return float(np.exp(np.mean(logs))) if logs else 0.0
+
+
+def signals(model: Model, d: Drive, values: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
+    """Every name of the plant along a trajectory."""
+    return {
+        **dict(zip(model.plant.inputs, d.u.T, strict=False)),
+        **dict(zip(model.parameters, map(float, values), strict=True)),
+        **dict(zip(model.states, x.T, strict=True)),
+        "t": d.t,
+        "pi": np.pi,
+    }
+
+
+def remainder(
+    model: Model,
+    drives: Sequence[Drive],
+    values: np.ndarray,
+    dx0: np.ndarray,
+    coordinates: Coordinates,
+    skip: set[str],
+) -> Remainder:
+    """The responses at these parameters (recordings, parameters); `skip`: nodes that store nothing (a position)."""
+    nodes = tuple(
+        n
+        for n in model.plant.nodes
+        if n not in skip and any(n in (f.source, f.target) for f in model.plant.flows.values())
+    )
+    white: dict[int, np.ndarray] = {}
+    random = np.random.default_rng(23)
+    trajectories = [
+        signals(model, d, values[r], model.run(d, values[r], dx0[r]).x) for r, d in enumerate(drives)
+    ]
+    size = [typical_flow(model.plant, n, trajectories) for n in nodes]
+    for r, d in enumerate(drives):
+        forces, q = [], []
+        for i, n in enumerate(nodes):
+            storage = np.broadcast_to(
+                np.asarray(ex.evaluate(model.plant.nodes[n].storage, trajectories[r]), float), d.t.shape
+            )
+            for k in range(DRAWS):
+                forces.append((model.states.index(n), i * DRAWS + k))
+                q.append(random.standard_normal(len(d.t)) * size[i] / storage)
+        count = len(nodes) * DRAWS
+        dy = model.respond(d, values[r], dx0[r], forces, np.stack(q, axis=1), count) if count else None
+        for k, c in enumerate(coordinates.channels):
+            if c.recording != r:
+                continue
+            white[k] = np.zeros((len(nodes), len(c.count)))
+            if dy is not None:
+                rows = coordinates.transform(c, dy[:, c.output]) ** 2
+                mean = np.stack([np.bincount(c.band, column) for column in rows.T]) / c.count
+                white[k] = mean.reshape(len(nodes), DRAWS, -1).mean(axis=1)
+    span = max(float(d.t[-1] - d.t[0]) for d in drives)
+    intervals = [float(np.median(np.diff(d.t))) for d in drives]
+    taus = np.geomspace(2 * min(intervals), 0.25 * span, CORNERS)
+    share, corner = np.meshgrid(SHARES if nodes else SHARES[:0], taus, indexing="ij")
+    size = np.log(1 - ABSENT) - share.ravel() / SMALL
+    size -= np.log(len(taus)) + np.log(np.exp(-SHARES / SMALL).sum())
+    prior = np.concatenate([[np.log(ABSENT)], size]) if nodes else np.zeros(1)
+    return Remainder(
+        nodes,
+        [white[k] for k in range(len(coordinates.channels))],
+        np.concatenate([[0.0], share.ravel()]),
+        np.concatenate([[0.0], corner.ravel()]),
+        prior,
+        intervals,
+    )

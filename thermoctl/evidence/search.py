@@ -1,0 +1,231 @@
+"""A beam of hypotheses, grown by the score test, compared by log evidence and prior odds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.diagnose.effects import PLACES, Candidate
+from thermoctl.diagnose.screen import Direction, sharpened
+from thermoctl.diagnose.search import extend, finalists, sticking, weaker
+from thermoctl.evidence.case import Case
+from thermoctl.evidence.fit import Fitted, Placed, fitted
+from thermoctl.evidence.limits import Limits
+from thermoctl.evidence.roles import Structure
+from thermoctl.evidence.screening import Screened, places, screened
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import SimulationError
+from thermoctl.yamlfile import InputError
+
+EVENTS = ("onsets", "windows")  # shapes that happen at one moment
+PAIR = 2
+ALIKE = 0.999  # cosine of two directions, above which they are one
+START = 10.0  # times that a start which nobody measured is less certain than the catalogue says
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A fitted hypothesis and its log prior odds; `chance`: family-wise p of what it leaves, None where it was not screened."""
+
+    fitted: Fitted
+    log_odds: float
+
+    @property
+    def score(self) -> float:
+        """log p(D | h) + log p(h)"""
+        return self.fitted.log_evidence + self.log_odds
+
+
+@dataclass(frozen=True)
+class Searched:
+    """All hypotheses tried, best first; whether the budget ended the search; the chance of what the null leaves."""
+
+    tried: tuple[Weighed, ...]
+    truncated: bool
+    p_null: float
+
+
+def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limits) -> float:
+    """Log prior odds of a hypothesis against no effect: entries share the odds alike, and their places theirs."""
+    total = 0.0
+    for e in effects:
+        c = e.candidate
+        share = len(where) * len(where.get(c.effect.name, {c.place.where}))
+        total += np.log(limits.missing / (1 - limits.missing) / share) + np.log(_class(c, limits))
+    return float(total)
+
+
+def _class(c: Candidate, limits: Limits) -> float:
+    """Odds of an entry's class against constant physics."""
+    event = any(kind in EVENTS for kind in c.effect.shapes.values()) or any(
+        p.per_recording for p in c.effect.parameters
+    )
+    return (limits.rare if event else 1.0) * (
+        limits.rare if c.place.input and c.effect.where != "drive" else 1.0
+    )
+
+
+def search(case: Case, limits: Limits) -> Searched:
+    """Extend the beam's best hypotheses until no extension is significant, or none is better, or the budget is spent."""
+    where = places(case)
+    null = Weighed(fitted(case, case.plant, (), case.null), 0.0)
+    tried: dict[frozenset[tuple[str, str]], Weighed] = {frozenset(): null}
+    beam, p_null, seen = [null], 1.0, set()
+    for _ in range(limits.effects):
+        best = beam[0].score
+        for parent in beam:
+            if parent.fitted.hypothesis.keys in seen:
+                continue
+            seen.add(parent.fitted.hypothesis.keys)
+            looked = screened(case, parent.fitted)
+            if parent is null:
+                p_null = looked.p_any
+            if looked.p_any < limits.alpha:
+                for w in extensions(case, parent, looked, where, limits, tried):
+                    tried[w.fitted.hypothesis.keys] = w
+        beam = leaders(list(tried.values()), limits)
+        if beam[0].score <= best or case.budget.spent:
+            break
+    return Searched(tuple(sorted(tried.values(), key=lambda w: -w.score)), case.budget.spent, p_null)
+
+
+def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
+    """The beam: by score and by free-run error in turn, since a remainder may absorb for a while what a later effect explains."""
+    ranked = [sorted(tried, key=lambda w: -w.score), sorted(tried, key=lambda w: w.fitted.rough.cost)]
+    out: dict[frozenset[tuple[str, str]], Weighed] = {}
+    for pair in zip(*ranked, strict=True):
+        for w in pair:
+            out.setdefault(w.fitted.hypothesis.keys, w)
+    return list(out.values())[: limits.beam]
+
+
+def relabels(c: Candidate) -> bool:
+    """Does the entry only say in another way what the plant, or a simpler entry at the same place, says already?"""
+    if c.effect.where == "bending_pair":
+        return any(_free_member(c, side) for side in ("TA", "TB"))
+    displaced = PLACES["displacement"](c.rig)
+    return (
+        c.effect.where == "sensor"
+        and "tau" in c.effect.shapes
+        and any(p.output == c.place.output for p in displaced)
+    )
+
+
+def _free_member(c: Candidate, side: str) -> bool:
+    """Does the displacement hold this side's temperature already, with a coefficient that a refit moves?"""
+    now = ex.substitute(c.place.symbols["y"], lambda e: e.args[0] if e.op == "delay" else None)
+    slope = ex.derivative(now, str(c.place.symbols[side].value))
+    parameters = c.rig.plant.parameters
+    return any(n in parameters and parameters[n].range for n in ex.names(slope))
+
+
+def extensions(
+    case: Case,
+    parent: Weighed,
+    looked: Screened,
+    where: Mapping[str, set[str]],
+    limits: Limits,
+    tried: Mapping[frozenset[tuple[str, str]], Weighed],
+) -> list[Weighed]:
+    """The parent with each direction of the shortlist, and with each pair that explains more than its parts, refitted."""
+    out: list[Weighed] = []
+    kept = [d for d in looked.directions if not relabels(d.candidate)]
+    singles = [(d,) for d in finalists(kept, limits.shortlist)]
+    for added in [*singles, *pairs(kept, looked, limits)]:
+        keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
+        if keys in tried or case.budget.spent:
+            continue
+        leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
+        found = [f for f in _followed(case, parent, looked, added, leader) if not f.absent]
+        if found:
+            best = max(found, key=lambda f: f.log_evidence)
+            out.append(Weighed(best, odds(best.hypothesis.effects, where, limits)))
+    return out
+
+
+def pairs(directions: Sequence[Direction], looked: Screened, limits: Limits) -> list[tuple[Direction, ...]]:
+    """The pairs of constant physics that together explain far more than one by one, at their joint sizes: what the plant's own
+    parameters imitate alone, they may not imitate together."""
+    best: dict[tuple[str, str], Direction] = {}
+    for d in directions:
+        if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values()):
+            best.setdefault(d.candidate.key, d)
+    kept = list(best.values())
+    if len(kept) < PAIR:
+        return []
+    v = np.stack([d.vector for d in kept]).astype(float)
+    g = np.maximum(v @ looked.metric.residual, np.finfo(float).tiny)
+    c = np.clip(v @ v.T, -ALIKE, ALIKE)
+    first = (g[:, None] - c * g[None]) / (
+        1 - c**2
+    )  # size of the first beside the second, along its unit vector
+    joint = g[:, None] * first + g[None] * first.T
+    alone = np.array([d.gain for d in kept])
+    extra = np.triu(joint - np.maximum.outer(alone, alone), 1)
+    out: list[tuple[Direction, ...]] = []
+    for k in np.argsort(-extra, axis=None):
+        a, b = np.unravel_index(k, extra.shape)
+        if len(out) >= limits.shortlist // PAIR or extra[a, b] <= max(alone[a], alone[b]):
+            break
+        pair = (resized(kept[a], first[a, b] / g[a]), resized(kept[b], first[b, a] / g[b]))
+        if all(d is not None for d in pair):
+            out.append(tuple(d for d in pair if d is not None))
+    return out
+
+
+def resized(d: Direction, factor: float) -> Direction | None:
+    """The direction at a multiple of its size; None where physics does not allow that."""
+    start = dict(d.start)
+    for p in d.candidate.effect.parameters:
+        if p.amplitude:
+            start[p.name] = p.null + factor * (start[p.name] - p.null)
+            low, high = d.candidate.bounds(p)
+            if not low <= start[p.name] <= high:
+                return None
+    return dataclasses.replace(d, start=start)
+
+
+def _followed(
+    case: Case, parent: Weighed, looked: Screened, added: Sequence[Direction], leader: Fitted
+) -> list[Fitted]:
+    """The refits from the starting points that the directions' shapes ask for; from nearer to nothing where the first steps went
+    astray and fit worse than without the effect."""
+    first = tuple(sharpened(looked.metric, looked.rig, d) for d in added)
+    stuck = tuple(sticking(d) or d for d in first)
+    found = [_refitted(case, parent, first, looked, leader)]
+    if stuck != first and max(d.gain for d in first) > looked.directions[0].gain / PAIR:
+        found.append(_refitted(case, parent, stuck, looked, leader))
+    if all(f is None or f.rough.cost > parent.fitted.rough.cost for f in found):
+        found.append(_refitted(case, parent, tuple(weaker(d) for d in first), looked, leader))
+    return [f for f in found if f is not None]
+
+
+def _refitted(
+    case: Case, parent: Weighed, added: Sequence[Direction], looked: Screened, leader: Fitted
+) -> Fitted | None:
+    effects, plant = parent.fitted.hypothesis.effects, parent.fitted.rough_plant
+    drives = looked.metric.drives
+    try:
+        for d in added:
+            rig = Structure(plant, drives, [t.columns for t in case.tables])
+            d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
+            plant, own = extend(plant, d, drives)
+            effects = (*effects, Placed(d.candidate, own))
+        return fitted(case, free_starts(case.plant, plant), effects, None, leader)
+    except (SimulationError, InputError, np.linalg.LinAlgError):
+        return None
+
+
+def free_starts(before: Plant, after: Plant) -> Plant:
+    """The plant with bodies that an effect brought starting anywhere near: what nobody measured need not rest at the start."""
+    nodes = {
+        n.name: n
+        if n.name in before.nodes or not n.initial_sigma
+        else dataclasses.replace(n, initial_sigma=START * n.initial_sigma)
+        for n in after.nodes.values()
+    }
+    return dataclasses.replace(after, nodes=nodes)
