@@ -46,6 +46,7 @@ cdef class Law:
     cdef public double coil_elapsed_s, power_mean_w, following_s, idle_s, saturation_s, amplifier_s, enable, drive
     cdef public double control_v
     cdef public double air_started, resumed, model_error_c, ohm_v, ohm_scale_v, current_error_a, displaced_um
+    cdef public double current_apart_a, drive_low, drive_high, drive_low_before, drive_high_before
     cdef public double position_zero_um, zeroed, reference_error_um, reference_zero_um, reference_zeroed, exchanged, driving
     cdef public double[::1] x, T, T_before, average, age, since_s, suspect, last, same_s, seen, verdict, corrections, apart_c
 
@@ -78,6 +79,8 @@ cdef class Law:
     @cython.locals(one=bits_t, m=cython.int, s=cython.double, part=cython.double, amperes=cython.double, current=cython.bint,
                    estimated=cython.bint)
     cdef void _agree(self) noexcept
+    @cython.locals(low=cython.double, high=cython.double)
+    cdef void _compare_drive(self, double amperes) noexcept
     @cython.locals(m=cython.int, k=cython.int, s=cython.double)
     cdef void _compare_order(self) noexcept
     @cython.locals(coil_new=cython.bint, i=cython.int, j=cython.int, k=cython.int, c=cython.int, s=cython.double,
