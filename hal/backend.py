@@ -140,6 +140,15 @@ def slow_devices(settings: Any) -> list:
     return [d for d in make_devices(settings) if d.slow]
 
 
+def can_drive(settings: Any) -> bool:
+    """Whether anything takes the command, so that the rig may be armed. Raises InputError."""
+    if settings.hal.backend != "devices":
+        return True
+    from hal.devices import driving_devices
+
+    return bool(driving_devices(settings))
+
+
 def disable_amplifier(settings: Any) -> None:
     """Disable the amplifier of `hal.devices` over a link of its own: for when the loop can no longer do it. No other device is
     opened, and a mistake in another device's profile does not count. Raises HardwareError, OSError, InputError."""

@@ -176,6 +176,7 @@ def build(trees: dict[str, ast.Module]) -> types.ModuleType:
                 sys.modules[f"thermoctl.control.{name}"] = module
                 setattr(package, name, module)
     made["law"].WARM_UP_TICKS = made["law"]._WARM_UP = 6  # interpreted ticks are slow
+    made["law"]._AIR_READINGS = 6.0
     made["law"].arming, made["law"].faults = made["arming"], made["faults"]
     return made["law"]
 

@@ -725,6 +725,7 @@ def nothing_that_is_not_finite_is_driven(module):
     for name in ("v", "expansion_before_um", "air_c", "eps1"):
         for value in (math.nan, math.inf)[: 1 if name == "v" else 2]:  # an infinite v is clipped
             bench = Bench(module).armed()
+            assert bench.law.primed == 1.0  # before, the expansion is made anew in every tick
             setattr(bench.law, name, value)
             bench.tick()
             assert bench.state == arming.FAULT and bench.law.enable == 0.0 and bench.law.drive == 0.0, name
@@ -920,6 +921,20 @@ def current_and_drive(module):
     b.set(current_a=0.0).tick(command=arming.DISARM).tick(2).tick(command=arming.ARM).set(current_a=0.5).tick(
         2
     ).well()
+
+    # A slow meter: its reading is older than its arrival, and may be any drive since the reading before the last.
+    def changing(sign):
+        b = bench(current_tolerance_a=1.0).tick(2)
+        b.law.configure(replace(b.parameters, current_tolerance_a=0.25))
+        b.tick(2).silent("current_a").law.v = 2.0 + 2.0 * sign
+        return b.tick(3).well()
+
+    for sign in (1.0, -1.0):
+        b = changing(sign).set(current_a=1.0).tick().well().tick().well()
+        b.tick().safe("amplifier_not_following")
+        b = changing(sign).set(current_a=1.0 - 0.25 * sign).tick().well()
+        b.set(current_a=1.0 - 0.375 * sign).tick().safe("amplifier_not_following")
+    bench(current_per_drive=-0.5, current_tolerance_a=1.0).tick(4).safe("amplifier_not_following")
     Bench(module, current_per_drive=0.0, current_tolerance_a=0.25, agree_time_s=P).armed().set(
         current_a=9.0
     ).tick(3).well()

@@ -16,6 +16,7 @@ PROTECTION = (
     "_resistance",
     "_watch_amplifier",
     "_agree",
+    "_compare_drive",
     "_compare_order",
     "protect",
     "_arm",

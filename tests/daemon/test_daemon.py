@@ -81,7 +81,8 @@ def test_reload_applies_whole_files_only(daemon):
     )
     daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.005").replace("ti_s: 0.004", "ti_s: never"))
     answer = daemon.ask("reload")
-    assert not answer["ok"] and "control.ti_s" in answer["error"] and ":12:9:" in answer["error"]
+    line = text[: text.index("ti_s:")].count("\n") + 1
+    assert not answer["ok"] and "control.ti_s" in answer["error"] and f":{line}:9:" in answer["error"]
     daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.006"))
     daemon.process.send_signal(signal.SIGHUP)
     wait(lambda: daemon.ask("status")["generation"] == 2, "the reload by SIGHUP")

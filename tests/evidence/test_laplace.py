@@ -13,7 +13,8 @@ from thermoctl.diagnose.search import extend
 from thermoctl.evidence.case import Budget, case
 from thermoctl.evidence.fit import Placed, Posterior, evidence_at, fitted
 from thermoctl.evidence.roles import Structure
-from thermoctl.plant.language import loads
+from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 HEATER = """
@@ -70,7 +71,7 @@ def _candidate(rig: Structure, effect: str) -> Candidate:
 
 
 def _extended(plant, table: Table, effect: str, values: dict[str, float]):
-    drive = plant.compile().drive(table)
+    drive = compile_plant(plant).excitation(table)
     rig = Structure(plant, [drive], [table.columns])
     c = _candidate(rig, effect)
     shape = {p.shape: values[p.name] for p in c.effect.parameters if p.shape}
@@ -92,7 +93,7 @@ def test_laplace_agrees_with_importance_sampling(name):
     if effect:
         (model, own), c = _extended(plant, table, effect, values)
         effects = (Placed(c, own),)
-    truth = model.compile().simulate(table).y[:, 0]
+    truth = compile_plant(model).simulate(table).y[:, 0]
     table = _recording(plant, truth, 3, slow, inputs, t)
     known = case(plant, [table], catalogue(), Budget(9, 9))
     found = fitted(known, model, effects)

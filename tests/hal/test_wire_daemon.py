@@ -38,7 +38,11 @@ class Chain:
         self.socket = load_settings(self.config).socket.path
         self.rig = self.start_rig()
         self.daemon = subprocess.Popen([*CLI, "run", "--config", str(self.config)], stderr=subprocess.DEVNULL)
-        self.until(lambda s: s.get("state") == "READY", 30)
+        try:
+            self.until(lambda s: s.get("state") == "READY", 60)  # two programs' imports, on a busy machine
+        except AssertionError:
+            self.stop()
+            raise
 
     def start_rig(self):
         rig = subprocess.Popen(

@@ -27,6 +27,7 @@ from thermoctl.daemon.supervisor import _Watcher
 from thermoctl.recording.commands import list_recordings
 from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter
+from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX, POINTS, SIGNALS
 
 SENSORS = (
@@ -70,7 +71,7 @@ def in_the_terminal(running, capsys, monkeypatch):
     """(status as printed, its JSON, the monitor's screen, Prometheus' page) of this moment."""
     answer = {"ok": True, **status(running.shared)}
     monkeypatch.setattr(client, "ask", lambda *a: answer)
-    monkeypatch.setattr(client, "settings_of", lambda config: running.settings)
+    monkeypatch.setattr(client, "load_settings", lambda config: running.settings)
     capsys.readouterr()
     client.status(None)
     printed = capsys.readouterr().out
@@ -311,6 +312,24 @@ def test_arm_in_fault_answers_in_readable_lines(settings, running):
     lines = answer["error"].splitlines()
     assert not answer["ok"] and 3 <= len(lines) <= 8 and max(map(len, lines)) < 300
     assert "open wire" in answer["error"] and "it brought" in answer["error"]
+
+
+def test_a_rig_without_a_drive_is_not_armed(settings, running, tmp_path):
+    """It would be ARMED with nothing behind it. The rig is the running one with a thermocouple module as only device."""
+    module = Path(__file__).resolve().parents[2] / "config/devices/thermocouples-modbus-8.yaml"
+    (tmp_path / "measures.yaml").write_text(
+        "rig: {name: measures}\ncontrol: {kp: 0.01, ti_s: 0.004, td_s: 0.001, output_limit: 1.5}\n"
+        "protection: {required: [coil_c]}\nhal:\n  backend: devices\n  devices:\n"
+        f"    - {{profile: {module}, port: 'tcp:127.0.0.1:502', roles: {{thermocouple_1: coil_c}}}}\n"
+        f"socket: {{path: {tmp_path}/rig.sock}}\nrecording: {{directory: {tmp_path}}}\n"
+    )
+    measuring = load_settings(tmp_path / "measures.yaml")
+    running.tick(500)
+    commands = Commands(running.shared, measuring, None, lambda *a, **k: None)
+    answer = commands.answer(b'{"command": "arm"}', "")
+    assert not answer["ok"] and "no device of hal.devices takes the command" in answer["error"]
+    running.tick(20)
+    assert status(running.shared)["state"] == "READY"  # nothing was sent to the loop
 
 
 def test_the_devices_words_are_logged_once_with_their_time(settings, running):

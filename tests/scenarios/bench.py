@@ -187,6 +187,10 @@ class Bench:
         self.bus.others.append(drive)
         drive.restart()
 
+    def kill(self, pid: int, number: int) -> None:
+        """A signal to a process of the daemon."""
+        os.kill(pid, number)
+
     def frame(self, can_id: int, extended: bool, data: str) -> None:
         """A frame that someone else sends."""
         self.bus.pass_on((can_id, extended, bytes.fromhex(data)), None)

@@ -84,12 +84,12 @@ def _drive(scenario: Scenario, rigs: Rigs) -> str:
     name = scenario.rig
     rigs.arm(name, scenario.setpoint_um)
     daemon = rigs.daemon(name)
-    pid = _victim(scenario, daemon)  # before the mark: to look for it takes time
-    rigs.bench.tell("inject", scenario.steps, name)
+    pid = _victim(scenario, daemon)  # to look for it takes time
+    # The bench kills, right after its mark: this program's turn may come 0.1 s later on a loaded machine.
+    kill = (("kill", [pid, getattr(signal, scenario.kill[1])]),) if scenario.kill else ()
+    rigs.bench.tell("inject", (*scenario.steps, *kill), name)
     if scenario.then_um is not None:
         daemon.ask("setpoint", value=scenario.then_um)
-    if scenario.kill:
-        os.kill(pid, getattr(signal, scenario.kill[1]))
     seen = _trip(scenario, rigs) if scenario.expect == TRIPS else _ride(scenario, rigs)
     return f"{seen}; {_heal(scenario, rigs, scenario.expect == TRIPS)}"
 

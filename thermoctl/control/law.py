@@ -19,7 +19,8 @@ both give the same bits (IEEE doubles, no contraction, one order of operations).
                 power, idle current, innovation, saturation, amplifier; arming; and last: every number finite.
     agree       what two readings say of one thing must agree in the mean; a sensor that drifts, is swapped or hangs
                 between its limits is found so, and in no other way:
-                coil's voltage and R20 (1 + alpha (coil - 20 degC)) current;  current and the drive that was asked for;
+                coil's voltage and R20 (1 + alpha (coil - 20 degC)) current;
+                current and the drive that was asked for since the reading before the last;
                 position and the current that holds it against the flexures;  a watched temperature and its estimate;
                 the reference encoder and position + expansion (each encoder's own zero is taken while OFF);
                 two temperatures and their estimates, which must not stand the other way round: y_i > y_j while T_i < T_j
@@ -178,6 +179,11 @@ _SCALARS = (
     "ohm_v",
     "ohm_scale_v",
     "current_error_a",
+    "current_apart_a",
+    "drive_low",
+    "drive_high",
+    "drive_low_before",
+    "drive_high_before",
     "displaced_um",
     "position_zero_um",
     "zeroed",
@@ -298,7 +304,8 @@ class Law:
         self.primed = self.phase_s = self.expansion_before_um = self.expansion_after_um = 0.0
         self.expansion_um = self.compensation_um = 0.0
         self.air_started = self.resumed = self.model_error_c = 0.0
-        self.ohm_v = self.ohm_scale_v = self.current_error_a = 0.0
+        self.ohm_v = self.ohm_scale_v = self.current_error_a = self.current_apart_a = 0.0
+        self.drive_low = self.drive_high = self.drive_low_before = self.drive_high_before = 0.0
         self.displaced_um = self.position_zero_um = self.zeroed = 0.0
         self.reference_error_um = self.reference_zero_um = self.reference_zeroed = 0.0
         self.exchanged = 0.0
@@ -674,7 +681,7 @@ class Law:
             return
         if self.state == _ARMED:
             step = self.p.slew_um_s * self.dt
-            if abs(target - self.compensation_um) > 2.0 * step:
+            if self.primed > 0.0 and abs(target - self.compensation_um) > 2.0 * step:  # else the origin moves
                 self.faults |= one << _B_SLEWING
             target = clip(target, self.compensation_um - step, self.compensation_um + step)
         self.compensation_um = target
@@ -811,12 +818,11 @@ class Law:
             self.ohm_scale_v += part * (max(abs(self.last[_VOLTAGE]), abs(s)) - self.ohm_scale_v)
             if abs(self.ohm_v) > self.p.resistance_tolerance * self.ohm_scale_v + self.p.resistance_v:
                 self.faults |= one << _B_ELECTRICAL
+        self._compare_drive(amperes)
         if self.state != _ARMED or not current or self.p.current_per_drive == 0.0:
             self.current_error_a = 0.0
         else:
-            self.current_error_a += part * (
-                amperes - self.p.current_per_drive * self.drive - self.current_error_a
-            )
+            self.current_error_a += part * (self.current_apart_a - self.current_error_a)
             if abs(self.current_error_a) > self.p.current_tolerance_a:
                 self.faults |= one << _B_NOT_FOLLOWING
         if current and self.verdict[_POSITION] == 0.0 and self.p.flexure_um_per_a != 0.0:
@@ -848,6 +854,23 @@ class Law:
             self.reference_error_um += part * (s - self.reference_zero_um - self.reference_error_um)
             if abs(self.reference_error_um) > self.p.reference_tolerance_um:
                 self.faults |= one << _B_MONITORED
+
+    def _compare_drive(self, amperes):
+        """current_apart_a: how far a new current lies outside all that was asked for since the reading before the last.
+
+        A slow meter's reading is older than its arrival: it was sampled somewhere in that time. Compared with the
+        present drive, it would accuse an amplifier that follows while the drive changes.
+        """
+        self.drive_low = min(self.drive_low, self.drive)
+        self.drive_high = max(self.drive_high, self.drive)
+        if self.fresh[_CURRENT] and self.p.current_per_drive != 0.0:
+            low = min(self.drive_low, self.drive_low_before)
+            high = max(self.drive_high, self.drive_high_before)
+            self.current_apart_a = amperes - self.p.current_per_drive * clip(
+                amperes / self.p.current_per_drive, low, high
+            )
+            self.drive_low_before, self.drive_high_before = self.drive_low, self.drive_high
+            self.drive_low = self.drive_high = self.drive
 
     def _compare_order(self):
         """exchanged: two mean readings would fit their estimates better the other way round."""

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from hal.backend import can_drive
 from thermoctl.channels import CHANNELS, STATUS_NAMES
 from thermoctl.control import arming
 from thermoctl.daemon import arrival, readings
@@ -157,6 +158,7 @@ class Commands:
         self.shared, self.settings, self.started = shared, settings, settings
         self.reload_settings, self.log = reload_settings, log
         self.expected_hz = arrival.expected_hz(settings)
+        self.can_drive = can_drive(settings)
 
     def answer(self, line: bytes, peer: str) -> dict[str, Any]:
         """The answer to one request line; never raises for what a client sent."""
@@ -230,6 +232,13 @@ class Commands:
         }
 
     def _arm(self, request: dict) -> dict[str, Any]:
+        if not self.can_drive:
+            return {
+                "ok": False,
+                "state": self._state(),
+                "error": "not armed: no device of hal.devices takes the command (a can-cia402 profile with 'drive'): "
+                "this rig measures, it cannot be driven",
+            }
         deadline = time.monotonic() + ANSWER_S  # a loop that was just started warms up for 0.1 s
         while not settled(status(self.shared)) and time.monotonic() < deadline:
             time.sleep(0.005)

@@ -16,7 +16,7 @@ from thermoctl.evidence.remainder import Remainder, remainder
 from thermoctl.evidence.roles import motions
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Noise, default_noise, fit
-from thermoctl.plant.simulate import Drive, Model
+from thermoctl.plant.simulate import Excitation, Model, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
@@ -56,15 +56,15 @@ class Case:
     budget: Budget
     notes: list[str] = field(default_factory=list)
 
-    def drives(self, model: Model) -> list[Drive]:
+    def drives(self, model: Model) -> list[Excitation]:
         """The recordings as a model reads them."""
-        return [model.drive(t) for t in self.tables]
+        return [model.excitation(t) for t in self.tables]
 
 
 def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect], budget: Budget) -> Case:
     """Refit the plant as it came, drop single outliers, measure how forces at its nodes reach its outputs. Raises InputError."""
-    model = plant.compile()
-    drives = [model.drive(t) for t in tables]
+    model = compile_plant(plant)
+    drives = [model.excitation(t) for t in tables]
     counts = [sum(int(np.isfinite(d.y[:, j]).sum()) for d in drives) for j in range(len(model.outputs))]
     if max(counts, default=0) < LEAST:
         raise InputError(
@@ -74,7 +74,7 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
     noise = default_noise(plant, drives)
     null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2)
     tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
-    drives = [model.drive(t) for t in tables]
+    drives = [model.excitation(t) for t in tables]
     coordinates = Coordinates(drives)
     outputs = [
         tuple(k for k, c in enumerate(coordinates.channels) if c.output == j)

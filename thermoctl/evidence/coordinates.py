@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import dct
 
-from thermoctl.plant.simulate import Drive
+from thermoctl.plant.simulate import Excitation
 
 SINGLE = 6  # lowest rows that are bands of their own
 WIDTH = 1.19  # of a band: a quarter of an octave
@@ -42,7 +42,7 @@ class Channel:
         return len(self.band)
 
 
-def channel(d: Drive, r: int, j: int, most: int | None = None) -> Channel | None:
+def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel | None:
     """Output j of recording r; at most about `most` rows (the lowest). None where too little was measured."""
     index = np.flatnonzero(np.isfinite(d.y[:, j]))
     if len(index) < FEWEST:
@@ -72,7 +72,7 @@ def channel(d: Drive, r: int, j: int, most: int | None = None) -> Channel | None
 class Coordinates:
     """The rows of all outputs in all recordings."""
 
-    def __init__(self, drives: Sequence[Drive], most: int | None = None):
+    def __init__(self, drives: Sequence[Excitation], most: int | None = None):
         found = (channel(d, r, j, most) for r, d in enumerate(drives) for j in range(d.y.shape[1]))
         self.channels = [c for c in found if c is not None]
         self.recordings = len(drives)

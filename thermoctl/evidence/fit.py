@@ -22,7 +22,7 @@ from thermoctl.evidence.noise import Averaged, Likely, averaged
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem, Scale
-from thermoctl.plant.simulate import Drive, SimulationError
+from thermoctl.plant.simulate import Excitation, SimulationError, compile_plant
 
 SIGNIFICANT = 2.0  # standard deviations
 BELIEF = 0.3  # standard deviation of the plant's parameters round their beliefs, as a share of their ranges
@@ -86,7 +86,7 @@ class Fitted:
 
     @property
     def log_evidence(self) -> float:
-        """log p(D | h)"""
+        """Log p(D | h)"""
         return self.log_likelihood + self.log_prior + self.volume
 
 
@@ -110,7 +110,7 @@ class Posterior:
 
     def __init__(self, case: Case, plant: Plant, effects: Sequence[Placed]):
         self.case, self.plant, self.effects = case, plant, effects
-        self.model = plant.compile()
+        self.model = compile_plant(plant)
         self.drives = case.drives(self.model)
         for d in self.drives:
             self.model.prepare(d)
@@ -118,7 +118,7 @@ class Posterior:
         self.amplitudes, mean, precision = _priors(case, self.problem, effects)
         self.mean, self.precision = mean, precision
         beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
-        self.problem.beliefs = tuple(beliefs)
+        self.problem.priors = tuple(beliefs)
 
     def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
         """(N, outputs, ...) of each recording as rows of each channel."""
@@ -152,7 +152,7 @@ class Posterior:
         values, _ = self.problem.unpack(z)
         return (
             -0.5 * float(self.precision @ (z - self.mean) ** 2)
-            - 0.5 * self.problem.believed(values, False)[0]
+            - 0.5 * self.problem.prior_terms(values, False)[0]
         )
 
     def slope(
@@ -173,7 +173,7 @@ class Posterior:
                 gradient[unknown] += j.T @ (w * rows[k])
                 matrix[np.ix_(unknown, unknown)] += j.T @ j
         values, _ = self.problem.unpack(z)
-        _, push, bend = self.problem.believed(values, True)
+        _, push, bend = self.problem.prior_terms(values, True)
         return gradient - self.precision * (z - self.mean) - push, matrix + np.diag(self.precision) + bend
 
     def climb(
@@ -236,7 +236,7 @@ def _priors(
     case: Case, problem: Problem, effects: Sequence[Placed]
 ) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
     """Which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian."""
-    mean, precision = problem.belief.copy(), np.ones(len(problem.unknowns))
+    mean, precision = problem.z_plant.copy(), np.ones(len(problem.unknowns))
     own = {
         e.own[p.name]: (e.candidate, p)
         for e in effects
@@ -273,7 +273,7 @@ def fitted(
             iterations=WHITE,
             tolerance=ROUGH,
             goal=best.rough.cost if best else np.inf,
-            beliefs=posterior.problem.beliefs,
+            priors=posterior.problem.priors,
         )
     goal = best.log_likelihood - HOPELESS if best else -np.inf
     z, average, powers, matrix, errors = posterior.climb(start.z, goal)
@@ -323,7 +323,7 @@ def _weighed(
         0,
         problem.samples,
         at_bound,
-        problem.beliefs,
+        problem.priors,
     )
     plant = refit.updated(posterior.plant, found, posterior.drives)
     return Fitted(
@@ -342,7 +342,7 @@ def _weighed(
 
 
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
-    """log p(z): Gaussians, uniform shapes, and the effects' sizes, which are not measured more finely than `sd`."""
+    """Log p(z): Gaussians, uniform shapes, and the effects' sizes, which are not measured more finely than `sd`."""
     values, _ = posterior.problem.unpack(z)
     out = posterior.prior(z) + 0.5 * float(
         np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi)))
@@ -357,7 +357,7 @@ def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) ->
 
 
 def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
-    """log p(D | z) + log p(z) at any z, with the sizes' scales of a fitted hypothesis: what `log_evidence` integrates."""
+    """Log p(D | z) + log p(z) at any z, with the sizes' scales of a fitted hypothesis: what `log_evidence` integrates."""
     return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(
         posterior, z, found.sd
     )
@@ -387,9 +387,9 @@ def with_values(plant: Plant, values: Mapping[str, float]) -> Plant:
     )
 
 
-def drives_of(case: Case, f: Fitted) -> list[Drive]:
+def drives_of(case: Case, f: Fitted) -> list[Excitation]:
     """The recordings as a fitted hypothesis' plant reads them."""
-    return [f.fit.model.drive(t) for t in case.tables]
+    return [f.fit.model.excitation(t) for t in case.tables]
 
 
 __all__ = ["Fitted", "Hypothesis", "Placed", "Scale", "fitted"]

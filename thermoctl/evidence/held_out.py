@@ -12,7 +12,7 @@ from thermoctl.evidence.case import Case
 from thermoctl.evidence.fit import Fitted
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Model, SimulationError
+from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 ENOUGH = 3  # recordings, from which the last one is set aside
@@ -70,8 +70,8 @@ def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:
 
 def _errors(case: Case, plant: Plant, table: Table) -> np.ndarray:
     """Free-run errors on a recording that took no part, less what its uncertain start explains."""
-    model = plant.compile()
-    d = model.prepare(model.drive(table))
+    model = compile_plant(plant)
+    d = model.prepare(model.excitation(table))
     try:
         run = model.run(d, None, None, sensitivities=True)
     except SimulationError:
@@ -93,12 +93,12 @@ def _crossed(case: Case, f: Fitted) -> dict[str, float]:
     errors = []
     for parity in (0, 1):
         train = [_masked(t, measured, parity) for t in case.tables]
-        model = f.plant.compile()
-        drives = [model.drive(t) for t in train]
+        model = compile_plant(f.plant)
+        drives = [model.excitation(t) for t in train]
         try:
-            found = refit.fit(model, drives, case.noise, iterations=10, tolerance=1e-3, beliefs=f.fit.beliefs)
+            found = refit.fit(model, drives, case.noise, iterations=10, tolerance=1e-3, priors=f.fit.priors)
             for r, t in enumerate(case.tables):
-                d = model.drive(_masked(t, measured, 1 - parity))
+                d = model.excitation(_masked(t, measured, 1 - parity))
                 errors.append(d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y)
         except SimulationError:
             errors += [np.full((len(t), len(model.outputs)), np.nan) for t in case.tables]

@@ -18,7 +18,7 @@ from thermoctl.evidence.coordinates import Coordinates
 from thermoctl.evidence.noise import first_order
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Drive, Model
+from thermoctl.plant.simulate import Excitation, Model
 
 SHARES = 10.0 ** np.arange(-3.5, 0.1, 0.5)  # eta
 SMALL = 0.02  # mean of eta's exponential prior: what nobody will name is a few per cent of what flows
@@ -69,7 +69,7 @@ def typical_flow(plant: Plant, node: str, values: Sequence[Mapping[str, np.ndarr
     return float(np.exp(np.mean(logs))) if logs else 0.0
 
 
-def signals(model: Model, d: Drive, values: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
+def signals(model: Model, d: Excitation, values: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
     """Every name of the plant along a trajectory."""
     return {
         **dict(zip(model.plant.inputs, d.u.T, strict=False)),
@@ -82,7 +82,7 @@ def signals(model: Model, d: Drive, values: np.ndarray, x: np.ndarray) -> dict[s
 
 def remainder(
     model: Model,
-    drives: Sequence[Drive],
+    drives: Sequence[Excitation],
     values: np.ndarray,
     dx0: np.ndarray,
     coordinates: Coordinates,

@@ -16,6 +16,7 @@ from thermoctl.evidence.search import Searched
 from thermoctl.evidence.unknown import Left
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import compile_plant
 
 NEXT = {
     "consistent": "Nothing. The smallest effects that these recordings would have shown depend on their excitation: wider steps show more.",
@@ -159,7 +160,7 @@ def _mismatch(d: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _before(d: Diagnosis) -> dict[str, float]:
-    model = d.case.plant.compile()
+    model = compile_plant(d.case.plant)
     errors = np.concatenate([x.y - model.run(x).y for x in d.case.drives(model)])
     return {
         o: float(np.sqrt(np.nanmean(errors[:, j] ** 2)))

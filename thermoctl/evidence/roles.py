@@ -13,7 +13,7 @@ import numpy as np
 from thermoctl.diagnose.effects import TEMPERATURE, Rig
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Drive
+from thermoctl.plant.simulate import Excitation
 
 
 def motions(plant: Plant) -> dict[str, str]:
@@ -34,7 +34,9 @@ def motions(plant: Plant) -> dict[str, str]:
 class Structure(Rig):
     """A plant and its recordings as the catalogue sees them, by structure and units."""
 
-    def __init__(self, plant: Plant, drives: Sequence[Drive], columns: Sequence[Mapping[str, np.ndarray]]):
+    def __init__(
+        self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
+    ):
         super().__init__(plant, drives, columns)
         pairs = motions(self.physics)
         self.velocities = [*self.velocities, *(v for v in pairs if v not in self.velocities)]

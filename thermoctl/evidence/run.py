@@ -15,9 +15,10 @@ from thermoctl.evidence.limits import Limits, limits
 from thermoctl.evidence.result import Diagnosis, contract
 from thermoctl.evidence.search import search
 from thermoctl.evidence.unknown import Left, left
-from thermoctl.plant import load
-from thermoctl.plant.language import Plant, save
-from thermoctl.recording.table import Table, read_table
+from thermoctl.plant import load, save
+from thermoctl.plant.language import Plant
+from thermoctl.recording.files import read_table
+from thermoctl.recording.table import Table
 
 
 def diagnose(

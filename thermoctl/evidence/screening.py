@@ -27,7 +27,7 @@ class Rows(Metric):
     def __init__(self, case: Case, fitted: Fitted, most: int, share: float):
         """`share`: of the remainder that counts as noise, too."""
         self.fit, self.model = fitted.rough, fitted.rough.model
-        self.drives = [self.model.drive(t) for t in case.tables]
+        self.drives = [self.model.excitation(t) for t in case.tables]
         self.problem = Problem(self.model, self.drives, case.noise)
         for d, values in zip(self.drives, self.fit.values, strict=True):
             self.model.prepare(d, values)

@@ -36,7 +36,7 @@ class Weighed:
 
     @property
     def score(self) -> float:
-        """log p(D | h) + log p(h)"""
+        """Log p(D | h) + log p(h)"""
         return self.fitted.log_evidence + self.log_odds
 
 
