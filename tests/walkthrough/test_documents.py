@@ -20,7 +20,7 @@ BIN = Path(sys.executable).parent
 def folder(tmp_path_factory):
     """config and examples of the clone; pages go on with what the pages before left."""
     place = tmp_path_factory.mktemp("reader")
-    for name in ("config", "examples"):
+    for name in ("config", "docs/examples"):
         shutil.copytree(ROOT / name, place / name)
     config = place / "config/simulated.yaml"
     config.write_text(patient(config.read_text()))
