@@ -70,7 +70,7 @@ class Text:
         ]
         paragraphs = re.split(r"\n\s*\n|\n(?=- )", "\n".join(prose))
         flat = (re.sub(r"\s+", " ", p).strip() for p in paragraphs)
-        return [s for p in flat for s in re.split(r"(?<=[.?!])\s+(?=[A-Z`\"'(])", p) if s]
+        return [s for p in flat for s in re.split(r"(?<=[.?!])\s+", p) if s]
 
     def faults(self) -> list[str]:
         """Return one line for each mechanical fault."""
@@ -116,6 +116,8 @@ def texts(path: Path) -> Iterator[Text]:
                 yield from comments()
             block.append(t)
         elif t.type == tokenize.STRING and last == tokenize.NEWLINE and tokens[i + 1].type in _AFTER:
+            if t.string.strip('"').startswith("/*"):
+                continue  # C for Cython
             yield from comments()
             text = t.string.strip("rRbBfF").strip("\"'").replace("\n" + " " * t.start[1], "\n")
             yield made(t.start[0], text, t.end[0])

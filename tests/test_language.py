@@ -6,15 +6,14 @@ from tests.language import ROOT, Text, counts, texts
 
 # From `python -m tests.language --count`. Lower a number when you mended some; a new package starts at 0.
 LIMITS = {
-    "hal": 161,
+    "hal": 160,
     "thermoctl": 27,
-    "thermoctl.control": 63,
-    "thermoctl.daemon": 157,
+    "thermoctl.control": 61,
+    "thermoctl.daemon": 155,
     "thermoctl.diagnose": 321,
     "thermoctl.evaluate": 107,
-    "thermoctl.identify": 61,
-    "thermoctl.plant": 26,
-    "thermoctl.recording": 18,
+    "thermoctl.identify": 60,
+    "thermoctl.plant": 2,
 }
 
 
