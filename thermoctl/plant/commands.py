@@ -81,9 +81,9 @@ def _all_uncertain(plant: Plant) -> Plant:
 def ahead(model: Model, excitation: Excitation, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`.
 
-    Each block starts from the states that the data before it tell (an extended Kalman filter that takes a
-    block at a time), so that a sample is predicted from data up to `horizon_s` older. The model must have
-    every state uncertain and no active parameter."""
+    An extended Kalman filter estimates the states at the start of each block from the data before it. So a
+    sample is predicted from data up to `horizon_s` older. The model must have every state uncertain and no
+    active parameter."""
     if not model.states:
         run = model.run(excitation)
         return run.x, run.y

@@ -3,10 +3,10 @@
     dx/dt = (flows in - flows out) / storage = f(t, x, u, p),    y = g(t, x, u, p)
     S = d x / d q,  dS/dt = f_x S + f_q,  S(0) = d initial / d q,  q = (active parameters, uncertain initial states)
 
-C was chosen by measurement (`make bench`): a plant is ready in some tenths of a second, where numba needs
-seconds. A jump (sign, step, a comparison) whose argument moves with the state or with time is smoothed,
-tanh(z / width), so that it has a slope: over 1e-5 of the range of its argument for a state, over half a
-sampling interval for time. Arguments that hold between samples (recorded inputs) keep their true jumps.
+C was chosen by measurement (`make bench`): a plant compiles in some tenths of a second, with numba in
+seconds. A jump (sign, step, a comparison) of a state or of time is smoothed to tanh(z / width), so that it
+has a slope. For a state the width is 1e-5 of the range of z, for time half a sampling interval. A jump of
+inputs that are held between samples is not smoothed.
 """
 
 from __future__ import annotations
@@ -409,8 +409,8 @@ def _library(key: str, source: str) -> ctypes.CDLL:
 
 def _build(work: Path, source: str) -> None:
     (work / "plant.c").write_text(source)
-    # -O1 translates a large file's straight-line code as well as -O3 in a fraction of the time. A small plant runs
-    # a tenth slower with -O1 and is ready in less than half of the time: a diagnosis compiles many.
+    # -O1 compiles a large file's straight-line code as well as -O3 in a fraction of the time. A small plant
+    # runs a tenth slower with -O1 and is ready in less than half of the time: a diagnosis compiles many.
     command = [("-O1" if a == "-O3" and not 10_000 < len(source) < 400_000 else a) for a in _compiler()[0]]
     done = subprocess.run(
         [*command, f"-I{_TEMPLATE.parent}", "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],

@@ -2,8 +2,8 @@
 
 Read without eval, differentiated exactly, evaluated with numpy or written as C.
 
-An expression is a graph of interned nodes (the same sub-expression is the same object), so that derivatives
-share their parts and the generated C computes each part once.
+An expression is a graph of interned nodes: equal sub-expressions are one object. So derivatives share their
+parts, and the generated C computes each part once.
 """
 
 from __future__ import annotations
@@ -48,18 +48,19 @@ _TOKEN = re.compile(
 
 
 class ExpressionError(ValueError):
-    """What is wrong with an expression, in words; the caller adds file and line."""
+    """An error in an expression, in words; the caller adds file and line."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Expr:
     """One node.
 
-    `op` is 'num' (value), 'name' (value), '+', '*', '/', '**', 'neg', a comparison, a function's name,
-    'table' (args: x, then the x points, then the y points; value = number of points), 'delay' (args:
-    expression, seconds), 'first' (value: name), or, in derivatives only, 'dpow' (a**(b-1), 0 where a <= 0),
-    'table_slope', 'bump' (slope of a smoothed step), 'side' (1 or -1) and 'le' (1 where a <= b, never
-    smoothed)."""
+    `op` is one of:
+    - 'num' and 'name', with `value`; '+', '*', '/', '**', 'neg'; a comparison; a function's name;
+    - 'table': args are x, the x points and the y points; value is the number of points;
+    - 'delay': args are an expression and seconds; 'first': value is a name;
+    - in derivatives only, 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope' and 'bump' (slope of a smoothed step);
+    - in derivatives only, 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed)."""
 
     op: str
     args: tuple[Expr, ...] = ()

@@ -1,10 +1,8 @@
-"""The plant file (format thermoctl-plant/1): what the simulation believes, read and checked.
+"""The content of a plant file (format thermoctl-plant/1, docs/reference/plant.md).
 
-    storage * d(node)/dt = sum(flows into) - sum(flows from)          outputs = what the sensors would read
+    storage * d(node)/dt = sum(flows into) - sum(flows from)          outputs = readings of perfect sensors
 
-`load` reads a file, `from_plain` the same from plain dicts (a plant that the diagnosis extended),
-`Plant.plain` gives the dicts back and `save` writes them. Every error is one line with file, line, the name
-at fault and what is allowed.
+`load` reads a file, `from_plain` plain dicts. `Plant.plain` returns the dicts and `save` writes them.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ ROLES = (
     "level",
     "time_of_day",
 )
-"""What a quantity may be, where its unit does not say."""
+"""Kinds of quantities, for where the unit does not determine the kind."""
 FLICKER_DECADES = 4  # 20 000 samples: from one over the recording's length to half the sampling rate
 
 
@@ -89,7 +87,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Node:
-    """A stored quantity; `initial_sigma` says how uncertain the start is (None: known)."""
+    """A stored quantity; `initial_sigma` is the standard deviation of its initial value (None: known)."""
 
     name: str
     storage: Expr
@@ -102,7 +100,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Flow:
-    """What leaves node `source` and arrives in node `target` (one of them may be None: the outside)."""
+    """A flow from node `source` to node `target`; None stands for the outside, for one of the two."""
 
     name: str
     rate: Expr
@@ -114,7 +112,7 @@ class Flow:
 
 @dataclass(frozen=True)
 class Output:
-    """What a sensor would read; `noise` is its random error (a number: white), `resolution` its step."""
+    """A sensor: `value` without error, `noise` its random error (a number: white), `resolution` its step."""
 
     name: str
     value: Expr

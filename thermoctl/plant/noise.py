@@ -1,14 +1,12 @@
-"""The noise of each sensor measured on a fit's residuals.
-
-a first-order coloured part beside the steps of the sensor.
+"""Estimate the noise of each sensor from a fit's residuals: a first-order part beside the sensor's steps.
 
     e_k = a_k + w_k,   a_k = phi a_(k-1) + n_k,   var w = r = resolution^2 / 12 (known)
     as ARMA(1,1):  e_k = phi e_(k-1) + i_k - theta i_(k-1),   theta = b - sqrt(b^2 - 1),
                    b = (s^2 (1 - phi^2) + r (1 + phi^2)) / (2 phi r),   s^2 = var a,   var i = phi r / theta
 
-phi is found channel by channel by restricted maximum likelihood (Patterson & Thompson 1971): the fitted
-parameters have taken a part of the slow noise with them, which the residuals' plain correlation would miss,
-and intervals would come out too narrow:
+phi is estimated channel by channel by restricted maximum likelihood (Patterson & Thompson 1971). The fit has
+absorbed a part of the slow noise; the plain correlation of the residuals would miss it and make intervals too
+narrow.
 
     minimise  n log v + RSS / v + log |M|,   M = sum over channels of J' V^-1 J,
               RSS after the parameters' answer -J M^-1 J' V^-1 e

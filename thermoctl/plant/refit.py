@@ -52,10 +52,11 @@ CORRELATED = 0.95
 class Fit:
     """The result of a refit.
 
-    `values` (recordings, parameters) in the model's order; `dx0` (recordings, uncertain states); `unknowns`:
-    (name, recording index or None); `z` their coordinates; `hessian` the Gauss-Newton matrix of the cost by
-    `z`, whose inverse is the covariance; `prior_hessian` the priors' share of it; `residuals`: (N, outputs)
-    by recording, NaN where missing."""
+    - `values` (recordings, parameters) in the model's order; `dx0` (recordings, uncertain states)
+    - `unknowns`: (name, recording index or None); `z`: their coordinates
+    - `hessian`: Gauss-Newton matrix of the cost by `z`; its inverse is the covariance
+    - `prior_hessian`: the priors' share of it
+    - `residuals`: (N, outputs) by recording, NaN where missing"""
 
     model: Model
     values: np.ndarray
@@ -367,7 +368,7 @@ def report(found: Fit, excitations: Sequence[Excitation] | None = None) -> list[
 
 
 def updated(plant: Plant, found: Fit, excitations: Sequence[Excitation]) -> Plant:
-    """Return the plant with the fitted values, per recording where the plant file says so."""
+    """Return the plant with the fitted values, by recording for parameters with `per_recording`."""
     parameters = dict(plant.parameters)
     for q in found.model.active:
         p = parameters[q]

@@ -4,7 +4,7 @@
               + w sum (z - z_plant)^2 + sum of priors
     e = y - yhat(p, x0 + dx0),   s^2 = sigma^2 (1 - phi^2)   for each channel
 
-phi is the correlation of a channel's noise over one median sampling interval (AR(1)); rho is Huber's
+phi is the correlation of a channel's noise over one median sampling interval (AR(1)). rho is Huber's
 function, quadratic up to a limit and linear beyond. z is a parameter's coordinate in its range, 0 to 1, on a
 log scale where the range spans a factor of three or more. The small weight w keeps a parameter that the data
 do not determine at the plant's value.

@@ -12,9 +12,10 @@ from thermoctl.plant.language import SensorNoise
 class SlowError:
     """The slow part of a sensor's error, one reading after the other.
 
-    It is a sum of first-order processes of stationary start: dx = -x / tau dt + sd sqrt(2 / tau) dW. A 1/f part
-    is one process per half decade of tau from `shortest` to `longest` seconds, of half the variance of a decade
-    each: the sum over log tau of 4 tau / (1 + (2 pi f tau)^2) is proportional to 1 / f."""
+    It is a sum of first-order processes of stationary start: dx = -x / tau dt + sd sqrt(2 / tau) dW. A 1/f
+    part is one process per half decade of tau from `shortest` to `longest` seconds. Each has half the
+    variance of a decade. Their spectrum is near 1 / f, since the integral of 4 tau / (1 + (2 pi f tau)^2)
+    over log tau is 1 / f."""
 
     def __init__(self, noise: SensorNoise, shortest: float, longest: float, rng: np.random.Generator) -> None:
         if noise.flicker is not None:

@@ -1,8 +1,8 @@
 """A plant as a picture (nodes, flows, outputs) and as a table.
 
 The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the distance in the graph, by
-majorisation (Gansner, Koren, North 2004). What enters from or leaves to the outside and what is read at a
-node are small satellites.
+majorisation (Gansner, Koren, North 2004). Flows to and from the outside and outputs are small satellites of
+their nodes.
 """
 
 from __future__ import annotations

@@ -30,11 +30,12 @@ class SimulationError(Exception):
 
 @dataclass
 class Excitation:
-    """What one recording gives to a plant.
+    """The inputs and measured outputs of one recording, in a plant's order.
 
-    `t` (N,) seconds from its first sample, `u` (N, inputs) with gaps filled (held, or on a straight line for
-    linear inputs), `y` (N, outputs) measured, NaN where missing, `first` the first recorded values, and the
-    scales that a simulation on it uses."""
+    - `t` (N,): seconds from the first sample
+    - `u` (N, inputs): gaps filled, held or linear as the input
+    - `y` (N, outputs): measured, NaN where missing
+    - `first`: first recorded value of each input and output"""
 
     name: str
     t: np.ndarray
@@ -281,11 +282,10 @@ class Model:
         rtol: float = RTOL,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> Simulation:
-        """Free run on a excitation.
+        """Simulate freely on an excitation. Raises SimulationError.
 
-        `buffers`: a dict that keeps the large arrays between runs (the next run with it changes the states'
-        slopes that the last one returned, and the outputs' of the last one on this excitation). Raises
-        SimulationError."""
+        `buffers` keeps the large arrays between runs. A later run with the same dict overwrites the
+        sensitivities that an earlier one returned."""
         if excitation.scale is None:
             self.prepare(excitation, parameters)
         return self._run(
@@ -305,7 +305,8 @@ class Model:
     def measure(self, table: Table, seed: int = 0) -> Table:
         """Return a simulated recording: the inputs of `table` and the readings of the sensors.
 
-        Noise, steps of resolution and uncertain initial values are drawn. Raises InputError, SimulationError."""
+        Draws noise and uncertain initial values, and rounds to the resolution. Raises InputError and
+        SimulationError."""
         rng, excitation = np.random.default_rng(seed), self.excitation(table)
         dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(
             size=len(self.uncertain)

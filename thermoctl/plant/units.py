@@ -1,10 +1,8 @@
-"""The unit check of a plant, by dimension.
+"""Check the units of a plant by dimension: m equals um, degC counts as K, % and 1 are dimensionless.
 
-m and um are alike, degC counts as K, % and 1 are dimensionless.
-
-A flow's unit must follow from its node (storage times node per second), an expression's from its names. Two
-things fit anywhere: a bare number, which takes whatever dimension its place asks for, and a name whose unit
-is not given; what is multiplied by them fits anywhere too. Exponents are pure numbers.
+A flow's unit must follow from its node (storage times node per second), an expression's from its names. A
+bare number and a name without a unit fit anywhere, and so does a product with one of them. Exponents are pure
+numbers.
 """
 
 from __future__ import annotations

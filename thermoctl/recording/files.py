@@ -1,7 +1,7 @@
-"""Reading and writing a `Table`, in the formats that people bring; the suffix of the file says which.
+"""Read and write a `Table`; the suffix of the file selects the format.
 
-A table has a time column `t` in seconds, strictly increasing, and any number of other columns; every cell is
-a number or missing (NaN). What is not that is refused with file and row, never repaired in silence.
+A table has a time column `t` in seconds, strictly increasing, and any number of other columns. Every cell is
+a number or missing (NaN). Any other file is refused with the row; nothing is repaired silently.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _COMMENT = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)
 
 @dataclass(frozen=True)
 class _Raw:
-    """What a reader gives: the columns by name (t among them) and how to name a data row (counted from 0)."""
+    """The result of a reader: columns by name, with t, and a function that names data row k (from 0)."""
 
     columns: dict[str, np.ndarray]
     meta: dict[str, str]
@@ -41,14 +41,13 @@ class _Raw:
 
 
 def read_table(path: str | Path, columns: Iterable[str] | None = None) -> Table:
-    """Read a recording; the suffix says the format (`FORMATS`).
+    """Read a recording; the suffix selects the format (`FORMATS`), `columns` the columns beside the time.
 
-    `columns` reads only those (beside the time).
-
-    The time column is `t`, in our own recordings `t_s`. Raises InputError with file and row (CSV: line) for a
-    text where a number belongs, an infinite value, a time that is missing, stands still or runs backwards, a
-    ragged row, a column named twice, no time column, no rows; and for a file that is too large, cut or not of
-    its format."""
+    The time column is `t`, in our own recordings `t_s`. Raises InputError with file and row (CSV: line) for:
+    - text in a number column, or an infinite value
+    - a time that is missing, equal to the one before, or earlier
+    - a ragged row, a repeated column, no time column, no rows
+    - a file that is too large, truncated, or not of its format"""
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
     if path.is_dir():

@@ -1,7 +1,7 @@
 """Recordings of other programs: MDF4 (asammdf) and TDMS (npTDMS) read, MDF4 and MCAP (mcap) written.
 
-The libraries are an extra, `pip install 'thermoctl[formats]'`. Channels of several rates are laid on the
-union of their times: a slow channel then has most of its cells empty, as in any recording.
+The libraries are an extra, `pip install 'thermoctl[formats]'`. Channels with different rates are merged by
+time, so most cells of a slow channel are empty.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """History for a plot: least, mean and largest value of a signal in each pixel's span.
 
-Only recordings of one rig are drawn, by the name in their metadata; those without a name belong to no rig. A reading that was
-stale or in error is no sample.
-Long spans come from the 10 Hz tier, short ones (FULL_SPAN_S and less) from the full rate. Files that are complete are
-reduced to one second once and kept in memory, so that a day is drawn again in milliseconds.
+Only recordings of one rig are drawn, by the name in their metadata; those without a name belong to no rig. A
+reading that was stale or in error is not a sample. Long spans come from the 10 Hz tier, short ones
+(FULL_SPAN_S and less) from the full rate. Files that are complete are reduced to one second once and kept in
+memory, so that a day is drawn again in milliseconds.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ Invalid = Callable[[np.ndarray, str], np.ndarray] | None
 
 
 def _samples(path: Path, signal: str, kind: str, step_s: float, invalid: Invalid) -> tuple[np.ndarray, ...]:
-    """(wall, low, mean, high) of one file, reduced to `step_s` (0: as recorded); a broken file gives nothing."""
+    """(wall, low, mean, high) of one file, reduced to `step_s` (0: as recorded); [] if broken."""
     try:
         size = path.stat().st_size
         return (

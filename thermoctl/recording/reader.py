@@ -1,4 +1,4 @@
-"""What our own recordings hold: rows for a replay, a summary, a mended copy, an export."""
+"""Read our own recordings: rows for a replay, a summary, a recovered copy, an export."""
 
 from __future__ import annotations
 

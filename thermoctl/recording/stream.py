@@ -1,10 +1,10 @@
 """Reading an Arrow IPC stream that may end anywhere.
 
 A stream is a schema message, one message a batch, and an end mark (ff ff ff ff 00 00 00 00). A recorder that
-is killed leaves no end mark and perhaps half a message: everything before it is whole, because each message
-carries its length. After a power cut a file system may also give back a message whose end is zeros, which
-Arrow reads as numbers: our batches carry a CRC-32 of every column (`crc32`, in the schema's order), and a
-batch that does not agree with it is not there.
+is killed leaves no end mark and perhaps half a message. Everything before is complete, because each message
+carries its length. After a power cut the end of a message may be zeros, which Arrow reads as numbers. So our
+batches carry a CRC-32 of every column (`crc32`, in the schema's order), and a batch that disagrees is
+dropped.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def checksums(batch: pa.RecordBatch) -> bytes:
 class Stream:
     """An open stream: iterate for its batches.
 
-    After that `good_bytes` is where the last whole message ends and `whole` says whether the end mark was
-    there (else the writer was killed, or is still writing)."""
+    Afterwards `good_bytes` is the end of the last complete message. `whole` is true if the end mark was read;
+    without it the writer was killed or is still writing."""
 
     path: Path
     schema: pa.Schema

@@ -1,12 +1,12 @@
 """Write a recording: every tick, and a 10 Hz tier of min, mean and max that is kept longer.
 
-Each is an Arrow IPC stream with zstd. A batch goes to the disk, synced, every half second: a power cut loses
-what came after the last one, and what stands before opens (stream.py). Files are named after the rig and the
-moment they begin, `rig-20261121T043000.123Z.arrows` and `.10hz.arrows`; the oldest ones go when the disk
-budget is used up.
+Each is an Arrow IPC stream with zstd. Every half second a batch is written and synced. A power cut loses the
+ticks after the last batch; the file before it can be read (stream.py). Files are named after the rig and
+their start, `rig-20261121T043000.123Z.arrows` and `.10hz.arrows`. The oldest are deleted when the disk budget
+is full.
 
-Nothing here raises because of a disk: what could not be written is counted as lost and said once, and the
-next file is tried some seconds later. The daemon goes on.
+A failing disk raises nothing here. Lost rows are counted and logged once, and the next file is tried some
+seconds later. The daemon continues.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import pyarrow as pa
 from thermoctl.recording.stream import CRC, END, checksums
 from thermoctl.signals import SIGNALS, Signal
 
-BATCH_S = 0.5  # of ticks in one batch of the full rate: what a power cut may cost
+BATCH_S = 0.5  # of ticks in one batch of the full rate, the most that a power cut loses
 BATCH_ROWS = 4096  # ... and no more than this where time runs faster
 TIER_HZ = 10.0
 TIER_BATCH_ROWS = 100  # 10 s: the full rate holds what a cut costs the tier
@@ -183,9 +183,10 @@ class RecordingWriter:
 
     When it is `full`, close it and open the next.
 
-    settings: folder, sizes and budgets; metadata: what the files say about themselves (configuration, model,
-    law); log(text): told when the disk refuses, once, and when it is well again. `error` is what it refused
-    last, '' when all is well."""
+    - settings: folder, sizes and budgets
+    - metadata: configuration, model and law, written into the files
+    - log(text): called once when the disk fails, and when it works again
+    - `error`: the last message of the disk, '' when it works"""
 
     def __init__(
         self,
@@ -306,7 +307,7 @@ class RecordingWriter:
 
     def _prune(self) -> None:
         self._pruned_at = self._full_file.bytes if self._full_file else 0
-        slack = 1 - 1 / 32  # what may come until the next look
+        slack = 1 - 1 / 32  # margin for the rows until the next check
         prune(self.directory, FULL, self.budget * slack, self.path)
         prune(
             self.directory, TIER, self.tier_budget * slack, self._tier_file.path if self._tier_file else None
