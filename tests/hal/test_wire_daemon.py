@@ -171,7 +171,7 @@ def test_a_stop_input_ends_driving_until_a_person_arms(chain, stop_ms):
     """The drive's quick stop, pulsed while the stage is held off its rest, with the shipped amplifier_s of 1 s."""
     chain.arm()
     assert chain.ask("setpoint", 15.0)["ok"]
-    chain.until(lambda s: abs(s["position_um"] - 15) < 1, 30)
+    chain.until(lambda s: s["position_um"] is not None and abs(s["position_um"] - 15) < 1, 30)
     pulsed = time.monotonic()
     chain.tell(f"drive stop {stop_ms}")
     s = chain.until(lambda s: s["state"] == "FAULT", 5)
@@ -182,6 +182,7 @@ def test_a_stop_input_ends_driving_until_a_person_arms(chain, stop_ms):
     again = time.monotonic()
     armed = chain.arm()
     assert abs(armed["setpoint_um"] - armed["position_um"]) < 0.5
+    chain.until(lambda s: s["ticks"] > armed["ticks"] + 500, 20)  # the drive takes its time to enable
     chain.stop()
     r = chain.reference()
     on, at = r.columns["enabled"] > 0, r.t
