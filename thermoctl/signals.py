@@ -106,7 +106,8 @@ SIGNALS: tuple[Signal, ...] = (
 NAMES = tuple(s.name for s in SIGNALS)
 INDEX = {name: i for i, name in enumerate(NAMES)}
 OUTPUTS = NAMES[INDEX["state"] :]
-"""What the law gives in a tick."""
+"""What the law gives in a tick, in the order of its array."""
+OUTPUT = {name: i for i, name in enumerate(OUTPUTS)}
 BIT_WORDS = frozenset(s.name for s in SIGNALS if s.bits)
 
 

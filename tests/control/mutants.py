@@ -55,10 +55,10 @@ _FLAG = "a flag: only ever looked at as zero or not"
 _NO_DRIVE = "v is 0 wherever enable is 0: control() and _arm() empty it; a second lock on the same door"
 WHY: dict[str, str] = {
     "law.py:_agree: `if self.fresh[_COIL]: self._compare_order()` condition True in `if self.fresh[_COIL]:`": "means and estimates move over seconds: looked at in every tick the same is found, up to 0.1 s earlier, at a cost",
-    "law.py:protect: `clip(self.v, -self.output_limit, self.output_limit) if self.` condition True in "
-    "`self.drive = clip(self.v, -self.output_limit, self.output_limit) if self.enable > 0.0 else`": _NO_DRIVE,
+    "law.py:protect: `clip(self.v, -self.p.output_limit, self.p.output_limit) if s` condition True in "
+    "`self.drive = clip(self.v, -self.p.output_limit, self.p.output_limit) if self.enable > 0.0 `": _NO_DRIVE,
     "law.py:protect: `self.enable > 0.0` Gt -> GtE in "
-    "`self.drive = clip(self.v, -self.output_limit, self.output_limit) if self.enable > 0.0 else`": _NO_DRIVE,
+    "`self.drive = clip(self.v, -self.p.output_limit, self.p.output_limit) if self.enable > 0.0 `": _NO_DRIVE,
     "law.py:_agree: `self.last[_CURRENT] if current else 0.0` condition True in "
     "`amperes = self.last[_CURRENT] if current else 0.0`": "amperes is looked at only where `current` holds",
     "law.py:_judge_readings: `1.0 + _K_ERROR` Add -> Sub in `self.verdict[c] = 1.0 + _K_ERROR`": "_K_ERROR is 0",

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from tests.limits import OFF
-from thermoctl.channels import CHANNELS, INDEX, TABLE, TEMPERATURES
+from thermoctl.channels import CHANNELS, GROUPS, INDEX, TABLE, TEMPERATURES
 from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel, Parameters
+from thermoctl.signals import OUTPUT
 
 P = 2.0**-10  # period, s
 AIR = 22.0
@@ -471,33 +472,35 @@ def power_without_a_voltage_meter(module):
         return b.say(3, "voltage_v")
 
     b = bench(replace(model(), C=np.zeros((12, 2)))).set(coil_c=120.0).armed().set(current_a=1.5).tick()
-    assert b.law.outputs[11] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5  # by the coil's reading
+    assert (
+        b.law.outputs[OUTPUT["power_w"]] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5
+    )  # by the coil's reading
     b.set(current_a=-1.5).tick()
-    assert b.law.outputs[11] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5
+    assert b.law.outputs[OUTPUT["power_w"]] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5
     b.say(2, "current_a").tick()
-    assert b.law.outputs[11] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5  # the last good one
+    assert b.law.outputs[OUTPUT["power_w"]] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5  # the last good one
     b.say(2, "coil_c").set(current_a=1.5).tick()
-    assert b.law.outputs[11] == 9.0  # at 20 degC
+    assert b.law.outputs[OUTPUT["power_w"]] == 9.0  # at 20 degC
     b = bench().set(air_c=20.0, coil_c=20.0).armed()
     b.law.x[0] = 100.0
     b.set(current_a=1.5).tick(2)
-    assert b.law.outputs[11] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5  # by the estimate
+    assert b.law.outputs[OUTPUT["power_w"]] == 4.0 * (1.0 + 0.00393 * 100.0) * 1.5 * 1.5  # by the estimate
     b = bench().say(2, "air_c", "coil_c").tick()
     b.law.T[0] = 50.0
     b.set(current_a=1.5).tick()
-    assert b.law.outputs[11] == 9.0  # an estimate above no air says nothing
+    assert b.law.outputs[OUTPUT["power_w"]] == 9.0  # an estimate above no air says nothing
     b = bench(power_limit_w=8.0, power_time_s=P).set(air_c=20.0, coil_c=20.0).armed().set(current_a=1.5)
     b.tick(2).safe("power_limit")
     b = bench(resistance_ohm=0.0).armed().set(current_a=1.5).tick(2).well()
-    assert math.isnan(b.law.outputs[11]) and b.law.power_w == 0.0
+    assert math.isnan(b.law.outputs[OUTPUT["power_w"]]) and b.law.power_w == 0.0
     b = bench().say(3, "current_a").armed().tick(2).well()
-    assert math.isnan(b.law.outputs[11])
+    assert math.isnan(b.law.outputs[OUTPUT["power_w"]])
     b = Bench(module, required=channels(0), resistance_ohm=4.0).set(voltage_v=2.0, current_a=1.0).armed()
-    assert b.law.outputs[11] == 2.0  # with a meter: its own
+    assert b.law.outputs[OUTPUT["power_w"]] == 2.0  # with a meter: its own
     b.say(2, "voltage_v").set(current_a=3.0).tick()
-    assert b.law.outputs[11] == 2.0  # at fault: the last good one
+    assert b.law.outputs[OUTPUT["power_w"]] == 2.0  # at fault: the last good one
     b = Bench(module, required=channels(0)).set(voltage_v=2.0, current_a=1.0).armed()
-    assert b.law.outputs[11] == 2.0
+    assert b.law.outputs[OUTPUT["power_w"]] == 2.0
 
 
 @scenario
@@ -716,7 +719,7 @@ def power_limit(module):
         .tick(2)
         .well()
     )
-    assert bench.law.outputs[11] == 16.0
+    assert bench.law.outputs[OUTPUT["power_w"]] == 16.0
     bench.tick().safe("power_limit")  # 4, 7, 9.25 W in the mean
 
 
@@ -1297,7 +1300,7 @@ def the_state_machine(module):
 @scenario
 def the_fault_table(module):
     table = module.faults
-    assert [f.bit for f in table.FAULTS] == list(range(len(table.FAULTS))) and len(table.FAULTS) <= 53
+    assert [f.bit for f in table.FAULTS] == list(range(53))
     assert table.FAULTS[0].name == "position_error" and len({f.name for f in table.FAULTS}) == len(
         table.FAULTS
     )
@@ -1305,7 +1308,7 @@ def the_fault_table(module):
         f.meaning and f.remedy and f.severity in ("warning", "fault", "critical") for f in table.FAULTS
     )
     assert [table.FAULTS[5 * g + k].name for g in range(7) for k in range(5)] == [
-        f"{g}_{k}" for g in table.GROUPS for k in table.KINDS
+        f"{g}_{k}" for g in GROUPS for k in table.KINDS
     ][:-1] + ["amplifier_stopped"]
     severity = {f.name: f.severity for f in table.FAULTS}
     assert {n for n, s in severity.items() if s == "critical"} == {
@@ -1333,7 +1336,10 @@ def the_fault_table(module):
     assert (
         table.decode(float(2**52))[0].bit == 52 and table.BY_NAME["not_finite"].bit == table.BIT["not_finite"]
     )
-    assert (
-        list(table.GROUP_OF_CHANNEL) == [0, 1, 2, 3, 4, 5, *[1] * 11, 6, 6, 6] and len(table.CHANNELS) == 20
-    )
-    assert table.CHANNELS[5:17] == table.TEMPERATURES and table.TEMPERATURES[0] == "coil_c"
+    groups = [0, 1, 2, 3, 4, 5, *[1] * 11, 6, 6, 6]
+    same = [*(5 * g + k for g in groups for k in range(5))]
+    assert [31 if bit == 34 else bit for bit in same] == list(
+        table.READING_BIT
+    )  # a frozen amplifier is stale
+    assert table.mask("fault", "critical", readings=False) == (table.mask("fault", "critical") >> 34 << 34)
+    assert (CHANNELS[5:17], TEMPERATURES[0], len(CHANNELS)) == (TEMPERATURES, "coil_c", 20)

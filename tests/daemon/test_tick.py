@@ -9,6 +9,7 @@ import pytest
 import thermoctl
 from hal.backend import ERROR, OK, ROLE, ROLES, STALE
 from tests.daemon.conftest import make_model
+from thermoctl.channels import SIGNAL
 from thermoctl.control import arming, faults
 from thermoctl.control.law import OUTPUTS
 from thermoctl.daemon.assemble import law_parameters
@@ -27,8 +28,8 @@ def column(rows, name):
 def test_one_list_of_names():
     """Signals, law, back ends and settings name the same things in the same order."""
     first, state = INDEX["position_raw_um"], INDEX["state"]
-    assert CHANNELS == ROLES == CHANNELS
-    assert NAMES[first + 1 : first + len(ROLES)] == ROLES[1:]
+    assert CHANNELS == ROLES
+    assert NAMES[first : first + len(ROLES)] == tuple(SIGNAL.values())
     assert NAMES[state:] == OUTPUTS
 
 

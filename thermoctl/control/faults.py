@@ -134,7 +134,8 @@ _OTHERS = (
         46,
         "amplifier_not_following",
         "fault",
-        "the amplifier does not do what it is told: it was not enabled in time after arming, drives while disabled, or the coil's current is not the one asked for",
+        "the amplifier does not do what it is told: it was not enabled in time after arming, drives "
+        "while disabled, or the coil's current is not the one asked for",
     ),
     Fault(
         47,
@@ -176,6 +177,9 @@ BIT = {f.name: f.bit for f in FAULTS}
 BY_NAME = {f.name: f for f in FAULTS}
 NAMES = {f.bit: f.name for f in FAULTS}
 """Bit -> name, as a recording stores it."""
+
+READING_BIT = bytes(bit for c in TABLE for bit in READING_BITS[c.group])
+"""Bits of the readings' faults, channel by channel in the order of KINDS: how the compiled tick asks."""
 
 NAMES_2 = (
     "position_error",
@@ -235,11 +239,6 @@ NAMES_2 = (
 """The names by bit in recordings of law version 2, which store no table. Data: never changed."""
 NAMES_1 = tuple("amplifier_frozen" if name == "amplifier_stopped" else name for name in NAMES_2)
 """The same of law version 1."""
-
-
-def reading_bit(channel: int, kind: int) -> int:
-    """Return the fault bit of a channel (its place in TABLE) for a kind (its place in KINDS)."""
-    return READING_BITS[TABLE[channel].group][kind]
 
 
 def mask(*severities: str, readings: bool = True) -> int:

@@ -70,7 +70,7 @@ from thermoctl.channels import (
 )
 from thermoctl.control import arming, faults
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters
-from thermoctl.signals import FAULT_WORD_BITS, OUTPUTS
+from thermoctl.signals import FAULT_WORD_BITS, OUTPUT, OUTPUTS
 
 MAX_AVERAGE = 64
 WARM_UP_TICKS = 100
@@ -91,23 +91,13 @@ _OK, _STALE, _ERROR, _ABSENT = OK, STALE, ERROR, ABSENT
 _NONE, _SETPOINT, _OFF, _ARMED, _FAULT = arming.NONE, arming.SETPOINT, arming.OFF, arming.ARMED, arming.FAULT
 _NEXT, _COMMANDS = arming.TABLE, len(arming.COMMANDS)
 _N, _M = len(CHANNELS), len(TEMPERATURES)
-_POSITION, _REFERENCE, _VOLTAGE, _CURRENT, _AIR, _COIL, _AMPLIFIER_STATE = (
-    INDEX[role]
-    for role in (
-        "position_um",
-        "output_reference_um",
-        "voltage_v",
-        "current_a",
-        "air_c",
-        "coil_c",
-        "amplifier_state",
-    )
-)
-_THERMAL, _THERMAL_END = INDEX[THERMAL[0]], INDEX[THERMAL[-1]] + 1
+_POSITION, _REFERENCE = INDEX["position_um"], INDEX["output_reference_um"]
+_VOLTAGE, _CURRENT = INDEX["voltage_v"], INDEX["current_a"]
+_AIR, _COIL, _AMPLIFIER_STATE = INDEX["air_c"], INDEX["coil_c"], INDEX["amplifier_state"]
+_THERMAL, _THERMAL_END = INDEX[THERMAL[0]], INDEX[THERMAL[0]] + len(THERMAL)
 _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT = int(AMP_ENABLED), int(AMP_FAULT)
 _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN = range(len(faults.KINDS))
-_KINDS = len(faults.KINDS)
-_READING_BIT = bytes(faults.reading_bit(c, kind) for c in range(_N) for kind in range(_KINDS))
+_KINDS, _READING_BIT = len(faults.KINDS), faults.READING_BIT
 _B_FOLLOWING = faults.BIT["following_error"]
 _B_HOT, _B_HOT_MODEL = faults.BIT["coil_overtemperature"], faults.BIT["coil_overtemperature_model"]
 _B_HEATING, _B_DISAGREES = faults.BIT["coil_heating_rate"], faults.BIT["coil_disagrees"]
@@ -124,15 +114,14 @@ _TRIP_OTHERS = faults.mask(
 )  # a reading's fault trips where it is required
 _CRITICAL = faults.mask("critical")
 _WORD_BITS, _WORD = FAULT_WORD_BITS, (1 << FAULT_WORD_BITS) - 1
-_O = {name: i for i, name in enumerate(OUTPUTS)}
-_O_STATE, _O_FAULTS, _O_FAULTS_2 = _O["state"], _O["fault_bits"], _O["fault_bits_2"]
-_O_SETPOINT, _O_REFERENCE, _O_POSITION = _O["setpoint_um"], _O["reference_um"], _O["position_um"]
-_O_COMPENSATED, _O_COMPENSATION = _O["compensated_um"], _O["compensation_um"]
-_O_EXPANSION, _O_CONTROL, _O_DRIVE = _O["expansion_um"], _O["control_v"], _O["drive"]
-_O_ENABLE, _O_POWER, _O_AIR_RATE = _O["enable"], _O["power_w"], _O["air_rate_k_s"]
-_O_ESTIMATES = _O[f"{POINTS[0]}_est_c"]
-_O_INNOVATION, _O_GAIN = _O["innovation_c"], _O["kalman_gain"]
-_O_POSITION_AGE, _O_COIL_AGE = _O["position_age_s"], _O["coil_age_s"]
+_O_STATE, _O_FAULTS, _O_FAULTS_2 = OUTPUT["state"], OUTPUT["fault_bits"], OUTPUT["fault_bits_2"]
+_O_SETPOINT, _O_REFERENCE, _O_POSITION = OUTPUT["setpoint_um"], OUTPUT["reference_um"], OUTPUT["position_um"]
+_O_COMPENSATED, _O_COMPENSATION = OUTPUT["compensated_um"], OUTPUT["compensation_um"]
+_O_EXPANSION, _O_CONTROL, _O_DRIVE = OUTPUT["expansion_um"], OUTPUT["control_v"], OUTPUT["drive"]
+_O_ENABLE, _O_POWER, _O_AIR_RATE = OUTPUT["enable"], OUTPUT["power_w"], OUTPUT["air_rate_k_s"]
+_O_ESTIMATES = OUTPUT[f"{POINTS[0]}_est_c"]
+_O_INNOVATION, _O_GAIN = OUTPUT["innovation_c"], OUTPUT["kalman_gain"]
+_O_POSITION_AGE, _O_COIL_AGE = OUTPUT["position_age_s"], OUTPUT["coil_age_s"]
 
 _SCALARS = (
     "state",

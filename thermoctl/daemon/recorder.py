@@ -73,6 +73,8 @@ def read_law_metadata(text: str) -> dict[str, Any]:
     if found["version"] != LAW_VERSION:
         raise ValueError(f"law version {found['version']}, this program has version {LAW_VERSION}")
     m = found["model"]
+    if unknown := set(m) - {*PLAIN, *ARRAYS}:
+        raise ValueError(f"the model has {', '.join(sorted(unknown))}, which this program does not know")
     values: dict[str, Any] = {name: m[name] for name in PLAIN if name in m} | {"sensors": tuple(m["sensors"])}
     values |= {name: decode(m[name]["values"]).reshape(m[name]["shape"]) for name in ARRAYS if name in m}
     model = CompensatorModel(**values)

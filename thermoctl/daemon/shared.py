@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl.channels import CHANNELS
+from thermoctl.control import faults
 from thermoctl.control.model import NAMES
 from thermoctl.daemon.ring import Box, Histogram, Mailbox, Remarks, Ring
 from thermoctl.signals import SIGNALS
@@ -65,7 +66,7 @@ START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED, RUN_
 estimates of an earlier run; RUN_S is when this run began, seconds since 1970."""
 BEATS = 8
 """From here on in `counters`: each helper process counts its rounds, so that one that hangs is seen."""
-_LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES]).encode())
+_LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES, faults.NAMES]).encode())
 
 
 class Shared:

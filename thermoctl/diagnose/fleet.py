@@ -29,6 +29,7 @@ from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import NAME, TIER
+from thermoctl.signals import join_fault_words
 from thermoctl.yamlfile import InputError, suggest
 
 DRIFT_SIGMA, DRIFT_SHARE, FIT_LIMIT = 4.0, 0.05, 3.0
@@ -128,7 +129,11 @@ def _health(table: Table, path: str, rig: str) -> Summary:
     missing = np.full(len(table), np.nan)
     wall, state = column("wall_s", missing), column("state", missing)
     armed = state == ARMED
-    bits = int(np.bitwise_or.reduce(np.nan_to_num(column("fault_bits", missing)).astype(np.int64)))
+    words = join_fault_words(column("fault_bits", missing), column("fault_bits_2", missing))
+    try:
+        names = faults.names(int(np.bitwise_or.reduce(words)), faults.recorded_names(table.meta))
+    except (ValueError, KeyError, TypeError) as e:
+        raise InputError(f"{path}: the names of its faults cannot be read: {e}") from None
     error = (column("output_reference_um", missing) - column("reference_um", missing))[armed]
     slips = column("slips", missing)
     return Summary(
@@ -137,7 +142,7 @@ def _health(table: Table, path: str, rig: str) -> Summary:
         float(wall[0]) if math.isfinite(wall[0]) else float(table.t[0]),
         float(table.t[-1] - table.t[0]) / 3600.0,
         float(armed.mean()) if np.isfinite(state).any() else math.nan,
-        tuple(f.name for f in faults.decode(bits)),
+        names,
         float(slips[-1] - slips[0]),
         _mean(column("innovation_c", missing)),
         math.sqrt(_mean(error**2)),
@@ -240,8 +245,9 @@ def _judge(name: str, group: list[Summary]) -> Rig:
             for p, d in drifts.items()
             if d.drifts
         ]
-        trips = [f for f in newest.faults if faults.BY_NAME[f].severity != "warning"]
-        advice += [f"fault {f}: {faults.BY_NAME[f].remedy}" for f in trips]
+        known = [faults.BY_NAME[f] for f in newest.faults if f in faults.BY_NAME]
+        advice += [f"fault {f.name}: {f.remedy}" for f in known if f.severity != "warning"]
+        advice += [f"fault {f}: of another version" for f in newest.faults if f not in faults.BY_NAME]
     return Rig(name, tuple(group), drifts, tuple(advice))
 
 

@@ -5,7 +5,7 @@
 
 enum { OK, STALE, ERROR, ABSENT };
 enum { POSITION = 0, REFERENCE = 1, VOLTAGE = 2, CURRENT = 3, AIR = 4, COIL = 5, AMPLIFIER_STATE = 18 };
-enum { K_ERROR, K_STALE, K_RANGE, K_RATE, K_FROZEN, KINDS };
+enum { K_ERROR, K_STALE, K_RANGE, K_RATE, K_FROZEN };
 enum { B_FOLLOWING = 35, B_HOT, B_HOT_MODEL, B_HEATING, B_DISAGREES, B_POWER, B_STUCK, B_BOUND, B_SLEWING, B_SATURATED,
        B_AMPLIFIER, B_NOT_FOLLOWING, B_LATE, B_WRITE, B_NOT_FINITE, B_ELECTRICAL, B_DISPLACED,
        B_MONITORED };
@@ -32,7 +32,7 @@ int law_load(law_t *l, const char *path) {
     memset(l, 0, sizeof *l);
     l->n = (int)*p++, l->sensors_used = (int)*p++, l->mkf = (int)*p++;
     for (int k = 0; k < l->sensors_used; k++) l->sensors[k] = (int)*p++;
-    for (int c = 0; c < N; c++) l->group[c] = (int)*p++;
+    for (int c = 0; c < N * KINDS; c++) l->reading_bit[c] = (int)*p++;
     for (int m = 0; m < M; m++) l->predicts[m] = *p++ > 0.0;
     l->expands = *p++ > 0.0;
     p = take(p, l->A, l->n * l->n), p = take(p, l->B, l->n * 2), p = take(p, l->C, M * l->n);
@@ -93,7 +93,7 @@ static void judge_readings(law_t *l, double dt) {
         }
         if (l->verdict[c] > 0.0) {
             int kind = (int)l->verdict[c] - 1;
-            uint64_t bit = BIT(l->group[c] * KINDS + kind);
+            uint64_t bit = BIT(l->reading_bit[c * KINDS + kind]);
             l->faults |= bit;
             if (l->required[c] > 0.0) {
                 l->trips |= bit;
@@ -392,11 +392,12 @@ static void protect(law_t *l, int command, uint64_t external) {
     l->enable = l->state == ARMED && finite_(l->v) ? 1.0 : 0.0;
     l->drive = l->enable > 0.0 ? clip(l->v, -l->output_limit, l->output_limit) : 0.0;
     double *o = l->out;
-    o[0] = l->state, o[1] = l->faults | l->latched, o[2] = l->setpoint_um, o[3] = l->reference_um, o[4] = l->position_um;
-    o[5] = l->compensated_um, o[6] = l->compensation_um, o[7] = l->expansion_um, o[8] = l->control_v, o[9] = l->drive;
-    o[10] = l->enable, o[11] = l->power_w, o[12] = l->air_rate_k_s;
-    for (int m = 0; m < M; m++) o[13 + m] = l->T[m] + l->air_c;
-    o[25] = l->innovation_c, o[26] = l->kalman_gain, o[27] = l->age[POSITION], o[28] = l->age[COIL];
+    uint64_t bits = l->faults | l->latched;
+    o[0] = l->state, o[1] = bits & (BIT(53) - 1), o[2] = bits >> 53, o[3] = l->setpoint_um, o[4] = l->reference_um;
+    o[5] = l->position_um, o[6] = l->compensated_um, o[7] = l->compensation_um, o[8] = l->expansion_um;
+    o[9] = l->control_v, o[10] = l->drive, o[11] = l->enable, o[12] = l->power_w, o[13] = l->air_rate_k_s;
+    for (int m = 0; m < M; m++) o[14 + m] = l->T[m] + l->air_c;
+    o[26] = l->innovation_c, o[27] = l->kalman_gain, o[28] = l->age[POSITION], o[29] = l->age[COIL];
 }
 
 void law_step(law_t *l, double dt, int command, double command_value, uint64_t external) {

@@ -4,11 +4,11 @@
 #define LAW_H
 #include <stdint.h>
 
-enum { N = 20, M = 12, ORDER = 24, AVERAGE = 64, OUTPUTS = 29 };
+enum { N = 20, M = 12, ORDER = 24, AVERAGE = 64, KINDS = 5, OUTPUTS = 30 };
 
 typedef struct {
     /* model */
-    int n, sensors_used, mkf, expands, sensors[M], predicts[M], group[N];
+    int n, sensors_used, mkf, expands, sensors[M], predicts[M], reading_bit[N * KINDS];
     double A[ORDER * ORDER], B[ORDER * 2], C[M * ORDER], K[ORDER * M], b1[M], b2[M];
     double b_air, f1, offset_um, expansion_period_s, R_w, R_v, air_filter_s, model_period_s, period_s, a1a1, first_gain, correction_step_s;
     /* parameters */

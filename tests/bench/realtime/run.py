@@ -361,8 +361,7 @@ def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
     from thermoctl.control import faults
     from thermoctl.control.law import MAX_AVERAGE
 
-    readings = 5 * len(faults.GROUPS)  # their bits trip by channel, not by severity
-    trip_others = faults.mask("fault", "critical") >> readings << readings
+    trip_others = faults.mask("fault", "critical", readings=False)
     first = model.A_minus_I[0].copy()
     first[0] += 1.0
     along = float(model.C[0] @ model.gain[:, 0])
@@ -372,7 +371,7 @@ def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
         len(model.sensors),
         model.kind == "mkf",
         model.sensors,
-        faults.GROUP_OF_CHANNEL,
+        list(faults.READING_BIT),
         model.C.any(axis=1),
         model.b1.any() or model.b2.any() or model.b_air != 0.0,
         model.A_minus_I,

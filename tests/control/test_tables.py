@@ -1,0 +1,240 @@
+"""One table each of channels, limits and faults: a row that is added reaches everything that derives from it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import thermoctl
+from thermoctl.channels import CHANNELS, GROUPS, POINTS, TABLE, THERMAL
+from thermoctl.control import faults, typed
+from thermoctl.control.model import CompensatorModel, zero_model
+from thermoctl.control.remedies import REMEDIES
+from thermoctl.daemon.keep import _fingerprint
+from thermoctl.signals import INDEX, NAMES, fault_word, fault_words
+
+PRODUCT = Path(thermoctl.__file__).parent
+
+
+def run_with(changes: dict[str, tuple[str, str]], script: str) -> dict[str, object]:
+    """Run a script in which modules have a changed source: {module: (text, its replacement)}; return its JSON.
+
+    The law runs interpreted, because a compiled one would still be of the table that it was built from.
+    """
+    head = f"""
+import importlib.util, json, sys
+CHANGES = {changes!r}
+class Changed:
+    def find_spec(self, name, path=None, target=None):
+        if name not in CHANGES and name != "thermoctl.control.law":
+            return None
+        file = {str(PRODUCT.parent)!r} + "/" + name.replace(".", "/") + ".py"
+        return importlib.util.spec_from_file_location(name, file, loader=Loader(name, file))
+class Loader(importlib.machinery.SourceFileLoader):
+    def get_code(self, name):
+        text = open(self.path).read()
+        old, new = CHANGES.get(name, ("", ""))
+        assert old in text, (name, old)
+        return compile(text.replace(old, new, 1) if old else text, self.path, "exec")
+sys.meta_path.insert(0, Changed())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", head + script], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    answer: dict[str, object] = json.loads(done.stdout)
+    return answer
+
+
+def test_tables_are_consistent():
+    """Recorded words hold every channel and fault exactly."""
+    assert len(set(CHANNELS)) == len(CHANNELS) <= 26
+    thermal = [c.thermal for c in TABLE]
+    first = thermal.index(True)
+    assert thermal[first : first + len(THERMAL)] == [True] * len(THERMAL) and len(THERMAL) <= 13
+    assert tuple(c.point for c in TABLE[first + 1 : first + 1 + len(POINTS)]) == POINTS
+    assert len(set(faults.BIT.values())) == len(faults.FAULTS) == len(faults.BIT)
+    assert set(faults.BIT.values()) <= set(range(64))
+    assert set(faults.READING_BITS) == set(GROUPS) == {c.group for c in TABLE}
+    assert set(REMEDIES) == set(faults.BIT)
+    assert faults.BIT["amplifier_write"] < 53, "external_bits is one float64"
+
+
+def test_the_faults_of_old_recordings_keep_their_bits():
+    """No bit that a recording of version 2 holds has got another meaning."""
+    assert {bit: faults.NAMES[bit] for bit in range(53)} == dict(enumerate(faults.NAMES_2))
+
+
+def test_types_of_the_law_are_up_to_date(capsys):
+    """`python -m thermoctl.control.typed --check`: law.pxd agrees with law.py and Parameters."""
+    assert typed.main(["--check"]) == 0, capsys.readouterr().out
+
+
+def test_a_channel_is_added_in_one_row():
+    """A new channel reaches the back ends, settings, parameters, record, law, status and its faults."""
+    end = '    Channel("amplifier_fault", "1", "amplifier", "the amplifier\'s own error code; 0 none", 0.0, code=True),\n'
+    row = '    Channel("humidity", "1", "monitored", "humidity of the chamber", 0.0, 1.0),\n'
+    found = run_with(
+        {"thermoctl.channels": (end, end + row)},
+        """
+import numpy as np
+from hal.backend import ROLES, Sample
+from thermoctl import settings, signals, reference
+from thermoctl.control import causes, faults, law, model
+from thermoctl.daemon import readings
+from thermoctl.control.model import Parameters, zero_model
+p = Parameters(0.0, 1.0, 0.0, 1.0)
+p.high[-1], p.required[-1] = 0.9, 1.0
+tick = law.Law(zero_model(), p, 0.001)
+value, status = np.zeros(len(ROLES)), np.zeros(len(ROLES), np.uint8)
+value[-1] = 0.95
+tick.bind(value, np.ones(len(ROLES), np.uint8), status)
+tick.step(0.001)
+print(json.dumps({
+    "role": ROLES[-1], "sample": len(Sample().value), "settings": settings.CHANNELS[-1],
+    "limit": "high[humidity]" in model.NAMES, "signal": "humidity" in signals.NAMES,
+    "page": "humidity of the chamber" in reference.signals(), "status": readings.SIGNAL["humidity"],
+    "cause": "humidity" in causes.channels_of("monitored_range"), "trips": tick.trips == 1 << faults.BIT["monitored_range"],
+    "replayed": bool(tick.faults >> faults.BIT["monitored_range"] & 1),
+}))""",
+    )
+    count = len(CHANNELS) + 1
+    assert found == {
+        "role": "humidity",
+        "sample": count,
+        "settings": "humidity",
+        "limit": True,
+        "signal": True,
+        "page": True,
+        "status": "humidity",
+        "cause": True,
+        "trips": True,
+        "replayed": True,
+    }
+
+
+def test_a_limit_is_added_in_one_row(tmp_path):
+    """A new limit reaches the configuration, its page, the law's parameters and the law's types."""
+    anchor = "    coil_rate_k_s: float = option("
+    row = '    voltage_limit_v: float = option("largest mean coil voltage", 48.0, "V", 0.0, 1e3)\n'
+    config = tmp_path / "rig.yaml"
+    config.write_text(
+        "control: {kp: 0.1, ti_s: 1, output_limit: 1}\nprotection: {voltage_limit_v: 12 V}\n"
+        "hal: {backend: simulated, plant: plant.yaml}\n"
+    )
+    found = run_with(
+        {"thermoctl.control.limits": (anchor, row + anchor)},
+        f"""
+from thermoctl import reference, settings
+from thermoctl.control import law, model, typed
+from thermoctl.daemon.assemble import law_parameters
+p = law_parameters(settings.load_settings({str(config)!r}))
+tick = law.Law(model.zero_model(), model.Parameters.unpack(p.pack()), 0.001)
+text = (typed.HERE / "law.pxd").read_text()
+print(json.dumps({{
+    "law": tick.p.voltage_limit_v, "page": "largest mean coil voltage" in reference.configuration(),
+    "declared": "voltage_limit_v" in typed.declarations(text, law), "stale": "voltage_limit_v" not in text,
+}}))""",
+    )
+    assert found == {"law": 12.0, "page": True, "declared": True, "stale": True}
+
+
+def test_a_fault_is_added_in_one_row():
+    """A new fault takes bit 53, is recorded in the second word, and is shown, explained and decoded."""
+    found = run_with(
+        {
+            "thermoctl.control.faults": (
+                "\n)\n\nFAULTS = ",
+                '\n    Fault(53, "door_open", "critical", "the chamber\'s door is open"),\n)\n\nFAULTS = ',
+            ),
+            "thermoctl.control.remedies": (
+                "REMEDIES = {",
+                'REMEDIES = {"door_open": Remedy("Somebody opened it.", "look", "close it"),',
+            ),
+        },
+        """
+import numpy as np
+from thermoctl import reference, signals
+from thermoctl.control import arming, faults, law
+from thermoctl.control.model import Parameters, zero_model
+tick = law.Law(zero_model(), Parameters(0.0, 1.0, 0.0, 1.0), 0.001)
+for k in range(law.WARM_UP_TICKS + 3):
+    tick.step(0.001, external=1 << faults.BIT["door_open"])
+row = np.zeros(len(signals.NAMES))
+row[-len(law.OUTPUTS):] = tick.outputs
+print(json.dumps({
+    "state": arming.STATES[tick.state], "shown": "door_open" in [f.name for f in faults.decode(signals.fault_word(row))],
+    "second word": row[signals.INDEX["fault_bits_2"]], "page": "`fault_bits_2` (value 1)" in reference.fault(faults.BY_NAME["door_open"]),
+    "recorded": faults.NAMES[53], "others": all(faults.NAMES[b] == n for b, n in enumerate(faults.NAMES_2)),
+}))""",
+    )
+    assert found == {
+        "state": "FAULT",
+        "shown": True,
+        "second word": 1.0,
+        "page": True,
+        "recorded": "door_open",
+        "others": True,
+    }
+
+
+def test_a_model_field_is_added_in_one_row():
+    """A new field of the model reaches model files, the recording's metadata and the warm start's fingerprint."""
+    anchor = "    meta: dict[str, Any]"
+    found = run_with(
+        {"thermoctl.control.model": (anchor, '    tilt: float = _number("um/K", 0.5)\n' + anchor)},
+        """
+import dataclasses
+from thermoctl.control.model import Parameters, zero_model
+from thermoctl.daemon.keep import _fingerprint
+from thermoctl.daemon.recorder import law_metadata, read_law_metadata
+from thermoctl.identify import modelfile
+model = dataclasses.replace(zero_model(), tilt=0.25)
+text = law_metadata(model, Parameters(0.0, 1.0, 0.0, 1.0), 0.001, 0, 0, None)
+old = json.loads(text)
+del old["model"]["tilt"]
+print(json.dumps({
+    "recording": read_law_metadata(text)["model"].tilt, "before it": read_law_metadata(json.dumps(old))["model"].tilt,
+    "unit": modelfile.UNITS["tilt"], "fingerprint": _fingerprint(model) != _fingerprint(zero_model()),
+}))""",
+    )
+    assert found == {"recording": 0.25, "before it": 0.5, "unit": "um/K", "fingerprint": True}
+
+
+@pytest.mark.parametrize(("version", "name"), [(1, "amplifier_frozen"), (2, "amplifier_stopped")])
+def test_an_old_recording_decodes_to_its_own_faults(version, name):
+    """Without a table in the metadata the names are those of the law's version; with one, its own."""
+    law = json.dumps({"version": version})
+    assert faults.names(1 << 34 | 1, faults.recorded_names({"law": law})) == ("position_error", name)
+    stored = {"law": law, "faults": json.dumps({34: "lamp_broken", 60: "of_a_newer_program"})}
+    assert faults.names(1 << 34 | 1 << 60, faults.recorded_names(stored)) == (
+        "lamp_broken",
+        "of_a_newer_program",
+    )
+    assert faults.names(1 << 59, faults.recorded_names(stored)) == ("bit 59",)
+
+
+def test_two_words_hold_every_bit():
+    """All 64 bits pass through two float64 columns."""
+    rows = np.zeros((2, len(NAMES)))
+    rows[:, INDEX["fault_bits"]], rows[1, INDEX["fault_bits_2"]] = 2.0**53 - 1, 2.0**11 - 1
+    assert fault_word(rows[1]) == 2**64 - 1 == int(fault_words(rows)[1])
+    assert fault_word(rows[0]) == 2**53 - 1 == int(fault_words(rows)[0])
+    rows[0, INDEX["fault_bits"]] = np.nan
+    assert int(fault_words(rows)[0]) == 0
+
+
+def test_the_fingerprint_covers_every_number():
+    """A change of any number of the model gives another fingerprint."""
+    model = zero_model()
+    assert isinstance(model, CompensatorModel)
+    changed = [
+        _fingerprint(type(model)(**{**vars(model), name: vars(model)[name] + 0.25}))
+        for name in ("b_air", "offset_um", "R_w", "R_v", "expansion_period_s", "f1")
+    ]
+    assert len({_fingerprint(model), *changed}) == 1 + len(changed)
