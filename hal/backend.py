@@ -1,8 +1,8 @@
-"""How the loop sees hardware: one small interface, whatever is behind it.
+"""The contract between the loop and the hardware: one small interface for every back end.
 
 A back end has `open()`, `read(now_s) -> Sample`, `write(drive, enable)`, `close()`. `hal.backend` in the configuration
-chooses what stands behind it: real devices (serial, CAN, Modbus), the simulated plant or a replayed recording; a
-fault-injecting wrapper goes around any of them.
+chooses it: real devices (serial, CAN, Modbus), the simulated plant or a replayed recording. A fault injector can wrap
+any of them. hal.make makes them.
 
 The contract
 - `open()` may block and raises HardwareError (one line: device, port, what was expected, what to do) or
@@ -43,7 +43,7 @@ shared memory; the back end made with `make_backend(settings, board)` merges the
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -107,72 +107,16 @@ class Backend(Protocol):
         """Connect to everything; all failures are reported together. Raises HardwareError."""
 
     def read(self, now_s: float) -> Sample:
-        """The newest reading of every channel at now_s (monotonic seconds); never blocks."""
+        """Return the newest reading of every channel at now_s (monotonic seconds); never blocks."""
 
     def write(self, drive: float, enable: bool) -> None:
-        """Send the drive (in the unit of its profile) and whether the amplifier shall be enabled."""
+        """Send the command (in the unit of the profile) and whether the amplifier shall be enabled."""
 
     def close(self) -> None:
-        """Disable the amplifier and let go of everything; may be called twice."""
+        """Disable the amplifier and release everything; may be called twice."""
 
     def problem(self, role: str) -> str:
-        """What the device of a role says is wrong, in its own words; '' when nothing is."""
+        """Say why a role is not OK, in its device's own words; '' when it is OK."""
 
     def counters(self) -> dict[str, int]:
-        """Counts since the start by name: frames lost, checksums that failed, reconnections."""
-
-
-def make_backend(settings: Any, board: Any = None) -> Backend:
-    """The back end that `settings.hal` asks for, not yet open; inside the fault injector where `hal.faults` lists any.
-
-    board: a hal.board.Board that poller processes fill, or None to poll slow devices from threads of this process.
-    Raises InputError where the configuration, a profile or the plant is at fault.
-    """
-    kind = settings.hal.backend
-    backend: Backend
-    if kind == "simulated":
-        from hal.simulated import simulated_backend
-
-        backend = simulated_backend(settings)
-    elif kind == "replay":
-        from hal.replay import replay_backend
-
-        backend = replay_backend(settings)
-    elif kind == "devices":
-        from hal.devices import DevicesBackend
-
-        backend = DevicesBackend(
-            fast_devices(settings), slow_devices(settings), board, settings.protection.required
-        )
-    else:
-        raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated, devices or replay")
-    if settings.hal.faults:
-        from hal.faulty import FaultInjector, schedule
-
-        backend = FaultInjector(backend, schedule(settings.hal.faults), seed=settings.hal.seed)
-    return backend
-
-
-def fast_devices(settings: Any) -> list:
-    """The devices of `hal.devices` that are read and written inside the tick, not yet open (hal.devices.Device)."""
-    from hal.devices import make_devices
-
-    return [d for d in make_devices(settings) if not d.slow]
-
-
-def slow_devices(settings: Any) -> list:
-    """The devices of `hal.devices` with a blocking poll(), not yet open (class hal.modbus.ModbusDevice)."""
-    from hal.devices import make_devices
-
-    return [d for d in make_devices(settings) if d.slow]
-
-
-def disable_amplifier(settings: Any) -> None:
-    """Disable the amplifier of `hal.devices` over a link of its own: for when the loop can no longer do it. No other device is
-    opened, and a mistake in another device's profile does not count. Raises HardwareError, OSError, InputError."""
-    if settings.hal.backend != "devices":
-        return
-    from hal.devices import driving_devices
-
-    for device in driving_devices(settings):
-        device.switch_off()
+        """Return counts since the start by name: lost frames, failed checksums, reconnections."""
