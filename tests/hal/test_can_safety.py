@@ -488,8 +488,8 @@ def test_frames_of_29_bits_are_none_of_the_drives(bus):
         (0x77A, "05"),
     ):
         other.send(can.Message(arbitration_id=can_id, data=bytes.fromhex(data), is_extended_id=True))
-    frames = m.device._heard
-    until(lambda s: m.device._heard > frames + 20, m)
+    frames = m.device.counters()["frames"]
+    until(lambda s: m.device.counters()["frames"] > frames + 20, m)
     assert m.backend.sample.value[STATE] == AMP_DISABLED and m.backend.sample.status[STATE] == OK
     assert m.backend.counters()["axis 5.emergencies"] == m.backend.counters()["axis 5.reconnections"] == 0
 
