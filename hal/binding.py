@@ -1,4 +1,4 @@
-"""Where each device is on this rig: one item of `hal.devices` binds a profile to a port, and channels to roles.
+"""Bindings: each item of `hal.devices` binds a profile to a port, and its channels to roles.
 
 Also the checks that need every binding of a rig at once.
 """
@@ -60,10 +60,10 @@ def resolve_port(port: str, folder: Path) -> str:
 def bind(node: Node, folder: Path) -> Binding:
     """Read one item of `hal.devices`.
 
-    {profile, port, roles: {channel: role}, name?, address?, stale_after_s?, watchdog_s?, master_id?}; `profile` is
-    relative to `folder`. stale_after_s and watchdog_s replace the profile's values on a machine that is too slow for
-    them. master_id replaces our node id when another device of the bus has it. Raises InputError: unknown channel,
-    unknown role, unit that does not fit the role."""
+    {profile, port, roles: {channel: role}, name?, address?, stale_after_s?, watchdog_s?, master_id?};
+    `profile` is relative to `folder`. stale_after_s and watchdog_s replace the profile's values on a machine
+    that is too slow for them. master_id replaces our node id when another device of the bus has it. Raises
+    InputError: unknown channel, unknown role, unit that does not fit the role."""
     s = Section(node, "device")
     path = folder / s.text("profile")
     if not path.is_file():
@@ -133,7 +133,7 @@ def _bound(profile: Profile, name: str, role: Node) -> Bound:
 
 
 def check_rig(bindings: Iterable[Binding]) -> None:
-    """Check that each role, the command and each exclusive port belong to one device only. Raises InputError."""
+    """Raise InputError where two devices share a role, the command or an exclusive port."""
     claimed: dict[str, Binding] = {}
     opened: dict[str, Binding] = {}
     for b in bindings:

@@ -1,8 +1,8 @@
-"""The board: newest readings of slow devices, written by their poller processes and read by the loop without a wait.
+"""The board: newest readings of slow devices, from their pollers to the loop, without a wait.
 
-Shared memory holds one row per role: sequence, value, time, status and the problem in one line of text. The rows of a
-device have one writer. The sequence of their first row is a seqlock: it is odd during a write. A reader that finds it
-odd or changed takes the rows at its next tick.
+Shared memory holds one row per role: sequence, value, time, status and the problem in one line of text. The
+rows of a device have one writer. The sequence of their first row is a seqlock: it is odd during a write. A
+reader that finds it odd or changed takes the rows at its next tick.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SHARED_MEMORY = Path("/dev/shm")
 
 
 class Board:
-    """Newest readings by role, made by `create`, `attach` (another process) or `private` (threads of one process)."""
+    """Newest readings by role; made by `create`, `attach` (another process) or `private` (threads)."""
 
     def __init__(self, buffer: mmap.mmap | bytearray, path: Path | None, owner: bool) -> None:
         self._path, self._owner, self._buffer = path, owner, buffer
@@ -115,7 +115,7 @@ class Board:
         return int(before)
 
     def beat(self, roles: list[int]) -> int:
-        """Return a number that grows with every post of the device with these roles, to detect a hung poller."""
+        """Return the number of posts of the device with these roles, to detect a hung poller."""
         return int(self._sequence[roles[0]])
 
     def problem(self, role: int) -> str:

@@ -7,8 +7,8 @@ A port is written "interface:channel@bitrate"; the default bitrate is 1000000.
 - socketcan:can0                python-can opens it and sets the kernel's filters; frames pass on the bare socket
 - virtual:name and any other interface of python-can: through the library
 
-Identifiers of 29 bits carry the bit EXTENDED everywhere, so that they never match an 11-bit one of the same number.
-Remote frames, error frames and CAN FD frames are counted and otherwise ignored.
+Identifiers of 29 bits carry the bit EXTENDED everywhere, so that they never match an 11-bit one of the same
+number. Remote frames, error frames and CAN FD frames are counted and otherwise ignored.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class LibraryPort(CanPort):
         self.bad = self.ignored = self._pending = 0
 
     def flush(self) -> int:
-        """Send what was queued, without waiting. Raises OSError when the bus is gone or takes nothing any more."""
+        """Send the queued frames, without waiting. Raises OSError when the bus is gone or full."""
         for can_id, data in self.queued():
             try:
                 self._send(can_id, data)

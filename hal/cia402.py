@@ -5,7 +5,8 @@ Expedited SDO transfers of CiA 301 (a number of up to 4 bytes in one frame) are 
     request to 0x600 + node     0x40 read, 0x2F 0x2B 0x23 write 1, 2, 4 bytes | index, sub-index | data
     answer from 0x580 + node    0x43 .. 0x4F, 0x60 done, 0x80 abort with a code of 32 bits
 
-PDO mappings are written as plain numbers, so that it does not matter whether the EDS calls them ARRAY or RECORD.
+PDO mappings are written as plain numbers, so that it does not matter whether the EDS calls them ARRAY or
+RECORD.
 """
 
 from __future__ import annotations
@@ -28,14 +29,15 @@ CONTROL_WORD = Object(0x6040)
 DRIVE_PROFILE = 402  # lower half of object 0x1000: CiA 402
 PDO_BYTES = 8
 LISTEN_S, LISTEN_BEATS = 0.1, 5
-"""Time to listen for a foreign heartbeat before anything is sent: at least LISTEN_S, and LISTEN_BEATS periods."""
+"""Time to listen for a foreign heartbeat before anything is sent: at least LISTEN_S, and LISTEN_BEATS
+periods."""
 DOUBLE_ANSWERS = 3  # this many second answers to a request prove that two devices share the node id
 _FORMATS = {0x01: "B", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I"}
 """Data types of CiA 301 (BOOLEAN, INTEGER8 .. 32, UNSIGNED8 .. 32) and their letters in `struct`."""
 
 
 class Objects:
-    """The objects of an EDS file that a profile names. Raises InputError with the object and what the file has."""
+    """The objects of an EDS file that a profile names. Raises InputError with the object."""
 
     def __init__(self, spec: Cia402, place: str, node: int) -> None:
         import canopen  # takes a second; only rigs with a drive need it
@@ -50,7 +52,7 @@ class Objects:
             ) from None
 
     def format(self, item: Object, key: str) -> str:
-        """Return the struct letter of an object's number; `key` is the profile's key that names the object."""
+        """Return the struct letter of an object; `key` is the profile's key that names it."""
         index, sub = item
         found = self._dictionary.get(index)
         if found is None:
@@ -90,7 +92,7 @@ class Sdo:
         return int.from_bytes(answer[4 : 4 + size], "little")
 
     def write(self, item: Object, letter: str, value: int) -> None:
-        """Write a number of this struct letter. Raises HardwareError with the object, and the drive's reason."""
+        """Write a number of this struct letter. Raises HardwareError with the drive's reason."""
         data = struct.pack("<" + letter, value)
         command = bytes((0x23 | 4 - len(data) << 2,))
         self._ask(item, command, data.ljust(4, b"\0"), f"{value} (0x{value & 0xFFFFFFFF:X}) to ")
@@ -163,9 +165,9 @@ def foreign_heartbeat(master: int, where: str) -> HardwareError:
 
 
 def set_up(sdo: Sdo, spec: Cia402, formats: dict[Object, str], where: str) -> int:
-    """Configure heartbeats, mode and PDOs of a drive and start its node; it stays disabled. Return its error code.
+    """Configure heartbeats, mode and PDOs of a drive and start its node; return its error code.
 
-    formats: struct letters of the objects of both PDOs and of start_up. Raises HardwareError."""
+    The drive stays disabled. formats: struct letters of the objects of both PDOs and of start_up. Raises HardwareError."""
     node, port = sdo.node, sdo.port
     sdo.listen(max(LISTEN_S, LISTEN_BEATS * spec.heartbeat_s))
     if 0x700 + spec.master_id in sdo.heartbeats:
@@ -200,7 +202,7 @@ def set_up(sdo: Sdo, spec: Cia402, formats: dict[Object, str], where: str) -> in
 
 
 def _map_pdo(sdo: Sdo, communication: int, cob_id: int, objects: list[tuple[Object, str]]) -> None:
-    """Map a PDO to these objects, at every SYNC. A drive that refuses PDO_NO_RTR in `cob_id` gets it without."""
+    """Map a PDO to these objects, at every SYNC; drop PDO_NO_RTR when the drive refuses it."""
     mapping = communication + 0x200
     try:
         sdo.write(Object(communication, 1), "I", cob_id | PDO_INVALID)

@@ -1,12 +1,12 @@
 # cython: annotation_typing=False, cdivision=True
 """What every driver shares: the bound channels of one device, the check of each reading, and the counters.
 
-A driver knows one protocol. Its `connect` may block (opening, configuring); `read` and `write`, called in the tick, may
-not.
+A driver knows one protocol. Its `connect` may block (opening, configuring); `read` and `write`, called in the
+tick, may not.
 
-ERROR is for what a device says of itself: a sentinel, a bad status flag, a refused register. A lost answer, a damaged
-frame or a link that is gone leaves the last value standing until it is stale. The device that drives is the exception:
-without its link nothing is known of the amplifier, so its channels are ERROR at once.
+A channel is ERROR when the device reports a fault: a sentinel, a bad status flag, a refused register. After a
+lost answer, a damaged frame or a lost link the last value is kept until it is stale. The device that drives
+is the exception: without its link the state of the amplifier is unknown, so its channels are ERROR at once.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ SLOW_BUSES = ("modbus",)
 class Device:
     """Bound channels, the check of each reading, counters.
 
-    A subclass implements connect, disconnect, and either read (and write where `drives`) or, where `slow`, poll."""
+    A subclass implements connect, disconnect, and either read (and write where `drives`) or, where `slow`,
+    poll."""
 
     def __init__(self, binding: Binding) -> None:
         self.binding = binding
@@ -71,7 +72,7 @@ class Device:
         raise NotImplementedError
 
     def put(self, sample: Sample, bound: int, raw: float, time_s: float) -> None:
-        """Store `raw`, scaled, as the reading of bound channel `bound`; ERROR when out of range or not finite."""
+        """Store `raw`, scaled, for bound channel `bound`; ERROR when out of range or not finite."""
         if self._channels.put(sample, bound, raw, time_s):
             if self.problems:
                 self.problems.pop(self.roles[bound], None)

@@ -24,8 +24,9 @@ from thermoctl.yamlfile import InputError
 class DevicesBackend:
     """`hal.backend.Backend` over real devices.
 
-    Other processes poll the slow devices and post to `board`; without a board, threads of this process poll them. A
-    fast device may be absent at the start when none of its roles is `required` (None: every role is)."""
+    Other processes poll the slow devices and post to `board`; without a board, threads of this process poll
+    them. A fast device may be absent at the start when none of its roles is `required` (None: every role
+    is)."""
 
     def __init__(
         self,
@@ -164,7 +165,7 @@ class DevicesBackend:
         return text
 
     def counters(self) -> dict[str, int]:
-        """Return `<device>.<counter>` of every device; of slow devices the counters that their pollers posted."""
+        """Return the counters of all devices (slow ones: as posted) as `<device>.<counter>`."""
         counts = {f"{d.name}.{name}": n for d in self.fast for name, n in d.counters().items()}
         for d in self.slow:
             posted = d.counters() if self.board is None else self.board.counts(d)

@@ -1,9 +1,10 @@
 # cython: annotation_typing=False, cdivision=True
 """A CiA-402 drive in the tick.
 
-RPDO 1 = control word | command, then SYNC. TPDO 1 answers the SYNC with status word | readings; it is read one tick
-later. Heartbeats go both ways: the drive stops by itself when ours is missing for `watchdog_s`, and its channels are
-ERROR when its own is missing. Set-up (identity, heartbeats, mode, PDO mapping, NMT start): hal.cia402.
+RPDO 1 = control word | command, then SYNC. TPDO 1 answers the SYNC with status word | readings; it is read
+one tick later. Heartbeats go both ways: the drive stops by itself when ours is missing for `watchdog_s`, and
+its channels are ERROR when its own is missing. Set-up (identity, heartbeats, mode, PDO mapping, NMT start):
+hal.cia402.
 
     status word & mask = value -> state          control word for the next step towards 'operation enabled'
       0x4F  0x00  not ready to switch on         -                        (the drive goes on by itself)
@@ -15,9 +16,9 @@ ERROR when its own is missing. Set-up (identity, heartbeats, mode, PDO mapping, 
       0x4F  0x0F  fault reaction active          -
       0x4F  0x08  fault                          0x80 fault reset (rising edge), only while `enable` is False
 
-Only a new `enable` takes these steps. A drive that leaves 'operation enabled' without our command (quick stop from an
-input, supply, its own fault) is disabled. It stays disabled until `enable` was withdrawn and is given again. Until then
-its state reads as the state it left to, so that a stop between two ticks is seen, too.
+Only a new `enable` takes these steps. A drive that leaves 'operation enabled' without our command (quick stop
+from an input, supply, its own fault) is disabled. It stays disabled until `enable` was withdrawn and is given
+again. Until then its state reads as the state it left to, so that a stop between two ticks is seen, too.
 """
 
 from __future__ import annotations
@@ -149,7 +150,7 @@ class Cia402Device(Device):
         self._left_to, self._left_word = _OFFLINE, -1
 
     def connect(self) -> None:
-        """Open the port, check the identity, configure heartbeats, mode and PDOs, start the node; it stays off."""
+        """Open the port, set the drive up and start its node; the drive stays disabled."""
         port = open_can(self.binding.port, self._ids)
         try:
             sdo = Sdo(port, self._node, self._spec.sdo_timeout_s)
@@ -285,7 +286,7 @@ class Cia402Device(Device):
         )
 
     def counters(self) -> dict[str, int]:
-        """Return frames, errors (bad lines, TPDOs of another length), emergencies, reconnections, ignored frames."""
+        """Return the counters; errors are bad lines and TPDOs of another length."""
         self.counts.update(frames=self._frames, emergencies=self._emergencies)
         if self._port is not None:
             self.counts.update(errors=self._port.bad + self._odd, ignored=self._port.ignored)

@@ -1,4 +1,4 @@
-"""Faults on purpose: a wrapper around any back end, on a schedule from the configuration. For tests and drills.
+"""Fault injection: a wrapper around any back end, on a schedule of the configuration, for tests and drills.
 
     faults:
       - {kind: freeze, role: coil_c, at_s: 10, for_s: 5}
@@ -106,7 +106,7 @@ def _roles(s: Section, kind: str) -> tuple[int, ...]:
 
 
 class FaultInjector:
-    """`hal.backend.Backend` that injects faults into another one's readings and commands; seeded, deterministic."""
+    """`hal.backend.Backend` that injects faults into another one; seeded, deterministic."""
 
     def __init__(self, inner: Backend, faults: Iterable[Fault], seed: int = 0) -> None:
         self.inner: Any = inner

@@ -21,10 +21,11 @@ from thermoctl.yamlfile import InputError
 
 
 def make_backend(settings: Settings, board: Board | None = None) -> Backend:
-    """Make the back end of `settings.hal`, not yet open; inside the fault injector where `hal.faults` lists any.
+    """Make the back end of `settings.hal`, not yet open.
 
-    board: filled by poller processes, or None to poll slow devices from threads of this process. Raises InputError where
-    the configuration, a profile or the plant is at fault."""
+    It is wrapped in a fault injector when `hal.faults` lists any. board: filled by poller processes, or None to
+    poll slow devices from threads of this process. Raises InputError: a mistake in the configuration, a profile
+    or the plant."""
     kind = settings.hal.backend
     backend: Backend
     if kind == "simulated":
@@ -54,8 +55,8 @@ def slow_devices(settings: Settings) -> list[Device]:
 def disable_amplifier(settings: Settings) -> None:
     """Disable the amplifier of `hal.devices` over a link of its own: for when the loop can no longer do it.
 
-    No other device is opened, and a mistake in another device's profile does not count. Raises HardwareError, OSError,
-    InputError."""
+    No other device is opened, and a mistake in another device's profile does not count. Raises HardwareError,
+    OSError, InputError."""
     if settings.hal.backend != "devices":
         return
     for device in driving_devices(settings):
@@ -76,15 +77,15 @@ def _bindings(settings: Settings) -> list[Binding]:
 
 
 def device_notes(settings: Settings) -> list[str]:
-    """Return a line for each setting of `hal.devices` that is allowed but probably a mistake. Raises InputError."""
+    """Return a line for each probable mistake in `hal.devices`. Raises InputError."""
     return rig_notes(_bindings(settings))
 
 
 def driving_devices(settings: Settings) -> list[Device]:
     """Make the drivers of the devices that take the command, not connected.
 
-    A mistake in another device's binding or profile does not count. Raises InputError where no device drives because of
-    a mistake."""
+    A mistake in another device's binding or profile does not count. Raises InputError where no device drives
+    because of a mistake."""
     devices, mistakes = [], []
     for node in settings.hal.devices:
         try:

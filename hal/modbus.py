@@ -1,10 +1,12 @@
-"""Modbus devices, TCP and RTU: the only module that knows pymodbus (which renames its interface in minor releases).
+"""Modbus devices, TCP and RTU.
 
-Ports: "tcp:host:port" or "rtu:/dev/serial/by-id/...". Channels are registers; neighbours are read in one block. The
-profile gives the word order of a value of several words; bytes inside a word are big-endian, by the protocol. Sentinel
-numbers, such as an open thermocouple's, make the channel an ERROR while the others stay OK. After a lost or damaged
-answer, or while the device is busy, the last values are kept. A refused block is read register by register, so that
-one illegal address does not cost its neighbours.
+No other module uses pymodbus, which renames its interface in minor releases.
+
+Ports: "tcp:host:port" or "rtu:/dev/serial/by-id/...". Channels are registers; neighbours are read in one
+block. The profile gives the word order of a value of several words; bytes inside a word are big-endian, by
+the protocol. Sentinel numbers, such as an open thermocouple's, make the channel an ERROR while the others
+stay OK. After a lost or damaged answer, or while the device is busy, the last values are kept. A refused
+block is read register by register, so that one illegal address does not cost its neighbours.
 """
 
 from __future__ import annotations
@@ -99,7 +101,7 @@ def decode(words: Sequence[int], register: Register) -> float:
 
 
 class ModbusDevice(Device):
-    """A register device, polled: `poll` reads every bound channel once and blocks up to the profile's timeout."""
+    """A register device; `poll` reads every bound channel and blocks up to the profile's timeout."""
 
     def __init__(self, binding: Binding) -> None:
         super().__init__(binding)
@@ -148,8 +150,9 @@ class ModbusDevice(Device):
     def poll(self, sample: Sample) -> None:
         """Read every block.
 
-        A lost answer ends this poll, because a late answer must not be taken for the next block's; the last values are
-        kept. Raises HardwareError when the link is gone or LOST_POLLS polls in a row had no answer."""
+        A lost answer ends this poll, because a late answer must not be taken for the next block's; the last
+        values are kept. Raises HardwareError when the link is gone or LOST_POLLS polls in a row had no
+        answer."""
         for block in list(self._blocks):
             try:
                 self._read(sample, block)

@@ -1,12 +1,13 @@
 """What a device profile says: vendor, model, bus and channels.
 
-A device is described, not programmed. A profile (`format: thermoctl-device/1`) describes what the vendor made; a binding
-(hal.binding) says where the device is on this rig. Every channel has
+A device is described, not programmed. A profile (`format: thermoctl-device/1`) describes what the vendor
+made; a binding (hal.binding) says where the device is on this rig. Every channel has
 
     reading = raw * scale + offset      in `unit`; outside `range`: error; older than `stale_after_s`: stale
 
 and the place of its raw number on the bus. Buses: serial-binary (framed bytes), serial-lines (text), can-dbc
-(any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). hal.read_profile reads the files.
+(any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). hal.read_profile reads the
+files.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ WORD_BYTES = 2  # of a Modbus register
 
 
 class Object(NamedTuple):
-    """Index and sub-index in a CANopen object dictionary; a profile writes 0x6041, or 0x30D1:1 for sub-index 1."""
+    """An object of CANopen: index and sub-index; a profile writes 0x6041 or 0x30D1:1."""
 
     number: int  # the index: `index` is a method of every tuple
     sub: int = 0
@@ -99,7 +100,8 @@ class BinaryFrame:
 class TextLine:
     """Lines of text: the named groups of `pattern` are the readings.
 
-    `request` is sent `request_hz` times a second. `decimal` is the decimal sign of the numbers, '.' or ','."""
+    `request` is sent `request_hz` times a second. `decimal` is the decimal sign of the numbers, '.' or
+    ','."""
 
     pattern: re.Pattern[str]
     request: bytes = b""
@@ -133,7 +135,7 @@ class DbcSource:
 
 @dataclass(frozen=True)
 class Cia402:
-    """A CiA-402 drive: EDS, the object that takes the command, the two PDOs, and the times of both heartbeats."""
+    """A CiA-402 drive: EDS file, command object, contents of the PDOs, heartbeats."""
 
     eds: Path
     node_id: int
@@ -181,7 +183,9 @@ Source = str | TextField | DbcSource | Object | Register
 
 @dataclass(frozen=True)
 class Channel:
-    """One reading of a device. `source` is its place on the bus: frame field, text group, DBC signal, object, register."""
+    """One reading of a device.
+
+    `source` is its place on the bus: frame field, text group, DBC signal, object, register."""
 
     name: str
     unit: str

@@ -1,4 +1,4 @@
-"""Read and check a device profile: `load_profile`, and for each bus a reader of its section and of a channel's source."""
+"""Read and check a device profile: `load_profile`, and two readers for each bus."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 # cython: annotation_typing=False, cdivision=True
 """Serial devices: framed bytes with a CRC, and lines of text.
 
-pyserial opens and configures the line, exclusively, so that a second program is refused. The tick then reads and writes
-the bare descriptor without waiting. hal.wire.Framer finds the frames in the bytes.
+pyserial opens and configures the line, exclusively, so that a second program is refused. The tick then reads
+and writes the bare descriptor without waiting. hal.wire.Framer finds the frames in the bytes.
 """
 
 from __future__ import annotations

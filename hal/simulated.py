@@ -1,12 +1,13 @@
 """The simulated rig: a plant file as hardware, deterministic, at any speed.
 
-The plant advances in periods of the loop, with the command held. A sensor reads the plant's output plus its noise, rounded
-to its resolution (both from the plant file), at its own rate: the encoders every period, the slow ones every
-`sensor_period_s`. The same seed and the same commands at the same times give the same bits.
+The plant advances in periods of the loop, with the command held. A sensor reads the plant's output plus its
+noise, rounded to its resolution (both from the plant file), at its own rate: the encoders every period, the
+slow ones every `sensor_period_s`. The same seed and the same commands at the same times give the same bits.
 
-The plant that plays the hardware (`hal.truth`) may differ from the one that the compensator was built from, to show
-an effect that the model leaves out. Outputs play the role of their own name, or the one that `hal.roles` gives them. The plant's
-other inputs (the chamber's air) follow `hal.inputs`: mean + swing * sin(2 pi t / period_s).
+The plant that plays the hardware (`hal.truth`) may differ from the one that the compensator was built from,
+to show an effect that the model leaves out. Outputs play the role of their own name, or the one that
+`hal.roles` gives them. The plant's other inputs (the chamber's air) follow `hal.inputs`: mean + swing * sin(2
+pi t / period_s).
 """
 
 from __future__ import annotations
@@ -78,7 +79,8 @@ class PlantRig:
     ) -> None:
         """Compile the plant and connect its inputs and outputs. Raises InputError when they do not fit.
 
-        surroundings: the plant's inputs other than the command; roles: output -> role where their names differ."""
+        surroundings: the plant's inputs other than the command; roles: output -> role where their names
+        differ."""
         plant = load(path)
         model = compile_plant(plant, ())
         if drive_input not in model.inputs:
@@ -122,7 +124,7 @@ class PlantRig:
         self.y = self.stepper.step(self.u)
 
     def sense(self, role: str) -> float:
-        """Return the present reading of the sensor in this role: output + noise, rounded to its resolution."""
+        """Return the reading of the sensor in this role: output + noise, rounded to its resolution."""
         return self.read_sensor(self.index[role])
 
     def true(self, role: str) -> float:
@@ -228,7 +230,7 @@ class SimulatedBackend:
         return sample
 
     def _take(self, channels: list[tuple[int, int]], roles: np.ndarray, now_s: float) -> None:
-        """Take new readings of these sensors; `roles` also holds the amplifier's state and fault with the fast ones."""
+        """Take new readings of these sensors; `roles` may also hold the amplifier's state and fault."""
         sample, read = self.sample, self.rig.read_sensor
         sample.fresh[roles], sample.time_s[roles], sample.status[roles] = True, now_s, OK
         for role, i in channels:

@@ -1,7 +1,7 @@
 """Numbers in lines of text: which base and which decimal sign, and why a line or a number was not taken.
 
-Ambiguous text is never guessed: "+78" is 78 or 120, "1,5" is 1.5 or two numbers. The profile decides. Text that does not
-fit the profile is reported with the received line.
+Ambiguous text is never guessed: "+78" is 78 or 120, "1,5" is 1.5 or two numbers. The profile decides. Text
+that does not fit the profile is reported with the received line.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def number(text: str, base: int, decimal: str) -> float | None:
 
 
 def cut_short(line: str, match: re.Match[str], group: str) -> bool:
-    """Return whether the number in the line is longer than the pattern's last group, so that digits are missing."""
+    """Return whether the line's number is longer than the pattern's last group."""
     return match.end(group) == match.end() and _GOES_ON.match(line, match.end()) is not None
 
 

@@ -1,8 +1,8 @@
 """A CiA-402 drive and a Lawicel adapter, as bytes on a wire. Pure: frames and time in, frames out.
 
-The drive has its own object dictionary, SDO server (expedited), NMT slave, heartbeat producer and consumer, SYNC-driven
-PDOs whose mapping the master writes, and the CiA-402 state machine. When the master's heartbeat (0x1016) is missing it
-stops by itself: error 0x8130, fault state, pre-operational.
+The drive has its own object dictionary, SDO server (expedited), NMT slave, heartbeat producer and consumer,
+SYNC-driven PDOs whose mapping the master writes, and the CiA-402 state machine. When the master's heartbeat
+(0x1016) is missing it stops by itself: error 0x8130, fault state, pre-operational.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def _dictionary(node: int) -> dict[tuple[int, int], Entry]:
 class Cia402Drive:
     """The drive. The rig sets readings in `od[index, 0].value` and takes `command` (counts of the target).
 
-    `command_object` is the target object (0x2071, 0x6071); `alive` False: unpowered, mute; `heartbeat` False: its own
-    heartbeat is off; `stop_until_s`: end of the time in which its stop input is active."""
+    `command_object` is the target object (0x2071, 0x6071); `alive` False: unpowered, mute; `heartbeat` False:
+    its own heartbeat is off; `stop_until_s`: end of the time in which its stop input is active."""
 
     node: int
     command_object: int = 0x2071
@@ -139,7 +139,7 @@ class Cia402Drive:
             self._master_seen_s = now_s
 
     def tick(self, now_s: float) -> list[Frame]:
-        """Return the drive's own messages and all answers since the last call; watch the master's heartbeat."""
+        """Watch the master's heartbeat; return the messages of the drive since the last call."""
         if not self.alive:
             self._out.clear()
             return []

@@ -1,4 +1,7 @@
-"""A Modbus device as bytes on a wire: TCP and RTU framing, functions 3 and 4, exceptions. Pure: bytes in, bytes out."""
+"""A Modbus device as bytes on a wire: TCP and RTU framing, functions 3 and 4, exceptions.
+
+Pure: bytes in, bytes out.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +31,8 @@ def encode(value: float, register: Register) -> list[int]:
 class ModbusUnit:
     """One unit: `registers[kind]` maps address to word.
 
-    Injected faults: `exception` (answer every request with this code), `silent`, `half` (send half of the answer),
-    `corrupt` (RTU: a wrong CRC)."""
+    Injected faults: `exception` (answer every request with this code), `silent`, `half` (send half of the
+    answer), `corrupt` (RTU: a wrong CRC)."""
 
     unit_id: int
     registers: dict[str, dict[int, int]] = field(default_factory=lambda: {"input": {}, "holding": {}})

@@ -1,8 +1,9 @@
 """The virtual rig: the devices of a configuration at the other end of their wires, in real time.
 
-`hal.devices` says which devices the daemon uses; this program plays those devices by the same profiles: a pty with
-a symbolic link at each serial port's path, a Lawicel adapter with a CiA-402 drive (or the sender of a DBC file) behind
-it, Modbus TCP servers and RTU units. One plant feeds them all; the drive's current moves it. It writes to `hal.run_dir`
+`hal.devices` says which devices the daemon uses; this program plays those devices by the same profiles: a pty
+with a symbolic link at each serial port's path, a Lawicel adapter with a CiA-402 drive (or the sender of a
+DBC file) behind it, Modbus TCP servers and RTU units. One plant feeds them all; the drive's current moves it.
+It writes to `hal.run_dir`
 
     reference.csv   data that the daemon never gets: the output's reference encoder and the true state, 100 rows a
                     second, `t` on the machine's monotonic clock
@@ -155,7 +156,9 @@ class VirtualRig:
                 return
 
     def obey(self, line: str) -> str:
-        """Obey one control command: help | quit | DEVICE plug|unplug|VERB [ARGUMENT]; return 'ok' or 'error: ...'."""
+        """Obey one control command; return 'ok' or 'error: ...'.
+
+        help | quit | DEVICE plug|unplug|VERB [ARGUMENT]"""
         name, _, rest = line.partition(" ")
         verb, _, argument = rest.strip().partition(" ")
         if name == "help":
@@ -194,7 +197,7 @@ def _listen(path: Path) -> socket.socket:
 
 
 def tell(path: Path, line: str) -> str:
-    """Send one command to a running rig's control socket; return its answer. FileNotFoundError where none runs."""
+    """Send one command to a running rig; return its answer. FileNotFoundError where none runs."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.settimeout(2.0)
         try:

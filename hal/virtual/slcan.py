@@ -1,4 +1,4 @@
-"""The virtual CAN devices: a Lawicel adapter on a pseudo-terminal with a CiA-402 drive or a DBC sender behind it."""
+"""The virtual CAN devices: a CiA-402 drive or a DBC sender behind a Lawicel adapter."""
 
 from __future__ import annotations
 
