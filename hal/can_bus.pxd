@@ -1,35 +1,5 @@
 # C types for can_bus.py, which runs in every tick; see there.
-cimport cython
-from hal.devices cimport Device
-from hal.wire cimport CanPort, SlcanLine, nearest
-
-cdef int _SYNC_ID
-cdef double _OFFLINE, _DISABLED, _ENABLED, _FAULT, _QUICK_STOP, _RESET_S
-
-cpdef double drive_state(int status_word) noexcept
-@cython.locals(state=cython.int)
-cpdef int next_control_word(int status_word, bint enable) noexcept
+from hal.wire cimport SlcanLine
 
 cdef class SlcanPort(SlcanLine):
     cdef public object _port
-
-cdef class Cia402Device(Device):
-    cdef public object _spec, _formats
-    cdef public CanPort _port
-    cdef public int _odd_size, _node, _master, _status_word, _fault_code, _transmit_size, _receive_size
-    cdef public long long _command_limit, _heard, _emergencies, _odd
-    cdef public int[::1] _index, _is_state, _shift, _bits, _signed
-    cdef public double _patience_s, _heartbeat_s, _heard_s, _beat_s, _reset_s, _low, _high, _scale
-    cdef public tuple _ids
-    cdef public bint _wanted, _driving, _left
-    cdef public double _left_to
-    cdef public int _left_word
-
-    @cython.locals(port=CanPort, kind=cython.long, k=cython.int, i=cython.int, size=cython.int, data=cython.ulonglong,
-                   state=cython.double)
-    cpdef read(self, sample, double now_s)
-    cpdef double _watch_state(self, double state) noexcept
-    @cython.locals(raw=cython.longlong, span=cython.longlong)
-    cdef double _number(self, unsigned long long data, int k) noexcept
-    @cython.locals(port=CanPort, word=cython.int, counts=cython.longlong, steps=cython.bint)
-    cpdef write(self, double drive, bint enable, double now_s)

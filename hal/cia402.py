@@ -5,7 +5,8 @@ Expedited SDO transfers of CiA 301 (a number of up to 4 bytes in one frame) are 
     request to 0x600 + node     0x40 read, 0x2F 0x2B 0x23 write 1, 2, 4 bytes | index, sub-index | data
     answer from 0x580 + node    0x43 .. 0x4F, 0x60 done, 0x80 abort with a code of 32 bits
 
-PDO mappings are written as plain numbers, so that it does not matter whether the EDS calls them ARRAY or RECORD.
+PDO mappings are written as plain numbers, so that it does not matter whether the EDS calls them ARRAY or
+RECORD.
 """
 
 from __future__ import annotations
@@ -15,11 +16,8 @@ import struct
 import time
 from typing import Any
 
-import canopen
-from canopen.objectdictionary import ODVariable, datatypes
-
 from hal.backend import HardwareError
-from hal.profile import STATUS_WORD, Cia402, Object, object_name
+from hal.profile import ERROR_CODE, STATUS_WORD, Cia402, Object, object_name
 from hal.wire import CanPort
 from thermoctl.yamlfile import InputError
 
@@ -27,26 +25,25 @@ SYNC_ID, NMT_ID = 0x080, 0x000
 NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET_COMMUNICATION = 0x01, 0x80, 0x82
 HEARTBEAT_LOST = 0x8130  # CiA 301 error code of a missing heartbeat
 PDO_INVALID, PDO_NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a PDO's COB-ID
-CONTROL_WORD: Object = (0x6040, 0)
+CONTROL_WORD = Object(0x6040)
+DRIVE_PROFILE = 402  # lower half of object 0x1000: CiA 402
+PDO_BYTES = 8
 LISTEN_S, LISTEN_BEATS = 0.1, 5
-"""How long to listen for a foreign heartbeat before anything is sent: at least, and in periods of our own."""
-DOUBLE_ANSWERS = 3  # second answers to one request, from which on two devices share the node id
-_FORMATS = {
-    datatypes.INTEGER8: "b",
-    datatypes.INTEGER16: "h",
-    datatypes.INTEGER32: "i",
-    datatypes.UNSIGNED8: "B",
-    datatypes.UNSIGNED16: "H",
-    datatypes.UNSIGNED32: "I",
-    datatypes.BOOLEAN: "B",
-}
+"""Time to listen for a foreign heartbeat before anything is sent: at least LISTEN_S, and LISTEN_BEATS
+periods."""
+DOUBLE_ANSWERS = 3  # this many second answers to a request prove that two devices share the node id
+_FORMATS = {0x01: "B", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I"}
+"""Data types of CiA 301 (BOOLEAN, INTEGER8 .. 32, UNSIGNED8 .. 32) and their letters in `struct`."""
 
 
 class Objects:
-    """The objects of an EDS file that a profile names. Raises InputError with the object and what the file has."""
+    """The objects of an EDS file that a profile names. Raises InputError with the object."""
 
     def __init__(self, spec: Cia402, place: str, node: int) -> None:
+        import canopen  # takes a second; only rigs with a drive need it
+
         self.place, self.eds = place, spec.eds
+        self._variable: Any = canopen.objectdictionary.ODVariable
         try:
             self._dictionary: Any = canopen.import_od(str(spec.eds), node_id=node)
         except Exception as e:  # the parsers of two libraries
@@ -55,15 +52,15 @@ class Objects:
             ) from None
 
     def format(self, item: Object, key: str) -> str:
-        """The struct letter of an object's number; `key` is where the profile names it."""
+        """Return the struct letter of an object; `key` is the profile's key that names it."""
         index, sub = item
         found = self._dictionary.get(index)
         if found is None:
             raise self._error(item, key, "is not in it")
-        if not isinstance(found, ODVariable):
+        if not isinstance(found, self._variable):
             subs = [k for k in found.subindices if k > 0]
             if sub == 0:
-                names = ", ".join(object_name((index, k)) for k in subs[:4])
+                names = ", ".join(object_name(Object(index, k)) for k in subs[:4])
                 raise self._error(item, key, f"has sub-indices; say which, as {names}")
             if sub not in subs:
                 raise self._error(item, key, f"has no sub-index {sub}; it has {', '.join(map(str, subs))}")
@@ -80,7 +77,7 @@ class Objects:
 
 
 class Sdo:
-    """Objects of one node, read and written one at a time. Remembers the heartbeats that were heard meanwhile."""
+    """Reads and writes objects of one node, one at a time; remembers the heartbeats that arrive meanwhile."""
 
     def __init__(self, port: CanPort, node: int, timeout_s: float) -> None:
         self.port, self.node, self.timeout_s = port, node, timeout_s
@@ -89,19 +86,19 @@ class Sdo:
         self._last = b""
 
     def read(self, item: Object) -> int:
-        """The object as an unsigned number. Raises HardwareError with the object."""
+        """Return the object as an unsigned number. Raises HardwareError with the object."""
         answer = self._ask(item, b"\x40", bytes(4))
         size = 4 - (answer[0] >> 2 & 3) if answer[0] & 1 else 4
         return int.from_bytes(answer[4 : 4 + size], "little")
 
     def write(self, item: Object, letter: str, value: int) -> None:
-        """Write a number of this struct letter. Raises HardwareError with the object, and the drive's reason."""
+        """Write a number of this struct letter. Raises HardwareError with the drive's reason."""
         data = struct.pack("<" + letter, value)
         command = bytes((0x23 | 4 - len(data) << 2,))
         self._ask(item, command, data.ljust(4, b"\0"), f"{value} (0x{value & 0xFFFFFFFF:X}) to ")
 
     def listen(self, seconds: float) -> None:
-        """Only listen, and remember whose heartbeats are there."""
+        """Listen without sending, and remember the heartbeats of the bus."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             for can_id, data in self.port.receive():
@@ -135,6 +132,8 @@ class Sdo:
 
     def _checked(self, answer: bytes, item: Object, what: str) -> bytes:
         if answer[0] == 0x80:
+            import canopen  # already loaded by Objects
+
             code = int.from_bytes(answer[4:], "little")
             text = canopen.SdoAbortedError.CODES.get(code, "the manual of the drive says what it means")
             raise HardwareError(
@@ -143,7 +142,8 @@ class Sdo:
             )
         if answer[0] & 0xE0 != 0x60 and answer[0] & 0xE2 != 0x42:
             raise HardwareError(
-                f"object {object_name(item)} was answered by 0x{answer[0]:02X}, no transfer of up to 4 bytes: check the profile"
+                f"object {object_name(item)} was answered by 0x{answer[0]:02X}, no transfer of up to 4 bytes: "
+                "check the profile"
             )
         return answer
 
@@ -151,44 +151,46 @@ class Sdo:
         others = sorted(i - 0x700 for i in self.heartbeats if i != 0x700 + self.node)
         if not others:
             return "check power, node id, bitrate and termination; a slow drive needs a longer sdo_timeout_s in its profile"
-        return f"heartbeats of nodes {', '.join(map(str, others))} are heard: check the node id ('address') and its power"
+        nodes = ", ".join(map(str, others))
+        return f"heartbeats of nodes {nodes} are heard: check the node id ('address') and its power"
 
 
 def foreign_heartbeat(master: int, where: str) -> HardwareError:
-    """The error for another producer of our own heartbeat on the bus."""
+    """Return the error for another producer of our own heartbeat on the bus."""
     return HardwareError(
-        f"another device on {where} sends the heartbeat 0x{0x700 + master:X} (node id {master}), which the drive is to watch as "
-        "ours: it would keep the drive driving when we are gone. Give one of the two another id: 'master_id' beside "
-        "'address' in hal.devices"
+        f"another device on {where} sends the heartbeat 0x{0x700 + master:X} (node id {master}), which the drive is "
+        "to watch as ours: it would keep the drive driving when we are gone. Give one of the two another id: "
+        "'master_id' beside 'address' in hal.devices"
     )
 
 
 def set_up(sdo: Sdo, spec: Cia402, formats: dict[Object, str], where: str) -> int:
-    """Configure heartbeats, mode and PDOs of a drive and start its node; it stays off. Returns its error code. Raises
-    HardwareError. formats: struct letters of the objects of both PDOs and of start_up."""
+    """Configure heartbeats, mode and PDOs of a drive and start its node; return its error code.
+
+    The drive stays disabled. formats: struct letters of the objects of both PDOs and of start_up. Raises HardwareError."""
     node, port = sdo.node, sdo.port
     sdo.listen(max(LISTEN_S, LISTEN_BEATS * spec.heartbeat_s))
     if 0x700 + spec.master_id in sdo.heartbeats:
         raise foreign_heartbeat(spec.master_id, where)
     port.send((NMT_ID, bytes((NMT_PRE_OPERATIONAL, node))))  # PDOs rest while they are mapped
-    profile = sdo.read((0x1000, 0)) & 0xFFFF
-    if profile != 402:
+    profile = sdo.read(Object(0x1000)) & 0xFFFF
+    if profile != DRIVE_PROFILE:
         raise HardwareError(
             f"node {node} has device profile {profile}, 402 (drive) was expected: is the node id right?"
         )
     sdo.write(CONTROL_WORD, "H", 0)
-    sdo.write((0x1016, 1), "I", spec.master_id << 16 | round(spec.watchdog_s * 1000))
-    sdo.write((0x1017, 0), "H", round(spec.heartbeat_s * 1000))
-    sdo.write((0x6060, 0), "b", spec.mode)
+    sdo.write(Object(0x1016, 1), "I", spec.master_id << 16 | round(spec.watchdog_s * 1000))
+    sdo.write(Object(0x1017), "H", round(spec.heartbeat_s * 1000))
+    sdo.write(Object(0x6060), "b", spec.mode)
     for index, sub, value in spec.start_up:
-        sdo.write((index, sub), formats[index, sub], value)
+        sdo.write(Object(index, sub), formats[Object(index, sub)], value)
     _map_pdo(sdo, 0x1800, 0x180 + node | PDO_NO_RTR, [(o, formats[o]) for o in spec.transmit])
     _map_pdo(sdo, 0x1400, 0x200 + node, [(CONTROL_WORD, "H"), (spec.command, formats[spec.command])])
-    fault_code = sdo.read((0x603F, 0))
-    if fault_code == HEARTBEAT_LOST:  # it missed us while we were away: no news
+    fault_code = sdo.read(ERROR_CODE)
+    if fault_code == HEARTBEAT_LOST:  # expected after a restart of ours
         sdo.write(CONTROL_WORD, "H", 0x80)
         sdo.write(CONTROL_WORD, "H", 0)
-        fault_code = sdo.read((0x603F, 0))
+        fault_code = sdo.read(ERROR_CODE)
     if sdo.double >= DOUBLE_ANSWERS:
         raise HardwareError(
             f"two devices answer as node {node}: give one of them another node id; both would be driven"
@@ -200,27 +202,27 @@ def set_up(sdo: Sdo, spec: Cia402, formats: dict[Object, str], where: str) -> in
 
 
 def _map_pdo(sdo: Sdo, communication: int, cob_id: int, objects: list[tuple[Object, str]]) -> None:
-    """A PDO of these objects, sent or taken at every SYNC. `cob_id` may hold PDO_NO_RTR; a drive that refuses the bit does
-    without."""
+    """Map a PDO to these objects, at every SYNC; drop PDO_NO_RTR when the drive refuses it."""
     mapping = communication + 0x200
     try:
-        sdo.write((communication, 1), "I", cob_id | PDO_INVALID)
+        sdo.write(Object(communication, 1), "I", cob_id | PDO_INVALID)
     except HardwareError:
         if not cob_id & PDO_NO_RTR:
             raise
         cob_id &= ~PDO_NO_RTR
-        sdo.write((communication, 1), "I", cob_id | PDO_INVALID)
-    sdo.write((communication, 2), "B", 1)
-    sdo.write((mapping, 0), "B", 0)
+        sdo.write(Object(communication, 1), "I", cob_id | PDO_INVALID)
+    sdo.write(Object(communication, 2), "B", 1)
+    sdo.write(Object(mapping), "B", 0)
     for k, ((index, sub), letter) in enumerate(objects, 1):
-        sdo.write((mapping, k), "I", index << 16 | sub << 8 | 8 * struct.calcsize(letter))
-    sdo.write((mapping, 0), "B", len(objects))
-    sdo.write((communication, 1), "I", cob_id)
+        sdo.write(Object(mapping, k), "I", index << 16 | sub << 8 | 8 * struct.calcsize(letter))
+    sdo.write(Object(mapping), "B", len(objects))
+    sdo.write(Object(communication, 1), "I", cob_id)
 
 
 def switch_off(sdo: Sdo, receive_size: int) -> None:
-    """Disable the drive without set-up: control word 0 by PDO and SDO, then reset communication. Raises HardwareError when it
-    does not confirm."""
+    """Disable the drive without set-up: control word 0 by PDO and SDO, then reset communication.
+
+    Raises HardwareError when the drive does not confirm."""
     node, port = sdo.node, sdo.port
     port.send((0x200 + node, bytes(receive_size)), (SYNC_ID, b""))
     try:
@@ -231,26 +233,27 @@ def switch_off(sdo: Sdo, receive_size: int) -> None:
 
 
 def check_objects(objects: Objects, spec: Cia402) -> dict[Object, str]:
-    """Struct letters of what the profile names, looked up in the EDS file. Raises InputError."""
-    formats = {item: objects.format(item, "transmit") for item in spec.transmit}
+    """Look up the struct letters of the profile's objects in the EDS file. Raises InputError."""
+    formats: dict[Object, str] = {item: objects.format(item, "transmit") for item in spec.transmit}
     formats[spec.command] = objects.format(spec.command, "command")
     if not formats[spec.command].islower():
         raise InputError(
             f"{objects.place}: command: {spec.eds}: object {object_name(spec.command)} has no sign"
         )
     for index, sub, value in spec.start_up:
-        letter = formats[index, sub] = objects.format((index, sub), "start_up")
+        item = Object(index, sub)
+        letter = formats[item] = objects.format(item, "start_up")
         try:
             struct.pack("<" + letter, value)
         except struct.error:
             size = 8 * struct.calcsize(letter)
             raise InputError(
-                f"{objects.place}: start_up: {value} does not fit object {object_name((index, sub))} ({size} bits, "
+                f"{objects.place}: start_up: {value} does not fit object {object_name(item)} ({size} bits, "
                 f"{'with' if letter.islower() else 'without'} sign)"
             ) from None
     size = sum(struct.calcsize(formats[item]) for item in spec.transmit)
-    if size > 8:
-        raise InputError(f"{objects.place}: transmit: a PDO has 8 bytes, these objects take {size}")
+    if size > PDO_BYTES:
+        raise InputError(f"{objects.place}: transmit: a PDO has {PDO_BYTES} bytes, these objects take {size}")
     if formats[STATUS_WORD] != "H":
         raise InputError(f"{objects.place}: transmit: {spec.eds}: the status word 0x6041 is no uint16")
     return formats

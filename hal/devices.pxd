@@ -1,17 +1,7 @@
 # C types for devices.py, which runs in every tick; see there.
 cimport cython
-from hal.wire cimport Ages, Channels
-
-cdef class Device:
-    cdef public object binding, name, counts
-    cdef public dict problems
-    cdef public list roles
-    cdef public bint slow, drives, up
-    cdef public Channels _channels
-
-    cpdef read(self, sample, double now_s)
-    cpdef write(self, double drive, bint enable, double now_s)
-    cpdef put(self, sample, int bound, double raw, double time_s)
+from hal.device cimport Device
+from hal.wire cimport Ages
 
 cdef class DevicesBackend:
     cdef public list fast, slow

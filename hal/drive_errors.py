@@ -1,7 +1,7 @@
 """Error codes of drives in words: CiA 301 table 26 (emergency error codes) and CiA 402-2 (object 0x603F).
 
-A code that is not in the table is named by its class, the digits that the standards reserve: 0x32xx is a voltage inside
-the device whatever the maker puts into the last two. 0xFFxx belongs to the maker.
+A code that is not in the table is named by its class. The class is in the first digits: 0x32xx is a voltage
+inside the device, whatever the vendor puts into the last two. 0xFFxx is free for the vendor.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ _CLASSES = {
 
 
 def describe(code: float) -> str:
-    """The code in hex and its text, as '0x3220 (DC link under-voltage ...)'."""
+    """Return the code in hex and its text, as '0x3220 (DC link under-voltage ...)'."""
     number = int(code)
     text = CODES.get(number) or _CLASSES.get(number >> 8) or _CLASSES.get(number >> 8 & 0xF0)
     return f"0x{number:04X} ({text or 'not in the CiA tables: see the manual of the drive'})"

@@ -1,12 +1,12 @@
-"""Faults on purpose: a wrapper around any back end, on a schedule from the configuration. For tests and drills.
+"""Fault injection: a wrapper around any back end, on a schedule of the configuration, for tests and drills.
 
     faults:
       - {kind: freeze, role: coil_c, at_s: 10, for_s: 5}
 
-`at_s` counts from the first read; without `for_s` a fault stays. `role` may be a list, or `all`. Kinds:
+`at_s` counts from the first read; without `for_s` a fault never ends. `role` may be a list, or `all`. Kinds:
     drop        readings do not arrive (with `probability`); STALE when older than `stale_after_s`
     delay       readings arrive `by` seconds late
-    duplicate   the last reading is given again as new in every tick
+    duplicate   every tick gives the last reading again as new
     corrupt     a random bit of the reading is flipped (with `probability`)
     freeze      the value stays, time stamps go on
     nan         readings are NaN and claim to be OK
@@ -14,7 +14,7 @@
     swap        the first two roles change places
     error       the device reports an error
     disconnect  error, and commands do not arrive: the amplifier stops by its own watchdog
-    stuck       the amplifier drives `by`, whatever it is told (no role)
+    stuck       the amplifier drives `by`, whatever its command is (no role)
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ KINDS = (
     "disconnect",
     "stuck",
 )
-MAX_DELAYED = 100_000  # readings of one role under way
+SWAPPED = 2  # roles of a swap
+MAX_DELAYED = 100_000  # readings of one role that wait for their delay
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Fault:
 
 
 def schedule(nodes: Iterable[Node]) -> list[Fault]:
-    """`hal.faults`. Raises InputError with the place of what is wrong."""
+    """Read `hal.faults`. Raises InputError with file and line."""
     faults = []
     for node in nodes:
         s = Section(node, "fault")
@@ -82,7 +83,7 @@ def schedule(nodes: Iterable[Node]) -> list[Fault]:
             raise node.error(f"{kind}: 'by' is missing")
         if kind == "delay" and fault.by <= 0.0:
             raise node.error("delay: 'by' must be above 0 s")
-        if kind == "swap" and len(fault.roles) != 2:
+        if kind == "swap" and len(fault.roles) != SWAPPED:
             raise node.error("swap: two roles were expected")
         s.end()
         faults.append(fault)
@@ -105,7 +106,7 @@ def _roles(s: Section, kind: str) -> tuple[int, ...]:
 
 
 class FaultInjector:
-    """`hal.backend.Backend` that spoils another one's readings and commands on schedule; seeded, deterministic."""
+    """`hal.backend.Backend` that injects faults into another one; seeded, deterministic."""
 
     def __init__(self, inner: Backend, faults: Iterable[Fault], seed: int = 0) -> None:
         self.inner: Any = inner
@@ -132,12 +133,12 @@ class FaultInjector:
         }
 
     def open(self) -> None:
-        """The inner back end's; the schedule starts with the first read."""
+        """Open the inner back end; the schedule starts with the first read."""
         self.inner.open()
         self._start_s = math.nan
 
     def read(self, now_s: float) -> Sample:
-        """The inner reading, spoiled by the faults that are active."""
+        """Read the inner back end and apply the active faults."""
         inner, out = self.inner.read(now_s), self.sample
         if math.isnan(self._start_s):
             self._start_s = now_s
@@ -152,14 +153,7 @@ class FaultInjector:
                     self._held.pop((number, role), None)
                     self._late.pop((number, role), None)
             elif fault.kind == "swap":
-                a, b = fault.roles
-                for spoiled, true in (
-                    (out.value, inner.value),
-                    (out.time_s, inner.time_s),
-                    (out.fresh, inner.fresh),
-                    (out.status, inner.status),
-                ):
-                    spoiled[a], spoiled[b] = true[b], true[a]
+                self._swap(inner, *fault.roles)
             elif fault.kind != "stuck":
                 for role in fault.roles:
                     if inner.status[role] != ABSENT:
@@ -167,7 +161,7 @@ class FaultInjector:
         return out
 
     def write(self, drive: float, enable: bool) -> None:
-        """The command, unless a fault of the schedule says otherwise."""
+        """Send the command, changed by the active faults."""
         for fault in self.faults:
             if fault.at_s <= self._t < fault.until_s:
                 if fault.kind == "stuck":
@@ -177,27 +171,33 @@ class FaultInjector:
         self.inner.write(drive, enable)
 
     def check_pacing(self) -> None:
-        """The inner back end's."""
+        """Ask the inner back end."""
         self.inner.check_pacing()
 
     def wait_frame(self, due_ns: int, until_ns: int) -> None:
-        """The inner back end's: a fault spoils the reading, not the time."""
+        """Wait for the inner back end: a fault changes the reading, not its time."""
         self.inner.wait_frame(due_ns, until_ns)
 
     def close(self) -> None:
-        """The inner back end's."""
+        """Close the inner back end."""
         self.inner.close()
 
     def problem(self, role: str) -> str:
-        """The injected fault, or the inner back end's problem."""
+        """Name the injected fault, else the inner back end's problem."""
         for fault in self.faults:
             if ROLE[role] in fault.roles and fault.at_s <= self._t < fault.until_s:
                 return f"{role}: injected fault: {fault.kind}"
         return self.inner.problem(role)
 
     def counters(self) -> dict[str, int]:
-        """The inner back end's."""
+        """Return the inner back end's counters."""
         return self.inner.counters()
+
+    def _swap(self, inner: Sample, a: int, b: int) -> None:
+        out = self.sample
+        pairs = ((out.value, inner.value), (out.time_s, inner.time_s), (out.fresh, inner.fresh))
+        for changed, true in (*pairs, (out.status, inner.status)):
+            changed[a], changed[b] = true[b], true[a]
 
     def _hit(self, fault: Fault) -> bool:
         return fault.probability >= 1.0 or self._random.random() < fault.probability

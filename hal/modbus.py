@@ -1,10 +1,12 @@
-"""Modbus devices, TCP and RTU: the only module that knows pymodbus (which renames its interface in minor releases).
+"""Modbus devices, TCP and RTU.
 
-Ports: "tcp:host:port" or "rtu:/dev/serial/by-id/...". Channels are registers; neighbours are read in one block. A value
-of several words is put together by its word order (bytes inside a word are big-endian, by the protocol); sentinel
-numbers, such as an open thermocouple's, make the channel an ERROR while the others stay OK. A lost or damaged answer, or a
-device that is busy, leaves the last values standing. A block that is refused is read register by register, so that one
-illegal address takes no other along.
+No other module uses pymodbus, which renames its interface in minor releases.
+
+Ports: "tcp:host:port" or "rtu:/dev/serial/by-id/...". Channels are registers; neighbours are read in one
+block. The profile gives the word order of a value of several words; bytes inside a word are big-endian, by
+the protocol. Sentinel numbers, such as an open thermocouple's, make the channel an ERROR while the others
+stay OK. After a lost or damaged answer, or while the device is busy, the last values are kept. A refused
+block is read register by register, so that one illegal address does not cost its neighbours.
 """
 
 from __future__ import annotations
@@ -24,8 +26,9 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException
 
 from hal.backend import HardwareError, Sample
-from hal.devices import Device
-from hal.profile import FIELD_TYPES, Binding, Modbus, Register, register_hint
+from hal.binding import Binding, register_hint
+from hal.device import Device
+from hal.profile import FIELD_TYPES, Modbus, Register, typed
 from hal.serial_port import open_port
 from hal.wire import crc16
 
@@ -47,14 +50,17 @@ EXCEPTIONS = {
     ),
 }
 """Modbus exception codes: the text, and what to do."""
-BUSY, PASSING = (5, 6), (5, 6, 10, 11)  # asked again at once; never a statement on the channel itself
-REFUSED = (2, 3)  # a register of the block may be at fault: they are read one by one
+BUSY, PASSING = (5, 6), (5, 6, 10, 11)  # asked again at once; never an ERROR of the channel itself
+ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
+REFUSED = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)  # one register may be the cause: the block is read one by one
+FUNCTIONS = {"holding": 3, "input": 4}  # Modbus function code of a kind of register
+MIN_FRAME, SHOWN = 4, 12  # bytes: the shortest RTU frame; the first bytes of a bad answer in a message
 BUSY_TRIES, BUSY_PAUSE_S = 3, 0.02
-LOST_POLLS = 3  # without any answer, then the link is opened again
+LOST_POLLS = 3  # polls without any answer, after which the link is opened again
 
 
 class NoAnswer(Exception):
-    """A request was not answered, or not by what Modbus allows: lost, cut short, wrong checksum, another unit."""
+    """No valid answer to a request: lost, cut short, wrong checksum, another unit."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,9 @@ class Block:
 
 
 def plan_blocks(registers: Iterable[tuple[int, Register]], max_gap: int, max_block: int) -> list[Block]:
-    """The fewest requests for (number of the channel, register): neighbours of one kind share a block over gaps <= max_gap,
-    up to max_block registers."""
+    """Plan the fewest requests for (number of the channel, register).
+
+    Registers of one kind share a block of up to max_block registers over gaps <= max_gap."""
     blocks: list[Block] = []
     for i, r in sorted(registers, key=lambda item: (item[1].kind, item[1].address)):
         last = blocks[-1] if blocks else None
@@ -87,28 +94,27 @@ def plan_blocks(registers: Iterable[tuple[int, Register]], max_gap: int, max_blo
 
 
 def decode(words: Sequence[int], register: Register) -> float:
-    """The raw number in `words` (uint16, as the wire has them)."""
+    """Return the raw number in `words` (uint16, in the order of the wire)."""
     ordered = words if register.word_order == "big" else words[::-1]
-    return float(
-        struct.unpack(">" + FIELD_TYPES[register.type], struct.pack(f">{len(ordered)}H", *ordered))[0]
-    )
+    data = struct.pack(f">{len(ordered)}H", *ordered)
+    return float(struct.unpack(">" + FIELD_TYPES[register.type], data)[0])
 
 
 class ModbusDevice(Device):
-    """A register device, polled: `poll` reads every bound channel once and blocks up to the profile's timeout."""
+    """A register device; `poll` reads every bound channel and blocks up to the profile's timeout."""
 
     def __init__(self, binding: Binding) -> None:
         super().__init__(binding)
         self.counts["lost"] = 0
         self._client: Any = None
-        self._spec: Modbus = binding.profile.bus_spec
+        self._spec = typed(binding.profile.bus_spec, Modbus)
         self._plan()
         self._lost_polls = 0
-        self._heard = b""  # what came in answer to the last request
-        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what it would log, we raise
+        self._received = b""  # after the last request
+        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # our errors say the same
 
     def _plan(self) -> None:
-        registers = [b.channel.source for b in self.binding.bounds]
+        registers = [typed(b.channel.source, Register) for b in self.binding.bounds]
         self._blocks = plan_blocks(enumerate(registers), self._spec.max_gap, self._spec.max_block)
 
     def connect(self) -> None:
@@ -120,7 +126,7 @@ class ModbusDevice(Device):
             if tcp:
                 self._client = ModbusTcpClient(tcp[1].strip("[]"), port=int(tcp[2]), **common)
             elif port.startswith("rtu:"):
-                open_port(port[4:], line).close()  # its message is better, and it sets the latency
+                open_port(port[4:], line).close()  # for its error messages, and for the latency timer
                 self._client = ModbusSerialClient(
                     port[4:], baudrate=line.baud, parity=line.parity, stopbits=line.stop_bits, **common
                 )
@@ -142,8 +148,11 @@ class ModbusDevice(Device):
             client.close()
 
     def poll(self, sample: Sample) -> None:
-        """Read every block. A lost answer leaves the last values standing and ends this poll: its late answer must not be
-        taken for the next block's. Raises HardwareError when the link is gone or LOST_POLLS in a row had no answer."""
+        """Read every block.
+
+        A lost answer ends this poll, because a late answer must not be taken for the next block's; the last
+        values are kept. Raises HardwareError when the link is gone or LOST_POLLS polls in a row had no
+        answer."""
         for block in list(self._blocks):
             try:
                 self._read(sample, block)
@@ -155,12 +164,12 @@ class ModbusDevice(Device):
                     self.miss(i, f"{self._named(block)}: {e}")
                 if self._lost_polls >= LOST_POLLS:
                     raise HardwareError(f"{self.binding.port}: {self._named(block)}: {e}") from None
-                at = self._blocks.index(block) + 1  # the next poll starts behind it
+                at = self._blocks.index(block) + 1  # the next poll starts after this block
                 self._blocks = self._blocks[at:] + self._blocks[:at]
                 return
 
     def silence(self) -> str:
-        """Its poller says why as soon as it can."""
+        """Say that the poller has posted no reading and no problem yet."""
         return "its poller has posted nothing"
 
     def _read(self, sample: Sample, block: Block) -> None:
@@ -173,8 +182,9 @@ class ModbusDevice(Device):
             self._refused(sample, block, answer)
 
     def _read_singly(self, sample: Sample, block: Block) -> None:
-        """Read a refused block's registers one by one, and keep apart from now on what is refused: a single register, or
-        the gaps between them."""
+        """Read a refused block's registers one by one.
+
+        From now on ask for the refused registers apart, and for the others without the gaps between them."""
         refused: list[Block] = []
         for member in block.members:
             single = Block(block.kind, member[1].address, member[1].words, (member,))
@@ -190,29 +200,31 @@ class ModbusDevice(Device):
         self._blocks[at : at + 1] = [*good, *refused]
 
     def _request(self, block: Block) -> list[int] | int:
-        """The words of a block, or the number of the exception. Raises NoAnswer, or HardwareError when the link is gone."""
+        """Return the words of a block, or the code of the exception.
+
+        Raises NoAnswer, or HardwareError when the link is gone."""
         client, code = self._client, 0
         read = client.read_input_registers if block.kind == "input" else client.read_holding_registers
         for _ in range(BUSY_TRIES):
-            self._heard = b""
+            self._received = b""
             try:
                 answer = read(block.address, count=block.count, device_id=self.binding.address)
             except (ConnectionException, OSError, serial.SerialException) as e:
                 self.counts["lost"] += 1
                 raise HardwareError(f"{self.binding.port}: the connection is gone ({e})") from None
-            except Exception:  # what comes from a device may be anything to the library
-                raise NoAnswer(self._what_came()) from None
+            except Exception:  # foreign bytes may raise anything in the library
+                raise NoAnswer(self._bad_answer()) from None
             if not answer.isError():
                 break
             self.counts["errors"] += 1
-            code = getattr(answer, "exception_code", 0)
+            code = int(getattr(answer, "exception_code", 0))
             if code not in BUSY:
                 return code
             time.sleep(BUSY_PAUSE_S)
         else:
             return code
         words = getattr(answer, "registers", None)
-        if answer.function_code != (4 if block.kind == "input" else 3) or words is None:
+        if answer.function_code != FUNCTIONS[block.kind] or words is None:
             raise NoAnswer(
                 f"function {answer.function_code} was answered, {block.kind} registers were asked for"
             )
@@ -223,19 +235,20 @@ class ModbusDevice(Device):
 
     def _trace(self, sending: bool, data: bytes) -> bytes:
         if not sending:
-            self._heard = data
+            self._received = data
         return data
 
-    def _what_came(self) -> str:
-        heard, unit = self._heard, self.binding.address
-        if not heard:
-            return f"no answer within {self._spec.timeout_s:g} s: check power, wiring, address {unit} and the line's settings"
-        text = f"no valid answer: {len(heard)} bytes came ({heard[:12].hex(' ')}{' ..' if len(heard) > 12 else ''})"
+    def _bad_answer(self) -> str:
+        data, unit, timeout_s = self._received, self.binding.address, self._spec.timeout_s
+        if not data:
+            return f"no answer within {timeout_s:g} s: check power, wiring, address {unit} and the line's settings"
+        more = " .." if len(data) > SHOWN else ""
+        text = f"no valid answer: {len(data)} bytes came ({data[:SHOWN].hex(' ')}{more})"
         if not self.binding.port.startswith("rtu:"):
             return f"{text}: cut short, or no Modbus TCP"
-        if len(heard) < 4 or crc16("modbus", heard[:-2]) != int.from_bytes(heard[-2:], "little"):
+        if len(data) < MIN_FRAME or crc16("modbus", data[:-2]) != int.from_bytes(data[-2:], "little"):
             return f"{text} with a wrong CRC, or cut short: check the baud rate, parity, termination and other masters"
-        return f"{text} of unit {heard[0]}, unit {unit} was asked: check 'address'"
+        return f"{text} of unit {data[0]}, unit {unit} was asked: check 'address'"
 
     def _store(self, sample: Sample, block: Block, words: list[int]) -> None:
         now_s = time.monotonic()
@@ -248,14 +261,12 @@ class ModbusDevice(Device):
                 self.put(sample, i, raw, now_s)
 
     def _refused(self, sample: Sample, block: Block, code: int) -> None:
-        """An exception was answered. It is the channel's ERROR once it has lasted as long as a reading may be old."""
+        """Note the exception of an answer; it becomes the channel's ERROR when the last reading is stale."""
         name, remedy = EXCEPTIONS.get(code, ("unknown", "see the device's manual"))
         now_s = time.monotonic()
         for i, register in block.members:
-            hint = register_hint(register.address) if code == 2 else ""
-            text = f"{self._named(block)}: exception {code} ({name}): {remedy}" + (
-                f"; {hint}" if hint else ""
-            )
+            hint = register_hint(register.address) if code == ILLEGAL_ADDRESS else ""
+            text = f"{self._named(block)}: exception {code} ({name}): {remedy}{'; ' if hint else ''}{hint}"
             stale_s = self.binding.bounds[i].channel.stale_after_s
             if code not in PASSING and now_s - sample.time_s[self.roles[i]] > stale_s:
                 self.fail(sample, i, text)

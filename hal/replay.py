@@ -1,8 +1,8 @@
-"""A recording as hardware: its samples arrive when the clock reaches their times; commands go nowhere.
+"""A recording as hardware: its samples arrive when the clock reaches their times; commands are ignored.
 
 Columns play the role of their own name, or what `hal.roles` says: `column: role`, with its unit in brackets
-where it differs from the role's, as `q: position_um [m]`. A missing cell is a sensor that had nothing new. After the
-last row every channel is stale and `finished` is True.
+where it differs from the role's, as `q: position_um [m]`. A missing cell means: no new reading of that
+sensor. After the last row every channel is stale and `finished` is True.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from hal.backend import OK, ROLE, ROLES, STALE, Sample
-from hal.profile import role_units
+from hal.units import role_units
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
+from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, suggest
 
-STALE_PERIODS = 5  # a channel is stale after so many of its usual periods without a sample
+STALE_PERIODS = 5  # a channel is stale after this many of its usual (median) periods without a reading
 
 
-def replay_backend(settings: Any) -> ReplayBackend:
-    """Back end `replay` of `settings`. Raises InputError: no such file, no column that plays a role."""
+def replay_backend(settings: Settings) -> ReplayBackend:
+    """Make the back end `replay`. Raises InputError: no such file, no column that plays a role."""
     return ReplayBackend(read_table(Path(settings.path).parent / settings.hal.recording), settings.hal.roles)
 
 
@@ -77,13 +77,13 @@ class ReplayBackend:
         return role, *units[match[2]]
 
     def open(self) -> None:
-        """From the first row."""
+        """Start with the first row."""
         self._next, self._start_s, self.finished = 0, math.nan, False
         for role, _, _ in self._channels:
             self.sample.status[role] = STALE
 
     def read(self, now_s: float) -> Sample:
-        """The samples up to `now_s`; the first read takes the first row."""
+        """Take the readings up to `now_s`; the first read takes the first row."""
         sample = self.sample
         sample.fresh[:] = False
         if math.isnan(self._start_s):
@@ -106,13 +106,13 @@ class ReplayBackend:
         return sample
 
     def write(self, drive: float, enable: bool) -> None:
-        """A recording takes no command."""
+        """Ignore the command: a recording takes none."""
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there is nothing to release."""
 
     def problem(self, role: str) -> str:
-        """Why a channel has nothing."""
+        """Say why a channel has no new reading."""
         status = self.sample.status[ROLE[role]]
         if status == OK:
             return ""
@@ -121,5 +121,5 @@ class ReplayBackend:
         return f"{role}: not in the recording"
 
     def counters(self) -> dict[str, int]:
-        """Rows played."""
+        """Return the number of rows played."""
         return {"replay.rows": self._next}

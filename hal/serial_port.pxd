@@ -1,10 +1,10 @@
 # C types for serial_port.py, which runs in every tick; see there.
 cimport cython
-from hal.devices cimport Device
+from hal.device cimport Device
 from hal.wire cimport Framer
 
 cdef class SerialDevice(Device):
-    cdef public object _port, _lines
+    cdef public object _port, _lines, _text, _fields
     cdef public str _why
     cdef public int _fd, _flags, _unread
     cdef public unsigned long long _bad_flags

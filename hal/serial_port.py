@@ -1,8 +1,8 @@
 # cython: annotation_typing=False, cdivision=True
 """Serial devices: framed bytes with a CRC, and lines of text.
 
-pyserial opens and configures the line (exclusive, so that a second program is refused); the tick then reads and writes
-the bare descriptor without waiting. Frames are cut out of the bytes by hal.wire.Framer.
+pyserial opens and configures the line, exclusively, so that a second program is refused. The tick then reads
+and writes the bare descriptor without waiting. hal.wire.Framer finds the frames in the bytes.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ import os
 import termios
 from array import array
 from pathlib import Path
-from typing import Any
 
 import serial
 
 from hal.backend import HardwareError, Sample
-from hal.devices import Device
-from hal.profile import BinaryFrame, Binding, LineSettings, TextField, TextLine
+from hal.binding import Binding
+from hal.device import Device
+from hal.profile import BinaryFrame, LineSettings, TextField, TextLine, typed
 from hal.text_number import cut_short, number, shown, why_no_match, why_no_number
 from hal.wire import Framer, read_available, wait_readable
 
 MAX_LINE = 1024  # a text line longer than this is garbage
+_CHARACTERS = 6  # place of the special characters in termios' list
 
 
 class LineReader:
@@ -35,7 +36,7 @@ class LineReader:
         self.bad = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Complete lines (without their CR, LF), in order."""
+        """Return the lines that `data` completes, in order, without CR and LF."""
         self._buffer += data
         *lines, rest = bytes(self._buffer).replace(b"\r", b"\n").split(b"\n")
         if lines and self._dropping:
@@ -48,7 +49,7 @@ class LineReader:
 
     @property
     def pending(self) -> int:
-        """Bytes of a line that has no end yet."""
+        """Count the bytes of a line that has no end yet."""
         return MAX_LINE if self._dropping else len(self._buffer)
 
     def reset(self) -> None:
@@ -58,7 +59,7 @@ class LineReader:
 
 
 def open_port(path: str, line: LineSettings) -> serial.Serial:
-    """Open and configure a serial port exclusively, non-blocking. Raises HardwareError with what to do."""
+    """Open and configure a serial port exclusively, non-blocking. Raises HardwareError with the remedy."""
     try:
         port = serial.Serial(
             path,
@@ -83,38 +84,38 @@ def open_port(path: str, line: LineSettings) -> serial.Serial:
         set_latency_timer(path, line.latency_timer_ms)
     try:
         settings = termios.tcgetattr(port.fileno())
-        settings[6][termios.VMIN] = 1  # so that 'nothing yet' (EAGAIN) differs from 'gone' (no bytes)
+        settings[_CHARACTERS][termios.VMIN] = 1  # 'nothing yet' is EAGAIN, so that no bytes mean 'gone'
         termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
         termios.tcflush(port.fileno(), termios.TCIOFLUSH)
         os.set_blocking(port.fileno(), False)
-    except (OSError, termios.error) as e:  # pulled out meanwhile; termios.error is no OSError
+    except (OSError, termios.error) as e:  # unplugged meanwhile; termios.error is no OSError
         port.close()
         raise HardwareError(f"{path}: gone while it was opened ({e})") from None
     return port
 
 
 def set_latency_timer(path: str, ms: int, sys_root: str = "/sys") -> bool:
-    """Set an FTDI adapter's latency timer (it holds bytes back for up to 16 ms by default). False where the port has
-    none or the system refuses."""
-    timer = Path(
-        sys_root, "bus/usb-serial/devices", os.path.basename(os.path.realpath(path)), "latency_timer"
-    )
+    """Set an FTDI adapter's latency timer; by default it holds bytes back for up to 16 ms.
+
+    False when the port has no such timer or the system refuses."""
     try:
-        timer.write_text(str(ms))
+        _latency_timer(path, sys_root).write_text(str(ms))
         return True
     except OSError:
         return False
 
 
 def latency_timer_ms(path: str, sys_root: str = "/sys") -> int | None:
-    """The FTDI latency timer in ms, or None where the port has none (for doctor)."""
-    timer = Path(
-        sys_root, "bus/usb-serial/devices", os.path.basename(os.path.realpath(path)), "latency_timer"
-    )
+    """Return the FTDI latency timer in ms, None when the port has no such timer (for doctor)."""
     try:
-        return int(timer.read_text())
+        return int(_latency_timer(path, sys_root).read_text())
     except (OSError, ValueError):
         return None
+
+
+def _latency_timer(path: str, sys_root: str) -> Path:
+    adapter = os.path.basename(os.path.realpath(path))
+    return Path(sys_root, "bus/usb-serial/devices", adapter, "latency_timer")
 
 
 class SerialDevice(Device):
@@ -125,18 +126,19 @@ class SerialDevice(Device):
         self._port: serial.Serial | None = None
         self._fd = -1
         spec = binding.profile.bus_spec
-        self._framer = Framer(spec) if isinstance(spec, BinaryFrame) else None
+        self._framer: Framer | None = None
         self._lines = LineReader()
         self._due_s, self._waited = 0.0, False
-        self._unread, self._why = (
-            0,
-            "",
-        )  # lines since the last reading that gave none, and why the last of them
-        if self._framer:
+        self._unread, self._why = 0, ""  # lines since the last reading, and why the last of them gave none
+        if isinstance(spec, BinaryFrame):
+            self._framer = Framer(spec)
             names = [n for n, _ in spec.fields]
-            self._index = array("i", [names.index(b.channel.source) for b in binding.bounds])
+            self._index = array("i", [names.index(typed(b.channel.source, str)) for b in binding.bounds])
             self._flags = names.index(spec.invalid[0]) if spec.invalid else -1
             self._bad_flags: int = spec.invalid[1] if spec.invalid else 0
+        else:
+            self._text = typed(spec, TextLine)
+            self._fields = [typed(b.channel.source, TextField) for b in binding.bounds]
 
     def connect(self) -> None:
         """Open the port; frames in its buffer are dropped."""
@@ -155,17 +157,19 @@ class SerialDevice(Device):
                 port.close()
 
     def wait_frame(self, until_ns: int) -> bool:
-        """Wait for a whole frame, at most until `until_ns` (monotonic clock); whether one came. `read` then stores it."""
-        framer: Any = self._framer
+        """Wait for a whole frame, at most until `until_ns` (monotonic clock); True when one came.
+
+        The next `read` stores it."""
+        framer = self._framer
         while not self._waited:
-            if framer.read(self._fd):
+            if framer is not None and framer.read(self._fd):
                 self._waited = True
             elif not wait_readable(self._fd, until_ns):
                 return False
         return True
 
     def read(self, sample: Sample, now_s: float) -> None:
-        """Newest frame or line into `sample`."""
+        """Put the newest frame or line into `sample`."""
         framer = self._framer
         if framer is None:
             self._take_lines(sample, read_available(self._fd), now_s)
@@ -179,40 +183,42 @@ class SerialDevice(Device):
                     self.put(sample, i, framer.number(self._index[i]), now_s)
 
     def counters(self) -> dict[str, int]:
-        """Frames, wrong frames, gaps of the sequence, reconnections."""
+        """Return frames, errors (bad frames), lost (gaps of the sequence), reconnections."""
         if self._framer is not None:
             framer = self._framer
             self.counts.update(frames=framer.frames, errors=framer.bad, lost=framer.lost)
         return self.counts
 
     def silence(self) -> str:
-        """What arrives instead of a reading."""
-        framer, line = self._framer, self.binding.profile.line
+        """Say what arrives instead of a reading."""
+        framer, baud = self._framer, self.binding.profile.line.baud
         if framer is None:
             if self._unread:
                 return f"{self._unread} lines gave no reading; {self._why}"
             if self._lines.pending:
-                return f"{self._lines.pending} bytes came and no line end (CR or LF): check baud {line.baud} and parity"
+                return f"{self._lines.pending} bytes came and no line end (CR or LF): check baud {baud} and parity"
             return super().silence()
         if not framer.quiet_bytes:
             return super().silence()
         came = f"{framer.quiet_bytes} bytes came"
         if framer.quiet_sums > framer.quiet_lengths:
-            return f"{came}, {framer.quiet_sums} frames with a wrong CRC: check 'crc', 'crc_endian', 'fields', baud {line.baud}"
+            return (
+                f"{came}, {framer.quiet_sums} frames with a wrong CRC: "
+                f"check 'crc', 'crc_endian', 'fields', baud {baud}"
+            )
         if framer.quiet_lengths:
             return (
                 f"{came}, {framer.quiet_lengths} frames with another length byte than {framer.spec.payload.size}: "
-                f"check 'length', 'fields' and baud {line.baud}"
+                f"check 'length', 'fields' and baud {baud}"
             )
-        return f"{came} without a whole frame that begins with {framer.spec.sync.hex(' ')}: check 'sync' and baud {line.baud}"
+        sync = framer.spec.sync.hex(" ")
+        return f"{came} without a whole frame that begins with {sync}: check 'sync' and baud {baud}"
 
     def _take_lines(self, sample: Sample, data: bytes, now_s: float) -> None:
-        spec: TextLine = self.binding.profile.bus_spec
+        spec = self._text
         if spec.request and now_s >= self._due_s:
             self._due_s = now_s + 1.0 / spec.request_hz
-            with contextlib.suppress(
-                BlockingIOError
-            ):  # the line takes nothing now: ask again at the next due time
+            with contextlib.suppress(BlockingIOError):  # the line is full: ask again at the next due time
                 os.write(self._fd, spec.request)
         for raw in self._lines.feed(data) if data else ():
             line = raw.decode("ascii", "replace")
@@ -225,14 +231,15 @@ class SerialDevice(Device):
                 self._unread = 0
 
     def _take_line(self, sample: Sample, line: str, now_s: float) -> str:
-        """Store the readings of a line; why it gave none, or ''. A line in which one number cannot be read gives none at all."""
-        spec: TextLine = self.binding.profile.bus_spec
+        """Store the readings of a line; return '', or the reason when it gave none.
+
+        A line with one number that cannot be read gives no reading at all."""
+        spec = self._text
         match = spec.pattern.match(line)
         if match is None:
             return why_no_match(line, spec.pattern)
         values: list[tuple[int, float]] = []
-        for i, bound in enumerate(self.binding.bounds):
-            field: TextField = bound.channel.source
+        for i, field in enumerate(self._fields):
             text = match[field.group]
             if text is None:  # a reading of another kind of line
                 continue
@@ -240,7 +247,10 @@ class SerialDevice(Device):
             if value is None:
                 return why_no_number(text, line, field.base, spec.decimal)
             if cut_short(line, match, field.group):
-                return f"received {shown(line)}: the number goes on behind {shown(text)}, where the pattern ends: end it with $"
+                return (
+                    f"received {shown(line)}: the number goes on behind {shown(text)}, where the pattern ends: "
+                    "end it with $"
+                )
             values.append((i, value))
         for i, value in values:
             self.put(sample, i, value, now_s)

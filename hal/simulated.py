@@ -1,21 +1,21 @@
 """The simulated rig: a plant file as hardware, deterministic, at any speed.
 
-The plant advances in periods of the loop with its drive held. A sensor reads the plant's output plus its noise, rounded
-to its resolution (both from the plant file), at its own rate: the encoders every period, the slow ones every
-`sensor_period_s`. The same seed and the same commands at the same times give the same bits.
+The plant advances in periods of the loop, with the command held. A sensor reads the plant's output plus its
+noise, rounded to its resolution (both from the plant file), at its own rate: the encoders every period, the
+slow ones every `sensor_period_s`. The same seed and the same commands at the same times give the same bits.
 
-The plant that plays the hardware may differ from the one that the compensator was built from (`hal.truth`): that is how
-a left-out effect is shown. Outputs play the role of their own name, or the one that `hal.roles` gives them. The plant's
-other inputs (the chamber's air) follow `hal.inputs`: mean + swing * sin(2 pi t / period_s).
+The plant that plays the hardware (`hal.truth`) may differ from the one that the compensator was built from,
+to show an effect that the model leaves out. Outputs play the role of their own name, or the one that
+`hal.roles` gives them. The plant's other inputs (the chamber's air) follow `hal.inputs`: mean + swing * sin(2
+pi t / period_s).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,11 +24,10 @@ from thermoctl.plant import load
 from thermoctl.plant.language import SensorNoise
 from thermoctl.plant.sensor import SlowError
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 
-MAX_CATCH_UP = (
-    1000  # periods in one read; a clock that jumps further (suspend) moves the plant's time instead
-)
+MAX_CATCH_UP = 1000  # periods in one read; when the clock jumps further (suspend), the plant skips that time
 SLOWEST_S = 3600.0  # longest time constant of a simulated 1/f error: below 1/h it is part of the offset
 _STATE = ROLE["amplifier_state"]
 EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
@@ -36,7 +35,7 @@ EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
 
 @dataclass(frozen=True)
 class Surrounding:
-    """A plant input that nobody commands, and the sensor that measures it."""
+    """A plant input that is not commanded, and the sensor that measures it."""
 
     mean: float
     swing: float = 0.0
@@ -45,12 +44,12 @@ class Surrounding:
     resolution: float = 0.0
 
     def at(self, t: float) -> float:
-        """Its value t seconds after the start."""
+        """Return the value t seconds after the start."""
         return self.mean + self.swing * math.sin(2 * math.pi * t / self.period_s)
 
 
 def surroundings(node: Node | None) -> dict[str, Surrounding]:
-    """`hal.inputs`: name -> {mean, swing, period_s, noise, resolution}. Raises InputError."""
+    """Read `hal.inputs`: name -> {mean, swing, period_s, noise, resolution}. Raises InputError."""
     if node is None:
         return {}
     found = {}
@@ -68,8 +67,9 @@ def surroundings(node: Node | None) -> dict[str, Surrounding]:
 
 
 class PlantRig:
-    """A plant that lives: `step` advances it, `sense` reads a sensor. Shared by the simulated back end and the virtual
-    rig at the wire."""
+    """A running plant: `step` advances it, `sense` reads a sensor.
+
+    Used by the simulated back end and by the virtual rig."""
 
     def __init__(
         self,
@@ -80,8 +80,10 @@ class PlantRig:
         roles: Mapping[str, str],
         seed: int,
     ) -> None:
-        """surroundings: the plant's inputs other than the drive; roles: output -> role where they differ in name.
-        Raises InputError where the plant and these do not fit."""
+        """Compile the plant and connect its inputs and outputs. Raises InputError when they do not fit.
+
+        surroundings: the plant's inputs other than the command; roles: output -> role where their names
+        differ."""
         plant = load(path)
         model = compile_plant(plant, ())
         if drive_input not in model.inputs:
@@ -106,23 +108,7 @@ class PlantRig:
         self.stepper = model.stepper(period_s, self.u)
         self._draw = _draws(np.random.default_rng(seed)).__next__
         self.y = self.stepper.step(self.u)
-        self.index: dict[str, int] = {}  # role -> output; after the outputs come the surroundings
-        for i, name in enumerate(model.outputs):
-            role = roles.get(name, name)
-            if role in ROLES:
-                self.index[role] = i
-            elif name in roles:
-                raise InputError(f"{path}: hal.roles: '{role}' is no role{suggest(role, ROLES)}")
-        for name in roles:
-            if name not in model.outputs:
-                raise InputError(
-                    f"{path}: hal.roles: the plant has no output '{name}'{suggest(name, model.outputs)}"
-                )
-        if "position_um" not in self.index:
-            raise InputError(
-                f"{path}: no output plays position_um; name one in hal.roles "
-                f"(outputs: {', '.join(model.outputs)})"
-            )
+        self.index = _roles_of_outputs(path, model.outputs, roles)  # after the outputs come the surroundings
         outputs = [plant.outputs[n] for n in model.outputs]
         self._noise = [o.noise.white if isinstance(o.noise, SensorNoise) else o.noise or 0.0 for o in outputs]
         self._noise += [s.noise for _, s in self._surroundings]
@@ -147,11 +133,11 @@ class PlantRig:
         self.y = self.stepper.step(self.u)
 
     def sense(self, role: str) -> float:
-        """What the sensor in this role reads now: output + noise, rounded to its resolution."""
+        """Return the reading of the sensor in this role: output + noise, rounded to its resolution."""
         return self.read_sensor(self.index[role])
 
     def true(self, role: str) -> float:
-        """What it would read without noise and steps."""
+        """Return the true value, without noise and rounding."""
         return self._value(self.index[role])
 
     def _value(self, i: int) -> float:
@@ -159,11 +145,11 @@ class PlantRig:
         return float(self.y[i] if i < n else self.u[self._surroundings[i - n][0]])
 
     def read_sensor(self, i: int) -> float:
-        """`sense` by number (`index[role]`)."""
+        """Return the present reading of sensor number i (`index[role]`)."""
         return self.measured(i, self._value(i))
 
     def measured(self, i: int, value: float) -> float:
-        """What sensor number i makes of a true value: noise added, rounded to its resolution."""
+        """Return sensor i's reading of a true value: noise added, rounded to its resolution."""
         if self._noise[i]:
             value += self._noise[i] * self._draw()
         if i in self._slow:
@@ -172,14 +158,33 @@ class PlantRig:
         return round(value / step) * step if step else value
 
 
+def _roles_of_outputs(path: str | Path, outputs: Sequence[str], roles: Mapping[str, str]) -> dict[str, int]:
+    """Return role -> number of the plant's output. Raises InputError."""
+    index = {}
+    for i, name in enumerate(outputs):
+        role = roles.get(name, name)
+        if role in ROLES:
+            index[role] = i
+        elif name in roles:
+            raise InputError(f"{path}: hal.roles: '{role}' is no role{suggest(role, ROLES)}")
+    for name in roles:
+        if name not in outputs:
+            raise InputError(f"{path}: hal.roles: the plant has no output '{name}'{suggest(name, outputs)}")
+    if "position_um" not in index:
+        raise InputError(
+            f"{path}: no output plays position_um; name one in hal.roles (outputs: {', '.join(outputs)})"
+        )
+    return index
+
+
 def _draws(random: np.random.Generator) -> Iterator[float]:
-    """Standard normal numbers one by one, drawn in blocks: the same numbers, a third of the time."""
+    """Draw standard normal numbers, in blocks: the same numbers in a third of the time."""
     while True:
         yield from random.standard_normal(4096).tolist()
 
 
-def make_rig(settings: Any) -> PlantRig:
-    """The plant that `settings.hal` names as the hardware's truth. Paths are relative to the config file."""
+def make_rig(settings: Settings) -> PlantRig:
+    """Make the plant that plays the hardware (`hal.truth`, else `hal.plant`). Raises InputError."""
     hal = settings.hal
     return PlantRig(
         Path(settings.path).parent / (hal.truth or hal.plant),
@@ -191,8 +196,8 @@ def make_rig(settings: Any) -> PlantRig:
     )
 
 
-def simulated_backend(settings: Any) -> SimulatedBackend:
-    """Back end `simulated` of `settings`."""
+def simulated_backend(settings: Settings) -> SimulatedBackend:
+    """Make the back end `simulated`. Raises InputError."""
     return SimulatedBackend(make_rig(settings), settings.loop.period_s, settings.hal.sensor_period_s)
 
 
@@ -212,7 +217,7 @@ class SimulatedBackend:
         self._shown = -1
 
     def open(self) -> None:
-        """Nothing to open; channels wait for the first read."""
+        """Mark all channels as stale until the first read."""
         self.sample.status[list(ROLE[r] for r in self.rig.index)] = STALE
 
     def read(self, now_s: float) -> Sample:
@@ -236,7 +241,7 @@ class SimulatedBackend:
         return sample
 
     def _take(self, channels: list[tuple[int, int]], roles: np.ndarray, now_s: float) -> None:
-        """New readings of these sensors; `roles` holds the amplifier's two words, too, which come with the fast ones."""
+        """Take new readings of these sensors; `roles` may also hold the amplifier's state and fault."""
         sample, read = self.sample, self.rig.read_sensor
         sample.fresh[roles], sample.time_s[roles], sample.status[roles] = True, now_s, OK
         for role, i in channels:
@@ -247,25 +252,22 @@ class SimulatedBackend:
                 sample.status[role] = ERROR
 
     def write(self, drive: float, enable: bool) -> None:
-        """Hold `drive` from now on; not enabled or not finite: zero."""
+        """Hold `drive` from now on; zero when it is not enabled or not finite."""
         self._enabled = bool(enable and math.isfinite(drive))
         self._drive = float(drive) if self._enabled else 0.0
 
     def close(self) -> None:
-        """The drive goes to zero."""
+        """Set the command to zero."""
         self.write(0.0, False)
 
     def problem(self, role: str) -> str:
-        """Why a simulated channel is not OK."""
+        """Say why a simulated channel is not OK."""
         status = self.sample.status[ROLE[role]]
         if status == OK:
             return ""
-        return (
-            f"{role}: the plant's output is not finite"
-            if status == ERROR
-            else f"{role}: not an output of the plant"
-        )
+        problem = "the plant's output is not finite" if status == ERROR else "not an output of the plant"
+        return f"{role}: {problem}"
 
     def counters(self) -> dict[str, int]:
-        """Periods simulated."""
+        """Return the number of periods simulated."""
         return {"simulated.periods": self._steps}

@@ -1,7 +1,7 @@
 """Numbers in lines of text: which base and which decimal sign, and why a line or a number was not taken.
 
-Text that another reading would also fit is not guessed: "+78" is 78 or 120, "1,5" is 1.5 or two numbers. The profile says
-which, and what does not fit it is reported with the line that was received.
+Ambiguous text is never guessed: "+78" is 78 or 120, "1,5" is 1.5 or two numbers. The profile decides. Text
+that does not fit the profile is reported with the received line.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ _NUMBER = {
     (16, "."): re.compile(r"([-+]?) *(?:0[xX])?([0-9A-Fa-f]{1,16})$", re.ASCII),
 }
 _NUMBER[16, ","] = _NUMBER[16, "."]
-_GOES_ON = re.compile(r"[.,]?\d|[eE][-+]?\d", re.ASCII)  # the number in the line is longer than its group
+_GOES_ON = re.compile(r"[.,]?\d|[eE][-+]?\d", re.ASCII)  # the rest of a number that is longer than its group
 _HEX = [sign + zeros + "A" for sign in ("", "+", "-", " ") for zeros in ("0" * n for n in range(16))]
 
 
 def number(text: str, base: int, decimal: str) -> float | None:
-    """The number in `text`, blanks allowed around it and after its sign; None when it is none."""
+    """Return the number in `text`, or None; blanks may stand around it and after its sign."""
     found = _NUMBER[base, decimal].match(text.strip())
     if found is None:
         return None
@@ -31,12 +31,12 @@ def number(text: str, base: int, decimal: str) -> float | None:
 
 
 def cut_short(line: str, match: re.Match[str], group: str) -> bool:
-    """True when the line's number goes on where the pattern's last group ends: its first digits alone would be wrong."""
+    """Return whether the line's number is longer than the pattern's last group."""
     return match.end(group) == match.end() and _GOES_ON.match(line, match.end()) is not None
 
 
 def takes_letters(pattern: re.Pattern[str], group: str) -> bool:
-    """True when `group` also matches numbers with the letters A to F, so that its base must be said."""
+    """Return whether `group` also matches the letters A to F, so that the profile must say its base."""
     start = pattern.pattern.index(f"(?P<{group}>")
     at, depth, in_class = start, 0, False
     text = pattern.pattern
@@ -56,13 +56,13 @@ def takes_letters(pattern: re.Pattern[str], group: str) -> bool:
         at += 1
     try:
         alone = re.compile(text[start : at + 1], re.ASCII)
-    except re.error:  # it refers to other groups: nothing can be said
+    except re.error:  # the group refers to other groups: undecidable here
         return False
     return any(alone.fullmatch(sample) for sample in _HEX)
 
 
 def why_no_match(line: str, pattern: re.Pattern[str]) -> str:
-    """One line: what was received, and why it did not match as far as that can be said."""
+    """Return one line: the received text, and why it does not match, if that can be found out."""
     if "," in line and pattern.match(line.replace(",", ".")):
         hint = "it would match with a decimal point: let the group take ',' and say decimal: ',' in 'text'"
     elif pattern.match(re.sub(r"([-+]) +(?=[\d.,])", r"\1", line)):
@@ -77,7 +77,7 @@ def why_no_match(line: str, pattern: re.Pattern[str]) -> str:
 
 
 def why_no_number(text: str, line: str, base: int, decimal: str) -> str:
-    """One line: what stood where a number was expected."""
+    """Return one line: the received text, and the text that is no number."""
     kind = "hexadecimal" if base == 16 else f"decimal (sign of decimals '{decimal}')"
     other = [
         f"{key}: {value}"
@@ -93,5 +93,5 @@ def why_no_number(text: str, line: str, base: int, decimal: str) -> str:
 
 
 def shown(line: str) -> str:
-    """A received line for a message: quoted, unprintable characters escaped, cut."""
+    """Return a received line for a message: quoted, unprintable characters escaped, cut to 60 characters."""
     return repr(line if len(line) <= _SHOWN else line[:_SHOWN] + "...")

@@ -1,11 +1,13 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-"""The bytes of a tick: frames with a CRC, Lawicel CAN in ASCII, checked readings; compiled, because a tick meets them cold.
+"""The bytes of a tick: frames with a CRC, Lawicel CAN in ASCII, checked readings.
+
+Compiled, because interpreted code is slow in a tick: it runs once a period, with cold caches.
 
 A binary frame on the wire:   sync (1..8 bytes) | length (uint8, optional) | payload | CRC-16 over all that follows sync (optional)
 
-Framing resynchronises after garbage: a frame whose length or CRC is wrong costs its first byte, and the search goes on
-from the next one, so a true frame behind a false sync is never lost. Nothing here waits, and what a sender can fill is
-bounded: a frame by its profile, a Lawicel message by 64 bytes.
+Framing resynchronises after garbage: a frame whose length or CRC is wrong costs its first byte, and the
+search goes on from the next one, so a true frame behind a false sync is never lost. Nothing here waits, and
+what a sender can fill is bounded: a frame by its profile, a Lawicel message by 64 bytes.
 """
 import errno
 import os
@@ -72,8 +74,10 @@ def crc16(str kind, const uint8_t[::1] data) -> int:
 
 
 cpdef bint wait_readable(int fd, int64_t until_ns) except -1:
-    """Wait until a descriptor has something to read or CLOCK_MONOTONIC reaches `until_ns`; whether it has. False also after
-    a signal, so that Python's handlers run."""
+    """Wait until a descriptor is readable or CLOCK_MONOTONIC reaches `until_ns`; return whether it is
+    readable.
+
+    Returns False after a signal, so that Python's handlers run."""
     cdef timespec now, left
     cdef pollfd what
     cdef int64_t ns
@@ -88,7 +92,7 @@ cpdef bint wait_readable(int fd, int64_t until_ns) except -1:
 
 
 cdef int _read(int fd, uint8_t *to, int size) except -1:
-    """Bytes that have arrived, 0 when none has. Raises OSError when the other end is gone.
+    """Return the number of bytes read, 0 when none has arrived. Raises OSError when the other end is gone.
 
     A terminal is asked first: to read an empty one waits, even without blocking, for the kernel's worker that moves
     bytes to it. On a busy machine that worker comes tens of milliseconds late, and the tick with it.
@@ -107,16 +111,17 @@ cdef int _read(int fd, uint8_t *to, int size) except -1:
 
 
 def read_available(int fd) -> bytes:
-    """What has arrived, without waiting; b'' when nothing has. Raises OSError when the other end is gone."""
+    """Return the bytes that have arrived, without waiting. Raises OSError when the other end is gone."""
     cdef uint8_t[MAX_READ] data
     cdef int got = _read(fd, data, MAX_READ)
     return data[:got]
 
 
 cdef class Framer:
-    """Bytes in, frames out. `newest` is the payload tuple of the last good frame (() before the first); `frames`, `bad`
-    (wrong lengths and CRCs), `skipped` (bytes outside frames) and `lost` (gaps of the sequence counter) count. The `quiet_`
-    counters start again at every good frame: bytes that came, wrong CRCs (`sums`) and wrong length bytes since then.
+    """Bytes in, frames out. `newest` is the payload tuple of the last good frame (() before the first);
+    `frames`, `bad` (wrong lengths and CRCs), `skipped` (bytes outside frames) and `lost` (gaps of the
+    sequence counter) count. The `quiet_` counters start again at every good frame: bytes that came, wrong
+    CRCs (`sums`) and wrong length bytes since then.
 
     spec: hal.profile.BinaryFrame.
     """
@@ -144,7 +149,7 @@ cdef class Framer:
 
     @property
     def modulus(self) -> int:
-        """Where the sequence counter starts again."""
+        """Return the number of values of the sequence counter."""
         return int(self._modulus_mask) + 1
 
     @property
@@ -153,18 +158,18 @@ cdef class Framer:
 
     @property
     def pending(self) -> int:
-        """Bytes of a frame that is not complete."""
+        """Count the bytes of an incomplete frame."""
         return self._length
 
     def encode(self, *values) -> bytes:
-        """A frame with these field values."""
+        """Return a frame with these field values."""
         body = (bytes([self._payload_size]) if self._has_length else b"") + self._payload.pack(*values)
         if not self._crc_size:
             return self.spec.sync + body
         return self.spec.sync + body + crc16(self.spec.crc, body).to_bytes(2, "big" if self._crc_big else "little")
 
     def feed(self, const uint8_t[::1] data) -> int:
-        """Take bytes; returns how many good frames they completed."""
+        """Take bytes; return the number of good frames that they completed."""
         cdef Py_ssize_t at = 0, part
         cdef int good = 0
         while at < data.shape[0]:
@@ -177,7 +182,7 @@ cdef class Framer:
         return good
 
     cpdef int read(self, int fd) except -1:
-        """Take what has arrived at a descriptor; how many good frames it completed. Raises OSError when it is gone."""
+        """Read a descriptor; return the number of good frames completed. Raises OSError when it is gone."""
         cdef int got = _read(fd, self._buffer + self._length, MAX_READ)
         if got == 0:
             return 0
@@ -243,12 +248,12 @@ cdef class Framer:
         return value
 
     cpdef uint64_t whole(self, int field) noexcept:
-        """A field of the newest frame as the bits of an unsigned number (sequence counters, status flags)."""
+        """Return the bits of a field of the newest frame (sequence counters, status flags)."""
         cdef char t = self._type[field]
         return self._bits(field, 1 if t in (b'b', b'B') else 2 if t in (b'h', b'H') else 4 if t in (b'i', b'I', b'f') else 8)
 
     cpdef double number(self, int field) noexcept:
-        """A field of the newest frame as a number."""
+        """Return a field of the newest frame as a number."""
         cdef uint64_t bits = self.whole(field)
         cdef uint32_t half = <uint32_t>bits
         cdef float single
@@ -311,24 +316,25 @@ cdef uint64_t _whole(bytes data) except? 1:
 
 
 cpdef bytes encode_slcan(uint32_t can_id, bytes data):
-    """A data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR where the id has the bit EXTENDED."""
+    """Return a data frame in Lawicel ASCII: t iii l dd.. CR, or T iiiiiiii l dd.. CR for an id of 29 bits."""
     cdef char[MAX_MESSAGE] out
     cdef uint64_t value = _whole(data)
     return out[:_encode(out, can_id, <const uint8_t *>&value, <int>len(data))]
 
 
 cdef class SlcanParser:
-    """Bytes from an adapter in, data frames out; the id of a 29-bit frame (T) has the bit EXTENDED. Acknowledgements (z, Z, CR)
-    pass silently. `refused` counts BEL, by which the adapter refuses a command, `ignored` remote and CAN FD frames, `bad`
-    what is no valid message. Time stamps after the data are ignored."""
+    """Bytes from an adapter in, data frames out; the id of a 29-bit frame (T) has the bit EXTENDED.
+    Acknowledgements (z, Z, CR) pass silently. `refused` counts BEL, by which the adapter refuses a command,
+    `ignored` remote and CAN FD frames, `bad` what is no valid message. Time stamps after the data are
+    ignored."""
 
     @property
     def pending(self) -> int:
-        """Bytes of a message that is not complete."""
+        """Count the bytes of an incomplete message."""
         return self._length
 
     cpdef list feed(self, const uint8_t[::1] data):
-        """Frames that `data` completed, in order: (id, data)."""
+        """Return the frames that `data` completed, in order: (id, data)."""
         cdef Py_ssize_t at, part
         found = []
         for at in range(0, data.shape[0], MAX_READ):
@@ -347,7 +353,7 @@ cdef class SlcanParser:
                 self._length = 0
             elif data[i] == b'\a':
                 self.refused += 1
-            elif self._length == MAX_MESSAGE:               # no message is so long: drop it up to its end
+            elif self._length == MAX_MESSAGE:               # longer than any message: drop it
                 self._length = -1
                 self.bad += 1
             elif self._length >= 0:
@@ -396,26 +402,29 @@ cdef tuple _pair(Frame *frame):
 
 
 cdef class CanPort:
-    """A CAN bus that the tick uses without waiting. A frame's data is one whole number, its first byte lowest.
+    """A CAN bus that the tick uses without waiting. A frame's data is one whole number, its first byte
+    lowest.
 
-    Subclasses implement `take`, which makes the frames that have arrived the ones that `can_id`, `size` and `data` give, and
-    `flush`, which sends what was queued; both raise OSError when the bus is gone. `receive` and `send` do the same with bytes.
+    Subclasses implement `take`, which receives frames for `can_id`, `size` and `data`, and `flush`, which
+    sends the queued frames; both raise OSError when the bus is gone. `receive` and `send` do the same with
+    bytes.
     """
 
     def __cinit__(self):
         self._in = self._own
 
     cpdef int take(self) except -1:
-        """Take what has arrived; how many frames. Raises OSError when the bus is gone."""
+        """Receive the frames that have arrived; return how many. Raises OSError when the bus is gone."""
         raise NotImplementedError
 
     cpdef int flush(self) except -1:
-        """Send what was queued, without waiting. Raises OSError when the bus is gone or takes nothing any more."""
+        """Send the queued frames, without waiting. Raises OSError when the bus is gone or takes no frames."""
         raise NotImplementedError
 
     cpdef bint deliver(self, uint32_t can_id, bytes data) except -1:
-        """For subclasses in Python: one more frame that has arrived since `begin`; False where there is no room, or it has more
-        than 8 bytes."""
+        """Add a frame that has arrived since `begin` (for subclasses in Python).
+
+        False when there is no room, or the frame has more than 8 bytes."""
         if self._count == MAX_FRAMES or len(data) > 8:
             return False
         self._own[self._count] = Frame(can_id, <int>len(data), _whole(data))
@@ -423,11 +432,11 @@ cdef class CanPort:
         return True
 
     def begin(self) -> None:
-        """For subclasses in Python: nothing has arrived yet."""
+        """Forget the received frames (for subclasses in Python)."""
         self._count = 0
 
     def queued(self) -> list:
-        """For subclasses in Python: what is to be sent, (id, data); it is queued no more."""
+        """Return the queued frames, (id, data), and empty the queue (for subclasses in Python)."""
         found = [_pair(&self._out[k]) for k in range(self._queued)]
         self._queued = 0
         return found
@@ -459,12 +468,12 @@ cdef class CanPort:
         self.flush()
 
     def receive(self) -> list:
-        """What has arrived, (id, data). Raises OSError when the bus is gone."""
+        """Return the frames that have arrived, (id, data). Raises OSError when the bus is gone."""
         return [_pair(&self._in[k]) for k in range(self.take())]
 
 
 cdef class SlcanLine(CanPort):
-    """Lawicel ASCII on an open descriptor. What the line does not take at once waits, MAX_PENDING bytes at most."""
+    """Lawicel ASCII on an open descriptor; at most MAX_PENDING unsent bytes wait."""
 
     def __init__(self, int fd):
         self.fd = fd
@@ -500,7 +509,7 @@ cdef class SlcanLine(CanPort):
 
 
 cpdef long long nearest(double value) noexcept:
-    """The nearest whole number, as `round`."""
+    """Return the nearest whole number, as `round`."""
     return llrint(value)
 
 
@@ -514,7 +523,8 @@ cdef class Channels:
         self.roles, self.scale, self.offset, self.low, self.high = roles, scale, offset, low, high
 
     cpdef bint put(self, object sample, int channel, double raw, double time_s) except -1:
-        """Store a raw reading of `channel` in a hal.backend.Sample; False, and nothing stored, when it is out of range."""
+        """Store a raw reading of `channel` in a hal.backend.Sample; False, and nothing stored, when it is out
+        of range."""
         cdef double value = raw * self.scale[channel] + self.offset[channel]
         cdef int role = self.roles[channel]
         if sample is not self._sample:
@@ -527,20 +537,20 @@ cdef class Channels:
 
 
 cdef class Ages:
-    """Which readings of a sample are too old. limit_s: float64 over the roles."""
+    """Finds the readings of a sample that are too old. limit_s: float64 over the roles."""
 
     def __init__(self, sample, double[::1] limit_s):
         self.time_s, self.fresh, self.status = sample.time_s, sample.fresh.view("u1"), sample.status
         self.limit_s = limit_s
 
     cpdef void begin(self) noexcept:
-        """A new tick: nothing is fresh."""
+        """Start a tick: mark every reading as not fresh."""
         cdef Py_ssize_t k
         for k in range(self.fresh.shape[0]):
             self.fresh[k] = 0
 
     cpdef void judge(self, double now_s) noexcept:
-        """OK becomes STALE where the newest reading is older than its limit; an ERROR stays one."""
+        """Change OK to STALE where the newest reading is older than its limit; an ERROR stays one."""
         cdef Py_ssize_t k
         for k in range(self.time_s.shape[0]):
             if self.status[k] == 0 and now_s - self.time_s[k] > self.limit_s[k]:

@@ -26,15 +26,12 @@ ARROWS = {
     ("thermoctl.evaluate.commands", "hal"),  # experiments on a rig drive a back end
 }
 CIRCLES = [
-    # hal.backend is contract and factory, hal.devices base and maker of drivers, hal.board seqlock and poller
-    "hal.backend hal.board hal.can_bus hal.devices hal.faulty hal.modbus hal.profile hal.replay hal.serial_port "
-    "hal.simulated hal.wire",
     # the page takes a sentence from the command; run writes the page
     "thermoctl.diagnose.command thermoctl.diagnose.fleet thermoctl.diagnose.page thermoctl.diagnose.prove "
     "thermoctl.diagnose.run",
     "thermoctl.evaluate.calibrate thermoctl.evaluate.commands",  # calibrate takes a private function of commands
 ]
-INSIDE_FUNCTIONS = {"cli", "daemon", "diagnose", "evaluate", "hal"}  # only `cli` should be left
+INSIDE_FUNCTIONS = {"cli", "daemon", "diagnose", "evaluate"}  # only `cli` should be left
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,8 @@
 """A CiA-402 drive and a Lawicel adapter, as bytes on a wire. Pure: frames and time in, frames out.
 
-The drive has its own object dictionary, SDO server (expedited), NMT slave, heartbeat producer and consumer, SYNC-driven
-PDOs whose mapping the master writes, and the CiA-402 state machine. When the master's heartbeat (0x1016) is missing it
-stops by itself: error 0x8130, fault state, pre-operational.
+The drive has its own object dictionary, SDO server (expedited), NMT slave, heartbeat producer and consumer,
+SYNC-driven PDOs whose mapping the master writes, and the CiA-402 state machine. When the master's heartbeat
+(0x1016) is missing it stops by itself: error 0x8130, fault state, pre-operational.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def _dictionary(node: int) -> dict[tuple[int, int], Entry]:
 class Cia402Drive:
     """The drive. The rig sets readings in `od[index, 0].value` and takes `command` (counts of the target).
 
-    `command_object` is the target that drives (0x2071, 0x6071); `alive` False: unpowered, mute;
-    `heartbeat` False: its own heartbeat is off; `stop_until_s`: so long its stop input is active."""
+    `command_object` is the target object (0x2071, 0x6071); `alive` False: unpowered, mute; `heartbeat` False:
+    its own heartbeat is off; `stop_until_s`: end of the time in which its stop input is active."""
 
     node: int
     command_object: int = 0x2071
@@ -121,7 +121,7 @@ class Cia402Drive:
         self._out.append((0x080 + self.node, struct.pack("<HB5x", code, self.od[0x1001, 0].value)))
 
     def take(self, frame: Frame, now_s: float) -> None:
-        """One frame from the bus."""
+        """Take one frame from the bus."""
         can_id, data = frame
         if not self.alive:
             return
@@ -139,7 +139,7 @@ class Cia402Drive:
             self._master_seen_s = now_s
 
     def tick(self, now_s: float) -> list[Frame]:
-        """What the drive sends on its own, and all answers since the last call. Watches the master's heartbeat."""
+        """Watch the master's heartbeat; return the messages of the drive since the last call."""
         if not self.alive:
             self._out.clear()
             return []
@@ -157,7 +157,7 @@ class Cia402Drive:
         return out
 
     def _watch_stop(self, now_s: float) -> None:
-        """The stop input: quick stop from 'operation enabled', and no way there while it is active."""
+        """Obey the stop input: quick stop from 'operation enabled', and no way there while it is active."""
         self._stopping = now_s < self.stop_until_s
         if self._stopping and self.state == ENABLED:
             self.state = QUICK_STOP
@@ -171,7 +171,7 @@ class Cia402Drive:
                 self.state = DISABLED
 
     def _step_state(self, word: int) -> None:
-        """CiA 402 table of transitions for a control word."""
+        """Take the transition of the CiA-402 table for a control word."""
         rising, self._control = word & ~self._control, word
         if self.state == FAULT:
             if rising & 0x80:
@@ -223,37 +223,43 @@ class Cia402Drive:
         return self.state | quick | voltage | 0x200  # remote
 
     def _sdo(self, data: bytes) -> bytes:
+        """Answer an SDO request."""
         command, index, sub = struct.unpack_from("<BHB", data)
         entry = self.od.get((index, sub))
-
-        def abort(code: int) -> bytes:
-            return struct.pack("<BHBI", 0x80, index, sub, code)
-
         if entry is None:
-            return abort(ABORT_NO_SUB if (index, 0) in self.od else ABORT_NO_OBJECT)
-        size = struct.calcsize(entry.type)
-        if command == 0x40:  # upload
+            code = ABORT_NO_SUB if (index, 0) in self.od else ABORT_NO_OBJECT
+        elif command == 0x40:
             if index == 0x6041:
                 entry.value = self._status_word()
-            return struct.pack("<BHB", 0x43 | (4 - size) << 2, index, sub) + struct.pack(
-                "<" + entry.type, entry.value
-            ).ljust(4, b"\0")
-        if command & 0xE0 == 0x20 and command & 0x02:  # expedited download
-            given = 4 - (command >> 2 & 3) if command & 1 else size
-            if not entry.writable:
-                return abort(ABORT_READ_ONLY)
-            if given != size:
-                return abort(ABORT_LENGTH)
-            value = struct.unpack_from("<" + entry.type, data, 4)[0]
-            if sub and index in (0x1600, 0x1A00) and (value >> 16, value >> 8 & 0xFF) not in self.od:
-                return abort(ABORT_VALUE)
-            entry.value = value
-            if (index, sub) == (0x6060, 0):
-                self.od[0x6061, 0].value = value
-            if (index, sub) == (0x6040, 0):
-                self._step_state(value)
-            return struct.pack("<BHB4x", 0x60, index, sub)
-        return abort(ABORT_COMMAND)
+            head = 0x43 | (4 - struct.calcsize(entry.type)) << 2
+            answer = struct.pack("<BHB", head, index, sub) + struct.pack("<" + entry.type, entry.value)
+            return answer.ljust(8, b"\0")
+        elif command & 0xE0 == 0x20 and command & 0x02:
+            code = self._download((index, sub), entry, data)
+            if not code:
+                return struct.pack("<BHB4x", 0x60, index, sub)
+        else:
+            code = ABORT_COMMAND
+        return struct.pack("<BHBI", 0x80, index, sub, code)
+
+    def _download(self, item: tuple[int, int], entry: Entry, data: bytes) -> int:
+        """Write an object (expedited download); return 0, or the code of the abort."""
+        index, sub = item
+        size = struct.calcsize(entry.type)
+        given = 4 - (data[0] >> 2 & 3) if data[0] & 1 else size
+        if not entry.writable:
+            return ABORT_READ_ONLY
+        if given != size:
+            return ABORT_LENGTH
+        value = struct.unpack_from("<" + entry.type, data, 4)[0]
+        if sub and index in (0x1600, 0x1A00) and (value >> 16, value >> 8 & 0xFF) not in self.od:
+            return ABORT_VALUE
+        entry.value = value
+        if item == (0x6060, 0):
+            self.od[0x6061, 0].value = value
+        if item == (0x6040, 0):
+            self._step_state(value)
+        return 0
 
 
 class SlcanAdapter:
@@ -265,7 +271,7 @@ class SlcanAdapter:
         self._rest = b""
 
     def feed(self, data: bytes) -> tuple[bytes, list[Frame]]:
-        """(answer to the host, frames for the bus). A command that is not understood is answered by BEL."""
+        """Return (answer to the host, frames for the bus); the answer to an unknown command is BEL."""
         *commands, self._rest = (self._rest + data).split(b"\r")
         self._rest = self._rest[-64:]
         answer, frames = bytearray(), []
@@ -311,7 +317,7 @@ class SlcanAdapter:
             return None
 
     def encode(self, frames: list[Frame]) -> bytes:
-        """Frames from the bus, for the host; none while the channel is closed."""
+        """Encode frames from the bus for the host; none while the channel is closed."""
         if not self.open:
             return b""
         return b"".join(

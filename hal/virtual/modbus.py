@@ -1,4 +1,7 @@
-"""A Modbus device as bytes on a wire: TCP and RTU framing, functions 3 and 4, exceptions. Pure: bytes in, bytes out."""
+"""A Modbus device as bytes on a wire: TCP and RTU framing, functions 3 and 4, exceptions.
+
+Pure: bytes in, bytes out.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
 
 
 def encode(value: float, register: Register) -> list[int]:
-    """The words of a raw number; whole types are rounded and held inside their range."""
+    """Return the words of a raw number; whole types are rounded and clipped to their range."""
     letter = FIELD_TYPES[register.type]
     if letter not in "fd":
         bits = 8 * struct.calcsize(letter)
@@ -26,8 +29,10 @@ def encode(value: float, register: Register) -> list[int]:
 
 @dataclass
 class ModbusUnit:
-    """One unit: `registers[kind]` maps address to word. What can be wrong with it: `exception` (code that answers every
-    request), `silent`, `half` (the answer stops in the middle), `corrupt` (RTU: a wrong CRC)."""
+    """One unit: `registers[kind]` maps address to word.
+
+    Injected faults: `exception` (answer every request with this code), `silent`, `half` (send half of the
+    answer), `corrupt` (RTU: a wrong CRC)."""
 
     unit_id: int
     registers: dict[str, dict[int, int]] = field(default_factory=lambda: {"input": {}, "holding": {}})
@@ -42,7 +47,7 @@ class ModbusUnit:
             self.registers[register.kind][register.address + i] = word
 
     def answer(self, request: bytes) -> bytes:
-        """The answer PDU to a request PDU (function code first)."""
+        """Return the answer PDU to a request PDU (function code first)."""
         function = request[0]
         if self.exception:
             return bytes((function | 0x80, self.exception))
@@ -61,7 +66,7 @@ class ModbusUnit:
         return struct.pack(f">BB{count}H", function, 2 * count, *(max(w, 0) for w in words))
 
     def feed_tcp(self, buffer: bytearray) -> bytes:
-        """Take complete requests off the buffer: answers with their MBAP header."""
+        """Take complete requests off the buffer; return the answers with their MBAP header."""
         out = bytearray()
         while len(buffer) >= 8:
             transaction, protocol, length, unit = struct.unpack_from(">HHHB", buffer)
@@ -80,7 +85,9 @@ class ModbusUnit:
         return bytes(out)
 
     def feed_rtu(self, buffer: bytearray) -> bytes:
-        """The same with RTU framing: requests of functions 3 and 4 have 8 bytes; garbage is skipped byte by byte."""
+        """Take complete RTU requests (8 bytes for functions 3 and 4) off the buffer; return the answers.
+
+        Garbage is skipped byte by byte."""
         out = bytearray()
         while len(buffer) >= 8:
             if crc16("modbus", bytes(buffer[:6])) != int.from_bytes(buffer[6:8], "little"):

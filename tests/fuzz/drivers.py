@@ -27,9 +27,11 @@ from typing import Any
 import can
 
 from hal.backend import ABSENT, ERROR, OK, STALE, HardwareError, Sample
-from hal.can_bus import Cia402Device, DbcDevice, open_can
+from hal.binding import bind
+from hal.can_bus import open_can
+from hal.dbc import DbcDevice
+from hal.drive import Cia402Device
 from hal.modbus import ModbusDevice
-from hal.profile import bind
 from hal.serial_port import SerialDevice
 from hal.wire import Framer
 from thermoctl import yamlfile

@@ -58,8 +58,9 @@ def plant() -> tuple[Callable[[bytes], Any], list[bytes]]:
 
 def config() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """A configuration, with its device profiles and faults."""
+    from hal.binding import bind
     from hal.faulty import schedule
-    from hal.profile import bind, load_profile
+    from hal.read_profile import load_profile
     from thermoctl.daemon.assemble import law_parameters
     from thermoctl.settings import effective, load_settings
 
@@ -146,7 +147,7 @@ def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
 
 def slcan() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """An adapter's answers, and a drive's frames behind them."""
-    from hal.can_bus import drive_state, next_control_word
+    from hal.drive import drive_state, next_control_word
     from hal.wire import SlcanParser, encode_slcan
 
     def one(data: bytes) -> None:
@@ -175,8 +176,8 @@ def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
     import threading
 
     from hal.backend import HardwareError, Sample
+    from hal.binding import bind
     from hal.modbus import ModbusDevice
-    from hal.profile import bind
     from thermoctl import yamlfile
 
     listener = socket.create_server(("127.0.0.1", 0))

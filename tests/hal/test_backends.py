@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hal.backend import ABSENT, AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample, make_backend
+from hal.backend import ABSENT, AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample
 from hal.faulty import FaultInjector, schedule
+from hal.make import make_backend
 from hal.replay import ReplayBackend
 from tests.hal.conftest import CONFIG, make_settings
 from thermoctl import yamlfile

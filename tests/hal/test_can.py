@@ -15,7 +15,8 @@ from hal.backend import (
     HardwareError,
     Sample,
 )
-from hal.can_bus import drive_state, next_control_word, open_can
+from hal.can_bus import open_can
+from hal.drive import drive_state, next_control_word
 from hal.virtual.drive import (
     DISABLED,
     ENABLED,
@@ -220,8 +221,8 @@ def test_library_port_over_the_virtual_interface():
 
 def test_dbc_device_decodes_what_cantools_encodes(tmp_path):
     from hal.backend import ROLE
-    from hal.can_bus import DbcDevice
-    from hal.profile import bind
+    from hal.binding import bind
+    from hal.dbc import DbcDevice
     from tests.hal.conftest import CONFIG
     from thermoctl import yamlfile
 

@@ -14,9 +14,11 @@ import can
 import pytest
 
 from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, STALE, HardwareError, Sample
-from hal.can_bus import Cia402Device, DbcDevice
+from hal.binding import bind, check_rig
+from hal.dbc import DbcDevice
 from hal.devices import DevicesBackend
-from hal.profile import bind, check_rig, load_profile
+from hal.drive import Cia402Device
+from hal.read_profile import load_profile
 from hal.wire import SlcanParser
 from tests.hal.conftest import CONFIG
 from thermoctl import yamlfile
@@ -486,8 +488,8 @@ def test_frames_of_29_bits_are_none_of_the_drives(bus):
         (0x77A, "05"),
     ):
         other.send(can.Message(arbitration_id=can_id, data=bytes.fromhex(data), is_extended_id=True))
-    frames = m.device._heard
-    until(lambda s: m.device._heard > frames + 20, m)
+    frames = m.device.counters()["frames"]
+    until(lambda s: m.device.counters()["frames"] > frames + 20, m)
     assert m.backend.sample.value[STATE] == AMP_DISABLED and m.backend.sample.status[STATE] == OK
     assert m.backend.counters()["axis 5.emergencies"] == m.backend.counters()["axis 5.reconnections"] == 0
 
@@ -505,7 +507,7 @@ def test_lawicel_text_as_in_its_manual():
 def test_the_amplifier_is_switched_off_although_nothing_else_opens(bus, tmp_path):
     from types import SimpleNamespace
 
-    from hal.backend import disable_amplifier
+    from hal.make import disable_amplifier
 
     drive, m = bus.drive(5), bus.master(5)
     m.backend.open()

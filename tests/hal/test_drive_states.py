@@ -9,8 +9,8 @@ import math
 import pytest
 
 from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, AMP_QUICK_STOP, ROLE, Sample
-from hal.can_bus import Cia402Device
-from hal.profile import bind
+from hal.binding import bind
+from hal.drive import Cia402Device
 from hal.wire import CanPort
 from tests.hal.conftest import CONFIG
 from thermoctl import yamlfile

@@ -15,10 +15,11 @@ import tty
 import pytest
 
 from hal.backend import ABSENT, ERROR, OK, ROLE, STALE, HardwareError, Sample
-from hal.board import Board, poll_until
+from hal.binding import bind
+from hal.board import Board
 from hal.devices import DevicesBackend
 from hal.modbus import LOST_POLLS, ModbusDevice
-from hal.profile import bind
+from hal.poller import poll_until
 from thermoctl import yamlfile
 
 COIL, AIR, SHAFT = (ROLE[r] for r in ("coil_c", "air_c", "shaft_1_c"))

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from hal.backend import ROLE
-from hal.devices import DevicesBackend, _driver
-from hal.profile import bind
+from hal.binding import bind
+from hal.devices import DevicesBackend
+from hal.make import driver
 from hal.wire import Framer
 from tests.hal.conftest import CONFIG
 from tests.limits import OFF
@@ -37,7 +38,7 @@ class Encoder:
         tty.setraw(slave)
         text = f"{{name: encoder, profile: encoder-serial.yaml, port: {os.ttyname(slave)}, roles: {{position: position_um}}}}"
         binding = bind(yamlfile.loads(text, "wiring.yaml"), CONFIG / "devices")
-        self.backend = DevicesBackend([_driver(binding)], [])
+        self.backend = DevicesBackend([driver(binding)], [])
         self.framer, self.sequence = Framer(binding.profile.bus_spec), 0
         self.backend.open()
 

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.backend import ROLE, Sample
-from hal.profile import bind, load_profile
+from hal.binding import bind
+from hal.read_profile import load_profile
 from hal.serial_port import SerialDevice
 from hal.text_number import number, takes_letters
 from thermoctl import yamlfile

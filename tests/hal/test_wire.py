@@ -21,10 +21,10 @@ from hal.backend import (
     STALE,
     HardwareError,
     Sample,
-    make_backend,
 )
-from hal.board import Board, poll_until
-from hal.devices import make_devices
+from hal.board import Board
+from hal.make import make_backend, make_devices
+from hal.poller import poll_until
 from hal.virtual.drive import HEARTBEAT_LOST
 from hal.virtual.rig import tell
 

@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 
 from hal.backend import ROLE, Sample
-from hal.devices import DevicesBackend, make_devices
+from hal.devices import DevicesBackend
+from hal.make import make_devices
 from hal.virtual import drive as drives
-from hal.virtual.rig import Pty
+from hal.virtual.device import Pty
 from hal.wire import Framer
 from tests.hazards.harness import ROOT, HazardRig, say
 from thermoctl import yamlfile

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.backend import ERROR, OK, ROLE, make_backend
+from hal.backend import ERROR, OK, ROLE
+from hal.make import make_backend
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.loop import Rig
 from thermoctl.daemon.shared import Shared

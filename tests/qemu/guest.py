@@ -20,9 +20,10 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(CHECKOUT), str(CHECKOUT / f".venv/lib/python3.{sys.version_info[1]}/site-packages")]
 
 from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE  # noqa: E402
-from hal.can_bus import Cia402Device, LibraryPort, open_can  # noqa: E402
+from hal.binding import bind  # noqa: E402
+from hal.can_bus import LibraryPort, open_can  # noqa: E402
 from hal.devices import DevicesBackend  # noqa: E402
-from hal.profile import bind  # noqa: E402
+from hal.drive import Cia402Device  # noqa: E402
 from hal.virtual.drive import DISABLED, ENABLED, Cia402Drive  # noqa: E402
 from thermoctl import yamlfile  # noqa: E402
 

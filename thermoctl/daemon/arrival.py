@@ -22,7 +22,7 @@ def expected_hz(settings: Any) -> dict[str, float]:
     """The profile's rate of each role, Hz; empty for back ends without devices. Raises InputError."""
     if settings.hal.backend != "devices":
         return {}
-    from hal.devices import make_devices
+    from hal.make import make_devices
 
     return {b.role: b.channel.rate_hz for d in make_devices(settings) for b in d.binding.bounds}
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hal.profile import bind
+from hal.binding import bind
 from thermoctl.channels import CHANNELS
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters, zero_model
 from thermoctl.settings import RigSettings

@@ -137,8 +137,7 @@ def _bars(bins: list[list[int]], width: int = 50) -> str:
 
 def check(config: str) -> int:
     """Validate the configuration, the model, the plant and the profiles; no hardware is touched."""
-    from hal.backend import make_backend
-    from hal.devices import device_notes
+    from hal.make import device_notes, make_backend
     from thermoctl.daemon.assemble import compensator, law_parameters, power_warning
 
     settings = load_settings(config)
@@ -161,7 +160,8 @@ def doctor(config: str, seconds: float = 2.0) -> int:
     """Connect, read every channel for `seconds`, show value, unit and rate; drives nothing. 1 when one is bad.
 
     Then what of the machine decides how late a tick may come, with remedies (docs/how-to/real-time.md); that is advice."""
-    from hal.backend import OK, ROLES, STATUS_NAMES, HardwareError, make_backend
+    from hal.backend import OK, ROLES, STATUS_NAMES, HardwareError
+    from hal.make import make_backend
     from thermoctl.daemon.arrival import expected_hz, slow
     from thermoctl.daemon.doctor import real_time_checks
     from thermoctl.daemon.loop import become_real_time

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hal.backend import fast_devices
+from hal.make import fast_devices
 from hal.serial_port import latency_timer_ms
 
 

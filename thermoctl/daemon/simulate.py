@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import make_backend
+from hal.make import make_backend
 from thermoctl.control import arming, faults
 from thermoctl.control.model import NAMES, CompensatorModel, Parameters
 from thermoctl.daemon.assemble import compensator, law_parameters

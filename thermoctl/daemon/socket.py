@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from hal.backend import can_drive
+from hal.make import can_drive
 from thermoctl.channels import CHANNELS, STATUS_NAMES
 from thermoctl.control import arming
 from thermoctl.daemon import arrival, readings

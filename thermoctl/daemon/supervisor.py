@@ -1,7 +1,7 @@
 """The supervisor: starts the daemon's processes, watches them, and makes the amplifier safe on every way out.
 
     supervisor ── loop        reads, controls, drives; alone and real-time
-              ├── poller      one for each slow device (hal.board.run_poller)
+              ├── poller      one for each slow device (hal.poller.run_poller)
               ├── recorder    ring -> recording
               ├── commands    the Unix socket
               └── reference   an idle loop beside it, when loop.reference is on
@@ -30,7 +30,8 @@ from typing import Any
 import numpy as np
 import structlog
 
-from hal.backend import HardwareError, disable_amplifier, make_backend, slow_devices
+from hal.backend import HardwareError
+from hal.make import disable_amplifier, make_backend, slow_devices
 from thermoctl.channels import CHANNELS
 from thermoctl.control import arming, faults
 from thermoctl.control.law import COMPILED
@@ -204,10 +205,10 @@ def _reference_process(settings: Any, shared: Shared, board: Any) -> int:
 
 
 def _poller_process(settings: Any, shared: Shared, board: Any, device: str) -> int:
-    from hal.board import run_poller
+    from hal.poller import run_poller
 
     loops.die_with_parent()
-    run_poller(settings, device, board.name)
+    run_poller(next(d for d in slow_devices(settings) if d.name == device), board.name)
     return EXIT_OK
 
 

@@ -441,7 +441,7 @@ def agreed(rig: SimulatedRig | DaemonRig, schedules: Sequence[Schedule], yes: bo
     )
     print(f"rig '{settings.rig.name}' ({settings.path}), back end {settings.hal.backend}: {rig.where}")
     if settings.hal.backend == "devices":
-        from hal.devices import make_devices
+        from hal.make import make_devices
 
         print("devices: " + ", ".join(f"{d.name} at {d.binding.port}" for d in make_devices(settings)))
     print(

@@ -103,7 +103,7 @@ def simulated(work: Path, hours: float) -> list[Sample]:
 
 def drivers(bench: Bench, ticks: int) -> list[Sample]:
     """A sample every twentieth of the ticks."""
-    from hal.backend import make_backend
+    from hal.make import make_backend
     from thermoctl.settings import load_settings
 
     backend = make_backend(load_settings(bench.config))

@@ -1,0 +1,118 @@
+"""From the configuration to the back end and the drivers that it names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hal.backend import Backend
+from hal.binding import Binding, bind, check_rig, rig_notes
+from hal.board import Board
+from hal.dbc import DbcDevice
+from hal.device import Device
+from hal.devices import DevicesBackend
+from hal.drive import Cia402Device
+from hal.faulty import FaultInjector, schedule
+from hal.modbus import ModbusDevice
+from hal.replay import replay_backend
+from hal.serial_port import SerialDevice
+from hal.simulated import simulated_backend
+from thermoctl.settings import Settings
+from thermoctl.yamlfile import InputError
+
+
+def make_backend(settings: Settings, board: Board | None = None) -> Backend:
+    """Make the back end of `settings.hal`, not yet open.
+
+    It is wrapped in a fault injector when `hal.faults` lists any. board: filled by poller processes, or None to
+    poll slow devices from threads of this process. Raises InputError: a mistake in the configuration, a profile
+    or the plant."""
+    kind = settings.hal.backend
+    backend: Backend
+    if kind == "simulated":
+        backend = simulated_backend(settings)
+    elif kind == "replay":
+        backend = replay_backend(settings)
+    elif kind == "devices":
+        fast, slow = fast_devices(settings), slow_devices(settings)
+        backend = DevicesBackend(fast, slow, board, settings.protection.required)
+    else:
+        raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated, devices or replay")
+    if settings.hal.faults:
+        backend = FaultInjector(backend, schedule(settings.hal.faults), seed=settings.hal.seed)
+    return backend
+
+
+def fast_devices(settings: Settings) -> list[Device]:
+    """Make the drivers of `hal.devices` that are read and written inside the tick, not yet open."""
+    return [d for d in make_devices(settings) if not d.slow]
+
+
+def slow_devices(settings: Settings) -> list[Device]:
+    """Make the drivers of `hal.devices` with a blocking poll(), not yet open."""
+    return [d for d in make_devices(settings) if d.slow]
+
+
+def disable_amplifier(settings: Settings) -> None:
+    """Disable the amplifier of `hal.devices` over a link of its own: for when the loop can no longer do it.
+
+    No other device is opened, and a mistake in another device's profile does not count. Raises HardwareError,
+    OSError, InputError."""
+    if settings.hal.backend != "devices":
+        return
+    for device in driving_devices(settings):
+        device.switch_off()
+
+
+def make_devices(settings: Settings) -> list[Device]:
+    """Make the drivers of `hal.devices`, not connected. Raises InputError.
+
+    Paths of profiles are relative to the configuration file."""
+    bindings = _bindings(settings)
+    check_rig(bindings)
+    return [driver(b) for b in bindings]
+
+
+def _bindings(settings: Settings) -> list[Binding]:
+    return [bind(node, Path(settings.path).parent) for node in settings.hal.devices]
+
+
+def device_notes(settings: Settings) -> list[str]:
+    """Return a line for each probable mistake in `hal.devices`. Raises InputError."""
+    return rig_notes(_bindings(settings))
+
+
+def driving_devices(settings: Settings) -> list[Device]:
+    """Make the drivers of the devices that take the command, not connected.
+
+    A mistake in another device's binding or profile does not count. Raises InputError where no device drives
+    because of a mistake."""
+    devices, mistakes = [], []
+    for node in settings.hal.devices:
+        try:
+            binding = bind(node, Path(settings.path).parent)
+            if binding.profile.amplifier is not None:
+                devices.append(driver(binding))
+        except InputError as e:
+            mistakes.append(e)
+    if mistakes and not devices:
+        raise mistakes[0]
+    return devices
+
+
+def can_drive(settings: Settings) -> bool:
+    """Return whether anything takes the command, so that the rig may be armed. Raises InputError."""
+    return settings.hal.backend != "devices" or bool(driving_devices(settings))
+
+
+_DRIVERS: dict[str, type[Device]] = {
+    "serial-binary": SerialDevice,
+    "serial-lines": SerialDevice,
+    "can-dbc": DbcDevice,
+    "can-cia402": Cia402Device,
+    "modbus": ModbusDevice,
+}
+
+
+def driver(binding: Binding) -> Device:
+    """Make the driver of a bound device, not connected. Raises InputError."""
+    return _DRIVERS[binding.profile.bus](binding)
