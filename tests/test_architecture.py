@@ -18,23 +18,28 @@ from tests.architecture import (
 
 # Present exceptions, each to be removed with its cause. An exception that is no longer needed fails, too.
 ARROWS = {
-    ("thermoctl.diagnose.live", "daemon"),  # reads the law's parameters of a recording: belongs to daemon
-    ("thermoctl.diagnose.command", "settings"),  # one option of the configuration; the caller could pass it
-    ("thermoctl.evaluate.calibrate", "daemon"),  # the wizard runs on a live daemon: belongs above daemon
-    ("thermoctl.evaluate.commands", "daemon"),  # experiments on a rig use the daemon's clock
-    ("thermoctl.evaluate.full", "daemon"),  # the closed-loop reproduction runs the daemon's simulation
-    ("thermoctl.evaluate.commands", "hal"),  # experiments on a rig drive a back end
+    ("thermoctl.diagnose.commands", "settings")  # one option of the configuration; the caller could pass it
 }
 CIRCLES = [
     # hal.backend is contract and factory, hal.devices base and maker of drivers, hal.board seqlock and poller
     "hal.backend hal.board hal.can_bus hal.devices hal.faulty hal.modbus hal.profile hal.replay hal.serial_port "
     "hal.simulated hal.wire",
     # the page takes a sentence from the command; run writes the page
-    "thermoctl.diagnose.command thermoctl.diagnose.fleet thermoctl.diagnose.page thermoctl.diagnose.prove "
-    "thermoctl.diagnose.run",
-    "thermoctl.evaluate.calibrate thermoctl.evaluate.commands",  # calibrate takes a private function of commands
+    "thermoctl.diagnose.commands thermoctl.diagnose.page thermoctl.diagnose.run thermoctl.fleet.health "
+    "thermoctl.fleet.live thermoctl.proof.run",
+    "thermoctl.calibration.commands thermoctl.calibration.wizard thermoctl.reproduction.rigs "
+    "thermoctl.reproduction.closed_loop thermoctl.reproduction.study",
 ]
-INSIDE_FUNCTIONS = {"cli", "daemon", "diagnose", "evaluate", "hal"}  # only `cli` should be left
+INSIDE_FUNCTIONS = {
+    "cli",
+    "daemon",
+    "diagnose",
+    "calibration",
+    "reproduction",
+    "proof",
+    "fleet",
+    "hal",
+}  # only `cli` should be left
 
 
 @pytest.fixture(scope="module")

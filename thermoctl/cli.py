@@ -391,7 +391,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
     """experiment, identify, model, tune, evaluate, reproduce."""
 
     def room():
-        from thermoctl.evaluate import commands
+        from thermoctl.calibration import commands
 
         return commands
 
@@ -507,20 +507,20 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
     """diagnose, prove, demo-concealed, effects."""
 
     def diagnose(args: argparse.Namespace) -> int:
-        from thermoctl.diagnose import command
+        from thermoctl.diagnose import commands
 
-        def record(experiment: Path, recording: Path) -> None:  # the rig is another room's business
-            from thermoctl.evaluate import commands
+        def record(experiment: Path, recording: Path) -> None:  # the rig is another package's business
+            from thermoctl.calibration.commands import record
 
-            commands.record(experiment, recording, args.config, args.rig, args.yes)
+            record(experiment, recording, args.config, args.rig, args.yes)
 
         args.record = record
-        return command.diagnose(args)
+        return commands.diagnose(args)
 
     def effects(args: argparse.Namespace) -> int:
-        from thermoctl.diagnose import command
+        from thermoctl.diagnose import commands
 
-        return command.effects(args)
+        return commands.effects(args)
 
     folder = (
         "--effects",
@@ -624,7 +624,7 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
     )
 
     def prove(args: argparse.Namespace) -> int:
-        from thermoctl.diagnose.prove import command
+        from thermoctl.proof.run import command
 
         return command(args)
 
@@ -767,7 +767,7 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     )
 
     def calibrate(args: argparse.Namespace) -> int:
-        from thermoctl.evaluate.calibrate import calibrate
+        from thermoctl.calibration.wizard import calibrate
 
         return calibrate(
             args.config, args.out, args.models, args.order, args.gains, args.accept, args.again, args.yes
@@ -793,7 +793,7 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     )
 
     def fleet(args: argparse.Namespace) -> int:
-        from thermoctl.diagnose.fleet import fleet
+        from thermoctl.fleet.health import fleet
 
         return fleet(args.folder, args.plant, args.parameters, args.workers, args.scheduler, args.json)
 

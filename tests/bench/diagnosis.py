@@ -35,8 +35,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from thermoctl.diagnose import locate, observer, prove, run, screen, search
-from thermoctl.diagnose import score as scoring
+from thermoctl.diagnose import locate, observer, run, screen, search
 from thermoctl.diagnose.effects import Candidate, Rig, candidates, catalogue
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.diagnose.heldout import unseen_errors
@@ -44,6 +43,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant import load
 from thermoctl.plant.refit import report
 from thermoctl.plant.simulate import SimulationError
+from thermoctl.proof import run as prove
+from thermoctl.proof import score as scoring
 from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 

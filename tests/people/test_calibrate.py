@@ -13,9 +13,9 @@ import pytest
 from browser import PICTURES, Browser, find
 
 from thermoctl import cli
+from thermoctl.calibration import drive
+from thermoctl.calibration.drive import Control, DaemonRig
 from thermoctl.daemon.socket import status
-from thermoctl.evaluate import drive
-from thermoctl.evaluate.drive import Control, DaemonRig
 from thermoctl.identify import modelfile
 from thermoctl.identify.experiments import Aborted, load_experiments
 from thermoctl.recording.files import read_table

@@ -16,9 +16,9 @@ import pytest
 from hal.backend import ROLE
 from hal.faulty import Fault, FaultInjector
 from thermoctl import cli
+from thermoctl.calibration import drive
 from thermoctl.control import arming
 from thermoctl.daemon.socket import Connection, ask, status
-from thermoctl.evaluate import drive
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError

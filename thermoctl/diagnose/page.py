@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermoctl.diagnose import experiment
-from thermoctl.diagnose.command import sentence
+from thermoctl.diagnose.commands import sentence
 from thermoctl.diagnose.effects import Candidate
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, page, table, unit

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from thermoctl import plant
+from thermoctl.calibration import chain
+from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.control.model import CompensatorModel
-from thermoctl.evaluate import chain, rigs
-from thermoctl.evaluate.iso230 import mean_and_two_s
 from thermoctl.identify import experiments
 from thermoctl.plant import extended
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
+from thermoctl.reproduction import rigs
 from thermoctl.signals import INDEX, NAMES, POINTS
 
 

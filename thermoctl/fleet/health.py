@@ -286,7 +286,7 @@ def fleet(
             )
     paths = find_recordings(folder)
     if workers or scheduler:
-        from thermoctl.diagnose.prove import cluster
+        from thermoctl.proof.run import cluster
 
         with cluster(scheduler, workers) as client:
             summaries = client.gather([client.submit(summarise, p, plant, names, pure=False) for p in paths])

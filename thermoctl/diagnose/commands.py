@@ -85,7 +85,7 @@ def diagnose(args: argparse.Namespace) -> int:
 
 def _live(args: argparse.Namespace) -> list[str]:
     """The stretch of the daemon's recordings that its model does not fit, as a file in OUT; none where it fits."""
-    from thermoctl.diagnose import live
+    from thermoctl.fleet import live
     from thermoctl.plant import load
     from thermoctl.settings import load_settings
 
@@ -130,8 +130,8 @@ def fleet(args: argparse.Namespace) -> int:
     """`thermoctl diagnose` over folders: every rig's newest recordings by themselves, spread over processes or a Dask cluster,
     into OUT/RIG each. A rig is what the program's recordings are named by, else the folder that holds them. A rig that cannot be
     diagnosed is told and does not stop the others; done rigs are not run again."""
-    from thermoctl.diagnose import prove
-    from thermoctl.diagnose.fleet import find_recordings, rig_of
+    from thermoctl.fleet.health import find_recordings, rig_of
+    from thermoctl.proof import run as prove
 
     rigs: dict[str, list[str]] = {}
     for path in (p for r in args.recordings for p in (find_recordings(r) if Path(r).is_dir() else [r])):

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from hal.backend import HardwareError
-from thermoctl.evaluate import chain, drive, iso230, rigs
+from thermoctl.calibration import chain, drive, iso230
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
+from thermoctl.reproduction import rigs
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError, suggest
@@ -367,6 +368,6 @@ def evaluate(recordings: list[str]) -> int:
 
 def reproduce(config: str, plant: str, out: str, seeds: int, quick: bool) -> int:
     """The whole report; 1 when a goal is missed."""
-    from thermoctl.evaluate import reproduce as room
+    from thermoctl.reproduction import study as room
 
     return 0 if room.reproduce(plant, config, Path(out), seeds, not quick, print) else 1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thermoctl.cli import main
-from thermoctl.diagnose.fleet import drift, judge, summarise
+from thermoctl.fleet.health import drift, judge, summarise
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import write_table

@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl import __version__
-from thermoctl.diagnose import score as scoring
 from thermoctl.diagnose.effects import CATALOGUE
+from thermoctl.proof import score as scoring
 from thermoctl.yamlfile import InputError, load
 
 RECORDINGS = (".csv", ".parquet", ".arrow")
@@ -56,10 +56,9 @@ def program() -> str:
 
 def _program() -> list[Path]:
     package = Path(__file__).parents[1]
-    files = [
-        f for room in ("diagnose", "plant", "recording") for f in sorted((package / room).glob("*.[ph]*"))
+    code = [
+        f for part in ("diagnose", "plant", "recording") for f in sorted((package / part).glob("*.[ph]*"))
     ]
-    code = [f for f in files if f.name not in ("prove.py", "score.py")]  # these read results and make none
     return [*sorted(CATALOGUE.glob("*.yaml")), *code]
 
 

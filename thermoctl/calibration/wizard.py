@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.evaluate import chain, drive
-from thermoctl.evaluate.drive import Control, DaemonRig, SimulatedRig, as_table, span
-from thermoctl.evaluate.iso230 import mean_and_two_s
+from thermoctl.calibration import chain, drive
+from thermoctl.calibration.drive import Control, DaemonRig, SimulatedRig, as_table, span
+from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.files import read_table, write_table
@@ -253,7 +253,7 @@ class Wizard:
         return self.folder / f"{name}.parquet"
 
     def _model(self) -> dict[str, Any]:
-        from thermoctl.evaluate.commands import _recorded
+        from thermoctl.calibration.commands import _recorded
 
         tests = [_recorded(str(self._recording(n))) for n in ("test_2", "test_3", "test_4a")]
         model, kalman, _, um = chain.calibrate_better(tests, self.order or None)
@@ -297,7 +297,7 @@ class Wizard:
             left = left - np.nanmean(left[:5])
             how = "the loop with the new model acting, judged by the second encoder, which it does not use"
         else:
-            from thermoctl.evaluate.commands import _recorded
+            from thermoctl.calibration.commands import _recorded
 
             tests = [_recorded(str(self._recording(n))) for n in ("test_2", "test_3", "test_4a", "test_4b")]
             _, kalman, _, um = chain.calibrate_better(tests[:3], self.order or None)

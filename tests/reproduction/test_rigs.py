@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from thermoctl import plant
-from thermoctl.evaluate import chain, full, iso230, rigs
+from thermoctl.calibration import chain, iso230
 from thermoctl.identify import experiments
 from thermoctl.report.page import page, table
+from thermoctl.reproduction import closed_loop, rigs
 from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -118,7 +119,7 @@ def test_the_full_runs_truth_is_found_from_any_folder(tmp_path, monkeypatch):
     """Settings read a relative path from their own folder; the truth is written beside the report."""
     monkeypatch.chdir(tmp_path)
     Path("out").mkdir()
-    written = full.scaled_truth(
+    written = closed_loop.scaled_truth(
         ROOT / "config" / "plants" / "actuator_truth.yaml", Path("out") / "truth.yaml"
     )
     assert written.is_absolute() and written.is_file()

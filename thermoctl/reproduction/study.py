@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from thermoctl import plant
-from thermoctl.evaluate import chain, rigs, tables
-from thermoctl.evaluate.iso230 import mean_and_two_s
+from thermoctl.calibration import chain
+from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.identify import experiments, filter
 from thermoctl.report.page import figure, page, table
+from thermoctl.reproduction import rigs, tables
 from thermoctl.signals import POINTS
 
 CUTOFF_HZ = 4.3e-4
@@ -209,9 +210,9 @@ def reproduce(
     kept = results[0].pop("kept")
     whole = None
     if full:
-        from thermoctl.evaluate import full as full_run
+        from thermoctl.reproduction import closed_loop
 
-        whole = full_run.run(config, plant_file, out, say)["figures"]
+        whole = closed_loop.run(config, plant_file, out, say)["figures"]
     rows, before = goals(results, disturbed), goals(first, [])
     used = time.monotonic() - began
     (out / "figures.json").write_text(
