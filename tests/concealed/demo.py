@@ -36,7 +36,7 @@ from thermoctl.identify.linearise import linearise
 from thermoctl.plant import load, save
 from thermoctl.plant.refit import fit, updated
 from thermoctl.plant.simulate import compile_plant
-from thermoctl.proof.run import program
+from thermoctl.proof.jobs import program
 from thermoctl.recording.files import read_table
 from thermoctl.report import page
 from thermoctl.yamlfile import InputError

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from thermoctl.cli import main
-from thermoctl.fleet.health import drift, judge, summarise
+from thermoctl.fleet.health import summarise
+from thermoctl.fleet.trend import drift, judge
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import write_table

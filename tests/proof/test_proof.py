@@ -16,8 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermoctl.proof import run as prove
-from thermoctl.proof import score
+from thermoctl.proof import score, statistics, summary, tables
+from thermoctl.proof.jobs import find_jobs, program_files, read_answers
+from thermoctl.proof.page import page as page_of
+from thermoctl.proof.prove import prove
+from thermoctl.proof.run import run_all, run_one
 from thermoctl.yamlfile import InputError
 
 
@@ -45,15 +48,15 @@ NONE = result("consistent")
 
 def test_wilson_interval_is_the_textbook_one():
     """Newcombe (1998), table I: 81/263 -> 0.2553..0.3662, 0/20 -> 0..0.1611, 15/148 -> 0.0624..0.1605."""
-    assert score.Share(81, 263).interval() == pytest.approx((0.2553, 0.3662), abs=5e-5)
-    assert score.Share(0, 20).interval() == pytest.approx((0.0, 0.1611), abs=5e-5)
-    assert score.Share(15, 148).interval() == pytest.approx((0.0624, 0.1605), abs=5e-5)
-    assert score.Share(0, 0).value is None
+    assert statistics.Share(81, 263).interval() == pytest.approx((0.2553, 0.3662), abs=5e-5)
+    assert statistics.Share(0, 20).interval() == pytest.approx((0.0, 0.1611), abs=5e-5)
+    assert statistics.Share(15, 148).interval() == pytest.approx((0.0624, 0.1605), abs=5e-5)
+    assert statistics.Share(0, 0).value is None
 
 
 def test_reliability_by_hand():
     """Bins 0.9: (0.9 + 0.98)/2 given, 1 of 2 right; 0.2: 0.2 given, 0 of 1; 1.0 goes into the last bin."""
-    table, ece = score.reliability([(0.92, True), (0.98, False), (0.2, False), (1.0, True)])
+    table, ece = statistics.reliability([(0.92, True), (0.98, False), (0.2, False), (1.0, True)])
     assert [b["n"] for b in table] == [1, 3]
     assert table[1]["probability"] == pytest.approx((0.92 + 0.98 + 1) / 3) and table[1][
         "right"
@@ -123,7 +126,7 @@ def test_in_the_open_world_strays_count_and_a_partly_explained_name_is_a_name():
         score.score("3", answer() | {"world": "open"}, result("unexplained")),
         score.score("4", answer(), result("consistent")),
     ]
-    content = score.summary(rows)
+    content = summary.summary(rows)
     assert content["figures"]["cases"] == 1 and content["open_world"]["cases"] == 3
     shares = content["open_world"]["shares"]
     assert (shares["named_and_placed"]["k"], shares["named_and_placed"]["n"]) == (1, 2)
@@ -197,7 +200,7 @@ def test_summary_of_a_hand_made_set():
             ]
         )
     ]
-    s = score.summary(rows)
+    s = summary.summary(rows)
     assert s["shares"]["false_alarms"] == {
         "k": 1,
         "n": 2,
@@ -226,7 +229,7 @@ def test_the_size_found_half_of_the_time_is_that_of_scipy_and_its_interval_holds
     for _ in range(60):
         sizes = np.exp(rng.uniform(np.log(3), np.log(40), 120))
         found = rng.random(120) < 1 / (1 + (6 / sizes) ** 4)
-        curve = score.found_by_size(sizes.tolist(), found.tolist())
+        curve = statistics.found_by_size(sizes.tolist(), found.tolist())
         assert curve is not None
         held += curve["low"] <= 6 <= curve["high"]
 
@@ -238,13 +241,13 @@ def test_the_size_found_half_of_the_time_is_that_of_scipy_and_its_interval_holds
         assert curve["half"] == pytest.approx(np.exp(best.x[0]), rel=0.03)
     assert held >= 52  # of 57 in the mean
     assert (
-        score.found_by_size([5.0] * 20, [True] * 20) is None
-        and score.found_by_size([3.0, 9.0], [False, True]) is None
+        statistics.found_by_size([5.0] * 20, [True] * 20) is None
+        and statistics.found_by_size([3.0, 9.0], [False, True]) is None
     )
 
 
 def test_a_kept_result_is_of_the_integrator_too_and_not_of_what_scores_it():
-    names = {f.name for f in prove._program()}
+    names = {f.name for f in program_files()}
     assert {"integrator.h", "refit.py", "search.py", "radiation.yaml"} <= names
     assert "score.py" not in names
 
@@ -279,20 +282,18 @@ def test_a_killed_worker_loses_nothing_and_done_cases_are_not_run_again(tmp_path
     import cloudpickle
 
     cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the workers need not find this file
-    jobs = prove.find_jobs(a_set(tmp_path / "cases"))
+    jobs = find_jobs(a_set(tmp_path / "cases"))
     seen = []
     assert (
-        prove.run_all(
-            jobs, tmp_path / "out/cases", workers=2, task=fake, progress=lambda *x: seen.append(x[:2])
-        )
+        run_all(jobs, tmp_path / "out/cases", workers=2, task=fake, progress=lambda *x: seen.append(x[:2]))
         == 4
     )
     assert (tmp_path / "out/cases/died").exists()
     assert sorted(set((tmp_path / "out/cases/log").read_text().split())) == ["a", "b", "c", "d"]
     assert [count for count, _ in seen] == [1, 2, 3, 4]
-    assert prove.run_all(jobs, tmp_path / "out/cases", workers=1, task=fake) == 0
+    assert run_all(jobs, tmp_path / "out/cases", workers=1, task=fake) == 0
     Path(jobs[2].recordings[0]).write_text("t,y\n0,2\n")  # other data: only this one again
-    assert prove.run_all(jobs, tmp_path / "out/cases", workers=1, task=fake) == 1
+    assert run_all(jobs, tmp_path / "out/cases", workers=1, task=fake) == 1
 
 
 def dies_once(job, out: str) -> dict:
@@ -302,7 +303,7 @@ def dies_once(job, out: str) -> dict:
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.write_text(str(os.getpid()))
         os.kill(os.getpid(), signal.SIGKILL)
-    return prove.run_one(job, out)
+    return run_one(job, out)
 
 
 @contextmanager
@@ -374,13 +375,13 @@ def test_a_remote_scheduler_loses_nothing_when_one_of_two_workers_is_killed(tmp_
             "--smoke",
         ]
     )
-    jobs = prove.find_jobs(tmp_path / "cases")
+    jobs = find_jobs(tmp_path / "cases")
     with a_dask_by_hand(tmp_path) as (address, workers):
         with Client(address) as client:
             client.wait_for_workers(2, timeout=120)
         told = []
         assert (
-            prove.run_all(
+            run_all(
                 jobs,
                 tmp_path / "out/cases",
                 scheduler=address,
@@ -394,7 +395,7 @@ def test_a_remote_scheduler_loses_nothing_when_one_of_two_workers_is_killed(tmp_
             -signal.SIGKILL
         ]  # one is dead, one lives
     assert (tmp_path / "out/cases/died").exists()
-    content = prove.prove(
+    content = prove(
         tmp_path / "cases", tmp_path / "out", tmp_path / "cases_answers", workers=1
     )  # nothing is run again
     assert content["figures"]["cases"] == 3 and content["figures"]["failed"] == 0
@@ -454,29 +455,29 @@ def test_diagnose_over_a_folder_of_rigs(tmp_path, capsys):
 
 
 def test_answers_apart_must_be_the_sealed_ones(tmp_path):
-    jobs = prove.find_jobs(a_set(tmp_path / "cases", ("a",)))
+    jobs = find_jobs(a_set(tmp_path / "cases", ("a",)))
     answers = tmp_path / "answers"
     answers.mkdir()
     with pytest.raises(InputError, match="no answer for case a"):
-        prove.read_answers(jobs, answers)
+        read_answers(jobs, answers)
     text = "verdict: consistent\neffects: []\nnearly_the_same: []\n"
     (answers / "a.yaml").write_text(text)
     (answers / "manifest.sha256").write_text(f"{hashlib.sha256(text.encode()).hexdigest()}  a.yaml\n")
-    assert prove.read_answers(jobs, answers)["a"]["verdict"] == "consistent"
+    assert read_answers(jobs, answers)["a"]["verdict"] == "consistent"
     (answers / "a.yaml").write_text(text.replace("consistent", "explained"))
     with pytest.raises(InputError, match="not the one that was sealed"):
-        prove.read_answers(jobs, answers)
+        read_answers(jobs, answers)
 
 
 def test_folders_without_cases_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
-        prove.find_jobs(tmp_path / "nowhere")
+        find_jobs(tmp_path / "nowhere")
     with pytest.raises(InputError, match="no case in it"):
-        prove.find_jobs(tmp_path)
+        find_jobs(tmp_path)
     (tmp_path / "x").mkdir()
     (tmp_path / "x/plant.yaml").write_text("")
     with pytest.raises(InputError, match="without a recording"):
-        prove.find_jobs(tmp_path)
+        find_jobs(tmp_path)
 
 
 def test_page_and_table_hold_the_figures():
@@ -488,8 +489,8 @@ def test_page_and_table_hold_the_figures():
             12.0,
         )
     ]
-    content = {"version": "0", "commit": "abc", **score.summary(rows)}
-    page = prove.page(content, rows)
+    content = {"version": "0", "commit": "abc", **summary.summary(rows)}
+    page = page_of(content, rows)
     assert (
         "case&lt;1&gt;" in page
         and "sensor_gain at y" in page
@@ -499,7 +500,7 @@ def test_page_and_table_hold_the_figures():
     from rich.console import Console
 
     console = Console(record=True, width=160, file=io.StringIO())
-    console.print(prove.table(content))
+    console.print(tables.table(content))
     assert "100.0 %" in console.export_text()
 
 
@@ -527,12 +528,12 @@ def test_smoke_set_is_diagnosed_and_scored(tmp_path):
                 kind,
             ]
         )
-    content = prove.prove(tmp_path / "cases", tmp_path / "out", tmp_path / "answers", workers=1)
+    content = prove(tmp_path / "cases", tmp_path / "out", tmp_path / "answers", workers=1)
     assert content["figures"]["failed"] == 0 and content["figures"]["cases"] == 2
     assert content["figures"]["false_alarms"] == 0
     assert content["figures"]["detected"] == 1
     assert json.loads((tmp_path / "out/proof.json").read_text())["rows"][0]["case"]
-    assert prove.prove(tmp_path / "cases", tmp_path / "out", tmp_path / "answers")["rows"] == content["rows"]
+    assert prove(tmp_path / "cases", tmp_path / "out", tmp_path / "answers")["rows"] == content["rows"]
 
 
 def test_bench_counts_a_peer_by_the_same_scoring(tmp_path, capsys):

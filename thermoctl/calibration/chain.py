@@ -11,46 +11,34 @@ measured error is judged over test 4B. Estimators:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import linalg, signal
 
+from thermoctl.calibration.recorded import Recorded, filled
 from thermoctl.control.model import CompensatorModel
 from thermoctl.identify import expansion, filter, modal, subspace
 from thermoctl.identify.statespace import StateSpace
 from thermoctl.yamlfile import InputError
 
-STEP_K, NOISE_K = 0.25, 0.06
+STEP_K, NOISE_K = 0.25, 0.06  # resolution and noise of a thermocouple's reading
 LONGEST_S = 36000.0  # no expansion takes longer than ten hours
+ROW_NOISE = 1e-16  # K^2, which keeps the Riccati equation regular where a state has no noise
+FASTEST = 0.05  # smallest real pole of a sampled heat network; smaller ones come from the noise
 AIR_FILTER_S = 60.0
-FIRST_ORDER = (
-    6  # of the better method's model until the air's movement is taken out; then by BIC where none is given
-)
-DRIFT_S = (
-    7200.0,
-    250.0,
-)  # what no input explains: forgotten in two hours, above the thermometers' noise below 1/(2 pi 250 s)
-PAPER_CHOICES = (
-    (1, 30),
-    (1, 40),
-    (1, 50),
-    (2, 15),
-    (2, 20),
-    (2, 30),
-    (2, 40),
-    (3, 15),
-    (3, 20),
-    (3, 30),
-    (4, 15),
-    (4, 20),
-    (4, 30),
-    (4, 40),
-    (6, 15),
-    (6, 20),
-    (8, 15),
-    (8, 20),
-)  # s, rows i
+FIRST_ORDER = 6  # of the better model until the air's changes are taken out; then by BIC where none is given
+# What no input explains, s: forgotten in two hours; above 1/(2 pi 250 s) it is the thermometers' noise.
+DRIFT_S = (7200.0, 250.0)
+# Sampling periods, s, and the block rows i tried with each
+PAPER_ROWS = {
+    1: (30, 40, 50),
+    2: (15, 20, 30, 40),
+    3: (15, 20, 30),
+    4: (15, 20, 30, 40),
+    6: (15, 20),
+    8: (15, 20),
+}
+PAPER_CHOICES = [(period_s, i) for period_s, rows in PAPER_ROWS.items() for i in rows]
 ESTIMATORS = ("siso", "paper", "better", "twelve")
 
 
@@ -70,40 +58,30 @@ class Calibration:
     variances: np.ndarray
 
 
-def rises(r: Any) -> np.ndarray:
-    """Measured rises above the measured air (N, 12), K."""
+def rises(r: Recorded) -> np.ndarray:
+    """Return the measured rises above the measured air (N, 12), K."""
     return r.temperatures - smooth_air(r.air_c)[:, None]
 
 
 def smooth_air(air_c: np.ndarray) -> np.ndarray:
-    """The air after a first-order low-pass of AIR_FILTER_S, as the law takes it; (N,) degC at 1 s."""
+    """Filter the air by a first-order low-pass of AIR_FILTER_S, as the law does; (N,) degC at 1 s."""
     f = np.exp(-1 / AIR_FILTER_S)
     return signal.lfilter([1 - f], [1, -f], air_c, zi=[f * air_c[0]])[0]
 
 
 def air_rate(air_c: np.ndarray) -> np.ndarray:
-    """d(air)/dt of the low-passed air, K/s, held over the following second."""
+    """Differentiate the low-passed air, K/s, held over the following second."""
     a = smooth_air(air_c)
     return np.append(np.diff(a), 0.0)
 
 
-def filled(y: np.ndarray) -> np.ndarray:
-    """Missing readings held (for methods that need every sample)."""
-    out = y.copy()
-    t = np.arange(len(y))
-    for j in range(y.shape[1]):
-        ok = np.isfinite(y[:, j])
-        out[:, j] = y[np.maximum.accumulate(np.where(ok, t, t[ok][0])), j]
-    return out
-
-
 def block_mean(v: np.ndarray, q: int) -> np.ndarray:
-    """Means over blocks of q rows; an incomplete last block is dropped."""
+    """Average over blocks of q rows; drop an incomplete last block."""
     return v[: len(v) // q * q].reshape(len(v) // q, q, -1).mean(1)
 
 
-def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = None) -> Calibration:
-    """All estimators from the three calibration tests (evaluate.rigs.Recorded or alike, 1 s)."""
+def calibrate(test_2: Recorded, test_3: Recorded, test_4a: Recorded, order: int | None = None) -> Calibration:
+    """Calibrate all estimators from the three calibration tests at 1 s."""
     r_v = filter.sensor_variance(STEP_K, NOISE_K)
     # the paper's way
     paper_model, mkf = identify_paper(test_2, test_4a)
@@ -127,12 +105,15 @@ def calibrate(test_2: Any, test_3: Any, test_4a: Any, order: int | None = None) 
     )
 
 
-def identify_paper(test_2: Any, check: Any) -> tuple[StateSpace, filter.Mkf]:
-    """The paper's model of order 12 by (7) to (26) and its MKF, both from test 2. The paper leaves sampling period and block rows i open:
-    of PAPER_CHOICES those whose stable model's filter follows the twelve thermometers best over `check` (another test)."""
+def identify_paper(test_2: Recorded, check: Recorded) -> tuple[StateSpace, filter.Mkf]:
+    """Identify the paper's model of order 12 by (7) to (26) and its MKF, both from test 2.
+
+    The paper leaves sampling period and block rows i open. Of PAPER_CHOICES this takes those whose stable model's filter follows
+    the twelve thermometers best over `check`, another test."""
     r_v = filter.sensor_variance(STEP_K, NOISE_K)
     y2, measured = filled(rises(test_2)), filled(rises(check))
-    best: tuple[float, Any, Any] = (np.inf, None, None)
+    best: tuple[StateSpace, filter.Mkf] | None = None
+    least = np.inf
     for period_s, i in PAPER_CHOICES:
         u, y = block_mean(test_2.power_w[:, None], period_s), block_mean(y2, period_s)
         try:
@@ -142,19 +123,21 @@ def identify_paper(test_2: Any, check: Any) -> tuple[StateSpace, filter.Mkf]:
             continue
         with np.errstate(over="ignore", invalid="ignore"):
             left = float(np.sqrt(np.mean((estimate_mkf(mkf, check) - measured) ** 2)))
-        if left < best[0] and (model.stable or best[1] is None):
-            best = left, replace(model, info={**model.info, "period_s": period_s, "i": i}), mkf
-    if best[1] is None:
+        if left < least and (model.stable or best is None):
+            least, best = left, (replace(model, info={**model.info, "period_s": period_s, "i": i}), mkf)
+    if best is None:
         raise InputError(
             "no choice of sampling and block rows gives a model of order 12 from this test; it is too short"
         )
-    return best[1], best[2]
+    return best
 
 
 def calibrate_better(
-    tests: list[Any], order: int | None = None, model: StateSpace | None = None
+    tests: list[Recorded], order: int | None = None, model: StateSpace | None = None
 ) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion]:
-    """The better estimator alone, from any tests: (model, filter, its variances, expansion). `model`: one that is known already."""
+    """Calibrate the better estimator alone, from any tests; return model, filter, its variances and expansion.
+
+    `model`: one that is known already."""
     model = model or identify_better(tests, order)
     plant = filter.disturbed(filter.with_air(model))
     records = [filter.Record(t.power_w, air_rate(t.air_c), rises(t)) for t in tests]
@@ -163,10 +146,11 @@ def calibrate_better(
 
 
 def calibrate_refined(
-    tests: list[Any], order: int | None = None
+    tests: list[Recorded], order: int | None = None
 ) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion, str]:
-    """`calibrate_better`, and beside it the same with the thermal model refined by its prediction errors on all tests but the last: of
-    the two the one whose filter follows the thermometers of the last test better. (.., what came of it in words)."""
+    """Calibrate with and without refining the thermal model by its prediction errors on all tests but the last.
+
+    Return the one whose filter follows the thermometers of the last test better, and that comparison in words."""
     plain = calibrate_better(tests, order)
     refined_model = refine(plain[0], tests[:-1])
     if refined_model is plain[0]:
@@ -176,13 +160,14 @@ def calibrate_refined(
     a, b = (
         float(np.sqrt(np.nanmean((run_kalman(k, tests[-1]) - last) ** 2))) for k in (plain[1], refined[1])
     )
-    said = f"{b:.4f} K rms with, {a:.4f} K without, over the test that it was not refined on"
-    return (*refined, said + "; taken") if b < a else (*plain, said + "; left out")
+    compared = f"{b:.4f} K rms with, {a:.4f} K without, over the test that it was not refined on"
+    return (*refined, compared + "; taken") if b < a else (*plain, compared + "; left out")
 
 
-def refine(model: StateSpace, tests: list[Any]) -> StateSpace:
-    """Prediction-error refinement (subspace.refine_prediction_error) of poles, B and C on blocks of 10 s of one test after the other,
-    the air's own movement taken out. The model itself where nothing improves."""
+def refine(model: StateSpace, tests: list[Recorded]) -> StateSpace:
+    """Refine poles, B and C by prediction errors on blocks of 10 s of one test after the other, without the air's own changes.
+
+    Return the model itself where nothing improves."""
     slow = model.resample(10.0)
     air = with_air_alone(model)
     for t in tests:
@@ -199,16 +184,17 @@ def refine(model: StateSpace, tests: list[Any]) -> StateSpace:
 
 
 def with_air_alone(model: StateSpace) -> StateSpace:
-    """The model driven by d(air)/dt alone."""
+    """Build the model driven by d(air)/dt alone."""
     air = filter.with_air(model)
     return StateSpace(air.a, air.b[:, 1:], air.c, air.period_s, np.zeros(air.order))
 
 
-def identify_better(tests: list[Any], order: int | None) -> StateSpace:
-    """Real-pole model from all calibration tests together, with the air's own movement taken out of the data: a change of the air
-    shifts every rise by C b_air, known up to the model, so it is simulated with the model of the round before and subtracted.
-    `order` None: by BIC in the last round."""
-    moved: list[Any] = [0.0] * len(tests)
+def identify_better(tests: list[Recorded], order: int | None) -> StateSpace:
+    """Identify a real-pole model from all calibration tests together, without the effect of the air's own changes.
+
+    A change of the air shifts every rise by C b_air, which the model gives: it is simulated with the model of the previous round
+    and subtracted. `order` None: by BIC in the last round."""
+    moved: list[np.ndarray] | list[float] = [0.0] * len(tests)
     for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
         model = modal.identify(
             [
@@ -224,29 +210,29 @@ def identify_better(tests: list[Any], order: int | None) -> StateSpace:
     return model
 
 
-def estimate_mkf(mkf: filter.Mkf, r: Any) -> np.ndarray:
-    """The MKF at its period over a 1 s recording; held between its steps: rises (N, 12)."""
+def estimate_mkf(mkf: filter.Mkf, r: Recorded) -> np.ndarray:
+    """Run the MKF at its period over a 1 s recording; rises (N, 12), held between its steps."""
     return held(_mkf_steps(mkf, r), round(mkf.period_s), len(r.power_w))
 
 
-def _mkf_steps(mkf: filter.Mkf, r: Any) -> np.ndarray:
+def _mkf_steps(mkf: filter.Mkf, r: Recorded) -> np.ndarray:
     """The MKF's rises (K, 12), one row for each of its periods."""
     q = round(mkf.period_s)
     return mkf.run(block_mean(r.power_w[:, None], q)[:, 0], block_mean(filled(rises(r)[:, :1]), q)[:, 0])[0]
 
 
 def held(v: np.ndarray, q: int, n: int) -> np.ndarray:
-    """Rows of v, each held for q samples, n in all (the last one to the end)."""
+    """Hold each row of v for q samples, n in all; the last one to the end."""
     return np.repeat(v, q, axis=0)[np.minimum(np.arange(n), len(v) * q - 1)]
 
 
-def run_kalman(k: filter.Kalman, r: Any) -> np.ndarray:
-    """Estimated rises (N, 12) over a recording from rest."""
+def run_kalman(k: filter.Kalman, r: Recorded) -> np.ndarray:
+    """Run the Kalman filter over a recording from rest; rises (N, 12)."""
     return k.run(r.power_w, air_rate(r.air_c), rises(r)[:, list(k.sensors)])
 
 
-def fit_expansion(k: filter.Kalman, tests: list[Any]) -> expansion.Expansion:
-    """Output error on the filter's own estimates over all calibration tests, the filter's error as the inputs' uncertainty."""
+def fit_expansion(k: filter.Kalman, tests: list[Recorded]) -> expansion.Expansion:
+    """Fit the expansion by output error on the filter's own estimates; the filter's error is the inputs' uncertainty."""
     sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", k.model.c, k.p, k.model.c), 0))
     return expansion.output_error(
         [run_kalman(k, t) for t in tests],
@@ -259,8 +245,10 @@ def fit_expansion(k: filter.Kalman, tests: list[Any]) -> expansion.Expansion:
     )
 
 
-def estimates(c: Calibration, r: Any, starts_anew: bool = False) -> dict[str, np.ndarray]:
-    """Each estimator's position error (N,) um over a recording that begins with test 4A, or (`starts_anew`) over another."""
+def estimates(c: Calibration, r: Recorded, starts_anew: bool = False) -> dict[str, np.ndarray]:
+    """Estimate the position error (N,) um by each estimator over a recording that starts with test 4A.
+
+    `starts_anew`: over another recording, from zero."""
     air = smooth_air(r.air_c)
     start = {k: 0.0 if starts_anew else getattr(c, f"{k}_um").info.get("start_um", 0.0) for k in ESTIMATORS}
     return {
@@ -278,10 +266,10 @@ def estimates(c: Calibration, r: Any, starts_anew: bool = False) -> dict[str, np
 def compensator(
     c: Calibration, kind: str, period_s: float = 0.001, sensor_s: float = 0.1
 ) -> CompensatorModel:
-    """What the daemon runs, at its own period: kind 'paper' (MKF and recursion (5)) or 'better'. Sensor readings come every `sensor_s`.
+    """Build what the daemon runs, at its own period: kind 'paper' (MKF and recursion (5)) or 'better'.
 
-    Process noise is per second, so it scales with the period; a quantised reading ten times a second brings no more information than one
-    a second, so its variance grows in proportion."""
+    Sensor readings come every `sensor_s`. Process noise is per second, so it scales with the period. A quantised reading ten times
+    a second brings no more information than one a second, so its variance grows in proportion."""
     if kind == "paper":
         model = c.paper_model
         alpha, _ = model.output_form()
@@ -312,14 +300,14 @@ def compensator(
 def better_compensator(
     kalman: filter.Kalman, um: expansion.Expansion, period_s: float = 0.001, sensor_s: float = 0.1
 ) -> CompensatorModel:
-    """The better estimator as the daemon runs it; see `compensator`."""
+    """Build the better estimator as the daemon runs it; see `compensator`."""
     model = kalman.model
     scale = sensor_s / model.period_s
     at_sensor = _at_period(model, sensor_s)
     q = kalman.noise * scale
     cs = at_sensor.c[:1]
     r = np.array([[filter.sensor_variance(STEP_K, NOISE_K) / scale]])
-    p = linalg.solve_discrete_are(at_sensor.a.T, cs.T, q + 1e-16 * np.eye(len(q)), r)
+    p = linalg.solve_discrete_are(at_sensor.a.T, cs.T, q + ROW_NOISE * np.eye(len(q)), r)
     gain = (p @ cs.T / (cs @ p @ cs.T + r))[:, 0]
     fast = _at_period(model, period_s)
     return CompensatorModel(
@@ -348,7 +336,7 @@ def _at_period(model: StateSpace, period_s: float) -> StateSpace:
 
 
 def _without_noise_poles(model: StateSpace) -> StateSpace:
-    """The model without modes that no sampled heat network has (real poles at or below 0.05, which the noise put there)."""
+    """The model without modes that no sampled heat network has (real poles at or below FASTEST)."""
     values, vectors = np.linalg.eig(model.a)
-    keep = np.where((np.abs(values.imag) < 1e-12) & (values.real <= 0.05), 0.05, values)
+    keep = np.where((np.abs(values.imag) < 1e-12) & (values.real <= FASTEST), FASTEST, values)
     return replace(model, a=np.real(vectors @ np.diag(keep) @ np.linalg.inv(vectors)))

@@ -14,7 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
+
+FEWEST = 2  # approaches to a target, by the standard's estimator of repeatability
+SETTLE_S = 2.0  # after arrival, before an approach is read
+SETTLED = 10  # first samples, whose mean error is taken as zero
+AT_TARGET_UM = 1e-6  # between reference and setpoint: the motion has ended
 
 
 @dataclass(frozen=True)
@@ -28,25 +34,27 @@ class Direction:
 
     @property
     def repeatability(self) -> float:
-        """R: the largest 4 s."""
+        """Return R, the largest 4 s, um."""
         return float(4 * self.s.max())
 
     @property
     def accuracy(self) -> float:
-        """A: from the lowest mean - 2 s to the highest mean + 2 s, um."""
+        """Return A, from the lowest mean - 2 s to the highest mean + 2 s, um."""
         return float((self.mean + 2 * self.s).max() - (self.mean - 2 * self.s).min())
 
     @property
     def systematic(self) -> float:
-        """E: range of the means, um."""
+        """Return E, the range of the means, um."""
         return float(self.mean.max() - self.mean.min())
 
 
 def unidirectional(targets_um: np.ndarray, deviations_um: np.ndarray) -> Direction:
-    """Figures of one direction from pairs (target, deviation) of every approach. Raises InputError below two approaches."""
+    """Compute the figures of one direction from pairs (target, deviation) of every approach.
+
+    Raises InputError below two approaches."""
     unique = np.unique(targets_um)
     groups = [deviations_um[targets_um == v] for v in unique]
-    if any(len(g) < 2 for g in groups):
+    if any(len(g) < FEWEST for g in groups):
         raise InputError("ISO 230-2 needs at least two approaches to every target")
     return Direction(
         unique,
@@ -57,7 +65,7 @@ def unidirectional(targets_um: np.ndarray, deviations_um: np.ndarray) -> Directi
 
 
 def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
-    """Mean deviation and 2 s of an error that is recorded all the time (the paper's 5 h figures)."""
+    """Compute mean deviation and 2 s of an error that is recorded all the time (the paper's 5 h figures)."""
     e = error_um[np.isfinite(error_um)]
     return float(e.mean()), float(2 * e.std(ddof=1))
 
@@ -65,7 +73,7 @@ def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
 def approaches(
     setpoint_um: np.ndarray, reference_um: np.ndarray, settle: int
 ) -> list[tuple[int, float, int]]:
-    """Where the motion stands still: (index `settle` samples after arrival, target, direction +1 or -1)."""
+    """Find where the motion stands still: (index `settle` samples after arrival, target, direction +1 or -1)."""
     still = np.concatenate([[False], setpoint_um[1:] == setpoint_um[:-1]])
     out, last = [], 0
     for k in range(1, len(still)):
@@ -74,3 +82,35 @@ def approaches(
         elif not still[k - 1] and k + settle < len(still) and still[k : k + settle].all():
             out.append((k + settle, float(setpoint_um[k]), last))
     return out
+
+
+def figures(table: Table, path: str) -> list[str]:
+    """Show the figures of a recording as lines: of the error at rest, and by target and direction.
+
+    Raises InputError for a recording without the reference encoder."""
+    for n in ("output_reference_um", "setpoint_um"):
+        if n not in table.columns:
+            raise InputError(
+                f"{path}: column '{n}' is missing; only a recording with the reference encoder can be judged"
+            )
+    setpoint, output = table.columns["setpoint_um"], table.columns["output_reference_um"]
+    reference = table.columns.get("reference_um", setpoint)
+    error = output - reference
+    error = error - np.nanmean(error[:SETTLED])
+    rest = np.abs(reference - setpoint) < AT_TARGET_UM
+    mean, two_s = mean_and_two_s(error[rest])
+    lines = [
+        f"{path}: {mean:+.3f} +- {two_s:.3f} um (mean deviation, 2 s, {int(rest.sum())} samples at rest)"
+    ]
+    stops = approaches(reference, output, max(1, round(SETTLE_S / np.median(np.diff(table.t)))))
+    for way, word in ((1, "upwards"), (-1, "downwards")):
+        targets = np.round([v for _, v, d in stops if d == way], 3)
+        deviations = np.round([error[k] for k, _, d in stops if d == way], 3)
+        several = np.array([np.sum(targets == v) >= FEWEST for v in targets], dtype=bool)
+        if several.any():
+            d = unidirectional(targets[several], deviations[several])
+            lines += [
+                f"  {word} to {v:g} um: {m:+.3f} +- {2 * s:.3f} um, {n} approaches"
+                for v, m, s, n in zip(d.targets, d.mean, d.s, d.n, strict=True)
+            ]
+    return lines

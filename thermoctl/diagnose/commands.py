@@ -10,7 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from thermoctl.diagnose import run
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
+from thermoctl.diagnose.experiment_file import peaks
+from thermoctl.diagnose.outcome import sentence
+from thermoctl.diagnose.resolve import resolve
 from thermoctl.yamlfile import InputError, suggest
 
 # How far along a diagnosis is when a stage begins (share of its whole time, a rough guess): for the estimate of what is left.
@@ -24,14 +28,14 @@ _STAGES = (
 )
 
 
-class Progress:
+class StageReporter:
     """Writes each stage with the time gone and, from the second stage on, a rough time left."""
 
     def __init__(self) -> None:
-        self.begun, self.share = time.monotonic(), 0.0
+        self.started, self.share = time.monotonic(), 0.0
 
     def __call__(self, text: str) -> None:
-        gone = time.monotonic() - self.begun
+        gone = time.monotonic() - self.started
         self.share = max(self.share, next((share for start, share in _STAGES if text.startswith(start)), 0.0))
         left = f", about {gone * (1 - self.share) / self.share:.0f} s left" if self.share else ""
         print(f"{gone:6.1f} s{left}: {text}", file=sys.stderr, flush=True)
@@ -39,20 +43,8 @@ class Progress:
 
 def diagnose(args: argparse.Namespace) -> int:
     """`thermoctl diagnose`: runs the diagnosis and prints its summary. Raises InputError for unusable inputs."""
-    if args.live:
-        if args.recordings:
-            raise InputError(
-                "diagnose --live reads the daemon's own recordings; no recording was expected beside it"
-            )
-        args.recordings = _live(args)
-        if not args.recordings:
-            return 0
     if not args.recordings:
         raise InputError("no recording was given; one or more were expected, or --live")
-    if any(Path(r).is_dir() for r in args.recordings):
-        return fleet(args)
-    from thermoctl.diagnose import run
-    from thermoctl.diagnose.experiment import resolve
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
         return run.diagnose(
@@ -60,7 +52,7 @@ def diagnose(args: argparse.Namespace) -> int:
             recordings,
             args.out,
             [Path(e) for e in args.effects or ()],
-            None if args.quiet else Progress(),
+            None if args.quiet else StageReporter(),
             args.drive or (),
             _limits(args.limit or ()),
         )
@@ -83,32 +75,6 @@ def diagnose(args: argparse.Namespace) -> int:
     return 0
 
 
-def _live(args: argparse.Namespace) -> list[str]:
-    """The stretch of the daemon's recordings that its model does not fit, as a file in OUT; none where it fits."""
-    from thermoctl.fleet import live
-    from thermoctl.plant import load
-    from thermoctl.settings import load_settings
-
-    settings = load_settings(args.config)
-    table = live.newest(settings.recording.directory, settings.rig.name, args.hours)
-    alarms = live.where(settings, table)
-    span = f"{table.t[0]:.0f} s to {table.t[-1]:.0f} s of the newest session"
-    if not alarms:
-        print(
-            f"The model fits: from {span} its innovations are what the filter expects. Nothing to diagnose."
-        )
-        return []
-    a = alarms[-1]
-    print(
-        f"The model no longer fits from {a.begin_s:.0f} s on (mean innovation {a.mean_c:+.3f} K; {span}); that is diagnosed.",
-        file=sys.stderr,
-    )
-    Path(args.out).mkdir(parents=True, exist_ok=True)
-    path = Path(args.out) / "live.csv"
-    live.extract(load(args.plant), table, a, path)
-    return [str(path)]
-
-
 def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
     """NAME=LOW:HIGH of each. Raises InputError."""
     out = {}
@@ -124,76 +90,6 @@ def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
         if not out[name][0] < out[name][1]:
             raise InputError(f"--limit {text}: the first number must be the smaller one")
     return out
-
-
-def fleet(args: argparse.Namespace) -> int:
-    """`thermoctl diagnose` over folders: every rig's newest recordings by themselves, spread over processes or a Dask cluster,
-    into OUT/RIG each. A rig is what the program's recordings are named by, else the folder that holds them. A rig that cannot be
-    diagnosed is told and does not stop the others; done rigs are not run again."""
-    from thermoctl.fleet.health import find_recordings, rig_of
-    from thermoctl.proof import run as prove
-
-    rigs: dict[str, list[str]] = {}
-    for path in (p for r in args.recordings for p in (find_recordings(r) if Path(r).is_dir() else [r])):
-        rigs.setdefault(rig_of(path), []).append(path)
-    jobs = [
-        prove.Job(
-            rig,
-            args.plant,
-            tuple(sorted(paths, key=lambda p: Path(p).name)[-args.last :]),
-            tuple(args.effects or ()),
-        )
-        for rig, paths in sorted(rigs.items())
-    ]
-    if not Path(args.plant).is_file():
-        raise InputError(f"{args.plant}: no such file; the plant of the fleet's rigs was expected")
-    out = Path(args.out)
-    prove.run_all(jobs, out, args.scheduler, args.workers, progress=None if args.quiet else prove.Reporter())
-    told = []
-    for job in jobs:
-        run = json.loads((out / job.name / "run.json").read_text())
-        found = {} if run["error"] else json.loads((out / job.name / "diagnosis.json").read_text())
-        told.append(
-            {
-                "rig": job.name,
-                "recordings": list(job.recordings),
-                "error": run["error"],
-                "seconds": run["seconds"],
-                "verdict": found.get("verdict"),
-                "findings": [
-                    {k: f[k] for k in ("effect", "where", "probability")} for f in found.get("findings", [])
-                ],
-            }
-        )
-    if args.json:
-        print(json.dumps(told, indent=1))
-    elif not args.quiet:
-        from rich.console import Console
-        from rich.table import Table
-
-        table = Table(
-            "rig",
-            "recordings",
-            "verdict",
-            "effect at place (probability)",
-            "s",
-            box=None,
-            header_style="bold",
-        )
-        for x in told:
-            what = x["error"] or "\n".join(
-                f"{f['effect']} at {f['where']} ({f['probability']:.2f})" for f in x["findings"]
-            )
-            table.add_row(
-                x["rig"],
-                str(len(x["recordings"])),
-                x["verdict"] or "not diagnosed",
-                what,
-                f"{x['seconds'] or 0:.0f}",
-            )
-        Console(soft_wrap=True).print(table)
-        print(f"reports: {out}/RIG/report.html")
-    return 0
 
 
 def effects(args: argparse.Namespace) -> int:
@@ -238,34 +134,6 @@ def effects(args: argparse.Namespace) -> int:
         table.add_row(e.name, e.where, e.title)
     console.print(table)
     return 0
-
-
-def sentence(found: dict[str, Any]) -> str:
-    """The verdict of a result (spec thermoctl-diagnosis/1) in one sentence."""
-    named = " and ".join(f"{f['effect'].replace('_', ' ')} at {f['where']}" for f in found["findings"])
-    sure = f" (probability {found['findings'][0]['probability']:.2f})" if found["findings"] else ""
-    if found["verdict"] == "consistent":
-        return (
-            "The recordings agree with the plant, as far as its sensors and its parameters' ranges can tell: "
-            "nothing is missing."
-        )
-    if found["verdict"] == "explained":
-        return f"The plant lacks {named}{sure}; with it the simulation follows the recordings as well as the sensors allow."
-    if found["verdict"] == "ambiguous":
-        others = ", ".join(
-            f"{a['effect'].replace('_', ' ')} at {a['where']}" for a in found["alternatives"][:4]
-        )
-        return (
-            f"Something is missing that these recordings cannot name for sure: most likely {named}{sure}"
-            + (f", but also {others} would fit." if others else ".")
-        )
-    where = found["mismatch"][0]["node"] or found["mismatch"][0]["channel"] if found["mismatch"] else None
-    return (
-        "Something is missing"
-        + (f", most of it at {where}," if where else "")
-        + " that no entry of the catalogue explains"
-        + (f"; {named} explains a part of it{sure}." if named else ".")
-    )
 
 
 def summary(found: dict[str, Any], out: str | Path) -> None:
@@ -333,8 +201,6 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
     for note in found["notes"]:
         console.print(f"note: {note}", markup=False)
     if found["next_experiment"]:
-        from thermoctl.diagnose.experiment import peaks
-
         told = found["next_experiment"]
         console.print(
             f"next experiment: {told['profile']}. {told['why']} {told['also_helpful'] or ''}", markup=False

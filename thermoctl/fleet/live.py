@@ -1,15 +1,13 @@
-"""`thermoctl diagnose --live`: the daemon's own recordings, searched for where its model no longer fits, as a recording to
-diagnose.
+"""The daemon's own recordings, searched for the stretch where its model no longer fits: `thermoctl diagnose --live`.
 
-The 10 Hz tier of the newest session is read back for some hours, and its innovations go through the same sum as in the daemon
-(daemon/misfit.py). The stretch from well before the onset to now is averaged to seconds and written as a CSV whose columns are
-those of the thermal plant.
+The 10 Hz tier of the newest session is read, some hours back, and its innovations go through the same sum as in the daemon
+(daemon/misfit.py). The stretch from BEFORE_S before the onset to now is averaged to seconds and written as a CSV whose columns
+are those of the thermal plant.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,14 +17,16 @@ from thermoctl.plant.language import Plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import TIER, recording_files
+from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
-BEFORE_S = 1800.0  # of a time when the model still fitted, taken along
+BEFORE_S = 1800.0  # taken along from before the alarm, when the model still fitted
+STRIDE = 10  # rows of the 10 Hz tier in a second
 _STEP_S = 1.0
 
 
 def newest(directory: str | Path, rig: str, hours: float) -> Table:
-    """The newest session of a rig, at most so many hours back, as recorded. Raises InputError where there is none."""
+    """Read the newest session of a rig, at most so many hours back. Raises InputError where there is none."""
     folder = Path(directory)
     files = (
         [p for p in recording_files(folder, TIER) if p.name.startswith(rig + "-")] if folder.is_dir() else []
@@ -51,12 +51,12 @@ def newest(directory: str | Path, rig: str, hours: float) -> Table:
     )
 
 
-def where(settings: Any, table: Table) -> list[Alarm]:
-    """Every time that the model stopped fitting in a table of `newest`."""
+def alarms(settings: Settings, table: Table) -> list[Alarm]:
+    """Find every time that the model stopped fitting in a table of `newest`."""
     watch = Misfit(compensator(settings))
     out = []
-    for k in range(0, len(table.t), 10):
-        rows = slice(k, k + 10)  # as the daemon sees them: an alarm that came and went between is not lost
+    for k in range(0, len(table.t), STRIDE):
+        rows = slice(k, k + STRIDE)  # in pieces as in the daemon: an alarm that came and went is not lost
         found = watch.add(
             table.t[rows], table.columns["innovation_c"][rows], table.columns["kalman_gain"][rows]
         )
@@ -66,7 +66,7 @@ def where(settings: Any, table: Table) -> list[Alarm]:
 
 
 def seconds(table: Table) -> Table:
-    """Means of a second, NaN where nothing was measured in it."""
+    """Average over each second; NaN where nothing was measured in it."""
     bins = np.floor((table.t - table.t[0]) / _STEP_S).astype(int)
     there = np.bincount(bins) > 0
     columns = {}
@@ -78,7 +78,9 @@ def seconds(table: Table) -> Table:
 
 
 def extract(plant: Plant, table: Table, alarm: Alarm | None, out: str | Path) -> None:
-    """Write what the plant reads of the table, in means of a second, from BEFORE_S before the alarm on (None: all of it). Raises InputError."""
+    """Write the columns that the plant reads, averaged to seconds, from BEFORE_S before the alarm on (None: all).
+
+    Raises InputError where an input of the plant is missing."""
     table = seconds(table)
     known = dict(table.columns)
     if {"output_reference_um", "position_raw_um"} <= set(known):
