@@ -17,29 +17,13 @@ from tests.architecture import (
 )
 
 # Present exceptions, each to be removed with its cause. An exception that is no longer needed fails, too.
-ARROWS = {
-    ("thermoctl.diagnose.commands", "settings")  # one option of the configuration; the caller could pass it
-}
+ARROWS = {}
 CIRCLES = [
     # hal.backend is contract and factory, hal.devices base and maker of drivers, hal.board seqlock and poller
     "hal.backend hal.board hal.can_bus hal.devices hal.faulty hal.modbus hal.profile hal.replay hal.serial_port "
-    "hal.simulated hal.wire",
-    # the page takes a sentence from the command; run writes the page
-    "thermoctl.diagnose.commands thermoctl.diagnose.page thermoctl.diagnose.run thermoctl.fleet.health "
-    "thermoctl.fleet.live thermoctl.proof.run",
-    "thermoctl.calibration.commands thermoctl.calibration.wizard thermoctl.reproduction.rigs "
-    "thermoctl.reproduction.closed_loop thermoctl.reproduction.study",
+    "hal.simulated hal.wire"
 ]
-INSIDE_FUNCTIONS = {
-    "cli",
-    "daemon",
-    "diagnose",
-    "calibration",
-    "reproduction",
-    "proof",
-    "fleet",
-    "hal",
-}  # only `cli` should be left
+INSIDE_FUNCTIONS = {"cli", "daemon", "hal"}  # only `cli` should be left
 
 
 @pytest.fixture(scope="module")

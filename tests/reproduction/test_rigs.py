@@ -8,6 +8,7 @@ import pytest
 
 from thermoctl import plant
 from thermoctl.calibration import chain, iso230
+from thermoctl.calibration.recorded import Recorded
 from thermoctl.identify import experiments
 from thermoctl.report.page import page, table
 from thermoctl.reproduction import closed_loop, rigs
@@ -81,10 +82,12 @@ def test_bad_experiments(tmp_path, text, message):
 @pytest.fixture(scope="module")
 def proof():
     tests = experiments.load_experiments(ROOT / "config" / "experiments.yaml")
-    rig = rigs.Rig(plant.load(ROOT / "config" / "plants" / "actuator_truth.yaml"), 2, None, rigs.PAPER_SCALE)
+    rig = rigs.ProvingRig(
+        plant.load(ROOT / "config" / "plants" / "actuator_truth.yaml"), 2, None, rigs.PAPER_SCALE
+    )
     run4 = rigs.joined(tests["test_4a"], tests["test_4b"], "test_4")
     r2, r3, r4 = rig.run(tests["test_2"], 1), rig.run(tests["test_3"], 2), rig.run(run4, 4)
-    r4a = rigs.Recorded(*(getattr(r4, f.name)[:7200] for f in dataclasses.fields(r4)))
+    r4a = Recorded(*(getattr(r4, f.name)[:7200] for f in dataclasses.fields(r4)))
     return rig, run4, r4, chain.calibrate(r2, r3, r4a)
 
 

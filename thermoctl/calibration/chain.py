@@ -216,7 +216,7 @@ def estimate_mkf(mkf: filter.Mkf, r: Recorded) -> np.ndarray:
 
 
 def _mkf_steps(mkf: filter.Mkf, r: Recorded) -> np.ndarray:
-    """The MKF's rises (K, 12), one row for each of its periods."""
+    """Run the MKF; rises (K, 12), one row for each of its periods."""
     q = round(mkf.period_s)
     return mkf.run(block_mean(r.power_w[:, None], q)[:, 0], block_mean(filled(rises(r)[:, :1]), q)[:, 0])[0]
 
@@ -336,7 +336,7 @@ def _at_period(model: StateSpace, period_s: float) -> StateSpace:
 
 
 def _without_noise_poles(model: StateSpace) -> StateSpace:
-    """The model without modes that no sampled heat network has (real poles at or below FASTEST)."""
+    """Move modes that no sampled heat network has (real poles below FASTEST) to FASTEST."""
     values, vectors = np.linalg.eig(model.a)
     keep = np.where((np.abs(values.imag) < 1e-12) & (values.real <= FASTEST), FASTEST, values)
     return replace(model, a=np.real(vectors @ np.diag(keep) @ np.linalg.inv(vectors)))

@@ -112,7 +112,7 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
 
 
 def _earlier(rig: drive.DrivenRig, path: Path, progress_path: Path) -> tuple[Table | None, float]:
-    """What was recorded of a test that was ended on a daemon, and how far it came."""
+    """Read what was recorded of a test that was ended on a daemon, and how far it came."""
     if not (path.exists() and progress_path.exists() and isinstance(rig, DaemonRig)):
         return None, 0.0
     earlier = rig.meanwhile(read_table(path))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -90,9 +90,9 @@ def _response(response: Response, pid: Pid) -> str:
     return figure(fig, caption) + table(titles, rows)
 
 
-def _axes(n: int = 1) -> tuple[Figure, Sequence[Axes]]:
+def _axes(n: int = 1) -> tuple[Figure, list[Axes]]:
     fig = Figure(figsize=(9, 2.6 * n), layout="constrained")
-    return fig, fig.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
+    return fig, list(fig.subplots(n, 1, sharex=True, squeeze=False)[:, 0])
 
 
 def _legend(fig: Figure, axes: Axes) -> None:

@@ -198,7 +198,7 @@ class Wizard:
         return True
 
     def _earlier(self, name: str, part: Path) -> tuple[Table | None, float]:
-        """The rows of a test that was ended on a daemon, with those since, and how far it came."""
+        """Read the rows of a test that was ended on a daemon, with those since, and how far it came."""
         if name not in self.at_s or not part.exists() or not isinstance(self.rig, DaemonRig):
             return None, 0.0
         earlier = self.rig.meanwhile(read_table(part))
@@ -253,7 +253,7 @@ class Wizard:
         return Path(self.settings.compensation.model or ".").resolve() == models.resolve()
 
     def _model_option(self, models: Path) -> str:
-        """The folder of calibrations as the configuration names it: relative to the configuration."""
+        """Name the folder of calibrations relative to the configuration, as it does itself."""
         return os.path.relpath(models.resolve(), Path(self.settings.path).resolve().parent)
 
     def accept(self, models: Path, gains: bool) -> None:

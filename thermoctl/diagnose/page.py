@@ -12,6 +12,7 @@ import numpy as np
 from thermoctl.diagnose.effects import Candidate
 from thermoctl.diagnose.experiment_file import peaks
 from thermoctl.diagnose.outcome import Diagnosis, sentence
+from thermoctl.plant.refit import report
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, page, table, unit
 
@@ -300,8 +301,6 @@ def _confused(found: Diagnosis) -> str:
 
 
 def _parameters(case: Case, found: Diagnosis) -> str:
-    from thermoctl.plant.refit import report
-
     before = {e.name: e for e in report(found.base.fit)}
     rows, said = [], []
     for e in report(found.final.fit):

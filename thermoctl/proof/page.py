@@ -97,7 +97,7 @@ def _names(effects: Sequence[tuple[str, str]]) -> str:
 
 
 def _plots(content: Mapping[str, Any], rows: Sequence[Row]) -> Figure:
-    """Detection and name by size, reliability, held-out gain, effect parameters, onset and time as one figure."""
+    """Plot detection and name by size, reliability, held-out gain, effect parameters, onset and time as one figure."""
     figure = Figure(figsize=(12, 6.6), layout="constrained")
     (size, reliable, gain), (wide, onset, clock) = figure.subplots(2, 3)
     _plot_sizes(size, content["shares"])

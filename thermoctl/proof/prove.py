@@ -75,7 +75,7 @@ def _duration(recordings: Sequence[str]) -> float | None:
 
 
 def _commit() -> str | None:
-    """The source's commit, `-dirty` when changed since; None outside a checkout."""
+    """Read the source's commit, `-dirty` when changed since; None outside a checkout."""
     if shutil.which("git") is None:
         return None
     run = subprocess.run(

@@ -204,7 +204,7 @@ def _onset(
 
 
 def _gain(fit: Mapping[str, Any], oracle: Mapping[str, float] | None) -> float | None:
-    """The share of the oracle's held-out gain; None where a refit alone is within 1 % of the oracle."""
+    """Compute the share of the oracle's held-out gain; None where a refit alone is within 1 % of the oracle."""
     before, after = fit.get("held_out_refit_only") or {}, fit.get("held_out_after") or {}
     outputs = [o for o in (oracle or {}) if before.get(o) is not None and after.get(o) is not None]
     if not outputs or oracle is None:

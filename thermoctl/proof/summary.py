@@ -97,7 +97,7 @@ def _shares(rows: Sequence[Row]) -> dict[str, Share]:
 
 
 def _by_size(single: Sequence[Row]) -> dict[str, dict[str, float] | None]:
-    """The size found half of the time, in all noise, in white and in coloured noise."""
+    """Fit the size found half of the time, in all noise, in white and in coloured noise."""
     sized = [r for r in single if r.size]
     groups = {
         "all": sized,

@@ -93,7 +93,7 @@ def lines(content: Mapping[str, Any]) -> Iterator[Line]:
 
 
 def _open_lines(found: Mapping[str, Any]) -> Iterator[Line]:
-    """The lines of the cases with small misfits that nobody will name."""
+    """Yield the lines of the cases with small misfits that nobody will name."""
     for key, s in found.get("shares", {}).items():
         if s["n"]:
             wide = f"{100 * s['low']:.0f}–{100 * s['high']:.0f} %"

@@ -6,7 +6,8 @@ Phase 1 (two processes): test 2; test 3 and test 4A, without compensation. Phase
 from __future__ import annotations
 
 import dataclasses
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,89 +16,63 @@ import numpy as np
 from thermoctl import plant
 from thermoctl.calibration import chain
 from thermoctl.calibration.iso230 import mean_and_two_s
+from thermoctl.calibration.recorded import Recorded, of_columns
+from thermoctl.calibration.schedules import of_config
+from thermoctl.calibration.simulated_rig import with_model
 from thermoctl.control.model import CompensatorModel
+from thermoctl.daemon.simulate import Simulation
 from thermoctl.identify import experiments
 from thermoctl.plant import extended
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.reproduction import rigs
+from thermoctl.reproduction.plants import HEATED, quasi_static
+from thermoctl.reproduction.rigs import PAPER_SCALE
+from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX, NAMES, POINTS
 
 
-def recorded(rows: np.ndarray, schedule: experiments.Schedule | None = None) -> rigs.Recorded:
-    """Record rows (N, signals) at 1 s as one test; the position error is the two encoders' difference from its first value."""
-    col = {n: rows[:, i] for n, i in INDEX.items()}
-    temperatures = np.column_stack([col[f"{p}_c"] for p in POINTS])
-    error = col["output_reference_um"] - col["position_raw_um"]
-    error = error - np.nanmean(error[:5])
-    nothing = np.full(temperatures.shape, np.nan)
-    return rigs.Recorded(
-        np.arange(len(rows), dtype=float),
-        col["power_w"],
-        col["air_c"],
-        temperatures,
-        error,
-        nothing,
-        error,
-        col["setpoint_um"],
-    )
+def of_rows(rows: np.ndarray) -> Recorded:
+    """Take record rows (N, signals) at 1 s as one test."""
+    return of_columns(np.arange(len(rows), dtype=float), {n: rows[:, i] for n, i in INDEX.items()})
 
 
 def run_test(
-    config: str,
-    truth: str,
-    names: list[str],
-    model: CompensatorModel | None,
-    every: int = 1000,
-    part: float = 1.0,
-) -> list[np.ndarray]:
-    """Each named test from rest, record rows once a second; the compensator `model` acts when given."""
-    from thermoctl.daemon.simulate import Simulation
-    from thermoctl.settings import load_settings
-
+    config: str, truth: str, name: str, model: CompensatorModel | None, every: int = 1000, part: float = 1.0
+) -> np.ndarray:
+    """Run one test from rest; record rows once every `every` ticks. The compensator `model` acts when given."""
     settings = load_settings(config)
-    settings = dataclasses.replace(
-        settings,
-        hal=dataclasses.replace(settings.hal, truth=truth),
-        compensation=dataclasses.replace(settings.compensation, enable=model is not None, model=""),
-    )
-    if model is None:  # nothing is estimated yet that the coil could be compared with
-        settings = dataclasses.replace(
-            settings, protection=dataclasses.replace(settings.protection, innovation_limit_c=1e3)
-        )
-    tests = experiments.load_experiments(Path(config).parent / "experiments.yaml")
-    out = []
-    for name in names:
-        simulation = Simulation(settings, model)
-        try:
-            test = dataclasses.replace(tests[name], duration_s=part * tests[name].duration_s)
-            out.append(np.vstack(list(experiments.run(simulation, test, every))))
-        finally:
-            simulation.close()
-    return out
+    settings = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, truth=truth))
+    test = experiments.load_experiments(of_config(config))[name]
+    simulation = Simulation(with_model(settings, model), model)
+    try:
+        test = dataclasses.replace(test, duration_s=part * test.duration_s)
+        return np.vstack(list(experiments.run(simulation, test, every)))
+    finally:
+        simulation.close()
 
 
 def scaled_truth(plant_file: str | Path, path: Path) -> Path:
-    """The truth plant with the proving rigs' expansions, written to `path`, whose absolute form is returned."""
+    """Write the truth plant with the proving rigs' expansions to `path`; return its absolute form."""
     p = plant.load(plant_file)
 
-    def change(data: dict) -> None:
-        for k, factor in rigs.PAPER_SCALE.items():
+    def change(data: dict[str, Any]) -> None:
+        for k, factor in PAPER_SCALE.items():
             data["parameters"][k]["value"] *= factor
 
     plant.save(extended(p, change), path)
     return path.resolve()  # settings read a relative path from their own file's folder
 
 
-def still(
+def quasi_static_run(
     plant_file: Path,
-    test: rigs.Recorded,
+    test: Recorded,
     schedule: experiments.Schedule,
     seed: int,
     compensation_um: np.ndarray | float = 0.0,
-) -> rigs.Recorded:
-    """The quasi-static plant on the same schedule and the same recorded air as a full run, read by the same instruments. What the law
-    compensated, (N,) um, the coil moves back: 15 um of 250 are a tenth of the heat."""
+) -> Recorded:
+    """Simulate the quasi-static plant on the schedule and the recorded air of a full run, read by the same instruments.
+
+    The coil also moves by what the law compensated, (N,) um: 15 um of 250 are a tenth of the heat."""
     p = plant.load(plant_file)
     n = len(test.t)
     value = {k: v.value for k, v in p.parameters.items()}
@@ -109,9 +84,9 @@ def still(
         "current": np.sqrt((i**2).reshape(n, 10).mean(1)),
         "eddy_w": (value["b_eddy"] * v**2).reshape(n, 10).mean(1),
         "air": chain.smooth_air(test.air_c),
-        **{f"heat_{b}": np.zeros(n) for b in rigs.HEATED},
+        **{f"heat_{b}": np.zeros(n) for b in HEATED},
     }
-    model = compile_plant(rigs.quasi_static(p))
+    model = compile_plant(quasi_static(p))
     sim = model.simulate(Table("still", "still", np.arange(n, dtype=float), columns))
     names = list(model.outputs)
     true_c = sim.y[:, [names.index(f"{q}_c") for q in POINTS]]
@@ -126,7 +101,7 @@ def still(
 
     measured = np.column_stack([read(true_c[:, j], f"{q}_c") for j, q in enumerate(POINTS)])
     error = read(true_um, "output_reference_um") - read(np.zeros(n), "position_um")
-    return rigs.Recorded(
+    return Recorded(
         test.t,
         sim.y[:, names.index("power_w")],
         test.air_c,
@@ -138,9 +113,10 @@ def still(
     )
 
 
-def agreement(full: rigs.Recorded, quasi: rigs.Recorded) -> dict[str, float]:
-    """How far the quasi-static run of a test is from the full one, minute by minute (instruments' steps averaged out): temperature and
-    position error, rms and largest; and the ratio of the energies."""
+def agreement(full: Recorded, quasi: Recorded) -> dict[str, float]:
+    """Compare the quasi-static run of a test with the full one: temperature and position, rms and largest, and the energies' ratio.
+
+    Both are averaged over each minute, which removes the instruments' steps."""
     minute = len(full.t) // 60 * 60
 
     def mean(a: np.ndarray) -> np.ndarray:
@@ -158,30 +134,31 @@ def agreement(full: rigs.Recorded, quasi: rigs.Recorded) -> dict[str, float]:
     }
 
 
-def run(config: str, plant_file: str, folder: Path, say: Any = print, part: float = 1.0) -> dict[str, Any]:
-    """Everything; returns figures and the recordings {name: rows}. `part` < 1 is for tests: only that part of each test."""
+def run(
+    config: str, plant_file: str, folder: Path, say: Callable[[str], object] = print, part: float = 1.0
+) -> dict[str, Any]:
+    """Run every test and return `judge`'s figures; the recordings go into FOLDER/full_run.npz.
+
+    `part` < 1 is for tests of this module: only that part of each test."""
     truth = scaled_truth(plant_file, folder / "truth.yaml")
-    tests = experiments.load_experiments(Path(config).parent / "experiments.yaml")
     with ProcessPoolExecutor(2) as pool:
-        waiting = {
-            k: pool.submit(run_test, config, str(truth), [k], None, 1000, part)
-            for k in ("test_2", "test_3", "test_4a")
-        }
-        rows = {k: f.result()[0] for k, f in waiting.items()}
+
+        def submit(name: str, model: CompensatorModel | None) -> Future[np.ndarray]:
+            return pool.submit(run_test, config, str(truth), name, model, 1000, part)
+
+        waiting = {k: submit(k, None) for k in ("test_2", "test_3", "test_4a")}
+        rows = {k: f.result() for k, f in waiting.items()}
         say("full run: calibration tests done")
-        r = {k: recorded(v) for k, v in rows.items()}
-        calibration = chain.calibrate(r["test_2"], r["test_3"], r["test_4a"])
+        calibration = chain.calibrate(
+            of_rows(rows["test_2"]), of_rows(rows["test_3"]), of_rows(rows["test_4a"])
+        )
         models = {k: chain.compensator(calibration, k) for k in ("paper", "better")}
-        futures = {
-            k: pool.submit(run_test, config, str(truth), ["test_4b"], m, 1000, part)
-            for k, m in models.items()
-        }
-        for k, f in futures.items():
-            rows[f"test_4b_{k}"] = f.result()[0]
+        waiting = {f"test_4b_{k}": submit("test_4b", m) for k, m in models.items()}
+        rows |= {k: f.result() for k, f in waiting.items()}
         say("full run: compensated tests done")
     arrays: dict[str, Any] = {"columns": np.array(NAMES), **rows}
     np.savez_compressed(folder / "full_run.npz", **arrays)
-    return {"figures": judge(truth, rows, calibration, tests), "rows": rows, "calibration": calibration}
+    return judge(truth, rows, calibration, experiments.load_experiments(of_config(config)))
 
 
 def judge(
@@ -190,11 +167,12 @@ def judge(
     calibration: chain.Calibration,
     tests: dict[str, experiments.Schedule],
 ) -> dict[str, Any]:
-    """(mean, 2 s) of test 4B wherever the reference stands at its target: the output's error under each compensator (`paper`, `better`),
-    what each estimator and the coil alone leave of the growth in the better one's run, and the same from the quasi-static plant
-    (`still_...`); and the agreement of the two plants over tests 2, 4A and 4B."""
+    """Compute (mean, 2 s) of test 4B wherever the reference stands at its target.
+
+    `paper`, `better`: the output's error under each compensator. `..._estimator`: the growth in the better one's run less each
+    estimate. `still_...`: the same from the quasi-static plant. `agreement`: of the two plants over tests 2, 4A and 4B."""
     figures: dict[str, Any] = {}
-    r = {k: recorded(v) for k, v in rows.items()}
+    r = {k: of_rows(v) for k, v in rows.items()}
     for k in ("paper", "better"):
         w = rows[f"test_4b_{k}"]
         col = {n: w[:, i] for n, i in INDEX.items()}
@@ -204,8 +182,8 @@ def judge(
     growth = r["test_4b_better"].error_um
     figures["uncompensated"] = mean_and_two_s(growth[at_rest])
     moved = rows["test_4b_better"][:, INDEX["compensation_um"]]
-    quasi = {k: still(truth, r[k], tests[k], 1) for k in ("test_2", "test_3", "test_4a")}
-    quasi["test_4b_better"] = still(truth, r["test_4b_better"], tests["test_4b"], 1, moved)
+    quasi = {k: quasi_static_run(truth, r[k], tests[k], 1) for k in ("test_2", "test_3", "test_4a")}
+    quasi["test_4b_better"] = quasi_static_run(truth, r["test_4b_better"], tests["test_4b"], 1, moved)
     again = chain.calibrate(quasi["test_2"], quasi["test_3"], quasi["test_4a"])
     for label, c, recording in (
         ("", calibration, r["test_4b_better"]),

@@ -45,7 +45,7 @@ RANGE_K = LARGEST_K / 0.018
 def temperature_rows(
     estimate: dict[str, np.ndarray], truth: np.ndarray
 ) -> tuple[list[list[Any]], list[list[Any]]]:
-    """Rows of Tables V and VI: point, paper (filtered), then every estimate (N, 12)'s largest and mean absolute error against the truth."""
+    """Return the rows of Tables V and VI: point, the paper's, then the largest and the mean error of every estimate (N, 12)."""
     largest = {k: np.nanmax(np.abs(v - truth), axis=0) for k, v in estimate.items()}
     mean = {k: np.nanmean(np.abs(v - truth), axis=0) for k, v in estimate.items()}
     five = [
@@ -60,5 +60,5 @@ def temperature_rows(
 
 
 def zeta_rows(zeta: np.ndarray) -> list[list[Any]]:
-    """Rows of Table IV."""
+    """Return the rows of Table IV."""
     return [[p.replace("_", " "), float(ZETA[j]), float(zeta[j])] for j, p in enumerate(POINTS)]
