@@ -1,11 +1,12 @@
 """The chain from recordings to position residuals, by the paper's method and by the better one.
 
-calibrate(test 2, test 3, test 4A) gives estimators; estimate(test 4) gives each one's position error estimate; what is left of the
-measured error is judged over test 4B. Estimators:
+`calibrate` fits the estimators to tests 2, 3 and 4A; `estimates` gives each one's position error over test 4. The
+measured error less the estimate is compared over test 4B. Estimators:
   siso     coil alone, first order, recursion (5)
-  paper    N4SID of order 12 with (26), MKF, recursion (5); one sampling period for all three, as (38) and (39) have one n
-  better   real poles by separable generalised least squares, Kalman filter with the coil alone and the air's rate as input, output error
-  twelve   the same filter and expansion model with all twelve thermometers: what more sensors would buy
+  paper    N4SID of order 12 with (26), MKF, recursion (5); one sampling period, as (38) and (39) have one n
+  better   real poles by separable generalised least squares; Kalman filter with the coil alone and the
+           air's rate as input; output error
+  twelve   the same filter and expansion model with all twelve thermometers
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ ESTIMATORS = ("siso", "paper", "better", "twelve")
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the calibration gave. `paper_model`, `mkf`, `paper_um`, `siso_um`; `model`, `kalman`, `better_um`, `twelve`, `twelve_um`."""
+    """What the calibration gave.
+
+    `paper_model`, `mkf`, `paper_um`, `siso_um`; `model`, `kalman`, `better_um`, `twelve`, `twelve_um`."""
 
     paper_model: StateSpace
     mkf: filter.Mkf
@@ -64,7 +67,9 @@ def rises(r: Recorded) -> np.ndarray:
 
 
 def smooth_air(air_c: np.ndarray) -> np.ndarray:
-    """Filter the air by a first-order low-pass of AIR_FILTER_S, as the law does; (N,) degC at 1 s."""
+    """Filter the air by a first-order low-pass of AIR_FILTER_S, as the law does.
+
+    (N,) degC at 1 s."""
     f = np.exp(-1 / AIR_FILTER_S)
     return signal.lfilter([1 - f], [1, -f], air_c, zi=[f * air_c[0]])[0]
 
@@ -108,8 +113,8 @@ def calibrate(test_2: Recorded, test_3: Recorded, test_4a: Recorded, order: int 
 def identify_paper(test_2: Recorded, check: Recorded) -> tuple[StateSpace, filter.Mkf]:
     """Identify the paper's model of order 12 by (7) to (26) and its MKF, both from test 2.
 
-    The paper leaves sampling period and block rows i open. Of PAPER_CHOICES this takes those whose stable model's filter follows
-    the twelve thermometers best over `check`, another test."""
+    The paper leaves sampling period and block rows i open. Of PAPER_CHOICES this takes those whose stable
+    model's filter follows the twelve thermometers best over `check`, another test."""
     r_v = filter.sensor_variance(STEP_K, NOISE_K)
     y2, measured = filled(rises(test_2)), filled(rises(check))
     best: tuple[StateSpace, filter.Mkf] | None = None
@@ -135,7 +140,9 @@ def identify_paper(test_2: Recorded, check: Recorded) -> tuple[StateSpace, filte
 def calibrate_better(
     tests: list[Recorded], order: int | None = None, model: StateSpace | None = None
 ) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion]:
-    """Calibrate the better estimator alone, from any tests; return model, filter, its variances and expansion.
+    """Calibrate the better estimator alone, from any tests.
+
+    Return model, filter, its variances and expansion.
 
     `model`: one that is known already."""
     model = model or identify_better(tests, order)
@@ -148,9 +155,10 @@ def calibrate_better(
 def calibrate_refined(
     tests: list[Recorded], order: int | None = None
 ) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion, str]:
-    """Calibrate with and without refining the thermal model by its prediction errors on all tests but the last.
+    """Calibrate with and without refining the thermal model by its prediction errors.
 
-    Return the one whose filter follows the thermometers of the last test better, and that comparison in words."""
+    The model is refined on all tests but the last. Return the one whose filter follows
+    the thermometers of the last test better, and that comparison in words."""
     plain = calibrate_better(tests, order)
     refined_model = refine(plain[0], tests[:-1])
     if refined_model is plain[0]:
@@ -165,9 +173,9 @@ def calibrate_refined(
 
 
 def refine(model: StateSpace, tests: list[Recorded]) -> StateSpace:
-    """Refine poles, B and C by prediction errors on blocks of 10 s of one test after the other, without the air's own changes.
+    """Refine poles, B and C by prediction errors, without the air's own changes.
 
-    Return the model itself where nothing improves."""
+    Blocks of 10 s are used, one test after the other. Return the model itself where nothing improves."""
     slow = model.resample(10.0)
     air = with_air_alone(model)
     for t in tests:
@@ -190,10 +198,10 @@ def with_air_alone(model: StateSpace) -> StateSpace:
 
 
 def identify_better(tests: list[Recorded], order: int | None) -> StateSpace:
-    """Identify a real-pole model from all calibration tests together, without the effect of the air's own changes.
+    """Identify a real-pole model from all tests together, without the effect of the air's changes.
 
-    A change of the air shifts every rise by C b_air, which the model gives: it is simulated with the model of the previous round
-    and subtracted. `order` None: by BIC in the last round."""
+    A change of the air shifts every rise by C b_air, which the model gives: it is simulated with the model of
+    the previous round and subtracted. `order` None: by BIC in the last round."""
     moved: list[np.ndarray] | list[float] = [0.0] * len(tests)
     for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
         model = modal.identify(
@@ -232,7 +240,9 @@ def run_kalman(k: filter.Kalman, r: Recorded) -> np.ndarray:
 
 
 def fit_expansion(k: filter.Kalman, tests: list[Recorded]) -> expansion.Expansion:
-    """Fit the expansion by output error on the filter's own estimates; the filter's error is the inputs' uncertainty."""
+    """Fit the expansion by output error on the filter's own estimates.
+
+    The filter's error is the inputs' uncertainty."""
     sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", k.model.c, k.p, k.model.c), 0))
     return expansion.output_error(
         [run_kalman(k, t) for t in tests],
@@ -246,7 +256,7 @@ def fit_expansion(k: filter.Kalman, tests: list[Recorded]) -> expansion.Expansio
 
 
 def estimates(c: Calibration, r: Recorded, starts_anew: bool = False) -> dict[str, np.ndarray]:
-    """Estimate the position error (N,) um by each estimator over a recording that starts with test 4A.
+    """Estimate the position error (N,) um by each estimator over a test that starts with test 4A.
 
     `starts_anew`: over another recording, from zero."""
     air = smooth_air(r.air_c)
@@ -266,10 +276,13 @@ def estimates(c: Calibration, r: Recorded, starts_anew: bool = False) -> dict[st
 def compensator(
     c: Calibration, kind: str, period_s: float = 0.001, sensor_s: float = 0.1
 ) -> CompensatorModel:
-    """Build what the daemon runs, at its own period: kind 'paper' (MKF and recursion (5)) or 'better'.
+    """Build what the daemon runs, at its own period.
 
-    Sensor readings come every `sensor_s`. Process noise is per second, so it scales with the period. A quantised reading ten times
-    a second brings no more information than one a second, so its variance grows in proportion."""
+    Kind 'paper' (MKF and recursion (5)) or 'better'.
+
+    Sensor readings come every `sensor_s`. Process noise is per second, so it scales with the period. A
+    quantised reading ten times a second brings no more information than one a second, so its variance grows
+    in proportion."""
     if kind == "paper":
         model = c.paper_model
         alpha, _ = model.output_form()
@@ -330,7 +343,9 @@ def better_compensator(
 
 
 def _at_period(model: StateSpace, period_s: float) -> StateSpace:
-    """Resampled, the air's effect (K per K/s over one period) kept exact: it is no rate held into a network but a shift of all rises."""
+    """Resampled, the air's effect (K per K/s over one period) kept exact.
+
+    It is no rate held into a network but a shift of all rises."""
     fast = model.resample(period_s)
     return replace(fast, b=np.column_stack([fast.b[:, 0], model.b[:, 1] * period_s / model.period_s]))
 

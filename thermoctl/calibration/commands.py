@@ -1,4 +1,6 @@
-"""The commands experiment, identify, model, tune, evaluate and calibrate; each returns its exit status."""
+"""The commands experiment, identify, model, tune, evaluate and calibrate.
+
+Each returns its exit status."""
 
 from __future__ import annotations
 
@@ -28,11 +30,11 @@ def run_experiment(
     plant: str | None = None,
     yes: bool = False,
 ) -> int:
-    """Run `thermoctl experiment`: a test of experiments.yaml, or the one experiment of the file `name`, and record it.
+    """Run `thermoctl experiment`: record a test of experiments.yaml, or the experiment of a file.
 
-    It runs on the daemon that answers, in real time and under its protections, else on the simulated back end, faster than real
-    time. An experiment of inputs can run on a plant file instead. 1 when the person said no, 3 when it ended early: the rows are
-    kept, and --resume goes on from there."""
+    It runs on the daemon that answers, in real time and under its protections, else on the simulated back
+    end, faster than real time. An experiment of inputs can run on a plant file instead. 1 when the person
+    said no, 3 when it ended early: the rows are kept, and --resume goes on from there."""
     if experiment.lists_inputs(name):
         inputs = experiment.of_inputs(name)
         if dry_run or plant:
@@ -51,7 +53,9 @@ def run_experiment(
 
 
 def record(experiment_file: Path, recording: Path, config: str, plant: str | None, yes: bool = False) -> None:
-    """Run an experiment file for `thermoctl diagnose --resolve`. Raises HardwareError where it ends early."""
+    """Run an experiment file for `thermoctl diagnose --resolve`.
+
+    Raises HardwareError where it ends early."""
     if run_experiment(str(experiment_file), config, str(recording), False, False, plant, yes):
         raise HardwareError(
             f"{experiment_file}: the experiment did not come to its end; what was recorded is in {recording}"
@@ -61,7 +65,9 @@ def record(experiment_file: Path, recording: Path, config: str, plant: str | Non
 def identify(
     test_2: str, test_3: str, test_4a: str, config: str, models: str, method: str, order: int
 ) -> int:
-    """Run `thermoctl identify`: calibrate from recordings and install the compensator in the folder `models`."""
+    """Run `thermoctl identify`.
+
+    Calibrate from recordings and install the compensator in the folder `models`."""
     settings = load_settings(config)
     r2, r3, r4 = (recorded.read(p) for p in (test_2, test_3, test_4a))
     figures: dict[str, Any] = {"method": method}
@@ -114,7 +120,9 @@ def model(action: str, models: str, name: str | None) -> int:
 
 
 def tune(config: str, method: str, write: bool, yes: bool) -> int:
-    """Run `thermoctl tune`: propose gains from the response to short setpoint ramps; write them only when asked.
+    """Run `thermoctl tune`: propose gains from the response to short setpoint ramps.
+
+    Write them only when asked.
 
     1 when the person said no."""
     settings = load_settings(config)
@@ -151,7 +159,9 @@ def tune(config: str, method: str, write: bool, yes: bool) -> int:
 
 
 def evaluate(recordings: list[str]) -> int:
-    """Run `thermoctl evaluate`: ISO 230-2 figures of the error at rest, over each recording and by target and direction."""
+    """Run `thermoctl evaluate`.
+
+    ISO 230-2 figures of the error at rest, over each recording and by target and direction."""
     for path in recordings:
         print("\n".join(iso230.figures(read_table(path), path)))
     return 0
@@ -162,8 +172,8 @@ def calibrate(
 ) -> int:
     """Run `thermoctl calibrate`: 0 when every step is done (and accepted, when asked).
 
-    1 when the person said no, 3 when a test ended early. Raises InputError for a rig that cannot be calibrated, HardwareError for
-    one that refuses."""
+    1 when the person said no, 3 when a test ended early. Raises InputError for a rig that cannot be
+    calibrated, HardwareError for one that refuses."""
     settings = load_settings(config)
     rig = drive.rig_of(settings)
     folder = Path(out or Path("calibration") / settings.rig.name)

@@ -33,7 +33,7 @@ from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
 POLL_S = 0.01  # between two polls of the rig and of the keyboard
-STALL_S = 1.0  # without a tick, after which the loop has ended (the supervisor's STALL_S), at least protection.late_s
+STALL_S = 1.0  # without a tick: the loop has ended (the supervisor's STALL_S; at least protection.late_s)
 RESTART_S = 5.0  # within which the supervisor restarts a command process that alone has ended
 REST_K, REST_S = 0.5, 600.0  # at rest: all points within REST_K, or none moved by more in REST_S
 REPORT_S = 60.0  # between two reports while the rig cools
@@ -82,9 +82,10 @@ class DaemonRig:
     ) -> Iterator[np.ndarray]:
         """Yield the rows of a test from `at_s` of its schedule on, after those of `earlier`.
 
-        Arms, and disarms on every way out. While paused the setpoint is held and the rows go on: heat does not wait, and the model
-        is fitted to what was measured, not to the schedule. `rest`: wait first until the rig is at rest. Raises Aborted when the
-        law leaves ARMED, the daemon ends or the person ends it; HardwareError where it does not arm."""
+        Arms, and disarms on every way out. While paused the setpoint is held and the rows go on: heat does
+        not wait, and the model is fitted to what was measured, not to the schedule. `rest`: wait first until
+        the rig is at rest. Raises Aborted when the law leaves ARMED, the daemon ends or the person ends it;
+        HardwareError where it does not arm."""
         if earlier is not None:
             yield rows_of(earlier)
         elif rest:
@@ -157,7 +158,9 @@ class DaemonRig:
             time.sleep(0.1)
 
     def _rest(self, keyboard: Keyboard) -> None:
-        """Wait until the rig is at rest: the models are fitted from there. Raises Aborted when the person ends it."""
+        """Wait until the rig is at rest: the models are fitted from there.
+
+        Raises Aborted when the person ends it."""
         seen: list[tuple[float, np.ndarray]] = []
         reported = -math.inf
         while True:
@@ -179,7 +182,9 @@ class DaemonRig:
             time.sleep(1.0)
 
     def meanwhile(self, earlier: Table) -> Table | None:
-        """Append to `earlier` what the daemon recorded since; None when that has a gap longer than GAP_S."""
+        """Append to `earlier` what the daemon recorded since.
+
+        None when that has a gap longer than GAP_S."""
         parts = [rows_of(earlier)]
         wall, folder = INDEX["wall_s"], Path(self.settings.recording.directory)
         for path in recording_files(folder, TIER) if folder.is_dir() else ():
@@ -210,7 +215,8 @@ def _rig_answers() -> Iterator[None]:
 def at_rest(seen: list[tuple[float, np.ndarray]]) -> bool:
     """Check whether a rig of these temperatures, (s, degC (12,)) oldest first, is at rest.
 
-    All are alike within REST_K, or none moved by more than REST_K in the last REST_S: thermocouples differ by a degree."""
+    All are alike within REST_K, or none moved by more than REST_K in the last REST_S: thermocouples differ by
+    a degree."""
     now, newest = seen[-1]
     if np.nanmax(newest) - np.nanmin(newest) <= REST_K:
         return True

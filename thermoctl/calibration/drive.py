@@ -1,8 +1,10 @@
-"""Drive a rig for a test: only through the daemon's law, armed, with all protections, and only after a yes.
+"""Drive a rig for a test.
 
-Two rigs run a schedule of setpoints alike: `DaemonRig`, which a running daemon holds, and `SimulatedRig`, in this process.
-Raises hal.backend.HardwareError (exit status 3, one line) where the rig refuses or is not there.
-"""
+Only through the daemon's law, armed, with all protections, and only after a yes.
+
+Two rigs run a schedule of setpoints alike: `DaemonRig`, which a running daemon holds, and `SimulatedRig`, in
+this process. Raises hal.backend.HardwareError (exit status 3, one line) where the rig refuses or is not
+there."""
 
 from __future__ import annotations
 
@@ -45,10 +47,12 @@ def rig_of(settings: Settings) -> DrivenRig:
 
 
 def agreed(rig: DrivenRig, schedules: Sequence[Schedule], yes: bool) -> bool:
-    """Report which rig will move, how far, how long and how warm it becomes; ask before a daemon's rig moves, unless `yes`.
+    """Report which rig will move, how far, how long and how warm it becomes.
 
-    Raises InputError for setpoints outside the configuration's limits, for a coil that would become too hot, and where nobody can
-    be asked."""
+    Ask before a daemon's rig moves, unless `yes`.
+
+    Raises InputError for setpoints outside the configuration's limits, for a coil that would become too hot,
+    and where nobody can be asked."""
     settings = rig.settings
     p = settings.protection
     low, high = within_limits(settings, schedules)

@@ -1,4 +1,6 @@
-"""Run one experiment and record it: a test of setpoints on a rig, or an experiment of inputs on a plant file."""
+"""Run one experiment and record it.
+
+A test of setpoints on a rig, or an experiment of inputs on a plant file."""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ ENDED = 3  # exit status of a test that ended early
 
 
 def lists_inputs(name: str) -> bool:
-    """Check whether a name is the file of an experiment that lists inputs, and not a test of the rig."""
+    """Check whether a name is the file of an experiment, and not a test of the rig."""
     return Path(name).suffix in (".yaml", ".yml")
 
 
@@ -36,7 +38,9 @@ def of_inputs(path: str) -> experiments.Inputs:
 
 
 def on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) -> int:
-    """Describe an experiment of inputs; run it on a plant file and record it at `path` where one is given."""
+    """Describe an experiment of inputs.
+
+    Run it on a plant file and record it at `path` where one is given."""
     driven = ", ".join(f"{n} {c[:, 1].min():.4g} to {c[:, 1].max():.4g}" for n, c in inputs.corners.items())
     print(f"{inputs.title}: {inputs.duration_s / 60:.4g} min, every {inputs.sample_s:g} s; drives {driven}")
     if plant_file is None:
@@ -60,7 +64,9 @@ def on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) -> 
 def on_rig(
     settings: Settings, schedule: experiments.Schedule, path: Path, dry_run: bool, resume: bool, yes: bool
 ) -> int:
-    """Describe a test of setpoints, ask, run it on the rig and record it; 1 when the person said no, ENDED when it ended early."""
+    """Describe a test of setpoints, ask, run it on the rig and record it.
+
+    1 when the person said no, ENDED when it ended early."""
     schedules.within_limits(settings, [schedule])
     print(
         f"{schedule.title}: {schedules.span(schedule.duration_s)}, {len(schedule.commands())} moves, "
@@ -76,7 +82,9 @@ def on_rig(
 
 
 def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, resume: bool) -> int:
-    """Run a schedule and write the rows; while it is not at its end, a file beside them says how far it came."""
+    """Run a schedule and write the rows.
+
+    While it is not at its end, a file beside them says how far it came."""
     progress_path = path.with_name(path.name + ".progress")
     earlier, at_s = _earlier(rig, path, progress_path) if resume else (None, 0.0)
     keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())

@@ -1,11 +1,12 @@
 """Positioning accuracy after ISO 230-2.
 
-Deviation x_ij = P_ij - P_i of the j-th approach to target i from one direction (arrow); n approaches, m targets:
-mean unidirectional deviation     x_i = 1/n sum_j x_ij
-estimator of repeatability        s_i = sqrt(1/(n-1) sum_j (x_ij - x_i)^2)
-unidirectional repeatability      R_i = 4 s_i, R = max_i R_i            written as x +- 2 s
-mean bidirectional deviation      (x_up + x_down) / 2;  reversal B_i = x_up - x_down;  M = range of it
-accuracy (systematic, unidirectional)  E = max x_i - min x_i;  A = max(x_i + 2 s_i) - min(x_i - 2 s_i)
+Deviation x_ij = P_ij - P_i of the j-th approach to target i from one direction; n approaches, m targets:
+  mean unidirectional deviation     x_i = 1/n sum_j x_ij
+  estimator of repeatability        s_i = sqrt(1/(n-1) sum_j (x_ij - x_i)^2)
+  unidirectional repeatability      R_i = 4 s_i, R = max_i R_i            written as x +- 2 s
+  mean bidirectional deviation      (x_up + x_down) / 2;  reversal B_i = x_up - x_down;  M = range of it
+  systematic, unidirectional        E = max x_i - min x_i
+  accuracy, unidirectional          A = max(x_i + 2 s_i) - min(x_i - 2 s_i)
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def unidirectional(targets_um: np.ndarray, deviations_um: np.ndarray) -> Directi
 
 
 def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
-    """Compute mean deviation and 2 s of an error that is recorded all the time (the paper's 5 h figures)."""
+    """Compute mean deviation and 2 s of an error that is recorded all the time, as in the paper."""
     e = error_um[np.isfinite(error_um)]
     return float(e.mean()), float(2 * e.std(ddof=1))
 
@@ -73,7 +74,9 @@ def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
 def approaches(
     setpoint_um: np.ndarray, reference_um: np.ndarray, settle: int
 ) -> list[tuple[int, float, int]]:
-    """Find where the motion stands still: (index `settle` samples after arrival, target, direction +1 or -1)."""
+    """Find where the motion stands still.
+
+    (index `settle` samples after arrival, target, direction +1 or -1)."""
     still = np.concatenate([[False], setpoint_um[1:] == setpoint_um[:-1]])
     out, last = [], 0
     for k in range(1, len(still)):

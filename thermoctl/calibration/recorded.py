@@ -1,4 +1,6 @@
-"""Recordings of a test: rows as the loop records them, a table of them, and the signals of a calibration at 1 s."""
+"""Recordings of a test.
+
+Rows as the loop records them, a table of them, and the signals of a calibration at 1 s."""
 
 from __future__ import annotations
 
@@ -27,9 +29,12 @@ SETTLED = 5  # first samples, whose mean error is the origin of the thermal grow
 
 @dataclass(frozen=True)
 class Recorded:
-    """One test at 1 s: t (N,) s, power_w, air_c, setpoint_um; temperatures (N, 12) degC as read (NaN: no reading).
+    """One test at 1 s: t (N,) s, power_w, air_c, setpoint_um.
 
-    error_um is the difference of the two encoders. A simulated rig adds the truth: true_c (N, 12), true_um (N,)."""
+    Temperatures (N, 12) degC as read (NaN: no reading).
+
+    error_um is the difference of the two encoders. A simulated rig adds the truth: true_c (N, 12), true_um
+    (N,)."""
 
     t: np.ndarray
     power_w: np.ndarray
@@ -42,7 +47,9 @@ class Recorded:
 
 
 def of_columns(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> Recorded:
-    """Take SIGNALS at 1 s as one test, the position error from its first value; no truth is known."""
+    """Take SIGNALS at 1 s as one test, the position error from its first value.
+
+    No truth is known."""
     temperatures = np.column_stack([columns[f"{p}_c"] for p in POINTS])
     error = columns["output_reference_um"] - columns["position_raw_um"]
     error = error - np.nanmean(error[:SETTLED])
@@ -53,7 +60,9 @@ def of_columns(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> Recorded:
 
 
 def read(path: str | Path) -> Recorded:
-    """Read a recording at 1 s; gaps in power and air are held. Raises InputError when a signal is missing."""
+    """Read a recording at 1 s; gaps in power and air are held.
+
+    Raises InputError when a signal is missing."""
     table = read_table(path)
     for n in SIGNALS:
         if n not in table.columns:
@@ -92,6 +101,8 @@ def as_table(rows: np.ndarray, path: str | Path) -> Table:
 
 
 def causes(row: np.ndarray) -> str:
-    """Name the faults of a record row that trip, with their remedies; without any, somebody disarmed the rig."""
+    """Name the faults of a record row that trip, with their remedies.
+
+    Without any, somebody disarmed the rig."""
     found = [f for f in faults.decode(row[INDEX["fault_bits"]]) if f.severity != "warning"]
     return "; ".join(f"{f.name}: {f.meaning} -> {f.remedy}" for f in found) or "somebody disarmed it"

@@ -1,4 +1,6 @@
-"""What a test will do, before anything moves: its limits, the coil's predicted power and temperature, its spectrum."""
+"""What a test will do, before anything moves.
+
+Its limits, the coil's predicted power and temperature, its spectrum."""
 
 from __future__ import annotations
 
@@ -41,9 +43,10 @@ def find(name: str, config: str | Path) -> Schedule:
 
 
 def triangles(settings: Settings, start_um: float) -> Schedule:
-    """Ramp the setpoint up and down about `start_um`, for a fit of the position's response, at the law's own rate.
+    """Ramp the setpoint up and down about `start_um` at the law's own rate, to fit the response.
 
-    Each turn is a step of velocity, which excites the fast dynamics. At 1 mm/min the output moves by 5 um at most."""
+    Each turn is a step of velocity, which excites the fast dynamics. At 1 mm/min the output moves by 5 um at
+    most."""
     c = settings.control
     sign = -1.0 if start_um + TRAVEL_UM > c.setpoint_high_um else 1.0
     corners = [(0.0, start_um), (0.5, start_um)]
@@ -55,7 +58,9 @@ def triangles(settings: Settings, start_um: float) -> Schedule:
 
 
 def within_limits(settings: Settings, schedules: Sequence[Schedule]) -> tuple[float, float]:
-    """Return the lowest and highest setpoint, um. Raises InputError where they leave the configuration's limits."""
+    """Return the lowest and highest setpoint, um.
+
+    Raises InputError where they leave the configuration's limits."""
     c = settings.control
     low = min(float(s.setpoint_um.min()) for s in schedules)
     high = max(float(s.setpoint_um.max()) for s in schedules)
@@ -68,7 +73,9 @@ def within_limits(settings: Settings, schedules: Sequence[Schedule]) -> tuple[fl
 
 
 def check_predicted(inputs: experiments.Inputs, settings: Settings) -> None:
-    """Refuse an experiment that a diagnosis predicts to leave the rig's protection. Raises InputError with the reading."""
+    """Refuse an experiment that a diagnosis predicts to leave the rig's protection.
+
+    Raises InputError with the reading."""
     p = settings.protection
     for column, (low, high) in inputs.predicted.items():
         channel = "position_um" if column == "position_raw_um" else column
@@ -82,11 +89,12 @@ def check_predicted(inputs: experiments.Inputs, settings: Settings) -> None:
 
 
 def forecast(settings: Settings, schedule: Schedule, coil_c: float) -> tuple[np.ndarray | None, float | None]:
-    """Predict the coil's power, W for each second of the schedule, and its highest temperature, degC, from `coil_c`.
+    """Predict the coil's power, W for each second, and its highest temperature, degC, from `coil_c`.
 
-    Power: R20 (1 + alpha (T - 20 degC)) i^2 with the current that holds the flexures, i = x / flexure_um_per_a, largest in each
-    second. Temperature: coil_c and the rise that the compensator's model gives this power. None where the configuration does not
-    say: protection.resistance_ohm and flexure_um_per_a, compensation.model."""
+    Power: R20 (1 + alpha (T - 20 degC)) i^2 with the current that holds the flexures, i = x /
+    flexure_um_per_a, largest in each second. Temperature: coil_c and the rise that the compensator's model
+    gives this power. None where the configuration does not say: protection.resistance_ohm and
+    flexure_um_per_a, compensation.model."""
     p = settings.protection
     if not (p.resistance_ohm and p.flexure_um_per_a):
         return None, None
@@ -108,7 +116,7 @@ def forecast(settings: Settings, schedule: Schedule, coil_c: float) -> tuple[np.
 
 
 def power_lines(settings: Settings, schedule: Schedule) -> list[str]:
-    """Describe the coil's power over a schedule and its spectrum, as far as the configuration tells them."""
+    """Describe the coil's power over a schedule and its spectrum, as far as they are known."""
     power, peak = forecast(settings, schedule, ROOM_C)
     if power is None:
         return ["power is not predicted: protection.resistance_ohm and flexure_um_per_a are not set"]

@@ -1,4 +1,6 @@
-"""A rig in this process: the configuration's simulated back end under the daemon's law, faster than real time."""
+"""A rig in this process.
+
+The configuration's simulated back end under the daemon's law, faster than real time."""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ ANY_INNOVATION_C = (
 
 
 def with_model(settings: Settings, model: CompensatorModel | None) -> Settings:
-    """Set up the compensation for a simulated test: `model` acts when given, else nothing is compensated or compared."""
+    """Set up the compensation for a simulated test.
+
+    `model` acts when given, else nothing is compensated or compared."""
     compensation = dataclasses.replace(settings.compensation, enable=model is not None, model="")
     protection = settings.protection
     if model is None:
@@ -47,7 +51,9 @@ class SimulatedRig:
         self.where = "the simulated rig, faster than real time"
 
     def now(self) -> dict[str, Any]:
-        """Read channel states, temperatures and position once the law is READY. Raises HardwareError after READY_S."""
+        """Read channel states, temperatures and position once the law is READY.
+
+        Raises HardwareError after READY_S."""
         simulation = Simulation(self.settings)
         try:
             ready = simulation.until(lambda row: row[INDEX["state"]] == arming.READY, READY_S)
@@ -75,8 +81,8 @@ class SimulatedRig:
     ) -> Iterator[np.ndarray]:
         """Yield the rows of a test, one every `every_s`, with `model` acting when given.
 
-        `earlier`, `at_s` and `rest` are not used: the same rows come again, and the rig starts at rest. Raises Aborted when the law
-        leaves ARMED or the person ends it."""
+        `earlier`, `at_s` and `rest` are not used: the same rows come again, and the rig starts at rest.
+        Raises Aborted when the law leaves ARMED or the person ends it."""
         simulation = Simulation(with_model(self.settings, model), model)
 
         def stop() -> bool:

@@ -1,4 +1,6 @@
-"""The steps of a calibration between its tests: each takes the rig or recordings and returns its result.
+"""The steps of a calibration between its tests.
+
+Each takes the rig or recordings and returns its result.
 
 `summary` of a result is the line for the person; the series are thinned for the report's figures.
 """
@@ -54,7 +56,9 @@ class Doctor:
 
 @dataclass(frozen=True)
 class Response:
-    """The position's response to short ramps, fitted by a second order with dead time; t1, t2: real, imaginary, s."""
+    """The position's response to short ramps, fitted by a second order with dead time.
+
+    `t1`, `t2`: real, imaginary, s."""
 
     summary: str
     t: list[float]
@@ -71,7 +75,9 @@ class Response:
 
 @dataclass(frozen=True)
 class Pid:
-    """Present and proposed gains with their margins: kp, ti_s, td_s, how, and the fields of tuning.Margins."""
+    """Present and proposed gains with their margins.
+
+    Of each: kp, ti_s, td_s, how, and the fields of tuning.Margins."""
 
     summary: str
     present: dict[str, Any]
@@ -164,7 +170,7 @@ def response(settings: Settings, rig: drive.DrivenRig) -> Response:
 
 
 def pid(settings: Settings, found: Response) -> Pid:
-    """Propose gains for the fitted response, and compute the margins of these and of the present ones."""
+    """Propose gains for the fitted response, with the margins of these and of the present ones."""
     c, period_s = settings.control, settings.loop.period_s
     average = int(c.moving_average)
     fitted = tuning.SecondOrder(found.gain, complex(*found.t1), complex(*found.t2), found.theta_s)
@@ -212,7 +218,9 @@ def model(settings: Settings, recordings: Mapping[str, Path], order: int, path: 
 
 
 def proof(recordings: Mapping[str, Path], order: int, acting: bool) -> Proof:
-    """Compare the position error over test 4B without and with the model; `acting`: the model acted in that test."""
+    """Compare the position error over test 4B without and with the model.
+
+    `acting`: the model acted in that test."""
     t = read_table(recordings["test_4b"])
     c = t.columns
     growth = _from_start(c["output_reference_um"] - c["position_raw_um"])

@@ -1,13 +1,15 @@
-"""The calibration wizard: doctor, step, PID, tests 1 to 4A, model, proof; and, only when told so, acceptance.
+"""The calibration wizard: doctor, step, PID, tests 1 to 4A, model, proof.
 
-Each step leaves its result in a folder of the calibration's own (`--out`), so the command can be ended at any time and called
-again: it goes on with the first step that is not done. Nothing outside that folder is written before `--accept`.
+And, only when told so, acceptance.
 
-Where a daemon answers on the socket, the tests run on it: setpoints by the socket, rows from its shared memory, in real time.
-A test that was ended goes on from there, with the daemon's own recording of the time between (heat does not wait); where that
-has a gap the test starts again. Without a daemon a simulated rig is run faster than real time. The same seed gives the same
-rows, so a test that was ended is simply run again.
-"""
+Each step leaves its result in a folder of the calibration's own (`--out`), so the command can be ended at any
+time and called again: it goes on with the first step that is not done. Nothing outside that folder is written
+before `--accept`.
+
+Where a daemon answers on the socket, the tests run on it: setpoints by the socket, rows from its shared
+memory, in real time. A test that was ended goes on from there, with the daemon's own recording of the time
+between (heat does not wait); where that has a gap the test starts again. Without a daemon a simulated rig is
+run faster than real time. The same seed gives the same rows, so a test that was ended is simply run again."""
 
 from __future__ import annotations
 
@@ -59,7 +61,9 @@ _R = TypeVar("_R", bound=steps.Result)
 
 
 class Wizard:
-    """One calibration in its folder: `done` {step: result}; `run(keyboard)` does the steps that are not done."""
+    """One calibration in its folder: `done` {step: result}.
+
+    `run(keyboard)` does the steps that are not done."""
 
     def __init__(
         self,
@@ -121,7 +125,9 @@ class Wizard:
         return found
 
     def run(self, keyboard: Keyboard) -> bool:
-        """Do every step that is not done; False when it was ended early. Raises InputError where a step refuses."""
+        """Do every step that is not done; False when it was ended early.
+
+        Raises InputError where a step refuses."""
         self.say(
             f"calibration of rig '{self.settings.rig.name}' on {self.rig.where}; results in {self.folder}/"
         )
@@ -157,7 +163,9 @@ class Wizard:
         return steps.proof(recordings, self.order, acting=not self.rig.real)
 
     def _test(self, number: int, name: str, keyboard: Keyboard) -> bool:
-        """Run a test to its end, or to where it is ended: then False, and the same command goes on from there."""
+        """Run a test to its end, or to where it is ended.
+
+        Then False, and the same command goes on from there."""
         schedule, part = self.tests[name], self.folder / f"{name}.part.parquet"
         earlier, at_s = self._earlier(name, part)
         self.say(f"{number:2d}/{len(STEPS)} {name}: {schedule.title}, {span(schedule.duration_s)}")
@@ -198,7 +206,7 @@ class Wizard:
         return True
 
     def _earlier(self, name: str, part: Path) -> tuple[Table | None, float]:
-        """Read the rows of a test that was ended on a daemon, with those since, and how far it came."""
+        """Read what a daemon recorded of a test that was ended, and how far it came."""
         if name not in self.at_s or not part.exists() or not isinstance(self.rig, DaemonRig):
             return None, 0.0
         earlier = self.rig.meanwhile(read_table(part))
@@ -289,7 +297,9 @@ class Wizard:
 
 
 def _progress_line(time_left: Callable[[Progress], tuple[float, float]]) -> Callable[[Progress], None]:
-    """Show progress: one line that is written over on a terminal, a line every EVERY_PERCENT elsewhere."""
+    """Show progress.
+
+    One line that is written over on a terminal, a line every EVERY_PERCENT elsewhere."""
     shown = [-1.0]
 
     def show(p: Progress) -> None:

@@ -1,4 +1,6 @@
-"""The commands `diagnose` and `effects`: progress while they work, a summary for a person, JSON for a program."""
+"""The commands `diagnose` and `effects`.
+
+Progress while they work, a summary for a person, JSON for a program."""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from thermoctl.diagnose.outcome import sentence
 from thermoctl.diagnose.resolve import resolve
 from thermoctl.yamlfile import InputError, suggest
 
-# How far along a diagnosis is when a stage begins (share of its whole time, a rough guess): for the estimate of what is left.
+# Share of a diagnosis that is done when a stage starts, roughly: for the time left.
 _STAGES = (
     ("refitting the plant", 0.0),
     ("screening the catalogue", 0.12),
@@ -42,7 +44,9 @@ class StageReporter:
 
 
 def diagnose(args: argparse.Namespace) -> int:
-    """`thermoctl diagnose`: runs the diagnosis and prints its summary. Raises InputError for unusable inputs."""
+    """`thermoctl diagnose`: runs the diagnosis and prints its summary.
+
+    Raises InputError for unusable inputs."""
     if not args.recordings:
         raise InputError("no recording was given; one or more were expected, or --live")
 
@@ -93,7 +97,9 @@ def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 def effects(args: argparse.Namespace) -> int:
-    """`thermoctl effects [show NAME]`: the catalogue, or one entry in full. Raises InputError for an unknown name."""
+    """`thermoctl effects [show NAME]`: the catalogue, or one entry in full.
+
+    Raises InputError for an unknown name."""
     from rich.console import Console
     from rich.table import Table
 

@@ -1,9 +1,9 @@
 """The candidate experiments: what can be driven, and how, inside the rig's limits.
 
-The family: levels, steps both ways, warm-up and cool-down, trapezoids slow and fast, triangles small and large, and
-pseudo-random sequences of two bands. Every input is driven by itself and all together, in several lengths and from several
-starts. Inputs stay inside the range, and below the speed, that was recorded, unless limits are given.
-"""
+The family: levels, steps both ways, warm-up and cool-down, trapezoids slow and fast, triangles small and
+large, and pseudo-random sequences of two bands. Every input is driven by itself and all together, in several
+lengths and from several starts. Inputs stay inside the range, and below the speed, that was recorded, unless
+limits are given."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from thermoctl.yamlfile import InputError
 TOGETHER = 0.98  # correlation from which two inputs count as one lever (voltage and current)
 SURROUNDINGS = ("K", "W/m^2", "Pa")  # dimensions of temperature, sunshine and pressure: nobody commands these
 LENGTHS = (1.0, 0.5, 2.0)  # of an experiment, in recordings' lengths
-STARTS_APART = 0.05  # share of its value by which a constant input must differ between recordings to be a start to choose
+STARTS_APART = 0.05  # share by which a constant input differs between recordings that count as two starts
 
 Limits = Mapping[str, tuple[float, float]]
 NONE: Limits = {}
@@ -31,7 +31,9 @@ Plateaus = list[tuple[float, float]]  # (seconds, value) of each
 
 @dataclass(frozen=True)
 class Lever:
-    """An input that can be driven, and those that move with it: {input: (factor, offset)}; its limits and rest."""
+    """An input that can be driven, and those that move with it: {input: (factor, offset)}.
+
+    Also its limits and its value at rest."""
 
     name: str
     moves: Mapping[str, tuple[float, float]]
@@ -43,7 +45,9 @@ class Lever:
 
 @dataclass(frozen=True)
 class Excitation:
-    """The inputs of an experiment: corners (K, 2) of seconds and value, on straight lines; `starts` are constant inputs."""
+    """The inputs of an experiment: corners (K, 2) of seconds and value, on straight lines.
+
+    `starts` are constant inputs."""
 
     title: str
     duration_s: float
@@ -64,10 +68,12 @@ class Excitation:
 def levers(
     plant: Plant, tables: Sequence[Table], only: Sequence[str] = (), limits: Limits = NONE
 ) -> list[Lever]:
-    """Find the inputs that moved in the recordings and can be commanded; inputs that moved alike are one lever.
+    """Find the inputs that moved in the recordings and can be commanded.
 
-    Temperatures, sunshine and pressure belong to the surroundings. `only`: names that count, whatever their unit. `limits`: by
-    input, instead of the recorded range. Raises InputError for an unknown name."""
+    Inputs that moved alike are one lever.
+
+    Temperatures, sunshine and pressure belong to the surroundings. `only`: names that count, whatever their
+    unit. `limits`: by input, instead of the recorded range. Raises InputError for an unknown name."""
     for n in only:
         if n not in plant.inputs:
             raise InputError(f"'{n}' is not an input of {plant.file}; there are {', '.join(plant.inputs)}")
@@ -118,7 +124,9 @@ def _lever(name: str, column: str, tables: Sequence[Table], limits: Limits) -> L
 
 
 def _ramps(lever: Lever, plateaus: Plateaus, step_s: float) -> np.ndarray:
-    """Corners (K, 2) of plateaus one after the other; the ramps between them are no faster than was recorded."""
+    """Corners (K, 2) of plateaus one after the other.
+
+    The ramps between them are no faster than was recorded."""
     corners = [(0.0, lever.rest)]
     for seconds, value in plateaus:
         t, now = corners[-1]
@@ -130,7 +138,7 @@ def _ramps(lever: Lever, plateaus: Plateaus, step_s: float) -> np.ndarray:
 
 
 def _pseudo_random(lever: Lever, hold_s: float, duration_s: float, seed: int) -> Plateaus:
-    """Levels of `hold_s` or a multiple, at both ends and between, from a shift register of maximum length (7 bits)."""
+    """Levels of `hold_s` or a multiple, from a shift register of maximum length (7 bits)."""
     low, high = lever.low, lever.high
     levels = (low, high, high, 0.5 * (low + high), low, low + 0.75 * (high - low), low, high)
     state, out = 0b1010011 + 17 * seed, []
@@ -175,7 +183,9 @@ def courses(lever: Lever, duration_s: float, step_s: float, seed: int = 0) -> di
 
 
 def family(plant: Plant, tables: Sequence[Table], found: Sequence[Lever], step_s: float) -> list[Excitation]:
-    """List the candidates: every lever by itself, the others at rest, and all together, over each of LENGTHS."""
+    """List the candidates.
+
+    Every lever by itself, the others at rest, and all together, over each of LENGTHS."""
     usual = float(np.median([t.t[-1] - t.t[0] for t in tables]))
     constant, starts = _constant(plant, tables, {n for lever in found for n in lever.moves})
     out = []
@@ -215,7 +225,7 @@ def _plans(
 def _constant(
     plant: Plant, tables: Sequence[Table], moved: set[str]
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
-    """Inputs that nobody drives at their mean, readings that a start asks for at their first values; and the starts.
+    """Inputs that nobody drives at their mean, readings that a start asks for, and the starts.
 
     Starts: where an input was constant in every recording but differed between them, both ends."""
     constant, low, high = {}, {}, {}

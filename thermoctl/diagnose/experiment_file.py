@@ -1,4 +1,6 @@
-"""The proposed experiment as files: one that `thermoctl experiment` runs, and its inputs over time for a person."""
+"""The proposed experiment as files.
+
+One that `thermoctl experiment` runs, and its inputs over time for a person."""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ FEWEST = 10  # samples from which a line of an input over the setpoint is fitted
 
 
 def write(folder: Path, case: Case, entry: Mapping[str, Any], chosen: Excitation) -> list[str]:
-    """Write FILES into a folder; return their names. On the program's own rig it is the setpoint that is driven."""
+    """Write FILES into a folder; return their names.
+
+    On the program's own rig it is the setpoint that is driven."""
     plant = case.plant
     driven = {plant.inputs[n].column: (plant.inputs[n].unit, c) for n, c in chosen.corners.items()}
     if (corners := _as_setpoint(case, chosen)) is not None:
@@ -62,7 +66,7 @@ def write(folder: Path, case: Case, entry: Mapping[str, Any], chosen: Excitation
 
 
 def _as_setpoint(case: Case, chosen: Excitation) -> np.ndarray | None:
-    """The corners of the setpoint that gives a driven input its course, where the recordings show that input to follow it."""
+    """Find the setpoint's corners where the recordings show that a driven input follows it."""
     if any(SETPOINT not in t.columns for t in case.tables):
         return None
     setpoint = np.concatenate([t.columns[SETPOINT] for t in case.tables])
@@ -77,7 +81,7 @@ def _as_setpoint(case: Case, chosen: Excitation) -> np.ndarray | None:
 
 
 def peaks(entry: Mapping[str, Any]) -> list[str]:
-    """Write each reading's predicted range as a line, beside the recorded range and the limit it was kept in."""
+    """Write each reading's predicted range as a line, beside the recorded range and its limit."""
     lines = []
     for name, p in entry["predicted"].items():
         unit = f" {p['unit']}" if p["unit"] else ""

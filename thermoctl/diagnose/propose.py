@@ -1,18 +1,19 @@
-"""The experiment that decides between the hypotheses left, best per hour of rig time inside the rig's limits.
+"""The experiment that decides between the hypotheses left, best per hour of rig time.
 
-Two fitted hypotheses a, b predict readings y_a, y_b (N,) of an experiment. The uncertainty left in their parameters counts
-against them (Buzzi-Ferraris & Forzatti, Chem. Eng. Sci. 38 (1983) 225), with R the noise's covariance, J = dy/dz, P = cov z:
+Two fitted hypotheses a, b predict readings y_a, y_b (N,) of an experiment. The uncertainty left in their
+parameters counts against them (Buzzi-Ferraris & Forzatti, Chem. Eng. Sci. 38 (1983) 225), with R the noise's
+covariance, J = dy/dz, P = cov z:
 
     D_ab = (y_a - y_b)' (R + J_a P_a J_a' + J_b P_b J_b')^-1 (y_a - y_b)                                           (1)
 
-The experiment's information on which hypothesis is true, in bits (lower bound of Kolchinsky & Tracey, Entropy 19 (2017) 361):
+The experiment's information on which hypothesis is true, in bits (lower bound of Kolchinsky & Tracey, Entropy
+19 (2017) 361):
 
     I = -sum_a w_a log2 sum_b w_b exp(-D_ab / 8)                                                                   (2)
 
-Chosen is the most I per hour among those that reach ENOUGH of the best I. Every reading, as every hypothesis predicts it, stays
-inside its recorded range, unless limits are given. Where no candidate stays inside, the inputs' excursions are made smaller
-(SHARES).
-"""
+Chosen is the most I per hour among those that reach ENOUGH of the best I. Every reading, as every hypothesis
+predicts it, stays inside its recorded range, unless limits are given. Where no candidate stays inside, the
+inputs' excursions are made smaller (SHARES)."""
 
 from __future__ import annotations
 
@@ -107,7 +108,7 @@ def _predictor(e: Explanation, plant: Plant) -> _Predictor:
 
 
 def distance(a: Prediction, b: Prediction, columns: Sequence[tuple[int, int]], sigma: np.ndarray) -> float:
-    """Compute D of (1) over the given pairs of columns (of a, of b) with noise `sigma` (columns,), by Woodbury's identity."""
+    """Compute D of (1) over pairs of columns (of a, of b), noise `sigma` each, by Woodbury's identity."""
     difference = np.concatenate(
         [(a[0][:, i] - b[0][:, j]) / s for (i, j), s in zip(columns, sigma, strict=True)]
     )
@@ -125,9 +126,12 @@ def bits(D: np.ndarray, weights: np.ndarray) -> float:
 
 
 def noise_of(case: Case, e: Explanation) -> np.ndarray:
-    """Estimate the uncertainty of one reading, per output (ny,): rms residual of the likeliest hypothesis, at least the sensor's noise.
+    """Estimate the uncertainty of one reading, per output (ny,).
 
-    It is widened for the correlation of neighbours, whose mean tells less than that of independent readings."""
+    Rms residual of the likeliest hypothesis, at least the sensor's noise.
+
+    It is widened for the correlation of neighbours, whose mean tells less than that of independent
+    readings."""
     out = []
     for o, n in zip(case.model.outputs, case.noise, strict=True):
         j = e.fit.model.outputs.index(o)
@@ -145,7 +149,7 @@ def noise_of(case: Case, e: Explanation) -> np.ndarray:
 
 
 def survivors(found: Diagnosis) -> list[Explanation]:
-    """List the hypotheses that the recordings do not rule out, likeliest first, one of each set of effects."""
+    """List the hypotheses that are not ruled out, likeliest first, one of each set of effects."""
     out: dict[tuple[Any, ...], Explanation] = {}
     for e in sorted([found.final, *found.rivals], key=lambda e: -e.probability):
         if e.effects:
@@ -156,7 +160,9 @@ def survivors(found: Diagnosis) -> list[Explanation]:
 
 @dataclass(frozen=True)
 class _Trial:
-    """A simulated candidate: its information, the distances D (n, n) and each hypothesis's prediction."""
+    """A simulated candidate.
+
+    Its information, the distances D (n, n) and each hypothesis's prediction."""
 
     excitation: Excitation
     bits: float
@@ -194,7 +200,9 @@ class _Comparison:
         return max(self.step, x.duration_s / self.points)
 
     def trial(self, x: Excitation) -> _Trial | None:
-        """Simulate a candidate; None where a hypothesis cannot, where a reading leaves its limits, or too late."""
+        """Simulate a candidate.
+
+        None where a hypothesis cannot, where a reading leaves its limits, or too late."""
         if time.thread_time() > self.deadline:
             return None
         table = x.table(self.case.plant, self.grid(x))
@@ -207,7 +215,7 @@ class _Comparison:
     def distances(
         self, predictions: Sequence[Prediction], sigma: np.ndarray, state: str | None = None
     ) -> np.ndarray:
-        """D of every two hypotheses over the recorded outputs, and over a state as if it had a sensor."""
+        """Compute D of every two hypotheses over the recorded outputs, and over a state with a sensor."""
         columns = []
         for b in self.predictors:
             recorded = [b.model.outputs.index(self.outputs[j]) for j in self.seen]
@@ -240,8 +248,8 @@ def propose(
 ) -> tuple[dict[str, Any], Excitation] | None:
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
 
-    None where one hypothesis stands alone or nothing can be driven. `limits`: {input or output: (low, high)} of the rig. Raises
-    InputError for a name that is neither."""
+    None where one hypothesis stands alone or nothing can be driven. `limits`: {input or output: (low, high)}
+    of the rig. Raises InputError for a name that is neither."""
     for n in limits:
         if n not in case.plant.inputs and n not in case.plant.outputs:
             raise InputError(
@@ -314,7 +322,7 @@ def _recorded(case: Case, j: int) -> np.ndarray:
 
 
 def _predicted(comparison: _Comparison, predictions: Sequence[Prediction]) -> dict[str, dict[str, Any]]:
-    """For each output its unit, the lowest and highest value that any hypothesis predicts, and the recorded range."""
+    """List each output's unit, predicted range over all hypotheses, and recorded range."""
     out = {}
     for j, o in enumerate(comparison.outputs):
         y = _recorded(comparison.case, j)
@@ -329,7 +337,9 @@ def _predicted(comparison: _Comparison, predictions: Sequence[Prediction]) -> di
 
 
 def _sensor(comparison: _Comparison, best: _Trial) -> str:
-    """Where even the best experiment leaves doubt: the stored quantity whose own sensor would tell most, in words."""
+    """Where even the best experiment leaves doubt.
+
+    The stored quantity whose own sensor would tell most, in words."""
     plant, sigma, seen = comparison.case.plant, comparison.sigma, comparison.seen
     share = np.sqrt(comparison.step / comparison.grid(best.excitation))
     shown = [plant.outputs[comparison.outputs[j]] for j in seen]

@@ -1,4 +1,6 @@
-"""Decide by experiments: diagnose, run the proposed experiment on the rig, and diagnose again with its data."""
+"""Decide by experiments.
+
+Diagnose, run the proposed experiment on the rig, and diagnose again with its data."""
 
 from __future__ import annotations
 
@@ -20,10 +22,11 @@ def resolve(
     rounds: int = ROUNDS,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Diagnose, and while nothing is decided run the proposed experiment and decide again, `rounds` times at most.
+    """Diagnose, and while nothing is decided run the proposed experiment, `rounds` times at most.
 
-    `diagnosed(recordings)` writes a result into `out`; `record(experiment, recording)` runs an experiment file on the rig; `say`
-    is told of each round. The last result lists the experiments and verdicts in `resolved`."""
+    `diagnosed(recordings)` writes a result into `out`; `record(experiment, recording)` runs an experiment
+    file on the rig; `say` is told of each round. The last result lists the experiments and verdicts in
+    `resolved`."""
     paths, history = list(recordings), []
     result = diagnosed(paths)
     for k in range(1, rounds + 1):

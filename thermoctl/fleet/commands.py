@@ -112,10 +112,12 @@ class RigDiagnosis:
 
 
 def diagnose_folders(args: argparse.Namespace) -> int:
-    """Run `thermoctl diagnose` over folders: every rig's newest recordings by themselves, into OUT/RIG each.
+    """Run `thermoctl diagnose` over folders.
 
-    The rigs are spread over processes or a Dask cluster. A rig that cannot be diagnosed is reported and does not stop the others;
-    rigs that are done are not run again."""
+    Every rig's newest recordings by themselves, into OUT/RIG each.
+
+    The rigs are spread over processes or a Dask cluster. A rig that cannot be diagnosed is reported and does
+    not stop the others; rigs that are done are not run again."""
     if not Path(args.plant).is_file():
         raise InputError(f"{args.plant}: no such file; the plant of the fleet's rigs was expected")
     jobs, out = _jobs(args), Path(args.out)
@@ -167,7 +169,9 @@ def _diagnoses(found: Sequence[RigDiagnosis]) -> Table:
 
 
 def live_recordings(args: argparse.Namespace) -> list[str]:
-    """Extract what `thermoctl diagnose --live` diagnoses: OUT/live.csv, from where the daemon's model no longer fits.
+    """Extract what `thermoctl diagnose --live` diagnoses.
+
+    OUT/live.csv, from where the daemon's model no longer fits.
 
     None where the model fits. Raises InputError where recordings were given, too."""
     if args.recordings:

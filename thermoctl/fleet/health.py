@@ -1,7 +1,7 @@
-"""One recording of a rig in numbers, each by itself, so that many can be spread over processes or a Dask cluster.
+"""One recording of a rig in numbers, by itself: many can be spread over processes.
 
 - health: share of time armed, faults, slipped ticks, mean innovation, error at the reference encoder;
-- fit: the plant with its written values against the recording: rms residual / the output's noise, of the worst output;
+- fit: the plant with its written values against the recording: rms residual / noise of the worst output;
 - parameters: a refit of the named ones, with standard errors.
 """
 
@@ -29,7 +29,9 @@ SECONDS_PER_HOUR = 3600.0
 
 @dataclass(frozen=True)
 class Summary:
-    """One recording in numbers; NaN where it holds no such signal. estimates: parameter -> (value, standard error)."""
+    """One recording in numbers; NaN where it holds no such signal.
+
+    `estimates`: parameter -> (value, standard error)."""
 
     path: str
     rig: str
@@ -48,7 +50,9 @@ class Summary:
 
 
 def summarise(path: str, plant_path: str | None, names: tuple[str, ...]) -> Summary:
-    """Summarise one recording. A file that cannot be read or simulated gives a Summary with `error`: the others go on."""
+    """Summarise one recording.
+
+    A file that cannot be read or simulated gives a Summary with `error`: the others go on."""
     rig = rig_of(path)
     try:
         with local(path) as here:

@@ -1,9 +1,10 @@
-"""The daemon's own recordings, searched for the stretch where its model no longer fits: `thermoctl diagnose --live`.
+"""The daemon's own recordings, searched for the stretch where its model no longer fits.
 
-The 10 Hz tier of the newest session is read, some hours back, and its innovations go through the same sum as in the daemon
-(daemon/misfit.py). The stretch from BEFORE_S before the onset to now is averaged to seconds and written as a CSV whose columns
-are those of the thermal plant.
-"""
+`thermoctl diagnose --live`.
+
+The 10 Hz tier of the newest session is read, some hours back, and its innovations go through the same sum as
+in the daemon (daemon/misfit.py). The stretch from BEFORE_S before the onset to now is averaged to seconds and
+written as a CSV whose columns are those of the thermal plant."""
 
 from __future__ import annotations
 
@@ -26,7 +27,9 @@ _STEP_S = 1.0
 
 
 def newest(directory: str | Path, rig: str, hours: float) -> Table:
-    """Read the newest session of a rig, at most so many hours back. Raises InputError where there is none."""
+    """Read the newest session of a rig, at most so many hours back.
+
+    Raises InputError where there is none."""
     folder = Path(directory)
     files = (
         [p for p in recording_files(folder, TIER) if p.name.startswith(rig + "-")] if folder.is_dir() else []
@@ -78,7 +81,7 @@ def seconds(table: Table) -> Table:
 
 
 def extract(plant: Plant, table: Table, alarm: Alarm | None, out: str | Path) -> None:
-    """Write the columns that the plant reads, averaged to seconds, from BEFORE_S before the alarm on (None: all).
+    """Write the columns that the plant reads, averaged to seconds, from BEFORE_S before the alarm.
 
     Raises InputError where an input of the plant is missing."""
     table = seconds(table)

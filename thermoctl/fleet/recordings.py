@@ -1,4 +1,6 @@
-"""Recordings of many rigs in a folder or an object store: find them, fetch one, say which rig it is of."""
+"""Recordings of many rigs in a folder or an object store.
+
+Find them, fetch one, say which rig it is of."""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ SUFFIXES = (".parquet", ".csv", ".arrow", TIER)
 
 
 def find_recordings(folder: str | Path) -> list[str]:
-    """Find all recordings below a folder, or below a path of an object store that fsspec knows (s3://BUCKET/RIGS).
+    """Find all recordings below a folder, or below a path of an object store (s3://BUCKET/RIGS).
 
     Recordings are our 10 Hz tiers and Parquet, CSV and Arrow files. Raises InputError without one."""
     if "://" in str(folder):
@@ -36,7 +38,9 @@ def find_recordings(folder: str | Path) -> list[str]:
 
 
 def _store(url: str) -> tuple[Any, str]:
-    """(file system, path in it) of an address; the library of the store finds its own credentials."""
+    """(file system, path in it) of an address.
+
+    The library of the store finds its own credentials."""
     try:
         import fsspec
     except ImportError:
@@ -64,6 +68,8 @@ def local(path: str) -> Iterator[str]:
 
 
 def rig_of(path: str) -> str:
-    """Name the rig of a recording: by the name that the program gives its recordings, else by its folder."""
+    """Name the rig of a recording.
+
+    By the name that the program gives its recordings, else by its folder."""
     match = NAME.match(Path(path).name)
     return match["rig"] if match else Path(path).parent.name

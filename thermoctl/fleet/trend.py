@@ -1,9 +1,9 @@
 """Rigs over time: which parameters drift, which model no longer fits, and what to do about it.
 
-A parameter drifts when the straight line through its estimates has a slope of more than DRIFT_SIGMA standard errors and changes
-it by more than DRIFT_SHARE over the time seen. A model no longer fits when the newest recording's misfit is above FIT_LIMIT;
-the misfit after the refit says whether values are wrong (identify again) or physics is missing (diagnose).
-"""
+A parameter drifts when the straight line through its estimates has a slope of more than DRIFT_SIGMA standard
+errors and changes it by more than DRIFT_SHARE over the time seen. A model no longer fits when the newest
+recording's misfit is above FIT_LIMIT; the misfit after the refit says whether values are wrong (identify
+again) or physics is missing (diagnose)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ MONTH_S = 30 * 86400.0
 
 @dataclass(frozen=True)
 class Drift:
-    """A straight line through a parameter's estimates: change per 30 days, its standard error, share of the mean."""
+    """A straight line through a parameter's estimates.
+
+    Change per 30 days, its standard error, share of the mean."""
 
     per_month: float
     sigma: float
@@ -91,8 +93,8 @@ def _advice(newest: Summary, drifts: dict[str, Drift]) -> list[str]:
 def drift(times_s: Sequence[float], estimates: Sequence[tuple[float, float]]) -> Drift:
     """Fit a weighted straight line through (value, standard error) over time.
 
-    The standard error of the slope is widened by the scatter about the line where that is larger than the estimates' own. Fewer
-    than FEWEST estimates never drift."""
+    The standard error of the slope is widened by the scatter about the line where that is larger than the
+    estimates' own. Fewer than FEWEST estimates never drift."""
     t = np.asarray(times_s) / MONTH_S
     value, sd = np.array(estimates, dtype=float).reshape(-1, 2).T
     if len(t) < FEWEST or np.ptp(t) == 0.0:

@@ -1,8 +1,9 @@
-"""The cases of a proof: where each lies, whether it has been run by this program, and its sealed answer.
+"""The cases of a proof.
 
-A case is a folder with plant.yaml and recordings. Answers lie apart (DIR/NAME.yaml, checked against manifest.sha256)
-or as answer.yaml inside the case.
-"""
+Where each lies, whether it has been run by this program, and its sealed answer.
+
+A case is a folder with plant.yaml and recordings. Answers lie apart (DIR/NAME.yaml, checked against
+manifest.sha256) or as answer.yaml inside the case."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ RECORDINGS = (".csv", ".parquet", ".arrow")
 
 
 class Run(TypedDict):
-    """How the diagnosis of one case went, as in its run.json; `error` is None when it came to a result."""
+    """How the diagnosis of one case went, as in its run.json.
+
+    `error` is None when it came to a result."""
 
     name: str
     fingerprint: str
@@ -32,7 +35,9 @@ class Run(TypedDict):
 
 @dataclass(frozen=True)
 class Job:
-    """One diagnosis to run: plant file, recordings, and folders of effects beside the catalogue's."""
+    """One diagnosis to run.
+
+    Plant file, recordings, and folders of effects beside the catalogue's."""
 
     name: str
     plant: str
@@ -40,7 +45,9 @@ class Job:
     effects: tuple[str, ...] = ()
 
     def fingerprint(self) -> str:
-        """Hash the inputs and the program that diagnoses: a result with another fingerprint is out of date."""
+        """Hash the inputs and the program that diagnoses.
+
+        A result with another fingerprint is out of date."""
         entries = [f for folder in map(Path, self.effects) for f in sorted(folder.glob("*.yaml"))]
         return _digest((*map(Path, (self.plant, *self.recordings)), *entries, *program_files()))
 
@@ -69,7 +76,8 @@ def _digest(paths: Iterable[Path]) -> str:
 def find_jobs(folder: str | Path, number: int | None = None, apart: Sequence[str] = ()) -> list[Job]:
     """Find the cases in a folder, in order of their names; `number`: only the first so many.
 
-    `apart`: folders whose recordings are of different rigs and are diagnosed one at a time. Raises InputError without a case."""
+    `apart`: folders whose recordings are of different rigs and are diagnosed one at a time. Raises InputError
+    without a case."""
     root = Path(folder)
     if not root.is_dir():
         raise InputError(
@@ -110,7 +118,9 @@ def outcome(job: Job, cases: Path) -> tuple[dict[str, Any] | None, Run]:
 
 
 def read_answers(jobs: Sequence[Job], answers: Path | None) -> dict[str, dict[str, Any]]:
-    """Read the answer of each case. Answers that lie apart must match their manifest.sha256. Raises InputError."""
+    """Read the answer of each case. Answers that lie apart must match their manifest.sha256.
+
+    Raises InputError."""
     sealed: dict[str, str] = {}
     if answers is not None and (answers / "manifest.sha256").exists():
         for line in (answers / "manifest.sha256").read_text().splitlines():

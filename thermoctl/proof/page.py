@@ -1,4 +1,6 @@
-"""The page of a proof: figures, plots, confusion, by rig family and effect, and each case that is not right."""
+"""The page of a proof.
+
+Figures, plots, confusion, by rig family and effect, and each case that is not right."""
 
 from __future__ import annotations
 
@@ -97,7 +99,7 @@ def _names(effects: Sequence[tuple[str, str]]) -> str:
 
 
 def _plots(content: Mapping[str, Any], rows: Sequence[Row]) -> Figure:
-    """Plot detection and name by size, reliability, held-out gain, effect parameters, onset and time as one figure."""
+    """Plot detection by size, reliability, held-out gain, parameters, onset and time."""
     figure = Figure(figsize=(12, 6.6), layout="constrained")
     (size, reliable, gain), (wide, onset, clock) = figure.subplots(2, 3)
     _plot_sizes(size, content["shares"])

@@ -1,4 +1,6 @@
-"""Diagnose real recordings, for which no answer is known: verdict, places and held-out error beside what was published."""
+"""Diagnose real recordings, for which no answer is known.
+
+Verdict, places and held-out error beside what was published."""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ _PUBLISHED = re.compile(r"publish|publication|benchmark's|upstream reports", re.
 
 @dataclass(frozen=True)
 class Entry:
-    """One folder of real recordings; held_out: output -> rms on data that took no part: as it was, refitted, extended."""
+    """One folder of real recordings.
+
+    Held_out: output -> rms on data that took no part: as it was, refitted, extended."""
 
     name: str
     verdict: str

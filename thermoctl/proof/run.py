@@ -1,4 +1,6 @@
-"""Run the diagnosis over many cases: through Dask in separate processes, none twice, past workers that die."""
+"""Run the diagnosis over many cases.
+
+Through Dask in separate processes, none twice, past workers that die."""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ OnCase = Callable[[int, int, Run], None]  # cases done, cases to do, the newest
 
 
 def run_one(job: Job, out: str) -> Run:
-    """Diagnose one case in this process; OUT/run.json is written last. Never raises for a bad case."""
+    """Diagnose one case in this process; OUT/run.json is written last.
+
+    Never raises for a bad case."""
     started, cpu = time.monotonic(), time.process_time()
     error = None
     try:
@@ -52,7 +56,9 @@ def _run(job: Job, error: str | None, seconds: float | None) -> Run:
 
 @contextmanager
 def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
-    """Open a Dask client: of the scheduler at the address, else of local single-threaded processes."""
+    """Open a Dask client.
+
+    Of the scheduler at the address, else of local single-threaded processes."""
     import dask
     from distributed import Client, LocalCluster
 
@@ -89,7 +95,9 @@ def run_all(
     task: Callable[[Job, str], Run] = run_one,
     progress: OnCase | None = None,
 ) -> int:
-    """Run every job that is not done yet into OUT/NAME; return how many were run. `task` is called in a worker."""
+    """Run every job that is not done yet into OUT/NAME; return how many were run.
+
+    `task` is called in a worker."""
     waiting = [j for j in jobs if not done(j, out / j.name)]
     if not waiting:
         return 0

@@ -1,4 +1,6 @@
-"""One diagnosis against its sealed answer: what was found, named, placed, and what adding it was worth.
+"""One diagnosis against its sealed answer.
+
+What was found, named, placed, and what adding it was worth.
 
 Held-out gain: with e the mean over outputs of (rms / oracle's rms)^2 on data that took no part,
 
@@ -25,7 +27,9 @@ Named = tuple[str, str]  # an effect and its place
 
 @dataclass
 class Row:
-    """One scored case. `called` is what the diagnosis said in one word: an effect, `none` or `unknown`."""
+    """One scored case.
+
+    `called` is what the diagnosis said in one word: an effect, `none` or `unknown`."""
 
     case: str
     family: str
@@ -57,7 +61,9 @@ class Row:
 
 
 def same_place(effect: str, a: str, b: str) -> bool:
-    """Check whether two places of an effect are the same: a symmetric one may name its two ends in either order."""
+    """Check whether two places of an effect are the same.
+
+    A symmetric one may name its two ends in either order."""
     return a == b or (effect in SYMMETRIC and "-" in a and a.split("-") == b.split("-")[::-1])
 
 
@@ -129,7 +135,7 @@ def score(
     error: str | None = None,
     duration_s: float | None = None,
 ) -> Row:
-    """Compare one diagnosis.json (None where the diagnosis failed: `error` says why) with its answer."""
+    """Compare one diagnosis.json with its answer; None where the diagnosis failed with `error`."""
     truth = Truth.of(case, answer)
     result = result or FAILED
     verdict = result["verdict"]
@@ -204,7 +210,9 @@ def _onset(
 
 
 def _gain(fit: Mapping[str, Any], oracle: Mapping[str, float] | None) -> float | None:
-    """Compute the share of the oracle's held-out gain; None where a refit alone is within 1 % of the oracle."""
+    """Compute the share of the oracle's held-out gain.
+
+    None where a refit alone is within 1 % of the oracle."""
     before, after = fit.get("held_out_refit_only") or {}, fit.get("held_out_after") or {}
     outputs = [o for o in (oracle or {}) if before.get(o) is not None and after.get(o) is not None]
     if not outputs or oracle is None:
@@ -219,7 +227,7 @@ def _parameters(
     true: Sequence[Mapping[str, float]],
     findings: Sequence[Mapping[str, Any]],
 ) -> list[dict[str, Any]]:
-    """Relative error and 95 % coverage of the parameters of rightly named findings (`A_1` is `A`)."""
+    """Compare the parameters of rightly named findings: error, coverage (`A_1` is `A`)."""
     rows = []
     for (effect, _), values in zip(truth, true, strict=False):
         found = next((f for f in findings if f["effect"] == effect), None)

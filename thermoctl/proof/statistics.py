@@ -4,10 +4,14 @@ Detection, false alarms and all shares carry Wilson's 95 % interval
 
     (p + z^2/2n +- z sqrt(p (1-p)/n + z^2/4n^2)) / (1 + z^2/n),  z = 1.96
 
-Calibration: the expected error  ECE = sum_b (n_b/n) |mean probability_b - share right_b|  over ten bins of width 0.1.
-Detection over size s, in sigmas of an ideal single test (the curve of MIL-HDBK-1823A), by maximum likelihood on a grid,
+Calibration: the expected error over ten bins b of width 0.1
 
-    P(found | s) = 1 / (1 + (half / s)^slope),  95 % interval of `half`: where twice the log likelihood has fallen by 3.84
+    ECE = sum_b (n_b/n) |mean probability_b - share right_b|
+
+Detection over size s, in sigmas of an ideal single test (the curve of MIL-HDBK-1823A), by maximum likelihood
+on a grid; 95 % interval of `half`: where twice the log likelihood has fallen by 3.84
+
+    P(found | s) = 1 / (1 + (half / s)^slope)
 """
 
 from __future__ import annotations
@@ -61,7 +65,9 @@ def share(flags: Iterable[bool]) -> Share:
 def reliability(
     pairs: Sequence[tuple[float, bool]], bins: int = 10
 ) -> tuple[list[dict[str, float]], float | None]:
-    """Compute the reliability diagram [{probability, right, n}] over bins of equal width; also the calibration error."""
+    """Compute the reliability diagram [{probability, right, n}] over bins of equal width.
+
+    Also the calibration error."""
     groups: dict[int, list[tuple[float, bool]]] = {}
     for p, right in pairs:
         groups.setdefault(min(int(p * bins), bins - 1), []).append((p, right))
@@ -75,7 +81,7 @@ def reliability(
 
 
 def by_chance(pairs: Sequence[tuple[float, bool]], draws: int = 400) -> float | None:
-    """Compute the mean calibration error of so few findings if their probabilities were exactly right."""
+    """Compute the mean calibration error of so few findings with exact probabilities."""
     rng = random.Random(5)
     errors = [reliability([(p, rng.random() < p) for p, _ in pairs])[1] for _ in range(draws)]
     given = [e for e in errors if e is not None]
@@ -83,7 +89,9 @@ def by_chance(pairs: Sequence[tuple[float, bool]], draws: int = 400) -> float | 
 
 
 def found_by_size(sizes: Sequence[float], found: Sequence[bool]) -> dict[str, float] | None:
-    """Fit the size found half of the time with its 95 % interval (`low`, `high`), nine times in ten, and the slope.
+    """Fit the curve of detection over size.
+
+    `half`: the size found half of the time, with its 95 % interval `low`, `high`; `nine_in_ten`; `slope`.
 
     None for fewer than FEWEST_SIZES sizes, or where all or none were found."""
     if len(sizes) < FEWEST_SIZES or all(found) or not any(found):

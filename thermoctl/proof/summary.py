@@ -1,4 +1,6 @@
-"""The figures of a scored set: one number each with its interval and goal, and tables by family and effect."""
+"""The figures of a scored set.
+
+One number each with its interval and goal, and tables by family and effect."""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ GOALS = {
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Compute all figures of a set for JSON: `figures` (one number each), `shares` (with intervals) and tables.
+    """Compute all figures of a set for JSON.
+
+    `figures` (one number each), `shares` (with intervals) and tables.
 
     The cases with small misfits that nobody will name are apart, under `open_world`."""
     opened = open_world([r for r in rows if r.world == "open"])
@@ -148,7 +152,9 @@ def _grouped(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, dict[str, in
 
 
 def open_world(rows: Sequence[Row]) -> dict[str, Any]:
-    """Compute the figures of the cases with small misfits that nobody will name; empty without any."""
+    """Compute the figures of the cases with small misfits that nobody will name.
+
+    Empty without any."""
     if not rows:
         return {}
     visible = [r for r in rows if r.kind == "one" and r.band in ("large", "middle")]

@@ -61,7 +61,7 @@ def table(content: Mapping[str, Any]) -> Table:
 
 
 def lines(content: Mapping[str, Any]) -> Iterator[Line]:
-    """Yield each figure that could be measured, with its interval, its number of cases and its goal."""
+    """Yield each measured figure with its interval, its number of cases and its goal."""
 
     def goal(key: str, percent: bool) -> tuple[str, bool | None]:
         g = content["goals"].get(key)

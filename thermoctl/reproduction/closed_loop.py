@@ -1,7 +1,9 @@
-"""The whole chain at the loop's own period: the daemon's law and the full electromechanical plant, in simulated time.
+"""The whole chain at the loop's own period.
 
-Phase 1 (two processes): test 2; test 3 and test 4A, without compensation. Phase 2: test 4B with the paper's and with the better compensator.
-"""
+The daemon's law and the full electromechanical plant, in simulated time.
+
+Phase 1 (two processes): test 2; test 3 and test 4A, without compensation. Phase 2: test 4B with the paper's
+and with the better compensator."""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def of_rows(rows: np.ndarray) -> Recorded:
 def run_test(
     config: str, truth: str, name: str, model: CompensatorModel | None, every: int = 1000, part: float = 1.0
 ) -> np.ndarray:
-    """Run one test from rest; record rows once every `every` ticks. The compensator `model` acts when given."""
+    """Run one test from rest; record rows once every `every` ticks.
+
+    The compensator `model` acts when given."""
     settings = load_settings(config)
     settings = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, truth=truth))
     test = experiments.load_experiments(of_config(config))[name]
@@ -52,7 +56,9 @@ def run_test(
 
 
 def scaled_truth(plant_file: str | Path, path: Path) -> Path:
-    """Write the truth plant with the proving rigs' expansions to `path`; return its absolute form."""
+    """Write the truth plant with the proving rigs' expansions to `path`.
+
+    Return its absolute form."""
     p = plant.load(plant_file)
 
     def change(data: dict[str, Any]) -> None:
@@ -70,7 +76,7 @@ def quasi_static_run(
     seed: int,
     compensation_um: np.ndarray | float = 0.0,
 ) -> Recorded:
-    """Simulate the quasi-static plant on the schedule and the recorded air of a full run, read by the same instruments.
+    """Simulate the quasi-static plant on a full run's schedule and air, with its instruments.
 
     The coil also moves by what the law compensated, (N,) um: 15 um of 250 are a tenth of the heat."""
     p = plant.load(plant_file)
@@ -114,7 +120,9 @@ def quasi_static_run(
 
 
 def agreement(full: Recorded, quasi: Recorded) -> dict[str, float]:
-    """Compare the quasi-static run of a test with the full one: temperature and position, rms and largest, and the energies' ratio.
+    """Compare the quasi-static run of a test with the full one.
+
+    Temperature and position, rms and largest, and the energies' ratio.
 
     Both are averaged over each minute, which removes the instruments' steps."""
     minute = len(full.t) // 60 * 60
@@ -169,8 +177,9 @@ def judge(
 ) -> dict[str, Any]:
     """Compute (mean, 2 s) of test 4B wherever the reference stands at its target.
 
-    `paper`, `better`: the output's error under each compensator. `..._estimator`: the growth in the better one's run less each
-    estimate. `still_...`: the same from the quasi-static plant. `agreement`: of the two plants over tests 2, 4A and 4B."""
+    `paper`, `better`: the output's error under each compensator. `..._estimator`: the growth in the better
+    one's run less each estimate. `still_...`: the same from the quasi-static plant. `agreement`: of the two
+    plants over tests 2, 4A and 4B."""
     figures: dict[str, Any] = {}
     r = {k: of_rows(v) for k, v in rows.items()}
     for k in ("paper", "better"):

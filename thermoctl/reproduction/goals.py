@@ -15,7 +15,9 @@ THREEFOLD = 0.4  # of SISO's repeatability: SISO's over the paper's rounds to th
 
 
 class Goal(NamedTuple):
-    """One promised figure: the value measured, the range wanted in words, and whether it is met, as yes or NO."""
+    """One promised figure.
+
+    The value measured, the range wanted in words, and whether it is met, as yes or NO."""
 
     what: str
     measured: float

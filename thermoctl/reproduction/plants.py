@@ -13,7 +13,9 @@ FAST = ("i_coil", "u_integral", "velocity", "position")  # states that settle in
 
 
 def quasi_static(plant: Plant) -> Plant:
-    """Replace amplifier and motion by the inputs coil current and eddy heat; add inputs of unmeasured heat."""
+    """Replace amplifier and motion by the inputs coil current and eddy heat.
+
+    Add inputs of unmeasured heat."""
     data = plant.plain()
     data["nodes"] = {k: v for k, v in data["nodes"].items() if k not in FAST}
     flows: dict[str, Any] = {}

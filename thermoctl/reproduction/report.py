@@ -1,4 +1,6 @@
-"""The report of the reproduction: the paper's numbers, ours by its method, ours by the better method."""
+"""The report of the reproduction.
+
+The paper's numbers, ours by its method, ours by the better method."""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def report(
     whole: Mapping[str, Any] | None,
     seconds: float,
 ) -> str:
-    """Write the page. `before`: the goals on the seeds that choices were made on; `whole`: the full run's figures."""
+    """Write the page.
+
+    `before`: the goals on the seeds that choices were made on; `whole`: the full run's figures."""
     sections = [
         _positions(results),
         _how_to_read(results),

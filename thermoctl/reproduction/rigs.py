@@ -1,12 +1,14 @@
-"""Simulated rigs to prove the method on: varied from seed to seed and day to day, with physics that no identified model has.
+"""Simulated rigs to prove the method on.
 
-The plant file's truth is used with its fast electromechanics replaced by the quasi-static equivalent (plants.py): the position
-loop settles in milliseconds, heat takes minutes. The current is what holds the flexures and drags the eddy damping,
-i = (k x + b v) / k_T, with x the reference after the rate limiter.
+Varied from seed to seed and day to day, with physics that no identified model has.
 
-Each seed has other heat capacities, conductances and expansions (SPREAD). Each day has another natural convection (CONVECTION),
-bench temperature, chamber drift, and unmeasured heat in three bodies (a random walk that is forgotten in HEAT_TAU_S).
-"""
+The plant file's truth is used with its fast electromechanics replaced by the quasi-static equivalent
+(plants.py): the position loop settles in milliseconds, heat takes minutes. The current is what holds the
+flexures and drags the eddy damping, i = (k x + b v) / k_T, with x the reference after the rate limiter.
+
+Each seed has other heat capacities, conductances and expansions (SPREAD). Each day has another natural
+convection (CONVECTION), bench temperature, chamber drift, and unmeasured heat in three bodies (a random walk
+that is forgotten in HEAT_TAU_S)."""
 
 from __future__ import annotations
 
@@ -68,7 +70,9 @@ def _changed_air(t: np.ndarray, late: np.ndarray, columns: dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """A change of a rig that the methods are not told of. Sensors and motion differ always, the rest after calibration."""
+    """A change of a rig that the methods are not told of.
+
+    Sensors and motion differ always, the rest after calibration."""
 
     inputs: Callable[[np.ndarray, np.ndarray, dict[str, np.ndarray]], None] | None = None
     factors: Mapping[str, float] = field(default_factory=dict)  # of parameters whose names start so
@@ -96,7 +100,9 @@ NONE = Disturbance()
 
 @dataclass(frozen=True)
 class _Day:
-    """What a rig goes through on a day: its parameters, the inputs of its thermal plant at 1 s, and its random numbers."""
+    """What a rig goes through on a day.
+
+    Its parameters, the inputs of its thermal plant at 1 s, and its random numbers."""
 
     t: np.ndarray
     parameters: dict[str, float]
@@ -110,9 +116,12 @@ class _Day:
 
 
 class ProvingRig:
-    """One seed's rig. `run(schedule, day)` simulates a test on a day; the same arguments give the same recording.
+    """One seed's rig.
 
-    `air`, `bench` and `heat` multiply the chamber's drift, the bench's and the unmeasured heat: 0 takes them away."""
+    `run(schedule, day)` simulates a test on a day; the same arguments give the same recording.
+
+    `air`, `bench` and `heat` multiply the chamber's drift, the bench's and the unmeasured heat: 0 takes them
+    away."""
 
     def __init__(
         self,
@@ -142,7 +151,9 @@ class ProvingRig:
         self.meter_gain = 1 + METER_SPREAD * rng.standard_normal()
 
     def run(self, schedule: Schedule, day: int, noise: bool = True) -> Recorded:
-        """Simulate a test at 1 s. `noise` False: the same day with perfect instruments and without the unmeasured heat."""
+        """Simulate a test at 1 s.
+
+        `noise` False: the same day with perfect instruments and without the unmeasured heat."""
         return self._read(self._day(schedule, day, noise), schedule, noise)
 
     def _day(self, schedule: Schedule, day: int, noise: bool) -> _Day:
@@ -223,9 +234,12 @@ class ProvingRig:
         return Recorded(day.t, power, air, measured, error, true_c, true_um, schedule.at(day.t))
 
     def bayes(self, schedule: Schedule, day: int, recorded: Recorded) -> np.ndarray:
-        """Estimate the position error (N,) as well as it can be: a Kalman filter about the true plant's own run.
+        """Estimate the position error (N,) as well as it can be.
 
-        It has the day's true parameters and air, the true statistics of the unmeasured heat, and the same one coil sensor."""
+        A Kalman filter about the true plant's own run.
+
+        It has the day's true parameters and air, the true statistics of the unmeasured heat, and the same one
+        coil sensor."""
         today = self._day(schedule, day, noise=False)
         nominal = self._read(today, schedule, noise=False)
         a, b, c = self._linearised(today)
@@ -252,7 +266,7 @@ class ProvingRig:
         return nominal.true_um + x @ error
 
     def _linearised(self, day: _Day) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute A, B (of the unmeasured heat) and C of one second's step about the day's mean, by differences."""
+        """Compute A, B (of the unmeasured heat) and C of a step of one second, by differences."""
         inputs = list(self.model.inputs)
         u0 = np.array([float(np.mean(day.columns[k])) for k in inputs])
         stepper = self.model.stepper(1.0, u0, day.parameters)

@@ -1,4 +1,6 @@
-"""All estimators on one simulated rig: calibrated on its tests 2, 3 and 4A, compared over its test 4B."""
+"""All estimators on one simulated rig.
+
+Calibrated on its tests 2, 3 and 4A, compared over its test 4B."""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ MeanTwoS = tuple[float, float]  # um
 
 @dataclass(frozen=True)
 class SeedResult:
-    """One rig: position {estimator: (mean, 2 s)} over test 4B; temperature {estimator: (largest, mean error)} in test 3, K.
+    """One rig: position {estimator: (mean, 2 s)} over test 4B.
+
+    Temperature {estimator: (largest, mean error)} in test 3, K.
 
     `stable`, `choice` (sampling period s, block rows): of the paper's model."""
 
@@ -34,7 +38,9 @@ class SeedResult:
 
 @dataclass(frozen=True)
 class Kept:
-    """What the figures need of one rig: its calibration, its tests, the estimates in test 3 and the residuals in test 4."""
+    """What the figures need of one rig.
+
+    Its calibration, its tests, the estimates in test 3 and the residuals in test 4."""
 
     calibration: chain.Calibration
     tests: tuple[Recorded, Recorded, Recorded, Recorded]
@@ -53,7 +59,9 @@ def one_seed(
     bench: float = CHAMBER,
     heat: float = 1.0,
 ) -> tuple[SeedResult, Kept | None]:
-    """Run one rig; `keep`: also return what the figures need. `air`, `bench`, `heat`: as ProvingRig takes them."""
+    """Run one rig; `keep`: also return what the figures need.
+
+    `air`, `bench`, `heat`: as ProvingRig takes them."""
     tests = experiments.load_experiments(tests_file)
     rig = ProvingRig(plant.load(plant_file), seed, disturbance, PAPER_SCALE, air, bench, heat)
     run4 = joined(tests["test_4a"], tests["test_4b"], "test_4")
@@ -88,7 +96,7 @@ def _figures(residual: np.ndarray) -> MeanTwoS:
 
 
 def _rises(c: chain.Calibration, r: Recorded) -> dict[str, np.ndarray]:
-    """Estimate the rises over a test by the paper's model alone, by its MKF and by the better filter."""
+    """Estimate the rises over a test: the paper's model alone, its MKF, the better filter."""
     q = round(c.paper_model.period_s)
     simulated = c.paper_model.simulate(chain.block_mean(r.power_w[:, None], q))
     return {

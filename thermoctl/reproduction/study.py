@@ -1,4 +1,6 @@
-"""The paper on simulated rigs: run all seeds, measure the goals, write the report and its figures."""
+"""The paper on simulated rigs.
+
+Run all seeds, measure the goals, write the report and its figures."""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def reproduce(
     full: bool = True,
     say: Callable[[str], object] = print,
 ) -> bool:
-    """Run everything; write report.html, figures.json and figures.txt into `out`. Return whether every goal is met."""
+    """Run everything; write report.html, figures.json and figures.txt into `out`.
+
+    Return whether every goal is met."""
     started = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     runs = _run(plant_file, str(of_config(config)), seeds)

@@ -45,7 +45,9 @@ RANGE_K = LARGEST_K / 0.018
 def temperature_rows(
     estimate: dict[str, np.ndarray], truth: np.ndarray
 ) -> tuple[list[list[Any]], list[list[Any]]]:
-    """Return the rows of Tables V and VI: point, the paper's, then the largest and the mean error of every estimate (N, 12)."""
+    """Return the rows of Tables V and VI.
+
+    Point, the paper's, then the largest and the mean error of every estimate (N, 12)."""
     largest = {k: np.nanmax(np.abs(v - truth), axis=0) for k, v in estimate.items()}
     mean = {k: np.nanmean(np.abs(v - truth), axis=0) for k, v in estimate.items()}
     five = [
