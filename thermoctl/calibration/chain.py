@@ -1,7 +1,7 @@
 """The chain from recordings to position residuals, by the paper's method and by the better one.
 
-`calibrate` fits the estimators to tests 2, 3 and 4A; `estimates` gives each one's position error over test 4. The
-measured error less the estimate is compared over test 4B. Estimators:
+`calibrate` fits the estimators to tests 2, 3 and 4A; `estimates` gives each one's position error over test 4.
+The measured error less the estimate is compared over test 4B. Estimators:
   siso     coil alone, first order, recursion (5)
   paper    N4SID of order 12 with (26), MKF, recursion (5); one sampling period, as (38) and (39) have one n
   better   real poles by separable generalised least squares; Kalman filter with the coil alone and the

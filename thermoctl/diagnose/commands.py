@@ -8,9 +8,12 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from rich.console import Console
+from rich.table import Table
 
 from thermoctl.diagnose import run
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
@@ -100,9 +103,6 @@ def effects(args: argparse.Namespace) -> int:
     """`thermoctl effects [show NAME]`: the catalogue, or one entry in full.
 
     Raises InputError for an unknown name."""
-    from rich.console import Console
-    from rich.table import Table
-
     found = catalogue((CATALOGUE, *map(Path, args.effects or ())))
     console = Console(soft_wrap=True)
     if args.action == "show":
@@ -144,85 +144,78 @@ def effects(args: argparse.Namespace) -> int:
 
 def summary(found: dict[str, Any], out: str | Path) -> None:
     """Print a result for a person."""
-    from rich.console import Console
-    from rich.table import Table
-
     console = Console() if sys.stdout.isatty() else Console(width=160)
     console.print(f"[bold]{found['verdict']}[/]. {sentence(found)}")
     if found["findings"]:
-        table = Table(
-            "effect", "where", "equation", "parameter", "value", "95 %", box=None, header_style="bold"
-        )
-        for f in found["findings"]:
-            first = [f["effect"], f["where"], f["equation"]]
-            for name, p in f["parameters"].items():
-                table.add_row(
-                    *first, name, f"{p['value']:.4g} {p['unit'] or ''}", f"± {1.96 * (p['sd'] or 0):.2g}"
-                )
-                first = ["", "", ""]
-        console.print(table)
+        console.print(_findings(found["findings"]))
     if found["alternatives"]:
-        table = Table("alternative", "where", "probability", box=None, header_style="bold")
+        table = _table("alternative", "where", "probability")
         for a in found["alternatives"][:8]:
             table.add_row(a["effect"], a["where"], f"{a['probability']:.3f}")
         console.print(table)
     if found["mismatch"]:
-        table = Table(
-            "misfit of", "rms", "sensor allows", "missing flow", "follows", box=None, header_style="bold"
-        )
-        for m in found["mismatch"]:
-            size, unit = m.get("missing_flow_rms"), m.get("missing_flow_unit")
-            flow = f"{size:.3g} {unit or ''} at {m['node']}" if size else "-"
-            table.add_row(
-                m["channel"],
-                f"{m['rms']:.4g}",
-                f"{m['expected_rms']:.4g}",
-                flow,
-                ", ".join(m.get("follows") or ()),
-            )
-        console.print(table)
-    table = Table(
-        "rms of",
-        "as it came",
-        "refitted",
-        "with the finding",
-        "held out: refitted",
-        "with the finding",
-        "ratio (95 %)",
-        box=None,
-        header_style="bold",
-    )
-    fit, gain = found["fit"], found.get("held_out_gain", {})
+        console.print(_mismatch(found["mismatch"]))
+    console.print(_errors(found["fit"], found.get("held_out_gain", {})))
+    lines = [f"note: {note}" for note in found["notes"]]
+    if found["next_experiment"]:
+        lines += _next_experiment(found["next_experiment"], Path(out))
+    lines += [
+        f"round {k}: was {r['verdict']}; ran {r['experiment']} -> {r['recording']}"
+        for k, r in enumerate(found.get("resolved", ()), 1)
+    ]
+    lines.append(f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json")
+    for line in lines:
+        console.print(line, markup=False)
+
+
+def _table(*titles: str) -> Table:
+    return Table(*titles, box=None, header_style="bold")
+
+
+def _findings(findings: Sequence[Mapping[str, Any]]) -> Table:
+    table = _table("effect", "where", "equation", "parameter", "value", "95 %")
+    for f in findings:
+        first = [f["effect"], f["where"], f["equation"]]
+        for name, p in f["parameters"].items():
+            value = f"{p['value']:.4g} {p['unit'] or ''}"
+            table.add_row(*first, name, value, f"± {1.96 * (p['sd'] or 0):.2g}")
+            first = ["", "", ""]
+    return table
+
+
+def _mismatch(mismatch: Sequence[Mapping[str, Any]]) -> Table:
+    table = _table("misfit of", "rms", "sensor allows", "missing flow", "follows")
+    for m in mismatch:
+        size, unit = m.get("missing_flow_rms"), m.get("missing_flow_unit")
+        flow = f"{size:.3g} {unit or ''} at {m['node']}" if size else "-"
+        rms = (f"{m['rms']:.4g}", f"{m['expected_rms']:.4g}")
+        table.add_row(m["channel"], *rms, flow, ", ".join(m.get("follows") or ()))
+    return table
+
+
+def _errors(fit: Mapping[str, Any], gain: Mapping[str, Any]) -> Table:
+    columns = {
+        "before": "as it came",
+        "refit_only": "refitted",
+        "after": "with the finding",
+        "held_out_refit_only": "held out: refitted",
+        "held_out_after": "with the finding",
+    }
+    table = _table("rms of", *columns.values(), "ratio (95 %)")
     for o in fit["refit_only"]:
         g = gain.get(o)
-        table.add_row(
-            o,
-            *(
-                _number(fit.get(k, {}).get(o))
-                for k in ("before", "refit_only", "after", "held_out_refit_only", "held_out_after")
-            ),
-            f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else "-",
-        )
-    console.print(table)
-    for note in found["notes"]:
-        console.print(f"note: {note}", markup=False)
-    if found["next_experiment"]:
-        told = found["next_experiment"]
-        console.print(
-            f"next experiment: {told['profile']}. {told['why']} {told['also_helpful'] or ''}", markup=False
-        )
-        for line in peaks(told):
-            console.print(f"    {line}", markup=False)
-        console.print(
-            f"run it: thermoctl experiment {Path(out) / told['file']}  (or by hand: next_experiment.csv), "
-            "or let `thermoctl diagnose --resolve` do it",
-            markup=False,
-        )
-    for k, r in enumerate(found.get("resolved", ()), 1):
-        console.print(
-            f"round {k}: was {r['verdict']}; ran {r['experiment']} -> {r['recording']}", markup=False
-        )
-    console.print(f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json", markup=False)
+        ratio = f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else "-"
+        table.add_row(o, *(_number(fit.get(k, {}).get(o)) for k in columns), ratio)
+    return table
+
+
+def _next_experiment(entry: Mapping[str, Any], out: Path) -> list[str]:
+    return [
+        f"next experiment: {entry['profile']}. {entry['why']} {entry['also_helpful'] or ''}",
+        *(f"    {line}" for line in peaks(entry)),
+        f"run it: thermoctl experiment {out / entry['file']}  (or by hand: next_experiment.csv), "
+        "or let `thermoctl diagnose --resolve` do it",
+    ]
 
 
 def _number(value: float | None) -> str:

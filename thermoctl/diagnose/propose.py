@@ -4,12 +4,12 @@ Two fitted hypotheses a, b predict readings y_a, y_b (N,) of an experiment. The 
 parameters counts against them (Buzzi-Ferraris & Forzatti, Chem. Eng. Sci. 38 (1983) 225), with R the noise's
 covariance, J = dy/dz, P = cov z:
 
-    D_ab = (y_a - y_b)' (R + J_a P_a J_a' + J_b P_b J_b')^-1 (y_a - y_b)                                           (1)
+    D_ab = (y_a - y_b)' (R + J_a P_a J_a' + J_b P_b J_b')^-1 (y_a - y_b)          (1)
 
 The experiment's information on which hypothesis is true, in bits (lower bound of Kolchinsky & Tracey, Entropy
 19 (2017) 361):
 
-    I = -sum_a w_a log2 sum_b w_b exp(-D_ab / 8)                                                                   (2)
+    I = -sum_a w_a log2 sum_b w_b exp(-D_ab / 8)                                  (2)
 
 Chosen is the most I per hour among those that reach ENOUGH of the best I. Every reading, as every hypothesis
 predicts it, stays inside its recorded range, unless limits are given. Where no candidate stays inside, the

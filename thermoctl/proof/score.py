@@ -4,7 +4,9 @@ What was found, named, placed, and what adding it was worth.
 
 Held-out gain: with e the mean over outputs of (rms / oracle's rms)^2 on data that took no part,
 
-    share = (e_refit - e_after) / (e_refit - 1)      1: as good as the true physics; 0: no better than a refit alone.
+    share = (e_refit - e_after) / (e_refit - 1)
+
+It is 1 where the result is as good as the true physics, 0 where it is no better than a refit alone.
 """
 
 from __future__ import annotations
