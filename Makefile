@@ -75,7 +75,7 @@ bench-identification: develop      # all bars in one run; 18 million samples tak
 	$(BIN)/python tests/bench/identification.py --scale
 
 test-identification: develop       # experiments, identification, model in the daemon and back, on a rig in simulated time
-	$(BIN)/python -m pytest tests/evaluate/test_experiment.py
+	$(BIN)/python -m pytest tests/calibration/test_experiment.py
 
 clean:                             # remove .venv, build and compiled files
 	rm -rf $(VENV) build *.egg-info
@@ -117,7 +117,7 @@ pictures: develop                  # the same, and its screenshots into docs/ima
 
 .PHONY: test-fleet
 test-fleet: develop                # many rigs' recordings, from a folder and an object store, also spread by Dask
-	$(BIN)/python -m pytest -m "slow or not slow" tests/people/test_fleet.py
+	$(BIN)/python -m pytest -m "slow or not slow" tests/fleet/test_fleet.py
 
 .PHONY: test-wizard
 test-wizard: develop               # thermoctl calibrate from doctor to proof, with shortened tests
@@ -146,7 +146,7 @@ walkthrough:                       # a new user's walk: a clean clone, every com
 
 .PHONY: test-scale
 test-scale: develop                # a Dask scheduler and workers started by hand, one killed; diagnose over a folder of rigs
-	$(BIN)/python -m pytest -m slow tests/diagnose/test_prove.py
+	$(BIN)/python -m pytest -m slow tests/proof/test_proof.py
 
 .PHONY: mutants
 mutants: develop                   # protection and arming: every branch reached, every mutant of the source broken or explained

@@ -390,16 +390,21 @@ def _recording_commands(sub: argparse._SubParsersAction) -> None:
 def _identify_commands(sub: argparse._SubParsersAction) -> None:
     """experiment, identify, model, tune, evaluate, reproduce."""
 
-    def room():
-        from thermoctl.evaluate import commands
+    def package():
+        from thermoctl.calibration import commands
 
         return commands
+
+    def reproduce(args: argparse.Namespace) -> int:
+        from thermoctl.reproduction import commands
+
+        return commands.reproduce(args.config, args.plant, args.out, args.seeds, args.quick)
 
     _add(
         sub,
         "experiment",
         "run a test of experiments.yaml, or an experiment file such as a diagnosis proposes, and record it",
-        lambda a: room().experiment(a.name, a.config, a.out, a.dry_run, a.resume, a.plant, a.yes),
+        lambda a: package().run_experiment(a.name, a.config, a.out, a.dry_run, a.resume, a.plant, a.yes),
         (
             "name",
             {
@@ -427,7 +432,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
         sub,
         "identify",
         "calibrate from the recordings of tests 2, 3 and 4A; the calibration goes into the machine's own folder",
-        lambda a: room().identify(a.test_2, a.test_3, a.test_4a, a.config, a.models, a.method, a.order),
+        lambda a: package().identify(a.test_2, a.test_3, a.test_4a, a.config, a.models, a.method, a.order),
         ("test_2", {"metavar": "TEST_2"}),
         ("test_3", {"metavar": "TEST_3"}),
         ("test_4a", {"metavar": "TEST_4A"}),
@@ -450,7 +455,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
         sub,
         "model",
         "list, show or roll back calibrations",
-        lambda a: room().model(a.action, a.models, a.name),
+        lambda a: package().model(a.action, a.models, a.name),
         ("action", {"choices": ("list", "show", "rollback")}),
         ("name", {"nargs": "?", "metavar": "NAME"}),
     )
@@ -462,7 +467,7 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
         "tune",
         "propose PID gains from the closed loop's answer to setpoint ramps of a few um; arms the rig, with all protections, after a "
         "question",
-        lambda a: room().tune(a.config, a.method, a.write, a.yes),
+        lambda a: package().tune(a.config, a.method, a.write, a.yes),
         CONFIG,
         (
             "--method",
@@ -480,14 +485,14 @@ def _identify_commands(sub: argparse._SubParsersAction) -> None:
         sub,
         "evaluate",
         "ISO 230-2 figures of recordings with a reference encoder",
-        lambda a: room().evaluate(a.recordings),
+        lambda a: package().evaluate(a.recordings),
         ("recordings", {"nargs": "+", "metavar": "RECORDING"}),
     )
     _add(
         sub,
         "reproduce",
         "the paper's tests on simulated rigs: one report with the paper's numbers, ours by its method, ours by the better one",
-        lambda a: room().reproduce(a.config, a.plant, a.out, a.seeds, a.quick),
+        reproduce,
         (
             "--config",
             {
@@ -507,20 +512,31 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
     """diagnose, prove, demo-concealed, effects."""
 
     def diagnose(args: argparse.Namespace) -> int:
-        from thermoctl.diagnose import command
+        from thermoctl.diagnose import commands
 
-        def record(experiment: Path, recording: Path) -> None:  # the rig is another room's business
-            from thermoctl.evaluate import commands
+        if args.live:
+            from thermoctl.fleet.commands import live_recordings
 
-            commands.record(experiment, recording, args.config, args.rig, args.yes)
+            args.recordings = live_recordings(args)
+            if not args.recordings:
+                return 0
+        if any(Path(r).is_dir() for r in args.recordings):
+            from thermoctl.fleet.commands import diagnose_folders
+
+            return diagnose_folders(args)
+
+        def record(experiment: Path, recording: Path) -> None:  # the rig is another package's business
+            from thermoctl.calibration.commands import record
+
+            record(experiment, recording, args.config, args.rig, args.yes)
 
         args.record = record
-        return command.diagnose(args)
+        return commands.diagnose(args)
 
     def effects(args: argparse.Namespace) -> int:
-        from thermoctl.diagnose import command
+        from thermoctl.diagnose import commands
 
-        return command.effects(args)
+        return commands.effects(args)
 
     folder = (
         "--effects",
@@ -624,9 +640,9 @@ def _diagnose_commands(sub: argparse._SubParsersAction) -> None:
     )
 
     def prove(args: argparse.Namespace) -> int:
-        from thermoctl.diagnose.prove import command
+        from thermoctl.proof import commands
 
-        return command(args)
+        return commands.prove(args)
 
     _add(
         sub,
@@ -767,9 +783,9 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     )
 
     def calibrate(args: argparse.Namespace) -> int:
-        from thermoctl.evaluate.calibrate import calibrate
+        from thermoctl.calibration import commands
 
-        return calibrate(
+        return commands.calibrate(
             args.config, args.out, args.models, args.order, args.gains, args.accept, args.again, args.yes
         )
 
@@ -793,9 +809,11 @@ def _people_commands(sub: argparse._SubParsersAction) -> None:
     )
 
     def fleet(args: argparse.Namespace) -> int:
-        from thermoctl.diagnose.fleet import fleet
+        from thermoctl.fleet import commands
 
-        return fleet(args.folder, args.plant, args.parameters, args.workers, args.scheduler, args.json)
+        return commands.fleet(
+            args.folder, args.plant, args.parameters, args.workers, args.scheduler, args.json
+        )
 
     _add(
         sub,

@@ -35,8 +35,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from thermoctl.diagnose import locate, observer, prove, run, screen, search
-from thermoctl.diagnose import score as scoring
+from thermoctl.diagnose import locate, observer, run, screen, search
 from thermoctl.diagnose.effects import Candidate, Rig, candidates, catalogue
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.diagnose.heldout import unseen_errors
@@ -44,6 +43,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant import load
 from thermoctl.plant.refit import report
 from thermoctl.plant.simulate import SimulationError
+from thermoctl.proof import jobs as proof_jobs
+from thermoctl.proof import score as scoring
 from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 
@@ -53,7 +54,7 @@ SHORT, MOST, LEVEL = 8, 3, 0.05
 # ------------------------------------------------------------------------------------------------------- common parts
 
 
-def prepared(job: prove.Job) -> tuple[Case, Explanation, Mapping[str, Any]]:
+def prepared(job: proof_jobs.Job) -> tuple[Case, Explanation, Mapping[str, Any]]:
     """The case, its plant refitted, the catalogue."""
     case = Case(load(job.plant), [read_table(r) for r in job.recordings])
     begun = time.monotonic()
@@ -140,13 +141,13 @@ def forward(
 # ----------------------------------------------------------------------------------------------------------- the methods
 
 
-def thermoctl(job: prove.Job) -> dict[str, Any]:
+def thermoctl(job: proof_jobs.Job) -> dict[str, Any]:
     """The product."""
     with tempfile.TemporaryDirectory() as out:
         return run.diagnose(job.plant, list(job.recordings), out)
 
 
-def ctsm(job: prove.Job) -> dict[str, Any]:
+def ctsm(job: proof_jobs.Job) -> dict[str, Any]:
     """Likelihood ratios of one-step predictions."""
     case, base, entries = prepared(job)
     best, likelihood = base, white(base)[0]
@@ -173,13 +174,13 @@ def ctsm(job: prove.Job) -> dict[str, Any]:
     return told(case, base, final)
 
 
-def bic(job: prove.Job) -> dict[str, Any]:
+def bic(job: proof_jobs.Job) -> dict[str, Any]:
     """Greedy BIC on the free run, white noise."""
     case, base, entries = prepared(job)
     return told(case, base, forward(case, base, entries, lambda added, n: added * float(np.log(n))))
 
 
-def latent(job: prove.Job) -> dict[str, Any]:
+def latent(job: proof_jobs.Job) -> dict[str, Any]:
     """Unknown smooth inputs only."""
     case, base, _ = prepared(job)
     drives = [base.fit.model.excitation(t) for t in case.tables]
@@ -196,7 +197,7 @@ def latent(job: prove.Job) -> dict[str, Any]:
     return told(case, base, base, found[0].name if alarm else None)
 
 
-def sindy(job: prove.Job) -> dict[str, Any]:
+def sindy(job: proof_jobs.Job) -> dict[str, Any]:
     """Sparse regression of what the measured states' derivatives have beyond the plant's slopes."""
     case, base, entries = prepared(job)
     model = base.fit.model
@@ -331,7 +332,7 @@ def _sparse(
     ]
 
 
-METHODS: dict[str, Callable[[prove.Job], dict[str, Any]]] = {
+METHODS: dict[str, Callable[[proof_jobs.Job], dict[str, Any]]] = {
     "thermoctl": thermoctl,
     "ctsm": ctsm,
     "sindy": sindy,
@@ -343,12 +344,12 @@ METHODS: dict[str, Callable[[prove.Job], dict[str, Any]]] = {
 # ---------------------------------------------------------------------------------------------------------- the bench
 
 
-def placed(job: prove.Job, answer: Mapping[str, Any], row: scoring.Row, suspect: str | None) -> bool:
+def placed(job: proof_jobs.Job, answer: Mapping[str, Any], row: scoring.Row, suspect: str | None) -> bool:
     """Whether a true place was pointed at: by a finding of any name, or by the suspected node or output itself."""
     plant = load(job.plant)
     places = {str(w) for _, w in answer["effects"]}
     if suspect is None:
-        return any(scoring._same_place(e, w, p) for e, w in row.findings for p in places)
+        return any(scoring.same_place(e, w, p) for e, w in row.findings for p in places)
     near: set[str] = set()
     for p in places:
         near |= {p, *p.split("-")}
@@ -357,7 +358,7 @@ def placed(job: prove.Job, answer: Mapping[str, Any], row: scoring.Row, suspect:
     return suspect in near
 
 
-def noise_of(job: prove.Job) -> dict[str, float]:
+def noise_of(job: proof_jobs.Job) -> dict[str, float]:
     """What the truth would leave, for answers that do not tell: the sensors' noise as the plant file has it."""
     return {
         o.name: float(np.hypot(o.noise_sd, (o.resolution or 0.0) / np.sqrt(12)))
@@ -366,7 +367,7 @@ def noise_of(job: prove.Job) -> dict[str, float]:
     }
 
 
-def one(method: str, job: prove.Job, out: Path) -> dict[str, Any]:
+def one(method: str, job: proof_jobs.Job, out: Path) -> dict[str, Any]:
     """Run a method on a case, or take what it gave before; keeps it in OUT/METHOD/CASE.json."""
     kept = out / method / f"{job.name}.json"
     if kept.exists() and (old := json.loads(kept.read_text()))["fingerprint"] == job.fingerprint():
@@ -389,7 +390,7 @@ def one(method: str, job: prove.Job, out: Path) -> dict[str, Any]:
 
 
 def figures(
-    jobs: Sequence[prove.Job],
+    jobs: Sequence[proof_jobs.Job],
     answers: Mapping[str, Mapping[str, Any]],
     results: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
@@ -511,8 +512,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         folders = [made]
     jobs, answers = [], {}
     for folder in folders:
-        some = prove.find_jobs(folder, a.number)
-        for job, answer in zip(some, prove.read_answers(some, a.answers).values(), strict=True):
+        some = proof_jobs.find_jobs(folder, a.number)
+        for job, answer in zip(some, proof_jobs.read_answers(some, a.answers).values(), strict=True):
             answers[f"{folder.name}-{job.name}"] = {"oracle_rms": noise_of(job), **answer}
         jobs += [dataclasses.replace(j, name=f"{folder.name}-{j.name}") for j in some]
     found = {}

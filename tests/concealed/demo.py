@@ -30,13 +30,13 @@ import numpy as np
 from tests.concealed import generate, sensors
 from tests.concealed.judge import snr
 from tests.concealed.rig import Scene
+from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.diagnose import run as diagnosis
-from thermoctl.diagnose.prove import program
-from thermoctl.evaluate.iso230 import mean_and_two_s
 from thermoctl.identify.linearise import linearise
 from thermoctl.plant import load, save
 from thermoctl.plant.refit import fit, updated
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.proof.jobs import program
 from thermoctl.recording.files import read_table
 from thermoctl.report import page
 from thermoctl.yamlfile import InputError

@@ -9,9 +9,13 @@ import pytest
 import yaml
 
 from thermoctl.cli import main
-from thermoctl.diagnose import experiment, search
+from thermoctl.diagnose import experiment_file, search
+from thermoctl.diagnose.design import Excitation, courses, levers
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
+from thermoctl.diagnose.experiment_file import peaks
 from thermoctl.diagnose.explain import Case
+from thermoctl.diagnose.propose import bits, distance, propose
+from thermoctl.diagnose.resolve import resolve
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
@@ -71,16 +75,14 @@ def shared_by_two(belief, truth, inputs):
 
 def test_proposal_stays_inside_the_limits_and_is_the_best_per_hour(undecided):
     case, found = undecided
-    entry, chosen = experiment.propose(case, found, limits=LIMITS)
+    entry, chosen = propose(case, found, limits=LIMITS)
     heat = np.array(entry["inputs"]["heat"])
     assert heat[:, 1].min() >= 0 and heat[:, 1].max() <= 20 and entry["inputs"]["air"] == [[0.0, 22.0]]
     ahead = compile_plant(loads(TRUTH), ()).simulate(chosen.table(case.plant, 5.0)).y
     assert ahead.min() > 15 and ahead.max() < 110
     assert entry["separates"][0]["sigmas"] > 3 and entry["bits"] > 0.6
     assert entry["bits_per_hour"] == pytest.approx(entry["bits"] / (entry["duration_s"] / 3600))
-    near, _ = experiment.propose(
-        case, found
-    )  # no limits given: not beyond what was recorded, and there they look alike
+    near, _ = propose(case, found)  # no limits given: not beyond what was recorded, and there they look alike
     assert near["bits"] < 0.5 * entry["bits"] and near["also_helpful"]
 
 
@@ -106,7 +108,7 @@ def printing():
 def test_a_hot_end_is_not_heated_beyond_what_was_recorded(tmp_path):
     """Full heat at fan 0 would go on far beyond the hottest reading: neither as any hypothesis nor as the truth has it."""
     case, found = shared_by_two(HOT_END, HOT_TRUTH, printing())
-    entry, chosen = experiment.propose(case, found)
+    entry, chosen = propose(case, found)
     (p,) = entry["predicted"].values()
     top = float(case.tables[0].columns["T_block"].max())
     assert top > 200 and p["high"] <= top and p["recorded"][1] == pytest.approx(top)
@@ -118,12 +120,9 @@ def test_a_hot_end_is_not_heated_beyond_what_was_recorded(tmp_path):
         {"heat": np.full(600, 60.0), "fan": np.zeros(600), "air": np.full(600, 22.0)},
     )
     assert compile_plant(loads(HOT_TRUTH), ()).simulate(full).y.max() > top + 20, "the danger is there"
-    experiment.write(tmp_path, case, entry, chosen)
+    experiment_file.write(tmp_path, case, entry, chosen)
     text = (tmp_path / "next_experiment.yaml").read_text()
-    assert (
-        f"{p['high']:.4g} degC predicted (recorded" in text
-        and "predicted (recorded" in experiment.peaks(entry)[0]
-    )
+    assert f"{p['high']:.4g} degC predicted (recorded" in text and "predicted (recorded" in peaks(entry)[0]
     (read,) = load_inputs(tmp_path / "next_experiment.yaml").values()
     assert read.predicted["T_block"] == pytest.approx((p["low"], p["high"]), rel=1e-4)
 
@@ -146,32 +145,27 @@ def test_distance_is_what_dense_algebra_says():
     covariance = np.diag(np.repeat(sigma**2, 30)) + J[0] @ J[0].T + J[1] @ J[1].T
     difference = stacked[0] - stacked[1]
     dense = difference @ np.linalg.solve(covariance, difference)
-    assert experiment.distance(a, b, [(0, 0), (1, 1)], sigma) == pytest.approx(dense, rel=1e-9)
+    assert distance(a, b, [(0, 0), (1, 1)], sigma) == pytest.approx(dense, rel=1e-9)
 
 
 def test_bits_are_none_for_equals_and_one_for_two_that_differ():
     w = np.array([0.5, 0.5])
-    assert experiment.bits(np.zeros((2, 2)), w) == pytest.approx(0)
-    assert experiment.bits(np.array([[0, 1e4], [1e4, 0]]), w) == pytest.approx(1)
+    assert bits(np.zeros((2, 2)), w) == pytest.approx(0)
+    assert bits(np.array([[0, 1e4], [1e4, 0]]), w) == pytest.approx(1)
 
 
 def test_decided_diagnoses_ask_for_nothing(undecided):
     case, found = undecided
-    assert (
-        experiment.propose(case, SimpleNamespace(verdict="explained", final=found.final, rivals=found.rivals))
-        is None
-    )
-    assert (
-        experiment.propose(case, SimpleNamespace(verdict="ambiguous", final=found.final, rivals=[])) is None
-    )
+    assert propose(case, SimpleNamespace(verdict="explained", final=found.final, rivals=found.rivals)) is None
+    assert propose(case, SimpleNamespace(verdict="ambiguous", final=found.final, rivals=[])) is None
     with pytest.raises(InputError, match="no such input or output"):
-        experiment.propose(case, found, limits={"T_blok": (0, 1)})
+        propose(case, found, limits={"T_blok": (0, 1)})
 
 
 def test_what_is_written_is_read_by_the_experiment_command(undecided, tmp_path):
     case, found = undecided
-    entry, chosen = experiment.propose(case, found, limits=LIMITS)
-    assert set(experiment.write(tmp_path, case, entry, chosen)) == {
+    entry, chosen = propose(case, found, limits=LIMITS)
+    assert set(experiment_file.write(tmp_path, case, entry, chosen)) == {
         "next_experiment.yaml",
         "next_experiment.csv",
     }
@@ -194,12 +188,12 @@ outputs: {y: {value: T}}""")
     table = Table(
         "r", "r", t, {"v": 5 * i + 0.1, "i": i, "air": 20 + t / 50, "sun": i**2, "still": np.ones(100)}
     )
-    (lever,) = experiment.levers(plant, [table])
+    (lever,) = levers(plant, [table])
     assert set(lever.moves) == {"v", "i"} and lever.moves["i"] == pytest.approx((0.2, -0.02))
-    assert [q.name for q in experiment.levers(plant, [table], only=["sun"])] == ["sun"]
+    assert [q.name for q in levers(plant, [table], only=["sun"])] == ["sun"]
     with pytest.raises(InputError, match="not an input"):
-        experiment.levers(plant, [table], only=["moon"])
-    for word, corners in experiment.courses(lever, 60.0, 1.0).items():
+        levers(plant, [table], only=["moon"])
+    for word, corners in courses(lever, 60.0, 1.0).items():
         assert (
             corners[0, 0] == 0 and corners[-1, 0] == pytest.approx(60) and np.all(np.diff(corners[:, 0]) > 0)
         ), word
@@ -224,10 +218,8 @@ def test_on_the_programs_own_rig_the_setpoint_is_driven(tmp_path):
         },
     )
     case = Case(plant, [table])
-    chosen = experiment.Excitation(
-        "hold", 60.0, {"heat": np.array([[0, 0.0], [10, 1.5], [60, 1.5]])}, {"air": 20.0}
-    )
-    experiment.write(tmp_path, case, {"why": "", "sample_s": 1.0, "predicted": {}, "limits": {}}, chosen)
+    chosen = Excitation("hold", 60.0, {"heat": np.array([[0, 0.0], [10, 1.5], [60, 1.5]])}, {"air": 20.0})
+    experiment_file.write(tmp_path, case, {"why": "", "sample_s": 1.0, "predicted": {}, "limits": {}}, chosen)
     schedule = load_experiments(tmp_path / "next_experiment.yaml")["next_experiment"]
     assert schedule.setpoint_um == pytest.approx([0, 150, 150]) and schedule.commands() == [
         (0.0, "setpoint", pytest.approx(150.0))
@@ -243,7 +235,7 @@ def test_rounds_end_when_nothing_is_left_to_ask(tmp_path):
         ]
     )
     asked, ran = [], []
-    end = experiment.resolve(
+    end = resolve(
         lambda paths: asked.append(list(paths)) or next(results),
         ["run_1.csv"],
         tmp_path,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from thermoctl.calibration.commands import record
 from thermoctl.cli import main
-from thermoctl.evaluate.commands import record
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError

@@ -13,9 +13,11 @@ import pytest
 from browser import PICTURES, Browser, find
 
 from thermoctl import cli
+from thermoctl.calibration import daemon_rig
+from thermoctl.calibration.daemon_rig import DaemonRig, at_rest
+from thermoctl.calibration.keyboard import Keyboard
+from thermoctl.calibration.recorded import as_table
 from thermoctl.daemon.socket import status
-from thermoctl.evaluate import drive
-from thermoctl.evaluate.drive import Control, DaemonRig
 from thermoctl.identify import modelfile
 from thermoctl.identify.experiments import Aborted, load_experiments
 from thermoctl.recording.files import read_table
@@ -119,7 +121,7 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
     running.record = lambda row: recorded.append(row.copy())
     running.until(lambda row: row[INDEX["state"]] == 2, "READY")
     running.run()
-    rig, control, rows = DaemonRig(settings), Control(False), []
+    rig, control, rows = DaemonRig(settings), Keyboard(False), []
 
     def end_late(p):
         control.ended = p.done_s > 0.8
@@ -128,12 +130,12 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
         for block in rig.run(schedule, end_late, control):
             rows.append(block)
     assert 0.8 < ended.value.done_s < schedule.duration_s and status(running.shared)["state"] != "ARMED"
-    part = drive.as_table(np.vstack(rows), tmp_path / "short.part.parquet")
+    part = as_table(np.vstack(rows), tmp_path / "short.part.parquet")
     with monkeypatch.context() as m:
-        m.setattr(drive, "GAP_S", 0.0)
+        m.setattr(daemon_rig, "GAP_S", 0.0)
         assert rig.meanwhile(part) is None, "nothing was recorded since, and now is later"
     Path(settings.recording.directory).mkdir()
-    monkeypatch.setattr(drive, "GAP_S", 60.0)  # this machine may be slow to write
+    monkeypatch.setattr(daemon_rig, "GAP_S", 60.0)  # this machine may be slow to write
     with running.lock:
         writer = RecordingWriter(
             settings.recording, {}, "simulated", clock=lambda: 0.0, wall=lambda: recorded[0][INDEX["wall_s"]]
@@ -152,14 +154,14 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
 
 def test_a_rig_is_at_rest_when_its_points_are_alike_or_none_moves():
     alike, warm, offsets = np.full(12, 22.0), np.linspace(22, 27, 12), np.linspace(21, 23, 12)
-    assert drive.at_rest([(0.0, alike + np.linspace(0, 0.25, 12))]) and not drive.at_rest([(0.0, warm)])
+    assert at_rest([(0.0, alike + np.linspace(0, 0.25, 12))]) and not at_rest([(0.0, warm)])
     cooling = [(60.0 * k, alike + 5.0 * np.exp(-k / 15) * np.linspace(0, 1, 12)) for k in range(40)]
-    rested = [drive.at_rest(cooling[: k + 1]) for k in range(40)]
+    rested = [at_rest(cooling[: k + 1]) for k in range(40)]
     assert not any(rested[:30]) and rested[-1], "5 K with a time constant of a quarter of an hour"
     steady = [(60.0 * k, offsets) for k in range(12)]
-    assert not drive.at_rest(steady[:9]) and drive.at_rest(steady), "thermocouples that differ, all still"
+    assert not at_rest(steady[:9]) and at_rest(steady), "thermocouples that differ, all still"
     missing = np.where(np.arange(12) == 3, np.nan, alike)
-    assert drive.at_rest([(0.0, missing)])
+    assert at_rest([(0.0, missing)])
 
 
 def test_a_rig_that_cannot_be_calibrated_is_told_so(settings, capsys):
@@ -188,7 +190,7 @@ def test_pause_and_end_by_the_keyboard(monkeypatch):
     read, write = os.pipe()
     with os.fdopen(read) as stdin:
         monkeypatch.setattr("sys.stdin", stdin)
-        control = Control(True)
+        control = Keyboard(True)
         with control.listening():
             os.kill(os.getpid(), signal.SIGINT)
             assert control.pausing() and not control.ended
@@ -198,6 +200,6 @@ def test_pause_and_end_by_the_keyboard(monkeypatch):
             os.kill(os.getpid(), signal.SIGINT)
             assert control.ended and not control.pausing()
     os.close(write)
-    control = Control(False)
+    control = Keyboard(False)
     control.interrupt(signal.SIGINT)
     assert control.ended

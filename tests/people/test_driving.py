@@ -16,9 +16,12 @@ import pytest
 from hal.backend import ROLE
 from hal.faulty import Fault, FaultInjector
 from thermoctl import cli
+from thermoctl.calibration import drive
+from thermoctl.calibration.schedules import forecast
+from thermoctl.calibration.simulated_rig import SimulatedRig
 from thermoctl.control import arming
 from thermoctl.daemon.socket import Connection, ask, status
-from thermoctl.evaluate import drive
+from thermoctl.identify.experiments import Schedule
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
@@ -250,10 +253,10 @@ def test_the_simulated_rig_runs_the_same_law(kind, folder, capsys, monkeypatch):
 
 def test_a_coil_that_would_become_too_hot_is_not_driven(settings):
     """From the plant file: 250 um take 3.3 W; the model says how warm that is."""
-    rig = drive.SimulatedRig(settings)
+    rig = SimulatedRig(settings)
     t = np.array([0.0, 15.0, 7200.0])
-    schedule = drive.Schedule("hold", "hold", t, np.array([0.0, 250.0, 250.0]), 7200.0)
-    power, peak = drive.forecast(settings, schedule, 22.0)
+    schedule = Schedule("hold", "hold", t, np.array([0.0, 250.0, 250.0]), 7200.0)
+    power, peak = forecast(settings, schedule, 22.0)
     assert power[-1] == pytest.approx(5.0 * (250 / 307.7) ** 2 * (1 + 0.00393 * (peak - 20.0)), rel=0.01)
     assert 30.0 < peak < 80.0
     assert drive.agreed(rig, [schedule], False), "nothing real moves"

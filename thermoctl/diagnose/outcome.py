@@ -211,3 +211,31 @@ def _clean(value: Any) -> Any:
     if isinstance(value, np.integer):
         return int(value)
     return value
+
+
+def sentence(found: dict[str, Any]) -> str:
+    """The verdict of a result (spec thermoctl-diagnosis/1) in one sentence."""
+    named = " and ".join(f"{f['effect'].replace('_', ' ')} at {f['where']}" for f in found["findings"])
+    sure = f" (probability {found['findings'][0]['probability']:.2f})" if found["findings"] else ""
+    if found["verdict"] == "consistent":
+        return (
+            "The recordings agree with the plant, as far as its sensors and its parameters' ranges can tell: "
+            "nothing is missing."
+        )
+    if found["verdict"] == "explained":
+        return f"The plant lacks {named}{sure}; with it the simulation follows the recordings as well as the sensors allow."
+    if found["verdict"] == "ambiguous":
+        others = ", ".join(
+            f"{a['effect'].replace('_', ' ')} at {a['where']}" for a in found["alternatives"][:4]
+        )
+        return (
+            f"Something is missing that these recordings cannot name for sure: most likely {named}{sure}"
+            + (f", but also {others} would fit." if others else ".")
+        )
+    where = found["mismatch"][0]["node"] or found["mismatch"][0]["channel"] if found["mismatch"] else None
+    return (
+        "Something is missing"
+        + (f", most of it at {where}," if where else "")
+        + " that no entry of the catalogue explains"
+        + (f"; {named} explains a part of it{sure}." if named else ".")
+    )

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermoctl.diagnose import experiment
-from thermoctl.diagnose.command import sentence
 from thermoctl.diagnose.effects import Candidate
+from thermoctl.diagnose.experiment_file import peaks
+from thermoctl.diagnose.outcome import Diagnosis, sentence
+from thermoctl.plant.refit import report
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, page, table, unit
 
 if TYPE_CHECKING:
     from thermoctl.diagnose.explain import Case, Explanation
-    from thermoctl.diagnose.outcome import Diagnosis
 
 POINTS = 1500  # of a curve; more would only make the page heavy
 SHOWN = 6  # outputs that are drawn, worst first
@@ -301,8 +301,6 @@ def _confused(found: Diagnosis) -> str:
 
 
 def _parameters(case: Case, found: Diagnosis) -> str:
-    from thermoctl.plant.refit import report
-
     before = {e.name: e for e in report(found.base.fit)}
     rows, said = [], []
     for e in report(found.final.fit):
@@ -365,7 +363,7 @@ def _next(told: dict[str, Any] | None) -> str:
     body = _p(
         f"{told['profile']}, {told['duration_s']:.4g} s. {told['why']} {told.get('also_helpful') or ''}"
     )
-    body += _items(experiment.peaks(told))
+    body += _items(peaks(told))
     moving = {
         k: np.array(v) for k, v in told["inputs"].items() if len(v) > 1 and np.ptp([p[1] for p in v]) > 0
     }

@@ -19,12 +19,15 @@ from typing import Any
 import numpy as np
 
 from thermoctl.channels import CHANNELS
-from thermoctl.diagnose import doubt, experiment, locate
+from thermoctl.diagnose import doubt, experiment_file, locate
+from thermoctl.diagnose.design import NONE, Limits
 from thermoctl.diagnose.effects import CATALOGUE, Rig, catalogue
 from thermoctl.diagnose.evidence import LARGE, white_sigma
 from thermoctl.diagnose.explain import Case, Explanation
 from thermoctl.diagnose.heldout import held_out, prediction, rms
 from thermoctl.diagnose.outcome import Diagnosis, result
+from thermoctl.diagnose.page import write_report
+from thermoctl.diagnose.propose import propose
 from thermoctl.diagnose.remains import REMAINS, energy, remains, smooth
 from thermoctl.diagnose.screen import Metric, log_p
 from thermoctl.diagnose.search import (
@@ -340,7 +343,7 @@ def diagnose(
     effects: Sequence[Path] = (),
     progress: Callable[[str], None] | None = None,
     drivable: Sequence[str] = (),
-    limits: experiment.Limits = experiment.NONE,
+    limits: Limits = NONE,
 ) -> dict[str, Any]:
     """Diagnose recordings against a plant file and write diagnosis.json, plant.yaml and report.html into `out_dir`, and where
     nothing is decided next_experiment.yaml and .csv, all or nothing. `drivable`: inputs that an experiment may drive (default:
@@ -360,7 +363,7 @@ def diagnose(
         found = examine(case, entries)
     except SimulationError as e:
         raise InputError(f"{plant_path}: the plant cannot follow these recordings at all: {e}") from None
-    proposed = experiment.propose(case, found, drivable, limits)
+    proposed = propose(case, found, drivable, limits)
     found.next_experiment = proposed[0] if proposed else None
     found.result = result(case, found)
     found.result["seconds"] = round(time.monotonic() - begun, 1)
@@ -375,13 +378,11 @@ def diagnose(
             + "".join(f"; with {c.effect.name} at {c.place.where}" for c in found.final.effects),
         )
         load(part / "plant.yaml")
-        from thermoctl.diagnose.page import write_report
-
         write_report(case, found, part / "report.html")
         (part / "diagnosis.json").write_text(json.dumps(found.result, indent=1, allow_nan=False) + "\n")
-        written = experiment.write(part, case, *proposed) if proposed else []
+        written = experiment_file.write(part, case, *proposed) if proposed else []
         out.mkdir(parents=True, exist_ok=True)
-        for stale in experiment.FILES:
+        for stale in experiment_file.FILES:
             (out / stale).unlink(missing_ok=True)
         for name in ("plant.yaml", "report.html", "diagnosis.json", *written):
             shutil.move(str(part / name), str(out / name))

@@ -1,0 +1,200 @@
+"""The commands experiment, identify, model, tune, evaluate and calibrate.
+
+Each returns its exit status."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hal.backend import HardwareError
+from thermoctl.calibration import chain, drive, experiment, iso230, recorded, schedules
+from thermoctl.calibration.keyboard import Keyboard
+from thermoctl.calibration.wizard import Wizard
+from thermoctl.identify import experiments, modelfile, tuning
+from thermoctl.recording.files import read_table
+from thermoctl.settings import load_settings
+from thermoctl.signals import INDEX
+from thermoctl.yamlfile import InputError
+
+
+def run_experiment(
+    name: str,
+    config: str,
+    out: str | None,
+    dry_run: bool,
+    resume: bool,
+    plant: str | None = None,
+    yes: bool = False,
+) -> int:
+    """Run `thermoctl experiment`: record a test of experiments.yaml, or the experiment of a file.
+
+    It runs on the daemon that answers, in real time and under its protections, else on the simulated back
+    end, faster than real time. An experiment of inputs can run on a plant file instead. 1 when the person
+    said no, 3 when it ended early: the rows are kept, and --resume goes on from there."""
+    if experiment.lists_inputs(name):
+        inputs = experiment.of_inputs(name)
+        if dry_run or plant:
+            return experiment.on_plant(inputs, None if dry_run else plant, Path(out or f"{inputs.name}.csv"))
+        settings = load_settings(config)
+        schedule, name = inputs.schedule(), inputs.name
+        schedules.check_predicted(inputs, settings)
+    elif plant:
+        raise InputError(
+            f"'{name}' is a test of the actuator's setpoint; --plant takes the file of an experiment that lists inputs"
+        )
+    else:
+        schedule = schedules.find(name, config)
+        settings = load_settings(config)
+    return experiment.on_rig(settings, schedule, Path(out or f"{name}.parquet"), dry_run, resume, yes)
+
+
+def record(experiment_file: Path, recording: Path, config: str, plant: str | None, yes: bool = False) -> None:
+    """Run an experiment file for `thermoctl diagnose --resolve`.
+
+    Raises HardwareError where it ends early."""
+    if run_experiment(str(experiment_file), config, str(recording), False, False, plant, yes):
+        raise HardwareError(
+            f"{experiment_file}: the experiment did not come to its end; what was recorded is in {recording}"
+        )
+
+
+def identify(
+    test_2: str, test_3: str, test_4a: str, config: str, models: str, method: str, order: int
+) -> int:
+    """Run `thermoctl identify`.
+
+    Calibrate from recordings and install the compensator in the folder `models`."""
+    settings = load_settings(config)
+    r2, r3, r4 = (recorded.read(p) for p in (test_2, test_3, test_4a))
+    figures: dict[str, Any] = {"method": method}
+    if method == "paper":
+        c = chain.calibrate(r2, r3, r4, order or None)
+        model = chain.compensator(c, method, settings.loop.period_s)
+        left = r4.error_um - chain.estimates(c, r4)[method]
+        figures |= {"time_constants_s": c.paper_model.time_constants_s, "zeta": c.mkf.zeta}
+    else:
+        thermal, kalman, variances, um, refined = chain.calibrate_refined([r2, r3, r4], order or None)
+        model = chain.better_compensator(kalman, um, settings.loop.period_s)
+        left = r4.error_um - um.predict(
+            chain.run_kalman(kalman, r4), chain.smooth_air(r4.air_c), um.info.get("start_um", 0.0)
+        )
+        figures |= {
+            "time_constants_s": thermal.info["time_constants_s"],
+            "residual_rms_k": thermal.info["residual_rms"],
+            "variances": variances,
+            "refinement": refined,
+        }
+        print(f"prediction-error refinement: {refined}")
+    figures["expansion_rms_um"] = float(np.sqrt(np.nanmean(left**2)))
+    path = modelfile.install(models, model, settings.rig.name, [test_2, test_3, test_4a], figures)
+    print(
+        f"{path}: expansion left {figures['expansion_rms_um']:.3g} um rms over test 4A; set compensation.model to it, or to {models}"
+    )
+    return 0
+
+
+def model(action: str, models: str, name: str | None) -> int:
+    """Run `thermoctl model`: list, show or roll back calibrations."""
+    if action == "rollback":
+        print(f"current is now {modelfile.roll_back(models, name)}")
+        return 0
+    now = modelfile.current(models)
+    if action == "list":
+        for p in modelfile.history(models):
+            c = modelfile.load_calibration(p)
+            print(
+                f"{'*' if p == now else ' '} {p.name}  {c.created}  rig {c.rig}  {c.model.kind}  order {len(c.model.A_minus_I)}"
+            )
+        return 0
+    c = modelfile.load_calibration(Path(models) / name if name else now)
+    print(
+        f"{name or now.name}: rig {c.rig}, {c.created}, {c.model.kind}, order {len(c.model.A_minus_I)}, f1 {c.model.f1:.5g}"
+    )
+    for key, value in {**c.figures, **{f"sha256 {k}": v for k, v in c.fingerprints.items()}}.items():
+        print(f"  {key}: {value}")
+    return 0
+
+
+def tune(config: str, method: str, write: bool, yes: bool) -> int:
+    """Run `thermoctl tune`: propose gains from the response to short setpoint ramps.
+
+    Write them only when asked.
+
+    1 when the person said no."""
+    settings = load_settings(config)
+    c = settings.control
+    rig = drive.rig_of(settings)
+    schedule = schedules.triangles(settings, rig.now()["compensated_um"])
+    if not drive.agreed(rig, [schedule], yes):
+        return 1
+    rows = drive.excite(rig, schedule, Keyboard(False))
+    period, average = settings.loop.period_s, int(c.moving_average)
+    t, u, y = (rows[:, INDEX[n]] for n in ("t_s", "drive", "position_raw_um"))
+    plant = tuning.fit_response(t, u, y, period)
+    present = tuning.Gains(c.kp, c.ti_s, c.td_s, "present")
+    proposed = tuning.ziegler_nichols(plant) if method == "zn" else tuning.robust(plant, period, average)
+    k0, tau_d, tau_c = tuning.tangent(plant)
+    print(
+        f"response: K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms, "
+        f"residual {plant.residual:.2g} um"
+    )
+    for g in (present, proposed):
+        m = tuning.margins(plant, g, period, average)
+        print(
+            f"{g.how}: gain margin {m.gain:.2f}, phase margin {m.phase_deg:.0f} deg{'' if m.stable else ', UNSTABLE'}"
+        )
+    print(tuning.difference(present, proposed))
+    if write:
+        if not m.stable:
+            raise InputError(
+                f"{config}: not written, the proposed gains make this loop unstable; take --method imc"
+            )
+        tuning.write(Path(config), proposed)
+        print(f"written to {config}; 'thermoctl reload' applies it")
+    return 0
+
+
+def evaluate(recordings: list[str]) -> int:
+    """Run `thermoctl evaluate`.
+
+    ISO 230-2 figures of the error at rest, over each recording and by target and direction."""
+    for path in recordings:
+        print("\n".join(iso230.figures(read_table(path), path)))
+    return 0
+
+
+def calibrate(
+    config: str, out: str | None, models: str, order: int, gains: bool, accept: bool, again: bool, yes: bool
+) -> int:
+    """Run `thermoctl calibrate`: 0 when every step is done (and accepted, when asked).
+
+    1 when the person said no, 3 when a test ended early. Raises InputError for a rig that cannot be
+    calibrated, HardwareError for one that refuses."""
+    settings = load_settings(config)
+    rig = drive.rig_of(settings)
+    folder = Path(out or Path("calibration") / settings.rig.name)
+    if again and (folder / "state.json").exists():
+        for path in [folder / "state.json", *folder.glob("test_*.part.parquet")]:
+            path.unlink()
+    tests = experiments.load_experiments(schedules.of_config(config))
+    keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())
+    wizard = Wizard(settings, rig, folder, tests, order, lambda line: print(line, flush=True))
+    left = [t for n, t in wizard.tests.items() if n not in wizard.done]
+    if left and not drive.agreed(rig, left, yes):
+        return 1
+    if not wizard.run(keyboard):
+        return experiment.ENDED
+    print("to accept it means to:\n" + "\n".join(f"- {line}" for line in wizard.changes(Path(models), gains)))
+    if not accept and keyboard.interactive:
+        accept = (
+            input("type 'accept' to do so; anything else leaves everything as it is: ").strip() == "accept"
+        )
+    if not accept:
+        print("nothing was changed; `thermoctl calibrate --accept` takes it")
+        return 0
+    wizard.accept(Path(models), gains)
+    return 0

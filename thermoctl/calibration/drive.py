@@ -1,0 +1,95 @@
+"""Drive a rig for a test.
+
+Only through the daemon's law, armed, with all protections, and only after a yes.
+
+Two rigs run a schedule of setpoints alike: `DaemonRig`, which a running daemon holds, and `SimulatedRig`, in
+this process. Raises hal.backend.HardwareError (exit status 3, one line) where the rig refuses or is not
+there."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+
+from hal.backend import HardwareError
+from hal.make import make_devices
+from thermoctl.calibration.daemon_rig import DaemonRig
+from thermoctl.calibration.keyboard import Keyboard
+from thermoctl.calibration.schedules import forecast, span, within_limits
+from thermoctl.calibration.simulated_rig import SimulatedRig
+from thermoctl.control import arming
+from thermoctl.daemon.socket import ask
+from thermoctl.identify.experiments import Aborted, Schedule
+from thermoctl.settings import Settings
+from thermoctl.signals import INDEX
+from thermoctl.yamlfile import InputError
+
+DrivenRig = SimulatedRig | DaemonRig
+
+
+def rig_of(settings: Settings) -> DrivenRig:
+    """Find the rig that tests run on: the daemon's where one answers, else the simulated one.
+
+    Raises HardwareError where there is neither."""
+    try:
+        ask(settings.socket.path, {"command": "status"})
+        return DaemonRig(settings)
+    except InputError as e:
+        if settings.hal.backend != "simulated":
+            raise HardwareError(
+                f"{settings.path}: no daemon holds this rig ({e}); it is driven only through the daemon: "
+                "thermoctl start, then this command again"
+            ) from None
+    return SimulatedRig(settings)
+
+
+def agreed(rig: DrivenRig, schedules: Sequence[Schedule], yes: bool) -> bool:
+    """Report which rig will move, how far, how long and how warm it becomes.
+
+    Ask before a daemon's rig moves, unless `yes`.
+
+    Raises InputError for setpoints outside the configuration's limits, for a coil that would become too hot,
+    and where nobody can be asked."""
+    settings = rig.settings
+    p = settings.protection
+    low, high = within_limits(settings, schedules)
+    coil_c = float(rig.now()["temperatures_c"]["coil"] or math.nan)
+    peaks = [forecast(settings, s, coil_c)[1] for s in schedules]
+    known = [t for t in peaks if t is not None and math.isfinite(t)]
+    if known and max(known) > p.coil_limit_c:
+        raise InputError(
+            f"{settings.path}: the coil would reach {max(known):.1f} degC, above protection.coil_limit_c ({p.coil_limit_c:g})"
+        )
+    warm = (
+        f"at most {max(known):.1f} degC predicted"
+        if known
+        else "not predicted (no model, or no reading of the coil)"
+    )
+    print(f"rig '{settings.rig.name}' ({settings.path}), back end {settings.hal.backend}: {rig.where}")
+    if settings.hal.backend == "devices":
+        print("devices: " + ", ".join(f"{d.name} at {d.binding.port}" for d in make_devices(settings)))
+    print(
+        f"moves the output from {low:.4g} to {high:.4g} um, {span(sum(s.duration_s for s in schedules))} in all; "
+        f"coil {warm}, the protection trips at {p.coil_limit_c:g} degC",
+        flush=True,
+    )
+    if not rig.real or yes:
+        return True
+    if not sys.stdin.isatty():
+        raise InputError(
+            "this moves a rig and there is no terminal to ask at; --yes starts it without a question"
+        )
+    return input("type go to arm the rig and start; anything else leaves it as it is: ").strip() == "go"
+
+
+def excite(rig: DrivenRig, schedule: Schedule, keyboard: Keyboard) -> np.ndarray:
+    """Record every tick of a short schedule. Raises HardwareError when it ends early."""
+    try:
+        with keyboard.listening():
+            rows = np.vstack(list(rig.run(schedule, lambda p: None, keyboard, every_s=0.0, rest=False)))
+    except Aborted as e:
+        raise HardwareError(f"ended after {e.done_s:.1f} s, the amplifier is disabled: {e.reason}") from None
+    return rows[rows[:, INDEX["state"]] == arming.ARMED]

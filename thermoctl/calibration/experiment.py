@@ -1,0 +1,134 @@
+"""Run one experiment and record it.
+
+A test of setpoints on a rig, or an experiment of inputs on a plant file."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from thermoctl.calibration import drive, schedules
+from thermoctl.calibration.daemon_rig import DaemonRig
+from thermoctl.calibration.keyboard import Keyboard
+from thermoctl.calibration.recorded import as_table
+from thermoctl.identify import experiments
+from thermoctl.plant import load
+from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.table import Table
+from thermoctl.settings import Settings
+from thermoctl.yamlfile import InputError
+
+ENDED = 3  # exit status of a test that ended early
+
+
+def lists_inputs(name: str) -> bool:
+    """Check whether a name is the file of an experiment, and not a test of the rig."""
+    return Path(name).suffix in (".yaml", ".yml")
+
+
+def of_inputs(path: str) -> experiments.Inputs:
+    """Read the one experiment of a file that lists inputs."""
+    found = list(experiments.load_inputs(path).values())
+    if len(found) != 1:
+        raise InputError(f"{path}: {len(found)} experiments that list inputs; one was expected")
+    return found[0]
+
+
+def on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) -> int:
+    """Describe an experiment of inputs.
+
+    Run it on a plant file and record it at `path` where one is given."""
+    driven = ", ".join(f"{n} {c[:, 1].min():.4g} to {c[:, 1].max():.4g}" for n, c in inputs.corners.items())
+    print(f"{inputs.title}: {inputs.duration_s / 60:.4g} min, every {inputs.sample_s:g} s; drives {driven}")
+    if plant_file is None:
+        return 0
+    plant = load(plant_file)
+    t, columns = inputs.columns()
+    missing = {i.column for i in plant.inputs.values()} - set(columns)
+    if missing:
+        raise InputError(
+            f"experiment '{inputs.name}' says nothing of {', '.join(sorted(missing))}, which {plant_file} reads"
+        )
+    table = Table(path.stem, str(path), t, columns)
+    try:
+        write_table(path, compile_plant(plant, ()).measure(table, seed=len(t)))
+    except SimulationError as e:
+        raise InputError(f"{plant_file}: {e}") from None
+    print(f"{path}: {len(t)} rows")
+    return 0
+
+
+def on_rig(
+    settings: Settings, schedule: experiments.Schedule, path: Path, dry_run: bool, resume: bool, yes: bool
+) -> int:
+    """Describe a test of setpoints, ask, run it on the rig and record it.
+
+    1 when the person said no, ENDED when it ended early."""
+    schedules.within_limits(settings, [schedule])
+    print(
+        f"{schedule.title}: {schedules.span(schedule.duration_s)}, {len(schedule.commands())} moves, "
+        f"{schedule.setpoint_um.min():g} to {schedule.setpoint_um.max():g} um"
+    )
+    print("\n".join(schedules.power_lines(settings, schedule)))
+    if dry_run:
+        return 0
+    rig = drive.rig_of(settings)
+    if not drive.agreed(rig, [schedule], yes):
+        return 1
+    return _record(rig, schedule, path, resume)
+
+
+def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, resume: bool) -> int:
+    """Run a schedule and write the rows.
+
+    While it is not at its end, a file beside them says how far it came."""
+    progress_path = path.with_name(path.name + ".progress")
+    earlier, at_s = _earlier(rig, path, progress_path) if resume else (None, 0.0)
+    keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())
+    blocks: list[np.ndarray] = []
+    done_s = [at_s]
+
+    def show(p: experiments.Progress) -> None:
+        done_s[0] = p.done_s
+        if sys.stderr.isatty():
+            print(f"\r{p.percent:5.1f} %  {p.eta_s:6.0f} s left", end="", file=sys.stderr, flush=True)
+
+    ended = ""
+    try:
+        with keyboard.listening():
+            for block in rig.run(schedule, show, keyboard, earlier, at_s):
+                blocks.append(block)
+    except experiments.Aborted as e:
+        ended = e.reason
+    if blocks:
+        rows = np.vstack(blocks)
+        write_table(path, as_table(rows, path))
+        print(f"{path}: {len(rows)} rows")
+    if not ended:
+        progress_path.unlink(missing_ok=True)
+        return 0
+    progress_path.write_text(f"{done_s[0]:.3f}\n")
+    print(
+        f"ended after {done_s[0]:.0f} of {schedule.duration_s:.0f} s, the amplifier is disabled: {ended}; "
+        f"go on with --resume --out {path}",
+        file=sys.stderr,
+    )
+    return ENDED
+
+
+def _earlier(rig: drive.DrivenRig, path: Path, progress_path: Path) -> tuple[Table | None, float]:
+    """Read what was recorded of a test that was ended on a daemon, and how far it came."""
+    if not (path.exists() and progress_path.exists() and isinstance(rig, DaemonRig)):
+        return None, 0.0
+    earlier = rig.meanwhile(read_table(path))
+    if earlier is None:
+        print(
+            "starts again: the daemon did not record without a gap since it was ended, and heat does not wait"
+        )
+        return None, 0.0
+    at_s = float(progress_path.read_text())
+    print(f"goes on at {at_s:.0f} s")
+    return earlier, at_s

@@ -1,0 +1,108 @@
+"""Recordings of a test.
+
+Rows as the loop records them, a table of them, and the signals of a calibration at 1 s."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from thermoctl.control import faults
+from thermoctl.recording.files import read_table
+from thermoctl.recording.table import Table
+from thermoctl.signals import INDEX, NAMES, POINTS, fault_word
+from thermoctl.yamlfile import InputError, suggest
+
+SIGNALS = (
+    "power_w",
+    "air_c",
+    "output_reference_um",
+    "position_raw_um",
+    "setpoint_um",
+    *(f"{p}_c" for p in POINTS),
+)
+SETTLED = 5  # first samples, whose mean error is the origin of the thermal growth
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One test at 1 s: t (N,) s, power_w, air_c, setpoint_um.
+
+    Temperatures (N, 12) degC as read (NaN: no reading).
+
+    error_um is the difference of the two encoders. A simulated rig adds the truth: true_c (N, 12), true_um
+    (N,)."""
+
+    t: np.ndarray
+    power_w: np.ndarray
+    air_c: np.ndarray
+    temperatures: np.ndarray
+    error_um: np.ndarray
+    true_c: np.ndarray
+    true_um: np.ndarray
+    setpoint_um: np.ndarray
+
+
+def of_columns(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> Recorded:
+    """Take SIGNALS at 1 s as one test, the position error from its first value.
+
+    No truth is known."""
+    temperatures = np.column_stack([columns[f"{p}_c"] for p in POINTS])
+    error = columns["output_reference_um"] - columns["position_raw_um"]
+    error = error - np.nanmean(error[:SETTLED])
+    unknown = np.full(temperatures.shape, np.nan)
+    return Recorded(
+        t, columns["power_w"], columns["air_c"], temperatures, error, unknown, error, columns["setpoint_um"]
+    )
+
+
+def read(path: str | Path) -> Recorded:
+    """Read a recording at 1 s; gaps in power and air are held.
+
+    Raises InputError when a signal is missing."""
+    table = read_table(path)
+    for n in SIGNALS:
+        if n not in table.columns:
+            raise InputError(
+                f"{path}: column '{n}' is missing{suggest(n, table.columns)}; a calibration needs it"
+            )
+    since = table.t - table.t[0]
+    t = np.arange(np.floor(since[-1]) + 1)
+    k = np.clip(np.searchsorted(since, t + 1e-9, side="right") - 1, 0, None)
+    columns = {n: table.columns[n][k] for n in SIGNALS}
+    for n in ("power_w", "air_c"):
+        columns[n] = filled(columns[n][:, None])[:, 0]
+    return of_columns(t, columns)
+
+
+def filled(y: np.ndarray) -> np.ndarray:
+    """Hold missing readings (N, m), for methods that need every sample."""
+    out = y.copy()
+    t = np.arange(len(y))
+    for j in range(y.shape[1]):
+        ok = np.isfinite(y[:, j])
+        out[:, j] = y[np.maximum.accumulate(np.where(ok, t, t[ok][0])), j]
+    return out
+
+
+def rows_of(table: Table) -> np.ndarray:
+    """Arrange a table as record rows (N, signals); NaN where a signal is missing."""
+    missing = np.full(len(table), np.nan)
+    return np.column_stack([table.t if n == "t_s" else table.columns.get(n, missing) for n in NAMES])
+
+
+def as_table(rows: np.ndarray, path: str | Path) -> Table:
+    """Arrange record rows as a table named after the file `path`."""
+    columns = {n: rows[:, i] for n, i in INDEX.items() if n != "t_s"}
+    return Table(Path(path).stem, str(path), rows[:, INDEX["t_s"]], columns)
+
+
+def causes(row: np.ndarray) -> str:
+    """Name the faults of a record row that trip, with their remedies.
+
+    Without any, somebody disarmed the rig."""
+    found = [f for f in faults.decode(fault_word(row)) if f.severity != "warning"]
+    return "; ".join(f"{f.name}: {f.meaning} -> {f.remedy}" for f in found) or "somebody disarmed it"

@@ -1,0 +1,100 @@
+"""A rig in this process.
+
+The configuration's simulated back end under the daemon's law, faster than real time."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from hal.backend import HardwareError
+from thermoctl.calibration.keyboard import Keyboard
+from thermoctl.calibration.recorded import causes
+from thermoctl.control import arming
+from thermoctl.control.model import CompensatorModel
+from thermoctl.daemon.simulate import Simulation
+from thermoctl.daemon.socket import channel_states
+from thermoctl.identify import experiments
+from thermoctl.identify.experiments import Aborted, Progress, Schedule
+from thermoctl.recording.table import Table
+from thermoctl.settings import Settings
+from thermoctl.signals import INDEX, POINTS
+
+EVERY_S = 0.1  # between the rows that are kept
+READY_S = 20.0  # of simulated time, within which the law must be READY
+ANY_INNOVATION_C = (
+    1e3  # limit that no coil reaches: without a model there is nothing to compare the coil with
+)
+
+
+def with_model(settings: Settings, model: CompensatorModel | None) -> Settings:
+    """Set up the compensation for a simulated test.
+
+    `model` acts when given, else nothing is compensated or compared."""
+    compensation = dataclasses.replace(settings.compensation, enable=model is not None, model="")
+    protection = settings.protection
+    if model is None:
+        protection = dataclasses.replace(protection, innovation_limit_c=ANY_INNOVATION_C)
+    return dataclasses.replace(settings, compensation=compensation, protection=protection)
+
+
+class SimulatedRig:
+    """The configuration's simulated back end, in this process, each test from rest."""
+
+    real = False
+
+    def __init__(self, settings: Settings):
+        self.settings = settings
+        self.where = "the simulated rig, faster than real time"
+
+    def now(self) -> dict[str, Any]:
+        """Read channel states, temperatures and position once the law is READY.
+
+        Raises HardwareError after READY_S."""
+        simulation = Simulation(self.settings)
+        try:
+            ready = simulation.until(lambda row: row[INDEX["state"]] == arming.READY, READY_S)
+            row = simulation.row
+            if not ready:
+                raise HardwareError(f"{self.settings.path}: not READY within {READY_S:g} s: {causes(row)}")
+            return {
+                "channels": channel_states(int(row[INDEX["status_bits"]])),
+                "temperatures_c": {p: float(row[INDEX[f"{p}_c"]]) for p in POINTS},
+                "compensated_um": float(row[INDEX["compensated_um"]]),
+            }
+        finally:
+            simulation.close()
+
+    def run(
+        self,
+        schedule: Schedule,
+        progress: Callable[[Progress], None],
+        keyboard: Keyboard,
+        earlier: Table | None = None,
+        at_s: float = 0.0,
+        model: CompensatorModel | None = None,
+        every_s: float = EVERY_S,
+        rest: bool = True,
+    ) -> Iterator[np.ndarray]:
+        """Yield the rows of a test, one every `every_s`, with `model` acting when given.
+
+        `earlier`, `at_s` and `rest` are not used: the same rows come again, and the rig starts at rest.
+        Raises Aborted when the law leaves ARMED or the person ends it."""
+        simulation = Simulation(with_model(self.settings, model), model)
+
+        def stop() -> bool:
+            while keyboard.pausing():
+                pass
+            return keyboard.ended
+
+        try:
+            yield from experiments.run(
+                simulation, schedule, max(1, round(every_s / simulation.period_s)), 0.0, progress, stop
+            )
+        except RuntimeError:
+            raise Aborted(f"not READY within {READY_S:g} s: {causes(simulation.row)}", 0.0) from None
+        finally:
+            simulation.close()

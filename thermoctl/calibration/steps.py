@@ -1,0 +1,271 @@
+"""The steps of a calibration between its tests.
+
+Each takes the rig or recordings and returns its result.
+
+`summary` of a result is the line for the person; the series are thinned for the report's figures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoctl.calibration import chain, drive
+from thermoctl.calibration.iso230 import mean_and_two_s
+from thermoctl.calibration.keyboard import Keyboard
+from thermoctl.calibration.recorded import Recorded, read
+from thermoctl.calibration.schedules import triangles
+from thermoctl.identify import modelfile, tuning
+from thermoctl.identify.expansion import Expansion
+from thermoctl.identify.filter import Kalman
+from thermoctl.recording.files import read_table
+from thermoctl.settings import Settings
+from thermoctl.signals import INDEX, POINTS
+from thermoctl.yamlfile import InputError
+
+FITTED = ("test_2", "test_3", "test_4a")  # the tests that the model is fitted to
+SHOWN_S = 3.0  # of the ramps' recording, in the report
+SHOWN = 2000  # points of a curve in the report, about
+SETTLED = 5  # first samples, whose mean error is the origin of the thermal growth
+AT_TARGET_UM = 1e-6  # between reference and setpoint: the motion has ended
+NEEDED = (
+    "position_raw_um",
+    "output_reference_um",
+    "voltage_v",
+    "current_a",
+    "air_c",
+    *(f"{p}_c" for p in POINTS),
+)
+
+Series = list[float | None]
+MeanTwoS = tuple[float, float]  # mean and 2 s, um, after ISO 230-2
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Every channel that a calibration needs reads well."""
+
+    summary: str
+    channels: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Response:
+    """The position's response to short ramps, fitted by a second order with dead time.
+
+    `t1`, `t2`: real, imaginary, s."""
+
+    summary: str
+    t: list[float]
+    measured_um: list[float]
+    fitted_um: list[float]
+    k0: float
+    tau_d_s: float
+    tau_c_s: float
+    gain: float
+    t1: tuple[float, float]
+    t2: tuple[float, float]
+    theta_s: float
+
+
+@dataclass(frozen=True)
+class Pid:
+    """Present and proposed gains with their margins.
+
+    Of each: kp, ti_s, td_s, how, and the fields of tuning.Margins."""
+
+    summary: str
+    present: dict[str, Any]
+    proposed: dict[str, Any]
+
+    def gains(self) -> tuple[tuning.Gains, tuning.Gains]:
+        """Return the present and the proposed gains."""
+        present, proposed = (
+            tuning.Gains(g["kp"], g["ti_s"], g["td_s"], g["how"]) for g in (self.present, self.proposed)
+        )
+        return present, proposed
+
+
+@dataclass(frozen=True)
+class Test:
+    """A test of the schedule, recorded to its end."""
+
+    summary: str
+    seconds: float
+    mean_w: float
+    largest_w: float
+
+
+@dataclass(frozen=True)
+class Model:
+    """The model and its residuals; the series are the growth over test 4A and its residual."""
+
+    summary: str
+    method: str
+    time_constants_s: list[float]
+    residual_rms_k: float
+    expansion_rms_um: float
+    grown_rms_um: float
+    t: list[float]
+    measured_um: Series
+    residual_um: Series
+
+
+@dataclass(frozen=True)
+class Proof:
+    """Position error over test 4B without and with the model; `how`: how the latter was found."""
+
+    summary: str
+    before: MeanTwoS
+    after: MeanTwoS
+    how: str
+    t: list[float]
+    without_um: Series
+    with_um: Series
+    better: bool
+
+
+Result = Doctor | Response | Pid | Test | Model | Proof
+
+
+def doctor(states: Mapping[str, str]) -> Doctor:
+    """Check the channels. Raises InputError with those that do not read well."""
+    found = {n: states.get("position_um" if n == "position_raw_um" else n, "ABSENT") for n in NEEDED}
+    if bad := [f"{n} is {s}" for n, s in found.items() if s != "OK"]:
+        raise InputError(
+            "a calibration needs the second encoder and all twelve thermocouples; "
+            + ", ".join(bad)
+            + ": see `thermoctl doctor`"
+        )
+    return Doctor(f"{len(NEEDED)} channels read well", dict(states))
+
+
+def response(settings: Settings, rig: drive.DrivenRig) -> Response:
+    """Drive short ramps and fit the position's response."""
+    period_s = settings.loop.period_s
+    rows = drive.excite(rig, triangles(settings, rig.now()["compensated_um"]), Keyboard(False))
+    t, u, y = (rows[:, INDEX[n]] for n in ("t_s", "drive", "position_raw_um"))
+    fitted = tuning.fit_response(t, u, y, period_s)
+    k0, tau_d, tau_c = tuning.tangent(fitted)
+    model = fitted.response(u - u[0], period_s)
+    shown = slice(0, round(SHOWN_S / period_s))
+    return Response(
+        f"K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms",
+        (t[shown] - t[0]).tolist(),
+        (y - y.mean())[shown].tolist(),
+        (model - model.mean())[shown].tolist(),
+        k0,
+        tau_d,
+        tau_c,
+        fitted.gain,
+        (fitted.t1.real, fitted.t1.imag),
+        (fitted.t2.real, fitted.t2.imag),
+        fitted.theta_s,
+    )
+
+
+def pid(settings: Settings, found: Response) -> Pid:
+    """Propose gains for the fitted response, with the margins of these and of the present ones."""
+    c, period_s = settings.control, settings.loop.period_s
+    average = int(c.moving_average)
+    fitted = tuning.SecondOrder(found.gain, complex(*found.t1), complex(*found.t2), found.theta_s)
+    gains = {
+        "present": tuning.Gains(c.kp, c.ti_s, c.td_s, "present"),
+        "proposed": tuning.robust(fitted, period_s, average),
+    }
+    margins = {k: tuning.margins(fitted, g, period_s, average) for k, g in gains.items()}
+    summary = "; ".join(
+        f"{k}: gain margin {m.gain:.2f}, phase margin {m.phase_deg:.0f} deg" for k, m in margins.items()
+    )
+    plain = {
+        k: {"kp": g.kp, "ti_s": g.ti_s, "td_s": g.td_s, "how": g.how, **asdict(margins[k])}
+        for k, g in gains.items()
+    }
+    return Pid(summary, plain["present"], plain["proposed"])
+
+
+def model(settings: Settings, recordings: Mapping[str, Path], order: int, path: Path) -> Model:
+    """Fit the model to the recordings of FITTED and save it at `path`."""
+    tests = [read(recordings[n]) for n in FITTED]
+    thermal, kalman, _, expansion = chain.calibrate_better(tests, order or None)
+    compensator = chain.better_compensator(kalman, expansion, settings.loop.period_s)
+    last = tests[-1]
+    residual = last.error_um - _estimate(kalman, expansion, last)
+    thin = max(1, len(residual) // SHOWN)
+    figures = {
+        "method": "better",
+        "time_constants_s": np.asarray(thermal.info["time_constants_s"]).tolist(),
+        "residual_rms_k": float(np.mean(thermal.info["residual_rms"])),
+        "expansion_rms_um": _rms(residual),
+    }
+    path.unlink(missing_ok=True)
+    modelfile.save_model(path, compensator, settings.rig.name, [recordings[n] for n in FITTED], figures)
+    return Model(
+        f"order {len(compensator.A_minus_I)} ({thermal.order} poles of the identified model, the rest for disturbing heat), "
+        f"temperatures to {figures['residual_rms_k']:.3f} K rms, expansion to "
+        f"{figures['expansion_rms_um']:.3f} um rms of {_rms(last.error_um):.2f}",
+        **figures,
+        grown_rms_um=_rms(last.error_um),
+        t=last.t[::thin].tolist(),
+        measured_um=_series(last.error_um[::thin]),
+        residual_um=_series(residual[::thin]),
+    )
+
+
+def proof(recordings: Mapping[str, Path], order: int, acting: bool) -> Proof:
+    """Compare the position error over test 4B without and with the model.
+
+    `acting`: the model acted in that test."""
+    t = read_table(recordings["test_4b"])
+    c = t.columns
+    growth = _from_start(c["output_reference_um"] - c["position_raw_um"])
+    if acting:
+        left = _from_start(c["output_reference_um"] - c["reference_um"])
+        how = "the loop with the new model acting, judged by the second encoder, which it does not use"
+    else:
+        _, kalman, _, expansion = chain.calibrate_better([read(recordings[n]) for n in FITTED], order or None)
+        r = read(recordings["test_4b"])
+        left = growth - np.interp(t.t - t.t[0], r.t, _estimate(kalman, expansion, r))
+        how = (
+            "the second encoder less what the new model estimates from the recording; the model is not acting before it is "
+            "accepted"
+        )
+    rest = np.abs(c["reference_um"] - c["setpoint_um"]) < AT_TARGET_UM
+    before, after = (mean_and_two_s(e[rest & np.isfinite(e)]) for e in (growth, left))
+    thin = max(1, len(t) // SHOWN)
+    return Proof(
+        f"without compensation {before[0]:+.2f} +- {before[1]:.2f} um, with the new model {after[0]:+.3f} +- {after[1]:.3f} um",
+        before,
+        after,
+        how,
+        (t.t - t.t[0])[::thin].tolist(),
+        _series(growth[::thin]),
+        _series(left[::thin]),
+        _worst(after) < _worst(before),
+    )
+
+
+def _from_start(error_um: np.ndarray) -> np.ndarray:
+    return error_um - np.nanmean(error_um[:SETTLED])
+
+
+def _estimate(kalman: Kalman, expansion: Expansion, r: Recorded) -> np.ndarray:
+    start = expansion.info.get("start_um", 0.0)
+    return expansion.predict(chain.run_kalman(kalman, r), chain.smooth_air(r.air_c), start)
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(x))))
+
+
+def _worst(mean_two_s: MeanTwoS) -> float:
+    return abs(mean_two_s[0]) + mean_two_s[1]
+
+
+def _series(x: np.ndarray) -> Series:
+    return [float(f"{v:.6g}") if math.isfinite(v) else None for v in x.tolist()]

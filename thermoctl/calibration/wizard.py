@@ -1,0 +1,314 @@
+"""The calibration wizard: doctor, step, PID, tests 1 to 4A, model, proof.
+
+And, only when told so, acceptance.
+
+Each step leaves its result in a folder of the calibration's own (`--out`), so the command can be ended at any
+time and called again: it goes on with the first step that is not done. Nothing outside that folder is written
+before `--accept`.
+
+Where a daemon answers on the socket, the tests run on it: setpoints by the socket, rows from its shared
+memory, in real time. A test that was ended goes on from there, with the daemon's own recording of the time
+between (heat does not wait); where that has a gap the test starts again. Without a daemon a simulated rig is
+run faster than real time. The same seed gives the same rows, so a test that was ended is simply run again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from thermoctl.calibration import steps
+from thermoctl.calibration.daemon_rig import DaemonRig
+from thermoctl.calibration.drive import DrivenRig
+from thermoctl.calibration.keyboard import Keyboard
+from thermoctl.calibration.recorded import as_table
+from thermoctl.calibration.report import report
+from thermoctl.calibration.schedules import of_config, span
+from thermoctl.calibration.simulated_rig import SimulatedRig
+from thermoctl.identify import modelfile, tuning
+from thermoctl.identify.experiments import Aborted, Progress, Schedule
+from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.table import Table
+from thermoctl.settings import Settings
+from thermoctl.signals import INDEX
+from thermoctl.yamlfile import InputError
+
+TESTS = ("test_1", "test_2", "test_3", "test_4a", "test_4b")
+RESULTS: dict[str, type[steps.Result]] = {
+    "doctor": steps.Doctor,
+    "step": steps.Response,
+    "pid": steps.Pid,
+    "test_1": steps.Test,
+    "test_2": steps.Test,
+    "test_3": steps.Test,
+    "test_4a": steps.Test,
+    "model": steps.Model,
+    "test_4b": steps.Test,
+    "proof": steps.Proof,
+}
+STEPS = tuple(RESULTS)
+EVERY_PERCENT = 10.0  # of a test between two lines of progress where there is no terminal
+
+_R = TypeVar("_R", bound=steps.Result)
+
+
+class Wizard:
+    """One calibration in its folder: `done` {step: result}.
+
+    `run(keyboard)` does the steps that are not done."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        rig: DrivenRig,
+        folder: Path,
+        tests: Mapping[str, Schedule],
+        order: int,
+        say: Callable[[str], None],
+    ):
+        self.settings, self.rig, self.folder = settings, rig, folder
+        self.order, self.say = order, say
+        self.state_path = folder / "state.json"
+        self.experiments = of_config(settings.path)
+        self.fingerprint = self._fingerprint()
+        self.done: dict[str, steps.Result] = {}
+        self.at_s: dict[str, float] = {}  # how far an ended test came
+        self._used_s, self._tested_s = (
+            0.0,
+            0.0,
+        )  # wall and rig seconds of tests in this run, for the time left
+        for name in TESTS:
+            if name not in tests:
+                raise InputError(f"{self.experiments}: no experiment '{name}'; a calibration needs it")
+        self.tests = {name: tests[name] for name in TESTS}
+        if self.state_path.exists():
+            self._load()
+
+    def _load(self) -> None:
+        try:
+            state = json.loads(self.state_path.read_text())
+            self.done = {k: RESULTS[k](**v) for k, v in state["done"].items()}
+            self.at_s, known = state["at_s"], state["configuration"]
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise InputError(f"{self.state_path}: not a calibration's state; give another --out") from None
+        if known != self.fingerprint:
+            raise InputError(
+                f"{self.folder}: was started with another configuration or other experiments than {self.settings.path} has now; "
+                "put them back, or start again with --again"
+            )
+
+    def _fingerprint(self) -> str:
+        files = Path(self.settings.path).read_bytes() + self.experiments.read_bytes()
+        return hashlib.sha256(files).hexdigest()
+
+    def _save(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        temporary = self.state_path.with_suffix(".writing")
+        done = {k: asdict(v) for k, v in self.done.items()}
+        temporary.write_text(
+            json.dumps({"configuration": self.fingerprint, "done": done, "at_s": self.at_s}, indent=1)
+        )
+        temporary.replace(self.state_path)
+
+    def result(self, step: str, kind: type[_R]) -> _R:
+        """Return the result of a step that is done."""
+        found = self.done[step]
+        assert isinstance(found, kind)
+        return found
+
+    def run(self, keyboard: Keyboard) -> bool:
+        """Do every step that is not done; False when it was ended early.
+
+        Raises InputError where a step refuses."""
+        self.say(
+            f"calibration of rig '{self.settings.rig.name}' on {self.rig.where}; results in {self.folder}/"
+        )
+        self._save()
+        for number, step in enumerate(STEPS, 1):
+            if step in self.done:
+                self.say(f"{number:2d}/{len(STEPS)} {step}: done before")
+                continue
+            if keyboard.ended:
+                return False
+            if step in self.tests:
+                with keyboard.listening():
+                    if not self._test(number, step, keyboard):
+                        return False
+            else:
+                self.done[step] = self._step(step)
+                self.say(f"{number:2d}/{len(STEPS)} {step}: {self.done[step].summary}")
+            self._save()
+        self._report()
+        return True
+
+    def _step(self, step: str) -> steps.Result:
+        recordings = {name: self._recording(name) for name in TESTS}
+        match step:
+            case "doctor":
+                return steps.doctor(self.rig.now()["channels"])
+            case "step":
+                return steps.response(self.settings, self.rig)
+            case "pid":
+                return steps.pid(self.settings, self.result("step", steps.Response))
+            case "model":
+                return steps.model(self.settings, recordings, self.order, self._model_path)
+        return steps.proof(recordings, self.order, acting=not self.rig.real)
+
+    def _test(self, number: int, name: str, keyboard: Keyboard) -> bool:
+        """Run a test to its end, or to where it is ended.
+
+        Then False, and the same command goes on from there."""
+        schedule, part = self.tests[name], self.folder / f"{name}.part.parquet"
+        earlier, at_s = self._earlier(name, part)
+        self.say(f"{number:2d}/{len(STEPS)} {name}: {schedule.title}, {span(schedule.duration_s)}")
+        left_s = sum(
+            self.tests[n].duration_s for n in STEPS[number:] if n in self.tests and n not in self.done
+        )
+        show = _progress_line(lambda p: self._time_left(p, left_s))
+        acting = name == "test_4b" and isinstance(self.rig, SimulatedRig)
+        model = modelfile.load_model(self._model_path) if acting else None
+        blocks, ended, started = [], None, time.monotonic()
+        try:
+            for block in self.rig.run(schedule, show, keyboard, earlier, at_s, model):
+                blocks.append(block)
+        except Aborted as e:
+            ended = e
+        self._used_s += time.monotonic() - started
+        self._tested_s += ended.done_s if ended else schedule.duration_s - at_s
+        print(file=sys.stderr)
+        if blocks:
+            write_table(part, as_table(np.vstack(blocks), part))
+        if ended is not None:
+            self.at_s[name] = ended.done_s
+            self._save()
+            self.say(
+                f"{name} ended at {ended.done_s:.0f} s: {ended.reason}. What was recorded is in {part}; "
+                "the same command goes on from here"
+            )
+            return False
+        part.replace(self._recording(name))
+        self.at_s.pop(name, None)
+        power = np.vstack(blocks)[:, INDEX["power_w"]]
+        self.done[name] = steps.Test(
+            f"{span(schedule.duration_s)} recorded",
+            schedule.duration_s,
+            float(np.nanmean(power)),
+            float(np.nanmax(power)),
+        )
+        return True
+
+    def _earlier(self, name: str, part: Path) -> tuple[Table | None, float]:
+        """Read what a daemon recorded of a test that was ended, and how far it came."""
+        if name not in self.at_s or not part.exists() or not isinstance(self.rig, DaemonRig):
+            return None, 0.0
+        earlier = self.rig.meanwhile(read_table(part))
+        if earlier is None:
+            self.say(f"   {name} starts again: the daemon did not record without a gap since it was ended")
+            return None, 0.0
+        self.say(f"   {name} goes on at {self.at_s[name]:.0f} s")
+        return earlier, self.at_s[name]
+
+    def _time_left(self, p: Progress, left_s: float) -> tuple[float, float]:
+        """Seconds left of this test and of all, at the pace of the tests so far."""
+        pace = (self._used_s + p.used_s) / max(self._tested_s + p.done_s, 1e-9)
+        return pace * (p.duration_s - p.done_s), pace * (p.duration_s - p.done_s + left_s)
+
+    def _recording(self, name: str) -> Path:
+        return self.folder / f"{name}.parquet"
+
+    @property
+    def _model_path(self) -> Path:
+        return self.folder / "model.yaml"
+
+    def _report(self) -> None:
+        path = self.folder / "report.html"
+        path.write_text(
+            report(
+                self.settings.rig.name,
+                self.rig.where,
+                {k: v.summary for k, v in self.done.items()},
+                self.result("step", steps.Response),
+                self.result("pid", steps.Pid),
+                self.result("model", steps.Model),
+                self.result("proof", steps.Proof),
+            ),
+            encoding="utf-8",
+        )
+        self.say(f"before and after: {path}")
+
+    def changes(self, models: Path, gains: bool) -> list[str]:
+        """List what an acceptance would do, as lines."""
+        lines = [f"install {self._model_path} as the current calibration of {models}/"]
+        if gains:
+            difference = tuning.difference(*self.result("pid", steps.Pid).gains())
+            lines.append(f"write into {self.settings.path}:\n{difference}")
+        if not self._in_use(models):
+            now = self.settings.compensation.model or "not set"
+            lines.append(
+                f"set compensation.model in {self.settings.path} to {self._model_option(models)} (now {now})"
+            )
+        return lines
+
+    def _in_use(self, models: Path) -> bool:
+        return Path(self.settings.compensation.model or ".").resolve() == models.resolve()
+
+    def _model_option(self, models: Path) -> str:
+        """Name the folder of calibrations relative to the configuration, as it does itself."""
+        return os.path.relpath(models.resolve(), Path(self.settings.path).resolve().parent)
+
+    def accept(self, models: Path, gains: bool) -> None:
+        """Install the model, name it in the configuration, and write the gains when asked.
+
+        Raises InputError when the proof shows no improvement."""
+        proof = self.result("proof", steps.Proof)
+        if not proof.better:
+            raise InputError(
+                f"{self.folder}: the proof shows no smaller error with the new model than without; nothing was installed"
+            )
+        c = modelfile.load_calibration(self._model_path)
+        figures: dict[str, Any] = {
+            **c.figures,
+            "proof_before_um": list(proof.before),
+            "proof_after_um": list(proof.after),
+        }
+        recordings = [self._recording(n) for n in steps.FITTED]
+        path = modelfile.install(models, c.model, c.rig, recordings, figures)
+        if gains:
+            tuning.write(Path(self.settings.path), self.result("pid", steps.Pid).gains()[1])
+        if not self._in_use(models):
+            try:
+                values = {"model": self._model_option(models)}
+                tuning.write_values(Path(self.settings.path), "compensation", values)
+            except InputError as e:  # the model is installed; the person names it
+                self.say(str(e))
+        self.fingerprint = self._fingerprint()
+        self._save()
+        self.say(
+            f"{path} is current; older ones stay (`thermoctl model rollback`). `thermoctl restart` uses it."
+        )
+
+
+def _progress_line(time_left: Callable[[Progress], tuple[float, float]]) -> Callable[[Progress], None]:
+    """Show progress.
+
+    One line that is written over on a terminal, a line every EVERY_PERCENT elsewhere."""
+    shown = [-1.0]
+
+    def show(p: Progress) -> None:
+        here, everything = time_left(p)
+        line = f"   {p.percent:5.1f} %   {span(here)} left of this test, {span(everything)} of all"
+        if sys.stderr.isatty():
+            print(f"\r{line:78}", end="", file=sys.stderr, flush=True)
+        elif p.percent - shown[0] >= EVERY_PERCENT:
+            shown[0] = p.percent
+            print(line, file=sys.stderr, flush=True)
+
+    return show

@@ -1,0 +1,222 @@
+"""The commands `diagnose` and `effects`.
+
+Progress while they work, a summary for a person, JSON for a program."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from thermoctl.diagnose import run
+from thermoctl.diagnose.effects import CATALOGUE, catalogue
+from thermoctl.diagnose.experiment_file import peaks
+from thermoctl.diagnose.outcome import sentence
+from thermoctl.diagnose.resolve import resolve
+from thermoctl.yamlfile import InputError, suggest
+
+# Share of a diagnosis that is done when a stage starts, roughly: for the time left.
+_STAGES = (
+    ("refitting the plant", 0.0),
+    ("screening the catalogue", 0.12),
+    ("looking again", 0.35),
+    ("refitting", 0.25),
+    ("screening again", 0.6),
+    ("one effect is not needed", 0.85),
+)
+
+
+class StageReporter:
+    """Writes each stage with the time gone and, from the second stage on, a rough time left."""
+
+    def __init__(self) -> None:
+        self.started, self.share = time.monotonic(), 0.0
+
+    def __call__(self, text: str) -> None:
+        gone = time.monotonic() - self.started
+        self.share = max(self.share, next((share for start, share in _STAGES if text.startswith(start)), 0.0))
+        left = f", about {gone * (1 - self.share) / self.share:.0f} s left" if self.share else ""
+        print(f"{gone:6.1f} s{left}: {text}", file=sys.stderr, flush=True)
+
+
+def diagnose(args: argparse.Namespace) -> int:
+    """`thermoctl diagnose`: runs the diagnosis and prints its summary.
+
+    Raises InputError for unusable inputs."""
+    if not args.recordings:
+        raise InputError("no recording was given; one or more were expected, or --live")
+
+    def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
+        return run.diagnose(
+            args.plant,
+            recordings,
+            args.out,
+            [Path(e) for e in args.effects or ()],
+            None if args.quiet else StageReporter(),
+            args.drive or (),
+            _limits(args.limit or ()),
+        )
+
+    if args.resolve:
+        found = resolve(
+            diagnosed,
+            args.recordings,
+            Path(args.out),
+            args.record,
+            args.rounds,
+            lambda text: print(text, file=sys.stderr, flush=True),
+        )
+    else:
+        found = diagnosed(args.recordings)
+    if args.json:
+        print(json.dumps(found, indent=1, allow_nan=False))
+    elif not args.quiet:
+        summary(found, args.out)
+    return 0
+
+
+def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """NAME=LOW:HIGH of each. Raises InputError."""
+    out = {}
+    for text in told:
+        name, _, span = text.partition("=")
+        low, _, high = span.partition(":")
+        try:
+            out[name] = (float(low), float(high))
+        except ValueError:
+            raise InputError(
+                f"--limit {text}: NAME=LOW:HIGH was expected, such as block_temperature=15:90"
+            ) from None
+        if not out[name][0] < out[name][1]:
+            raise InputError(f"--limit {text}: the first number must be the smaller one")
+    return out
+
+
+def effects(args: argparse.Namespace) -> int:
+    """`thermoctl effects [show NAME]`: the catalogue, or one entry in full.
+
+    Raises InputError for an unknown name."""
+    found = catalogue((CATALOGUE, *map(Path, args.effects or ())))
+    console = Console(soft_wrap=True)
+    if args.action == "show":
+        if args.name not in found:
+            raise InputError(
+                f"'{args.name}' is not an effect of the catalogue{suggest(str(args.name), found)}; "
+                "`thermoctl effects` lists them"
+            )
+        e = found[args.name]
+        console.print(
+            f"[bold]{e.name}[/]: {e.title}\nplace       {e.where}\nexcited by  {e.excited_by}\n"
+            f"mimics      {', '.join(e.mimics) or '-'}\nsource      {e.source}"
+        )
+        for number, change in enumerate(e.changes):
+            for item in change:
+                for kind, value in item.items():
+                    body = (
+                        ", ".join(f"{k}: {v}" for k, v in value.items())
+                        if isinstance(value, dict)
+                        else str(value)
+                    )
+                    console.print(
+                        f"{'change' if not number else f'variant {number}':11} {kind}: {body}", markup=False
+                    )
+        for p in e.parameters:
+            console.print(
+                f"parameter   {p.name} [{p.unit or '1'}] {p.low:g} .. {p.high:g}, absent at {p.null:g}",
+                markup=False,
+            )
+        return 0
+    if args.action:
+        raise InputError(f"effects: 'show NAME' or nothing was expected, not '{args.action}'")
+    table = Table("effect", "place", "what it is", box=None, header_style="bold")
+    for e in found.values():
+        table.add_row(e.name, e.where, e.title)
+    console.print(table)
+    return 0
+
+
+def summary(found: dict[str, Any], out: str | Path) -> None:
+    """Print a result for a person."""
+    console = Console() if sys.stdout.isatty() else Console(width=160)
+    console.print(f"[bold]{found['verdict']}[/]. {sentence(found)}")
+    if found["findings"]:
+        console.print(_findings(found["findings"]))
+    if found["alternatives"]:
+        table = _table("alternative", "where", "probability")
+        for a in found["alternatives"][:8]:
+            table.add_row(a["effect"], a["where"], f"{a['probability']:.3f}")
+        console.print(table)
+    if found["mismatch"]:
+        console.print(_mismatch(found["mismatch"]))
+    console.print(_errors(found["fit"], found.get("held_out_gain", {})))
+    lines = [f"note: {note}" for note in found["notes"]]
+    if found["next_experiment"]:
+        lines += _next_experiment(found["next_experiment"], Path(out))
+    lines += [
+        f"round {k}: was {r['verdict']}; ran {r['experiment']} -> {r['recording']}"
+        for k, r in enumerate(found.get("resolved", ()), 1)
+    ]
+    lines.append(f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json")
+    for line in lines:
+        console.print(line, markup=False)
+
+
+def _table(*titles: str) -> Table:
+    return Table(*titles, box=None, header_style="bold")
+
+
+def _findings(findings: Sequence[Mapping[str, Any]]) -> Table:
+    table = _table("effect", "where", "equation", "parameter", "value", "95 %")
+    for f in findings:
+        first = [f["effect"], f["where"], f["equation"]]
+        for name, p in f["parameters"].items():
+            value = f"{p['value']:.4g} {p['unit'] or ''}"
+            table.add_row(*first, name, value, f"± {1.96 * (p['sd'] or 0):.2g}")
+            first = ["", "", ""]
+    return table
+
+
+def _mismatch(mismatch: Sequence[Mapping[str, Any]]) -> Table:
+    table = _table("misfit of", "rms", "sensor allows", "missing flow", "follows")
+    for m in mismatch:
+        size, unit = m.get("missing_flow_rms"), m.get("missing_flow_unit")
+        flow = f"{size:.3g} {unit or ''} at {m['node']}" if size else "-"
+        rms = (f"{m['rms']:.4g}", f"{m['expected_rms']:.4g}")
+        table.add_row(m["channel"], *rms, flow, ", ".join(m.get("follows") or ()))
+    return table
+
+
+def _errors(fit: Mapping[str, Any], gain: Mapping[str, Any]) -> Table:
+    columns = {
+        "before": "as it came",
+        "refit_only": "refitted",
+        "after": "with the finding",
+        "held_out_refit_only": "held out: refitted",
+        "held_out_after": "with the finding",
+    }
+    table = _table("rms of", *columns.values(), "ratio (95 %)")
+    for o in fit["refit_only"]:
+        g = gain.get(o)
+        ratio = f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else "-"
+        table.add_row(o, *(_number(fit.get(k, {}).get(o)) for k in columns), ratio)
+    return table
+
+
+def _next_experiment(entry: Mapping[str, Any], out: Path) -> list[str]:
+    return [
+        f"next experiment: {entry['profile']}. {entry['why']} {entry['also_helpful'] or ''}",
+        *(f"    {line}" for line in peaks(entry)),
+        f"run it: thermoctl experiment {out / entry['file']}  (or by hand: next_experiment.csv), "
+        "or let `thermoctl diagnose --resolve` do it",
+    ]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

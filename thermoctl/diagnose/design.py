@@ -1,0 +1,250 @@
+"""The candidate experiments: what can be driven, and how, inside the rig's limits.
+
+The family: levels, steps both ways, warm-up and cool-down, trapezoids slow and fast, triangles small and
+large, and pseudo-random sequences of two bands. Every input is driven by itself and all together, in several
+lengths and from several starts. Inputs stay inside the range, and below the speed, that was recorded, unless
+limits are given."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
+from thermoctl.plant.units import dimension
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+TOGETHER = 0.98  # correlation from which two inputs count as one lever (voltage and current)
+SURROUNDINGS = ("K", "W/m^2", "Pa")  # dimensions of temperature, sunshine and pressure: nobody commands these
+LENGTHS = (1.0, 0.5, 2.0)  # of an experiment, in recordings' lengths
+STARTS_APART = 0.05  # share by which a constant input differs between recordings that count as two starts
+
+Limits = Mapping[str, tuple[float, float]]
+NONE: Limits = {}
+Plateaus = list[tuple[float, float]]  # (seconds, value) of each
+
+
+@dataclass(frozen=True)
+class Lever:
+    """An input that can be driven, and those that move with it: {input: (factor, offset)}.
+
+    Also its limits and its value at rest."""
+
+    name: str
+    moves: Mapping[str, tuple[float, float]]
+    low: float
+    high: float
+    rest: float
+    rate: float  # most it was seen to change in a second
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """The inputs of an experiment: corners (K, 2) of seconds and value, on straight lines.
+
+    `starts` are constant inputs."""
+
+    title: str
+    duration_s: float
+    corners: Mapping[str, np.ndarray]
+    starts: Mapping[str, float]
+
+    def table(self, plant: Plant, step_s: float, name: str = "next_experiment") -> Table:
+        """Tabulate the inputs every `step_s`, by their columns."""
+        t = np.arange(int(np.floor(self.duration_s / step_s + 1e-9)) + 1) * step_s
+        columns = {plant.inputs[n].column: np.interp(t, c[:, 0], c[:, 1]) for n, c in self.corners.items()}
+        columns |= {
+            plant.inputs[n].column if n in plant.inputs else plant.outputs[n].column: np.full(len(t), v)
+            for n, v in self.starts.items()
+        }
+        return Table(name, name, t, columns)
+
+
+def levers(
+    plant: Plant, tables: Sequence[Table], only: Sequence[str] = (), limits: Limits = NONE
+) -> list[Lever]:
+    """Find the inputs that moved in the recordings and can be commanded.
+
+    Inputs that moved alike are one lever.
+
+    Temperatures, sunshine and pressure belong to the surroundings. `only`: names that count, whatever their
+    unit. `limits`: by input, instead of the recorded range. Raises InputError for an unknown name."""
+    for n in only:
+        if n not in plant.inputs:
+            raise InputError(f"'{n}' is not an input of {plant.file}; there are {', '.join(plant.inputs)}")
+    found: list[Lever] = []
+    series: list[np.ndarray] = []
+    for i in plant.inputs.values():
+        if i.name not in only if only else i.unit and _of_surroundings(i.unit):
+            continue
+        parts = [t.columns[i.column] for t in tables if i.column in t.columns]
+        values = np.concatenate(parts) if parts else np.zeros(0)
+        if not _moved(values, parts):
+            continue
+        alike = next((k for k, other in enumerate(series) if _together(values, other)), None)
+        if alike is None:
+            found.append(_lever(i.name, i.column, tables, limits))
+            series.append(values)
+        else:
+            other, lever = series[alike], found[alike]
+            both = np.isfinite(values) & np.isfinite(other)
+            factor, offset = np.polyfit(other[both], values[both], 1)
+            moves = {**lever.moves, i.name: (float(factor), float(offset))}
+            found[alike] = dataclasses.replace(lever, moves=moves)
+    return found
+
+
+def _of_surroundings(unit: str) -> bool:
+    return any(dimension(unit) == dimension(u) for u in SURROUNDINGS)
+
+
+def _moved(values: np.ndarray, parts: Sequence[np.ndarray]) -> bool:
+    good = values[np.isfinite(values)]
+    return bool(len(good)) and any(np.nanstd(p) > 1e-6 * max(abs(good).max(), 1e-300) for p in parts)
+
+
+def _together(a: np.ndarray, b: np.ndarray) -> bool:
+    both = np.isfinite(a) & np.isfinite(b) if len(a) == len(b) else None
+    return both is not None and bool(abs(np.corrcoef(a[both], b[both])[0, 1]) > TOGETHER)
+
+
+def _lever(name: str, column: str, tables: Sequence[Table], limits: Limits) -> Lever:
+    parts = [(t.t, t.columns[column]) for t in tables if column in t.columns]
+    finite = [v[np.isfinite(v)] for _, v in parts if np.isfinite(v).any()]
+    good = np.concatenate(finite)
+    low, high = limits.get(name, (float(good.min()), float(good.max())))
+    first = float(np.median([v[0] for v in finite]))
+    rates = [float(np.nanmax(np.abs(np.diff(v) / np.diff(t)))) for t, v in parts if len(t) > 1]
+    return Lever(name, {name: (1.0, 0.0)}, low, high, min(max(first, low), high), max(rates, default=np.inf))
+
+
+def _ramps(lever: Lever, plateaus: Plateaus, step_s: float) -> np.ndarray:
+    """Corners (K, 2) of plateaus one after the other.
+
+    The ramps between them are no faster than was recorded."""
+    corners = [(0.0, lever.rest)]
+    for seconds, value in plateaus:
+        t, now = corners[-1]
+        ramp = max(abs(value - now) / max(lever.rate, 1e-300), 1e-3 * step_s)
+        if ramp > seconds:  # too slow to get there in time
+            ramp, value = seconds, now + (value - now) * seconds / ramp
+        corners += [(t + ramp, value), (t + seconds, value)]
+    return np.array([c for k, c in enumerate(corners) if k == 0 or c[0] > corners[k - 1][0]])
+
+
+def _pseudo_random(lever: Lever, hold_s: float, duration_s: float, seed: int) -> Plateaus:
+    """Levels of `hold_s` or a multiple, from a shift register of maximum length (7 bits)."""
+    low, high = lever.low, lever.high
+    levels = (low, high, high, 0.5 * (low + high), low, low + 0.75 * (high - low), low, high)
+    state, out = 0b1010011 + 17 * seed, []
+    for _ in range(int(duration_s / hold_s)):
+        state = (state << 1 | ((state >> 6 ^ state >> 5) & 1)) & 0x7F
+        out.append((hold_s, levels[state & 7]))
+    return [*out, (duration_s - hold_s * len(out), lever.rest)]
+
+
+def _swings(low: float, high: float, period_s: float, duration_s: float) -> Plateaus:
+    count = max(int(duration_s / period_s), 1)
+    return [(0.5 * period_s, q) for _ in range(count) for q in (high, low)]
+
+
+def courses(lever: Lever, duration_s: float, step_s: float, seed: int = 0) -> dict[str, np.ndarray]:
+    """List the family for one lever: {its course in words: corners (K, 2)}."""
+    low, high, T = lever.low, lever.high, duration_s
+    middle, span = 0.5 * (low + high), high - low
+    away = high if high - lever.rest >= lever.rest - low else low
+    half = lever.rest + 0.5 * (away - lever.rest)
+
+    plans: dict[str, Plateaus] = {
+        "at rest, then held at its end": [(0.1 * T, lever.rest), (0.9 * T, away)],
+        "held at its end, then at rest (warm-up and cool-down)": [(0.5 * T, away), (0.5 * T, lever.rest)],
+        "held at half, then at rest": [(0.5 * T, half), (0.5 * T, lever.rest)],
+        "in four levels up and down": [
+            (T / 7, lever.rest + (away - lever.rest) * q) for q in (0.25, 0.5, 0.75, 1.0, 0.66, 0.33, 0.0)
+        ],
+        "in slow trapezoids": _swings(low, high, T / 2, T),
+        "in fast trapezoids": _swings(low, high, T / 12, T),
+        "in small fast trapezoids": _swings(middle - 0.1 * span, middle + 0.1 * span, T / 12, T),
+        "in a pseudo-random sequence, slow": _pseudo_random(lever, max(T / 20, 2 * step_s), T, seed),
+        "in a pseudo-random sequence, fast": _pseudo_random(lever, max(T / 80, 2 * step_s), T, seed),
+    }
+    out = {k: _ramps(lever, p, step_s) for k, p in plans.items()}
+    for word, part in (("large", 1.0), ("small", 0.2)):
+        at = np.linspace(0, T, 9)
+        swing = 0.5 * min(part * span, lever.rate * T / 8)
+        wave = np.where(np.arange(9) % 2, swing, -swing) + middle
+        out[f"in {word} triangles"] = np.column_stack([at, wave])
+    return out
+
+
+def family(plant: Plant, tables: Sequence[Table], found: Sequence[Lever], step_s: float) -> list[Excitation]:
+    """List the candidates.
+
+    Every lever by itself, the others at rest, and all together, over each of LENGTHS."""
+    usual = float(np.median([t.t[-1] - t.t[0] for t in tables]))
+    constant, starts = _constant(plant, tables, {n for lever in found for n in lever.moves})
+    out = []
+    for share in LENGTHS:
+        duration_s = usual * share
+        for title, plan in _plans(found, duration_s, step_s):
+            corners = {
+                n: np.column_stack([plan[lever.name][:, 0], plan[lever.name][:, 1] * factor + offset])
+                for lever in found
+                for n, (factor, offset) in lever.moves.items()
+            }
+            for start in starts if share == LENGTHS[0] else starts[:1]:
+                text = f"{title}, {duration_s:.5g} s"
+                if len(starts) > 1:
+                    text += ", from " + ", ".join(f"{n} {v:.4g}" for n, v in start.items())
+                out.append(Excitation(text, duration_s, corners, constant | start))
+    return out
+
+
+def _plans(
+    found: Sequence[Lever], duration_s: float, step_s: float
+) -> list[tuple[str, dict[str, np.ndarray]]]:
+    """(title, {lever: corners}) of every course over one length."""
+    rest = {lever.name: np.array([[0.0, lever.rest], [duration_s, lever.rest]]) for lever in found}
+    plans = [
+        (f"{lever.name} {words}", rest | {lever.name: c})
+        for lever in found
+        for words, c in courses(lever, duration_s, step_s).items()
+    ]
+    if len(found) > 1:
+        each = {v.name: courses(v, duration_s, step_s, seed) for seed, v in enumerate(found)}
+        together = [w for w in each[found[0].name] if w.startswith(("in a pseudo", "held at its end"))]
+        plans += [(f"{' and '.join(each)} {w}", {n: c[w] for n, c in each.items()}) for w in together]
+    return plans
+
+
+def _constant(
+    plant: Plant, tables: Sequence[Table], moved: set[str]
+) -> tuple[dict[str, float], list[dict[str, float]]]:
+    """Inputs that nobody drives at their mean, readings that a start asks for, and the starts.
+
+    Starts: where an input was constant in every recording but differed between them, both ends."""
+    constant, low, high = {}, {}, {}
+    for i in plant.inputs.values():
+        if i.name in moved:
+            continue
+        parts = [t.columns[i.column] for t in tables if i.column in t.columns]
+        parts = [p for p in parts if np.isfinite(p).any()]
+        means = [float(np.nanmean(p)) for p in parts]
+        constant[i.name] = float(np.mean(means)) if means else 0.0
+        if not means or not any(i.name in ex.names(n.initial) for n in plant.nodes.values()):
+            continue
+        steady = all(np.nanstd(p) < 1e-9 * (abs(m) + 1e-300) for p, m in zip(parts, means, strict=True))
+        if steady and max(means) - min(means) > STARTS_APART * max(abs(m) for m in means):
+            low[i.name], high[i.name] = min(means), max(means)
+    asked = {e.value for n in plant.nodes.values() for e in ex.walk(n.initial) if e.op == "first"}
+    for o in plant.outputs.values():
+        parts = [t.columns[o.column] for t in tables if o.column in t.columns]
+        values = [p[np.isfinite(p)][0] for p in parts if np.isfinite(p).any()]
+        if o.name in asked and values:
+            constant[o.name] = float(np.mean(values))
+    return constant, [low, high] if low else [{}]

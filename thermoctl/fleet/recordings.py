@@ -1,0 +1,75 @@
+"""Recordings of many rigs in a folder or an object store.
+
+Find them, fetch one, say which rig it is of."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from thermoctl.recording.writer import NAME, TIER
+from thermoctl.yamlfile import InputError
+
+SUFFIXES = (".parquet", ".csv", ".arrow", TIER)
+
+
+def find_recordings(folder: str | Path) -> list[str]:
+    """Find all recordings below a folder, or below a path of an object store (s3://BUCKET/RIGS).
+
+    Recordings are our 10 Hz tiers and Parquet, CSV and Arrow files. Raises InputError without one."""
+    if "://" in str(folder):
+        fs, root = _store(str(folder))
+        try:
+            found = sorted(fs.unstrip_protocol(p) for p in fs.find(root) if p.endswith(SUFFIXES))
+        except Exception as e:  # each store raises what its own library raises
+            raise InputError(f"{folder}: cannot be listed: {e}") from None
+    elif not Path(folder).is_dir():
+        raise InputError(f"{folder}: not a folder; one with the rigs' recordings was expected")
+    else:
+        found = sorted(str(p) for p in Path(folder).rglob("*") if p.is_file() and p.name.endswith(SUFFIXES))
+    if not found:
+        raise InputError(
+            f"{folder}: no recordings in it; files ending in {', '.join(SUFFIXES)} were expected"
+        )
+    return found
+
+
+def _store(url: str) -> tuple[Any, str]:
+    """(file system, path in it) of an address.
+
+    The library of the store finds its own credentials."""
+    try:
+        import fsspec
+    except ImportError:
+        raise InputError(f"{url}: needs the package 'fsspec': pip install 'thermoctl[fleet]'") from None
+    try:
+        return fsspec.core.url_to_fs(url)
+    except (ImportError, ValueError) as e:
+        raise InputError(f"{url}: {e}") from None
+
+
+@contextmanager
+def local(path: str) -> Iterator[str]:
+    """Give a path that can be read here: itself, or a temporary copy out of an object store."""
+    if "://" not in path:
+        yield path
+        return
+    fs, inside = _store(path)
+    with tempfile.TemporaryDirectory(prefix="thermoctl-fleet") as folder:
+        copy = f"{folder}/{Path(inside).name}"
+        try:
+            fs.get_file(inside, copy)
+        except Exception as e:  # as above
+            raise InputError(f"{path}: cannot be fetched: {e}") from None
+        yield copy
+
+
+def rig_of(path: str) -> str:
+    """Name the rig of a recording.
+
+    By the name that the program gives its recordings, else by its folder."""
+    match = NAME.match(Path(path).name)
+    return match["rig"] if match else Path(path).parent.name

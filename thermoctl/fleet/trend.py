@@ -1,0 +1,113 @@
+"""Rigs over time: which parameters drift, which model no longer fits, and what to do about it.
+
+A parameter drifts when the straight line through its estimates has a slope of more than DRIFT_SIGMA standard
+errors and changes it by more than DRIFT_SHARE over the time seen. A model no longer fits when the newest
+recording's misfit is above FIT_LIMIT; the misfit after the refit says whether values are wrong (identify
+again) or physics is missing (diagnose)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from thermoctl.control import faults
+from thermoctl.fleet.health import Summary
+
+DRIFT_SIGMA, DRIFT_SHARE, FIT_LIMIT = 4.0, 0.05, 3.0
+FEWEST = 3  # estimates from which a straight line has a scatter
+MONTH_S = 30 * 86400.0
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A straight line through a parameter's estimates.
+
+    Change per 30 days, its standard error, share of the mean."""
+
+    per_month: float
+    sigma: float
+    share: float
+    drifts: bool
+
+
+@dataclass(frozen=True)
+class RigHealth:
+    """One rig over all its recordings, oldest first, and what to do about it."""
+
+    name: str
+    summaries: tuple[Summary, ...]
+    drifts: dict[str, Drift]
+    advice: tuple[str, ...]
+
+
+def judge(summaries: Iterable[Summary]) -> list[RigHealth]:
+    """Group summaries of any rigs in any order by rig, and judge each."""
+    by_rig: dict[str, list[Summary]] = {}
+    for s in summaries:
+        by_rig.setdefault(s.rig, []).append(s)
+    return [
+        _judged(name, sorted(group, key=lambda s: (math.isnan(s.begin_s), s.begin_s, s.path)))
+        for name, group in sorted(by_rig.items())
+    ]
+
+
+def _judged(name: str, group: list[Summary]) -> RigHealth:
+    good = [s for s in group if not s.error]
+    names = list(dict.fromkeys(p for s in good for p in s.estimates))
+    drifts = {
+        p: drift(
+            [s.begin_s for s in good if p in s.estimates], [s.estimates[p] for s in good if p in s.estimates]
+        )
+        for p in names
+    }
+    advice = [f"{Path(s.path).name}: {s.error}" for s in group if s.error]
+    if good:
+        advice += _advice(good[-1], drifts)
+    return RigHealth(name, tuple(group), drifts, tuple(advice))
+
+
+def _advice(newest: Summary, drifts: dict[str, Drift]) -> list[str]:
+    lines = []
+    if newest.misfit > FIT_LIMIT:
+        cure = (
+            "new values fit, identify again"
+            if newest.misfit_refitted <= FIT_LIMIT
+            else f"look for what is missing: thermoctl diagnose {newest.path}"
+        )
+        lines.append(
+            f"the model no longer fits ({newest.worst}: {newest.misfit:.1f} times its noise): {cure}"
+        )
+    lines += [
+        f"{p} drifts by {d.per_month:+.3g} a month ({100 * d.share:+.1f} % in the time seen)"
+        for p, d in drifts.items()
+        if d.drifts
+    ]
+    known = [faults.BY_NAME[f] for f in newest.faults if f in faults.BY_NAME]
+    lines += [f"fault {f.name}: {f.remedy}" for f in known if f.severity != "warning"]
+    return lines + [f"fault {f}: of another version" for f in newest.faults if f not in faults.BY_NAME]
+
+
+def drift(times_s: Sequence[float], estimates: Sequence[tuple[float, float]]) -> Drift:
+    """Fit a weighted straight line through (value, standard error) over time.
+
+    The standard error of the slope is widened by the scatter about the line where that is larger than the
+    estimates' own. Fewer than FEWEST estimates never drift."""
+    t = np.asarray(times_s) / MONTH_S
+    value, sd = np.array(estimates, dtype=float).reshape(-1, 2).T
+    if len(t) < FEWEST or np.ptp(t) == 0.0:
+        return Drift(0.0, math.inf, 0.0, False)
+    weight = 1.0 / np.maximum(sd, 1e-9 * np.abs(value) + 1e-300) ** 2
+    middle = np.average(t, weights=weight)
+    mean = np.average(value, weights=weight)
+    spread = np.sum(weight * (t - middle) ** 2)
+    slope = np.sum(weight * (t - middle) * (value - mean)) / spread
+    scatter = np.sum(weight * (value - mean - slope * (t - middle)) ** 2) / (len(t) - 2)
+    sigma = math.sqrt(max(scatter, 1.0) / spread)
+    share = float(slope * np.ptp(t) / abs(mean)) if mean else 0.0
+    return Drift(
+        float(slope), sigma, share, bool(abs(slope) > DRIFT_SIGMA * sigma and abs(share) > DRIFT_SHARE)
+    )

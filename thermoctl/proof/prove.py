@@ -1,0 +1,84 @@
+"""Proof on a folder of cases: run the diagnosis on each, then open the answers and score.
+
+Answers are read after the last diagnosis has ended.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from thermoctl import __version__
+from thermoctl.proof.jobs import Job, find_jobs, outcome, read_answers
+from thermoctl.proof.page import page
+from thermoctl.proof.run import OnCase, run_all
+from thermoctl.proof.score import Row, plain, score
+from thermoctl.proof.summary import summary
+from thermoctl.recording.files import read_table
+from thermoctl.yamlfile import InputError
+
+
+def prove(
+    cases: str | Path,
+    out_dir: str | Path,
+    answers: str | Path | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    number: int | None = None,
+    progress: OnCase | None = None,
+) -> dict[str, Any]:
+    """Run and score a set of cases; return the content of OUT/proof.json.
+
+    OUT/summary.json is the same without the cases, to be kept with a commit; OUT/proof.html is for people."""
+    out = Path(out_dir)
+    jobs = find_jobs(cases, number)
+    run_all(jobs, out / "cases", scheduler, workers, progress=progress)
+    sealed = read_answers(jobs, Path(answers) if answers is not None else None)
+    rows = [_scored(job, out / "cases", sealed[job.name]) for job in jobs]
+    figures = {
+        "format": "thermoctl-proof/1",
+        "version": __version__,
+        "commit": _commit(),
+        "machine": platform.machine(),
+        "cpus": os.cpu_count(),
+        "set": {"answers_sha256": hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()},
+        **summary(rows),
+    }
+    content = {**figures, "rows": plain(rows)}
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "proof.json").write_text(json.dumps(content, indent=1) + "\n")
+    (out / "summary.json").write_text(json.dumps(figures, indent=1) + "\n")
+    (out / "proof.html").write_text(page(content, rows))
+    return content
+
+
+def _scored(job: Job, cases: Path, answer: Mapping[str, Any]) -> Row:
+    result, run = outcome(job, cases)
+    duration_s = _duration(job.recordings) if answer.get("onset") is not None else None
+    return score(job.name, answer, result, run.get("seconds"), run["error"], duration_s)
+
+
+def _duration(recordings: Sequence[str]) -> float | None:
+    """Length of the first recording, s; None where it cannot be read."""
+    try:
+        t = read_table(recordings[0], columns=["t"]).t
+    except InputError:
+        return None
+    return float(t[-1] - t[0])
+
+
+def _commit() -> str | None:
+    """Read the source's commit, `-dirty` when changed since; None outside a checkout."""
+    if shutil.which("git") is None:
+        return None
+    run = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent, capture_output=True, text=True
+    )
+    return run.stdout.strip() or None

@@ -1,0 +1,137 @@
+"""Run the diagnosis over many cases.
+
+Through Dask in separate processes, none twice, past workers that die."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+from thermoctl import __version__
+from thermoctl.diagnose.run import diagnose
+from thermoctl.proof.jobs import Job, Run, done
+from thermoctl.yamlfile import InputError
+
+RETRIES = 3  # workers that may die over one case before it counts as failed
+
+OnCase = Callable[[int, int, Run], None]  # cases done, cases to do, the newest
+
+
+def run_one(job: Job, out: str) -> Run:
+    """Diagnose one case in this process; OUT/run.json is written last.
+
+    Never raises for a bad case."""
+    started, cpu = time.monotonic(), time.process_time()
+    error = None
+    try:
+        diagnose(job.plant, list(job.recordings), out, [Path(e) for e in job.effects])
+    except InputError as e:
+        error = str(e)
+    except Exception as e:  # a crash is a result of the proof, not the end of it
+        error = f"{type(e).__name__}: {e}"
+    run = _run(job, error, round(time.monotonic() - started, 2))
+    run["cpu_s"] = round(time.process_time() - cpu, 2)
+    Path(out).mkdir(parents=True, exist_ok=True)
+    part = Path(out) / f".run-{os.getpid()}.json"
+    part.write_text(json.dumps(run) + "\n")
+    os.replace(part, Path(out) / "run.json")
+    return run
+
+
+def _run(job: Job, error: str | None, seconds: float | None) -> Run:
+    return {
+        "name": job.name,
+        "fingerprint": job.fingerprint(),
+        "version": __version__,
+        "error": error,
+        "seconds": seconds,
+    }
+
+
+@contextmanager
+def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
+    """Open a Dask client.
+
+    Of the scheduler at the address, else of local single-threaded processes."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    with dask.config.set(
+        {
+            "distributed.scheduler.allowed-failures": RETRIES,
+            "distributed.worker.daemon": False,
+            "distributed.comm.timeouts.connect": "60s",
+        }
+    ):
+        if scheduler:
+            with Client(scheduler) as client:
+                yield client
+            return
+        with (
+            LocalCluster(
+                n_workers=workers or os.cpu_count(),
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address="127.0.0.1:0",
+                memory_limit=0,
+                silence_logs=50,
+            ) as local,
+            Client(local) as client,
+        ):
+            yield client
+
+
+def run_all(
+    jobs: Sequence[Job],
+    out: Path,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    task: Callable[[Job, str], Run] = run_one,
+    progress: OnCase | None = None,
+) -> int:
+    """Run every job that is not done yet into OUT/NAME; return how many were run.
+
+    `task` is called in a worker."""
+    waiting = [j for j in jobs if not done(j, out / j.name)]
+    if not waiting:
+        return 0
+    from distributed import as_completed
+
+    with cluster(scheduler, workers) as client:
+        futures = {
+            client.submit(task, j, str(out / j.name), pure=False, key=f"case-{j.name}"): j for j in waiting
+        }
+        for count, future in enumerate(as_completed(list(futures)), 1):
+            job = futures[future]
+            if future.status == "error":  # its workers died RETRIES times
+                run = _run(job, f"{type(future.exception()).__name__}: {future.exception()}", None)
+                folder = out / job.name
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / "run.json").write_text(json.dumps(run) + "\n")
+            else:
+                run = future.result()
+            if progress:
+                progress(count, len(waiting), run)
+    return len(waiting)
+
+
+class Reporter:
+    """Progress on stderr: one line a case with the time that is left."""
+
+    def __init__(self, stream: TextIO | None = None):
+        self.started, self.stream = time.monotonic(), stream or sys.stderr
+
+    def __call__(self, count: int, total: int, run: Run) -> None:
+        left = (time.monotonic() - self.started) / count * (total - count)
+        what = f" {run['error']}" if run["error"] else ""
+        print(
+            f"[{count}/{total}] {run['name']} {run.get('seconds') or 0:.0f} s, {left / 60:.1f} min left{what}",
+            file=self.stream,
+            flush=True,
+        )

@@ -1,0 +1,133 @@
+"""The figures of a proof as lines and as tables for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from rich.table import Table
+
+from thermoctl.proof.recordings import Entry
+
+Line = tuple[
+    str, str, str, str, str, bool | None
+]  # figure, is, 95 % interval, of, goal, whether it is reached
+
+_TITLES = {
+    "false_alarms": "false alarms on nothing missing",
+    "detected_large": "detected, large",
+    "detected_middle": "detected, middle",
+    "detected_small": "detected, small",
+    "exact_name": "exact name",
+    "name_or_its_like": "name, or one the data cannot tell from it",
+    "right_when_named": "right when it names (or its like)",
+    "right_when_named_exactly": "right when it names, exactly",
+    "inside_the_set": "truth (or its like) inside the set",
+    "inside_the_set_exactly": "truth itself inside the set",
+    "place_right": "place right",
+    "onset_within_2_percent": "onset within 2 % of the record",
+    "unknown_called_unknown": "unknown called unknown",
+    "confidently_misnamed": "unknown named with confidence",
+    "pairs_both_right": "pairs: both right",
+    "pairs_one_right": "pairs: at least one right",
+    "interval_coverage": "95 % intervals that hold the parameter",
+    "failed": "diagnosis failed",
+}
+_NUMBERS = {
+    "half_found_at_all": "found half of the time, sigmas of an ideal test",
+    "half_found_at_white": "the same in white noise",
+    "half_found_at_coloured": "the same in coloured noise",
+    "calibration_error": "calibration error of the probabilities",
+    "gain_median": "held-out gain, share of the oracle's, median",
+    "gain_worst_tenth": "held-out gain, worst tenth",
+    "parameter_error_median": "effect parameter error, median",
+    "set_size_when_ambiguous": "names in an ambiguous set",
+    "seconds_median": "seconds a case, median",
+    "seconds_longest": "seconds a case, longest",
+}
+
+
+def table(content: Mapping[str, Any]) -> Table:
+    """Show the figures of a proof."""
+    t = Table(
+        title=f"{content['figures']['cases']} cases, thermoctl {content['version']} ({content['commit']})"
+    )
+    t.add_column("figure")
+    for title in ("is", "95 % interval", "of", "goal"):
+        t.add_column(title, justify="right")
+    for line in lines(content):
+        t.add_row(*line[:5], style="red" if line[5] is False else None)
+    return t
+
+
+def lines(content: Mapping[str, Any]) -> Iterator[Line]:
+    """Yield each measured figure with its interval, its number of cases and its goal."""
+
+    def goal(key: str, percent: bool) -> tuple[str, bool | None]:
+        g = content["goals"].get(key)
+        if g is None:
+            return "", None
+        sign = "≥" if g["at"] == "least" else "≤"
+        return (f"{sign} {100 * g['goal']:.0f} %" if percent else f"{sign} {g['goal']:g}"), g["reached"]
+
+    for key, title in _TITLES.items():
+        s = content["shares"][key]
+        if s["n"]:
+            text, reached = goal(key, True)
+            yield (
+                title,
+                f"{100 * s['share']:.1f} %",
+                f"{100 * s['low']:.0f}–{100 * s['high']:.0f} %",
+                f"{s['k']}/{s['n']}",
+                text,
+                reached,
+            )
+    for key, title in _NUMBERS.items():
+        value = content["figures"][key]
+        if value is not None:
+            text, reached = goal(key, False)
+            curve = content["found_by_size"].get(key.removeprefix("half_found_at_"))
+            wide, of = (f"{curve['low']:.1f}–{curve['high']:.1f}", str(curve["n"])) if curve else ("", "")
+            yield title, f"{value:.3g}", wide, of, text, reached
+    yield from _open_lines(content["open_world"])
+
+
+def _open_lines(found: Mapping[str, Any]) -> Iterator[Line]:
+    """Yield the lines of the cases with small misfits that nobody will name."""
+    for key, s in found.get("shares", {}).items():
+        if s["n"]:
+            wide = f"{100 * s['low']:.0f}–{100 * s['high']:.0f} %"
+            yield (
+                f"open world: {key.replace('_', ' ')}",
+                f"{100 * s['share']:.1f} %",
+                wide,
+                f"{s['k']}/{s['n']}",
+                "",
+                None,
+            )
+    for key in ("strays_per_diagnosis", "calibration_error", "gain_median"):
+        if found.get(key) is not None:
+            yield f"open world: {key.replace('_', ' ')}", f"{found[key]:.3g}", "", "", "", None
+
+
+def real_table(entries: Sequence[Entry]) -> Table:
+    """Show the diagnoses of real recordings, under each its README's lines on published figures."""
+    t = Table(title="Real recordings, each from its naive plant")
+    for title in (
+        "recording",
+        "verdict",
+        "effect at place (probability)",
+        "held-out rms: as it was → refit → extended",
+        "s",
+    ):
+        t.add_column(title)
+    for x in entries:
+        found = "\n".join(f"{a} at {b} ({p:.2f})" for a, b, p in x.findings) or (x.error or "")
+        rms = "\n".join(
+            f"{o}: " + " → ".join("–" if v is None else f"{v:.4g}" for v in three)
+            for o, three in x.held_out.items()
+        )
+        t.add_row(x.name, x.verdict, found, rms, f"{x.seconds or 0:.0f}")
+        for line in x.published:
+            t.add_row("", "", f"[dim]README: {line[:110]}[/dim]", "", "")
+    return t
