@@ -12,7 +12,7 @@ LIMITS = {
     "thermoctl.daemon": 155,
     "thermoctl.diagnose": 321,
     "thermoctl.evaluate": 107,
-    "thermoctl.identify": 60,
+    "thermoctl.identify": 34,
     "thermoctl.plant": 2,
 }
 

@@ -8,6 +8,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hal.simulated import PlantRig
 from tests.plants import ONE_BLOCK, SPRING_STAGE, TWO_BLOCKS
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import FLICKER_DECADES, ROLES, SensorNoise
@@ -167,6 +168,28 @@ def test_slow_noise_follows_the_times_of_unequal_samples():
     e = error(SensorNoise(0.0, 1.0, 50.0), t, rng)
     near, far = np.mean(e[1::2] * e[:-1:2]), np.mean(e[2::2] * e[1:-1:2])
     assert near == pytest.approx(np.exp(-1 / 50), abs=0.05) and far == pytest.approx(np.exp(-2), abs=0.05)
+
+
+def test_the_simulated_rig_has_the_slow_parts_too(tmp_path):
+    (tmp_path / "rig.yaml").write_text(
+        "format: thermoctl-plant/1\ninputs: {u: {}}\nnodes: {x: {storage: 1, initial: 0}}\n"
+        "flows: {f: {into: x, rate: u - x}}\n"
+        "outputs: {position_um: {value: x, noise: {white: 0, drift: 0.5, time: 0.02}}}\n"
+    )
+
+    def readings():
+        rig = PlantRig(tmp_path / "rig.yaml", 1e-3, "u", {}, {}, seed=3)
+        found = []
+        for _ in range(20_000):
+            rig.step(0.0)
+            found.append(rig.sense("position_um"))
+        assert rig.true("position_um") == 0 and rig.sense("position_um") == found[-1], "one error an instant"
+        return np.array(found)
+
+    e = readings()
+    assert np.std(e) == pytest.approx(0.5, rel=0.15)
+    assert np.mean(e[1:] * e[:-1]) == pytest.approx(0.25 * np.exp(-0.05), rel=0.25)
+    assert np.array_equal(e, readings()), "the same seed gives the same bits"
 
 
 # -------------------------------------------------------------------------------------------- inputs and time

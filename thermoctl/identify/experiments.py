@@ -1,12 +1,12 @@
 """Experiments: setpoint, or inputs of any rig, over time, read from a file.
 
 An experiment has `parts`, which build a setpoint, or `inputs`: corners for each column of a recording. If the
-only input is setpoint_um, it is a schedule and runs on the daemon's tick. For another rig, a person runs it from
-the CSV beside it, or a plant file simulates it.
+only input is setpoint_um, it is a schedule and runs on the daemon's tick. For another rig, a person runs it
+from the CSV beside it, or a plant file simulates it.
 
-A schedule is a list of (seconds, um) corners, joined by straight lines; the law's rate limiter makes the ramps.
-It runs under all protections and gives a recording. A fault ends it, nothing recorded is lost, and it can be
-resumed at the same time.
+A schedule is a list of (seconds, um) corners, joined by straight lines; the law's rate limiter makes the
+ramps. It runs under all protections and gives a recording. A fault ends it, nothing recorded is lost, and it
+can be resumed where it stopped.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class Inputs:
     """An experiment that drives inputs of a rig.
 
     `corners`: column to (K, 2) of seconds and value, joined by straight lines up to duration_s and sampled
-    every sample_s. `assumed`: values of the columns that are not driven. `predicted`: lowest and highest value
-    of each reading by the diagnosis."""
+    every sample_s. `assumed`: values of the columns that are not driven. `predicted`: lowest and highest
+    value of each reading by the diagnosis."""
 
     name: str
     title: str
@@ -231,8 +231,8 @@ def design_pulses(
 ) -> tuple[list[float], list[float]]:
     """Return widths and gaps of `count` power pulses that fill `active_s`, none shorter than `least_s`.
 
-    They maximise the geometric mean of the alternating power in four bands below `cutoff_hz`. Raises InputError
-    when they do not fit."""
+    They maximise the geometric mean of the alternating power in four bands below `cutoff_hz`. Raises
+    InputError when they do not fit."""
     unit = active_s / (4 * count)
     lengths = [v for v in (0.5 * unit, unit, 1.5 * unit, 2 * unit, 3 * unit, 4 * unit) if v >= least_s]
     best, found = -np.inf, None

@@ -6,11 +6,15 @@ MKF    output as state (33), scalar gain of the coil's row (34), (35), mapped to
        test)^2 + R_v, as the paper takes it from both (its 0.46 degC)
 Kalman x(n+1) = A x + B [power, d(air)/dt] + w, y = C x + v, rises above the air.
 
-The air's rate is a known input with a known effect: when only the air warms by 1 K, every rise falls by 1 K, so
-C b_air = -1. The process noise w has four parts: an error of the coil's heat (b b'), a drift of all points against
-the air (b_air b_air'), outside heat into one body (C+ C+'), and a slowly decaying outside heat as a disturbance
-state. Their variances come from the calibration, where all twelve points are measured: the filter with them
-estimates the twelve points best from the coil alone.
+The air's rate is a known input with a known effect: when only the air warms by 1 K, every rise falls by 1 K,
+so C b_air = -1. The process noise w has four parts:
+- an error of the coil's heat (b b')
+- a drift of all points against the air (b_air b_air')
+- outside heat into one body (C+ C+')
+- a slowly decaying outside heat as a disturbance state
+
+Their variances come from the calibration, where all twelve points are measured. They are those with which the
+filter estimates the twelve points best from the coil alone.
 """
 
 from __future__ import annotations

@@ -4,17 +4,19 @@ A passive heat network (RC) has real poles, so its response to heat u is y(n) = 
 p_k^n with s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only the poles are
 searched.
 
-1. One pass over the samples reduces them to blocks of q samples: the mean of each output, and the first r moments of
-   each input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block. Its end state and its mean
-   depend on the inputs with weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p). Three moments represent both to 1e-4 of the
-   smallest effect of a block, so averaging 10 000 samples of 1 ms into one of 10 s loses no slow dynamics.
+1. One pass over the samples reduces them to blocks of q samples: the mean of each output, and the first r
+   moments of each input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block. Its end
+   state and its mean depend on the inputs with weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p). Three moments
+   represent both to 1e-4 of the smallest effect of a block, so averaging 10 000 samples of 1 ms into one of
+   10 s loses no slow dynamics.
 2. Variable projection (Golub and Pereyra 1973) with Kaufman's simplification over x_k = ln(time constant):
    J'J = (dF' P dF) o (T T'), J'r = -diag(dF' r T'), F (J, K) block responses, T the residues, P the projector off F.
 3. The order is the one with the least BIC.
-4. The residual is not white: the chamber, the bench and unmeasured heat move temperatures for hours. Plain least
-   squares then fits the slowest, most disturbed part of the record hardest. With `drift_s` = (td, tc) the residual is
-   white noise plus a first-order drift of time constant td. The drift exceeds the noise below 1/(2 pi tc). Outputs and
-   responses first pass the whitening filter (1 - exp(-T/td) z^-1)/(1 - exp(-T/tc) z^-1) (generalised least squares).
+4. The residual is not white: the chamber, the bench and unmeasured heat move temperatures for hours. Plain
+   least squares then fits the slowest, most disturbed part of the record hardest. With `drift_s` = (td, tc)
+   the residual is white noise plus a first-order drift of time constant td. The drift exceeds the noise below
+   1/(2 pi tc). Outputs and responses first pass the whitening filter (1 - exp(-T/td) z^-1)/(1 - exp(-T/tc)
+   z^-1) (generalised least squares).
 All models are stable by construction.
 """
 
