@@ -19,10 +19,10 @@ help:                              # this list
 	@grep -hE '^[a-z-]+:.*#' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*# */\1\t/' | sort | awk -F'\t' '{printf "  make %-22s %s\n", $$1, $$2}'
 
 RUNS ?= 5
-first-minute: install              # errors with and without compensation at 20, 60 and 120 s of RUNS demos, from their own recordings
+first-minute: install              # errors with and without compensation at 20, 60 and 120 s, from the recordings of RUNS demos
 	$(BIN)/python tests/first_minute.py $(RUNS)
 
-rig-hour: install                  # an hour of rig time in the paper's trapezoids, compensation on and off, judged by the reference encoder
+rig-hour: install                  # an hour of rig time in the paper's trapezoids, compensation on and off, measured by the reference encoder
 	$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1
 	-$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1 --no-compensation
 
@@ -36,7 +36,7 @@ test: develop lint                 # lint and all quick tests
 PROOF ?= build/proof
 SEED ?= 7
 NUMBER ?= 600
-prove: develop                     # the full proof on concealed cases: made, sealed, diagnosed, scored; hours; goes on where it stopped
+prove: develop                     # the full proof on concealed cases: made, sealed, diagnosed, scored; hours; run again to continue
 	$(BIN)/python -m tests.concealed.generate --out $(PROOF)/cases --answers $(PROOF)/answers --number $(NUMBER) --seed $(SEED)
 	$(BIN)/thermoctl prove $(PROOF)/cases --answers $(PROOF)/answers --out $(PROOF)/result
 
@@ -67,10 +67,10 @@ $(VENV)/.developed: $(VENV)/.installed pyproject.toml
 	@$(PIP) --requirement $(VENV)/needs
 	@touch $@
 
-reproduce: install                 # the paper's tests, and the better method beside them
+reproduce: install                 # the paper's tests by its method and by the better one
 	$(BIN)/thermoctl reproduce
 
-bench-identification: develop      # all bars in one run; 18 million samples take 4 GB for the peer and some minutes
+bench-identification: develop      # identification beside other methods; 18 million samples take 4 GB for the peer and some minutes
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/identification.py --scale
 
@@ -83,24 +83,24 @@ clean:                             # remove .venv, build and compiled files
 	find thermoctl hal -name '*.pyx' -o -name '*.pxd' | sed 's/p.x*d*$$/c/' | xargs rm -f
 
 .PHONY: models
-models: install                    # the compensator's models that are shipped, computed from the plant file
+models: install                    # the shipped compensator models, computed from the plant file
 	$(BIN)/thermoctl plant linearise config/plants/actuator_thermal.yaml --rig simulated --out config/models/simulated.yaml --replace
 	$(BIN)/thermoctl plant linearise config/plants/actuator_thermal.yaml --rig wire --out config/models/wire.yaml --replace
 
 .PHONY: bench
-bench: develop                     # plants against scipy and CasADi
+bench: develop                     # speed of plants beside scipy and CasADi
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/plant.py
 
 .PHONY: prove-refit refit-recordings
-prove-refit: develop               # do 95 % intervals hold the truth? 100 truths a kind of rig and noise
+prove-refit: develop               # share of 95 % intervals that contain the true parameter: 100 truths for each rig and noise
 	nice -n 15 $(BIN)/python tests/plant/prove_refit.py
 
-refit-recordings: develop          # every fit quoted for the naive plants of the real recordings, and ours
+refit-recordings: develop          # fits of real recordings, beside the published fits of the same structure
 	$(BIN)/python -m pytest -m slow -s tests/plant/test_refit_recordings.py
 
 .PHONY: test-resolve
-test-resolve: develop              # two explanations that look alike, decided by the experiment that was proposed
+test-resolve: develop              # two equally good effects, separated by the proposed experiment
 	$(BIN)/python -m pytest -m slow tests/diagnose/test_next_experiment.py
 
 .PHONY: test-wire
@@ -108,11 +108,11 @@ test-wire: develop                 # pulled cables and killed programs, with the
 	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py
 
 .PHONY: test-browser
-test-browser: develop              # pages in headless Chromium (Debian: apt-get install chromium)
+test-browser: develop              # the dashboard in headless Chromium (Debian: apt-get install chromium)
 	$(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py
 
 .PHONY: pictures
-pictures: develop                  # the same, and its screenshots into docs/images
+pictures: develop                  # test-browser, and its screenshots into docs/images
 	THERMOCTL_PICTURES=docs/images $(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py tests/people/test_calibrate.py
 
 .PHONY: test-fleet
@@ -124,20 +124,20 @@ test-wizard: develop               # thermoctl calibrate from doctor to proof, w
 	$(BIN)/python -m pytest -m slow tests/people/test_calibrate.py
 
 .PHONY: bench-diagnosis
-bench-diagnosis: develop           # the diagnosis beside its peers on the same cases; CASES= takes other folders of cases with answers
+bench-diagnosis: develop           # the diagnosis beside other methods on the same cases; CASES= other folders of cases with answers
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/diagnosis.py $(CASES)
 
 .PHONY: demo-concealed
-demo-concealed: develop            # six and more effects concealed in rigs of the judge's own making: diagnosed, modelled, compensated
+demo-concealed: develop            # seven hidden effects on independently simulated rigs: diagnosed, modelled, compensated
 	$(BIN)/python -m tests.concealed.demo
 
 .PHONY: hazards
-hazards: develop                   # every hazard with its limit; the table of what was measured goes to docs/proof/hazards.md
+hazards: develop                   # every hazard with its limit; measured results in docs/proof/hazards.md
 	THERMOCTL_HAZARDS=docs/proof/hazards.md $(BIN)/python -m pytest -m "slow or not slow" tests/hazards
 
 .PHONY: causes
-causes: install                    # 27 broken things, the first line that is shown, its remedy: docs/proof/causes.md
+causes: install                    # 27 injected causes, the first line shown for each, its remedy: docs/proof/causes.md
 	THERMOCTL_CAUSES=docs/proof/causes.md $(BIN)/python -m pytest -m slow tests/people/test_causes.py
 
 .PHONY: walkthrough
@@ -149,7 +149,7 @@ test-scale: develop                # a Dask scheduler and workers started by han
 	$(BIN)/python -m pytest -m slow tests/proof/test_proof.py
 
 .PHONY: mutants
-mutants: develop                   # protection and arming: every branch reached, every mutant of the source broken or explained
+mutants: develop                   # protection and arming: every branch covered, every mutant of the source caught or explained
 	$(BIN)/python -m pytest -m slow tests/control/test_protection.py
 	$(BIN)/python -m tests.control.mutants --page docs/proof/mutants.md
 
@@ -161,15 +161,15 @@ bench-realtime: develop            # the loop beside cyclictest, C twins and pys
 	$(BIN)/python -m tests.bench.realtime.steady
 
 .PHONY: systemd-test
-systemd-test: develop              # the unit in a really booted systemd (root; Debian: systemd-container, mmdebstrap)
+systemd-test: develop              # the unit in a booted systemd (root; Debian: systemd-container, mmdebstrap)
 	$(BIN)/python -m pytest -q -s -m slow tests/systemd
 
 .PHONY: qemu-test
-qemu-test: develop                 # SocketCAN for real in a qemu guest (root; Debian: qemu-system-x86, mmdebstrap)
+qemu-test: develop                 # SocketCAN in a qemu guest (root; Debian: qemu-system-x86, mmdebstrap)
 	$(BIN)/python -m pytest -q -s -m slow tests/qemu
 
 .PHONY: diagnose-recordings
-diagnose-recordings: develop       # real rigs from their naive plants: what is named, where, and its worth on unseen data
+diagnose-recordings: develop       # real recordings with naive plants: effect, place and gain on held-out data
 	$(BIN)/python -m pytest -m slow -s --no-header tests/diagnose/test_recordings.py
 
 .PHONY: fuzz

@@ -116,7 +116,7 @@ def texts(path: Path) -> Iterator[Text]:
                 yield from comments()
             block.append(t)
         elif t.type == tokenize.STRING and last == tokenize.NEWLINE and tokens[i + 1].type in _AFTER:
-            if t.string.strip('"').startswith("/*"):
+            if t.string.strip('"').lstrip().startswith("/*"):
                 continue  # C for Cython
             yield from comments()
             text = t.string.strip("rRbBfF").strip("\"'").replace("\n" + " " * t.start[1], "\n")

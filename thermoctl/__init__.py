@@ -1,3 +1,3 @@
-"""thermoctl: thermal compensation of a precision linear actuator, and the diagnosis of physics its model left out."""
+"""thermoctl: thermal compensation of a precision linear actuator, and diagnosis of missing physics."""
 
 __version__ = "0.1.0"

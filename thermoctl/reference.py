@@ -2,8 +2,9 @@
 
 `python -m thermoctl.reference [--check]`.
 
-docs/reference/{configuration,signals,faults,effects,cli,commands-that-act}.md and docs/faults/NAME.md. With --check nothing is
-written; exit status 1 says which page is stale.
+They are configuration, signals, faults, effects, cli and commands-that-act in docs/reference, and one page a
+fault in docs/faults.
+With --check nothing is written; exit status 1 if a page is stale, and its name on stderr.
 """
 
 from __future__ import annotations

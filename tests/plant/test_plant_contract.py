@@ -8,9 +8,11 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hal.simulated import PlantRig
 from tests.plants import ONE_BLOCK, SPRING_STAGE, TWO_BLOCKS
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import FLICKER_DECADES, ROLES, SensorNoise
+from thermoctl.plant.refit import fit, updated
 from thermoctl.plant.residuals import default_noise
 from thermoctl.plant.sensor import error
 from thermoctl.plant.simulate import compile_plant
@@ -169,6 +171,28 @@ def test_slow_noise_follows_the_times_of_unequal_samples():
     assert near == pytest.approx(np.exp(-1 / 50), abs=0.05) and far == pytest.approx(np.exp(-2), abs=0.05)
 
 
+def test_the_simulated_rig_has_the_slow_parts_too(tmp_path):
+    (tmp_path / "rig.yaml").write_text(
+        "format: thermoctl-plant/1\ninputs: {u: {}}\nnodes: {x: {storage: 1, initial: 0}}\n"
+        "flows: {f: {into: x, rate: u - x}}\n"
+        "outputs: {position_um: {value: x, noise: {white: 0, drift: 0.5, time: 0.02}}}\n"
+    )
+
+    def readings():
+        rig = PlantRig(tmp_path / "rig.yaml", 1e-3, "u", {}, {}, seed=3)
+        found = []
+        for _ in range(20_000):
+            rig.step(0.0)
+            found.append(rig.sense("position_um"))
+        assert rig.true("position_um") == 0 and rig.sense("position_um") == found[-1], "one error an instant"
+        return np.array(found)
+
+    e = readings()
+    assert np.std(e) == pytest.approx(0.5, rel=0.15)
+    assert np.mean(e[1:] * e[:-1]) == pytest.approx(0.25 * np.exp(-0.05), rel=0.25)
+    assert np.array_equal(e, readings()), "the same seed gives the same bits"
+
+
 # -------------------------------------------------------------------------------------------- inputs and time
 
 
@@ -299,6 +323,25 @@ def test_a_recording_has_its_own_value_of_a_parameter():
     assert unnamed == pytest.approx(cooled), "`value` stands for any other recording"
     with pytest.raises(InputError, match="per_recording: true"):
         loads(text.replace("per_recording: true, ", ""))
+
+
+def test_a_refit_finds_a_value_for_each_recording_and_their_mean_inside_the_range_only():
+    plant = loads(
+        "format: thermoctl-plant/1\ninputs: {u: {}}\n"
+        "parameters: {b: {value: 1, range: [-5, 5], per_recording: true}, k: {value: 2}}\n"
+        "outputs: {y: {value: k * u + b, noise: 0.01}}\n"
+    )
+    u = np.arange(40) / 40
+    tables = [table(u=u, y=3 * u + b) for b in (0.5, 1.5, 9.0)]  # k is known, and b = 9 is not physical
+    tables = [dataclasses.replace(t, name=n) for t, n in zip(tables, "abc", strict=True)]
+    model = compile_plant(plant)
+    excitations = [model.excitation(t) for t in tables]
+    fitted = updated(plant, fit(model, excitations), excitations).parameters
+    assert fitted["k"].value == 2, "a parameter without a range is known"
+    middle = np.mean(u)  # b takes the mean error of k
+    values = fitted["b"].values
+    assert values == pytest.approx({"a": 0.5 + middle, "b": 1.5 + middle, "c": 5.0}, abs=0.02)
+    assert fitted["b"].value == pytest.approx(np.mean(list(values.values())))
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,11 @@ output error     the regressor holds the model's own past output. For a given f1
 ridge            thermometers are noisy: gains g multiply their noise (quantisation step^2/12 and the sensor's own variance,
                  less what the filter 1/(z - f1) averages away: (1 - f1)/(1 + f1)). Adding N sigma^2 g'g to the criterion
                  minimises the expected squared error *with such inputs*: 25 nearly collinear parameters need that.
-The time constant itself cannot be told with so many parameters; the prediction can.
+With so many parameters the time constant itself is not determined; the prediction is.
 
-The output moves with the bodies' absolute temperatures, the models speak of rises above the air. T_abs = rise
-+ air, so air enters with the sum of all gains: b_air = sum(b1 + b2). A free air regressor is not excited in
-two hours.
+The output moves with the bodies' absolute temperatures, but the model has rises above the air. T_abs = rise +
+air, so air enters with the sum of all gains: b_air = sum(b1 + b2). Two hours of test do not excite a free air
+regressor.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Experiments: what the setpoint, or any rig's inputs, do over time, as data from a file.
+"""Experiments: setpoint, or inputs of any rig, over time, read from a file.
 
-An experiment is made of `parts` (what the setpoint does) or lists `inputs`: a recording's column with its
-corners each. One whose only input is setpoint_um is a schedule like any other and runs on the daemon's own
-tick; another rig's is run by a person from the CSV beside it, or on a plant file in its place.
+An experiment has `parts`, which build a setpoint, or `inputs`: corners for each column of a recording. If the
+only input is setpoint_um, it is a schedule and runs on the daemon's tick. For another rig, a person runs it
+from the CSV beside it, or a plant file simulates it.
 
-A schedule is a list of (seconds, um) corners, joined by straight lines; the law's own rate limiter makes the
-ramps. Running it gives a recording. It runs under all protections: a fault ends it, nothing recorded is lost,
-and it can be resumed where it stood.
+A schedule is a list of (seconds, um) corners, joined by straight lines; the law's rate limiter makes the
+ramps. It runs under all protections and gives a recording. A fault ends it, nothing recorded is lost, and it
+can be resumed where it stopped.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Inputs:
     """An experiment that drives inputs of a rig.
 
     `corners`: column to (K, 2) of seconds and value, joined by straight lines up to duration_s and sampled
-    every sample_s. `assumed`: the values of the columns that nobody drives. `predicted`: the lowest and highest
-    value of each reading that the diagnosis expects."""
+    every sample_s. `assumed`: values of the columns that are not driven. `predicted`: lowest and highest
+    value of each reading by the diagnosis."""
 
     name: str
     title: str
@@ -230,8 +230,8 @@ def design_pulses(
 ) -> tuple[list[float], list[float]]:
     """Return widths and gaps of `count` power pulses that fill `active_s`, none shorter than `least_s`.
 
-    They put the largest part of their alternating power below `cutoff_hz`, spread over the band: the
-    geometric mean of the power in four bands is maximised. Raises InputError when they do not fit."""
+    They maximise the geometric mean of the alternating power in four bands below `cutoff_hz`. Raises
+    InputError when they do not fit."""
     unit = active_s / (4 * count)
     lengths = [v for v in (0.5 * unit, unit, 1.5 * unit, 2 * unit, 3 * unit, 4 * unit) if v >= least_s]
     best, found = -np.inf, None
@@ -294,7 +294,7 @@ class Progress:
 
 
 class Aborted(Exception):
-    """The run ended before its time: `reason`; what was recorded is kept, `done_s` says how far it came."""
+    """The run ended early for `reason` after `done_s` seconds; the recording is kept."""
 
     def __init__(self, reason: str, done_s: float):
         super().__init__(reason)
@@ -302,7 +302,7 @@ class Aborted(Exception):
 
 
 class ScheduleTarget(Protocol):
-    """What a schedule runs on: `daemon.simulate.Simulation`, or a rig of the same methods."""
+    """A rig that runs a schedule: `daemon.simulate.Simulation`, or another with the same methods."""
 
     @property
     def row(self) -> np.ndarray:

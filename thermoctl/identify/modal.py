@@ -4,17 +4,19 @@ A passive heat network (RC) has real poles, so its response to heat u is y(n) = 
 p_k^n with s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only the poles are
 searched.
 
-1. One pass over the samples forms, for blocks of q samples, the mean of each output and the first r moments of each
-   input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block, and both the block's end state and its
-   mean depend on the inputs through weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p), which r = 3 moments carry to 1e-4 of
-   a block's slightest effect: nothing of the slow dynamics is lost by averaging 10 000 samples of 1 ms into one of 10 s.
+1. One pass over the samples reduces them to blocks of q samples: the mean of each output, and the first r
+   moments of each input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block. Its end
+   state and its mean depend on the inputs with weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p). Three moments
+   represent both to 1e-4 of the smallest effect of a block, so averaging 10 000 samples of 1 ms into one of
+   10 s loses no slow dynamics.
 2. Variable projection (Golub and Pereyra 1973) with Kaufman's simplification over x_k = ln(time constant):
    J'J = (dF' P dF) o (T T'), J'r = -diag(dF' r T'), F (J, K) block responses, T the residues, P the projector off F.
 3. The order is the one with the least BIC.
-4. What no input explains is not white: the chamber, the bench and heat nobody measures move temperatures for hours. Plain least squares
-   then fits the slowest, most disturbed part of the record hardest. With `drift_s` = (td, tc) the residual is taken as a first-order drift,
-   forgotten in td, over white noise, the drift standing above the noise below 1/(2 pi tc): outputs and responses pass its whitening filter
-   (1 - exp(-T/td) z^-1)/(1 - exp(-T/tc) z^-1) first (generalised least squares).
+4. The residual is not white: the chamber, the bench and unmeasured heat move temperatures for hours. Plain
+   least squares then fits the slowest, most disturbed part of the record hardest. With `drift_s` = (td, tc)
+   the residual is white noise plus a first-order drift of time constant td. The drift exceeds the noise below
+   1/(2 pi tc). Outputs and responses first pass the whitening filter (1 - exp(-T/td) z^-1)/(1 - exp(-T/tc)
+   z^-1) (generalised least squares).
 All models are stable by construction.
 """
 
@@ -37,8 +39,9 @@ MOMENTS = 3
 class Blocks:
     """Recordings reduced to J blocks of `q` samples.
 
-    `u` (J, m, r) input moments, `y` (J, l) output means (NaN: no sample), `weight` (J, l) share of samples in
-    each mean, `period_s` of the samples, `basis` (r, q) the polynomials."""
+    - `u` (J, m, r): input moments; `basis` (r, q): their polynomials
+    - `y` (J, l): output means (NaN: no sample); `weight` (J, l): share of samples in each mean
+    - `period_s`: of the samples"""
 
     u: np.ndarray
     y: np.ndarray
@@ -147,7 +150,7 @@ def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, 
             s, ds = kernels.decays(pq[k : k + 1], np.ascontiguousarray(end[:, m])[None])
             t, _ = kernels.decays(pq[k : k + 1], np.ascontiguousarray(dend[:, m])[None])
             s, ds = s[0], ds[0] * dpq[k] + t[0]
-            # scaled by (1 - p): every column is then of the input's size, whatever its time constant
+            # scaled by (1 - p), so that every column has the size of the input for any time constant
             f = first * s + mean[:, m]
             df = dfirst * s + first * ds + dmean[:, m]
             F.append((1 - p[k]) * f)

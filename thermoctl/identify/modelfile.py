@@ -1,8 +1,8 @@
 """Calibrations on disk: one YAML file each, in a folder that only the program writes.
 
-A file holds the compensator's coefficients with units and sampling, the SHA-256 of each recording that they
-were made from, the fit's figures, the rig's name and the date. `current` in the folder names the one in use;
-older ones stay for a roll back. A file is refused when its checksum, its shape or its rig do not fit."""
+A file holds the compensator's coefficients with units and sampling, the fit's figures, the rig's name and the
+date. It lists the SHA-256 of each recording used. `current` in the folder names the one in use; older ones stay
+for a roll back. A file is refused when its checksum, its shape or its rig do not fit."""
 
 from __future__ import annotations
 
@@ -118,9 +118,7 @@ def load_calibration(path: str | Path, rig: str | None = None) -> Calibration:
 
 
 def load_model(path: str | Path, rig: str | None = None) -> CompensatorModel:
-    """Return the compensator's model of a calibration; what the daemon calls.
-
-    Raises as `load_calibration`."""
+    """Return the compensator's model of a calibration, for the daemon. Raises as `load_calibration`."""
     return load_calibration(path, rig).model
 
 
@@ -210,7 +208,7 @@ def _checksum(content: dict[str, Any]) -> str:
 
 
 def _canonical(v: Any) -> Any:
-    """Numbers by value (1 and 1.0 alike), mappings in order of key."""
+    """Numbers by value (1 equals 1.0), mappings in order of key."""
     if isinstance(v, dict):
         return [(k, _canonical(v[k])) for k in sorted(v)]
     if isinstance(v, list):

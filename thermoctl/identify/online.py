@@ -1,11 +1,11 @@
 """Tuning the expansion model while a reference encoder is present.
 
-Nothing is learnt before the rig has moved through what it shall be good for: samples are counted in buckets
-of coil temperature and of its trend (warming, cooling); progress is the part of the buckets that are full.
-The newest samples (`hold_s`) are kept back from the bank of output-error estimators, which is fed the older
-ones; its proposal is taken only where it explains what was kept back better. Static gains stay within bounds
-round the calibrated ones, also after many tunings: a tuned model carries the gains of the calibration it came
-from. Every change is a calibration of its own (`modelfile.install`), so it can be rolled back.
+Nothing is proposed before the rig has covered its range. Samples are counted in buckets of coil temperature and
+of its trend (warming, cooling); progress is the share of full buckets. A bank of output-error estimators learns
+from all but the newest samples (`hold_s`). Its proposal is accepted only if it predicts those better.
+
+Static gains stay within bounds of the calibrated ones, also after many tunings, because a tuned model carries the
+gains of its first calibration. Every change is a calibration (`modelfile.install`), so it can be rolled back.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from thermoctl.identify.expansion import Bank, Expansion
 class Tuner:
     """Feed `update` with estimated rises and the reference; ask `progress` and `proposal`.
 
-    buckets: coil temperature rises K between which samples are sought; `full` samples fill one; `clip` bounds
-    the change of each gain as a part of the largest calibrated gain; the newest `hold_s` seconds are the
-    test."""
+    - buckets: edges of the buckets, coil temperature rises in K; `full` samples fill one
+    - `clip`: largest change of each gain, as a share of the largest calibrated gain
+    - `hold_s`: seconds of newest samples that are the test"""
 
     def __init__(
         self,
@@ -47,8 +47,8 @@ class Tuner:
     def update(self, rises_k: np.ndarray, error_um: float, air_k: float = 0.0) -> None:
         """One sample at the expansion model's period.
 
-        Estimated rises (12,), the measured position error (NaN: no reference), and how much warmer than at
-        the start the air is (the bodies' own temperatures are what expands them)."""
+        Arguments: estimated rises (12,), the measured position error (NaN: no reference), and the rise of the air
+        since the start. Bodies expand with their absolute temperature, hence the air."""
         coil = float(rises_k[0])
         if self.last_coil is not None:
             self.slow += 0.02 * ((coil - self.last_coil) - self.slow)

@@ -71,14 +71,14 @@ class StateSpace:
             axis=-1,
         )
         here = np.isfinite(y)
-        # over a short stretch slow states look alike: a ridge keeps what cannot be told apart small
+        # slow states are nearly collinear over a short record: a ridge keeps them small
         return _ridge(columns[here], (y - free)[here][:, None], 1e-5)[:, 0]
 
     def output_form(self, tolerance: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
         """Return alpha (l, l), beta (l, m) of (33).
 
-        C is inverted with its singular values below `tolerance` of the largest left out: order 12 always
-        holds noise modes, cond(C) reached 3e5, and the plain inverse then amplifies them."""
+        The inverse of C omits singular values below `tolerance` of the largest. Order 12 always has noise modes:
+        cond(C) reached 3e5, and the plain inverse amplifies them."""
         return self.c @ self.a @ np.linalg.pinv(self.c, rcond=tolerance), self.c @ self.b
 
     def resample(self, period_s: float) -> StateSpace:

@@ -13,10 +13,10 @@ the paper's B (`paper`)   Z_i = Yf / [Wp; Uf], Z_{i+1} = Yf- / [Wp+; Uf-]       
 our B and x(0)            simulation least squares: y(n) = C A^n x0 + sum C A^(n-1-k) B u(k) is linear in B and x0; in modal
                           form its normal matrix is (C'C) o (S'S), S the modal states: no simulation per unknown.
 
-The Hankel matrix H is never formed. Only its Gram matrix H H' is needed, whose entries are lag correlations;
-every block follows from its upper left neighbour: G[s+1, t+1] = G[s, t] + z(s+N) z(t+N)' - z(s) z(t)'. They
-accumulate in one pass over the data, in bounded memory. H = L Q then has L from the Cholesky factor; where
-that breaks (noise-free data), from a blocked QR that carries only the triangle.
+The Hankel matrix H is never formed. Only its Gram matrix H H' of lag correlations is needed. Each block follows
+from its upper left neighbour: G[s+1, t+1] = G[s, t] + z(s+N) z(t+N)' - z(s) z(t)'. One pass over the data
+accumulates them in bounded memory. In H = L Q, L is the Cholesky factor. If that fails (noise-free data), a
+blocked QR gives L and keeps only the triangle.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def _gram(sums: np.ndarray, head: np.ndarray, tail: np.ndarray, columns: int) ->
     lags, w, _ = sums.shape
     g = np.empty((lags, w, lags, w))
     g[0] = sums.transpose(1, 0, 2)
-    tail = tail[-(lags - 1) :]  # z(columns .. columns + lags - 2)
+    tail = tail[-(lags - 1) :]  # samples z(columns) to z(columns + lags - 2)
     for s in range(1, lags):
         a = np.einsum("a,tb->atb", tail[s - 1], tail[s - 1 :])
         b = np.einsum("a,tb->atb", head[s - 1], head[s - 1 : lags - 1])
@@ -334,8 +334,8 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
     z_next = (target @ q) @ q.T
     state = np.hstack([pin_i @ z_i, np.zeros((n, L.shape[1] - np_))])
     left = np.vstack([pin_less @ z_next, yf[:l]]) - np.vstack([a, c]) @ state
-    # (24) regressed on Uf, and (25), (26) linear in B (D = 0), solved together: min |left - N(B) Uf|. Solving for K
-    # first and for B from K without weights is the same without noise, and far worse with it: Uf of long pulses
+    # Solve (24), and (25), (26), which are linear in B (D = 0), together: min |left - N(B) Uf|. Solving for K first
+    # and then for B without weights is equal without noise. With noise it is far worse, because Uf of long pulses
     # is nearly singular.
     nu_factor = uf[:, :nu]
     target = left[:, :nu]  # left, projected on Uf

@@ -1,14 +1,22 @@
-"""PID tuning: the response of position to drive, fitted to a recording of the closed loop, and gains proposed from it.
+"""PID tuning: fit the response of position to drive to a recording of the closed loop, and propose gains.
 
 PID, velocity form (41): D(s) = Kp (1 + 1/(Ti s) + Td s)
-Response: K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)), by the direct method of closed-loop identification (Ljung, System Identification,
-2nd ed., section 13.5): recorded drive in, recorded position out, output error least squares. The loop answers a sample's noise one
-period later at the earliest, so white noise of the encoder does not bias the fit.
-Ziegler-Nichols (Table I): Kp = 1.2 tau_c/(K0 tau_d), Ti = 2 tau_d, Td = 0.5 tau_d, with the tangent at the steepest point of the
-fitted step response. The steepest difference of noisy samples would be too steep (0.15 um of noise: Kp 21 % low; fitted: 0.1 %).
-Lambda / IMC (Rivera, Morari, Skogestad): series form Kc = t1/(K0 (lambda + theta)), tI = t1, tD = t2 (half rule for what is faster
-than theta); parallel form Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI + tD)
-Margins: of the sampled loop L(e^jw) = D(z) G(z), G with a zero-order hold and the dead time, moving average included.
+
+Response: K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)), by the direct method of closed-loop identification (Ljung,
+System Identification, 2nd ed., section 13.5): output error least squares from recorded drive to recorded
+position. The loop answers the noise of a sample one period later at the earliest. So white noise of the
+encoder does not bias the fit.
+
+Ziegler-Nichols (Table I): Kp = 1.2 tau_c/(K0 tau_d), Ti = 2 tau_d, Td = 0.5 tau_d, from the steepest tangent
+of the fitted step response. The steepest difference of noisy samples is too steep: with 0.15 um of noise Kp
+was 21 % low, fitted 0.1 %.
+
+Lambda / IMC (Rivera, Morari, Skogestad): series form Kc = t1/(K0 (lambda + theta)), tI = t1, tD = t2, with
+the half rule for faster lags than theta. Parallel form: Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI +
+tD).
+
+Margins are those of the sampled loop L(e^jw) = D(z) G(z). G has a zero-order hold, the dead time and the
+moving average.
 """
 
 from __future__ import annotations
@@ -74,8 +82,8 @@ class Gains:
 def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s: float) -> SecondOrder:
     """Fit the second order with dead time that gives positions y_um (N,) from drives (N,) at times t_s (N,).
 
-    Row k holds the position read and the drive written in the same tick of `period_s`; a missing tick kept the drive before it.
-    Raises InputError when the recording does not determine the response."""
+    Row k holds the position read and the drive written in the same tick of `period_s`; a missing tick kept
+    the drive before it. Raises InputError when the recording does not determine the response."""
     at = np.round((np.asarray(t_s) - t_s[0]) / period_s).astype(int)
     n = int(at[-1]) + 1
     if len(at) < 20:
