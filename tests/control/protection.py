@@ -919,6 +919,7 @@ def current_and_drive(module):
     b.set(current_a=0.0).tick(command=arming.DISARM).tick(2).tick(command=arming.ARM).set(current_a=0.5).tick(
         2
     ).well()
+
     # A slow meter: its reading is older than its arrival, and may be any drive since the reading before the last.
     def changing(sign):
         b = bench(current_tolerance_a=1.0).tick(2)
@@ -929,9 +930,11 @@ def current_and_drive(module):
     for sign in (1.0, -1.0):
         b = changing(sign).set(current_a=1.0).tick().well().tick().well()
         b.tick().safe("amplifier_not_following")
+        changing(sign).set(current_a=1.0 + sign).tick().well()  # the newest drive
         b = changing(sign).set(current_a=1.0 - 0.25 * sign).tick().well()
         b.set(current_a=1.0 - 0.375 * sign).tick().safe("amplifier_not_following")
     bench(current_per_drive=-0.5, current_tolerance_a=1.0).tick(4).safe("amplifier_not_following")
+    bench(current_per_drive=1.0, current_tolerance_a=0.5).safe("amplifier_not_following")
     Bench(module, current_per_drive=0.0, current_tolerance_a=0.25, agree_time_s=P).armed().set(
         current_a=9.0
     ).tick(3).well()

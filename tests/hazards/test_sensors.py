@@ -124,7 +124,11 @@ JUMP = {
     "output_reference_um": (100.0, 1, {"monitored_rate"}),
     "voltage_v": (2.0, 50, {"electrical_disagrees"}),
     "current_a": (0.5, 50, {"amplifier_not_following", "electrical_disagrees"}),
-    "air_c": (5.0, 200, {"air_rate"}),  # two readings in a row, 100 ticks apart: one proves no jump of a temperature
+    "air_c": (
+        5.0,
+        200,
+        {"air_rate"},
+    ),  # two readings in a row, 100 ticks apart: one proves no jump of a temperature
     "coil_c": (5.0, 200, {"coil_rate"}),
 }
 

@@ -94,7 +94,9 @@ def _watch(rigs: Rigs, seconds: float) -> tuple[bool, str]:
                     f"the machine stood, rig {name} {why}, bench {seen['stood_s'] * 1e3:.0f} ms", flush=True
                 )
                 stood += 1
-                with contextlib.suppress(AssertionError):  # it stood again meanwhile: the next look finds that
+                with contextlib.suppress(
+                    AssertionError
+                ):  # it stood again meanwhile: the next look finds that
                     rigs.arm(name)
                     rigs.until(name, lambda s: s["driven"], 5.0, "driven")
                     rigs.bench.tell("mark", name)
