@@ -935,9 +935,11 @@ def current_and_drive(module):
     for sign in (1.0, -1.0):
         b = changing(sign).set(current_a=1.0).tick().well().tick().well()
         b.tick().safe("amplifier_not_following")
+        changing(sign).set(current_a=1.0 + sign).tick().well()  # the newest drive
         b = changing(sign).set(current_a=1.0 - 0.25 * sign).tick().well()
         b.set(current_a=1.0 - 0.375 * sign).tick().safe("amplifier_not_following")
     bench(current_per_drive=-0.5, current_tolerance_a=1.0).tick(4).safe("amplifier_not_following")
+    bench(current_per_drive=1.0, current_tolerance_a=0.5).safe("amplifier_not_following")
     Bench(module, current_per_drive=0.0, current_tolerance_a=0.25, agree_time_s=P).armed().set(
         current_a=9.0
     ).tick(3).well()
