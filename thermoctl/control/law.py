@@ -229,12 +229,12 @@ def clip(value, low, high):
 
 
 class Typed:
-    """The numbers of Parameters, by the same names, with C types: the fields in law.pxd are generated."""
+    """The single numbers of Parameters, by the same names, with C types: the fields in law.pxd are generated."""
 
     def __init__(self, parameters: Parameters):
         for f in fields(parameters):
-            value = getattr(parameters, f.name)
-            setattr(self, f.name, value.copy() if f.name in BY_CHANNEL else value)
+            if f.name not in BY_CHANNEL:
+                setattr(self, f.name, getattr(parameters, f.name))
 
 
 class Law:
@@ -313,8 +313,10 @@ class Law:
     def configure(self, parameters: Parameters):
         """Take new gains and limits, all at once, between two ticks; the state stays."""
         self.parameters, self.p = parameters, Typed(parameters)
+        for name in BY_CHANNEL:
+            setattr(self, name, getattr(parameters, name).copy())
         for role in CODES:  # a state or an error number does not change while all is well
-            self.p.frozen_s[INDEX[role]] = np.inf
+            self.frozen_s[INDEX[role]] = np.inf
         length = int(min(max(parameters.moving_average, 1), MAX_AVERAGE))
         if self.tick > 0 and length != self.average_length:
             self.average = np.full(MAX_AVERAGE, self.position_um)  # the filter restarts at its own output
@@ -445,7 +447,7 @@ class Law:
             self.age[c] += self.dt
             self.since_s[c] += self.dt
             status = self.status[c]
-            if status == _ABSENT and self.p.required[c] == 0.0:
+            if status == _ABSENT and self.required[c] == 0.0:
                 self.verdict[c] = 1.0 + _K_ERROR
                 continue
             if status in (_ERROR, _ABSENT):
@@ -455,7 +457,7 @@ class Law:
             elif self.fresh[c]:
                 self._judge_reading(c, self.value[c])
                 self.age[c] = 0.0
-            elif self.age[c] > self.p.stale_s[c] or (self.seen[c] == 0.0 and self.verdict[c] == 0.0):
+            elif self.age[c] > self.stale_s[c] or (self.seen[c] == 0.0 and self.verdict[c] == 0.0):
                 self.verdict[c] = 1.0 + _K_STALE
             if self.verdict[c] > 0.0:
                 kind = _K_ERROR
@@ -463,7 +465,7 @@ class Law:
                     kind += 1
                 bit = one << _READING_BIT[c * _KINDS + kind]
                 self.faults |= bit
-                if self.p.required[c] > 0.0:
+                if self.required[c] > 0.0:
                     self.trips |= bit
                     if c in (_VOLTAGE, _CURRENT, _AIR, _COIL):
                         self.hold = 1
@@ -477,9 +479,9 @@ class Law:
         late = _DELAY_S * self.delay[c]
         elapsed = max(self.since_s[c] - late, self.period_s)
         thermal = _THERMAL <= c < _THERMAL_END
-        allowed = self.p.rate[c] * (max(elapsed, _THERMAL_S) if thermal else elapsed)
+        allowed = self.rate[c] * (max(elapsed, _THERMAL_S) if thermal else elapsed)
         jumped = self.seen[c] > 0.0 and abs(value - self.last[c]) > allowed
-        if not (self.p.low[c] <= value <= self.p.high[c]) or not finite(value):
+        if not (self.low[c] <= value <= self.high[c]) or not finite(value):
             self.verdict[c] = 1.0 + _K_RANGE
         elif jumped and thermal and self.suspect[c] == 0.0:
             self.suspect[c] = 1.0  # one reading proves no jump: the next one decides
@@ -491,7 +493,7 @@ class Law:
             if jumped:
                 self.verdict[c] = 1.0 + _K_RATE
             else:
-                self.verdict[c] = 1.0 + _K_FROZEN if self.same_s[c] > self.p.frozen_s[c] else 0.0
+                self.verdict[c] = 1.0 + _K_FROZEN if self.same_s[c] > self.frozen_s[c] else 0.0
             self.last[c] = value
             self.seen[c] = 1.0
             self.suspect[c] = 0.0
