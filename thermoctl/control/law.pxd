@@ -93,7 +93,7 @@ cdef class Law:
     @cython.locals(one=bits_t, m=cython.int, s=cython.double, part=cython.double, amperes=cython.double, current=cython.bint,
                    estimated=cython.bint)
     cdef void _agree(self) noexcept
-    @cython.locals(m=cython.int, k=cython.int, s=cython.double)
+    @cython.locals(m=cython.int, k=cython.int, s=cython.double, limit=cython.double)
     cdef void _compare_order(self) noexcept
     @cython.locals(coil_new=cython.bint, i=cython.int, j=cython.int, k=cython.int, c=cython.int, s=cython.double,
                    elapsed=cython.double, gain=cython.double, prior=cython.double)

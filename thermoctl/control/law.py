@@ -50,6 +50,7 @@ from __future__ import annotations
 
 from array import array
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -312,9 +313,11 @@ class Law:
 
     def configure(self, parameters: Parameters):
         """Take new gains and limits, all at once, between two ticks; the state stays."""
-        self.parameters, self.p = parameters, Typed(parameters)
-        for name in BY_CHANNEL:
-            setattr(self, name, getattr(parameters, name).copy())
+        typed: Any = Typed(parameters)  # its fields are declared in law.pxd only
+        self.parameters, self.p = parameters, typed
+        self.low, self.high = parameters.low.copy(), parameters.high.copy()
+        self.rate, self.required = parameters.rate.copy(), parameters.required.copy()
+        self.stale_s, self.frozen_s = parameters.stale_s.copy(), parameters.frozen_s.copy()
         for role in CODES:  # a state or an error number does not change while all is well
             self.frozen_s[INDEX[role]] = np.inf
         length = int(min(max(parameters.moving_average, 1), MAX_AVERAGE))
@@ -843,6 +846,7 @@ class Law:
     def _compare_order(self):
         """exchanged: two mean readings would fit their estimates better the other way round."""
         self.exchanged = 0.0
+        limit = -self.p.order_limit_c * self.p.order_limit_c
         for m in range(1, _M):
             for k in range(m):
                 if (
@@ -852,9 +856,7 @@ class Law:
                     and self.verdict[_COIL + k] == 0.0
                 ):
                     s = self.T[m] - self.T[k]
-                    if (
-                        s + self.apart_c[m] - self.apart_c[k]
-                    ) * s < -self.p.order_limit_c * self.p.order_limit_c:
+                    if (s + self.apart_c[m] - self.apart_c[k]) * s < limit:
                         self.exchanged = 1.0
 
     def _arm(self, command):
