@@ -218,12 +218,12 @@ _KEPT = (
 
 
 def finite(value):
-    """True for a number that is neither infinite nor NaN."""
+    """Return True for a number that is neither infinite nor NaN."""
     return value - value == 0.0
 
 
 def clip(value, low, high):
-    """value held inside low..high; NaN stays NaN."""
+    """Return the value limited to low..high; NaN stays NaN."""
     if value < low:
         return low
     return high if value > high else value
@@ -304,8 +304,9 @@ class Law:
         self.bind(np.full(_N, np.nan), np.zeros(_N, dtype=np.uint8), np.full(_N, _ABSENT, dtype=np.uint8))
 
     def bind(self, value, fresh, status, delay=None):
-        """The arrays over CHANNELS that hold the readings of each tick: value float64, fresh uint8, status uint8.
+        """Take the arrays over CHANNELS that hold the readings of each tick.
 
+        value: float64; fresh: uint8, 1 for a new reading; status: uint8, OK to ABSENT of channels.py.
         delay: uint8, the age of a new reading when it arrived, in units of DELAY_S; None: read in the tick.
         """
         self.value, self.fresh, self.status = value, fresh, status
@@ -327,7 +328,7 @@ class Law:
         self.average_length = length
 
     def snapshot(self) -> np.ndarray:
-        """The whole state as one float64 vector, for replay and for a warm restart."""
+        """Return the whole state as one float64 vector, for replay and for a warm restart."""
         return np.concatenate(
             [
                 np.array([float(getattr(self, name)) for name in _SCALARS]),
@@ -336,8 +337,10 @@ class Law:
         )
 
     def restore(self, vector: np.ndarray):
-        """Take a state that `snapshot` gave for a model of the same order. Raises ValueError for another length, and where
-        a number that counts is not finite."""
+        """Take a state that `snapshot` gave for a model of the same order.
+
+        Raises ValueError for another length, and where a counter is not finite or out of range.
+        """
         size = len(self.snapshot())
         if len(vector) != size:
             raise ValueError(
@@ -396,7 +399,7 @@ class Law:
         self.phase_s, self.expansion_before_um, self.expansion_after_um = phase, before, after
 
     def _forget(self):
-        """The estimate starts again on the coil's next reading; the air at the start stays the expansion's origin."""
+        """Restart the estimate on the coil's next reading; keep the air at the start as the expansion's origin."""
         for i in range(self.n):
             self.x[i] = 0.0
             self.corrections[i] = 0.0
@@ -527,7 +530,7 @@ class Law:
             self.air_c += self.air_rate_k_s * self.dt
 
     def _resistance(self):
-        """The coil's, ohm, at its temperature: estimated, or else read; at 20 degC while neither is known."""
+        """Return the coil's resistance, ohm, at its estimated or else measured temperature (20 degC if unknown)."""
         s = 20.0
         if self.predicts[0] and self.air_known > 0.0:
             s = self.T[0] + self.air_c
@@ -536,7 +539,7 @@ class Law:
         return self.p.resistance_ohm * (1.0 + _COPPER * (s - 20.0))
 
     def _start_air(self, value):
-        """The air's low-pass starts at its first reading; the first one of all is where the expansion counts from."""
+        """Start the air's low-pass at this reading; the first reading of all is the origin of the expansion."""
         self.air_c = value
         self.air_known = 1.0
         if self.air_started == 0.0:
@@ -544,7 +547,7 @@ class Law:
             self.air_started = 1.0
 
     def _average_air_start(self):
-        """The origin of the expansion is the mean of the first readings; the estimates, rises above the air, follow it."""
+        """Average the first air readings into the origin of the expansion, and shift the estimates with it."""
         self.air_started += 1.0
         s = (self.last[_AIR] - self.air_c) / self.air_started
         self.air_c += s
@@ -612,7 +615,7 @@ class Law:
                     self.corrections[i] += gain * self.K[i, k] * self.e[k]
 
     def _predict_corrections(self, elapsed):
-        """c over the time since the coil's last reading; then reading - (model alone) = e + C c."""
+        """Advance c over the time since the coil's last reading; then reading - (model alone) = e + C c."""
         left = min(elapsed, _GAP_S)
         while left > 0.0:
             step = min(left, self.correction_step_s)
@@ -632,7 +635,7 @@ class Law:
     # ---- compensate ---------------------------------------------------------------------------------------------
 
     def compensate(self):
-        """The estimated thermal error, um: expansion model, bound, slew; frozen while a needed reading is at fault."""
+        """Compute the estimated thermal error, um: expansion model, bound, slew; frozen while a needed reading is at fault."""
         one = 1
         if self.primed == 0.0:  # quasi-steady start at the first temperatures
             s = self.b_air * (self.air_c - self.air_start_c)
@@ -676,7 +679,7 @@ class Law:
     # ---- control ------------------------------------------------------------------------------------------------
 
     def control(self, command, command_value):
-        """Moving average, setpoint limiter, velocity-form PID (41). Not armed: the setpoint follows the stage.
+        """Run moving average, setpoint limiter, velocity-form PID (41). Not armed: the setpoint follows the stage.
 
         The reference follows the stage, and v stays 0, also while an armed amplifier reports that it does not drive.
         """
@@ -769,7 +772,7 @@ class Law:
         self._report()
 
     def _watch_amplifier(self):
-        """What the amplifier reports of itself against what it was told: enabled where ARMED, else disabled."""
+        """Compare the amplifier's reported state with its command: enabled in ARMED, else disabled."""
         one = 1
         told = self.state == _ARMED
         if not told:
@@ -786,7 +789,7 @@ class Law:
             self.faults |= one << _B_NOT_FOLLOWING
 
     def _agree(self):
-        """Readings against each other, low-passed; `drive` is still what was asked for one tick ago."""
+        """Compare low-passed readings with each other; `drive` is still the command of the tick before."""
         one = 1
         part = min(1.0, self.dt / self.p.agree_time_s)
         current = self.verdict[_CURRENT] == 0.0
@@ -860,7 +863,7 @@ class Law:
                         self.exchanged = 1.0
 
     def _arm(self, command):
-        """The state machine; what tripped stays in `fault_bits` until FAULT is left."""
+        """Run the state machine; faults that tripped stay in `fault_bits` until FAULT is left."""
         before, known = self.state, command if 0 <= command < _COMMANDS else _NONE
         started, critical = self.tick > _WARM_UP, (self.trips & _CRITICAL) != 0
         tripped = self.trips != 0 or (
@@ -901,5 +904,5 @@ class Law:
 
     @property
     def fault_bits(self) -> int:
-        """Standing faults, and while FAULT those that led there."""
+        """Active faults and, in FAULT, the latched faults that caused it."""
         return self.faults | self.latched
