@@ -100,26 +100,36 @@ class ReadingLimits:
     """Limits of each channel's readings: mappings channel: limit."""
 
     required: tuple[str, ...] = option(
-        "channels without which nothing is driven; others only warn",
+        "channels that must be valid: an invalid one disables the amplifier; an invalid reading of any other channel "
+        "is a warning",
         ("position_um", "voltage_v", "current_a", "coil_c"),
     )
-    low: dict[str, float] = option("smallest believable reading", factory=dict)
-    high: dict[str, float] = option("largest believable reading", factory=dict)
+    low: dict[str, float] = option(
+        "smallest valid reading by channel, in the channel's unit; a smaller one is invalid", factory=dict
+    )
+    high: dict[str, float] = option(
+        "largest valid reading by channel, in the channel's unit; a larger one is invalid", factory=dict
+    )
     rate: dict[str, float] = option(
-        "largest believable change per second; of a temperature over at least 0.1 s, and twice in a row",
+        "largest valid change per second by channel, in the channel's unit. Temperatures are compared over at least "
+        "0.1 s and must exceed it twice in a row",
         factory=dict,
         low=0.0,
     )
-    stale_s: dict[str, float] = option("longest time without a new reading", factory=dict, unit="s", low=0.0)
+    stale_s: dict[str, float] = option(
+        "longest time without a new reading, by channel", factory=dict, unit="s", low=0.0
+    )
     frozen_s: dict[str, float] = option(
-        "longest time with exactly the same reading", factory=dict, unit="s", low=0.0
+        "longest time with exactly the same reading, by channel", factory=dict, unit="s", low=0.0
     )
 
 
 @dataclass(frozen=True)
 class ProtectionSettings(Limits, ReadingLimits):
-    """When the amplifier is disabled. Mappings are channel: limit; a channel that is not named has none; temperatures_c
-    stands for all twelve temperatures that are not named themselves."""
+    """Limits that disable the amplifier when they are exceeded.
+
+    The options `low` to `frozen_s` are mappings of channel: limit. A channel without an entry has no limit. The entry
+    `temperatures_c` sets the limit of every temperature without an entry of its own."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from math import inf
 
 import numpy as np
 
-from thermoctl.channels import POINTS, STATUS_NAMES, TABLE
+from thermoctl.channels import POINTS as POINTS
+from thermoctl.channels import STATUS_NAMES, TABLE
 
 FAULT_WORD_BITS = 53
 """Bits of `fault_bits`: a float64 holds so many exactly. The faults from this bit on are in `fault_bits_2`."""

@@ -22,7 +22,7 @@ COMMANDS = ("none", "arm", "disarm", "setpoint")
 
 
 def next_state(state: int, command: int, started: bool, tripped: bool, critical: bool) -> int:
-    """The state after this tick.
+    """Return the state after this tick.
 
     started: the law has run long enough to be believed. tripped: a fault stands that forbids driving. critical: one of
     them latches from every state (implies tripped).

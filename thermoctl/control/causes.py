@@ -91,7 +91,7 @@ class Standing:
 
 
 def channels_of(name: str) -> tuple[str, ...]:
-    """The channels that share this reading's fault; () for another fault."""
+    """Return the channels that share this reading's fault; () for another fault."""
     group = BY_NAME[name].group
     return tuple(c.role for c in TABLE if group and c.group == group)
 
@@ -143,6 +143,6 @@ def _reach(name: str) -> int:
 
 
 def severity_of(name: str, trips: int) -> str:
-    """A reading's fault is a warning unless its channel is required."""
+    """Return the severity; a reading's fault is a warning unless its channel is required."""
     severity = BY_NAME[name].severity
     return "warning" if BY_NAME[name].group and not _trips(name, trips) else severity

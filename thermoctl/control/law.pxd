@@ -30,7 +30,6 @@ cdef class Typed:
     cdef public double amplifier_s, late_s, agree_time_s, drift_limit_c, monitored_limit_c, resistance_ohm
     cdef public double resistance_tolerance, resistance_v, current_per_drive, current_tolerance_a
     cdef public double flexure_um_per_a, position_tolerance_um, reference_tolerance_um, order_limit_c
-    cdef public double[::1] low, high, rate, stale_s, frozen_s, required
     # end
 
 cdef class Law:
@@ -48,6 +47,9 @@ cdef class Law:
     cdef readonly double period_s, dt
     cdef bits_t faults, trips
     cdef public double control_v
+    # generated: the arrays of Parameters
+    cdef public double[::1] low, high, rate, stale_s, frozen_s, required
+    # end
     # generated: the state that snapshot() holds
     cdef public long long state, tick, average_at, averaged
     cdef public bits_t latched
@@ -94,7 +96,7 @@ cdef class Law:
     cdef void _agree(self) noexcept
     @cython.locals(low=cython.double, high=cython.double)
     cdef void _compare_drive(self, double amperes) noexcept
-    @cython.locals(m=cython.int, k=cython.int, s=cython.double)
+    @cython.locals(m=cython.int, k=cython.int, s=cython.double, limit=cython.double)
     cdef void _compare_order(self) noexcept
     @cython.locals(coil_new=cython.bint, i=cython.int, j=cython.int, k=cython.int, c=cython.int, s=cython.double,
                    elapsed=cython.double, gain=cython.double, prior=cython.double)

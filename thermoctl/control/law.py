@@ -51,6 +51,7 @@ from __future__ import annotations
 
 from array import array
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -223,24 +224,24 @@ _KEPT = (
 
 
 def finite(value):
-    """True for a number that is neither infinite nor NaN."""
+    """Return True for a number that is neither infinite nor NaN."""
     return value - value == 0.0
 
 
 def clip(value, low, high):
-    """value held inside low..high; NaN stays NaN."""
+    """Return the value limited to low..high; NaN stays NaN."""
     if value < low:
         return low
     return high if value > high else value
 
 
 class Typed:
-    """The numbers of Parameters, by the same names, with C types: the fields in law.pxd are generated."""
+    """The single numbers of Parameters, by the same names, with C types: the fields in law.pxd are generated."""
 
     def __init__(self, parameters: Parameters):
         for f in fields(parameters):
-            value = getattr(parameters, f.name)
-            setattr(self, f.name, value.copy() if f.name in BY_CHANNEL else value)
+            if f.name not in BY_CHANNEL:
+                setattr(self, f.name, getattr(parameters, f.name))
 
 
 class Law:
@@ -310,8 +311,9 @@ class Law:
         self.bind(np.full(_N, np.nan), np.zeros(_N, dtype=np.uint8), np.full(_N, _ABSENT, dtype=np.uint8))
 
     def bind(self, value, fresh, status, delay=None):
-        """The arrays over CHANNELS that hold the readings of each tick: value float64, fresh uint8, status uint8.
+        """Take the arrays over CHANNELS that hold the readings of each tick.
 
+        value: float64; fresh: uint8, 1 for a new reading; status: uint8, OK to ABSENT of channels.py.
         delay: uint8, the age of a new reading when it arrived, in units of DELAY_S; None: read in the tick.
         """
         self.value, self.fresh, self.status = value, fresh, status
@@ -319,9 +321,13 @@ class Law:
 
     def configure(self, parameters: Parameters):
         """Take new gains and limits, all at once, between two ticks; the state stays."""
-        self.parameters, self.p = parameters, Typed(parameters)
+        typed: Any = Typed(parameters)  # its fields are declared in law.pxd only
+        self.parameters, self.p = parameters, typed
+        self.low, self.high = parameters.low.copy(), parameters.high.copy()
+        self.rate, self.required = parameters.rate.copy(), parameters.required.copy()
+        self.stale_s, self.frozen_s = parameters.stale_s.copy(), parameters.frozen_s.copy()
         for role in CODES:  # a state or an error number does not change while all is well
-            self.p.frozen_s[INDEX[role]] = np.inf
+            self.frozen_s[INDEX[role]] = np.inf
         length = int(min(max(parameters.moving_average, 1), MAX_AVERAGE))
         if self.tick > 0 and length != self.average_length:
             self.average = np.full(MAX_AVERAGE, self.position_um)  # the filter restarts at its own output
@@ -329,7 +335,7 @@ class Law:
         self.average_length = length
 
     def snapshot(self) -> np.ndarray:
-        """The whole state as one float64 vector, for replay and for a warm restart."""
+        """Return the whole state as one float64 vector, for replay and for a warm restart."""
         return np.concatenate(
             [
                 np.array([float(getattr(self, name)) for name in _SCALARS]),
@@ -338,8 +344,10 @@ class Law:
         )
 
     def restore(self, vector: np.ndarray):
-        """Take a state that `snapshot` gave for a model of the same order. Raises ValueError for another length, and where
-        a number that counts is not finite."""
+        """Take a state that `snapshot` gave for a model of the same order.
+
+        Raises ValueError for another length, and where a counter is not finite or out of range.
+        """
         size = len(self.snapshot())
         if len(vector) != size:
             raise ValueError(
@@ -398,7 +406,7 @@ class Law:
         self.phase_s, self.expansion_before_um, self.expansion_after_um = phase, before, after
 
     def _forget(self):
-        """The estimate starts again on the coil's next reading; the air at the start stays the expansion's origin."""
+        """Restart the estimate on the coil's next reading; keep the air at the start as the expansion's origin."""
         for i in range(self.n):
             self.x[i] = 0.0
             self.corrections[i] = 0.0
@@ -452,7 +460,7 @@ class Law:
             self.age[c] += self.dt
             self.since_s[c] += self.dt
             status = self.status[c]
-            if status == _ABSENT and self.p.required[c] == 0.0:
+            if status == _ABSENT and self.required[c] == 0.0:
                 self.verdict[c] = 1.0 + _K_ERROR
                 continue
             if status in (_ERROR, _ABSENT):
@@ -462,7 +470,7 @@ class Law:
             elif self.fresh[c]:
                 self._judge_reading(c, self.value[c])
                 self.age[c] = 0.0
-            elif self.age[c] > self.p.stale_s[c] or (self.seen[c] == 0.0 and self.verdict[c] == 0.0):
+            elif self.age[c] > self.stale_s[c] or (self.seen[c] == 0.0 and self.verdict[c] == 0.0):
                 self.verdict[c] = 1.0 + _K_STALE
             if self.verdict[c] > 0.0:
                 kind = _K_ERROR
@@ -470,7 +478,7 @@ class Law:
                     kind += 1
                 bit = one << _READING_BIT[c * _KINDS + kind]
                 self.faults |= bit
-                if self.p.required[c] > 0.0:
+                if self.required[c] > 0.0:
                     self.trips |= bit
                     if c in (_VOLTAGE, _CURRENT, _AIR, _COIL):
                         self.hold = 1
@@ -484,9 +492,9 @@ class Law:
         late = _DELAY_S * self.delay[c]
         elapsed = max(self.since_s[c] - late, self.period_s)
         thermal = _THERMAL <= c < _THERMAL_END
-        allowed = self.p.rate[c] * (max(elapsed, _THERMAL_S) if thermal else elapsed)
+        allowed = self.rate[c] * (max(elapsed, _THERMAL_S) if thermal else elapsed)
         jumped = self.seen[c] > 0.0 and abs(value - self.last[c]) > allowed
-        if not (self.p.low[c] <= value <= self.p.high[c]) or not finite(value):
+        if not (self.low[c] <= value <= self.high[c]) or not finite(value):
             self.verdict[c] = 1.0 + _K_RANGE
         elif jumped and thermal and self.suspect[c] == 0.0:
             self.suspect[c] = 1.0  # one reading proves no jump: the next one decides
@@ -498,7 +506,7 @@ class Law:
             if jumped:
                 self.verdict[c] = 1.0 + _K_RATE
             else:
-                self.verdict[c] = 1.0 + _K_FROZEN if self.same_s[c] > self.p.frozen_s[c] else 0.0
+                self.verdict[c] = 1.0 + _K_FROZEN if self.same_s[c] > self.frozen_s[c] else 0.0
             self.last[c] = value
             self.seen[c] = 1.0
             self.suspect[c] = 0.0
@@ -529,7 +537,7 @@ class Law:
             self.air_c += self.air_rate_k_s * self.dt
 
     def _resistance(self):
-        """The coil's, ohm, at its temperature: estimated, or else read; at 20 degC while neither is known."""
+        """Return the coil's resistance, ohm, at its estimated or else measured temperature (20 degC if unknown)."""
         s = 20.0
         if self.predicts[0] and self.air_known > 0.0:
             s = self.T[0] + self.air_c
@@ -538,7 +546,7 @@ class Law:
         return self.p.resistance_ohm * (1.0 + _COPPER * (s - 20.0))
 
     def _start_air(self, value):
-        """The air's low-pass starts at its first reading; the first one of all is where the expansion counts from."""
+        """Start the air's low-pass at this reading; the first reading of all is the origin of the expansion."""
         self.air_c = value
         self.air_known = 1.0
         if self.air_started == 0.0:
@@ -546,7 +554,7 @@ class Law:
             self.air_started = 1.0
 
     def _average_air_start(self):
-        """The origin of the expansion is the mean of the first readings; the estimates, rises above the air, follow it."""
+        """Average the first air readings into the origin of the expansion, and shift the estimates with it."""
         self.air_started += 1.0
         s = (self.last[_AIR] - self.air_c) / self.air_started
         self.air_c += s
@@ -614,7 +622,7 @@ class Law:
                     self.corrections[i] += gain * self.K[i, k] * self.e[k]
 
     def _predict_corrections(self, elapsed):
-        """c over the time since the coil's last reading; then reading - (model alone) = e + C c."""
+        """Advance c over the time since the coil's last reading; then reading - (model alone) = e + C c."""
         left = min(elapsed, _GAP_S)
         while left > 0.0:
             step = min(left, self.correction_step_s)
@@ -634,7 +642,7 @@ class Law:
     # ---- compensate ---------------------------------------------------------------------------------------------
 
     def compensate(self):
-        """The estimated thermal error, um: expansion model, bound, slew; frozen while a needed reading is at fault."""
+        """Compute the estimated thermal error, um: expansion model, bound, slew; frozen while a needed reading is at fault."""
         one = 1
         if self.primed == 0.0:  # quasi-steady start at the first temperatures
             s = self.b_air * (self.air_c - self.air_start_c)
@@ -678,7 +686,7 @@ class Law:
     # ---- control ------------------------------------------------------------------------------------------------
 
     def control(self, command, command_value):
-        """Moving average, setpoint limiter, velocity-form PID (41). Not armed: the setpoint follows the stage.
+        """Run moving average, setpoint limiter, velocity-form PID (41). Not armed: the setpoint follows the stage.
 
         The reference follows the stage, and v stays 0, also while an armed amplifier reports that it does not drive.
         """
@@ -771,7 +779,7 @@ class Law:
         self._report()
 
     def _watch_amplifier(self):
-        """What the amplifier reports of itself against what it was told: enabled where ARMED, else disabled."""
+        """Compare the amplifier's reported state with its command: enabled in ARMED, else disabled."""
         one = 1
         told = self.state == _ARMED
         if not told:
@@ -788,7 +796,7 @@ class Law:
             self.faults |= one << _B_NOT_FOLLOWING
 
     def _agree(self):
-        """Readings against each other, low-passed; `drive` is still what was asked for one tick ago."""
+        """Compare low-passed readings with each other; `drive` is still the command of the tick before."""
         one = 1
         part = min(1.0, self.dt / self.p.agree_time_s)
         current = self.verdict[_CURRENT] == 0.0
@@ -864,6 +872,7 @@ class Law:
     def _compare_order(self):
         """exchanged: two mean readings would fit their estimates better the other way round."""
         self.exchanged = 0.0
+        limit = -self.p.order_limit_c * self.p.order_limit_c
         for m in range(1, _M):
             for k in range(m):
                 if (
@@ -873,13 +882,11 @@ class Law:
                     and self.verdict[_COIL + k] == 0.0
                 ):
                     s = self.T[m] - self.T[k]
-                    if (
-                        s + self.apart_c[m] - self.apart_c[k]
-                    ) * s < -self.p.order_limit_c * self.p.order_limit_c:
+                    if (s + self.apart_c[m] - self.apart_c[k]) * s < limit:
                         self.exchanged = 1.0
 
     def _arm(self, command):
-        """The state machine; what tripped stays in `fault_bits` until FAULT is left."""
+        """Run the state machine; faults that tripped stay in `fault_bits` until FAULT is left."""
         before, known = self.state, command if 0 <= command < _COMMANDS else _NONE
         started, critical = self.tick > _WARM_UP, (self.trips & _CRITICAL) != 0
         tripped = self.trips != 0 or (
@@ -920,5 +927,5 @@ class Law:
 
     @property
     def fault_bits(self) -> int:
-        """Standing faults, and while FAULT those that led there."""
+        """Active faults and, in FAULT, the latched faults that caused it."""
         return self.faults | self.latched

@@ -118,7 +118,7 @@ UNITS = {f.name: f.metadata["unit"] for f in _MODEL_FIELDS if f.metadata.get("un
 
 
 def zero_model(period_s: float = 0.001) -> CompensatorModel:
-    """A model that estimates no rise and no expansion: the loop without compensation."""
+    """Return a model that estimates no rise and no expansion: the loop without compensation."""
     return CompensatorModel(
         "mkf",
         period_s,

@@ -59,9 +59,9 @@ def parts(law: ModuleType) -> dict[str, list[tuple[str, list[str]]]]:
     return {
         "the constants of law.py": [(k, [n for n, kind in constants if kind == k]) for k in kinds],
         "the fields of Parameters": [
-            ("public double", [f.name for f in fields(Parameters) if f.name not in BY_CHANNEL]),
-            ("public double[::1]", list(BY_CHANNEL)),
+            ("public double", [f.name for f in fields(Parameters) if f.name not in BY_CHANNEL])
         ],
+        "the arrays of Parameters": [("public double[::1]", list(BY_CHANNEL))],
         "the state that snapshot() holds": [
             ("public long long", whole),
             ("public bits_t", ["latched"]),
