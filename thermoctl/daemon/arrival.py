@@ -7,10 +7,10 @@ older than the control loop and the limits on jumps assume, so `thermoctl doctor
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from thermoctl.control.faults import CHANNELS
 from thermoctl.daemon.shared import Shared
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 
 SLOW_SHARE = 0.5  # of rate_hz: below it a reading is called slow; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3
@@ -18,7 +18,7 @@ LOOK_ROWS = 4000  # ticks of the record that `status` counts over
 FEWEST = 10  # readings that must have been due in that time
 
 
-def expected_hz(settings: Any) -> dict[str, float]:
+def expected_hz(settings: Settings) -> dict[str, float]:
     """The profile's rate of each role, Hz; empty for back ends without devices. Raises InputError."""
     if settings.hal.backend != "devices":
         return {}

@@ -12,13 +12,13 @@ import numpy as np
 from hal.profile import bind
 from thermoctl.control.faults import CHANNELS
 from thermoctl.control.model import CompensatorModel, Parameters, zero_model
-from thermoctl.settings import RigSettings
+from thermoctl.settings import RigSettings, Settings
 from thermoctl.yamlfile import InputError, load
 
 UNNAMED = RigSettings().name
 
 
-def law_parameters(settings: Any) -> Parameters:
+def law_parameters(settings: Settings) -> Parameters:
     """Gains, limits and protection of `settings` as the law takes them. Raises InputError for an unknown channel."""
     control, compensation, protection = settings.control, settings.compensation, settings.protection
     taken = {f.name for f in fields(Parameters)}
@@ -65,7 +65,7 @@ def _by_channel(given: Any, default: float, where: str) -> np.ndarray:
     return array
 
 
-def power_warning(settings: Any) -> str:
+def power_warning(settings: Settings) -> str:
     """What is lost, with file:line, where the coil's power cannot be known; '' where it can."""
     protection = settings.protection
     if settings.hal.backend != "devices":
@@ -89,7 +89,7 @@ def power_warning(settings: Any) -> str:
     )
 
 
-def compensator(settings: Any) -> CompensatorModel:
+def compensator(settings: Settings) -> CompensatorModel:
     """The model that `compensation.model` names; without one, the model that estimates nothing. Raises InputError for a model of another rig."""
     if not settings.compensation.model:
         return zero_model(settings.loop.period_s)
@@ -98,12 +98,12 @@ def compensator(settings: Any) -> CompensatorModel:
     return load_model(settings.compensation.model, settings.rig.name)
 
 
-def shared_name(settings: Any) -> str:
+def shared_name(settings: Settings) -> str:
     """The name of the daemon's shared memory: one daemon a socket path."""
     return f"thermoctl-{zlib.crc32(str(Path(settings.socket.path).absolute()).encode()):08x}"
 
 
-def rig_identity(settings: Any) -> str:
+def rig_identity(settings: Settings) -> str:
     """What its recordings call the rig: rig.name, or, where none is given, the configuration's name and a hash of its path."""
     if settings.rig.name != UNNAMED:
         return settings.rig.name

@@ -10,9 +10,9 @@ import sys
 import time
 from pathlib import Path
 
+from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.readings import fault_lines, value_lines
-from thermoctl.daemon.socket import ask
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
 

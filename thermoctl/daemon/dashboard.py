@@ -42,11 +42,12 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from thermoctl.daemon.assemble import rig_identity
+from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.metrics import CONTENT_TYPE, metrics
 from thermoctl.daemon.readings import SOURCES, hide_invalid, invalid
-from thermoctl.daemon.socket import ask
 from thermoctl.daemon.watch import Watch
 from thermoctl.recording.history import history
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, POINTS, SIGNALS
 from thermoctl.yamlfile import InputError
 
@@ -121,7 +122,7 @@ class Server(ThreadingHTTPServer):
     allow_reuse_address = True
     request_queue_size = 64
 
-    def __init__(self, address: tuple[str, int], settings: Any, watch: Watch, policy: Policy):
+    def __init__(self, address: tuple[str, int], settings: Settings, watch: Watch, policy: Policy):
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         self.settings, self.watch, self.policy = settings, watch, policy
         self.page, self.page_policy = _page()
@@ -463,7 +464,7 @@ def _numbers(array: np.ndarray, digits: int | None = None) -> list[float | None]
 
 
 def make_server(
-    settings: Any,
+    settings: Settings,
     listen: str,
     watch: Watch,
     commands: bool = False,
@@ -518,7 +519,7 @@ def url(server: Server) -> str:
 
 
 def dashboard(
-    settings: Any,
+    settings: Settings,
     listen: str,
     commands: bool,
     with_metrics: bool,

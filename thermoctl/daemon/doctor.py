@@ -10,10 +10,10 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hal.backend import fast_devices
 from hal.serial_port import latency_timer_ms
+from thermoctl.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Check:
     remedy: str
 
 
-def real_time_checks(settings: Any, root: str = "/") -> Iterator[Check]:
+def real_time_checks(settings: Settings, root: str = "/") -> Iterator[Check]:
     """The checks for these settings (loop.cpu, loop.spin_s and the serial ports of hal.devices)."""
     base, cpu = Path(root), settings.loop.cpu
     yield _preemption(base)
@@ -146,7 +146,7 @@ def _governor(base: Path, cpu: int) -> Check:
     )
 
 
-def _latency_timers(settings: Any, sys_root: str) -> Iterator[Check]:
+def _latency_timers(settings: Settings, sys_root: str) -> Iterator[Check]:
     if settings.hal.backend != "devices":
         return
     for device in fast_devices(settings):

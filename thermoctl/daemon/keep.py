@@ -15,12 +15,12 @@ import time
 import zlib
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.recorder import decode, encode
+from thermoctl.settings import Settings
 
 KEEP_S = 600.0  # older estimates say little about the rig's slow parts
 EVERY_S = 5.0  # between two times that the supervisor keeps them
@@ -28,7 +28,7 @@ MAX_BYTES = 65536
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
-def kept_path(settings: Any) -> Path:
+def kept_path(settings: Settings) -> Path:
     """Where a daemon keeps its estimates: beside its socket."""
     return Path(settings.socket.path).with_suffix(".state")
 

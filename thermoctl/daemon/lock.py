@@ -9,19 +9,19 @@ import fcntl
 import os
 import time
 from pathlib import Path
-from typing import Any
 
+from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 PROBE_S = 0.2  # a command that only looks (`holder`) has the lock for less than this
 
 
-def lock_path(settings: Any) -> Path:
+def lock_path(settings: Settings) -> Path:
     """Return the lock's file, beside the rig's socket."""
     return Path(settings.socket.path).with_suffix(".lock")
 
 
-def hold(settings: Any) -> int:
+def hold(settings: Settings) -> int:
     """Take the rig's lock; returns the open file that keeps it. Raises InputError where another process holds the rig."""
     path = lock_path(settings)
     try:
@@ -44,7 +44,7 @@ def hold(settings: Any) -> int:
     return file
 
 
-def holder(settings: Any) -> int | None:
+def holder(settings: Settings) -> int | None:
     """Return the process id that holds the rig, None where nobody does. Raises InputError where this user may not look."""
     path = lock_path(settings)
     try:

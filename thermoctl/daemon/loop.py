@@ -28,6 +28,7 @@ from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring import Mailbox, Record, Remarks, Ring
 from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, SIGNALS
 
 RELOAD = float(len(arming.COMMANDS))
@@ -207,7 +208,7 @@ class Rig:
 
 
 def run_loop(
-    settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], bool], warm_up_ticks: int = 100
+    settings: Settings, shared: Shared, rig: Rig, stopping: Callable[[], bool], warm_up_ticks: int = 100
 ) -> None:
     """Tick until `stopping()`; the caller has opened the back end and disables the amplifier afterwards."""
     period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
@@ -252,7 +253,7 @@ def run_loop(
             deadline += skipped * period_ns
 
 
-def run_reference(settings: Any, shared: Shared, stopping: Callable[[], bool]) -> None:
+def run_reference(settings: Settings, shared: Shared, stopping: Callable[[], bool]) -> None:
     """An idle loop of the same clock, priority and processor, half a period apart: what the machine gives at best."""
     period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
     deadline = now_ns() // period_ns * period_ns + period_ns + period_ns // 2
@@ -264,7 +265,7 @@ def run_reference(settings: Any, shared: Shared, stopping: Callable[[], bool]) -
             deadline += period_ns
 
 
-def become_real_time(settings: Any, warn: Callable[[str], None]) -> list[Any]:
+def become_real_time(settings: Settings, warn: Callable[[str], None]) -> list[Any]:
     """Priority, processor, locked memory, latency request and frozen collector, as far as the system allows.
 
     Returns what must be kept open (the latency request lasts as long as its file). Each refusal is one `warn` line.

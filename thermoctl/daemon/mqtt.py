@@ -19,7 +19,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.control_socket import ask
+from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 CONNECT_S = 10.0
@@ -40,7 +41,7 @@ class Bridge:
 
     def __init__(
         self,
-        settings: Any,
+        settings: Settings,
         broker: str,
         topic: str = "",
         user: str = "",
@@ -128,7 +129,13 @@ class Bridge:
 
 
 def mqtt(
-    settings: Any, broker: str, topic: str, rate_hz: float, user: str, password_file: str | None, tls: bool
+    settings: Settings,
+    broker: str,
+    topic: str,
+    rate_hz: float,
+    user: str,
+    password_file: str | None,
+    tls: bool,
 ) -> int:
     """The command: publish until Ctrl-C. Raises InputError for a broker that is not there or refuses."""
     if not 0.01 <= rate_hz <= 10.0:

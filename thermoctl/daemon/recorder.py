@@ -21,6 +21,7 @@ import numpy as np
 from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.misfit import Misfit
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, RUN_S, Shared
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 
 INTERVAL_S = 0.1
@@ -193,7 +194,7 @@ class Recorder:
             self.writer = None
 
 
-def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Recorder:
+def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) -> Recorder:
     """The recorder of a daemon: files hold the configuration in force, every option, and the law's metadata."""
     from thermoctl.daemon.assemble import compensator, law_parameters, rig_identity
     from thermoctl.recording.writer import RecordingWriter

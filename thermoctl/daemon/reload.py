@@ -6,10 +6,10 @@ from typing import Any
 
 from thermoctl.control.model import Parameters
 from thermoctl.daemon.assemble import law_parameters
-from thermoctl.settings import changed, load_settings
+from thermoctl.settings import Settings, changed, load_settings
 
 
-def reload_settings(current: Any, started: Any) -> tuple[Any, Parameters, list[str], list[str]]:
+def reload_settings(current: Settings, started: Settings) -> tuple[Any, Parameters, list[str], list[str]]:
     """(settings, parameters, applied keys, keys that count only after a restart).
 
     current: the settings in force; started: those that the daemon was started with. Raises InputError for a file that

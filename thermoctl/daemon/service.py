@@ -14,12 +14,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
+from thermoctl.daemon.control_socket import ask, settled
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.loop import die_with_parent
-from thermoctl.daemon.socket import ask, settled
-from thermoctl.settings import load_settings
+from thermoctl.settings import Settings, load_settings
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 
@@ -49,7 +48,7 @@ def units(root: Path = Path("/")) -> dict[str, Path]:
     return found
 
 
-def _unit_for(settings: Any) -> str | None:
+def _unit_for(settings: Settings) -> str | None:
     """The installed unit that runs this very configuration."""
     if not LIVE.is_dir():
         return None
@@ -67,7 +66,7 @@ def _unit_of(pid: int) -> str | None:
     return found[1] if found else None
 
 
-def start(settings: Any) -> int:
+def start(settings: Settings) -> int:
     """Start the daemon, by its unit where one runs this configuration, and wait until it takes commands.
 
     Returns 0, or 3 with the daemon's own error."""
@@ -98,7 +97,7 @@ def start(settings: Any) -> int:
     return 3
 
 
-def _state(settings: Any) -> str:
+def _state(settings: Settings) -> str:
     """The state of whoever holds the rig, for a message."""
     try:
         return ask(settings.socket.path, {"command": "status"})["state"]
@@ -106,7 +105,7 @@ def _state(settings: Any) -> str:
         return "it does not answer"
 
 
-def stop(settings: Any) -> int:
+def stop(settings: Settings) -> int:
     """Disarm and stop whoever holds the rig, and wait until it is gone; 0 also when nobody does.
 
     Never asks: it is the safe direction. A rig that another configuration describes is not touched."""
@@ -140,12 +139,12 @@ def stop(settings: Any) -> int:
     return 0
 
 
-def restart(settings: Any) -> int:
+def restart(settings: Settings) -> int:
     """Stop, then start."""
     return stop(settings) or start(settings)
 
 
-def log_path(settings: Any) -> Path:
+def log_path(settings: Settings) -> Path:
     """Where a daemon that `start` put in the background writes its log: beside its socket."""
     return Path(settings.socket.path).with_suffix(".log")
 
@@ -155,7 +154,7 @@ class Background(subprocess.Popen):
 
     dies_with_us: it is asked to stop when this process ends, however that ends."""
 
-    def __init__(self, settings: Any, dies_with_us: bool = False):
+    def __init__(self, settings: Settings, dies_with_us: bool = False):
         log = log_path(settings)
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as out:
@@ -230,7 +229,7 @@ def install(config: Path, root: Path = Path("/")) -> int:
     return 0
 
 
-def _unit_name(settings: Any, config: Path, root: Path) -> str:
+def _unit_name(settings: Settings, config: Path, root: Path) -> str:
     """The unit for this configuration: the one that runs it already, else a free name. Raises InputError for a collision."""
     installed = units(root)
     for name, other in installed.items():

@@ -19,6 +19,7 @@ from thermoctl.control.model import NAMES, CompensatorModel, Parameters
 from thermoctl.daemon.assemble import compensator, law_parameters
 from thermoctl.daemon.loop import RELOAD, Rig
 from thermoctl.daemon.ring import Box, Mailbox
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, SIGNALS
 
 COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reload": RELOAD}
@@ -33,7 +34,7 @@ class Simulation:
 
     def __init__(
         self,
-        settings: Any,
+        settings: Settings,
         model: CompensatorModel | None = None,
         parameters: Parameters | None = None,
         publish: Any = None,
@@ -109,7 +110,7 @@ def _no_clock() -> int:
 
 
 def run_simulated(
-    settings: Any,
+    settings: Settings,
     schedule: Iterable[tuple],
     duration_s: float,
     seed: int | None = None,
@@ -143,7 +144,7 @@ SETTLE_S = 0.5  # after the reference has arrived
 STROKE_UM, CYCLE_S = 200.0, 75.0
 
 
-def trapezoids(settings: Any, hours: float, compensate: bool, out: str | None = None) -> int:
+def trapezoids(settings: Settings, hours: float, compensate: bool, out: str | None = None) -> int:
     """`hours` of rig time in trapezoids of 75 s (the paper's test 4B): how far the output stayed from the setpoint.
 
     Judged by the reference encoder, which the law never reads, wherever the reference has stood for SETTLE_S. Prints

@@ -19,7 +19,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
-import socket as sockets
+import socket
 import sys
 import time
 from collections.abc import Callable, MutableMapping
@@ -38,6 +38,7 @@ from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.lock import hold
 from thermoctl.daemon.shared import BEATS, LOOP_PID, RESUMED, WARNINGS, Shared
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
@@ -91,7 +92,7 @@ class _Stop:
         return self.asked
 
 
-def safe_amplifier(settings: Any, log: Log) -> bool:
+def safe_amplifier(settings: Settings, log: Log) -> bool:
     """Disable the amplifier over a link of our own: when the loop can no longer do it. No other device is opened."""
     try:
         disable_amplifier(settings)
@@ -101,7 +102,7 @@ def safe_amplifier(settings: Any, log: Log) -> bool:
         return False
 
 
-def _loop_process(settings: Any, shared: Shared, board: Any) -> int:
+def _loop_process(settings: Settings, shared: Shared, board: Any) -> int:
     stop = _Stop()
     loops.die_with_parent()
     backend = make_backend(settings, board)
@@ -135,7 +136,7 @@ def _loop_process(settings: Any, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
-def _resume(settings: Any, shared: Shared, rig: loops.Rig) -> None:
+def _resume(settings: Settings, shared: Shared, rig: loops.Rig) -> None:
     """Take up the estimates of the run before, where they are recent and of this model."""
     state, age_s, why = keep.load(keep.kept_path(settings), rig.law.model)
     if state is not None:
@@ -153,7 +154,7 @@ def _resume(settings: Any, shared: Shared, rig: loops.Rig) -> None:
     )
 
 
-def _recorder_process(settings: Any, shared: Shared, board: Any) -> int:
+def _recorder_process(settings: Settings, shared: Shared, board: Any) -> int:
     from thermoctl.daemon.recorder import make_recorder, record
 
     stop = _Stop(shared, RECORDER)
@@ -162,9 +163,9 @@ def _recorder_process(settings: Any, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
-def _command_process(settings: Any, shared: Shared, board: Any) -> int:
+def _command_process(settings: Settings, shared: Shared, board: Any) -> int:
+    from thermoctl.daemon.control_socket import Commands, listen, serve
     from thermoctl.daemon.reload import reload_settings
-    from thermoctl.daemon.socket import Commands, listen, serve
 
     stop = _Stop(shared, COMMANDS)
     loops.die_with_parent()
@@ -179,7 +180,7 @@ def _command_process(settings: Any, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
-def _tuner_process(settings: Any, shared: Shared, board: Any) -> int:
+def _tuner_process(settings: Settings, shared: Shared, board: Any) -> int:
     from thermoctl.daemon import tuner
 
     stop = _Stop()
@@ -194,7 +195,7 @@ def _tuner_process(settings: Any, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
-def _reference_process(settings: Any, shared: Shared, board: Any) -> int:
+def _reference_process(settings: Settings, shared: Shared, board: Any) -> int:
     stop = _Stop(shared, REFERENCE)
     loops.die_with_parent()
     loops.become_real_time(settings, lambda text: None)
@@ -202,7 +203,7 @@ def _reference_process(settings: Any, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
-def _poller_process(settings: Any, shared: Shared, board: Any, device: str) -> int:
+def _poller_process(settings: Settings, shared: Shared, board: Any, device: str) -> int:
     from hal.board import run_poller
 
     loops.die_with_parent()
@@ -272,7 +273,7 @@ class _Notify:
         if not self.address:
             return
         address = "\0" + self.address[1:] if self.address.startswith("@") else self.address
-        with sockets.socket(sockets.AF_UNIX, sockets.SOCK_DGRAM) as s, contextlib.suppress(OSError):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as s, contextlib.suppress(OSError):
             s.connect(address)
             s.sendall(text.encode())
 
@@ -353,7 +354,7 @@ class _Watcher:
             self.log("device", role="amplifier_fault", message=repr(f"the drive reports {code['text']}"))
 
 
-def run(settings: Any, log: Log = console_log) -> int:
+def run(settings: Settings, log: Log = console_log) -> int:
     """Run the daemon until SIGTERM or SIGINT; returns its exit status. Raises InputError when it cannot be started."""
     if not COMPILED:
         log(
@@ -417,7 +418,7 @@ def run(settings: Any, log: Log = console_log) -> int:
         os.close(lock)
 
 
-def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child], log: Log) -> int:
+def _supervise(settings: Settings, shared: Shared, loop: _Child, others: list[_Child], log: Log) -> int:
     asked: list[int] = []
     reload_asked: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -484,7 +485,7 @@ def _supervise(settings: Any, shared: Shared, loop: _Child, others: list[_Child]
     return code
 
 
-def _keep(settings: Any, shared: Shared, model: Any) -> None:
+def _keep(settings: Settings, shared: Shared, model: Any) -> None:
     state = shared.state.get()
     if state is not None:
         keep.save(keep.kept_path(settings), model, state[2:])
@@ -509,8 +510,8 @@ def _restart(children: list[_Child], now: float, log: Log) -> None:
             child.start()
 
 
-def _reload(settings: Any, log: Log) -> None:
-    from thermoctl.daemon.socket import ask
+def _reload(settings: Settings, log: Log) -> None:
+    from thermoctl.daemon.control_socket import ask
 
     try:
         answer = ask(settings.socket.path, {"command": "reload"})

@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.shared import TUNING, Shared
 from thermoctl.identify import modelfile
 from thermoctl.identify.online import Tuner
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError
 
@@ -95,7 +95,7 @@ class Tuning:
         )
 
 
-def check(settings: Any) -> None:
+def check(settings: Settings) -> None:
     """Raises InputError when compensation.tune is asked for and there is no folder of calibrations to put results into."""
     if settings.compensation.tune and not Path(settings.compensation.model or "-").is_dir():
         raise InputError(

@@ -25,13 +25,13 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.dashboard import make_server, url
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.monitor import errors, ramp_of, remember, screen
 from thermoctl.daemon.service import START_S, STOP_S, Background
-from thermoctl.daemon.socket import ask
 from thermoctl.daemon.watch import Watch
-from thermoctl.settings import effective, load_settings
+from thermoctl.settings import Settings, effective, load_settings
 from thermoctl.yamlfile import InputError
 
 MOTION, CYCLE_S = ((0.0, 240.0), (70.0, 200.0)), 90.0
@@ -42,7 +42,7 @@ STALL_S = 10.0  # a machine that stands for less than this does not end the demo
 DASHBOARD = "127.0.0.1:8765"
 
 
-def demo(settings: Any, seconds: float | None = None) -> int:
+def demo(settings: Settings, seconds: float | None = None) -> int:
     """Start a daemon of its own, arm, move and show it until Ctrl-C or for `seconds`.
 
     Returns 1 when a fault stands at the end, 3 when the daemon did not start. Raises InputError for a rig that is not simulated
@@ -64,12 +64,12 @@ def demo(settings: Any, seconds: float | None = None) -> int:
             show.close()
 
 
-def demo_folder(settings: Any) -> Path:
+def demo_folder(settings: Settings) -> Path:
     """Where the demo of this configuration keeps what it writes: beside the rig's socket."""
     return Path(settings.socket.path).parent / "demo"
 
 
-def _own(settings: Any) -> Any:
+def _own(settings: Settings) -> Any:
     """The configuration of the demo, written into its folder: the rig of `settings` with all else of its own.
 
     Its time counts ticks, so that a machine that stalls slows the rig down instead of faulting it."""
@@ -118,7 +118,7 @@ def _ignore_signals() -> None:
 class _Demo:
     """The daemon of `settings` as a child, and what the terminal shows of it."""
 
-    def __init__(self, settings: Any, console: Console):
+    def __init__(self, settings: Settings, console: Console):
         self.settings, self.console = settings, console
         self.child = Background(settings, dies_with_us=True)
         self.page = ""

@@ -21,9 +21,10 @@ import numpy as np
 
 from thermoctl.control import arming, faults
 from thermoctl.daemon.assemble import compensator, shared_name
+from thermoctl.daemon.control_socket import latency, status
 from thermoctl.daemon.readings import hide_invalid
 from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.socket import latency, status
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
@@ -89,7 +90,7 @@ class Watch:
     captures: newest last. past: the last minute, {state, PAST signals} every tenth of a second, oldest first.
     """
 
-    def __init__(self, settings: Any, rate_hz: float = 20.0):
+    def __init__(self, settings: Settings, rate_hz: float = 20.0):
         self.settings, self.rate_hz = settings, rate_hz
         self.name = shared_name(settings)
         self.shared: Shared | None = None
@@ -141,7 +142,7 @@ class Watch:
         return next((c for c in list(self.captures) if c.number == number), None)
 
     def latency(self) -> dict[str, Any] | None:
-        """Lateness, busy time and slips (socket.latency), each histogram in LATENESS_EDGES_US; None without a daemon."""
+        """Lateness, busy time and slips (control_socket.latency), each histogram in LATENESS_EDGES_US; None without a daemon."""
         shared = self.shared
         if shared is None:
             return None

@@ -97,8 +97,8 @@ class SimulatedRig:
 
     def now(self) -> dict[str, Any]:
         """Channel states, temperatures and position once the law is READY. Raises HardwareError when it does not get there."""
+        from thermoctl.daemon.control_socket import channel_states
         from thermoctl.daemon.simulate import Simulation
-        from thermoctl.daemon.socket import channel_states
 
         simulation = Simulation(self.settings)
         try:
@@ -163,7 +163,7 @@ class DaemonRig:
 
     def now(self) -> dict[str, Any]:
         """The daemon's status. Raises HardwareError unless it is READY."""
-        from thermoctl.daemon.socket import ask
+        from thermoctl.daemon.control_socket import ask
 
         until = time.monotonic() + STILL_S  # a loop that was just started or disarmed needs a few ticks
         with _rig_answers():
@@ -200,8 +200,8 @@ class DaemonRig:
         is fitted to what was measured, not to the schedule. `rest`: wait first until the rig is at rest. Raises Aborted when the
         law leaves ARMED, the daemon ends or the person ends it; HardwareError where it does not arm."""
         from thermoctl.daemon.assemble import shared_name
+        from thermoctl.daemon.control_socket import Connection
         from thermoctl.daemon.shared import Shared
-        from thermoctl.daemon.socket import Connection
 
         if earlier is not None:
             yield _rows(earlier)
@@ -259,7 +259,7 @@ class DaemonRig:
 
     def _disarm(self, daemon: Any, shared: Any) -> None:
         """Disarm where it is still armed; a fault stays latched for the person to read."""
-        from thermoctl.daemon.socket import ask
+        from thermoctl.daemon.control_socket import ask
 
         newest = shared.ring.newest()
         if newest is None or newest[INDEX["state"]] != arming.ARMED:
@@ -361,7 +361,7 @@ def _causes(row: np.ndarray) -> str:
 
 def rig_of(settings: Any) -> SimulatedRig | DaemonRig:
     """The rig that tests run on: the daemon's where one answers, else the simulated one. Raises HardwareError where there is neither."""
-    from thermoctl.daemon.socket import ask
+    from thermoctl.daemon.control_socket import ask
 
     try:
         ask(settings.socket.path, {"command": "status"})

@@ -23,9 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.control import arming, faults
+from thermoctl.control.model import Parameters
 from thermoctl.daemon import arrival, readings
 from thermoctl.daemon.loop import RELOAD
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, POINTS, SIGNALS
 from thermoctl.yamlfile import InputError
 
@@ -152,8 +154,8 @@ class Commands:
     def __init__(
         self,
         shared: Shared,
-        settings: Any,
-        reload_settings: Callable[[Any, Any], tuple[Any, Any, list[str], list[str]]],
+        settings: Settings,
+        reload_settings: Callable[[Settings, Settings], tuple[Settings, Parameters, list[str], list[str]]],
         log: Callable[..., None],
     ):
         self.shared, self.settings, self.started = shared, settings, settings
