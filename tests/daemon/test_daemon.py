@@ -213,8 +213,8 @@ def test_start_tells_why_it_failed(unrecorded, capsys, monkeypatch):
 @pytest.mark.parametrize(
     "old,new,message",
     [
-        ("kp: 0.01", "kpp: 0.01", r"unknown option 'control.kpp' (did you mean 'kp'?)"),
-        ("kp: 0.01", "kp: -1", "control.kp: -1 is out of range; expected 0 to 1000"),
+        ("kp: 0.01", "kpp: 0.01", "control: unknown key 'kpp' (did you mean 'kp'?)"),
+        ("kp: 0.01", "kp: -1", "control.kp: -1 is outside 0 .. 1000 1/um"),
         ("period_s: 1 ms", "period_s: 1 kg", "the unit does not fit"),
         ("period_s: 1 ms", "period_s: soon", "a number in s was expected"),
         ("control:", "controll:", "(did you mean 'control'?)"),
