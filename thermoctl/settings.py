@@ -10,6 +10,7 @@ The dataclasses below are the table; `options()` lists it for the reference page
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import types
 import typing
@@ -589,18 +590,23 @@ def _number(node: Node, label: str, row: Option, whole: bool = False) -> float:
 
 def _with_unit(label: str, text: str, unit: str, node: Node) -> float:
     """Convert text such as '5 ms' to the option's unit."""
-    import pint  # slow to import, and rarely needed
-
-    registry: Any = pint.UnitRegistry()
     number, _, given = text.strip().partition(" ")
     try:
-        return float(registry.Quantity(float(number), given).to(unit).magnitude)
+        return float(_unit_registry().Quantity(float(number), given).to(unit).magnitude)
     except ValueError:
         raise node.error(f"{label}: a number in {unit or 'no unit'} was expected, not '{text}'") from None
     except Exception as e:  # pint's errors have no common base but Exception
         raise node.error(
             f"{label}: '{text}': the unit does not fit ({str(e).splitlines()[0]}); expected {unit or 'no unit'}"
         ) from None
+
+
+@functools.cache
+def _unit_registry() -> Any:
+    """Return pint's units; importing it takes longer than reading the configuration."""
+    import pint
+
+    return pint.UnitRegistry()
 
 
 def _texts(mapping: Section) -> dict[str, str]:

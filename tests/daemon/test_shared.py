@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermoctl.daemon.clock import now_ns, sleep_until
-from thermoctl.daemon.control_socket import latency
 from thermoctl.daemon.ring import Box, Histogram, Mailbox, Record, Ring, unpack_readings
 from thermoctl.daemon.shared import Shared, percentiles
+from thermoctl.daemon.snapshot import latency
 from thermoctl.yamlfile import InputError
 
 

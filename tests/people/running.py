@@ -8,7 +8,7 @@ import numpy as np
 
 from hal.backend import ERROR, OK, ROLE, make_backend
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
-from thermoctl.daemon.control_socket import Commands, listen, serve
+from thermoctl.daemon.command_server import Commands, listen, serve
 from thermoctl.daemon.loop import Rig
 from thermoctl.daemon.shared import Shared
 from thermoctl.signals import INDEX

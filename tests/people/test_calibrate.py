@@ -13,7 +13,7 @@ import pytest
 from browser import PICTURES, Browser, find
 
 from thermoctl import cli
-from thermoctl.daemon.control_socket import status
+from thermoctl.daemon.snapshot import status
 from thermoctl.evaluate import drive
 from thermoctl.evaluate.drive import Control, DaemonRig
 from thermoctl.identify import modelfile

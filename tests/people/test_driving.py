@@ -17,7 +17,8 @@ from hal.backend import ROLE
 from hal.faulty import Fault, FaultInjector
 from thermoctl import cli
 from thermoctl.control import arming
-from thermoctl.daemon.control_socket import Connection, ask, status
+from thermoctl.daemon.control_socket import Connection, ask
+from thermoctl.daemon.snapshot import status
 from thermoctl.evaluate import drive
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX

@@ -19,9 +19,10 @@ from hal.drive_errors import describe
 from thermoctl.control import causes, faults
 from thermoctl.control.causes import Standing, in_order
 from thermoctl.daemon import client, dashboard, monitor
-from thermoctl.daemon.control_socket import Commands, status
+from thermoctl.daemon.command_server import Commands
+from thermoctl.daemon.display import fault_lines
 from thermoctl.daemon.metrics import metrics
-from thermoctl.daemon.readings import fault_lines
+from thermoctl.daemon.snapshot import status
 from thermoctl.daemon.supervisor import _Watcher
 from thermoctl.recording.commands import list_recordings
 from thermoctl.recording.history import history

@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 
 from thermoctl.daemon.control_socket import ask
+from thermoctl.daemon.display import fault_lines, value_lines
 from thermoctl.daemon.lock import holder
-from thermoctl.daemon.readings import fault_lines, value_lines
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
 

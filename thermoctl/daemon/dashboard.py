@@ -44,7 +44,8 @@ import numpy as np
 from thermoctl.daemon.assemble import rig_identity
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.metrics import CONTENT_TYPE, metrics
-from thermoctl.daemon.readings import SOURCES, hide_invalid, invalid
+from thermoctl.daemon.readings import hide_invalid, invalid
+from thermoctl.daemon.sources import SOURCES
 from thermoctl.daemon.watch import Watch
 from thermoctl.recording.history import history
 from thermoctl.settings import Settings

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from thermoctl.daemon.control_socket import ask
-from thermoctl.daemon.readings import fault_lines, message_lines, number, span
+from thermoctl.daemon.display import fault_lines, message_lines, number, span
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 

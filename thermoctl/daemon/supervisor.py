@@ -36,6 +36,7 @@ from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep, readings
 from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
+from thermoctl.daemon.display import LATE_REMEDY
 from thermoctl.daemon.lock import hold
 from thermoctl.daemon.shared import BEATS, LOOP_PID, RESUMED, WARNINGS, Shared
 from thermoctl.settings import Settings
@@ -164,7 +165,7 @@ def _recorder_process(settings: Settings, shared: Shared, board: Any) -> int:
 
 
 def _command_process(settings: Settings, shared: Shared, board: Any) -> int:
-    from thermoctl.daemon.control_socket import Commands, listen, serve
+    from thermoctl.daemon.command_server import Commands, listen, serve
     from thermoctl.daemon.reload import reload_settings
 
     stop = _Stop(shared, COMMANDS)
@@ -324,7 +325,7 @@ class _Watcher:
                 continue
             self.told[name] = f["t_s"]
             if f["late_s"]:
-                self.log("late", ms=round(f["late_s"] * 1e3), before=name, remedy=repr(readings.LATE_REMEDY))
+                self.log("late", ms=round(f["late_s"] * 1e3), before=name, remedy=repr(LATE_REMEDY))
             self.log(
                 f["severity"],
                 tick=f["tick"],

@@ -21,9 +21,9 @@ import numpy as np
 
 from thermoctl.control import arming, faults
 from thermoctl.daemon.assemble import compensator, shared_name
-from thermoctl.daemon.control_socket import latency, status
 from thermoctl.daemon.readings import hide_invalid
 from thermoctl.daemon.shared import Shared
+from thermoctl.daemon.snapshot import latency, status
 from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError

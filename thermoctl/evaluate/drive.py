@@ -97,8 +97,8 @@ class SimulatedRig:
 
     def now(self) -> dict[str, Any]:
         """Channel states, temperatures and position once the law is READY. Raises HardwareError when it does not get there."""
-        from thermoctl.daemon.control_socket import channel_states
         from thermoctl.daemon.simulate import Simulation
+        from thermoctl.daemon.snapshot import channel_states
 
         simulation = Simulation(self.settings)
         try:

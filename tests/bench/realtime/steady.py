@@ -62,7 +62,7 @@ def configuration(work: Path) -> Path:
 def simulated(work: Path, hours: float) -> list[Sample]:
     """A sample every five minutes of simulated time."""
     from thermoctl.daemon import keep
-    from thermoctl.daemon.control_socket import Commands
+    from thermoctl.daemon.command_server import Commands
     from thermoctl.daemon.recorder import make_recorder
     from thermoctl.daemon.shared import Shared
     from thermoctl.daemon.simulate import Simulation

@@ -1,0 +1,271 @@
+"""The server's side of the command socket, in a process of its own; control_socket.py is the client's side.
+
+The file permissions of the socket (owner and group) decide who may connect. Each command that moves anything is
+logged with the kernel's peer credentials. Every size that a client decides is limited.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import grp
+import json
+import os
+import selectors
+import socket
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from thermoctl.control import arming
+from thermoctl.control.model import Parameters
+from thermoctl.daemon import arrival
+from thermoctl.daemon.control_socket import settled
+from thermoctl.daemon.display import fault_lines
+from thermoctl.daemon.loop import RELOAD
+from thermoctl.daemon.shared import Shared
+from thermoctl.daemon.snapshot import latency, status
+from thermoctl.settings import Settings
+from thermoctl.signals import SIGNALS
+from thermoctl.yamlfile import InputError
+
+MAX_LINE = 65536  # bytes of one request
+MAX_CLIENTS = 32
+ANSWER_S = 1.0  # time within which the loop must take a command
+
+
+class Commands:
+    """What a request does. `reload_settings(settings in force, settings at the start)` validates the file again and
+    returns (settings, parameters, applied keys, keys that need a restart)."""
+
+    def __init__(
+        self,
+        shared: Shared,
+        settings: Settings,
+        reload_settings: Callable[[Settings, Settings], tuple[Settings, Parameters, list[str], list[str]]],
+        log: Callable[..., None],
+    ):
+        self.shared, self.settings, self.started = shared, settings, settings
+        self.reload_settings, self.log = reload_settings, log
+        self.expected_hz = arrival.expected_hz(settings)
+
+    def answer(self, line: bytes, peer: str) -> dict[str, Any]:
+        """The answer to one request line; never raises for what a client sent."""
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict) or not isinstance(request.get("command"), str):
+                raise ValueError("expected an object with a 'command'")
+        except (ValueError, RecursionError) as e:
+            return {"ok": False, "error": f"not a request: {e}"}
+        name = request["command"]
+        if name == "status":
+            slow = arrival.slow_readings(self.shared, self.expected_hz)
+            return {"ok": True, **status(self.shared), "slow": slow}
+        if name == "latency":
+            return {"ok": True, **latency(self.shared, self.settings.loop.period_s)}
+        if name == "signals":
+            return {"ok": True, "signals": [[s.name, s.unit, s.meaning] for s in SIGNALS]}
+        actions = {
+            "arm": self._arm,
+            "disarm": self._disarm,
+            "setpoint": self._setpoint,
+            "reload": self._reload,
+        }
+        action = actions.get(name)
+        if action is None:
+            return {
+                "ok": False,
+                "error": f"unknown command '{name[:40]}'; "
+                "expected status, latency, signals, arm, disarm, setpoint or reload",
+            }
+        try:
+            answer = action(request)
+        except InputError as e:
+            answer = {"ok": False, "error": str(e)}
+        self.log(
+            "command",
+            name=name,
+            peer=peer,
+            ok=answer["ok"],
+            value=request.get("value"),
+            error=str(answer["error"]).splitlines()[0] if "error" in answer else None,
+        )
+        return answer
+
+    def _state(self) -> str:
+        return status(self.shared)["state"]
+
+    def _send(self, kind: float, value: float = 0.0) -> None:
+        """Hand a command to the loop and wait until it took it."""
+        if not self.shared.mailbox.push(kind, value):
+            raise InputError("the loop does not take commands: its mailbox is full (is it running?)")
+        position = self.shared.mailbox.pushed
+        head = self.shared.ring.head
+        deadline = time.monotonic() + ANSWER_S
+        while self.shared.mailbox.taken < position or self.shared.ring.head < head + 3:
+            if time.monotonic() > deadline:
+                raise InputError(f"the loop did not take the command within {ANSWER_S} s (is it running?)")
+            time.sleep(0.001)
+
+    def _result(self, wanted: str, refusal: str) -> dict[str, Any]:
+        now = status(self.shared)
+        if now["state"] == wanted:
+            return {"ok": True, "state": now["state"], "setpoint_um": now["setpoint_um"]}
+        lines = fault_lines(now["faults"])
+        return {
+            "ok": False,
+            "state": now["state"],
+            "error": "\n  ".join(
+                [f"{refusal}: the state is {now['state']}{' because of' if lines else ''}", *lines]
+            ),
+        }
+
+    def _arm(self, request: dict) -> dict[str, Any]:
+        deadline = time.monotonic() + ANSWER_S  # a loop that was just started warms up for 0.1 s
+        while not settled(status(self.shared)) and time.monotonic() < deadline:
+            time.sleep(0.005)
+        held = bool(request.get("held"))
+        if self._state() == "ARMED" and held:
+            return {
+                "ok": False,
+                "state": "ARMED",
+                "error": "not armed for this command: the rig is ARMED already, somebody uses it; `thermoctl disarm` ends that",
+            }
+        if self._state() == "ARMED":
+            return {"ok": True, "state": "ARMED", "setpoint_um": status(self.shared)["setpoint_um"]}
+        if self._state() == "FAULT":
+            return self._result(
+                "ARMED",
+                "not armed, a fault is latched: `thermoctl disarm` acknowledges it once its cause is gone",
+            )
+        self._send(arming.ARM)
+        answer = self._result("ARMED", "not armed")
+        return {**answer, "held": held and answer["ok"]}
+
+    def let_go(self, peer: str) -> None:
+        """Disarm: the connection that the rig was armed for is gone, however its program ended."""
+        if self._state() == "ARMED":
+            self.log("command", name="disarm", peer=peer, ok=True, why="its connection is gone")
+            self._send(arming.DISARM)
+
+    def _disarm(self, request: dict) -> dict[str, Any]:
+        self._send(arming.DISARM)
+        now = self._state()
+        if now in ("SAFE", "READY", "OFF"):
+            return {"ok": True, "state": now, "held": False}
+        return self._result("SAFE", "the amplifier is disabled, but the fault still stands")
+
+    def _setpoint(self, request: dict) -> dict[str, Any]:
+        value = request.get("value")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+            raise InputError("setpoint: expected a finite number of micrometres as 'value'")
+        control = self.settings.control
+        if not control.setpoint_low_um <= value <= control.setpoint_high_um:
+            raise InputError(
+                f"setpoint {value:g} um: outside control.setpoint_low_um..setpoint_high_um "
+                f"({control.setpoint_low_um:g}..{control.setpoint_high_um:g})"
+            )
+        if self._state() != "ARMED":
+            return self._result("ARMED", "setpoint not taken, it counts only when armed")
+        self._send(arming.SETPOINT, float(value))
+        return self._result("ARMED", "setpoint not taken")
+
+    def _reload(self, request: dict) -> dict[str, Any]:
+        settings, parameters, applied, restart = self.reload_settings(self.settings, self.started)
+        self.shared.parameters.put(parameters.pack())
+        self._send(RELOAD)
+        self.settings = settings
+        return {
+            "ok": True,
+            "generation": status(self.shared).get("generation"),
+            "applied": applied,
+            "needs_restart": restart,
+        }
+
+
+class _Client:
+    """One connection; `holds`: the rig was armed for as long as it lasts."""
+
+    def __init__(self, connection: socket.socket, peer: str):
+        self.connection, self.peer, self.received, self.unsent = connection, peer, b"", b""
+        self.holds = False
+
+
+def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
+    """The listening socket at `path`, for owner and group. Raises InputError where it cannot be made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileNotFoundError):
+        path.unlink()
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    before = os.umask(0o177)
+    try:
+        listener.bind(str(path))
+        if group:
+            os.chown(path, -1, grp.getgrnam(group).gr_gid)
+        os.chmod(path, mode)
+    except (OSError, KeyError) as e:
+        listener.close()
+        why = f"no group '{group}' on this system" if isinstance(e, KeyError) else e.strerror or str(e)
+        raise InputError(f"{path}: cannot listen: {why}; check socket.path and socket.group") from None
+    finally:
+        os.umask(before)
+    listener.listen(8)
+    listener.setblocking(False)
+    return listener
+
+
+def serve(listener: socket.socket, commands: Commands, stopping: Callable[[], bool]) -> None:
+    """Answer requests until `stopping()`. A client that sends too much or does not read is dropped."""
+    selector = selectors.DefaultSelector()
+    selector.register(listener, selectors.EVENT_READ)
+    while not stopping():
+        for key, events in selector.select(timeout=0.2):
+            if key.fileobj is listener:
+                _accept(listener, selector)
+            else:
+                _serve_client(key.data, events, selector, commands)
+    selector.close()
+
+
+def _accept(listener: socket.socket, selector: selectors.BaseSelector) -> None:
+    try:
+        connection, _ = listener.accept()
+    except OSError:
+        return
+    if len(selector.get_map()) > MAX_CLIENTS:
+        connection.close()
+        return
+    connection.setblocking(False)
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    pid, uid, _ = struct.unpack("3i", credentials)
+    selector.register(connection, selectors.EVENT_READ, _Client(connection, f"uid {uid} pid {pid}"))
+
+
+def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector, commands: Commands) -> None:
+    """One read, one request, one write at most: no client keeps another waiting. One that does not take its answer is
+    not read from."""
+    try:
+        if events & selectors.EVENT_READ:
+            data = client.connection.recv(MAX_LINE)
+            if not data:
+                raise OSError("closed")
+            client.received += data
+        if not client.unsent and b"\n" in client.received:
+            line, client.received = client.received.split(b"\n", 1)
+            answer = commands.answer(line, client.peer)
+            client.holds = answer.pop("held", client.holds)
+            client.unsent = json.dumps(answer).encode() + b"\n"
+        if not client.unsent and len(client.received) > MAX_LINE:
+            raise OSError("an endless line")
+        if client.unsent:
+            with contextlib.suppress(BlockingIOError):
+                client.unsent = client.unsent[client.connection.send(client.unsent) :]
+        busy = client.unsent or b"\n" in client.received
+        selector.modify(client.connection, selectors.EVENT_WRITE if busy else selectors.EVENT_READ, client)
+    except OSError:
+        selector.unregister(client.connection)
+        client.connection.close()
+        if client.holds:
+            with contextlib.suppress(InputError):  # the loop is gone, too
+                commands.let_go(client.peer)

@@ -1,0 +1,18 @@
+"""Which channels a signal of the record comes from."""
+
+from __future__ import annotations
+
+from thermoctl.control import faults
+
+COLUMN = {role: "position_raw_um" if role == "position_um" else role for role in faults.CHANNELS}
+"""Each channel's signal in the record."""
+SOURCES: dict[str, tuple[str, ...]] = {
+    **{signal: (role,) for role, signal in COLUMN.items()},
+    "position_um": ("position_um",),
+    "compensated_um": ("position_um",),
+    "power_w": ("voltage_v", "current_a"),
+    "innovation_c": ("coil_c",),
+    "kalman_gain": ("coil_c",),
+    "air_rate_k_s": ("air_c",),
+}
+"""Signals that are worth as much as these channels. ABSENT does not count against a computed one: the law does without."""
