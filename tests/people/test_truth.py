@@ -18,7 +18,7 @@ from hal.backend import ERROR, OK, ROLE, STALE
 from hal.drive_errors import describe
 from thermoctl.control import causes, faults
 from thermoctl.control.causes import Standing, in_order
-from thermoctl.daemon import client, dashboard, monitor
+from thermoctl.daemon import commands, dashboard, monitor
 from thermoctl.daemon.command_server import Commands
 from thermoctl.daemon.display import fault_lines
 from thermoctl.daemon.metrics import metrics
@@ -69,12 +69,11 @@ class Silent:
 def in_the_terminal(running, capsys, monkeypatch):
     """(status as printed, its JSON, the monitor's screen, Prometheus' page) of this moment."""
     answer = {"ok": True, **status(running.shared)}
-    monkeypatch.setattr(client, "ask", lambda *a: answer)
-    monkeypatch.setattr(client, "settings_of", lambda config: running.settings)
+    monkeypatch.setattr(commands, "ask", lambda *a: answer)
     capsys.readouterr()
-    client.status(None)
+    commands.status(running.settings)
     printed = capsys.readouterr().out
-    client.status(None, as_json=True)
+    commands.status(running.settings, as_json=True)
     trails: dict[str, deque[float]] = {}
     monitor.remember(trails, answer)
     console = Console(file=StringIO(), width=80, record=True)

@@ -121,7 +121,7 @@ class Commands:
             ),
         }
 
-    def _arm(self, request: dict) -> dict[str, Any]:
+    def _arm(self, request: dict[str, Any]) -> dict[str, Any]:
         deadline = time.monotonic() + ANSWER_S  # a loop that was just started warms up for 0.1 s
         while not settled(status(self.shared)) and time.monotonic() < deadline:
             time.sleep(0.005)
@@ -149,14 +149,14 @@ class Commands:
             self.log("command", name="disarm", peer=peer, ok=True, why="its connection is gone")
             self._send(arming.DISARM)
 
-    def _disarm(self, request: dict) -> dict[str, Any]:
+    def _disarm(self, request: dict[str, Any]) -> dict[str, Any]:
         self._send(arming.DISARM)
         now = self._state()
         if now in ("SAFE", "READY", "OFF"):
             return {"ok": True, "state": now, "held": False}
         return self._result("SAFE", "the amplifier is disabled, but the fault still stands")
 
-    def _setpoint(self, request: dict) -> dict[str, Any]:
+    def _setpoint(self, request: dict[str, Any]) -> dict[str, Any]:
         value = request.get("value")
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
             raise InputError("setpoint: expected a finite number of micrometres as 'value'")
@@ -171,7 +171,7 @@ class Commands:
         self._send(arming.SETPOINT, float(value))
         return self._result("ARMED", "setpoint not taken")
 
-    def _reload(self, request: dict) -> dict[str, Any]:
+    def _reload(self, request: dict[str, Any]) -> dict[str, Any]:
         settings, parameters, applied, restart = self.reload_settings(self.settings, self.started)
         self.shared.parameters.put(parameters.pack())
         self._send(RELOAD)

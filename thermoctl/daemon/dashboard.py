@@ -31,7 +31,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -471,7 +471,7 @@ def make_server(
     commands: bool = False,
     with_metrics: bool = False,
     token: str = "",
-    names: tuple[str, ...] = (),
+    names: Sequence[str] = (),
 ) -> Server:
     """A server on `listen` (ADDRESS:PORT, [V6ADDRESS]:PORT, or PORT on loopback), not yet serving.
 
@@ -519,14 +519,14 @@ def url(server: Server) -> str:
     return f"http://{host}:{port}/" + (f"#token={server.policy.token}" if needed else "")
 
 
-def dashboard(
+def serve(
     settings: Settings,
     listen: str,
     commands: bool,
     with_metrics: bool,
     token_file: str | None,
     rate_hz: float,
-    names: tuple[str, ...],
+    names: Sequence[str],
 ) -> int:
     """Serve until Ctrl-C."""
     if not 1.0 <= rate_hz <= 50.0:

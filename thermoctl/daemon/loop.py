@@ -119,7 +119,9 @@ class Rig:
                 self._delay[c] = 0 if age < 0.0 else _LATEST if age >= _LATEST else int(age)
         self.command, self.value, self.external = 0, 0.0, self.write_failed
         if self.mailbox is not None and self.mailbox.waiting():
-            self._obey(*self.mailbox.take())
+            command = self.mailbox.take()
+            if command is not None:
+                self._obey(*command)
 
     def _obey(self, kind: float, value: float) -> None:
         if kind == RELOAD:

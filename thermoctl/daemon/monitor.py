@@ -214,7 +214,7 @@ def look(path: str, with_latency: bool = True) -> tuple[dict[str, Any], dict[str
         }, None
 
 
-def monitor(settings: Settings, interval_s: float = 0.5, once: bool = False) -> int:
+def show(settings: Settings, interval_s: float = 0.5, once: bool = False) -> int:
     """Show the rig until Ctrl-C; `once` (or no terminal): one screen, and 1 when no daemon runs or a fault stands."""
     if not 0.05 <= interval_s <= 60.0:
         raise InputError(f"--interval {interval_s:g}: 0.05 to 60 seconds were expected")

@@ -128,7 +128,7 @@ class Bridge:
         self.client.loop_stop()
 
 
-def mqtt(
+def publish(
     settings: Settings,
     broker: str,
     topic: str,

@@ -149,7 +149,7 @@ def log_path(settings: Settings) -> Path:
     return Path(settings.socket.path).with_suffix(".log")
 
 
-class Background(subprocess.Popen):
+class Background(subprocess.Popen[bytes]):
     """`thermoctl run` on a configuration, its log appended to `log_path`; `began` is where in it this run begins.
 
     dies_with_us: it is asked to stop when this process ends, however that ends."""

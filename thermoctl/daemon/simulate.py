@@ -111,7 +111,7 @@ def _no_clock() -> int:
 
 def run_simulated(
     settings: Settings,
-    schedule: Iterable[tuple],
+    schedule: Iterable[tuple[Any, ...]],
     duration_s: float,
     seed: int | None = None,
     every: int = 1,

@@ -31,13 +31,17 @@ import numpy as np
 import structlog
 
 from hal.backend import HardwareError, disable_amplifier, make_backend, slow_devices
+from hal.board import Board, run_poller
 from thermoctl.control import arming, faults
 from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep, readings
 from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
+from thermoctl.daemon.command_server import Commands, listen, serve
+from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.display import LATE_REMEDY
 from thermoctl.daemon.lock import hold
+from thermoctl.daemon.reload import reload_settings
 from thermoctl.daemon.shared import BEATS, LOOP_PID, RESUMED, WARNINGS, Shared
 from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
@@ -165,9 +169,6 @@ def _recorder_process(settings: Settings, shared: Shared, board: Any) -> int:
 
 
 def _command_process(settings: Settings, shared: Shared, board: Any) -> int:
-    from thermoctl.daemon.command_server import Commands, listen, serve
-    from thermoctl.daemon.reload import reload_settings
-
     stop = _Stop(shared, COMMANDS)
     loops.die_with_parent()
     path = Path(settings.socket.path)
@@ -205,8 +206,6 @@ def _reference_process(settings: Settings, shared: Shared, board: Any) -> int:
 
 
 def _poller_process(settings: Settings, shared: Shared, board: Any, device: str) -> int:
-    from hal.board import run_poller
-
     loops.die_with_parent()
     run_poller(settings, device, board.name)
     return EXIT_OK
@@ -252,7 +251,7 @@ class _Child:
                 self.process.join()
 
 
-def _run_child(name: str, main: Callable[..., int], arguments: tuple) -> None:
+def _run_child(name: str, main: Callable[..., int], arguments: tuple[Any, ...]) -> None:
     try:
         code = main(*arguments)
     except InputError as e:
@@ -372,8 +371,6 @@ def run(settings: Settings, log: Log = console_log) -> int:
     shared = Shared.create(shared_name(settings))
     board, pollers = None, []
     if settings.hal.backend == "devices":
-        from hal.board import Board
-
         slow = slow_devices(settings)
         if slow:
             board = Board.create(shared_name(settings) + "-board")
@@ -512,8 +509,6 @@ def _restart(children: list[_Child], now: float, log: Log) -> None:
 
 
 def _reload(settings: Settings, log: Log) -> None:
-    from thermoctl.daemon.control_socket import ask
-
     try:
         answer = ask(settings.socket.path, {"command": "reload"})
         log("reload", **answer)
