@@ -19,7 +19,10 @@ FEWEST = 10  # readings that must have been due in that time
 
 
 def expected_hz(settings: Settings) -> dict[str, float]:
-    """The profile's rate of each role, Hz; empty for back ends without devices. Raises InputError."""
+    """Return the profile's rate of each role, Hz; empty for back ends without devices.
+
+    Raises InputError.
+    """
     if settings.hal.backend != "devices":
         return {}
     from hal.devices import make_devices
@@ -28,7 +31,10 @@ def expected_hz(settings: Settings) -> dict[str, float]:
 
 
 def slow(role: str, found_hz: float, expected: Mapping[str, float], looks_hz: float) -> str:
-    """What to say where `role` arrives too slowly, else ''. looks_hz: how often it was looked for; more cannot be seen."""
+    """Return a sentence when `role` arrives too slowly, else ''.
+
+    looks_hz: how often the reading was checked; a higher rate cannot be seen.
+    """
     due_hz = min(expected.get(role, 0.0), looks_hz)
     if found_hz >= SLOW_SHARE * due_hz:
         return ""
@@ -39,7 +45,10 @@ def slow(role: str, found_hz: float, expected: Mapping[str, float], looks_hz: fl
 
 
 def slow_readings(shared: Shared, expected: Mapping[str, float]) -> list[str]:
-    """A line for each reading that arrived too slowly in the last LOOK_ROWS ticks and is not lost altogether."""
+    """List a line for each reading that arrived too slowly in the last LOOK_ROWS ticks.
+
+    A reading that is lost altogether is a fault and not listed.
+    """
     rows, _, _ = shared.ring.read(max(0, shared.ring.head - LOOK_ROWS))
     if len(rows) < 2:
         return []

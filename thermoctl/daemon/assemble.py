@@ -1,4 +1,4 @@
-"""From the configuration to what the law takes: parameters, the compensator's model, names of shared memory."""
+"""Make what the law needs from the configuration: parameters, the model, names of shared memory."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _by_channel(given: Any, default: float, where: str) -> np.ndarray:
 
 
 def power_warning(settings: Settings) -> str:
-    """What is lost, with file:line, where the coil's power cannot be known; '' where it can."""
+    """Return a warning with file:line when the coil's power cannot be computed, else ''."""
     protection = settings.protection
     if settings.hal.backend != "devices":
         return ""
@@ -90,7 +90,10 @@ def power_warning(settings: Settings) -> str:
 
 
 def compensator(settings: Settings) -> CompensatorModel:
-    """The model that `compensation.model` names; without one, the model that estimates nothing. Raises InputError for a model of another rig."""
+    """Load the model that `compensation.model` names; without one, a model that estimates nothing.
+
+    Raises InputError for a model of another rig.
+    """
     if not settings.compensation.model:
         return zero_model(settings.loop.period_s)
     from thermoctl.identify.modelfile import load_model
@@ -99,12 +102,15 @@ def compensator(settings: Settings) -> CompensatorModel:
 
 
 def shared_name(settings: Settings) -> str:
-    """The name of the daemon's shared memory: one daemon a socket path."""
+    """Return the name of the daemon's shared memory: one daemon a socket path."""
     return f"thermoctl-{zlib.crc32(str(Path(settings.socket.path).absolute()).encode()):08x}"
 
 
 def rig_identity(settings: Settings) -> str:
-    """What its recordings call the rig: rig.name, or, where none is given, the configuration's name and a hash of its path."""
+    """Return the rig's name in recordings.
+
+    It is rig.name, or, without one, the configuration's name and a hash of its path.
+    """
     if settings.rig.name != UNNAMED:
         return settings.rig.name
     path = Path(settings.path).absolute()

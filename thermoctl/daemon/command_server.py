@@ -36,8 +36,11 @@ ANSWER_S = 1.0  # time within which the loop must take a command
 
 
 class Commands:
-    """What a request does. `reload_settings(settings in force, settings at the start)` validates the file again and
-    returns (settings, parameters, applied keys, keys that need a restart)."""
+    """Obeys the requests.
+
+    `reload_settings(settings in force, settings at the start)` reads the file again and returns (settings,
+    parameters, applied keys, keys that need a restart).
+    """
 
     def __init__(
         self,
@@ -51,7 +54,7 @@ class Commands:
         self.expected_hz = arrival.expected_hz(settings)
 
     def answer(self, line: bytes, peer: str) -> dict[str, Any]:
-        """The answer to one request line; never raises for what a client sent."""
+        """Answer one request line; nothing that a client sends raises an exception."""
         try:
             request = json.loads(line)
             if not isinstance(request, dict) or not isinstance(request.get("command"), str):
@@ -97,7 +100,7 @@ class Commands:
         return status(self.shared)["state"]
 
     def _send(self, kind: float, value: float = 0.0) -> None:
-        """Hand a command to the loop and wait until it took it."""
+        """Hand a command to the loop and wait until the loop has taken it."""
         if not self.shared.mailbox.push(kind, value):
             raise InputError("the loop does not take commands: its mailbox is full (is it running?)")
         position = self.shared.mailbox.pushed
@@ -144,7 +147,7 @@ class Commands:
         return {**answer, "held": held and answer["ok"]}
 
     def let_go(self, peer: str) -> None:
-        """Disarm: the connection that the rig was armed for is gone, however its program ended."""
+        """Disarm after the connection that armed the rig has ended, for whatever reason."""
         if self._state() == "ARMED":
             self.log("command", name="disarm", peer=peer, ok=True, why="its connection is gone")
             self._send(arming.DISARM)
@@ -185,7 +188,7 @@ class Commands:
 
 
 class _Client:
-    """One connection; `holds`: the rig was armed for as long as it lasts."""
+    """One connection; `holds`: the rig stays armed only as long as the connection lasts."""
 
     def __init__(self, connection: socket.socket, peer: str):
         self.connection, self.peer, self.received, self.unsent = connection, peer, b"", b""
@@ -193,7 +196,10 @@ class _Client:
 
 
 def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
-    """The listening socket at `path`, for owner and group. Raises InputError where it cannot be made."""
+    """Return a listening socket at `path`, for owner and group.
+
+    Raises InputError where it cannot be made.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileNotFoundError):
         path.unlink()
@@ -216,7 +222,7 @@ def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
 
 
 def serve(listener: socket.socket, commands: Commands, stopping: Callable[[], bool]) -> None:
-    """Answer requests until `stopping()`. A client that sends too much or does not read is dropped."""
+    """Answer requests until `stopping()`; drop a client that sends too much."""
     selector = selectors.DefaultSelector()
     selector.register(listener, selectors.EVENT_READ)
     while not stopping():
@@ -243,8 +249,10 @@ def _accept(listener: socket.socket, selector: selectors.BaseSelector) -> None:
 
 
 def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector, commands: Commands) -> None:
-    """One read, one request, one write at most: no client keeps another waiting. One that does not take its answer is
-    not read from."""
+    """Do at most one read, one request and one write, so that no client delays another.
+
+    Nothing is read from a client that has not taken its answer.
+    """
     try:
         if events & selectors.EVENT_READ:
             data = client.connection.recv(MAX_LINE)

@@ -1,4 +1,7 @@
-"""Commands that ask a running daemon: status, latency, arm, disarm, setpoint, reload. They load neither numpy nor drivers."""
+"""Commands that ask a running daemon: status, latency, arm, disarm, setpoint, reload.
+
+They load neither numpy nor drivers, so they answer at once.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,7 @@ def status(settings: Settings, as_json: bool = False) -> int:
 
 
 def latency(settings: Settings, as_json: bool = False) -> int:
-    """Print histograms of lateness and busy time, skipped ticks, and the idle loop's lateness in the same run."""
+    """Print histograms of lateness and busy time, skipped ticks, and the idle loop's lateness."""
     answer = ask(settings.socket.path, {"command": "latency"})
     if as_json:
         print(json.dumps(answer))

@@ -18,15 +18,17 @@ from thermoctl.yamlfile import InputError
 
 
 def settled(now: dict[str, Any]) -> bool:
-    """Whether the loop of this status has warmed up: its state changes no more by itself, but for a fault."""
+    """Return whether the loop has warmed up: only a command or a fault changes its state now."""
     state = now.get("state", "OFF")
     return state != "OFF" and (state != "SAFE" or any(f["severity"] != "warning" for f in now["faults"]))
 
 
 class Connection:
-    """A connection to the daemon at `path`: one request after the other. Raises InputError when nobody answers.
+    """A connection to the daemon at `path`: one request after the other.
 
-    A rig armed with {"command": "arm", "held": true} is disarmed by the daemon when the connection ends, however it ends."""
+    Raises InputError when the daemon does not answer. After {"command": "arm", "held": true} the daemon
+    disarms the rig when the connection ends, for whatever reason.
+    """
 
     def __init__(self, path: Path | str, timeout_s: float = 3.0):
         self.path, self.timeout_s = path, timeout_s
@@ -36,7 +38,7 @@ class Connection:
             self.socket.connect(str(path))
 
     def ask(self, request: dict[str, Any]) -> dict[str, Any]:
-        """The answer to one request."""
+        """Send one request and return its answer."""
         with self._answering():
             self.socket.sendall(json.dumps(request).encode() + b"\n")
             received = b""
@@ -75,6 +77,9 @@ class Connection:
 
 
 def ask(path: Path | str, request: dict[str, Any], timeout_s: float = 3.0) -> dict[str, Any]:
-    """One request to the daemon at `path`. Raises InputError when nobody answers."""
+    """Send one request to the daemon at `path`; return its answer.
+
+    Raises InputError when the daemon does not answer.
+    """
     with Connection(path, timeout_s) as connection:
         return connection.ask(request)

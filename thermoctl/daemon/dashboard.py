@@ -71,7 +71,10 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Policy:
-    """Who may do what. names: host names, besides addresses and localhost, that the page is asked for by."""
+    """Decides who may do what.
+
+    names: host names, besides addresses and localhost, by which the page may be requested.
+    """
 
     token: str
     token_to_look: bool
@@ -80,7 +83,10 @@ class Policy:
     names: frozenset[str] = field(default_factory=frozenset)
 
     def check_source(self, headers: Any) -> None:
-        """Refuse what another web page made the browser send: a foreign Host (DNS rebinding) or Origin."""
+        """Refuse requests that another web page made the browser send.
+
+        They show a foreign Host (DNS rebinding) or Origin.
+        """
         host = headers.get_all("Host") or []
         if len(host) != 1 or not self._ours(_host_name(host[0])):
             raise Refused(HTTPStatus.MISDIRECTED_REQUEST, "this host name is not served; see --name")
@@ -117,7 +123,7 @@ def _host_name(host: str) -> str:
 
 
 class Server(ThreadingHTTPServer):
-    """At most MAX_CONNECTIONS at a time; one more is closed at once."""
+    """Serves at most MAX_CONNECTIONS at a time; a further connection is closed at once."""
 
     daemon_threads = True
     allow_reuse_address = True
@@ -132,21 +138,21 @@ class Server(ThreadingHTTPServer):
         super().__init__(address, Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """A thread for it, when one is free."""
+        """Start a thread for the request, when a place is free."""
         if not self.connections.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """As in the library, and the place is free again."""
+        """Serve the request as the library does, then free the place."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self.connections.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that went away is no news; a defect of ours is."""
+        """Ignore clients that disconnect; report every other error."""
         import sys
 
         if not isinstance(sys.exception(), OSError):
@@ -154,7 +160,7 @@ class Server(ThreadingHTTPServer):
 
 
 def _page() -> tuple[bytes, str]:
-    """The page and the policy that lets nothing run or load but what is in it."""
+    """Return the page, and the policy that forbids every script and style but the page's own."""
     text = PAGE.read_text()
 
     def hashes(tag: str) -> str:
@@ -169,7 +175,7 @@ def _page() -> tuple[bytes, str]:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One request a connection."""
+    """Answers one request a connection."""
 
     server: Server
     protocol_version = "HTTP/1.1"
@@ -257,7 +263,10 @@ class Handler(BaseHTTPRequestHandler):
         route(Query(url.query))
 
     def _live(self, query: Query) -> None:
-        """Frames until the client goes away. One that reads slowly misses frames, and is dropped when it stops."""
+        """Send frames until the client disconnects.
+
+        A slow client misses frames; one that stops reading is dropped.
+        """
         if not self.server.streams.acquire(blocking=False):
             raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, f"already {MAX_STREAMS} pages are open")
         try:
@@ -420,12 +429,12 @@ class Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """What the library says of a request that it does not understand."""
+        """Answer a request that the library rejects."""
         self.request_version = "HTTP/1.1"
         self._json({"ok": False, "error": message or HTTPStatus(code).phrase}, HTTPStatus(code))
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not logged: a page asks many times a second, and a log would keep addresses."""
+        """Do not log requests: a page asks many times a second, and a log would keep addresses."""
 
 
 class Query:
@@ -438,11 +447,11 @@ class Query:
             raise InputError("the query is not understood: at most 8 names in UTF-8 were expected") from None
 
     def text(self, name: str, default: str) -> str:
-        """The value of `name`."""
+        """Return the value of `name`."""
         return self.values.get(name, default)
 
     def number(self, name: str, default: float) -> float:
-        """The finite number of `name`. Raises InputError for anything else."""
+        """Return the finite number of `name`. Raises InputError for anything else."""
         try:
             value = float(self.values.get(name, default))
         except ValueError:
@@ -473,9 +482,9 @@ def make_server(
     token: str = "",
     names: Sequence[str] = (),
 ) -> Server:
-    """A server on `listen` (ADDRESS:PORT, [V6ADDRESS]:PORT, or PORT on loopback), not yet serving.
+    """Make a server on `listen` that does not serve yet.
 
-    Raises InputError for an address that cannot be listened on and a token that can be guessed.
+    listen: ADDRESS:PORT, [V6ADDRESS]:PORT, or PORT on loopback.
     """
     address, port = _address(listen)
     if token and len(token) < MIN_TOKEN:
@@ -512,7 +521,7 @@ def _address(listen: str) -> tuple[str, int]:
 
 
 def url(server: Server) -> str:
-    """The address to open, with the token where one is needed."""
+    """Return the address to open, with the token where one is needed."""
     host, port = str(server.server_address[0]), server.server_address[1]
     host = f"[{host}]" if ":" in host else host
     needed = server.policy.token_to_look or server.policy.commands

@@ -1,4 +1,7 @@
-"""Text for terminals and logs, made from a status answer: readings, faults, times. It loads neither numpy nor the loop."""
+"""Text for terminals and logs, made from a status answer: readings, faults, times.
+
+It loads neither numpy nor the loop.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ LATE_REMEDY = "docs/how-to/real-time.md: stop what burns the processor beside th
 
 
 def shown(reading: Mapping[str, Any] | None, digits: int = 2) -> str:
-    """A reading in a terminal: '27.03', or '- (error, 20 s old)'; '-' where no device is bound to it."""
+    """Format a reading: '27.03', or '- (error, 20 s old)'; '-' where no device is bound."""
     if reading is None or reading["state"] == "ABSENT":
         return "-"
     if reading["value"] is not None:
@@ -22,12 +25,12 @@ def shown(reading: Mapping[str, Any] | None, digits: int = 2) -> str:
 
 
 def number(value: float | None, digits: int) -> str:
-    """A number, '-' for none, and no -0.00."""
+    """Format a number; '-' for none, and never -0.00."""
     return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def span(seconds: float | None) -> str:
-    """A time as people say it."""
+    """Format a time span in the largest fitting units."""
     if seconds is None:
         return "-"
     if seconds < 60.0:
@@ -37,7 +40,10 @@ def span(seconds: float | None) -> str:
 
 
 def fault_lines(standing: Iterable[Mapping[str, Any]]) -> list[str]:
-    """The faults as lines of a terminal: each cause with its time, its devices' words and its remedy, then what follows."""
+    """List the faults as lines of a terminal.
+
+    Each cause has its time, its devices' messages and its remedy; its consequences follow.
+    """
     lines: list[str] = []
     listed = list(standing)
     for f in listed:
@@ -58,7 +64,10 @@ def fault_lines(standing: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def value_lines(status: Mapping[str, Any]) -> list[str]:
-    """The values of a status as lines of a terminal; what is not valid is '-' with its state and age."""
+    """List a status' values as lines of a terminal.
+
+    An invalid value is '-' with its state and age.
+    """
     found = status["readings"]
     shown_or = {
         name: number(status[name], 3)
@@ -86,8 +95,10 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
 
 
 def message_lines(status: Mapping[str, Any]) -> list[str]:
-    """A line for each reading that is not valid, in its device's words; in FAULT for those, too, that are well again; and
-    the drive's newest error code."""
+    """List a line for each invalid reading, with its device's message.
+
+    In FAULT also readings that are valid again are listed. The drive's newest error code comes last.
+    """
     lines = []
     for role, r in status["readings"].items():
         said = f": {r['message']} (since {clock(r['message_wall_s'])})" if r["message"] else ""
@@ -102,5 +113,5 @@ def message_lines(status: Mapping[str, Any]) -> list[str]:
 
 
 def clock(wall_s: float) -> str:
-    """The time of day."""
+    """Format seconds since 1970 as the local time of day."""
     return time.strftime("%H:%M:%S", time.localtime(wall_s))

@@ -1,6 +1,7 @@
 """Commands that examine a rig that no daemon holds: `check` reads files only, `doctor` connects and reads.
 
-The checks of real time read /proc and /sys below `root`; nothing is changed. docs/how-to/real-time.md explains each line.
+The checks of real time read /proc and /sys below `root` and change nothing. docs/how-to/real-time.md
+explains each.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def check(settings: Settings) -> int:
 
 @dataclass
 class _Readings:
-    """What a channel gave while it was read: how often it was looked at, new readings of each role, the last sample."""
+    """Number of reads, new readings of each role, and the last sample."""
 
     reads: int
     counts: dict[str, int]
@@ -120,7 +121,7 @@ def _print_channels(settings: Settings, backend: Backend, found: _Readings, seco
 
 @dataclass(frozen=True)
 class Check:
-    """One property: `good` as it is, what was `found`, and the `remedy` where it is not good."""
+    """One property of the machine: `good`, the value `found`, and the `remedy` when it is not good."""
 
     name: str
     good: bool
@@ -129,7 +130,7 @@ class Check:
 
 
 def real_time_checks(settings: Settings, root: str = "/") -> Iterator[Check]:
-    """The checks for these settings (loop.cpu, loop.spin_s and the serial ports of hal.devices)."""
+    """Check the machine for these settings: loop.cpu, loop.spin_s and the serial ports."""
     base, cpu = Path(root), settings.loop.cpu
     yield _preemption(base)
     if cpu < 0:
@@ -159,7 +160,7 @@ def real_time_checks(settings: Settings, root: str = "/") -> Iterator[Check]:
 
 
 def cpu_list(text: str) -> set[int]:
-    """The numbers of a kernel list such as '0-2,5'; empty for '' and '(null)'."""
+    """Return the numbers of a kernel list such as '0-2,5'; empty for '' and '(null)'."""
     numbers: set[int] = set()
     for low, high in re.findall(r"(\d+)(?:-(\d+))?", text):
         numbers.update(range(int(low), int(high or low) + 1))

@@ -38,7 +38,7 @@ _ELSEWHERE = {
 
 
 def metrics(shared: Shared | None) -> str:
-    """The page of one moment; without a daemon only `thermoctl_up 0`."""
+    """Return the page of this moment; without a daemon only `thermoctl_up 0`."""
     row = None if shared is None else shared.ring.newest()
     lines: list[str] = []
 
@@ -121,7 +121,7 @@ def metrics(shared: Shared | None) -> str:
 
 
 def _histogram(lines: list[str], name: str, help: str, counts: np.ndarray) -> None:
-    """Counts of whole microseconds as a cumulative histogram; the sum takes each at the middle of its microsecond."""
+    """Append a cumulative histogram of whole microseconds; the sum takes the middle of each bin."""
     counts = counts.astype(np.float64)
     lines += [f"# HELP {name} {help}", f"# TYPE {name} histogram"]
     lines += [f'{name}_bucket{{le="{us * 1e-6:.6g}"}} {_number(counts[:us].sum())}' for us in BUCKETS_US]

@@ -25,7 +25,7 @@ CORRELATED = 4.0  # quantisation correlates neighbours: so many samples count as
 
 @dataclass(frozen=True)
 class Alarm:
-    """The model does not fit from `begin_s` to `end_s`; `mean_c`: the mean innovation there, K."""
+    """The model did not fit from `begin_s` to `end_s`; `mean_c`: the mean innovation then, K."""
 
     begin_s: float
     end_s: float
@@ -33,8 +33,12 @@ class Alarm:
 
 
 class Misfit:
-    """Feed it rows in order: `add(t_s, innovation_c, kalman_gain)` returns an alarm when one is new. How the rows are cut
-    into calls does not matter. A model that says nothing of the coil has no innovations to watch: no alarm ever."""
+    """Detects a lasting bias of the innovations by a CUSUM on both sides.
+
+    Pass rows in order: `add(t_s, innovation_c, kalman_gain)` returns an alarm when one is new. The
+    division into calls has no influence. A model without a coil temperature has no innovations and never
+    raises an alarm.
+    """
 
     def __init__(self, model: CompensatorModel):
         self._gain, self._noise = float(model.C[0] @ model.gain[:, 0]), math.sqrt(model.R_v)
@@ -42,7 +46,7 @@ class Misfit:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was seen: another model, or a clock that began again."""
+        """Reset the sums: after a change of the model, or when the clock starts again."""
         self._rows = np.empty((3, 0))  # of the block that is not complete: t, innovation, gain
         self._last_t, self._last_c = -math.inf, math.nan
         self.sums = [0.0, 0.0]
@@ -50,7 +54,10 @@ class Misfit:
         self.alarmed = False
 
     def add(self, t_s: np.ndarray, innovation_c: np.ndarray, kalman_gain: np.ndarray) -> Alarm | None:
-        """Rows (n,) of each; the newest alarm that they raise. NaN innovations (no sample yet) are left out."""
+        """Add rows (n,) of each signal; return the newest alarm that they raise.
+
+        NaN innovations (no sample yet) are left out.
+        """
         rows = np.array([t_s, innovation_c, kalman_gain])[:, np.isfinite(t_s) & np.isfinite(innovation_c)]
         found = None
         if not self._watches or not rows.shape[1]:

@@ -35,9 +35,11 @@ def _library() -> ModuleType:
 
 
 class Bridge:
-    """Follows the daemon of `settings` and publishes below `topic`.
+    """Asks the daemon of `settings` and publishes below `topic`.
 
-    broker: HOST or HOST:PORT (1883, with `tls` 8883); user, password: where the broker asks for them."""
+    broker: HOST or HOST:PORT (default 1883, with `tls` 8883); user, password: where the broker asks for
+    them.
+    """
 
     def __init__(
         self,
@@ -79,7 +81,7 @@ class Bridge:
         self.connected.set()
 
     def open(self) -> None:
-        """Connect. Raises InputError when the broker is not there or refuses."""
+        """Connect. Raises InputError when the broker cannot be reached or refuses."""
         where = f"broker {self.broker[0]}:{self.broker[1]}"
         try:
             self.client.connect(*self.broker, keepalive=15)
@@ -116,7 +118,7 @@ class Bridge:
                 self._faults = faults
 
     def close(self) -> None:
-        """Say `offline` and leave."""
+        """Publish `offline` and disconnect."""
         if self.connected.is_set():
             with contextlib.suppress(
                 RuntimeError, ValueError
@@ -137,7 +139,7 @@ def publish(
     password_file: str | None,
     tls: bool,
 ) -> int:
-    """The command: publish until Ctrl-C. Raises InputError for a broker that is not there or refuses."""
+    """Publish until Ctrl-C. Raises InputError when the broker cannot be reached or refuses."""
     if not 0.01 <= rate_hz <= 10.0:
         raise InputError(f"--rate {rate_hz:g}: 0.01 to 10 messages a second were expected")
     try:

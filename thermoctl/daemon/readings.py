@@ -1,7 +1,7 @@
-"""Readings and faults as every view shows them: value, state, age, the device's own words; causes first.
+"""Readings and faults as every view shows them: value, state, age, the device's message; causes first.
 
-`status`, `--json`, monitor, dashboard, metrics and MQTT take them from here. A number whose reading is not valid is null;
-the last one stands in `readings` as `last`, beside its state and age.
+`status`, `--json`, monitor, dashboard, metrics and MQTT use them. An invalid reading has the value null;
+`readings` keeps its last value as `last`, with state and age.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ STATUS = ("OK", "STALE", "ERROR", "ABSENT")
 
 
 def verdict(status_bits: int, kind: float, channel: int) -> str:
-    """State of a channel: OK, ABSENT, or what is wrong by the device or by the law (ERROR STALE RANGE RATE FROZEN)."""
+    """Return a channel's state: OK, ABSENT, or the error found by the device or the law.
+
+    Errors are ERROR, STALE, RANGE, RATE and FROZEN.
+    """
     state = STATUS[status_bits >> (2 * channel) & 3]
     if state == "OK" and kind > 0.0:
         return faults.KINDS[int(kind) - 1].upper()
@@ -31,8 +34,11 @@ def verdict(status_bits: int, kind: float, channel: int) -> str:
 
 
 def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Every channel of the newest row: value (null unless OK), last, state, age_s, and the device's newest message with
-    its time (seconds since 1970), which stays when the channel is well again."""
+    """Return every channel of the newest row: value (null unless OK), last, state, age_s, message.
+
+    The message is the device's newest one, with its time (seconds since 1970); it stays when the channel
+    is valid again.
+    """
     bits, found = int(row[INDEX["status_bits"]]), {}
     begin_s = row[INDEX["wall_s"]] - row[INDEX["t_s"]]
     for c, role in enumerate(faults.CHANNELS):
@@ -51,19 +57,19 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
 
 
 def valid(name: str, found: Mapping[str, Mapping[str, Any]]) -> bool:
-    """Whether a signal's number may be shown as one: every channel it comes from is well."""
+    """Return whether a signal is valid: every channel it comes from is."""
     allowed = ("OK",) if name in COLUMN.values() else ("OK", "ABSENT")
     return all(found[role]["state"] in allowed for role in SOURCES.get(name, ()))
 
 
 def hide_invalid(rows: np.ndarray, name: str) -> np.ndarray:
-    """The column of a signal in rows (n, signals), NaN where the device of one of its channels was not well."""
+    """Return a signal's column of rows (n, signals), NaN where one of its channels was invalid."""
     values = rows[:, INDEX[name]]
     return np.where(invalid(rows[:, INDEX["status_bits"]], name), np.nan, values)
 
 
 def invalid(status_bits: np.ndarray, name: str) -> np.ndarray:
-    """Which of these rows' words of status say that a channel of this signal is stale or in error."""
+    """Return for each status word whether a channel of this signal is stale or in error."""
     bits, bad = np.nan_to_num(status_bits).astype(np.int64), np.zeros(len(status_bits), bool)
     for role in SOURCES.get(name, ()):
         state = bits >> (2 * faults.CHANNELS.index(role)) & 3
@@ -72,7 +78,10 @@ def invalid(status_bits: np.ndarray, name: str) -> np.ndarray:
 
 
 def drive_code(shared: Shared, row: np.ndarray) -> dict[str, Any] | None:
-    """The drive's newest error code, kept after its reset: code, its text and time; None where there was none."""
+    """Return the drive's newest error code with text and time; None where there was none.
+
+    It is kept after the drive's reset.
+    """
     code, at_s = (float(shared.areas["remark_numbers"][k]) for k in (CODE, CODE_S))
     if not code:
         return None
@@ -82,7 +91,10 @@ def drive_code(shared: Shared, row: np.ndarray) -> dict[str, Any] | None:
 
 
 def standing_faults(shared: Shared, row: np.ndarray, found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Standing and latched faults, the cause first and what follows behind it (control/causes.py); [] while it starts."""
+    """List active and latched faults, each cause before its consequences (control/causes.py).
+
+    Empty while the daemon starts.
+    """
     if row[INDEX["state"]] == 0.0:
         return []
     trips, onsets = int(shared.areas["remark_numbers"][TRIPS]), shared.areas["onsets"]
@@ -112,7 +124,10 @@ def standing_faults(shared: Shared, row: np.ndarray, found: Mapping[str, Any]) -
 def _messages(
     fault: causes.Standing, found: Mapping[str, Any], begin_s: float, code: Mapping[str, Any] | None
 ) -> list[str]:
-    """The devices' own words for this fault: those of its channels that are not well, or were so since it began."""
+    """Return the devices' messages for this fault.
+
+    They come from its channels that are invalid now, or were invalid since the fault began.
+    """
     roles: dict[str, list[str]] = {}  # by what is said: a lost device says the same for each channel
     texts: dict[str, str] = {}
     for role in causes.channels_of(fault.name):

@@ -1,4 +1,4 @@
-"""Replay: the recorded inputs through the law again, the outputs compared with the recorded ones bit for bit."""
+"""Replay: run the recorded inputs through the law again and compare the outputs bit for bit."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ _DT, _COMMAND, _VALUE, _EXTERNAL = (INDEX[n] for n in ("dt_s", "command", "comma
 
 @dataclass
 class Replay:
-    """`ticks` compared, `skipped` before the stored state, `differences` {signal: (ticks that differ, first of them,
-    largest difference)}; `outputs` (ticks, len(OUTPUTS)) as the law gave them now."""
+    """Result of a replay.
+
+    `ticks` compared, `skipped` before the stored state; `differences` {signal: (ticks that differ, first
+    of them, largest difference)}; `outputs` (ticks, len(OUTPUTS)) of this replay.
+    """
 
     ticks: int
     skipped: int

@@ -69,7 +69,7 @@ _LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES]).enco
 
 
 class Shared:
-    """The segment with its areas; `create` in the supervisor, `attach` elsewhere."""
+    """The segment with its areas; the supervisor calls `create`, others `attach`."""
 
     def __init__(self, memory: mmap.mmap, path: Path):
         self._memory, self._path = memory, path
@@ -91,7 +91,7 @@ class Shared:
         self.remarks = self.make_remarks()
 
     def make_remarks(self, period_s: float = 0.001) -> Remarks:
-        """The remarks' areas; period_s is for the writer."""
+        """Return the areas of the remarks; period_s matters to the writer only."""
         a = self.areas
         return Remarks(
             a["ages"],
@@ -106,7 +106,7 @@ class Shared:
 
     @classmethod
     def create(cls, name: str) -> Shared:
-        """A fresh segment; one that a killed daemon left is removed first."""
+        """Create the segment; one that a killed daemon left behind is removed first."""
         size = sum(int(np.prod(shape)) * 8 for _, _, shape in _AREAS)
         path = SHARED_MEMORY / name
         try:
@@ -127,7 +127,10 @@ class Shared:
 
     @classmethod
     def attach(cls, name: str) -> Shared:
-        """The segment of a running daemon. Raises InputError when there is none, it is another user's or has another layout."""
+        """Attach to the segment of a running daemon.
+
+        Raises InputError when there is none, it belongs to another user, or it has another layout.
+        """
         path = SHARED_MEMORY / name
         try:
             file = os.open(path, os.O_RDWR)
@@ -149,11 +152,11 @@ class Shared:
         return cls(memory, path)
 
     def beats(self, place: int) -> float:
-        """Rounds that the helper at this place has done."""
+        """Return the rounds that the helper at this place has done."""
         return float(self.counters[BEATS + place])
 
     def remove(self) -> None:
-        """Take the segment's name away (by its creator); the memory goes with its last user."""
+        """Remove the segment's name (by its creator); the memory is freed with its last user."""
         self._path.unlink(missing_ok=True)
 
 

@@ -12,8 +12,11 @@ from thermoctl.signals import INDEX, POINTS
 
 
 def status(shared: Shared) -> dict[str, Any]:
-    """The newest row as `thermoctl status --json` gives it: a number whose reading is not valid is null, `readings` has its
-    state, age and the device's words; faults with the cause first."""
+    """Return the newest row as `thermoctl status --json` prints it.
+
+    A number whose reading is invalid is null; `readings` has its state, age and message. Faults have the
+    cause first.
+    """
     row = shared.ring.newest()
     if row is None:
         return {
@@ -83,7 +86,7 @@ def status(shared: Shared) -> dict[str, Any]:
 
 
 def channel_states(status_bits: int) -> dict[str, str]:
-    """Each channel's reading: OK, STALE, ERROR or ABSENT, from the signal status_bits."""
+    """Return each channel's state, OK, STALE, ERROR or ABSENT, from the signal status_bits."""
     return {
         name: ("OK", "STALE", "ERROR", "ABSENT")[status_bits >> (2 * c) & 3]
         for c, name in enumerate(faults.CHANNELS)
@@ -91,7 +94,7 @@ def channel_states(status_bits: int) -> dict[str, str]:
 
 
 def latency(shared: Shared, period_s: float) -> dict[str, Any]:
-    """Histograms and percentiles of lateness and busy time, slips, and the reference loop's, us."""
+    """Return histograms and percentiles of lateness, busy time and the idle loop's lateness, us."""
     row = shared.ring.newest()
     answer: dict[str, Any] = {
         "period_us": period_s * 1e6,

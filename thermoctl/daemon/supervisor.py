@@ -80,7 +80,10 @@ def _line(_logger: Any, _method: str, values: MutableMapping[str, Any]) -> str:
 
 
 class _Stop:
-    """Set by SIGTERM, and a helper's heartbeat; `SIGINT` is left to the supervisor, which gets it from the terminal as the children do."""
+    """Set by SIGTERM; each call also counts a heartbeat of the helper.
+
+    SIGINT is left to the supervisor: the terminal sends it to the children, too.
+    """
 
     def __init__(self, shared: Shared | None = None, beat: int = 0) -> None:
         self.asked, self.shared, self.beat = False, shared, beat
@@ -98,7 +101,10 @@ class _Stop:
 
 
 def safe_amplifier(settings: Settings, log: Log) -> bool:
-    """Disable the amplifier over a link of our own: when the loop can no longer do it. No other device is opened."""
+    """Disable the amplifier over a link of the supervisor's own, when the loop no longer can.
+
+    No other device is opened.
+    """
     try:
         disable_amplifier(settings)
         return True
@@ -142,7 +148,7 @@ def _loop_process(settings: Settings, shared: Shared, board: Any) -> int:
 
 
 def _resume(settings: Settings, shared: Shared, rig: loops.Rig) -> None:
-    """Take up the estimates of the run before, where they are recent and of this model."""
+    """Restore the estimates of the run before, when they are recent and of this model."""
     state, age_s, why = keep.load(keep.kept_path(settings), rig.law.model)
     if state is not None:
         try:
@@ -212,7 +218,10 @@ def _poller_process(settings: Settings, shared: Shared, board: Any, device: str)
 
 
 class _Child:
-    """One process: how it is started, and when it may be started again. beats: gives its rounds done, None: unwatched."""
+    """One process: how it is started, and when it may be started again.
+
+    beats: returns the rounds it has done; None: it is not watched.
+    """
 
     def __init__(
         self, name: str, main: Callable[..., int], *arguments: Any, beats: Callable[[], float] | None = None
@@ -230,7 +239,7 @@ class _Child:
         self.started = self.heard_at = time.monotonic()
 
     def hangs(self, now: float) -> bool:
-        """True when it lives and has not done a round for HANG_S."""
+        """Return whether it lives and has not done a round for HANG_S."""
         if self.beats is None or not self.alive:
             return False
         if (beats := self.beats()) != self.heard:
@@ -264,7 +273,7 @@ def _run_child(name: str, main: Callable[..., int], arguments: tuple[Any, ...]) 
 
 
 class _Notify:
-    """sd_notify without a library: nothing happens where systemd did not start us."""
+    """Sends sd_notify messages without a library; does nothing where systemd did not start us."""
 
     def __init__(self) -> None:
         self.address = os.environ.get("NOTIFY_SOCKET", "")
@@ -279,8 +288,10 @@ class _Notify:
 
 
 class _Watcher:
-    """Puts changes of state, faults and the devices' messages into the log: the loop itself logs nothing. Faults are told
-    with their cause first; while the law warms up (OFF) nothing is one."""
+    """Logs changes of state, faults and the devices' messages: the loop itself logs nothing.
+
+    Faults are logged with their cause first. While the law warms up (OFF) nothing is a fault.
+    """
 
     def __init__(self, shared: Shared, log: Log):
         self.shared, self.log = shared, log
@@ -315,7 +326,7 @@ class _Watcher:
             self._faults(rows[-1], new)
 
     def _faults(self, row: np.ndarray, new: int) -> None:
-        """Those of `new`, causes first, also where they are gone again by now."""
+        """Log the faults of `new`, causes first, including those that have cleared by now."""
         row = row.copy()
         row[INDEX["fault_bits"]] = float(int(row[INDEX["fault_bits"]]) | new)
         for f in readings.standing_faults(self.shared, row, readings.readings(self.shared, row)):
@@ -336,7 +347,10 @@ class _Watcher:
             )
 
     def _devices(self, row: np.ndarray) -> None:
-        """New lines of the devices, and the drive's error code; a channel's again only after TELL_AGAIN_S."""
+        """Log new messages of the devices, and the drive's error code.
+
+        A channel is logged again only after TELL_AGAIN_S.
+        """
         if row[INDEX["state"]] == arming.OFF:
             return
         for c, role in enumerate(faults.CHANNELS):
@@ -355,7 +369,10 @@ class _Watcher:
 
 
 def run(settings: Settings, log: Log = console_log) -> int:
-    """Run the daemon until SIGTERM or SIGINT; returns its exit status. Raises InputError when it cannot be started."""
+    """Run the daemon until SIGTERM or SIGINT; return its exit status.
+
+    Raises InputError when it cannot be started.
+    """
     if not COMPILED:
         log(
             "warning",

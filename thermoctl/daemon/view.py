@@ -1,7 +1,7 @@
 """`demo`: a simulated rig of its own, armed and moving, with the monitor's view in front of it.
 
-The demo drives nothing but its own child: its configuration, socket, lock, log and recordings stand in a folder of their
-own beside the rig's socket, and before it arms, moves or disarms it checks that its child holds the lock.
+The demo drives only its own child: configuration, socket, lock, log and recordings lie in a folder beside
+the rig's socket. Before it arms, moves or disarms, it checks that its child holds the lock.
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ DASHBOARD = "127.0.0.1:8765"
 def demo(settings: Settings, seconds: float | None = None) -> int:
     """Start a daemon of its own, arm, move and show it until Ctrl-C or for `seconds`.
 
-    Returns 1 when a fault stands at the end, 3 when the daemon did not start. Raises InputError for a rig that is not simulated
-    and while another demo runs here."""
+    Returns 1 when a fault is active at the end, 3 when the daemon did not start. Raises InputError for a
+    rig that is not simulated, and while another demo runs here.
+    """
     if settings.hal.backend != "simulated":
         raise InputError(
             f"{settings.path}: demo moves a simulated rig only, and this one's back end is '{settings.hal.backend}'; "
@@ -65,14 +66,15 @@ def demo(settings: Settings, seconds: float | None = None) -> int:
 
 
 def demo_folder(settings: Settings) -> Path:
-    """Where the demo of this configuration keeps what it writes: beside the rig's socket."""
+    """Return the folder of everything that the demo of this configuration writes."""
     return Path(settings.socket.path).parent / "demo"
 
 
 def _own(settings: Settings) -> Any:
-    """The configuration of the demo, written into its folder: the rig of `settings` with all else of its own.
+    """Write the configuration of the demo into its folder: this rig, with files of its own.
 
-    Its time counts ticks, so that a machine that stalls slows the rig down instead of faulting it."""
+    Its time counts ticks, so that a stalled machine slows the rig down instead of faulting it.
+    """
     folder, beside = demo_folder(settings), Path(settings.path).absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
     hal = settings.hal
@@ -127,7 +129,7 @@ class _Demo:
         self.faulty = False
 
     def ask(self, command: str, **more: Any) -> dict[str, Any]:
-        """A request to our own child. Raises InputError where it does not hold the lock."""
+        """Send a request to our own child. Raises InputError where it does not hold the lock."""
         if holder(self.settings) != self.child.pid:
             raise InputError(f"{self.settings.socket.path}: the demo's daemon does not run")
         return ask(self.settings.socket.path, {"command": command, **more})
@@ -144,7 +146,7 @@ class _Demo:
         return int(self.faulty or self.child.poll() is not None)
 
     def close(self) -> None:
-        """Disarm and end the child; say what came of it."""
+        """Disarm and end the child; print the result."""
         with contextlib.suppress(InputError):
             self.ask("disarm")
         self.child.terminate()
@@ -224,7 +226,7 @@ class _Demo:
                     moved = -1.0 if self.ask("arm")["ok"] else moved
 
     def _head(self, status: dict[str, Any]) -> list[Text]:
-        """Above the monitor's screen: the sentence, the page; then late ticks, and what to do about a fault."""
+        """Return the lines above the monitor's screen: growth, page, late ticks, and help with a fault."""
         lines = [
             Text(self.growth.sentence(), "bold"),
             Text(f"dashboard {self.page}   q or Ctrl-C stops", "dim"),
@@ -262,20 +264,20 @@ class _Demo:
 
 
 def corner(at_s: float) -> tuple[float, float]:
-    """The newest (s, setpoint um) of the motion, `at_s` after arming."""
+    """Return the newest (s, setpoint um) of the motion, `at_s` after arming."""
     cycles, within = divmod(at_s, CYCLE_S)
     t, value = max(c for c in MOTION if c[0] <= within)
     return t + cycles * CYCLE_S, value
 
 
 class Growth:
-    """How far the shaft has grown and what compensation leaves of it: means over the newest MEAN_S."""
+    """The shaft's growth and its compensated part: means over the newest MEAN_S."""
 
     def __init__(self) -> None:
         self.values: deque[tuple[float, float, float]] = deque()
 
     def add(self, status: dict[str, Any]) -> None:
-        """Take a status; nothing while the reference moves."""
+        """Add a status; ignored while the reference moves."""
         with_, without = errors(status)
         if with_ is None or without is None or status["reference_um"] != status["setpoint_um"]:
             return
@@ -285,7 +287,7 @@ class Growth:
             self.values.popleft()
 
     def sentence(self) -> str:
-        """What it says in one sentence."""
+        """Return the growth and what compensation leaves of it, in one sentence."""
         if not self.values:
             return f"Moving to {MOTION[0][1]:g} um; holding it takes 3 W, which warm the coil and lengthen the shaft."
         left, grown = (abs(float(v)) for v in np.mean(np.array(self.values)[:, 1:], axis=0))
@@ -297,7 +299,7 @@ class Growth:
 
 @contextlib.contextmanager
 def _keys() -> Iterator[None]:
-    """Keys come one by one and unseen, where the terminal can do that."""
+    """Read keys one by one, without echo, where the terminal can do that."""
     if not sys.stdin.isatty():
         yield
         return
@@ -310,7 +312,7 @@ def _keys() -> Iterator[None]:
 
 
 def _key(wait_s: float) -> str:
-    """The key that was pressed within `wait_s`, or ''."""
+    """Return the key that was pressed within `wait_s`, or ''."""
     if not sys.stdin.isatty():
         time.sleep(wait_s)
         return ""
