@@ -21,9 +21,9 @@ from thermoctl.control.causes import Standing, in_order
 from thermoctl.daemon import commands, dashboard, monitor
 from thermoctl.daemon.command_server import Commands
 from thermoctl.daemon.display import fault_lines
+from thermoctl.daemon.journal import Watcher
 from thermoctl.daemon.metrics import metrics
 from thermoctl.daemon.snapshot import status
-from thermoctl.daemon.supervisor import _Watcher
 from thermoctl.recording.commands import list_recordings
 from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter
@@ -260,7 +260,7 @@ def test_the_drives_code_stays_after_its_reset(settings, running):
 
     inner.read = with_code
     log = []
-    watcher = _Watcher(running.shared, lambda event, **v: log.append((event, v)))
+    watcher = Watcher(running.shared, lambda event, **v: log.append((event, v)))
     running.tick(5)
     watcher.look()
     code[0] = 0
@@ -294,7 +294,7 @@ def test_starting_is_no_fault(settings, running):
 
     inner.read = later
     log = []
-    watcher = _Watcher(running.shared, lambda event, **v: log.append((event, v)))
+    watcher = Watcher(running.shared, lambda event, **v: log.append((event, v)))
     for _ in range(30):
         running.tick(10)
         watcher.look()
@@ -309,13 +309,13 @@ def test_arm_in_fault_answers_in_readable_lines(settings, running):
     answer = Commands(running.shared, settings, None, lambda *a, **k: None).answer(b'{"command": "arm"}', "")
     lines = answer["error"].splitlines()
     assert not answer["ok"] and 3 <= len(lines) <= 8 and max(map(len, lines)) < 300
-    assert "open wire" in answer["error"] and "it brought" in answer["error"]
+    assert "open wire" in answer["error"] and "followed by" in answer["error"]
 
 
 def test_the_devices_words_are_logged_once_with_their_time(settings, running):
     running.arm()
     log = []
-    watcher = _Watcher(running.shared, lambda event, **v: log.append((event, v)))
+    watcher = Watcher(running.shared, lambda event, **v: log.append((event, v)))
     watcher.look()
     running.backend.broken.add("coil_c")
     for _ in range(20):

@@ -1,7 +1,7 @@
 """How many readings a second arrive, against `rate_hz` of the devices' profiles.
 
-A sensor that sends at a tenth of its rate passes every check of age that a slow machine needs. Its readings are then
-older than the control loop and the limits on jumps assume, so `thermoctl doctor` and `thermoctl status` compare both.
+A sensor that sends at a tenth of its rate passes every limit on age that a slow machine needs. But its readings
+are older than the control loop and the limits on jumps assume. So `doctor` and `status` compare both rates.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from thermoctl.daemon.shared import Shared
 from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 
-SLOW_SHARE = 0.5  # of rate_hz: below it a reading is called slow; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3
-LOOK_ROWS = 4000  # ticks of the record that `status` counts over
-FEWEST = 10  # readings that must have been due in that time
+SLOW_SHARE = (
+    0.5  # of rate_hz: a lower rate is reported; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3
+)
+LOOK_ROWS = 4000  # newest ticks in which `status` counts readings
+FEWEST = 10  # expected readings in that time, below which no rate is reported
 
 
 def expected_hz(settings: Settings) -> dict[str, float]:
@@ -30,12 +32,12 @@ def expected_hz(settings: Settings) -> dict[str, float]:
     return {b.role: b.channel.rate_hz for d in make_devices(settings) for b in d.binding.bounds}
 
 
-def slow(role: str, found_hz: float, expected: Mapping[str, float], looks_hz: float) -> str:
+def slow(role: str, found_hz: float, expected: Mapping[str, float], reads_hz: float) -> str:
     """Return a sentence when `role` arrives too slowly, else ''.
 
-    looks_hz: how often the reading was checked; a higher rate cannot be seen.
+    reads_hz: how often the reading was checked; a higher rate cannot be seen.
     """
-    due_hz = min(expected.get(role, 0.0), looks_hz)
+    due_hz = min(expected.get(role, 0.0), reads_hz)
     if found_hz >= SLOW_SHARE * due_hz:
         return ""
     return (

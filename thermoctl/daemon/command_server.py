@@ -133,7 +133,7 @@ class Commands:
             return {
                 "ok": False,
                 "state": "ARMED",
-                "error": "not armed for this command: the rig is ARMED already, somebody uses it; `thermoctl disarm` ends that",
+                "error": "not armed for this command: the rig is ARMED already and in use; `thermoctl disarm` ends that",
             }
         if self._state() == "ARMED":
             return {"ok": True, "state": "ARMED", "setpoint_um": status(self.shared)["setpoint_um"]}

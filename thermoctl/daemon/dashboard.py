@@ -1,18 +1,18 @@
 """The dashboard: one page in the browser, served by a process of its own, with Prometheus' metrics beside it.
 
     GET  /                  the page: complete in itself, no file from elsewhere
-    GET  /api/live          server-sent events: `past`, the last minute; then frames, 1 to 50 a second (watch.Watch), and
-                            `slow` once a second: latency and captures
+    GET  /api/live          server-sent events: `past`, the last minute; then frames, 1 to 50 a second
+                            (watch.Watch), and `slow` once a second: latency and captures
     GET  /api/info          rig, limits, signals, whether commands are taken
-    GET  /api/history       ?signal=NAME&begin=S&end=S&points=N   least, mean and largest per pixel, from the recording
+    GET  /api/history       ?signal=NAME&begin=S&end=S&points=N   least, mean and largest a pixel
     GET  /api/captures      faults with full-rate rows;  /api/capture?number=N&signal=NAME[&format=csv]
     GET  /metrics           with --metrics
     POST /api/command       arm, disarm, setpoint; with --commands only
 
-Who may: everyone on this machine may look while it listens on loopback. Elsewhere, and for every command, the token is
-needed ("Authorization: Bearer TOKEN"; the page takes it from the address's #token=). Requests of other web pages are
-refused (Host, Origin, Sec-Fetch-Site), so is what is too large, too slow or too many. It speaks plain HTTP: beyond the
-machine, put an ssh tunnel or a TLS proxy in front.
+Access: on loopback every user of this machine may read. On other addresses, and for every command, the token is
+needed ("Authorization: Bearer TOKEN"; the page takes it from the address's #token=). Requests of other web pages
+are refused (Host, Origin, Sec-Fetch-Site). So are requests that are too large, too slow or too many. The protocol
+is plain HTTP: beyond the machine, use an ssh tunnel or a TLS proxy.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
-import hmac
 import io
 import ipaddress
 import json
@@ -32,7 +31,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -41,6 +39,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from thermoctl.daemon.access import MIN_TOKEN, Policy, Refused, parse_address
 from thermoctl.daemon.assemble import rig_identity
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.metrics import CONTENT_TYPE, metrics
@@ -55,71 +54,9 @@ from thermoctl.yamlfile import InputError
 PAGE = Path(__file__).with_name("dashboard.html")
 MAX_HEAD, MAX_BODY = 8192, 1024  # bytes of a request
 MAX_CONNECTIONS, MAX_STREAMS = 32, 12
-REQUEST_S, SEND_S = 5.0, 5.0  # a request must have come, and an answer have gone, within these
-MIN_TOKEN = 16
+REQUEST_S, SEND_S = 5.0, 5.0  # time limits of receiving a request and of sending an answer
 COMMANDS = ("arm", "disarm", "setpoint")
 TOKEN_VARIABLE = "THERMOCTL_DASHBOARD_TOKEN"
-
-
-class Refused(Exception):
-    """The request is answered with this status and text."""
-
-    def __init__(self, status: HTTPStatus, text: str):
-        super().__init__(text)
-        self.status, self.text = status, text
-
-
-@dataclass(frozen=True)
-class Policy:
-    """Decides who may do what.
-
-    names: host names, besides addresses and localhost, by which the page may be requested.
-    """
-
-    token: str
-    token_to_look: bool
-    commands: bool = False
-    metrics: bool = False
-    names: frozenset[str] = field(default_factory=frozenset)
-
-    def check_source(self, headers: Any) -> None:
-        """Refuse requests that another web page made the browser send.
-
-        They show a foreign Host (DNS rebinding) or Origin.
-        """
-        host = headers.get_all("Host") or []
-        if len(host) != 1 or not self._ours(_host_name(host[0])):
-            raise Refused(HTTPStatus.MISDIRECTED_REQUEST, "this host name is not served; see --name")
-        origin = headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host[0]:
-            raise Refused(HTTPStatus.FORBIDDEN, "requests of other web pages are refused")
-        if headers.get("Sec-Fetch-Site") not in (None, "same-origin", "none"):
-            raise Refused(HTTPStatus.FORBIDDEN, "requests of other web pages are refused")
-
-    def check_token(self, headers: Any) -> None:
-        """Refuse a request without the token."""
-        given = headers.get("Authorization", "")
-        if not hmac.compare_digest(given.encode(errors="replace"), f"Bearer {self.token}".encode()):
-            raise Refused(
-                HTTPStatus.UNAUTHORIZED,
-                "the token is missing or wrong: open the address that `thermoctl dashboard` printed",
-            )
-
-    def _ours(self, name: str) -> bool:
-        if name == "localhost" or name in self.names:
-            return True
-        try:
-            ipaddress.ip_address(name)
-        except ValueError:
-            return False
-        return True
-
-
-def _host_name(host: str) -> str:
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
 
 
 class Server(ThreadingHTTPServer):
@@ -486,7 +423,7 @@ def make_server(
 
     listen: ADDRESS:PORT, [V6ADDRESS]:PORT, or PORT on loopback.
     """
-    address, port = _address(listen)
+    address, port = parse_address(listen)
     if token and len(token) < MIN_TOKEN:
         raise InputError(f"the token has {len(token)} characters; at least {MIN_TOKEN} were expected")
     loopback = ipaddress.ip_address(address).is_loopback
@@ -503,21 +440,6 @@ def make_server(
         raise InputError(
             f"{listen}: cannot listen: {e.strerror or e}; choose another address with --listen"
         ) from None
-
-
-def _address(listen: str) -> tuple[str, int]:
-    host, colon, port = listen.rpartition(":")
-    host = host.strip("[]") if colon else "127.0.0.1"
-    host = "127.0.0.1" if host == "localhost" else host
-    try:
-        ipaddress.ip_address(host)
-        if not 0 <= int(port) <= 65535:
-            raise ValueError
-    except ValueError:
-        raise InputError(
-            f"--listen {listen}: ADDRESS:PORT was expected, as 127.0.0.1:8765 or [::]:8765"
-        ) from None
-    return host, int(port)
 
 
 def url(server: Server) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from thermoctl.daemon.sources import SOURCES
 
-LATE_REMEDY = "docs/how-to/real-time.md: stop what burns the processor beside the loop; `thermoctl latency` shows how late"
+LATE_REMEDY = "docs/how-to/real-time.md: stop other programs on the loop's processor; `thermoctl latency` shows the lateness"
 
 
 def shown(reading: Mapping[str, Any] | None, digits: int = 2) -> str:
@@ -59,7 +59,7 @@ def fault_lines(standing: Iterable[Mapping[str, Any]]) -> list[str]:
         lines += [f"{f['severity']} {f['name']} {at}: {said}".replace(" :", ":"), f"    -> {f['remedy']}"]
         after = [g["name"] for g in listed if g.get("follows") == f["name"]]
         if after:
-            lines.append(f"    it brought: {', '.join(after)}")
+            lines.append(f"    followed by: {', '.join(after)}")
     return lines
 
 

@@ -34,8 +34,8 @@ from thermoctl.signals import INDEX, SIGNALS
 
 RELOAD = float(len(arming.COMMANDS))
 """The mailbox command that applies the parameter block; the others are arming's."""
-SUSPEND_NS = 1_000_000  # the two clocks are not read at once; less than this is no suspend
-SUSPEND_EVERY = 16  # ticks between two looks for one
+SUSPEND_NS = 1_000_000  # a smaller difference is no suspend: the two clocks are read one after the other
+SUSPEND_EVERY = 16  # ticks between two checks for a suspend
 STATE_EVERY = 1000  # ticks between two snapshots of the law's state
 _HEAD = INDEX["position_raw_um"]  # numbers of a row before the channels, in the order of `publish`
 _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = (
@@ -119,7 +119,7 @@ class Rig:
             self.record.bind(reading.value, fresh, reading.status, self._delay, self.law.outputs)
             self._status = reading.status
         for c in range(_AIR, _SUPPLY):
-            if self._fresh[c]:  # temperatures come from slow buses: when was each one read?
+            if self._fresh[c]:  # temperatures come from slow buses: record the age of each
                 age = (now_s - self._time_s[c]) / _DELAY_S
                 self._delay[c] = 0 if age < 0.0 else _LATEST if age >= _LATEST else int(age)
         self.command, self.value, self.external = 0, 0.0, self.write_failed
@@ -232,7 +232,7 @@ def run_loop(
     slept_before = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
     deadline = before + period_ns
     while not stopping():
-        if paced:  # a frame is late: so is the tick, but not by two periods
+        if paced:  # a late frame delays the tick, but by less than two periods
             sleep_until(before + period_ns // 2)
             rig.backend.wait_frame(deadline, deadline + period_ns)
             now = now_ns()
@@ -243,11 +243,11 @@ def run_loop(
                 continue
         lateness_us = (now - deadline) * 1e-3
         gap_ns = 0
-        if rig.law.tick % _SUSPEND_EVERY == 0:  # CLOCK_MONOTONIC stands while the machine sleeps
+        if rig.law.tick % _SUSPEND_EVERY == 0:  # CLOCK_MONOTONIC stops during a suspend
             slept = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
             gap_ns = slept - slept_before if slept - slept_before > _SUSPEND_NS else 0
             slept_before = slept
-        if counted:  # a late tick is one period like any other: the rig's time stands while the machine does
+        if counted:  # the simulated rig's time stops while the machine stalls
             rig.tick(rig.start_s + (rig.law.tick + 1) * rig.law.period_s, rig.law.period_s, lateness_us)
         else:
             rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)

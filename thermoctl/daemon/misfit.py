@@ -1,10 +1,11 @@
-"""Does the model of the daemon still fit its rig? The coil's innovations, watched without end.
+"""Detect that the daemon's model no longer fits its rig, by a CUSUM (Page 1954) of the coil's innovations.
 
-    z_k = mean of the innovation over BLOCK_S / (S / sqrt(n)),   S^2 = R_v / (1 - C K) the variance that the filter expects (35),
-    n independent samples in the block;                          CUSUM (Page 1954): g = max(0, g + |z| side - DRIFT) > LIMIT
+    z_k = mean of the innovation over BLOCK_S / (S / sqrt(n)),  n independent samples in the block
+    S^2 = R_v / (1 - C K), the variance that the filter expects (35)
+    g   = max(0, g +- z - DRIFT);  alarm when g > LIMIT; both signs
 
-Where the model holds, z is about standard normal and the sum falls back to zero; where it does not, both the alarm and the
-onset (the sum's last zero) come out. The sum runs on both sides.
+While the model fits, z is about standard normal and the sums fall back to zero. When it does not, the sum gives the
+alarm, and its last zero the onset.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ import numpy as np
 from thermoctl.control.model import CompensatorModel
 
 BLOCK_S = 20.0  # of innovations in one value
-DRIFT = 1.0  # a lasting shift of two standard errors of a block is what the sum is tuned to
+DRIFT = 1.0  # tuned to a lasting shift of two standard errors of a block
 LIMIT = 15.0
-CLIP = 4.0  # no single block decides
-CORRELATED = 4.0  # quantisation correlates neighbours: so many samples count as one
+CLIP = 4.0  # limit of |z|, so that no single block raises an alarm
+CORRELATED = 4.0  # samples that count as one: quantisation correlates neighbours
 
 
 @dataclass(frozen=True)

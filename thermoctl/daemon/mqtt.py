@@ -1,12 +1,12 @@
-"""The rig's state to an MQTT broker; an extra, `pip install 'thermoctl[mqtt]'`. It publishes and takes no commands.
+"""Publish the rig's state to an MQTT broker; it accepts no commands. Needs `pip install 'thermoctl[mqtt]'`.
 
-    TOPIC/availability   `online` while the daemon answers, else `offline`; the broker says `offline` when this program is gone
-                         (last will). Retained.
-    TOPIC/status         what `thermoctl status --json` says, RATE times a second
-    TOPIC/faults         standing faults with meaning and remedy, when they change. Retained.
+    TOPIC/availability   `online` while the daemon answers, else `offline`. The broker publishes `offline` when
+                         this program is gone (last will). Retained.
+    TOPIC/status         the output of `thermoctl status --json`, RATE times a second
+    TOPIC/faults         active faults with meaning and remedy, when they change. Retained.
 
-TOPIC is thermoctl/RIG unless told otherwise. What cannot be sent while the broker is away is dropped, not kept: the newest
-state counts, and the recording has the rest.
+The default TOPIC is thermoctl/RIG. Messages that cannot be sent while the broker is away are dropped: only the newest
+state matters, and the recording has the rest.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Bridge:
         if reason.is_failure:
             self.refused = str(reason)
             return
-        self._online = self._faults = None  # the broker may have forgotten: say it again
+        self._online = self._faults = None  # the broker may have lost them: publish again
         self.connected.set()
 
     def open(self) -> None:
@@ -122,7 +122,7 @@ class Bridge:
         if self.connected.is_set():
             with contextlib.suppress(
                 RuntimeError, ValueError
-            ):  # the connection went at this moment: the last will says it
+            ):  # disconnected just now: the last will publishes it
                 self.client.publish(
                     f"{self.topic}/availability", OFFLINE, qos=1, retain=True
                 ).wait_for_publish(2.0)

@@ -155,9 +155,9 @@ class Recorder:
             alarm = self.misfit.add(
                 rows[:, INDEX["t_s"]], rows[:, INDEX["innovation_c"]], rows[:, INDEX["kalman_gain"]]
             )
-        except Exception as e:  # to record is what we are for: never for the watch's sake not
+        except Exception as e:  # a failing model check must never stop the recording
             self.misfit = None
-            self.log("the watch of the model failed, the recorder goes on without it", error=repr(e))
+            self.log("the check of the model failed and is switched off; recording continues", error=repr(e))
             return
         if alarm is not None:
             self.log(
@@ -165,7 +165,7 @@ class Recorder:
                 begins_s=round(alarm.begin_s, 1),
                 ends_s=round(alarm.end_s, 1),
                 mean_innovation_c=round(alarm.mean_c, 3),
-                remedy="`thermoctl diagnose --live --out DIR` says which physics changed",
+                remedy="`thermoctl diagnose --live --out DIR` finds which physics changed",
             )
 
     def _write(self, rows: np.ndarray) -> None:

@@ -146,7 +146,7 @@ def run_simulated(
     return rows
 
 
-SETTLE_S = 0.5  # after the reference has arrived
+SETTLE_S = 0.5  # time after the reference has reached the setpoint
 STROKE_UM, CYCLE_S = 200.0, 75.0
 
 

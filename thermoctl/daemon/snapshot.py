@@ -10,6 +10,31 @@ from thermoctl.daemon import readings
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
 from thermoctl.signals import INDEX, POINTS
 
+NUMBERS = (
+    "setpoint_um",
+    "reference_um",
+    "position_um",
+    "compensated_um",
+    "compensation_um",
+    "expansion_um",
+    "output_reference_um",
+    "control_v",
+    "drive",
+    "enable",
+    "voltage_v",
+    "current_a",
+    "power_w",
+    "air_c",
+    "innovation_c",
+    "kalman_gain",
+    "position_age_s",
+    "coil_age_s",
+    "supply_v",
+    "amplifier_state",
+    "amplifier_fault",
+)
+"""Signals that a status answer has under their own names."""
+
 
 def status(shared: Shared) -> dict[str, Any]:
     """Return the newest row as `thermoctl status --json` prints it.
@@ -40,32 +65,7 @@ def status(shared: Shared) -> dict[str, Any]:
         "slips": int(row[INDEX["slips"]]),
         "generation": int(row[INDEX["generation"]]),
         "uptime_s": number["t_s"],
-        **{
-            name: number[name]
-            for name in (
-                "setpoint_um",
-                "reference_um",
-                "position_um",
-                "compensated_um",
-                "compensation_um",
-                "expansion_um",
-                "output_reference_um",
-                "control_v",
-                "drive",
-                "enable",
-                "voltage_v",
-                "current_a",
-                "power_w",
-                "air_c",
-                "innovation_c",
-                "kalman_gain",
-                "position_age_s",
-                "coil_age_s",
-                "supply_v",
-                "amplifier_state",
-                "amplifier_fault",
-            )
-        },
+        **{name: number[name] for name in NUMBERS},
         "channels": {role: r["state"] for role, r in found.items()},
         "readings": found,
         "estimates_state": "OK" if found["coil_c"]["state"] == "OK" else "NOT CORRECTED",

@@ -15,4 +15,5 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "kalman_gain": ("coil_c",),
     "air_rate_k_s": ("air_c",),
 }
-"""Signals that are worth as much as these channels. ABSENT does not count against a computed one: the law does without."""
+"""Channels that must be valid for a signal to be valid. For a computed signal, ABSENT is allowed: the law does
+without that channel."""

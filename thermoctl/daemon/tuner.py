@@ -23,7 +23,7 @@ from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError
 
 INTERVAL_S = 0.5
-PROPOSE_S = 600.0  # of rig time between two looks at the proposal
+PROPOSE_S = 600.0  # rig time between two checks of the proposal
 _ESTIMATES = [INDEX[f"{p}_est_c"] for p in POINTS]
 _T, _AIR, _STATUS = INDEX["t_s"], INDEX["air_c"], INDEX["status_bits"]
 _POSITION, _REFERENCE = INDEX["position_raw_um"], INDEX["output_reference_um"]

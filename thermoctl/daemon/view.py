@@ -35,10 +35,10 @@ from thermoctl.settings import Settings, effective, load_settings
 from thermoctl.yamlfile import InputError
 
 MOTION, CYCLE_S = ((0.0, 240.0), (70.0, 200.0)), 90.0
-"""(s in the cycle, setpoint um). 240 um take 0.78 A, 2.9 W: the shaft grows by 2 um in a minute."""
-MEAN_S = 2.0  # the sentence says means over this: a single reading has 0.01 um of noise
-SHOWN_UM = 0.2  # growth from which on the sentence compares; below, noise would decide
-STALL_S = 10.0  # a machine that stands for less than this does not end the demo
+"""Corners (s in the cycle, setpoint um). 240 um take 0.78 A and 2.9 W: the shaft grows by 2 um in a minute."""
+MEAN_S = 2.0  # averaging time of the displayed growth: a single reading has 0.01 um of noise
+SHOWN_UM = 0.2  # smallest growth that is compared with what compensation leaves; below, noise dominates
+STALL_S = 10.0  # longest stall of the machine that the demo survives
 DASHBOARD = "127.0.0.1:8765"
 
 
@@ -90,7 +90,7 @@ def _own(settings: Settings) -> Any:
     )
     if (pid := holder(own)) is not None:
         raise InputError(f"{folder}: another demo runs here (pid {pid}); stop it first")
-    (folder / "rig.state").unlink(missing_ok=True)  # the simulated rig starts cold
+    (folder / "rig.state").unlink(missing_ok=True)  # no saved estimates: the simulated rig starts cold
     path = folder / "rig.yaml"
     path.write_text(f"# Written by `thermoctl demo` from {settings.path}.\n{effective(own)}")
     return load_settings(path)
@@ -239,7 +239,7 @@ class _Demo:
         if late > 50:
             lines.append(
                 Text(
-                    f"this machine was late: {late} ticks skipped in the last second, the rig's time stood",
+                    f"this machine stalled: {late} ticks skipped in the last second; the rig's time stopped meanwhile",
                     "yellow",
                 )
             )

@@ -30,7 +30,7 @@ from thermoctl.yamlfile import InputError
 
 BEFORE_S, AFTER_S = 2.0, 2.0  # of a capture
 CAPTURES = 16
-SILENT_S = 2.0  # no tick for so long: the rows are shown as old
+SILENT_S = 2.0  # without a tick for this time the rows are shown as old
 PAST_S, PAST_STEP_S = 60.0, 0.1  # the last minute that a page gets when it opens
 PAST = (
     "wall_s",
@@ -51,7 +51,7 @@ RANGED = (
     "power_w",
     "innovation_c",
 )
-"""Signals of which a frame says the least and largest value since the frame before."""
+"""Signals whose least and largest value since the previous frame is in each frame."""
 LATENESS_EDGES_US = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
 _T, _WALL, _BITS = INDEX["t_s"], INDEX["wall_s"], INDEX["fault_bits"]

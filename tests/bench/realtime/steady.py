@@ -63,10 +63,10 @@ def simulated(work: Path, hours: float) -> list[Sample]:
     """A sample every five minutes of simulated time."""
     from thermoctl.daemon import keep
     from thermoctl.daemon.command_server import Commands
+    from thermoctl.daemon.journal import Watcher
     from thermoctl.daemon.recorder import make_recorder
     from thermoctl.daemon.shared import Shared
     from thermoctl.daemon.simulate import Simulation
-    from thermoctl.daemon.supervisor import _Watcher
     from thermoctl.settings import load_settings
 
     def silent(*_: Any, **__: Any) -> None:
@@ -76,7 +76,7 @@ def simulated(work: Path, hours: float) -> list[Sample]:
     shared = Shared.create(f"thermoctl-steady-{os.getpid()}")
     try:
         simulation = Simulation(settings, publish=shared.ring)
-        recorder, watcher = make_recorder(settings, shared, silent), _Watcher(shared, silent)
+        recorder, watcher = make_recorder(settings, shared, silent), Watcher(shared, silent)
         commands = Commands(shared, settings, silent, silent)
         simulation.arm()
         found = []
