@@ -77,9 +77,10 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
         )
         for name in ("position_um", "output_reference_um", "power_w")
     }
+    mark = "" if status["estimates_state"] == "OK" else "?"
     lines = [
         f"setpoint {number(status['setpoint_um'], 3)} um   position {shown_or['position_um']} um   compensation "
-        f"{number(status['compensation_um'], 3)} um   output {shown_or['output_reference_um']} um",
+        f"{number(status['compensation_um'], 3)}{mark} um   output {shown_or['output_reference_um']} um",
         f"drive {number(status['drive'], 3)}   power {shown_or['power_w']} W   air {shown(found['air_c'])} C",
         f"{'temperature, C':20}{'measured':>9}{'estimated':>11}{'age':>9}",
     ]
@@ -90,7 +91,9 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
             f"{point.replace('_', ' '):20}{number(r['value'], 2):>9}{number(estimate, 2):>11}{span(r['age_s']):>9}{bad}"
         )
     if status["estimates_state"] != "OK":
-        lines.append(f"estimates: not corrected by the coil's sensor for {span(found['coil_c']['age_s'])}")
+        lines.append(
+            f"estimates and compensation (?): not corrected by the coil's sensor for {span(found['coil_c']['age_s'])}"
+        )
     return lines + message_lines(status)
 
 

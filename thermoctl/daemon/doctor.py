@@ -116,6 +116,8 @@ def _print_channels(settings: Settings, backend: Backend, found: _Readings, seco
             f"{role:24}{sample.value[k]:14.4f} {units.get(COLUMN[role], ''):8}{state:8}{rate_hz:7.1f} Hz"
             + (f"   {problem}" if problem else "")
         )
+    if counters := backend.counters():
+        print("counters: " + ", ".join(f"{name} {count}" for name, count in counters.items()))
     return bad
 
 

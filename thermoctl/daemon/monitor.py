@@ -137,7 +137,8 @@ def _numbers(status: dict[str, Any]) -> Table:
         ("innovation", status["innovation_c"], "K"),
         ("air", status["air_c"], "C"),
     ):
-        table.add_row(label, _value(status, label, value), unit)
+        estimated = label in ("expansion", "compensation") and status["estimates_state"] != "OK"
+        table.add_row(f"{label} (?)" if estimated else label, _value(status, label, value), unit)
     return table
 
 

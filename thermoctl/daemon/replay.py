@@ -10,7 +10,7 @@ import numpy as np
 from thermoctl.control.law import OUTPUTS, Law
 from thermoctl.daemon.recorder import read_law_metadata
 from thermoctl.daemon.ring import unpack_readings
-from thermoctl.recording.reader import read_rows
+from thermoctl.recording.reader import info, read_rows
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
@@ -97,9 +97,11 @@ def command(recording: str) -> int:
     begin = time.perf_counter()
     result = replay(rows, metadata, recording)
     seconds = time.perf_counter() - begin
+    meta = info(recording).meta
     print(
         f"{recording}: {result.ticks} ticks replayed in {seconds:.2f} s"
         + (f", {result.skipped} before the stored state skipped" if result.skipped else "")
+        + f"; rig {meta.get('rig', 'unknown')}, run {meta.get('run', 'unknown')}"
     )
     for name, (count, first, largest) in result.differences.items():
         print(f"  {name}: differs in {count} ticks, first in tick {first}, by at most {largest:g}")
