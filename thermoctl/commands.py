@@ -9,21 +9,18 @@ from __future__ import annotations
 import argparse
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 
-@dataclass(frozen=True)
-class Argument:
+class Argument(NamedTuple):
     """One argument, as argparse's add_argument takes it."""
 
     flags: tuple[str, ...]
     options: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """One command; a name of two words is a command below a group.
 
     takes: the arguments that the function gets, in order, by the names that argparse gives them. `settings` stands for
