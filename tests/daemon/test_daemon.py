@@ -81,7 +81,7 @@ def test_reload_applies_whole_files_only(daemon):
     )
     daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.005").replace("ti_s: 0.004", "ti_s: never"))
     answer = daemon.ask("reload")
-    assert not answer["ok"] and "control.ti_s" in answer["error"] and ":12:9:" in answer["error"]
+    assert not answer["ok"] and "control.ti_s" in answer["error"] and ":14:9:" in answer["error"]
     daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.006"))
     daemon.process.send_signal(signal.SIGHUP)
     wait(lambda: daemon.ask("status")["generation"] == 2, "the reload by SIGHUP")
@@ -225,8 +225,8 @@ def test_start_tells_why_it_failed(unrecorded, capsys, monkeypatch):
         ("required: [position_um", "required: [postion_um", "(did you mean 'position_um'?)"),
         ("setpoint_high_um: 250", "setpoint_high_um: -300", "must be above"),
         ("  kp: 0.01\n", "", "'control.kp' is missing"),
-        ("  plant:", "  roles: 7\n  plant:", "a mapping of names was expected"),
-        ("rig: {name: simulated}", "rig: 3", "a mapping was expected"),
+        ("  plant:", "  roles: 7\n  plant:", "a mapping (key: value) was expected"),
+        ("rig: {name: simulated}", "rig: 3", "a mapping (key: value) was expected"),
     ],
 )
 def test_a_bad_configuration_is_one_good_line(config, old, new, message, capsys):

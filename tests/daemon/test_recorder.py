@@ -116,6 +116,6 @@ def test_a_watch_that_fails_loses_no_row():
             if tick % 50 == 0:
                 assert recorder.move() == 50
         assert writer.rows == list(range(1, 501)) and shared.counters[RECORDER_ROWS] == 500
-        assert told == ["the watch of the model failed, the recorder goes on without it"]
+        assert told == ["the check of the model failed and is switched off; recording continues"]
     finally:
         shared.remove()
