@@ -1,6 +1,7 @@
 """The import graph of thermoctl and hal, read from the source: `python -m tests.architecture` prints it.
 
 Every import counts: at the top of a module, inside a function, under TYPE_CHECKING, and `cimport` in Cython sources.
+So does a function that a row of thermoctl/commands.py names as text, "module:function".
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ PAGE = ROOT / "docs/explanation/architecture.md"
 _CYTHON = re.compile(
     r"^\s*(?:from\s+((?:thermoctl|hal)[\w.]*)\s+c?import\s+(.+)|c?import\s+((?:thermoctl|hal)[\w.]*))"
 )
+_FUNCTION = re.compile(r"((?:thermoctl|hal)\.[\w.]+):\w+$")
 
 Graph = dict[str, set[str]]
 
@@ -44,6 +46,8 @@ def _named(path: Path) -> Iterator[tuple[str, list[str]]]:
             yield from ((alias.name, []) for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield node.module, [alias.name for alias in node.names]
+        elif isinstance(node, ast.Constant) and (match := _FUNCTION.match(str(node.value))):
+            yield match[1], []
 
 
 def module_graph() -> Graph:

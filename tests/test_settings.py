@@ -23,7 +23,7 @@ def loaded(tmp_path, old="", new=""):
     "old, new, says",
     [
         ("  kp: 0.01", "  kpp: 0.01", r"kpp.*did you mean 'kp'"),
-        ("control:\n", "controll:\n", r"controll.*did you mean 'control'"),
+        ("control:", "controll:", r"controll.*did you mean 'control'"),
         ("  kp: 0.01", "  kp: fast", r"control\.kp.*number.*fast|fast.*number"),
         ("  kp: 0.01", "  kp: -1", r"control\.kp"),
         ("  kp: 0.01", "  kp: .nan", r"control\.kp"),

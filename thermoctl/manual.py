@@ -124,11 +124,16 @@ def uninstall(root: str | Path = "/") -> list[Path]:
     return there
 
 
-def manual(parser: argparse.ArgumentParser, action: str, root: str) -> int:
-    """Return the command: show, install or uninstall."""
+def command(parser: argparse.ArgumentParser, action: str, root: str) -> int:
+    """Show, install or uninstall the manual page."""
     if action == "show":
         os.write(1, manual_page(parser).encode())
         return 0
     for path in install(parser, root) if action == "install" else uninstall(root):
         print(("wrote " if action == "install" else "removed ") + str(path))
     return 0
+
+
+def completion(parser: argparse.ArgumentParser, shell: str) -> None:
+    """Print a shell's completion script."""
+    print(shtab.complete(parser, shell))

@@ -1,8 +1,8 @@
 """The configuration: every option once, with unit, range, default, meaning, and whether a change needs a restart.
 
-One YAML file describes a rig. `load_settings` reads it strictly: an unknown key, a value of the wrong kind or out of range,
-a unit that does not fit, a duplicate or a missing key is an error with file, line and column, what was expected and, where
-something is close, "did you mean". A number may carry a unit ("5 ms", "1 mm/min"): it is converted to the option's own.
+One YAML file describes a rig. `load_settings` reads it strictly: an unknown key, a wrong type, a value out of range,
+a unit that does not fit, a duplicate or a missing key is an error. The error names file, line and column, what was
+expected, and the nearest known name. A number may carry a unit ("5 ms", "1 mm/min"); it is converted to the option's unit.
 
 The dataclasses below are the table; `options()` lists it for the reference page and for `reload`.
 """
@@ -10,7 +10,7 @@ The dataclasses below are the table; `options()` lists it for the reference page
 from __future__ import annotations
 
 import dataclasses
-import math
+import functools
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -24,75 +24,106 @@ from thermoctl import channels
 from thermoctl.channels import CHANNELS
 from thermoctl.control.limits import Limits
 from thermoctl.option import Option, option
-from thermoctl.yamlfile import InputError, Node, load, suggest
+from thermoctl.yamlfile import InputError, Node, Section, kind_of, load, number_of, suggest
 
 TEMPERATURES = "temperatures_c"
-"""In a mapping of limits: all twelve temperatures that are not named themselves."""
+"""In a mapping of limits: every temperature of the twelve points that has no entry of its own."""
 
 
 @dataclass(frozen=True)
 class RigSettings:
-    """What this rig is called."""
+    """The rig's name."""
 
-    name: str = option("a name for recordings and pages", "rig", restart=True)
+    name: str = option("name of the rig in recordings and on pages", "rig", restart=True)
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """The tick."""
+    """The control loop: one tick a period."""
 
     period_s: float = option("period of the tick", 0.001, "s", 2e-4, 0.1, restart=True)
     cpu: int = option(
-        "processor the loop is pinned to; -1: wherever the scheduler likes", -1, "1", -1, 1023, restart=True
+        "number of the processor that runs the loop; -1 leaves the choice to the scheduler",
+        -1,
+        "1",
+        -1,
+        1023,
+        restart=True,
     )
-    priority: int = option("SCHED_FIFO priority; 0: no real-time scheduling", 80, "1", 0, 99, restart=True)
+    priority: int = option(
+        "SCHED_FIFO priority of the loop; 0 switches real-time scheduling off", 80, "1", 0, 99, restart=True
+    )
     spin_s: float = option(
-        "how long before a deadline the loop waits burning the processor", 0.0, "s", 0.0, 5e-4, restart=True
+        "time before each deadline in which the loop polls the clock instead of sleeping; it lowers the lateness "
+        "and keeps the processor busy",
+        0.0,
+        "s",
+        0.0,
+        5e-4,
+        restart=True,
     )
     pace: str = option(
-        "what starts a tick: the clock, or the position encoder's frame (the clock, when none came for two "
-        "periods); tick: the clock, but each tick counts as one period, so that a simulated rig on a machine that "
-        "stalls runs slower instead of faulting",
+        "what starts a tick. clock: the period. device: each frame of the position encoder, or the period after two "
+        "periods without a frame. tick: the period, and each tick counts as exactly one period; a simulated rig then "
+        "runs slower on a stalled machine instead of faulting",
         "clock",
         restart=True,
         choices=("clock", "device", "tick"),
     )
     reference: bool = option(
-        "run an idle loop of the same clock beside it, for `thermoctl latency`", False, restart=True
+        "run an idle loop with the same clock beside the control loop; `thermoctl latency` compares both",
+        False,
+        restart=True,
     )
 
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """The position loop, equation (41)."""
+    """The position controller, equation (41)."""
 
-    kp: float = option("proportional gain, drive unit per um of error", unit="1/um", low=0.0, high=1e3)
-    ti_s: float = option("integral time", unit="s", low=1e-5, high=1e6)
-    td_s: float = option("derivative time", 0.0, "s", 0.0, 1e3)
-    output_limit: float = option("largest drive, in the amplifier's unit", unit="1", low=0.0, high=1e6)
-    setpoint_rate_um_s: float = option(
-        "how fast the reference follows the setpoint (1 mm/min)", 1000.0 / 60.0, "um/s", 1e-3, 1e6
+    kp: float = option("proportional gain: drive per um of position error", unit="1/um", low=0.0, high=1e3)
+    ti_s: float = option("integral time of the controller", unit="s", low=1e-5, high=1e6)
+    td_s: float = option("derivative time of the controller; 0 switches the term off", 0.0, "s", 0.0, 1e3)
+    output_limit: float = option(
+        "largest absolute drive, in the amplifier's unit", unit="1", low=0.0, high=1e6
     )
-    setpoint_low_um: float = option("smallest setpoint taken", -1e6, "um", -1e6, 1e6)
-    setpoint_high_um: float = option("largest setpoint taken", 1e6, "um", -1e6, 1e6)
-    moving_average: int = option("frames of the position encoder in its mean", 1, "1", 1, 64)
+    setpoint_rate_um_s: float = option(
+        "largest speed of the reference on its way to a new setpoint (default: 1 mm/min)",
+        1000.0 / 60.0,
+        "um/s",
+        1e-3,
+        1e6,
+    )
+    setpoint_low_um: float = option("smallest setpoint that is accepted", -1e6, "um", -1e6, 1e6)
+    setpoint_high_um: float = option("largest setpoint that is accepted", 1e6, "um", -1e6, 1e6)
+    moving_average: int = option(
+        "number of position readings that are averaged for the controller; 1: no averaging", 1, "1", 1, 64
+    )
 
 
 @dataclass(frozen=True)
 class CompensationSettings:
-    """The thermal error and its compensation."""
+    """The estimate of the thermal error, and its compensation."""
 
     model: str = option(
-        "model file made by identification, relative to this file; empty: no compensation", "", restart=True
+        "model file from `thermoctl identify`, or folder of calibrations, relative to this file; empty: no estimate "
+        "and no compensation",
+        "",
+        restart=True,
     )
-    enable: bool = option("act on the estimated thermal error", True)
+    enable: bool = option("correct the position by the estimated thermal error", True)
     tune: bool = option(
-        "learn the expansion model while the reference encoder is there; better ones become calibrations in the folder `model`",
+        "learn the expansion model online while the reference encoder is connected; a better model is saved as a new "
+        "calibration in the folder `model`",
         False,
         restart=True,
     )
-    bound_um: float = option("largest believable thermal error", 50.0, "um", 0.0, 1e4)
-    slew_um_s: float = option("fastest change of the compensation while armed", 1.0, "um/s", 1e-4, 1e4)
+    bound_um: float = option(
+        "largest absolute compensation; a larger estimate is clipped", 50.0, "um", 0.0, 1e4
+    )
+    slew_um_s: float = option(
+        "largest rate of change of the compensation while armed", 1.0, "um/s", 1e-4, 1e4
+    )
 
 
 @dataclass(frozen=True)
@@ -137,49 +168,77 @@ class RecordingSettings:
     """The recorder."""
 
     enable: bool = option("record every tick", True, restart=True)
-    directory: str = option("where recordings go, relative to this file", "../recordings", restart=True)
-    file_mb: float = option("a new file after this much", 512.0, "MB", 1.0, 1e5, restart=True)
-    file_s: float = option("a new file after this long", 3600.0, "s", 1.0, 1e6, restart=True)
+    directory: str = option("folder of the recordings, relative to this file", "../recordings", restart=True)
+    file_mb: float = option(
+        "size at which a new recording file is started", 512.0, "MB", 1.0, 1e5, restart=True
+    )
+    file_s: float = option(
+        "time after which a new recording file is started", 3600.0, "s", 1.0, 1e6, restart=True
+    )
     budget_gb: float = option(
-        "disk budget of the full rate; the oldest files go", 20.0, "GB", 0.001, 1e6, restart=True
+        "disk space for recordings of every tick; the oldest files are deleted when it is used up",
+        20.0,
+        "GB",
+        0.001,
+        1e6,
+        restart=True,
     )
     tier_budget_gb: float = option(
-        "disk budget of the 10 Hz tier (min, mean, max)", 5.0, "GB", 0.001, 1e6, restart=True
+        "disk space for the 10 Hz recordings (least, mean and largest value of each signal); the oldest files are "
+        "deleted when it is used up",
+        5.0,
+        "GB",
+        0.001,
+        1e6,
+        restart=True,
     )
 
 
 @dataclass(frozen=True)
 class HalSettings:
-    """The hardware."""
+    """The hardware, or what simulates it."""
 
     backend: str = option(
-        "what stands behind the loop", restart=True, choices=("simulated", "devices", "replay")
+        "where readings come from: a simulated plant, devices, or a recording that is played back",
+        restart=True,
+        choices=("simulated", "devices", "replay"),
     )
     plant: str = option(
-        "plant file that the compensator believes in, relative to this file", "", restart=True
+        "plant file of back end `simulated`, relative to this file; the compensator's model assumes this plant",
+        "",
+        restart=True,
     )
-    truth: str = option("plant file that plays the hardware, when it is another", "", restart=True)
-    drive_input: str = option("the plant's input that the amplifier moves", "drive", restart=True)
+    truth: str = option(
+        "plant file that back end `simulated` simulates instead of `plant`, to give the compensator a wrong model; "
+        "empty: simulate `plant`",
+        "",
+        restart=True,
+    )
+    drive_input: str = option("name of the plant's input that the amplifier drives", "drive", restart=True)
     inputs: Node | None = option(
-        "other plant inputs: name: {mean, swing, period_s, noise, resolution}", None, restart=True
+        "course of the other plant inputs: name: {mean, swing, period_s, noise, resolution}",
+        None,
+        restart=True,
     )
     roles: dict[str, str] = option(
-        "plant output: channel role, where they differ in name", factory=dict, restart=True
+        "channel role of each plant output whose name is not a role: output: role", factory=dict, restart=True
     )
-    seed: int = option("seed of the simulated noise", 1, "1", 0, 2**31, restart=True)
+    seed: int = option("seed of the simulated sensors' noise", 1, "1", 0, 2**31, restart=True)
     sensor_period_s: float = option(
-        "period of the simulated slow sensors", 0.1, "s", 1e-3, 60.0, restart=True
+        "sampling period of the simulated temperature sensors", 0.1, "s", 1e-3, 60.0, restart=True
     )
-    recording: str = option(
-        "the recording that back end `replay` plays, relative to this file", "", restart=True
-    )
+    recording: str = option("recording that back end `replay` plays, relative to this file", "", restart=True)
     run_dir: str = option(
-        "where the virtual rig keeps its control socket and reference recording, relative to this file",
+        "folder of the virtual rig's control socket and reference recording, relative to this file",
         "../run/wire",
         restart=True,
     )
-    devices: tuple[Node, ...] = option("bindings of profile, port and channel roles", (), restart=True)
-    faults: tuple[Node, ...] = option("faults to inject, for tests", (), restart=True)
+    devices: tuple[Node, ...] = option(
+        "devices of back end `devices`: each with its profile, port and channel roles", (), restart=True
+    )
+    faults: tuple[Node, ...] = option(
+        "faults that are injected into the readings, for tests", (), restart=True
+    )
 
 
 @dataclass(frozen=True)
@@ -187,9 +246,15 @@ class SocketSettings:
     """The command socket."""
 
     path: str = option(
-        "the Unix socket; lock, log and kept estimates stand beside it", "../run/thermoctl.sock", restart=True
+        "path of the Unix socket, relative to this file; lock, log and saved estimates are written beside it",
+        "../run/thermoctl.sock",
+        restart=True,
     )
-    group: str = option("group that may command; empty: the daemon's own", "", restart=True)
+    group: str = option(
+        "group whose members may connect and give commands; empty: the group of the daemon's user",
+        "",
+        restart=True,
+    )
 
 
 @dataclass(frozen=True)
@@ -219,15 +284,15 @@ SECTIONS: dict[str, type] = {
 }
 
 
-def options() -> Iterator[tuple[str, dataclasses.Field, Option]]:
-    """Every option as (section.key, dataclass field, Option), in order."""
+def options() -> Iterator[tuple[str, dataclasses.Field[Any], Option]]:
+    """List every option as (section.key, dataclass field, Option), in order."""
     for section, cls in SECTIONS.items():
         for f in dataclasses.fields(cls):
             yield f"{section}.{f.name}", f, f.metadata["option"]
 
 
 def changed(old: Settings, new: Settings) -> list[tuple[str, bool]]:
-    """The options that differ, each with whether the change needs a restart."""
+    """List the options that differ, each with whether the change needs a restart."""
     found = []
     for key, f, row in options():
         section = key.split(".")[0]
@@ -238,7 +303,7 @@ def changed(old: Settings, new: Settings) -> list[tuple[str, bool]]:
 
 
 def effective(settings: Settings) -> str:
-    """Every option with the value in force, as YAML that `load_settings` takes back (paths absolute)."""
+    """Write every option with the value in force, as YAML that `load_settings` reads (absolute paths)."""
     values: dict[str, dict[str, Any]] = {}
     for key, f, _ in options():
         section, name = key.split(".")
@@ -255,18 +320,13 @@ def _plain(value: Any) -> Any:
 
 
 def load_settings(path: str | Path) -> Settings:
-    """Read and validate a configuration. Raises InputError with file:line:column for the first thing that is wrong."""
-    root = load(path)
-    if not isinstance(root.value, dict):
-        raise root.error(f"a mapping with the sections {', '.join(SECTIONS)} was expected")
-    for name, node in root.value.items():
-        if name not in SECTIONS:
-            raise node.error(
-                f"unknown section '{name}'{suggest(name, SECTIONS)}; expected one of {', '.join(SECTIONS)}"
-            )
-    sections = {name: _section(name, cls, root.value.get(name), root) for name, cls in SECTIONS.items()}
+    """Read and check a configuration. Raises InputError with file:line:column for the first error."""
+    root = Section(load(path), "configuration")
+    root.asked.update(SECTIONS)
+    root.end()
+    sections = {name: _section(name, cls, root.given(name), root.node) for name, cls in SECTIONS.items()}
     settings = Settings(path=str(path), **sections)
-    _together(settings, root)
+    _check_together(settings, root.node)
     folder = Path(path).absolute().parent
     return dataclasses.replace(
         settings,
@@ -284,131 +344,116 @@ def _below(folder: Path, path: str) -> str:
     return str((folder / path).resolve()) if path else ""
 
 
+class _Options(Section):
+    """A mapping of the configuration; its errors name an option as section.key."""
+
+    def label(self, key: str) -> str:
+        """Return section.key."""
+        return f"{self.what}.{key}"
+
+
 def _section(name: str, cls: type, node: Node | None, root: Node) -> Any:
+    """Read one section into its dataclass; `root` is the place of the error where the section is missing."""
+    place = root if node is None else node
+    section = _Options(node or dataclasses.replace(root, value={}), name)
     fields = {f.name: f for f in dataclasses.fields(cls)}
-    types_ = typing.get_type_hints(cls)
-    if node is None or node.value is None:
-        place, given = root, {}
-    elif isinstance(node.value, dict):
-        place, given = node, node.value
-    else:
-        raise node.error(f"section '{name}': a mapping was expected")
-    values = {}
-    for key, item in given.items():
-        if key not in fields:
-            raise item.error(
-                f"unknown option '{name}.{key}'{suggest(key, fields)}; expected one of {', '.join(fields)}"
-            )
-        values[key] = _value(f"{name}.{key}", types_[key], fields[key].metadata["option"], item)
+    section.asked.update(fields)
+    section.end()
+    kinds = typing.get_type_hints(cls)
     for key, f in fields.items():
-        if (
-            key not in values
-            and f.default is dataclasses.MISSING
-            and f.default_factory is dataclasses.MISSING
-        ):
+        no_default = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+        if no_default and key not in section.node.value:
             raise place.error(f"'{name}.{key}' is missing: {f.metadata['option'].meaning}")
-    return cls(**values)
+    return cls(
+        **{
+            key: _value(section, key, kinds[key], fields[key].metadata["option"])
+            for key in section.node.value
+        }
+    )
 
 
-def _value(key: str, kind: Any, row: Option, node: Node) -> Any:
-    """One option's value, checked and converted."""
-    origin = typing.get_origin(kind)
+def _value(section: Section, key: str, kind: Any, row: Option) -> Any:
+    """Read one option, checked and converted to its type."""
+    node, label = section.get(key), section.label(key)
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if kind is bool:
-        if not isinstance(node.value, bool):
-            raise node.error(f"{key}: true or false was expected, not {_shown(node)}")
-        return node.value
-    if kind in (int, float):
-        return _number(key, kind, row, node)
+        return section.flag(key, False)
     if kind is str:
-        if not isinstance(node.value, str):
-            raise node.error(f"{key}: a text was expected, not {_shown(node)}")
-        if row.choices and node.value not in row.choices:
-            raise node.error(
-                f"{key}: '{node.value}'{suggest(node.value, row.choices)}; expected one of "
-                f"{', '.join(row.choices)}"
-            )
-        return node.value
+        return section.text(key, choices=row.choices)
+    if kind in (int, float):
+        return _number(node, label, row, whole=kind is int)
     if origin is dict:
-        return _mapping(key, typing.get_args(kind)[1], row, node)
+        mapping = _Options(node, label)
+        return _texts(mapping) if inner[1] is str else _limits(mapping, row)
+    if origin is tuple and inner[0] is Node:
+        return tuple(section.list(key))
     if origin is tuple:
-        if not isinstance(node.value, list):
-            raise node.error(f"{key}: a list was expected, not {_shown(node)}")
-        if typing.get_args(kind)[0] is Node:
-            return tuple(node.value)
-        for item in node.value:
-            _channel(key, item.value, item)
-        return tuple(item.value for item in node.value)
-    if origin in (types.UnionType, typing.Union):  # Node | None: the reader of that part checks it
+        return tuple(_channel(label, item.value, item) for item in section.list(key))
+    if origin is types.UnionType:  # Node | None: the reader of that part checks it
         return node
-    raise TypeError(f"{key}: no rule for {kind}")
+    raise TypeError(f"{label}: no rule for {kind}")
 
 
-def _number(key: str, kind: Any, row: Option, node: Node) -> Any:
-    value: Any = node.value
-    if isinstance(value, str):
-        value = _with_unit(key, value, row, node)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        unit = f" in {row.unit}" if row.unit not in ("", "1") else ""
-        raise node.error(f"{key}: a number{unit} was expected, not {_shown(node)}")
-    if kind is int and value != int(value if math.isfinite(value) else 0):
-        raise node.error(f"{key}: a whole number was expected, not {value}")
-    if not row.low <= value <= row.high:
-        raise node.error(
-            f"{key}: {value:g} is out of range; expected {row.low:g} to {row.high:g} {row.unit}".rstrip()
-        )
-    return kind(value)
+def _number(node: Node, label: str, row: Option, whole: bool = False) -> float:
+    unit = "" if row.unit == "1" else row.unit
+    if isinstance(node.value, str):
+        node = dataclasses.replace(node, value=_with_unit(label, node.value, unit, node))
+    value = number_of(node, label, row.low, row.high, unit)
+    if whole and not value.is_integer():
+        raise node.error(f"{label}: a whole number was expected, found {kind_of(node)}")
+    return int(value) if whole else value
 
 
-def _with_unit(key: str, text: str, row: Option, node: Node) -> float:
-    """'5 ms' in the option's own unit."""
-    import pint  # slow to import, and rarely needed
-
-    registry: Any = pint.UnitRegistry()
-    number, _, unit = text.strip().partition(" ")
+def _with_unit(label: str, text: str, unit: str, node: Node) -> float:
+    """Convert text such as '5 ms' to the option's unit."""
+    number, _, given = text.strip().partition(" ")
     try:
-        return float(registry.Quantity(float(number), unit).to(row.unit if row.unit != "1" else "").magnitude)
+        return float(_unit_registry().Quantity(float(number), given).to(unit).magnitude)
     except ValueError:
-        raise node.error(f"{key}: a number in {row.unit or 'no unit'} was expected, not '{text}'") from None
+        raise node.error(f"{label}: a number in {unit or 'no unit'} was expected, not '{text}'") from None
     except Exception as e:  # pint's errors have no common base but Exception
         raise node.error(
-            f"{key}: '{text}': the unit does not fit ({str(e).splitlines()[0]}); expected {row.unit}"
+            f"{label}: '{text}': the unit does not fit ({str(e).splitlines()[0]}); expected {unit or 'no unit'}"
         ) from None
 
 
-def _mapping(key: str, kind: Any, row: Option, node: Node) -> dict[str, Any]:
-    if not isinstance(node.value, dict):
-        raise node.error(f"{key}: a mapping of names was expected, not {_shown(node)}")
-    if kind is str:
-        return {name: _value(f"{key}.{name}", str, row, item) for name, item in node.value.items()}
-    numbers = {}
-    for name, item in sorted(
-        node.value.items(), key=lambda pair: pair[0] != TEMPERATURES
-    ):  # single channels after all
+@functools.cache
+def _unit_registry() -> Any:
+    """Return pint's units; importing it takes longer than reading the configuration."""
+    import pint
+
+    return pint.UnitRegistry()
+
+
+def _texts(mapping: Section) -> dict[str, str]:
+    return {name: mapping.text(name) for name in mapping.node.value}
+
+
+def _limits(mapping: Section, row: Option) -> dict[str, float]:
+    """Read a limit by channel; a channel's own entry wins over TEMPERATURES."""
+    limits = {}
+    names: dict[str, Node] = mapping.node.value
+    for name in sorted(names, key=lambda name: name != TEMPERATURES):
+        number = _number(names[name], mapping.label(name), row)
         for channel in channels.TEMPERATURES if name == TEMPERATURES else (name,):
-            _channel(key, channel, item)
-            numbers[channel] = _number(f"{key}.{name}", float, row, item)
-    return numbers
+            limits[_channel(mapping.what, channel, names[name])] = number
+    return limits
 
 
-def _channel(key: str, name: Any, node: Node) -> None:
+def _channel(label: str, name: Any, node: Node) -> str:
     if name not in CHANNELS:
         raise node.error(
-            f"{key}: no channel '{name}'{suggest(str(name), CHANNELS)}; expected one of {', '.join(CHANNELS)}"
+            f"{label}: no channel '{name}'{suggest(str(name), CHANNELS)}; expected one of {', '.join(CHANNELS)}"
         )
+    return str(name)
 
 
-def _shown(node: Node) -> str:
-    if isinstance(node.value, dict | list):
-        return "a mapping" if isinstance(node.value, dict) else "a list"
-    return f"'{str(node.value)[:40]}'"
-
-
-def _together(settings: Settings, root: Node) -> None:
-    """What options must be towards each other."""
+def _check_together(settings: Settings, root: Node) -> None:
+    """Check the conditions between options. Raises InputError."""
 
     def place(section: str, key: str) -> Node:
-        node = root.value.get(section)
-        return node.value.get(key, node) if node is not None and isinstance(node.value, dict) else root
+        node: Node = root.value.get(section, root)
+        return node.value.get(key, node) if isinstance(node.value, dict) else node
 
     control, hal, protection = settings.control, settings.hal, settings.protection
     if control.setpoint_low_um >= control.setpoint_high_um:
@@ -423,12 +468,12 @@ def _together(settings: Settings, root: Node) -> None:
     for name in channels.CODES:
         if name in protection.frozen_s:
             raise place("protection", "frozen_s").error(
-                f"protection.frozen_s.{name}: it stands still when all is well; supply_v, an analogue reading of the same "
-                "frame, shows that the amplifier repeats an old one"
+                f"protection.frozen_s.{name}: this reading is constant in normal operation; limit supply_v instead, an "
+                "analogue reading of the same frame"
             )
     needed = {"simulated": "plant", "devices": "devices", "replay": "recording"}[hal.backend]
     if not getattr(hal, needed):
-        raise place("hal", "backend").error(f"hal.{needed} is missing: the back end '{hal.backend}' needs it")
+        raise place("hal", "backend").error(f"hal.{needed} is missing: back end '{hal.backend}' needs it")
     backend = {"device": "devices", "tick": "simulated"}.get(settings.loop.pace, hal.backend)
     if hal.backend != backend:
         raise place("loop", "pace").error(

@@ -1,6 +1,7 @@
 """Which rig a command means: the one rule by which every command finds its configuration.
 
-`--config FILE`; else `$THERMOCTL_CONFIG`; else `config/simulated.yaml` in the current folder; else `/etc/thermoctl/rig.yaml`.
+`--config FILE`; else `$THERMOCTL_CONFIG`; else `config/simulated.yaml` in the current folder; else
+`/etc/thermoctl/rig.yaml`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ FALLBACKS = ("config/simulated.yaml", "/etc/thermoctl/rig.yaml")
 class Act:
     """What a command may do to a rig; one row of docs/reference/commands-that-act.md.
 
-    question: what it asks before; beside: what it does where another process holds the rig."""
+    question: what it asks first; beside: what it does when another process holds the rig."""
 
     command: str
     does: str
@@ -29,13 +30,19 @@ class Act:
     status: str
 
 
-_OWN = "none: the command is the person's own act"
-_MOVES = "says what moves, how far, how long and how warm, and asks for `go`, or takes `--yes`; without a terminal and `--yes`: status 2"
-_THROUGH = "runs through that daemon's law and protection, from READY only, and disarms at its end; a rig that is ARMED or in FAULT is left alone"
+_OWN = "none: a person gives this command"
+_MOVES = (
+    "prints what moves, how far, for how long and how warm it gets, and asks for `go`, unless `--yes` is given; without "
+    "a terminal and without `--yes`: status 2"
+)
+_THROUGH = (
+    "drives through that daemon with its law and protection, from READY only, and disarms at its end; a rig that is "
+    "ARMED or in FAULT is not touched"
+)
 ACTS = (
     Act(
         "run",
-        "starts the daemon in the foreground; drives nothing before somebody arms",
+        "starts the daemon in the foreground; drives nothing until it is armed",
         "none",
         "refused",
         "2 held",
@@ -44,8 +51,8 @@ ACTS = (
         "demo",
         "starts a copy of a simulated rig with its own lock, socket, log and recordings, arms and moves it",
         "none: it refuses every back end but the simulated one",
-        "runs beside it and leaves it alone",
-        "0 stopped; 1 a fault stood; 2 no simulated rig, or another demo runs; 3 not started",
+        "runs beside it without touching it",
+        "0 stopped; 1 a fault was active; 2 no simulated rig, or another demo runs; 3 not started",
     ),
     Act(
         "start",
@@ -74,7 +81,7 @@ ACTS = (
         "disables the amplifier; in FAULT acknowledges",
         "none: it is the safe direction",
         "its purpose",
-        "1 a fault still stands; 2 no daemon",
+        "1 a fault is still active; 2 no daemon",
     ),
     Act(
         "setpoint",
@@ -123,16 +130,16 @@ ACTS = (
     ),
     Act(
         "virtual-rig",
-        "plays the devices of a configuration; drives no amplifier. `--tell` breaks or mends a virtual device",
+        "plays the devices of a configuration; drives no amplifier. `--tell` injects a fault into a virtual device, or clears it",
         "none",
-        "leaves it alone: a virtual rig that runs already is not replaced",
+        "does not touch it: a virtual rig that runs already is not replaced",
         "2 another virtual rig runs, or no back end `devices`",
     ),
     Act(
         "service",
         "install writes the unit of this configuration and starts nothing; uninstall stops and removes it",
         "none",
-        "install leaves it alone; uninstall stops the rig of its own unit",
+        "install does not touch it; uninstall stops the rig of its own unit",
         "0; 1 no such unit; 2 it cannot be written, or two rigs collide",
     ),
 )

@@ -290,13 +290,16 @@ def kind_of(node: Node) -> str:
     return "nothing" if v is None else repr(v)[:80]
 
 
-def number_of(node: Node, label: str, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return a node's number within low..high; `label` names it in the InputError."""
+def number_of(
+    node: Node, label: str, low: float = -math.inf, high: float = math.inf, unit: str = ""
+) -> float:
+    """Return a node's number within low..high; `label` and `unit` describe it in the InputError."""
     value = node.value
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
-        raise node.error(f"{label}: a number was expected, found {kind_of(node)}")
+        in_unit = f" in {unit}" if unit else ""
+        raise node.error(f"{label}: a number{in_unit} was expected, found {kind_of(node)}")
     if not low <= value <= high:
-        raise node.error(f"{label}: {value:g} is outside {low:g} .. {high:g}")
+        raise node.error(f"{label}: {value:g} is outside {low:g} .. {high:g} {unit}".rstrip())
     return float(value)
 
 

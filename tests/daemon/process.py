@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 
 from thermoctl.daemon.assemble import shared_name
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.control_socket import ask
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
 

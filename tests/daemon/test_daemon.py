@@ -14,7 +14,7 @@ import pytest
 
 from tests.daemon.process import LIMIT_S, ROOT, Daemon, wait
 from thermoctl.cli import main
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.control_socket import ask
 from thermoctl.recording.reader import info
 from thermoctl.settings import load_settings
 
@@ -214,8 +214,8 @@ def test_start_tells_why_it_failed(unrecorded, capsys, monkeypatch):
 @pytest.mark.parametrize(
     "old,new,message",
     [
-        ("kp: 0.01", "kpp: 0.01", r"unknown option 'control.kpp' (did you mean 'kp'?)"),
-        ("kp: 0.01", "kp: -1", "control.kp: -1 is out of range; expected 0 to 1000"),
+        ("kp: 0.01", "kpp: 0.01", "control: unknown key 'kpp' (did you mean 'kp'?)"),
+        ("kp: 0.01", "kp: -1", "control.kp: -1 is outside 0 .. 1000 1/um"),
         ("period_s: 1 ms", "period_s: 1 kg", "the unit does not fit"),
         ("period_s: 1 ms", "period_s: soon", "a number in s was expected"),
         ("control:", "controll:", "(did you mean 'control'?)"),
@@ -226,8 +226,8 @@ def test_start_tells_why_it_failed(unrecorded, capsys, monkeypatch):
         ("required: [position_um", "required: [postion_um", "(did you mean 'position_um'?)"),
         ("setpoint_high_um: 250", "setpoint_high_um: -300", "must be above"),
         ("  kp: 0.01\n", "", "'control.kp' is missing"),
-        ("  plant:", "  roles: 7\n  plant:", "a mapping of names was expected"),
-        ("rig: {name: simulated}", "rig: 3", "a mapping was expected"),
+        ("  plant:", "  roles: 7\n  plant:", "a mapping (key: value) was expected"),
+        ("rig: {name: simulated}", "rig: 3", "a mapping (key: value) was expected"),
     ],
 )
 def test_a_bad_configuration_is_one_good_line(config, old, new, message, capsys):
@@ -285,7 +285,7 @@ def test_what_a_session_recorded_replays_to_the_bit(config, capsys):
     for path in files:
         assert main(["replay", str(path)]) == 0
         out = capsys.readouterr().out
-        assert "bit for bit" in out
+        assert "bit for bit" in out and "rig simulated, run 2" in out
         ticks += int(out.split(": ")[1].split()[0])
     assert ticks > 2000  # what was seen on the disk of the last two
     assert main(["replay", str(config)]) == 2 and "rig.yaml" in capsys.readouterr().err

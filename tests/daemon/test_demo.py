@@ -15,7 +15,7 @@ import pytest
 from tests.daemon.process import LIMIT_S, ROOT, wait
 from thermoctl.cli import main
 from thermoctl.daemon import lock, view
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.control_socket import ask
 from thermoctl.settings import load_settings
 
 

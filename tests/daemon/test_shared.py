@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from thermoctl.daemon.clock import now_ns, sleep_until
 from thermoctl.daemon.ring import Box, Histogram, Mailbox, Record, Ring, unpack_readings
 from thermoctl.daemon.shared import Shared, percentiles
-from thermoctl.daemon.socket import latency
+from thermoctl.daemon.snapshot import latency
 from thermoctl.yamlfile import InputError
 
 

@@ -258,7 +258,7 @@ def commands() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """Requests to the daemon's socket, on a ring with one row."""
     import numpy as np
 
-    from thermoctl.daemon import socket as room
+    from thermoctl.daemon import command_server as room
     from thermoctl.daemon.shared import Shared
     from thermoctl.settings import load_settings
     from thermoctl.signals import SIGNALS

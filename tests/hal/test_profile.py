@@ -190,7 +190,7 @@ def test_the_virtual_rig_refuses_a_bus_it_cannot_play():
 
 
 def test_check_says_what_is_allowed_and_yet_unusual(tmp_path, capsys):
-    from thermoctl.daemon.client import check
+    from thermoctl.daemon.doctor import check
 
     (tmp_path / "module.yaml").write_text(MODULE.replace("register: 0,", "register: 40001,"))
     (tmp_path / "rig.yaml").write_text(
@@ -199,7 +199,7 @@ def test_check_says_what_is_allowed_and_yet_unusual(tmp_path, capsys):
         "    - {profile: module.yaml, port: 'tcp:127.0.0.1:502', roles: {thermocouple_1: coil_c}}\n"
         f"socket: {{path: {tmp_path}/rig.sock}}\nrecording: {{directory: {tmp_path}}}\n"
     )
-    assert check(str(tmp_path / "rig.yaml")) == 0
+    assert check(load_settings(tmp_path / "rig.yaml")) == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
     assert "no device takes the command" in notes[0] and "cannot be driven" in notes[0]
     assert (

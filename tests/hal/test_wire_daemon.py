@@ -15,7 +15,7 @@ import pytest
 
 from hal.virtual.rig import tell
 from tests.hal.conftest import CONFIG, free_port
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.control_socket import ask
 from thermoctl.recording.files import read_table
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError

@@ -169,7 +169,7 @@ def test_the_recorder_stopped_for_a_while_loses_nothing(daemon):
 
 @pytest.mark.parametrize("name", ["commands", "recorder"])
 def test_a_helper_stopped_for_good_is_replaced(daemon, name):
-    from thermoctl.daemon.supervisor import HANG_S
+    from thermoctl.daemon.processes import HANG_S
 
     daemon.armed()
     os.kill(daemon.child(name), signal.SIGSTOP)

@@ -17,7 +17,7 @@ from thermoctl.calibration import daemon_rig
 from thermoctl.calibration.daemon_rig import DaemonRig, at_rest
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table
-from thermoctl.daemon.socket import status
+from thermoctl.daemon.snapshot import status
 from thermoctl.identify import modelfile
 from thermoctl.identify.experiments import Aborted, load_experiments
 from thermoctl.recording.files import read_table

@@ -13,9 +13,9 @@ import pytest
 from hal.backend import ROLE
 from tests.hazards.harness import HazardRig, quick_settings
 from tests.hazards.test_wires import ERROR_FRAME, KernelBus, WiredRig
-from thermoctl.daemon.readings import fault_lines, message_lines
+from thermoctl.daemon.display import fault_lines, message_lines
 from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.socket import status
+from thermoctl.daemon.snapshot import status
 
 ROWS: list[tuple[str, str, str]] = []
 TEMPERATURES = tuple(r for r in ROLE if r.endswith("_c") and r != "air_c")

@@ -19,8 +19,9 @@ from rich.terminal_theme import DIMMED_MONOKAI
 from running import Running
 
 from thermoctl.daemon import dashboard, monitor, view
+from thermoctl.daemon.command_server import Commands
 from thermoctl.daemon.metrics import metrics
-from thermoctl.daemon.socket import Commands, status
+from thermoctl.daemon.snapshot import status
 from thermoctl.daemon.watch import Watch
 from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter

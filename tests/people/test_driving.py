@@ -20,7 +20,8 @@ from thermoctl.calibration import drive
 from thermoctl.calibration.schedules import forecast
 from thermoctl.calibration.simulated_rig import SimulatedRig
 from thermoctl.control import arming
-from thermoctl.daemon.socket import Connection, ask, status
+from thermoctl.daemon.control_socket import Connection, ask
+from thermoctl.daemon.snapshot import status
 from thermoctl.identify.experiments import Schedule
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX

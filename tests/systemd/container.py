@@ -14,7 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.control_socket import ask
 from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -22,8 +22,8 @@ from thermoctl.calibration.simulated_rig import EVERY_S
 from thermoctl.control import arming
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.assemble import shared_name
+from thermoctl.daemon.control_socket import Connection, ask
 from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.socket import Connection, ask
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table

@@ -21,7 +21,7 @@ from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.schedules import forecast, span, within_limits
 from thermoctl.calibration.simulated_rig import SimulatedRig
 from thermoctl.control import arming
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.control_socket import ask
 from thermoctl.identify.experiments import Aborted, Schedule
 from thermoctl.settings import Settings
 from thermoctl.signals import INDEX

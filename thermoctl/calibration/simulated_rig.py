@@ -16,7 +16,7 @@ from thermoctl.calibration.recorded import causes
 from thermoctl.control import arming
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.simulate import Simulation
-from thermoctl.daemon.socket import channel_states
+from thermoctl.daemon.snapshot import channel_states
 from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.table import Table

@@ -1,25 +1,30 @@
 """How many readings a second arrive, against `rate_hz` of the devices' profiles.
 
-A sensor that sends at a tenth of its rate passes every check of age that a slow machine needs. Its readings are then
-older than the control loop and the limits on jumps assume, so `thermoctl doctor` and `thermoctl status` compare both.
+A sensor that sends at a tenth of its rate passes every limit on age that a slow machine needs. But its readings
+are older than the control loop and the limits on jumps assume. So `doctor` and `status` compare both rates.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from thermoctl.channels import CHANNELS
 from thermoctl.daemon.shared import Shared
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 
-SLOW_SHARE = 0.5  # of rate_hz: below it a reading is called slow; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3
-LOOK_ROWS = 4000  # ticks of the record that `status` counts over
-FEWEST = 10  # readings that must have been due in that time
+SLOW_SHARE = (
+    0.5  # of rate_hz: a lower rate is reported; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3
+)
+LOOK_ROWS = 4000  # newest ticks in which `status` counts readings
+FEWEST = 10  # expected readings in that time, below which no rate is reported
 
 
-def expected_hz(settings: Any) -> dict[str, float]:
-    """The profile's rate of each role, Hz; empty for back ends without devices. Raises InputError."""
+def expected_hz(settings: Settings) -> dict[str, float]:
+    """Return the profile's rate of each role, Hz; empty for back ends without devices.
+
+    Raises InputError.
+    """
     if settings.hal.backend != "devices":
         return {}
     from hal.make import make_devices
@@ -27,9 +32,12 @@ def expected_hz(settings: Any) -> dict[str, float]:
     return {b.role: b.channel.rate_hz for d in make_devices(settings) for b in d.binding.bounds}
 
 
-def slow(role: str, found_hz: float, expected: Mapping[str, float], looks_hz: float) -> str:
-    """What to say where `role` arrives too slowly, else ''. looks_hz: how often it was looked for; more cannot be seen."""
-    due_hz = min(expected.get(role, 0.0), looks_hz)
+def slow(role: str, found_hz: float, expected: Mapping[str, float], reads_hz: float) -> str:
+    """Return a sentence when `role` arrives too slowly, else ''.
+
+    reads_hz: how often the reading was checked; a higher rate cannot be seen.
+    """
+    due_hz = min(expected.get(role, 0.0), reads_hz)
     if found_hz >= SLOW_SHARE * due_hz:
         return ""
     return (
@@ -39,7 +47,10 @@ def slow(role: str, found_hz: float, expected: Mapping[str, float], looks_hz: fl
 
 
 def slow_readings(shared: Shared, expected: Mapping[str, float]) -> list[str]:
-    """A line for each reading that arrived too slowly in the last LOOK_ROWS ticks and is not lost altogether."""
+    """List a line for each reading that arrived too slowly in the last LOOK_ROWS ticks.
+
+    A reading that is lost altogether is a fault and not listed.
+    """
     rows, _, _ = shared.ring.read(max(0, shared.ring.head - LOOK_ROWS))
     if len(rows) < 2:
         return []

@@ -1,4 +1,4 @@
-"""From the configuration to what the law takes: parameters, the compensator's model, names of shared memory."""
+"""Make what the law needs from the configuration: parameters, the model, names of shared memory."""
 
 from __future__ import annotations
 
@@ -12,27 +12,26 @@ import numpy as np
 from hal.binding import bind
 from thermoctl.channels import CHANNELS
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters, zero_model
-from thermoctl.settings import RigSettings
+from thermoctl.settings import RigSettings, Settings
 from thermoctl.yamlfile import InputError, load
 
 UNNAMED = RigSettings().name
 
 
-def law_parameters(settings: Any) -> Parameters:
+def law_parameters(settings: Settings) -> Parameters:
     """Gains, limits and protection of `settings` as the law takes them. Raises InputError for an unknown channel."""
     given: dict[str, Any] = vars(settings.control) | vars(settings.compensation) | vars(settings.protection)
     given |= {
         "compensate": settings.compensation.enable,
         "required": dict.fromkeys(settings.protection.required, 1.0),
     }
-    return Parameters(
-        **{
-            f.name: _by_channel(given[f.name], BY_CHANNEL[f.name], f"protection.{f.name}")
-            if f.name in BY_CHANNEL
-            else float(given[f.name])
-            for f in fields(Parameters)
-        }
-    )
+    taken: dict[str, Any] = {
+        f.name: _by_channel(given[f.name], BY_CHANNEL[f.name], f"protection.{f.name}")
+        if f.name in BY_CHANNEL
+        else float(given[f.name])
+        for f in fields(Parameters)
+    }
+    return Parameters(**taken)
 
 
 def _by_channel(given: Any, default: float, where: str) -> np.ndarray:
@@ -44,8 +43,8 @@ def _by_channel(given: Any, default: float, where: str) -> np.ndarray:
     return array
 
 
-def power_warning(settings: Any) -> str:
-    """What is lost, with file:line, where the coil's power cannot be known; '' where it can."""
+def power_warning(settings: Settings) -> str:
+    """Return a warning with file:line when the coil's power cannot be computed, else ''."""
     protection = settings.protection
     if settings.hal.backend != "devices":
         return ""
@@ -68,8 +67,11 @@ def power_warning(settings: Any) -> str:
     )
 
 
-def compensator(settings: Any) -> CompensatorModel:
-    """The model that `compensation.model` names; without one, the model that estimates nothing. Raises InputError for a model of another rig."""
+def compensator(settings: Settings) -> CompensatorModel:
+    """Load the model that `compensation.model` names; without one, a model that estimates nothing.
+
+    Raises InputError for a model of another rig.
+    """
     if not settings.compensation.model:
         return zero_model(settings.loop.period_s)
     from thermoctl.identify.modelfile import load_model
@@ -77,13 +79,16 @@ def compensator(settings: Any) -> CompensatorModel:
     return load_model(settings.compensation.model, settings.rig.name)
 
 
-def shared_name(settings: Any) -> str:
-    """The name of the daemon's shared memory: one daemon a socket path."""
+def shared_name(settings: Settings) -> str:
+    """Return the name of the daemon's shared memory: one daemon a socket path."""
     return f"thermoctl-{zlib.crc32(str(Path(settings.socket.path).absolute()).encode()):08x}"
 
 
-def rig_identity(settings: Any) -> str:
-    """What its recordings call the rig: rig.name, or, where none is given, the configuration's name and a hash of its path."""
+def rig_identity(settings: Settings) -> str:
+    """Return the rig's name in recordings.
+
+    It is rig.name, or, without one, the configuration's name and a hash of its path.
+    """
     if settings.rig.name != UNNAMED:
         return settings.rig.name
     path = Path(settings.path).absolute()

@@ -19,20 +19,21 @@ cdef inline int64_t _now() noexcept nogil:
 
 
 cpdef int64_t now_ns() noexcept:
-    """CLOCK_MONOTONIC, ns: the clock of `time.monotonic()` and of every process of the daemon."""
+    """Return CLOCK_MONOTONIC, ns: the clock of `time.monotonic()` and of every process of the daemon."""
     return _now()
 
 
 cpdef double wall_s() noexcept:
-    """The system's own clock, CLOCK_REALTIME, s: `time.time()`."""
+    """Return the system's clock, CLOCK_REALTIME, s, as `time.time()`."""
     cdef timespec t
     clock_gettime(CLOCK_REALTIME, &t)
     return <double>t.tv_sec + t.tv_nsec * 1e-9
 
 
 cpdef int64_t suspended_ns() noexcept:
-    """How long the machine has slept since it was started (CLOCK_BOOTTIME - CLOCK_MONOTONIC), ns: the one clock that
-    a suspend shows in. A growth of some 100 ns is the time between the two looks."""
+    """Return the time that the machine was suspended since its start, ns: CLOCK_BOOTTIME - CLOCK_MONOTONIC.
+
+    The two clocks are read some 100 ns apart, so a growth of that size is no suspend."""
     cdef timespec t
     clock_gettime(CLOCK_BOOTTIME, &t)
     return <int64_t>t.tv_sec * 1000000000 + t.tv_nsec - _now()

@@ -1,18 +1,18 @@
 """The dashboard: one page in the browser, served by a process of its own, with Prometheus' metrics beside it.
 
     GET  /                  the page: complete in itself, no file from elsewhere
-    GET  /api/live          server-sent events: `past`, the last minute; then frames, 1 to 50 a second (watch.Watch), and
-                            `slow` once a second: latency and captures
+    GET  /api/live          server-sent events: `past`, the last minute; then frames, 1 to 50 a second
+                            (watch.Watch), and `slow` once a second: latency and captures
     GET  /api/info          rig, limits, signals, whether commands are taken
-    GET  /api/history       ?signal=NAME&begin=S&end=S&points=N   least, mean and largest per pixel, from the recording
+    GET  /api/history       ?signal=NAME&begin=S&end=S&points=N   least, mean and largest a pixel
     GET  /api/captures      faults with full-rate rows;  /api/capture?number=N&signal=NAME[&format=csv]
     GET  /metrics           with --metrics
     POST /api/command       arm, disarm, setpoint; with --commands only
 
-Who may: everyone on this machine may look while it listens on loopback. Elsewhere, and for every command, the token is
-needed ("Authorization: Bearer TOKEN"; the page takes it from the address's #token=). Requests of other web pages are
-refused (Host, Origin, Sec-Fetch-Site), so is what is too large, too slow or too many. It speaks plain HTTP: beyond the
-machine, put an ssh tunnel or a TLS proxy in front.
+Access: on loopback every user of this machine may read. On other addresses, and for every command, the token is
+needed ("Authorization: Bearer TOKEN"; the page takes it from the address's #token=). Requests of other web pages
+are refused (Host, Origin, Sec-Fetch-Site). So are requests that are too large, too slow or too many. The protocol
+is plain HTTP: beyond the machine, use an ssh tunnel or a TLS proxy.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
-import hmac
 import io
 import ipaddress
 import json
@@ -31,8 +30,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -41,87 +39,34 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from thermoctl.daemon.access import MIN_TOKEN, Policy, Refused, parse_address
 from thermoctl.daemon.assemble import rig_identity
+from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.metrics import CONTENT_TYPE, metrics
-from thermoctl.daemon.readings import SOURCES, hide_invalid, invalid
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.readings import hide_invalid, invalid
+from thermoctl.daemon.sources import SOURCES
 from thermoctl.daemon.watch import Watch
 from thermoctl.recording.history import history
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, POINTS, SIGNALS
 from thermoctl.yamlfile import InputError
 
 PAGE = Path(__file__).with_name("dashboard.html")
 MAX_HEAD, MAX_BODY = 8192, 1024  # bytes of a request
 MAX_CONNECTIONS, MAX_STREAMS = 32, 12
-REQUEST_S, SEND_S = 5.0, 5.0  # a request must have come, and an answer have gone, within these
-MIN_TOKEN = 16
+REQUEST_S, SEND_S = 5.0, 5.0  # time limits of receiving a request and of sending an answer
 COMMANDS = ("arm", "disarm", "setpoint")
 TOKEN_VARIABLE = "THERMOCTL_DASHBOARD_TOKEN"
 
 
-class Refused(Exception):
-    """The request is answered with this status and text."""
-
-    def __init__(self, status: HTTPStatus, text: str):
-        super().__init__(text)
-        self.status, self.text = status, text
-
-
-@dataclass(frozen=True)
-class Policy:
-    """Who may do what. names: host names, besides addresses and localhost, that the page is asked for by."""
-
-    token: str
-    token_to_look: bool
-    commands: bool = False
-    metrics: bool = False
-    names: frozenset[str] = field(default_factory=frozenset)
-
-    def check_source(self, headers: Any) -> None:
-        """Refuse what another web page made the browser send: a foreign Host (DNS rebinding) or Origin."""
-        host = headers.get_all("Host") or []
-        if len(host) != 1 or not self._ours(_host_name(host[0])):
-            raise Refused(HTTPStatus.MISDIRECTED_REQUEST, "this host name is not served; see --name")
-        origin = headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host[0]:
-            raise Refused(HTTPStatus.FORBIDDEN, "requests of other web pages are refused")
-        if headers.get("Sec-Fetch-Site") not in (None, "same-origin", "none"):
-            raise Refused(HTTPStatus.FORBIDDEN, "requests of other web pages are refused")
-
-    def check_token(self, headers: Any) -> None:
-        """Refuse a request without the token."""
-        given = headers.get("Authorization", "")
-        if not hmac.compare_digest(given.encode(errors="replace"), f"Bearer {self.token}".encode()):
-            raise Refused(
-                HTTPStatus.UNAUTHORIZED,
-                "the token is missing or wrong: open the address that `thermoctl dashboard` printed",
-            )
-
-    def _ours(self, name: str) -> bool:
-        if name == "localhost" or name in self.names:
-            return True
-        try:
-            ipaddress.ip_address(name)
-        except ValueError:
-            return False
-        return True
-
-
-def _host_name(host: str) -> str:
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
-
-
 class Server(ThreadingHTTPServer):
-    """At most MAX_CONNECTIONS at a time; one more is closed at once."""
+    """Serves at most MAX_CONNECTIONS at a time; a further connection is closed at once."""
 
     daemon_threads = True
     allow_reuse_address = True
     request_queue_size = 64
 
-    def __init__(self, address: tuple[str, int], settings: Any, watch: Watch, policy: Policy):
+    def __init__(self, address: tuple[str, int], settings: Settings, watch: Watch, policy: Policy):
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         self.settings, self.watch, self.policy = settings, watch, policy
         self.page, self.page_policy = _page()
@@ -130,21 +75,21 @@ class Server(ThreadingHTTPServer):
         super().__init__(address, Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """A thread for it, when one is free."""
+        """Start a thread for the request, when a place is free."""
         if not self.connections.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """As in the library, and the place is free again."""
+        """Serve the request as the library does, then free the place."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self.connections.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that went away is no news; a defect of ours is."""
+        """Ignore clients that disconnect; report every other error."""
         import sys
 
         if not isinstance(sys.exception(), OSError):
@@ -152,7 +97,7 @@ class Server(ThreadingHTTPServer):
 
 
 def _page() -> tuple[bytes, str]:
-    """The page and the policy that lets nothing run or load but what is in it."""
+    """Return the page, and the policy that forbids every script and style but the page's own."""
     text = PAGE.read_text()
 
     def hashes(tag: str) -> str:
@@ -167,7 +112,7 @@ def _page() -> tuple[bytes, str]:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One request a connection."""
+    """Answers one request a connection."""
 
     server: Server
     protocol_version = "HTTP/1.1"
@@ -255,7 +200,10 @@ class Handler(BaseHTTPRequestHandler):
         route(Query(url.query))
 
     def _live(self, query: Query) -> None:
-        """Frames until the client goes away. One that reads slowly misses frames, and is dropped when it stops."""
+        """Send frames until the client disconnects.
+
+        A slow client misses frames; one that stops reading is dropped.
+        """
         if not self.server.streams.acquire(blocking=False):
             raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, f"already {MAX_STREAMS} pages are open")
         try:
@@ -418,12 +366,12 @@ class Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """What the library says of a request that it does not understand."""
+        """Answer a request that the library rejects."""
         self.request_version = "HTTP/1.1"
         self._json({"ok": False, "error": message or HTTPStatus(code).phrase}, HTTPStatus(code))
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not logged: a page asks many times a second, and a log would keep addresses."""
+        """Do not log requests: a page asks many times a second, and a log would keep addresses."""
 
 
 class Query:
@@ -436,11 +384,11 @@ class Query:
             raise InputError("the query is not understood: at most 8 names in UTF-8 were expected") from None
 
     def text(self, name: str, default: str) -> str:
-        """The value of `name`."""
+        """Return the value of `name`."""
         return self.values.get(name, default)
 
     def number(self, name: str, default: float) -> float:
-        """The finite number of `name`. Raises InputError for anything else."""
+        """Return the finite number of `name`. Raises InputError for anything else."""
         try:
             value = float(self.values.get(name, default))
         except ValueError:
@@ -463,19 +411,19 @@ def _numbers(array: np.ndarray, digits: int | None = None) -> list[float | None]
 
 
 def make_server(
-    settings: Any,
+    settings: Settings,
     listen: str,
     watch: Watch,
     commands: bool = False,
     with_metrics: bool = False,
     token: str = "",
-    names: tuple[str, ...] = (),
+    names: Sequence[str] = (),
 ) -> Server:
-    """A server on `listen` (ADDRESS:PORT, [V6ADDRESS]:PORT, or PORT on loopback), not yet serving.
+    """Make a server on `listen` that does not serve yet.
 
-    Raises InputError for an address that cannot be listened on and a token that can be guessed.
+    listen: ADDRESS:PORT, [V6ADDRESS]:PORT, or PORT on loopback.
     """
-    address, port = _address(listen)
+    address, port = parse_address(listen)
     if token and len(token) < MIN_TOKEN:
         raise InputError(f"the token has {len(token)} characters; at least {MIN_TOKEN} were expected")
     loopback = ipaddress.ip_address(address).is_loopback
@@ -494,37 +442,22 @@ def make_server(
         ) from None
 
 
-def _address(listen: str) -> tuple[str, int]:
-    host, colon, port = listen.rpartition(":")
-    host = host.strip("[]") if colon else "127.0.0.1"
-    host = "127.0.0.1" if host == "localhost" else host
-    try:
-        ipaddress.ip_address(host)
-        if not 0 <= int(port) <= 65535:
-            raise ValueError
-    except ValueError:
-        raise InputError(
-            f"--listen {listen}: ADDRESS:PORT was expected, as 127.0.0.1:8765 or [::]:8765"
-        ) from None
-    return host, int(port)
-
-
 def url(server: Server) -> str:
-    """The address to open, with the token where one is needed."""
+    """Return the address to open, with the token where one is needed."""
     host, port = str(server.server_address[0]), server.server_address[1]
     host = f"[{host}]" if ":" in host else host
     needed = server.policy.token_to_look or server.policy.commands
     return f"http://{host}:{port}/" + (f"#token={server.policy.token}" if needed else "")
 
 
-def dashboard(
-    settings: Any,
+def serve(
+    settings: Settings,
     listen: str,
     commands: bool,
     with_metrics: bool,
     token_file: str | None,
     rate_hz: float,
-    names: tuple[str, ...],
+    names: Sequence[str],
 ) -> int:
     """Serve until Ctrl-C."""
     if not 1.0 <= rate_hz <= 50.0:

@@ -1,24 +1,129 @@
-"""What of this machine decides how late a tick may come, and what to do about it: one line each for `thermoctl doctor`.
+"""Commands that examine a rig that no daemon holds: `check` reads files only, `doctor` connects and reads.
 
-Everything is read from /proc and /sys below `root`; nothing is changed. docs/how-to/real-time.md explains each line.
+The checks of real time read /proc and /sys below `root` and change nothing. docs/how-to/real-time.md
+explains each.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from hal.make import fast_devices
+from hal.backend import OK, ROLES, STATUS_NAMES, Backend, HardwareError, Sample
+from hal.make import device_notes, fast_devices, make_backend
 from hal.serial_port import latency_timer_ms
+from thermoctl.channels import SIGNAL
+from thermoctl.daemon.arrival import expected_hz, slow
+from thermoctl.daemon.assemble import compensator, law_parameters, power_warning
+from thermoctl.daemon.lock import holder
+from thermoctl.daemon.loop import become_real_time
+from thermoctl.settings import Settings
+from thermoctl.signals import SIGNALS
+from thermoctl.yamlfile import InputError
+
+
+def check(settings: Settings) -> int:
+    """Check the configuration, the model, the plant and the profiles; no hardware is touched."""
+    law_parameters(settings)
+    model = compensator(settings)
+    make_backend(settings)
+    if warning := power_warning(settings):
+        print(f"warning: {warning}")
+    print(
+        f"{settings.path}: good. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, model "
+        f"{settings.compensation.model or 'none'} ({model.kind}, order {len(model.A_minus_I)})"
+    )
+    if settings.hal.backend == "devices":
+        for note in device_notes(settings):
+            print(f"note: {note}")
+    return 0
+
+
+@dataclass
+class _Readings:
+    """Number of reads, new readings of each role, and the last sample."""
+
+    reads: int
+    counts: dict[str, int]
+    sample: Sample
+
+
+def doctor(settings: Settings, seconds: float = 2.0) -> int:
+    """Connect and read every channel for `seconds`; print value, unit and rate. Drives nothing.
+
+    Returns 1 when a channel is bad. Then prints which properties of the machine make ticks late, with remedies
+    (docs/how-to/real-time.md); these do not change the exit status."""
+    if (pid := holder(settings)) is not None:  # a second master on its buses could disarm it
+        raise InputError(
+            f"{settings.path}: pid {pid} holds the rig; look with `thermoctl status`, or stop it first"
+        )
+    backend = make_backend(settings)
+    try:
+        backend.open()
+        found = _read_for(backend, seconds, settings.loop.period_s)
+        bad = _print_channels(settings, backend, found, seconds)
+    except HardwareError as e:
+        print(f"thermoctl: {e}", file=sys.stderr)
+        return 3
+    finally:
+        backend.close()
+    print("\nreal time:")
+    refused: list[str] = []
+    become_real_time(settings, refused.append)
+    for line in refused or ["priority, locked memory, processor and latency request are all granted"]:
+        print(f"  {line}")
+    for property in real_time_checks(settings):
+        print(
+            f"  {property.name:24}{'good' if property.good else 'tune'}  {property.found}"
+            + ("" if property.good else f"\n{'':30}-> {property.remedy}")
+        )
+    return 1 if bad else 0
+
+
+def _read_for(backend: Backend, seconds: float, period_s: float) -> _Readings:
+    """Read every period for `seconds`, with the amplifier disabled."""
+    counts, reads = dict.fromkeys(ROLES, 0), 0
+    begin = now = time.monotonic()
+    while not reads or now < begin + seconds:
+        sample = backend.read(now)
+        for role, fresh in zip(ROLES, sample.fresh, strict=True):
+            counts[role] += int(fresh)
+        reads += 1
+        backend.write(0.0, False)  # a drive answers to its SYNC; it stays disabled
+        time.sleep(period_s)
+        now = time.monotonic()
+    return _Readings(reads, counts, sample)
+
+
+def _print_channels(settings: Settings, backend: Backend, found: _Readings, seconds: float) -> int:
+    """Print one line a channel; return how many are bad."""
+    units = {s.name: s.unit for s in SIGNALS}
+    expected, sample, bad = expected_hz(settings), found.sample, 0
+    print(f"{'channel':24}{'value':>14} {'unit':8}{'status':8}{'rate':>10}")
+    for k, role in enumerate(ROLES):
+        state = STATUS_NAMES[sample.status[k]]
+        if state == "ABSENT" and role not in settings.protection.required:
+            continue
+        bad += sample.status[k] != OK
+        rate_hz = found.counts[role] / seconds
+        problem = backend.problem(role) or slow(role, rate_hz, expected, found.reads / seconds)
+        print(
+            f"{role:24}{sample.value[k]:14.4f} {units.get(SIGNAL[role], ''):8}{state:8}{rate_hz:7.1f} Hz"
+            + (f"   {problem}" if problem else "")
+        )
+    if counters := backend.counters():
+        print("counters: " + ", ".join(f"{name} {count}" for name, count in counters.items()))
+    return bad
 
 
 @dataclass(frozen=True)
 class Check:
-    """One property: `good` as it is, what was `found`, and the `remedy` where it is not good."""
+    """One property of the machine: `good`, the value `found`, and the `remedy` when it is not good."""
 
     name: str
     good: bool
@@ -26,8 +131,8 @@ class Check:
     remedy: str
 
 
-def real_time_checks(settings: Any, root: str = "/") -> Iterator[Check]:
-    """The checks for these settings (loop.cpu, loop.spin_s and the serial ports of hal.devices)."""
+def real_time_checks(settings: Settings, root: str = "/") -> Iterator[Check]:
+    """Check the machine for these settings: loop.cpu, loop.spin_s and the serial ports."""
     base, cpu = Path(root), settings.loop.cpu
     yield _preemption(base)
     if cpu < 0:
@@ -57,7 +162,7 @@ def real_time_checks(settings: Any, root: str = "/") -> Iterator[Check]:
 
 
 def cpu_list(text: str) -> set[int]:
-    """The numbers of a kernel list such as '0-2,5'; empty for '' and '(null)'."""
+    """Return the numbers of a kernel list such as '0-2,5'; empty for '' and '(null)'."""
     numbers: set[int] = set()
     for low, high in re.findall(r"(\d+)(?:-(\d+))?", text):
         numbers.update(range(int(low), int(high or low) + 1))
@@ -146,7 +251,7 @@ def _governor(base: Path, cpu: int) -> Check:
     )
 
 
-def _latency_timers(settings: Any, sys_root: str) -> Iterator[Check]:
+def _latency_timers(settings: Settings, sys_root: str) -> Iterator[Check]:
     if settings.hal.backend != "devices":
         return
     for device in fast_devices(settings):

@@ -1,9 +1,10 @@
-"""The law's estimates across a restart: kept on disk by the supervisor, taken up by the next loop.
+"""The law's estimates across a restart: saved by the supervisor, restored by the next loop.
 
-Kept are temperatures, expansion, compensation and the encoders' zeros, never arming, setpoint or controller: a daemon
-that was started again is as safe as a new one. They are taken up when they are of this boot of the machine and of this
-model, not older than KEEP_S, and (law.resume) when the coil's first reading is within RESUME_LIMIT_C of them; else
-the estimate starts anew on the coil's first reading. The time between is advanced without power.
+Saved are temperatures, expansion, compensation and the encoders' zeros. Arming, setpoint and controller
+are not: a restarted daemon is as safe as a new one. The estimates are restored when they are of this boot
+of the machine and of this model, and not older than KEEP_S. The coil's first reading must also lie within
+RESUME_LIMIT_C of them (law.resume); otherwise the estimate starts at that reading. The time in between is
+advanced without power.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ import time
 import zlib
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.recorder import decode, encode
+from thermoctl.settings import Settings
 
 KEEP_S = 600.0  # older estimates say little about the rig's slow parts
 EVERY_S = 5.0  # between two times that the supervisor keeps them
@@ -28,7 +29,7 @@ MAX_BYTES = 65536
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
-def kept_path(settings: Any) -> Path:
+def kept_path(settings: Settings) -> Path:
     """Where a daemon keeps its estimates: beside its socket."""
     return Path(settings.socket.path).with_suffix(".state")
 
@@ -49,7 +50,7 @@ def _fingerprint(model: CompensatorModel) -> int:
 
 
 def save(path: Path, model: CompensatorModel, state: np.ndarray) -> bool:
-    """Keep a law's snapshot; False where the disk refuses (the next start is then a cold one)."""
+    """Save a law's snapshot; return False when the disk refuses (the next start is then cold)."""
     text = json.dumps(
         {
             "version": 1,
@@ -72,7 +73,7 @@ def save(path: Path, model: CompensatorModel, state: np.ndarray) -> bool:
 
 
 def load(path: Path, model: CompensatorModel) -> tuple[np.ndarray | None, float, str]:
-    """(snapshot or None, its age in s, why there is none)."""
+    """Return (snapshot or None, its age in s, the reason when there is none)."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)

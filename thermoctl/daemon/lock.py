@@ -1,6 +1,6 @@
-"""Who holds a rig: one lock beside its socket, held by whatever drives it (the daemon, or a command that drives by itself).
+"""The lock of a rig, beside its socket: held by the daemon, or by a command that drives the rig itself.
 
-The lock ends with its last holder, however that ends; the file holds the holder's process id.
+The lock ends with its last holder, for whatever reason; the file holds the holder's process id.
 """
 
 from __future__ import annotations
@@ -9,20 +9,23 @@ import fcntl
 import os
 import time
 from pathlib import Path
-from typing import Any
 
+from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 PROBE_S = 0.2  # a command that only looks (`holder`) has the lock for less than this
 
 
-def lock_path(settings: Any) -> Path:
+def lock_path(settings: Settings) -> Path:
     """Return the lock's file, beside the rig's socket."""
     return Path(settings.socket.path).with_suffix(".lock")
 
 
-def hold(settings: Any) -> int:
-    """Take the rig's lock; returns the open file that keeps it. Raises InputError where another process holds the rig."""
+def hold(settings: Settings) -> int:
+    """Take the rig's lock; return the open file that keeps it.
+
+    Raises InputError when another process holds the rig.
+    """
     path = lock_path(settings)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -44,8 +47,11 @@ def hold(settings: Any) -> int:
     return file
 
 
-def holder(settings: Any) -> int | None:
-    """Return the process id that holds the rig, None where nobody does. Raises InputError where this user may not look."""
+def holder(settings: Settings) -> int | None:
+    """Return the process id that holds the rig, or None.
+
+    Raises InputError when this user may not read the lock.
+    """
     path = lock_path(settings)
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

@@ -3,10 +3,11 @@
 
     sample -> estimate -> compensate -> control -> protect -> actuate -> publish
 
-Nothing in a tick waits, parses, logs or touches a disk. A tick that takes too long costs the ticks it covered: they are
-skipped, counted and published, and the phase is kept (policy `skip`). A tick of real devices runs in C from end to end
-(loop.pxd types it): Python's objects are cold after a period of sleep, and each costs a cache miss. Real-time measures (priority, locked memory,
-processor, latency request) are asked for one by one; what the system refuses is one warning each, never a crash.
+Nothing in a tick waits, parses, logs or touches a disk. A tick that takes too long skips the ticks it
+covered; they are counted and published, and the phase is kept (policy `skip`). A tick of real devices runs
+in C from end to end (loop.pxd has the types): after a sleep Python's objects are out of the cache, and
+each costs a miss. Priority, locked memory, processor and latency request are asked for one by one. Each
+refusal is one warning, never a crash.
 """
 
 from __future__ import annotations
@@ -29,12 +30,13 @@ from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring import Mailbox, Record, Remarks, Ring
 from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, SIGNALS
 
 RELOAD = float(len(arming.COMMANDS))
 """The mailbox command that applies the parameter block; the others are arming's."""
-SUSPEND_NS = 1_000_000  # the two clocks are not read at once; less than this is no suspend
-SUSPEND_EVERY = 16  # ticks between two looks for one
+SUSPEND_NS = 1_000_000  # a smaller difference is no suspend: the two clocks are read one after the other
+SUSPEND_EVERY = 16  # ticks between two checks for a suspend
 STATE_EVERY = 1000  # ticks between two snapshots of the law's state
 _HEAD = INDEX["position_raw_um"]  # numbers of a row before the channels, in the order of `publish`
 _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = (
@@ -52,8 +54,9 @@ _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
 class Rig:
     """Back end, law and record of one rig, and the stages of its tick.
 
-    backend: opened; publish: the ring that takes the finished rows, or a function that is called with each; mailbox,
-    parameters, state, remarks: as in shared.Shared, or None where nobody commands or reads. wall_s, suspended_ns: other clocks than the system's.
+    backend: an open back end. publish: the ring that takes the finished rows, or a function that is called
+    with each. mailbox, parameters, state, remarks: as in shared.Shared, or None where nobody commands or
+    reads. wall_s, suspended_ns: clocks that replace the system's.
     """
 
     def __init__(
@@ -87,7 +90,10 @@ class Rig:
     def tick(
         self, now_s: float, dt_s: float, lateness_us: float = 0.0, clock_ns: Callable[[], int] | None = None
     ) -> None:
-        """One tick that began at `now_s`, `dt_s` after the one before; clock_ns times it, None: the loop's own clock."""
+        """Run one tick that began at `now_s`, `dt_s` after the one before.
+
+        clock_ns: clock that measures the busy time; None: the loop's own clock.
+        """
         begin = now_ns() if clock_ns is None else int(clock_ns())
         self.sample(now_s)
         self.law.estimate(dt_s)
@@ -100,7 +106,7 @@ class Rig:
         self.publish(now_s, dt_s, lateness_us)
 
     def sample(self, now_s: float) -> None:
-        """New readings into the law's arrays, and the next command."""
+        """Read new values into the law's arrays, and take the next command."""
         if isinstance(self.backend, DevicesBackend):
             devices = self.backend
             reading = devices.read(now_s)
@@ -114,12 +120,14 @@ class Rig:
             self.record.bind(reading.value, fresh, reading.status, self._delay, self.law.outputs)
             self._status = reading.status
         for c in range(_THERMAL, _THERMAL_END):
-            if self._fresh[c]:  # temperatures come from slow buses: when was each one read?
+            if self._fresh[c]:  # temperatures come from slow buses: record the age of each
                 age = (now_s - self._time_s[c]) / _DELAY_S
                 self._delay[c] = 0 if age < 0.0 else _LATEST if age >= _LATEST else int(age)
         self.command, self.value, self.external = 0, 0.0, self.write_failed
         if self.mailbox is not None and self.mailbox.waiting():
-            self._obey(*self.mailbox.take())
+            command = self.mailbox.take()
+            if command is not None:
+                self._obey(*command)
 
     def _obey(self, kind: float, value: float) -> None:
         if kind == RELOAD:
@@ -132,7 +140,7 @@ class Rig:
             self.command, self.value = int(kind), value
 
     def actuate(self) -> None:
-        """The amplifier's command. A failed write is a fault of the next tick."""
+        """Send the amplifier's command. A failed write is a fault of the next tick."""
         try:
             if isinstance(self.backend, DevicesBackend):
                 devices = self.backend
@@ -144,7 +152,7 @@ class Rig:
             self.write_failed = _AMPLIFIER_WRITE
 
     def publish(self, now_s: float, dt_s: float, lateness_us: float) -> None:
-        """The finished row, and now and then the law's state (where a replay may start)."""
+        """Publish the finished row, and at intervals the law's state, where a replay may start."""
         law, head = self.law, self._head
         head[0] = now_s - self.start_s
         head[1] = wall_s() if self.wall_s is None else float(self.wall_s())
@@ -165,8 +173,11 @@ class Rig:
             self.keep_state()
 
     def remark(self, t_s: float, dt_s: float) -> None:
-        """What the row does not say of its readings. One channel a tick is looked at for a new line of text, all of them
-        where a fault is new. Nothing is a fault while the law warms up."""
+        """Publish what the row does not hold: ages, verdicts, onsets and the devices' messages.
+
+        One channel a tick is checked for a new message; all are checked when a fault is new. Nothing is a
+        fault while the law warms up.
+        """
         law, head = self.law, self._head
         off = head[_STATE] == _OFF
         bits = 0 if off else law.faults | law.latched
@@ -179,7 +190,7 @@ class Rig:
             self._say(law.tick % _N, t_s)
 
     def _say(self, c: int, t_s: float) -> None:
-        """Channel c's line, where it is not well and the line is new."""
+        """Publish channel c's message when the channel is invalid and the message is new."""
         verdict = self.law.verdict[c]
         if self._status[c] == _ABSENT or (verdict == 0.0 and self.said[c][0] == 0.0):
             return
@@ -191,7 +202,7 @@ class Rig:
             self.remarks.put(c, t_s, (words or self._verdict_in_words(c, int(verdict) - 1)).encode())
 
     def _verdict_in_words(self, c: int, kind: int) -> str:
-        """What the law says of a reading of which the device says nothing."""
+        """Describe the law's verdict on a reading for which the device gives no message."""
         p, value = self.law.parameters, self.reading.value[c]
         return (
             "reported as invalid",
@@ -202,15 +213,15 @@ class Rig:
         )[kind]
 
     def keep_state(self) -> None:
-        """The law's state, its tick and generation into the box: where a replay, or the next run, may begin."""
+        """Put the law's state, its tick and generation into the box, to start a replay or the next run."""
         if self.state_box is not None:
             self.state_box.put(np.concatenate(((self.law.tick, self.generation), self.law.snapshot())))
 
 
 def run_loop(
-    settings: Any, shared: Shared, rig: Rig, stopping: Callable[[], bool], warm_up_ticks: int = 100
+    settings: Settings, shared: Shared, rig: Rig, stopping: Callable[[], bool], warm_up_ticks: int = 100
 ) -> None:
-    """Tick until `stopping()`; the caller has opened the back end and disables the amplifier afterwards."""
+    """Tick until `stopping()`; the caller opens the back end before and disables the amplifier after."""
     period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
     paced = settings.loop.pace == "device"
     counted = settings.loop.pace == "tick"
@@ -222,7 +233,7 @@ def run_loop(
     slept_before = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
     deadline = before + period_ns
     while not stopping():
-        if paced:  # a frame is late: so is the tick, but not by two periods
+        if paced:  # a late frame delays the tick, but by less than two periods
             sleep_until(before + period_ns // 2)
             rig.backend.wait_frame(deadline, deadline + period_ns)
             now = now_ns()
@@ -233,11 +244,11 @@ def run_loop(
                 continue
         lateness_us = (now - deadline) * 1e-3
         gap_ns = 0
-        if rig.law.tick % _SUSPEND_EVERY == 0:  # CLOCK_MONOTONIC stands while the machine sleeps
+        if rig.law.tick % _SUSPEND_EVERY == 0:  # CLOCK_MONOTONIC stops during a suspend
             slept = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
             gap_ns = slept - slept_before if slept - slept_before > _SUSPEND_NS else 0
             slept_before = slept
-        if counted:  # a late tick is one period like any other: the rig's time stands while the machine does
+        if counted:  # the simulated rig's time stops while the machine stalls
             rig.tick(rig.start_s + (rig.law.tick + 1) * rig.law.period_s, rig.law.period_s, lateness_us)
         else:
             rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)
@@ -253,8 +264,11 @@ def run_loop(
             deadline += skipped * period_ns
 
 
-def run_reference(settings: Any, shared: Shared, stopping: Callable[[], bool]) -> None:
-    """An idle loop of the same clock, priority and processor, half a period apart: what the machine gives at best."""
+def run_reference(settings: Settings, shared: Shared, stopping: Callable[[], bool]) -> None:
+    """Run an idle loop half a period apart, to measure the machine's best lateness.
+
+    It has the control loop's clock, priority and processor.
+    """
     period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
     deadline = now_ns() // period_ns * period_ns + period_ns + period_ns // 2
     while not stopping():
@@ -265,10 +279,11 @@ def run_reference(settings: Any, shared: Shared, stopping: Callable[[], bool]) -
             deadline += period_ns
 
 
-def become_real_time(settings: Any, warn: Callable[[str], None]) -> list[Any]:
-    """Priority, processor, locked memory, latency request and frozen collector, as far as the system allows.
+def become_real_time(settings: Settings, warn: Callable[[str], None]) -> list[Any]:
+    """Ask for priority, processor, locked memory and low latency, and freeze the garbage collector.
 
-    Returns what must be kept open (the latency request lasts as long as its file). Each refusal is one `warn` line.
+    Returns the files that must stay open: the latency request lasts as long as its file. Each refusal is
+    one `warn` line.
     """
     kept: list[Any] = []
     loop = settings.loop

@@ -1,15 +1,15 @@
 """The daemon's numbers in Prometheus' text format (version 0.0.4).
 
-Every number of the newest row becomes `thermoctl_<signal>` with the signal's own unit as its ending; the temperatures
-carry the point as a label.
-What is not valid is NaN; `thermoctl_reading_ok` and `thermoctl_reading_age_seconds` say so by role.
+Every number of the newest row becomes `thermoctl_<signal>`, in the signal's unit; temperatures have the point as a
+label. An invalid number is NaN; `thermoctl_reading_ok` and `thermoctl_reading_age_seconds` give state and age by role.
 Lateness and busy time are histograms in seconds, faults are 0 or 1 each.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,11 @@ from thermoctl.signals import BIT_WORDS, INDEX, POINTS, SIGNALS, fault_word
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BUCKETS_US = (10, 20, 50, 100, 200, 500, 1000, 2000, 4096)
+HISTOGRAMS = {
+    "lateness": "wake-up after the tick's deadline",
+    "busy": "wake-up until the amplifier was written",
+    "reference": "lateness of the idle loop beside it",
+}
 _COUNTERS = {"tick": "thermoctl_ticks_total", "slips": "thermoctl_slips_total"}
 _ELSEWHERE = {
     "t_s",
@@ -34,48 +39,63 @@ _ELSEWHERE = {
 }
 
 
+Family = tuple[str, str, str, list[tuple[str, float]]]
+"""Name, type, help, and samples as (labels, value)."""
+
+
 def metrics(shared: Shared | None) -> str:
-    """The page of one moment; without a daemon only `thermoctl_up 0`."""
+    """Return the page of this moment; without a daemon only `thermoctl_up 0`."""
     row = None if shared is None else shared.ring.newest()
-    lines: list[str] = []
-
-    def family(name: str, kind: str, help: str, samples: Iterable[tuple[str, float]]) -> None:
-        lines.append(f"# HELP {name} {help}")
-        lines.append(f"# TYPE {name} {kind}")
-        lines.extend(f"{name}{labels} {_number(value)}" for labels, value in samples)
-
-    family("thermoctl_up", "gauge", "1 while the daemon runs", [("", float(row is not None))])
+    families: list[Family] = [
+        ("thermoctl_up", "gauge", "1 while the daemon runs", [("", float(row is not None))])
+    ]
     if shared is None or row is None:
-        return "\n".join(lines) + "\n"
+        return "\n".join(_lines(families)) + "\n"
     found = readings(shared, row)
     row = np.array([v if valid(n, found) else math.nan for n, v in zip(INDEX, row, strict=True)])
+    families += [*_state_families(row, found), *_signal_families(row), *_recorder_families(shared)]
+    lines = list(_lines(families))
+    for name, meaning in HISTOGRAMS.items():
+        lines += _histogram(f"thermoctl_{name}_seconds", meaning, shared.areas[name])
+    return "\n".join(lines) + "\n"
+
+
+def _lines(families: Iterable[Family]) -> Iterator[str]:
+    for name, kind, help, samples in families:
+        yield f"# HELP {name} {help}"
+        yield f"# TYPE {name} {kind}"
+        yield from (f"{name}{labels} {_number(value)}" for labels, value in samples)
+
+
+def _state_families(row: np.ndarray, found: Mapping[str, Mapping[str, Any]]) -> Iterator[Family]:
+    """Yield state, faults, readings and temperatures."""
     state, bits = int(row[INDEX["state"]]), fault_word(row)
-    family(
+    yield (
         "thermoctl_state",
         "gauge",
         "1 for the state the daemon is in",
         [(f'{{state="{name}"}}', float(k == state)) for k, name in enumerate(arming.STATES)],
     )
-    family(
+    yield (
         "thermoctl_fault",
         "gauge",
-        "1 while the fault stands",
+        "1 while the fault is active",
         [(f'{{name="{f.name}",severity="{f.severity}"}}', float(bits >> f.bit & 1)) for f in faults.FAULTS],
     )
     fitted = {role: r for role, r in found.items() if r["state"] != "ABSENT"}
-    family(
+    yield (
         "thermoctl_reading_ok",
         "gauge",
         "1 while the role's reading is valid",
         [(f'{{role="{role}"}}', float(r["state"] == "OK")) for role, r in fitted.items()],
     )
-    family(
+    yield (
         "thermoctl_reading_age_seconds",
         "gauge",
         "time since the role's newest reading",
         [(f'{{role="{role}"}}', r["age_s"]) for role, r in fitted.items()],
     )
-    family(
+    yield (
         "thermoctl_temperature_celsius",
         "gauge",
         "temperature of a point",
@@ -85,44 +105,39 @@ def metrics(shared: Shared | None) -> str:
             for kind, end in (("measured", "_c"), ("estimated", "_est_c"))
         ],
     )
-    family(
+
+
+def _signal_families(row: np.ndarray) -> Iterator[Family]:
+    """Yield the start time, and every signal that no other family holds."""
+    start_s = row[INDEX["wall_s"]] - row[INDEX["t_s"]]
+    yield (
         "thermoctl_start_time_seconds",
         "gauge",
         "when the daemon started, seconds since 1970",
-        [("", row[INDEX["wall_s"]] - row[INDEX["t_s"]])],
+        [("", start_s)],
     )
     for s in SIGNALS:
         if s.name in _COUNTERS:
-            family(_COUNTERS[s.name], "counter", s.meaning, [("", row[INDEX[s.name]])])
+            yield _COUNTERS[s.name], "counter", s.meaning, [("", row[INDEX[s.name]])]
         elif s.name not in _ELSEWHERE:
-            family(f"thermoctl_{s.name}", "gauge", s.meaning, [("", row[INDEX[s.name]])])
-    family(
-        "thermoctl_recorder_rows_total",
-        "counter",
-        "ticks written to the recording",
-        [("", shared.counters[RECORDER_ROWS])],
-    )
-    family(
-        "thermoctl_recorder_lost_total",
-        "counter",
-        "ticks that the recorder lost",
-        [("", shared.counters[RECORDER_LOST])],
-    )
-    for name, meaning in (
-        ("lateness", "wake-up after the tick's deadline"),
-        ("busy", "wake-up until the amplifier was written"),
-        ("reference", "lateness of the idle loop beside it"),
+            yield f"thermoctl_{s.name}", "gauge", s.meaning, [("", row[INDEX[s.name]])]
+
+
+def _recorder_families(shared: Shared) -> Iterator[Family]:
+    for name, help, place in (
+        ("rows", "ticks written to the recording", RECORDER_ROWS),
+        ("lost", "ticks that the recorder lost because it fell behind", RECORDER_LOST),
     ):
-        _histogram(lines, f"thermoctl_{name}_seconds", meaning, shared.areas[name])
-    return "\n".join(lines) + "\n"
+        yield f"thermoctl_recorder_{name}_total", "counter", help, [("", shared.counters[place])]
 
 
-def _histogram(lines: list[str], name: str, help: str, counts: np.ndarray) -> None:
-    """Counts of whole microseconds as a cumulative histogram; the sum takes each at the middle of its microsecond."""
+def _histogram(name: str, help: str, counts: np.ndarray) -> list[str]:
+    """Return a cumulative histogram of whole microseconds; the sum takes the middle of each bin."""
     counts = counts.astype(np.float64)
-    lines += [f"# HELP {name} {help}", f"# TYPE {name} histogram"]
-    lines += [f'{name}_bucket{{le="{us * 1e-6:.6g}"}} {_number(counts[:us].sum())}' for us in BUCKETS_US]
-    lines += [
+    return [
+        f"# HELP {name} {help}",
+        f"# TYPE {name} histogram",
+        *(f'{name}_bucket{{le="{us * 1e-6:.6g}"}} {_number(counts[:us].sum())}' for us in BUCKETS_US),
         f'{name}_bucket{{le="+Inf"}} {_number(counts.sum())}',
         f"{name}_sum {_number((np.arange(len(counts)) + 0.5) @ counts * 1e-6)}",
         f"{name}_count {_number(counts.sum())}",

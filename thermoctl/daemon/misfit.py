@@ -1,10 +1,11 @@
-"""Does the model of the daemon still fit its rig? The coil's innovations, watched without end.
+"""Detect that the daemon's model no longer fits its rig, by a CUSUM (Page 1954) of the coil's innovations.
 
-    z_k = mean of the innovation over BLOCK_S / (S / sqrt(n)),   S^2 = R_v / (1 - C K) the variance that the filter expects (35),
-    n independent samples in the block;                          CUSUM (Page 1954): g = max(0, g + |z| side - DRIFT) > LIMIT
+    z_k = mean of the innovation over BLOCK_S / (S / sqrt(n)),  n independent samples in the block
+    S^2 = R_v / (1 - C K), the variance that the filter expects (35)
+    g   = max(0, g +- z - DRIFT);  alarm when g > LIMIT; both signs
 
-Where the model holds, z is about standard normal and the sum falls back to zero; where it does not, both the alarm and the
-onset (the sum's last zero) come out. The sum runs on both sides.
+While the model fits, z is about standard normal and the sums fall back to zero. When it does not, the sum gives the
+alarm, and its last zero the onset.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ import numpy as np
 from thermoctl.control.model import CompensatorModel
 
 BLOCK_S = 20.0  # of innovations in one value
-DRIFT = 1.0  # a lasting shift of two standard errors of a block is what the sum is tuned to
+DRIFT = 1.0  # tuned to a lasting shift of two standard errors of a block
 LIMIT = 15.0
-CLIP = 4.0  # no single block decides
-CORRELATED = 4.0  # quantisation correlates neighbours: so many samples count as one
+CLIP = 4.0  # limit of |z|, so that no single block raises an alarm
+CORRELATED = 4.0  # samples that count as one: quantisation correlates neighbours
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """The model does not fit from `begin_s` to `end_s`; `mean_c`: the mean innovation there, K."""
+    """The model did not fit from `begin_s` to `end_s`; `mean_c`: the mean innovation then, K."""
 
     begin_s: float
     end_s: float
@@ -33,8 +34,12 @@ class Alarm:
 
 
 class Misfit:
-    """Feed it rows in order: `add(t_s, innovation_c, kalman_gain)` returns an alarm when one is new. How the rows are cut
-    into calls does not matter. A model that says nothing of the coil has no innovations to watch: no alarm ever."""
+    """Detects a lasting bias of the innovations by a CUSUM on both sides.
+
+    Pass rows in order: `add(t_s, innovation_c, kalman_gain)` returns an alarm when one is new. The
+    division into calls has no influence. A model without a coil temperature has no innovations and never
+    raises an alarm.
+    """
 
     def __init__(self, model: CompensatorModel):
         self._gain, self._noise = float(model.C[0] @ model.gain[:, 0]), math.sqrt(model.R_v)
@@ -42,7 +47,7 @@ class Misfit:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was seen: another model, or a clock that began again."""
+        """Reset the sums: after a change of the model, or when the clock starts again."""
         self._rows = np.empty((3, 0))  # of the block that is not complete: t, innovation, gain
         self._last_t, self._last_c = -math.inf, math.nan
         self.sums = [0.0, 0.0]
@@ -50,7 +55,10 @@ class Misfit:
         self.alarmed = False
 
     def add(self, t_s: np.ndarray, innovation_c: np.ndarray, kalman_gain: np.ndarray) -> Alarm | None:
-        """Rows (n,) of each; the newest alarm that they raise. NaN innovations (no sample yet) are left out."""
+        """Add rows (n,) of each signal; return the newest alarm that they raise.
+
+        NaN innovations (no sample yet) are left out.
+        """
         rows = np.array([t_s, innovation_c, kalman_gain])[:, np.isfinite(t_s) & np.isfinite(innovation_c)]
         found = None
         if not self._watches or not rows.shape[1]:

@@ -1,4 +1,7 @@
-"""`thermoctl monitor`: the rig on one screen of a terminal, as over ssh. It asks the command socket and commands nothing."""
+"""`thermoctl monitor`: the rig on one screen of a terminal, for instance over ssh.
+
+It asks the command socket and gives no commands.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from thermoctl.daemon.readings import fault_lines, message_lines, number, span
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.control_socket import ask
+from thermoctl.daemon.display import fault_lines, message_lines, number, span
+from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
@@ -41,9 +45,11 @@ TRAILS = (
 
 
 def errors(status: dict[str, Any]) -> tuple[float | None, float | None]:
-    """(what the output errs by with compensation, what it would err by without), um; None unless armed.
+    """Return the output's error with compensation and without it, um; None unless armed.
 
-    From the proof encoder where there is one, else as the law estimates it. None, too, while that encoder is not well."""
+    The reference encoder measures the output; without one the law's estimate is used. Both are None while
+    that encoder is invalid.
+    """
     reference, output = status.get("reference_um"), status.get("output_reference_um")
     if status.get("channels", {}).get("output_reference_um", "ABSENT") == "ABSENT":
         output = status.get("compensated_um")
@@ -63,7 +69,7 @@ def remember(trails: dict[str, deque[float]], status: dict[str, Any]) -> None:
 
 
 def sparkline(values: Iterable[float], width: int, ramp: str = BLOCKS) -> str:
-    """The newest `width` values, lowest to highest as the ramp's characters; blank where there is no value."""
+    """Draw the newest `width` values with the ramp's characters; blank where there is no value."""
     newest = list(values)[-width:] if width > 0 else []
     finite = [v for v in newest if math.isfinite(v)]
     if not finite:
@@ -84,7 +90,7 @@ def screen(
     width: int = 80,
     ramp: str = BLOCKS,
 ) -> Group:
-    """The view of one moment from what the command socket answers, for a terminal `width` characters wide."""
+    """Draw one moment from the answers of the command socket, `width` characters wide."""
     faults = _faults(status["faults"])
     head = Text.assemble(("thermoctl ", "bold"), (f" {status['state']} ", STYLE.get(status["state"], "bold")))
     if "channels" not in status:
@@ -103,7 +109,7 @@ def screen(
 
 
 def _faults(standing: list[dict[str, Any]]) -> list[Text]:
-    """The fault lines of `status` in colour: the cause first."""
+    """Return the fault lines of `status` in colour, the cause first."""
     lines = []
     for line in fault_lines(standing):
         style = "dim" if line.startswith(" ") else "bold yellow" if line.startswith("warning") else "bold red"
@@ -131,12 +137,13 @@ def _numbers(status: dict[str, Any]) -> Table:
         ("innovation", status["innovation_c"], "K"),
         ("air", status["air_c"], "C"),
     ):
-        table.add_row(label, _value(status, label, value), unit)
+        estimated = label in ("expansion", "compensation") and status["estimates_state"] != "OK"
+        table.add_row(f"{label} (?)" if estimated else label, _value(status, label, value), unit)
     return table
 
 
 def _value(status: dict[str, Any], label: str, value: float | None) -> Text:
-    """The number; where it has none because a reading is not valid, that reading's state and age."""
+    """Return the number, or the state of the reading that makes it invalid."""
     role = _READINGS.get(label)
     reading = status["readings"][role] if role and value is None else None
     if reading is None or reading["state"] in ("OK", "ABSENT"):
@@ -196,12 +203,12 @@ def _timing(latency: dict[str, Any], ramp: str) -> Text:
 
 
 def ramp_of(console: Console) -> str:
-    """The characters of sparklines that this terminal can show."""
+    """Return the sparkline characters that this terminal can show."""
     return BLOCKS if console.encoding.lower().startswith("utf") else ASCII
 
 
 def look(path: str, with_latency: bool = True) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """Status and latency from the daemon's socket; without a daemon a status that says so."""
+    """Ask the daemon for status and latency; without a daemon return a status that says so."""
     try:
         return ask(path, {"command": "status"}), ask(path, {"command": "latency"}) if with_latency else None
     except InputError as e:
@@ -213,8 +220,11 @@ def look(path: str, with_latency: bool = True) -> tuple[dict[str, Any], dict[str
         }, None
 
 
-def monitor(settings: Any, interval_s: float = 0.5, once: bool = False) -> int:
-    """Show the rig until Ctrl-C; `once` (or no terminal): one screen, and 1 when no daemon runs or a fault stands."""
+def show(settings: Settings, interval_s: float = 0.5, once: bool = False) -> int:
+    """Show the rig until Ctrl-C.
+
+    `once`, or no terminal: print one screen and return 1 when no daemon runs or a fault is active.
+    """
     if not 0.05 <= interval_s <= 60.0:
         raise InputError(f"--interval {interval_s:g}: 0.05 to 60 seconds were expected")
     console = Console()

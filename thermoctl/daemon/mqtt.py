@@ -1,12 +1,12 @@
-"""The rig's state to an MQTT broker; an extra, `pip install 'thermoctl[mqtt]'`. It publishes and takes no commands.
+"""Publish the rig's state to an MQTT broker; it accepts no commands. Needs `pip install 'thermoctl[mqtt]'`.
 
-    TOPIC/availability   `online` while the daemon answers, else `offline`; the broker says `offline` when this program is gone
-                         (last will). Retained.
-    TOPIC/status         what `thermoctl status --json` says, RATE times a second
-    TOPIC/faults         standing faults with meaning and remedy, when they change. Retained.
+    TOPIC/availability   `online` while the daemon answers, else `offline`. The broker publishes `offline` when
+                         this program is gone (last will). Retained.
+    TOPIC/status         the output of `thermoctl status --json`, RATE times a second
+    TOPIC/faults         active faults with meaning and remedy, when they change. Retained.
 
-TOPIC is thermoctl/RIG unless told otherwise. What cannot be sent while the broker is away is dropped, not kept: the newest
-state counts, and the recording has the rest.
+The default TOPIC is thermoctl/RIG. Messages that cannot be sent while the broker is away are dropped: only the newest
+state matters, and the recording has the rest.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from thermoctl.daemon.socket import ask
+from thermoctl.daemon.control_socket import ask
+from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 CONNECT_S = 10.0
@@ -34,13 +35,15 @@ def _library() -> ModuleType:
 
 
 class Bridge:
-    """Follows the daemon of `settings` and publishes below `topic`.
+    """Asks the daemon of `settings` and publishes below `topic`.
 
-    broker: HOST or HOST:PORT (1883, with `tls` 8883); user, password: where the broker asks for them."""
+    broker: HOST or HOST:PORT (default 1883, with `tls` 8883); user, password: where the broker asks for
+    them.
+    """
 
     def __init__(
         self,
-        settings: Any,
+        settings: Settings,
         broker: str,
         topic: str = "",
         user: str = "",
@@ -74,11 +77,11 @@ class Bridge:
         if reason.is_failure:
             self.refused = str(reason)
             return
-        self._online = self._faults = None  # the broker may have forgotten: say it again
+        self._online = self._faults = None  # the broker may have lost them: publish again
         self.connected.set()
 
     def open(self) -> None:
-        """Connect. Raises InputError when the broker is not there or refuses."""
+        """Connect. Raises InputError when the broker cannot be reached or refuses."""
         where = f"broker {self.broker[0]}:{self.broker[1]}"
         try:
             self.client.connect(*self.broker, keepalive=15)
@@ -115,11 +118,11 @@ class Bridge:
                 self._faults = faults
 
     def close(self) -> None:
-        """Say `offline` and leave."""
+        """Publish `offline` and disconnect."""
         if self.connected.is_set():
             with contextlib.suppress(
                 RuntimeError, ValueError
-            ):  # the connection went at this moment: the last will says it
+            ):  # disconnected just now: the last will publishes it
                 self.client.publish(
                     f"{self.topic}/availability", OFFLINE, qos=1, retain=True
                 ).wait_for_publish(2.0)
@@ -127,10 +130,16 @@ class Bridge:
         self.client.loop_stop()
 
 
-def mqtt(
-    settings: Any, broker: str, topic: str, rate_hz: float, user: str, password_file: str | None, tls: bool
+def publish(
+    settings: Settings,
+    broker: str,
+    topic: str,
+    rate_hz: float,
+    user: str,
+    password_file: str | None,
+    tls: bool,
 ) -> int:
-    """The command: publish until Ctrl-C. Raises InputError for a broker that is not there or refuses."""
+    """Publish until Ctrl-C. Raises InputError when the broker cannot be reached or refuses."""
     if not 0.01 <= rate_hz <= 10.0:
         raise InputError(f"--rate {rate_hz:g}: 0.01 to 10 messages a second were expected")
     try:

@@ -1,10 +1,10 @@
 """The recorder process: moves the ring's rows into a recording, ten times a second.
 
-It is never waited for. When it falls behind by more than the ring holds, the lost ticks are counted, and `status` shows
-them.
-A recording holds the effective configuration, the model, the law's parameters and a state of the law to start a replay
-from; a reload starts a new file, so that one file has one set of parameters.
-What passes is also watched: innovations that the filter does not expect raise "the model no longer fits" in the log.
+Nothing waits for it. When it falls behind by more than the ring holds, the lost ticks are counted and
+shown by `status`. A recording holds the effective configuration, the model, the law's parameters, and a
+state of the law where a replay starts. A reload starts a new file, so that a file has one set of
+parameters. The recorder also tests the innovations: when the model no longer fits, it writes so into the
+log.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from thermoctl.control import faults
 from thermoctl.control.model import ARRAYS, PLAIN, CompensatorModel, Parameters
 from thermoctl.daemon.misfit import Misfit
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, RUN_S, Shared
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 
 INTERVAL_S = 0.1
@@ -30,12 +31,12 @@ _TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
 
 
 def encode(array: np.ndarray) -> str:
-    """A float64 array as text, exact."""
+    """Return a float64 array as text, without loss."""
     return base64.b64encode(np.ascontiguousarray(array, dtype=np.float64).tobytes()).decode()
 
 
 def decode(text: str) -> np.ndarray:
-    """The reverse of `encode` (flat)."""
+    """Return the array that `encode` made into text, flat."""
     return np.frombuffer(base64.b64decode(text, validate=True))
 
 
@@ -47,7 +48,10 @@ def law_metadata(
     tick: int,
     state: np.ndarray | None,
 ) -> str:
-    """What a replay needs besides the rows, as JSON: model, parameters, the law's state after `tick` (None: new)."""
+    """Return what a replay needs besides the rows, as JSON.
+
+    These are the model, the parameters, and the law's state after `tick` (None: a new law).
+    """
     return json.dumps(
         {
             "version": LAW_VERSION,
@@ -68,7 +72,10 @@ def law_metadata(
 
 
 def read_law_metadata(text: str) -> dict[str, Any]:
-    """The reverse: period_s, generation, tick, state (or None), parameters (Parameters), model (CompensatorModel)."""
+    """Read what `law_metadata` wrote.
+
+    Keys: period_s, generation, tick, state (or None), parameters (Parameters), model (CompensatorModel).
+    """
     found = json.loads(text)
     if found["version"] != LAW_VERSION:
         raise ValueError(f"law version {found['version']}, this program has version {LAW_VERSION}")
@@ -87,9 +94,9 @@ def read_law_metadata(text: str) -> dict[str, Any]:
 
 
 class Recorder:
-    """Writes rows in order; a new file where the generation changes or the writer wants one.
+    """Writes rows in order; starts a new file when the generation changes or the writer is full.
 
-    open_writer(law_metadata) gives a writer with write(rows) and close().
+    open_writer(law_metadata) returns a writer with write(rows) and close().
     """
 
     def __init__(
@@ -138,9 +145,9 @@ class Recorder:
             alarm = self.misfit.add(
                 rows[:, INDEX["t_s"]], rows[:, INDEX["innovation_c"]], rows[:, INDEX["kalman_gain"]]
             )
-        except Exception as e:  # to record is what we are for: never for the watch's sake not
+        except Exception as e:  # a failing model check must never stop the recording
             self.misfit = None
-            self.log("the watch of the model failed, the recorder goes on without it", error=repr(e))
+            self.log("the check of the model failed and is switched off; recording continues", error=repr(e))
             return
         if alarm is not None:
             self.log(
@@ -148,14 +155,17 @@ class Recorder:
                 begins_s=round(alarm.begin_s, 1),
                 ends_s=round(alarm.end_s, 1),
                 mean_innovation_c=round(alarm.mean_c, 3),
-                remedy="`thermoctl diagnose --live --out DIR` says which physics changed",
+                remedy="`thermoctl diagnose --live --out DIR` finds which physics changed",
             )
 
     def _write(self, rows: np.ndarray) -> None:
         self.shared.counters[RECORDER_LOST] += self.writer.write(rows)
 
     def _new_file_after(self, rows: np.ndarray) -> int | None:
-        """Where in `rows` a new file may begin: after the newest kept state, so that its replay starts there."""
+        """Return the row of `rows` where a new file may begin, or None.
+
+        It follows the newest saved state, so that the file's replay starts there.
+        """
         kept = self.shared.state.get()
         if kept is None:
             return None
@@ -183,8 +193,11 @@ class Recorder:
             self.writer = None
 
 
-def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Recorder:
-    """The recorder of a daemon: files hold the configuration in force, every option, and the law's metadata."""
+def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) -> Recorder:
+    """Make the recorder of a daemon.
+
+    Its files hold every option of the configuration in force, and the law's metadata.
+    """
     from thermoctl.daemon.assemble import compensator, law_parameters, rig_identity
     from thermoctl.recording.writer import RecordingWriter
     from thermoctl.settings import effective
@@ -202,7 +215,7 @@ def make_recorder(settings: Any, shared: Shared, log: Callable[..., None]) -> Re
 
 
 def record(recorder: Recorder, stopping: Callable[[], bool]) -> None:
-    """Until `stopping()`, then what is left in the ring."""
+    """Record until `stopping()`, then write what is left in the ring."""
     while not stopping():
         recorder.move()
         time.sleep(INTERVAL_S)

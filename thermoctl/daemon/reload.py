@@ -6,14 +6,14 @@ from typing import Any
 
 from thermoctl.control.model import Parameters
 from thermoctl.daemon.assemble import law_parameters
-from thermoctl.settings import changed, load_settings
+from thermoctl.settings import Settings, changed, load_settings
 
 
-def reload_settings(current: Any, started: Any) -> tuple[Any, Parameters, list[str], list[str]]:
-    """(settings, parameters, applied keys, keys that count only after a restart).
+def reload_settings(current: Settings, started: Settings) -> tuple[Any, Parameters, list[str], list[str]]:
+    """Read the file again; return (settings, parameters, applied keys, keys that need a restart).
 
-    current: the settings in force; started: those that the daemon was started with. Raises InputError for a file that
-    is not valid: nothing is applied then.
+    current: the settings in force; started: those at the daemon's start. Raises InputError for an invalid
+    file; then nothing is applied.
     """
     settings = load_settings(current.path)
     applied = [key for key, restart in changed(current, settings) if not restart]

@@ -1,7 +1,8 @@
-"""Replay: the recorded inputs through the law again, the outputs compared with the recorded ones bit for bit."""
+"""Replay: run the recorded inputs through the law again and compare the outputs bit for bit."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from thermoctl.control.law import OUTPUTS, Law
 from thermoctl.daemon.recorder import read_law_metadata
 from thermoctl.daemon.ring import unpack_readings
+from thermoctl.recording.reader import info, read_rows
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
@@ -19,8 +21,11 @@ _DT, _COMMAND, _VALUE, _EXTERNAL = (INDEX[n] for n in ("dt_s", "command", "comma
 
 @dataclass
 class Replay:
-    """`ticks` compared, `skipped` before the stored state, `differences` {signal: (ticks that differ, first of them,
-    largest difference)}; `outputs` (ticks, len(OUTPUTS)) as the law gave them now."""
+    """Result of a replay.
+
+    `ticks` compared, `skipped` before the stored state; `differences` {signal: (ticks that differ, first
+    of them, largest difference)}; `outputs` (ticks, len(OUTPUTS)) of this replay.
+    """
 
     ticks: int
     skipped: int
@@ -74,7 +79,7 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
     given = np.empty((len(rows), len(OUTPUTS)))
     for k, row in enumerate(rows):
         value[:] = row[_CHANNELS : _BITS[0]]
-        unpack_readings(*row[_BITS], fresh, status, delay)
+        unpack_readings(row[_BITS[0]], row[_BITS[1]], row[_BITS[2]], fresh, status, delay)
         law.step(row[_DT], int(row[_COMMAND]), row[_VALUE], int(row[_EXTERNAL]))
         given[k] = law.outputs
     recorded = np.ascontiguousarray(rows[:, _OUTPUTS:])
@@ -86,3 +91,23 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
             largest = float(np.nanmax(np.abs(given[wrong, j] - recorded[wrong, j]), initial=0.0))
             differences[output] = (len(wrong), int(rows[wrong[0], INDEX["tick"]]), largest)
     return Replay(len(rows), skipped, differences, given)
+
+
+def command(recording: str) -> int:
+    """Run a recording's inputs through the law; return 1 when an output differs in one bit."""
+    rows, metadata = read_rows(recording)
+    begin = time.perf_counter()
+    result = replay(rows, metadata, recording)
+    seconds = time.perf_counter() - begin
+    meta = info(recording).meta
+    print(
+        f"{recording}: {result.ticks} ticks replayed in {seconds:.2f} s"
+        + (f", {result.skipped} before the stored state skipped" if result.skipped else "")
+        + f"; rig {meta.get('rig', 'unknown')}, run {meta.get('run', 'unknown')}"
+    )
+    for name, (count, first, largest) in result.differences.items():
+        print(f"  {name}: differs in {count} ticks, first in tick {first}, by at most {largest:g}")
+    if result.differences:
+        return 1
+    print(f"  all {np.size(result.outputs)} outputs are the recorded ones, bit for bit")
+    return 0

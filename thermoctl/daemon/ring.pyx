@@ -1,12 +1,12 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
-"""What the loop writes into shared memory, and how others read it without ever making it wait.
+"""The structures in shared memory that the loop writes and others read without making it wait.
 
 Ring: rows of float64, one a tick. The writer fills a slot, then publishes it by raising `head`; a reader copies rows and
-looks at `head` again: what may have been overwritten meanwhile is dropped and counted. The newest row is the last one.
+reads `head` again: rows that may have been overwritten meanwhile are dropped and counted. The newest row is the last one.
 Mailbox: (kind, value) commands from one producer to the loop, lock-free, oldest refused when full.
 Box: one vector with a sequence number (odd while written): parameters to the loop, the law's state from it.
 Histogram: counts of whole microseconds.
-Remarks: what the row does not say of its readings: age, verdict, when each standing fault began, and the device's own words.
+Remarks: what the row does not hold: age and verdict of each reading, onset of each active fault, messages of the devices.
 """
 from libc.stdint cimport uint64_t
 from libc.string cimport memcpy
@@ -50,7 +50,7 @@ cdef class Ring:
         store_release(&self.counter[0], head + 1)
 
     def read(self, uint64_t position, int limit=1 << 30):
-        """Rows from `position` on: (array (n, columns), next position, rows lost before the first one)."""
+        """Read from `position` on; return (rows (n, columns), next position, rows lost before the first one)."""
         cdef uint64_t head = load_acquire(&self.counter[0]), first, k, after, keep, lost = 0
         cdef double[:, ::1] out
         if position > head:
@@ -72,7 +72,7 @@ cdef class Ring:
         return array[keep - first:], head, keep - position
 
     def newest(self):
-        """A copy of the newest row, or None before the first."""
+        """Return a copy of the newest row, or None before the first."""
         cdef uint64_t head
         while True:
             head = load_acquire(&self.counter[0])
@@ -90,7 +90,7 @@ cdef class Mailbox:
         self.counters, self.slots = counters, slots
 
     def push(self, double kind, double value=0.0) -> bool:
-        """Add a command (one producer only); False when the box is full."""
+        """Add a command (one producer only); return False when the box is full."""
         cdef uint64_t pushed = self.counters[0]
         if pushed - load_acquire(&self.counters[1]) >= <uint64_t>self.slots.shape[0]:
             return False
@@ -108,11 +108,11 @@ cdef class Mailbox:
         return load_acquire(&self.counters[0])
 
     cpdef bint waiting(self) noexcept:
-        """Whether there is a command to take."""
+        """Return whether there is a command to take."""
         return self.counters[1] != load_acquire(&self.counters[0])
 
     def take(self):
-        """The oldest command as (kind, value), or None (by the loop only)."""
+        """Take the oldest command as (kind, value), or None (by the loop only)."""
         cdef uint64_t taken = self.counters[1]
         if taken == load_acquire(&self.counters[0]):
             return None
@@ -142,7 +142,7 @@ cdef class Box:
         store_release(&self.counter[0], before + 2)
 
     def get(self):
-        """A copy of the content, or None when nothing was put yet or it is being written."""
+        """Return a copy of the content, or None when there is none yet or it is being written."""
         cdef uint64_t before = load_acquire(&self.counter[0])
         if before == 0 or before & 1:
             return None
@@ -167,8 +167,7 @@ cdef class Histogram:
 
 
 cdef class Record:
-    """The record row of a tick, filled in place behind its first `head` scalars, which the loop writes itself. `bind` gives it
-    what it copies from.
+    """The record row of a tick. The loop writes the first `head` scalars itself; `fill` copies the rest from bound arrays.
 
     Layout (signals.SIGNALS): head scalars | values of the channels | fresh bits (one a channel) | status bits (two) |
     delay bits (four a temperature) | outputs of the law; the bits as whole float64 numbers.
@@ -178,13 +177,13 @@ cdef class Record:
 
     def bind(self, double[::1] value, unsigned char[::1] fresh, unsigned char[::1] status, unsigned char[::1] delay,
              double[::1] outputs):
-        """The arrays of the back end's sample and of the law. Raises ValueError where they do not make up a row."""
+        """Set the arrays to copy from, of the back end's sample and of the law. Raises ValueError where they do not make up a row."""
         if self.head + value.shape[0] + 3 + outputs.shape[0] != self.row.shape[0] or value.shape[0] > 26:
             raise ValueError(f"{self.head} + {value.shape[0]} + 3 + {outputs.shape[0]} numbers are not a row of {self.row.shape[0]}")
         self.value, self.fresh, self.status, self.delay, self.outputs = value, fresh, status, delay, outputs
 
     cpdef void fill(self) noexcept:
-        """What the bound arrays hold now into the row."""
+        """Copy the bound arrays into the row."""
         cdef int k, n = <int>self.value.shape[0]
         cdef uint64_t f = 0, s = 0, d = 0
         memcpy(&self.row[self.head], &self.value[0], n * sizeof(double))
@@ -199,17 +198,17 @@ cdef class Record:
 
 TRIPS, CODE, CODE_S = range(3)
 """Places in `Remarks.numbers`: fault bits that trip; the drive's newest error code other than 0, and when it came (t_s)."""
-LATE_TICKS = 5.0    # so many periods without a tick are worth a word beside a fault
-LATE_FOR_S = 1.0    # ... for so long after
+LATE_TICKS = 5.0    # a gap of more periods than this is reported beside a fault
+LATE_FOR_S = 1.0    # time after the gap for which it is reported
 
 
 cdef class Remarks:
-    """What the loop says beside the row, in shared memory. Channels are channels.CHANNELS.
+    """What the loop publishes besides the row. Channels are channels.CHANNELS.
 
     ages, verdicts float64 (channels,): of every tick, as in the law;  numbers float64 (3,): TRIPS, CODE, CODE_S;
     onsets float64 (64, 3): t_s and tick of each fault bit's onset, longest tick of the second before where late, s, else 0;
-    sequences uint64, times float64 (channels,), texts uint8 (channels, n): one line a channel and the t_s since when it stands,
-    a seqlock each, written when the line changes. The line stays when the channel is well again.
+    sequences uint64, times float64 (channels,), texts uint8 (channels, n): one message a channel and the t_s of its onset,
+    a seqlock each, written when the message changes. The message is kept when the channel is valid again.
     """
 
     def __init__(self, double[::1] ages, double[::1] verdicts, double[::1] numbers, double[:, ::1] onsets,
@@ -221,7 +220,7 @@ cdef class Remarks:
 
     cpdef bint fill(self, double[::1] age, double[::1] verdict, uint64_t bits, uint64_t trips, double t_s, double tick,
                     double dt_s, double code) noexcept:
-        """A tick's remarks (by the loop only); true when a fault bit is new."""
+        """Write a tick's remarks (by the loop only); return whether a fault bit is new."""
         cdef uint64_t new = bits & ~self.bits
         cdef int c, n = <int>self.ages.shape[0]
         self.bits = bits
@@ -241,7 +240,7 @@ cdef class Remarks:
         return new != 0
 
     cpdef put(self, int channel, double t_s, bytes text):
-        """Replace a channel's line (by the loop only); what is too long is cut."""
+        """Replace a channel's message (by the loop only); the end of a long one is cut off."""
         cdef uint64_t before = self.sequences[channel]
         cdef int k, size = <int>self.texts.shape[1]
         cdef const unsigned char[::1] data = text[:size].ljust(size, b"\0")
@@ -253,7 +252,7 @@ cdef class Remarks:
         store_release(&self.sequences[channel], before + 2)
 
     def get(self, int channel):
-        """(changes so far, t_s since when it stands, line); ('', NaN) before the first one. None while it is being written."""
+        """Return (changes so far, t_s of the onset, message); (0, NaN, '') before the first. None while it is being written."""
         cdef uint64_t before = load_acquire(&self.sequences[channel])
         if before == 0:
             return 0, float("nan"), ""
@@ -268,7 +267,7 @@ cdef class Remarks:
 
 def unpack_readings(double fresh_bits, double status_bits, double delay_bits, unsigned char[::1] fresh,
                     unsigned char[::1] status, unsigned char[::1] delay):
-    """The reverse of what `Record.fill` packs, into the given arrays."""
+    """Unpack what `Record.fill` packed, into the given arrays."""
     cdef uint64_t f = <uint64_t>fresh_bits, s = <uint64_t>status_bits, d = <uint64_t>delay_bits
     cdef int c
     for c in range(fresh.shape[0]):

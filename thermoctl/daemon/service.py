@@ -1,4 +1,4 @@
-"""start, stop, restart of the rig that a configuration describes, known by its lock and socket; and the systemd units.
+"""Start, stop and restart the rig of a configuration, known by its lock and socket; install systemd units.
 
 A daemon is found the same way whether `thermoctl run`, `thermoctl start` or systemd started it.
 """
@@ -14,12 +14,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
+from thermoctl.daemon.control_socket import ask, settled
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.loop import die_with_parent
-from thermoctl.daemon.socket import ask, settled
-from thermoctl.settings import load_settings
+from thermoctl.settings import Settings, load_settings
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 
@@ -41,7 +40,7 @@ def _systemctl(*arguments: str) -> int:
 
 
 def units(root: Path = Path("/")) -> dict[str, Path]:
-    """The installed units below `root`, each with the configuration that it runs."""
+    """Return the installed units below `root`, each with the configuration that it runs."""
     found = {}
     for path in sorted((root / UNITS).glob("thermoctl*.service")):
         if config := re.search(r"^ExecStart=.* --config (.+)$", path.read_text(), re.MULTILINE):
@@ -49,8 +48,8 @@ def units(root: Path = Path("/")) -> dict[str, Path]:
     return found
 
 
-def _unit_for(settings: Any) -> str | None:
-    """The installed unit that runs this very configuration."""
+def _unit_for(settings: Settings) -> str | None:
+    """Return the installed unit that runs this configuration, or None."""
     if not LIVE.is_dir():
         return None
     config = Path(settings.path).resolve()
@@ -58,7 +57,7 @@ def _unit_for(settings: Any) -> str | None:
 
 
 def _unit_of(pid: int) -> str | None:
-    """The unit that systemd started this process in, when it is one of ours."""
+    """Return the unit of ours in which systemd started this process, or None."""
     try:
         groups = Path(f"/proc/{pid}/cgroup").read_text()
     except OSError:
@@ -67,7 +66,7 @@ def _unit_of(pid: int) -> str | None:
     return found[1] if found else None
 
 
-def start(settings: Any) -> int:
+def start(settings: Settings) -> int:
     """Start the daemon, by its unit where one runs this configuration, and wait until it takes commands.
 
     Returns 0, or 3 with the daemon's own error."""
@@ -98,18 +97,19 @@ def start(settings: Any) -> int:
     return 3
 
 
-def _state(settings: Any) -> str:
-    """The state of whoever holds the rig, for a message."""
+def _state(settings: Settings) -> str:
+    """Return the state of the daemon that holds the rig, for a message."""
     try:
         return ask(settings.socket.path, {"command": "status"})["state"]
     except InputError:
         return "it does not answer"
 
 
-def stop(settings: Any) -> int:
-    """Disarm and stop whoever holds the rig, and wait until it is gone; 0 also when nobody does.
+def stop(settings: Settings) -> int:
+    """Disarm and stop the process that holds the rig; return 0 also when there is none.
 
-    Never asks: it is the safe direction. A rig that another configuration describes is not touched."""
+    It never asks: stopping is the safe direction. The rig of another configuration is not touched.
+    """
     pid = holder(settings)
     if pid is None:
         print("not running")
@@ -140,22 +140,23 @@ def stop(settings: Any) -> int:
     return 0
 
 
-def restart(settings: Any) -> int:
+def restart(settings: Settings) -> int:
     """Stop, then start."""
     return stop(settings) or start(settings)
 
 
-def log_path(settings: Any) -> Path:
+def log_path(settings: Settings) -> Path:
     """Where a daemon that `start` put in the background writes its log: beside its socket."""
     return Path(settings.socket.path).with_suffix(".log")
 
 
-class Background(subprocess.Popen):
-    """`thermoctl run` on a configuration, its log appended to `log_path`; `began` is where in it this run begins.
+class Background(subprocess.Popen[bytes]):
+    """`thermoctl run` on a configuration, its log appended to `log_path` from position `began` on.
 
-    dies_with_us: it is asked to stop when this process ends, however that ends."""
+    dies_with_us: stop it when this process ends, for whatever reason.
+    """
 
-    def __init__(self, settings: Any, dies_with_us: bool = False):
+    def __init__(self, settings: Settings, dies_with_us: bool = False):
         log = log_path(settings)
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as out:
@@ -180,14 +181,14 @@ class Background(subprocess.Popen):
         self.log = log
 
     def said(self) -> str:
-        """What it wrote into its log."""
+        """Return what it wrote into its log."""
         with self.log.open("rb") as lines:
             lines.seek(self.began)
             return lines.read().decode(errors="replace")
 
 
 def _program() -> Path:
-    """This installation's program: the one that was called, else the one beside the interpreter."""
+    """Return this installation's program: the one that was called, else the interpreter's neighbour."""
     called = Path(sys.argv[0]).absolute()
     return (
         called
@@ -199,8 +200,9 @@ def _program() -> Path:
 def install(config: Path, root: Path = Path("/")) -> int:
     """Install the unit of this configuration under `root`, with user, run directory and device rules.
 
-    The first rig's unit is thermoctl.service, a further one's thermoctl-RIG.service; no other rig's unit is changed.
-    systemd is informed where `root` is the running system. Raises InputError where a file cannot be written or two rigs collide.
+    The first rig's unit is thermoctl.service, a further one's thermoctl-RIG.service; other rigs' units
+    stay as they are. systemd is informed where `root` is the running system. Raises InputError where a
+    file cannot be written or two rigs collide.
     """
     settings = load_settings(config)
     config = config.resolve()
@@ -230,8 +232,11 @@ def install(config: Path, root: Path = Path("/")) -> int:
     return 0
 
 
-def _unit_name(settings: Any, config: Path, root: Path) -> str:
-    """The unit for this configuration: the one that runs it already, else a free name. Raises InputError for a collision."""
+def _unit_name(settings: Settings, config: Path, root: Path) -> str:
+    """Return the unit that runs this configuration already, else a free name.
+
+    Raises InputError for a collision.
+    """
     installed = units(root)
     for name, other in installed.items():
         if other == config:
@@ -254,9 +259,11 @@ def _socket_of(config: Path) -> str | None:
 
 
 def uninstall(config: Path | None, root: Path = Path("/")) -> int:
-    """Stop and remove the unit of this configuration (None: the only one); with the last one what all of them share.
+    """Stop and remove the unit of this configuration (None: the only one).
 
-    User and recordings stay. Returns 1 where no such unit is installed."""
+    With the last unit, what all units share is removed. User and recordings stay. Returns 1 where no such
+    unit is installed.
+    """
     installed = units(root)
     chosen = [n for n, runs in installed.items() if config is None or runs == config.resolve()]
     if len(chosen) != 1:

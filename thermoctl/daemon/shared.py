@@ -1,13 +1,13 @@
-"""The shared memory of one daemon: what the loop publishes and what it is told.
+"""The shared memory of one daemon: the loop's output and its commands.
 
-One segment, named after the rig, with a header that says which version and layout it has. The supervisor creates it and
-removes it; a segment left over by a killed daemon is replaced. It is a plain file in SHARED_MEMORY, mapped: multiprocessing's
-own class starts one more process beside the daemon, which removes what a killed daemon left at a time of its own.
+One segment, named after the rig's socket, with version and layout in its header. The supervisor creates and removes
+it; a segment left behind by a killed daemon is replaced. It is a mapped file in SHARED_MEMORY. multiprocessing's own
+class is not used: it starts one more process, which removes the segment of a killed daemon at any later time.
 
     ring        the record of every tick (rows in the order of signals.SIGNALS)
     mailbox     commands to the loop;  parameters: the block that a RELOAD command applies
-    remarks     age and verdict of every reading, onset of every standing fault, and what the devices say of themselves
-    state       the law's state now and then, with its tick and generation: where a recording's replay starts
+    remarks     age and verdict of every reading, onset of every active fault, messages of the devices
+    state       the law's state at intervals, with tick and generation: where a recording's replay starts
     lateness, busy, reference   histograms, microseconds
     counters    start time, ticks of the reference loop, process ids
 """
@@ -35,7 +35,7 @@ MAGIC = 0x7468726D6F63746C  # 'thrmoctl'
 ROWS = 8192  # ticks a reader may lag behind
 BINS = 4096  # us
 STATE_NUMBERS = 1024
-TEXT_WORDS = 40  # 8 bytes each, of a device's line
+TEXT_WORDS = 40  # of 8 bytes each, for a device's message
 SHARED_MEMORY = Path("/dev/shm")
 
 _AREAS = (
@@ -62,15 +62,15 @@ _AREAS = (
     ("texts", "u8", (len(CHANNELS), TEXT_WORDS)),
 )
 START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED, RUN_S = range(8)
-"""Places in `counters`; TUNING is 1 + percent, 0 where nothing is tuned; RESUMED is 1 where the law began with the
-estimates of an earlier run; RUN_S is when this run began, seconds since 1970."""
+"""Places in `counters`. TUNING: 1 + percent, 0 without tuning. RESUMED: 1 when the law started with the estimates
+of an earlier run. RUN_S: start of this run, seconds since 1970."""
 BEATS = 8
-"""From here on in `counters`: each helper process counts its rounds, so that one that hangs is seen."""
+"""First place in `counters` where each helper process counts its rounds; the supervisor detects one that hangs."""
 _LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES, faults.NAMES]).encode())
 
 
 class Shared:
-    """The segment with its areas; `create` in the supervisor, `attach` elsewhere."""
+    """The segment with its areas; the supervisor calls `create`, others `attach`."""
 
     def __init__(self, memory: mmap.mmap, path: Path):
         self._memory, self._path = memory, path
@@ -92,7 +92,7 @@ class Shared:
         self.remarks = self.make_remarks()
 
     def make_remarks(self, period_s: float = 0.001) -> Remarks:
-        """The remarks' areas; period_s is for the writer."""
+        """Return the areas of the remarks; period_s matters to the writer only."""
         a = self.areas
         return Remarks(
             a["ages"],
@@ -107,7 +107,7 @@ class Shared:
 
     @classmethod
     def create(cls, name: str) -> Shared:
-        """A fresh segment; one that a killed daemon left is removed first."""
+        """Create the segment; one that a killed daemon left behind is removed first."""
         size = sum(int(np.prod(shape)) * 8 for _, _, shape in _AREAS)
         path = SHARED_MEMORY / name
         try:
@@ -128,7 +128,10 @@ class Shared:
 
     @classmethod
     def attach(cls, name: str) -> Shared:
-        """The segment of a running daemon. Raises InputError when there is none, it is another user's or has another layout."""
+        """Attach to the segment of a running daemon.
+
+        Raises InputError when there is none, it belongs to another user, or it has another layout.
+        """
         path = SHARED_MEMORY / name
         try:
             file = os.open(path, os.O_RDWR)
@@ -150,11 +153,11 @@ class Shared:
         return cls(memory, path)
 
     def beats(self, place: int) -> float:
-        """Rounds that the helper at this place has done."""
+        """Return the rounds that the helper at this place has done."""
         return float(self.counters[BEATS + place])
 
     def remove(self) -> None:
-        """Take the segment's name away (by its creator); the memory goes with its last user."""
+        """Remove the segment's name (by its creator); the memory is freed with its last user."""
         self._path.unlink(missing_ok=True)
 
 

@@ -19,6 +19,7 @@ from thermoctl.control.model import NAMES, CompensatorModel, Parameters
 from thermoctl.daemon.assemble import compensator, law_parameters
 from thermoctl.daemon.loop import RELOAD, Rig
 from thermoctl.daemon.ring import Box, Mailbox
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, SIGNALS, fault_word
 
 COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reload": RELOAD}
@@ -27,13 +28,13 @@ COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reloa
 class Simulation:
     """One rig in simulated time: `command`, `tick`, and `row`, the newest record row (INDEX of signals.py).
 
-    settings: as from settings.load_settings, with hal.backend simulated or replay; model, parameters: default those of
-    the settings. `law` is the law, `backend` the (opened) back end.
+    settings: with hal.backend simulated or replay; model, parameters: default those of the settings. `law`
+    is the law, `backend` the open back end.
     """
 
     def __init__(
         self,
-        settings: Any,
+        settings: Settings,
         model: CompensatorModel | None = None,
         parameters: Parameters | None = None,
         publish: Any = None,
@@ -60,7 +61,10 @@ class Simulation:
         self.law, self.row = self.rig.law, self.rig.row
 
     def command(self, name: str, value: float = 0.0) -> None:
-        """Give arm, disarm, or setpoint (um) for the next tick. Raises RuntimeError where too many wait."""
+        """Give arm, disarm, or setpoint (um) for the next tick.
+
+        Raises RuntimeError when the mailbox is full.
+        """
         if not self.mailbox.push(COMMANDS[name], float(value)):
             raise RuntimeError("more commands than the mailbox holds: let it tick")
 
@@ -70,7 +74,10 @@ class Simulation:
         self.command("reload")
 
     def tick(self, count: int = 1) -> np.ndarray:
-        """Run `count` ticks; returns the newest row (a view). Where nobody takes the rows (`publish`), only the last is made."""
+        """Run `count` ticks; return the newest row (a view).
+
+        Without `publish` only the last row is made.
+        """
         rig, law, period_s = self.rig, self.law, self.period_s
         for left in range(count - 1, -1, -1):
             self.ticks += 1
@@ -84,11 +91,11 @@ class Simulation:
         return self.row
 
     def until(self, condition: Any, limit_s: float) -> bool:
-        """Tick until condition(row) or `limit_s` of simulated time have passed; whether it came true."""
+        """Tick until condition(row), for at most `limit_s` of simulated time; return whether it held."""
         return any(condition(self.tick()) for _ in range(round(limit_s / self.period_s)))
 
     def arm(self, limit_s: float = 20.0) -> None:
-        """Wait for READY and arm. Raises RuntimeError when it does not get there."""
+        """Wait for READY and arm. Raises RuntimeError when READY does not come."""
         state = INDEX["state"]
         if not self.until(lambda row: row[state] == arming.READY, limit_s):
             raise RuntimeError(
@@ -109,8 +116,8 @@ def _no_clock() -> int:
 
 
 def run_simulated(
-    settings: Any,
-    schedule: Iterable[tuple],
+    settings: Settings,
+    schedule: Iterable[tuple[Any, ...]],
     duration_s: float,
     seed: int | None = None,
     every: int = 1,
@@ -139,15 +146,16 @@ def run_simulated(
     return rows
 
 
-SETTLE_S = 0.5  # after the reference has arrived
+SETTLE_S = 0.5  # time after the reference has reached the setpoint
 STROKE_UM, CYCLE_S = 200.0, 75.0
 
 
-def trapezoids(settings: Any, hours: float, compensate: bool, out: str | None = None) -> int:
-    """`hours` of rig time in trapezoids of 75 s (the paper's test 4B): how far the output stayed from the setpoint.
+def trapezoids(settings: Settings, hours: float, compensate: bool, out: str | None = None) -> int:
+    """Move in trapezoids of 75 s (the paper's test 4B) and print the output's deviation.
 
-    Judged by the reference encoder, which the law never reads, wherever the reference has stood for SETTLE_S. Prints
-    mean and largest deviation; `out`: ten rows a second as Parquet. Returns 0 when all are within 0.5 um, else 1.
+    The reference encoder measures it, which the law never reads, whenever the reference has stood for
+    SETTLE_S. Prints mean and largest deviation. out: file of ten rows a second, Parquet. Returns 0 when
+    all deviations are within 0.5 um, else 1.
     """
     parameters = dataclasses.replace(law_parameters(settings), compensate=float(compensate))
     simulation = Simulation(settings, parameters=parameters)

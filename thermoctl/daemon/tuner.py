@@ -1,7 +1,8 @@
-"""The tuner process: learns the expansion model from the ring while the reference encoder is there (compensation.tune).
+"""The tuner process: learns the expansion model from the ring while the reference encoder is connected.
 
-It never touches the loop. A better model becomes a new calibration in the folder that compensation.model names, in use from the daemon's
-next start on; `thermoctl model rollback` takes it back. `status` shows the progress in percent.
+compensation.tune starts it. It never touches the loop. A better model becomes a new calibration in the
+folder that compensation.model names, in use from the daemon's next start on; `thermoctl model rollback`
+undoes it. `status` shows the progress in percent.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,11 +18,12 @@ from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.shared import TUNING, Shared
 from thermoctl.identify import modelfile
 from thermoctl.identify.online import Tuner
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError
 
 INTERVAL_S = 0.5
-PROPOSE_S = 600.0  # of rig time between two looks at the proposal
+PROPOSE_S = 600.0  # rig time between two checks of the proposal
 _ESTIMATES = [INDEX[f"{p}_est_c"] for p in POINTS]
 _T, _AIR, _STATUS = INDEX["t_s"], INDEX["air_c"], INDEX["status_bits"]
 _POSITION, _REFERENCE = INDEX["position_raw_um"], INDEX["output_reference_um"]
@@ -30,9 +31,10 @@ _BOTH = 3 << 2 * CHANNELS.index("position_um") | 3 << 2 * CHANNELS.index("output
 
 
 class Tuning:
-    """From record rows to calibrations: `take` rows in order of time; `tuner` has the state of learning.
+    """Makes calibrations from record rows: `take` rows in order of time; `tuner` holds the state of learning.
 
-    folder: of calibrations, or None to learn without installing; say(text): what happened, for the log."""
+    folder: of calibrations, or None to learn without installing; say(text): writes to the log.
+    """
 
     def __init__(
         self,
@@ -50,7 +52,7 @@ class Tuning:
         self._rows: list[np.ndarray] = []
 
     def take(self, rows: np.ndarray) -> None:
-        """Rows (K, signals) of consecutive ticks: each whole period of the expansion model becomes one sample."""
+        """Take rows (K, signals) of consecutive ticks; each period of the model makes one sample."""
         if not len(rows):
             return
         rows = np.vstack([*self._rows, rows])
@@ -95,8 +97,8 @@ class Tuning:
         )
 
 
-def check(settings: Any) -> None:
-    """Raises InputError when compensation.tune is asked for and there is no folder of calibrations to put results into."""
+def check(settings: Settings) -> None:
+    """Check that compensation.tune has a folder for its results. Raises InputError."""
     if settings.compensation.tune and not Path(settings.compensation.model or "-").is_dir():
         raise InputError(
             f"{settings.path}: compensation.tune needs compensation.model to be a folder of calibrations (as `thermoctl identify` "
@@ -105,7 +107,7 @@ def check(settings: Any) -> None:
 
 
 def run(shared: Shared, tuning: Tuning, stopping: Callable[[], bool]) -> None:
-    """Until `stopping()`."""
+    """Learn until `stopping()`."""
     position = shared.ring.head
     while not stopping():
         rows, position, _ = shared.ring.read(position)

@@ -1,7 +1,7 @@
 """`demo`: a simulated rig of its own, armed and moving, with the monitor's view in front of it.
 
-The demo drives nothing but its own child: its configuration, socket, lock, log and recordings stand in a folder of their
-own beside the rig's socket, and before it arms, moves or disarms it checks that its child holds the lock.
+The demo drives only its own child: configuration, socket, lock, log and recordings lie in a folder beside
+the rig's socket. Before it arms, moves or disarms, it checks that its child holds the lock.
 """
 
 from __future__ import annotations
@@ -25,28 +25,29 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.dashboard import make_server, url
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.monitor import errors, ramp_of, remember, screen
 from thermoctl.daemon.service import START_S, STOP_S, Background
-from thermoctl.daemon.socket import ask
 from thermoctl.daemon.watch import Watch
-from thermoctl.settings import effective, load_settings
+from thermoctl.settings import Settings, effective, load_settings
 from thermoctl.yamlfile import InputError
 
 MOTION, CYCLE_S = ((0.0, 240.0), (70.0, 200.0)), 90.0
-"""(s in the cycle, setpoint um). 240 um take 0.78 A, 2.9 W: the shaft grows by 2 um in a minute."""
-MEAN_S = 2.0  # the sentence says means over this: a single reading has 0.01 um of noise
-SHOWN_UM = 0.2  # growth from which on the sentence compares; below, noise would decide
-STALL_S = 10.0  # a machine that stands for less than this does not end the demo
+"""Corners (s in the cycle, setpoint um). 240 um take 0.78 A and 2.9 W: the shaft grows by 2 um in a minute."""
+MEAN_S = 2.0  # averaging time of the displayed growth: a single reading has 0.01 um of noise
+SHOWN_UM = 0.2  # smallest growth that is compared with what compensation leaves; below, noise dominates
+STALL_S = 10.0  # longest stall of the machine that the demo survives
 DASHBOARD = "127.0.0.1:8765"
 
 
-def demo(settings: Any, seconds: float | None = None) -> int:
+def demo(settings: Settings, seconds: float | None = None) -> int:
     """Start a daemon of its own, arm, move and show it until Ctrl-C or for `seconds`.
 
-    Returns 1 when a fault stands at the end, 3 when the daemon did not start. Raises InputError for a rig that is not simulated
-    and while another demo runs here."""
+    Returns 1 when a fault is active at the end, 3 when the daemon did not start. Raises InputError for a
+    rig that is not simulated, and while another demo runs here.
+    """
     if settings.hal.backend != "simulated":
         raise InputError(
             f"{settings.path}: demo moves a simulated rig only, and this one's back end is '{settings.hal.backend}'; "
@@ -64,15 +65,16 @@ def demo(settings: Any, seconds: float | None = None) -> int:
             show.close()
 
 
-def demo_folder(settings: Any) -> Path:
-    """Where the demo of this configuration keeps what it writes: beside the rig's socket."""
+def demo_folder(settings: Settings) -> Path:
+    """Return the folder of everything that the demo of this configuration writes."""
     return Path(settings.socket.path).parent / "demo"
 
 
-def _own(settings: Any) -> Any:
-    """The configuration of the demo, written into its folder: the rig of `settings` with all else of its own.
+def _own(settings: Settings) -> Any:
+    """Write the configuration of the demo into its folder: this rig, with files of its own.
 
-    Its time counts ticks, so that a machine that stalls slows the rig down instead of faulting it."""
+    Its time counts ticks, so that a stalled machine slows the rig down instead of faulting it.
+    """
     folder, beside = demo_folder(settings), Path(settings.path).absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
     hal = settings.hal
@@ -88,7 +90,7 @@ def _own(settings: Any) -> Any:
     )
     if (pid := holder(own)) is not None:
         raise InputError(f"{folder}: another demo runs here (pid {pid}); stop it first")
-    (folder / "rig.state").unlink(missing_ok=True)  # the simulated rig starts cold
+    (folder / "rig.state").unlink(missing_ok=True)  # no saved estimates: the simulated rig starts cold
     path = folder / "rig.yaml"
     path.write_text(f"# Written by `thermoctl demo` from {settings.path}.\n{effective(own)}")
     return load_settings(path)
@@ -118,7 +120,7 @@ def _ignore_signals() -> None:
 class _Demo:
     """The daemon of `settings` as a child, and what the terminal shows of it."""
 
-    def __init__(self, settings: Any, console: Console):
+    def __init__(self, settings: Settings, console: Console):
         self.settings, self.console = settings, console
         self.child = Background(settings, dies_with_us=True)
         self.page = ""
@@ -127,7 +129,7 @@ class _Demo:
         self.faulty = False
 
     def ask(self, command: str, **more: Any) -> dict[str, Any]:
-        """A request to our own child. Raises InputError where it does not hold the lock."""
+        """Send a request to our own child. Raises InputError where it does not hold the lock."""
         if holder(self.settings) != self.child.pid:
             raise InputError(f"{self.settings.socket.path}: the demo's daemon does not run")
         return ask(self.settings.socket.path, {"command": command, **more})
@@ -144,7 +146,7 @@ class _Demo:
         return int(self.faulty or self.child.poll() is not None)
 
     def close(self) -> None:
-        """Disarm and end the child; say what came of it."""
+        """Disarm and end the child; print the result."""
         with contextlib.suppress(InputError):
             self.ask("disarm")
         self.child.terminate()
@@ -224,7 +226,7 @@ class _Demo:
                     moved = -1.0 if self.ask("arm")["ok"] else moved
 
     def _head(self, status: dict[str, Any]) -> list[Text]:
-        """Above the monitor's screen: the sentence, the page; then late ticks, and what to do about a fault."""
+        """Return the lines above the monitor's screen: growth, page, late ticks, and help with a fault."""
         lines = [
             Text(self.growth.sentence(), "bold"),
             Text(f"dashboard {self.page}   q or Ctrl-C stops", "dim"),
@@ -237,7 +239,7 @@ class _Demo:
         if late > 50:
             lines.append(
                 Text(
-                    f"this machine was late: {late} ticks skipped in the last second, the rig's time stood",
+                    f"this machine stalled: {late} ticks skipped in the last second; the rig's time stopped meanwhile",
                     "yellow",
                 )
             )
@@ -262,20 +264,20 @@ class _Demo:
 
 
 def corner(at_s: float) -> tuple[float, float]:
-    """The newest (s, setpoint um) of the motion, `at_s` after arming."""
+    """Return the newest (s, setpoint um) of the motion, `at_s` after arming."""
     cycles, within = divmod(at_s, CYCLE_S)
     t, value = max(c for c in MOTION if c[0] <= within)
     return t + cycles * CYCLE_S, value
 
 
 class Growth:
-    """How far the shaft has grown and what compensation leaves of it: means over the newest MEAN_S."""
+    """The shaft's growth and its compensated part: means over the newest MEAN_S."""
 
     def __init__(self) -> None:
         self.values: deque[tuple[float, float, float]] = deque()
 
     def add(self, status: dict[str, Any]) -> None:
-        """Take a status; nothing while the reference moves."""
+        """Add a status; ignored while the reference moves."""
         with_, without = errors(status)
         if with_ is None or without is None or status["reference_um"] != status["setpoint_um"]:
             return
@@ -285,7 +287,7 @@ class Growth:
             self.values.popleft()
 
     def sentence(self) -> str:
-        """What it says in one sentence."""
+        """Return the growth and what compensation leaves of it, in one sentence."""
         if not self.values:
             return f"Moving to {MOTION[0][1]:g} um; holding it takes 3 W, which warm the coil and lengthen the shaft."
         left, grown = (abs(float(v)) for v in np.mean(np.array(self.values)[:, 1:], axis=0))
@@ -297,7 +299,7 @@ class Growth:
 
 @contextlib.contextmanager
 def _keys() -> Iterator[None]:
-    """Keys come one by one and unseen, where the terminal can do that."""
+    """Read keys one by one, without echo, where the terminal can do that."""
     if not sys.stdin.isatty():
         yield
         return
@@ -310,7 +312,7 @@ def _keys() -> Iterator[None]:
 
 
 def _key(wait_s: float) -> str:
-    """The key that was pressed within `wait_s`, or ''."""
+    """Return the key that was pressed within `wait_s`, or ''."""
     if not sys.stdin.isatty():
         time.sleep(wait_s)
         return ""

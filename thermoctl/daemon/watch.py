@@ -1,9 +1,9 @@
-"""What the dashboard shows: a thread that follows the ring and makes a frame a few times a second.
+"""Frames for the dashboard: a thread that follows the ring and makes a frame a few times a second.
 
-It only reads shared memory: the loop never knows. A daemon that ends is seen (its segment is gone), one that starts
-again is found. Around each new fault the rows of every tick are kept: the capture. It begins with what the ring still
-held when the follower came, so a fault soon after the dashboard's start has its seconds before as well. The last minute
-is kept in few numbers: a page that opens shows it at once.
+It only reads shared memory; the loop does not notice. It finds the end of a daemon (the segment is gone)
+and a new start. Around each new fault it keeps the rows of every tick: the capture. It starts with the
+rows that the ring still held, so a fault soon after the dashboard's start has its seconds before, too. The
+last minute is kept in few numbers, so that a page that opens shows it at once.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from thermoctl.control import arming, faults
 from thermoctl.daemon.assemble import compensator, shared_name
 from thermoctl.daemon.readings import hide_invalid
 from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.socket import latency, status
+from thermoctl.daemon.snapshot import latency, status
+from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, fault_words
 from thermoctl.yamlfile import InputError
 
 BEFORE_S, AFTER_S = 2.0, 2.0  # of a capture
 CAPTURES = 16
-SILENT_S = 2.0  # no tick for so long: the rows are shown as old
+SILENT_S = 2.0  # without a tick for this time the rows are shown as old
 PAST_S, PAST_STEP_S = 60.0, 0.1  # the last minute that a page gets when it opens
 PAST = (
     "wall_s",
@@ -50,7 +51,7 @@ RANGED = (
     "power_w",
     "innovation_c",
 )
-"""Signals of which a frame says the least and largest value since the frame before."""
+"""Signals whose least and largest value since the previous frame is in each frame."""
 LATENESS_EDGES_US = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
 _T, _WALL = INDEX["t_s"], INDEX["wall_s"]
@@ -70,7 +71,7 @@ class Capture:
     lost: int = 0  # ticks that were overwritten before they could be read
 
     def summary(self) -> dict[str, Any]:
-        """What a list of captures shows."""
+        """Return the entry of a list of captures."""
         return {
             "number": self.number,
             "wall_s": self.wall_s,
@@ -83,13 +84,14 @@ class Capture:
 
 
 class Watch:
-    """Follows the ring of `settings`' daemon: `look()` once, or `run()` at `rate_hz` until `stop()`.
+    """Follows the ring of a daemon: `look()` once, or `run()` at `rate_hz` until `stop()`.
 
-    frame: the newest one, a dict ready for JSON; `wait(seen)` gives (number, frame) as soon as its number is not `seen`.
-    captures: newest last. past: the last minute, {state, PAST signals} every tenth of a second, oldest first.
+    frame: the newest one, a dict ready for JSON; `wait(seen)` returns (number, frame) as soon as its
+    number is not `seen`. captures: newest last. past: the last minute, {state, PAST signals} every tenth
+    of a second, oldest first.
     """
 
-    def __init__(self, settings: Any, rate_hz: float = 20.0):
+    def __init__(self, settings: Settings, rate_hz: float = 20.0):
         self.settings, self.rate_hz = settings, rate_hz
         self.name = shared_name(settings)
         self.shared: Shared | None = None
@@ -123,7 +125,7 @@ class Watch:
         return self._stopping.is_set()
 
     def wait(self, seen: int, timeout_s: float) -> tuple[int, dict[str, Any]]:
-        """The newest frame, at once or when there is one newer than `seen`, at the latest after timeout_s."""
+        """Return the newest frame once there is one newer than `seen`, at the latest after timeout_s."""
         with self._changed:
             self._changed.wait_for(lambda: self.number != seen or self.stopping, timeout_s)
             return self.number, self.frame
@@ -137,11 +139,11 @@ class Watch:
             self._changed.notify_all()
 
     def capture(self, number: int) -> Capture | None:
-        """The capture of this number, None when it is gone."""
+        """Return the capture of this number, None when it is no longer kept."""
         return next((c for c in list(self.captures) if c.number == number), None)
 
     def latency(self) -> dict[str, Any] | None:
-        """Lateness, busy time and slips (socket.latency), each histogram in LATENESS_EDGES_US; None without a daemon."""
+        """Return snapshot.latency with each histogram in LATENESS_EDGES_US; None without a daemon."""
         shared = self.shared
         if shared is None:
             return None
@@ -156,7 +158,7 @@ class Watch:
         return {**answer, "edges_us": list(LATENESS_EDGES_US)}
 
     def _attached(self) -> Shared | None:
-        """The segment of the daemon that runs now; None when there is none."""
+        """Return the segment of the daemon that runs now; None when there is none."""
         try:
             inode = os.stat(f"/dev/shm/{self.name}").st_ino
         except OSError:
@@ -204,12 +206,12 @@ class Watch:
         return frame
 
     def _sigma(self, row: np.ndarray) -> float | None:
-        """Standard deviation of the innovation that the filter expects, K: S = R_v / (1 - C K), from (35)."""
+        """Return the innovation's expected standard deviation, K: S = R_v / (1 - C K), from (35)."""
         share = self._gain * row[INDEX["kalman_gain"]]
         return _finite(math.sqrt(self._noise_c2 / (1.0 - share))) if 0.0 <= share < 1.0 else None
 
     def _remember(self, rows: np.ndarray) -> None:
-        """The last row of each PAST_STEP_S of the newest minute into `past`."""
+        """Put the last row of each PAST_STEP_S of the newest minute into `past`."""
         rows = rows[rows[:, _WALL] > rows[-1, _WALL] - PAST_S]
         step = np.floor(rows[:, _WALL] / PAST_STEP_S)
         rows = rows[np.append(np.diff(step) != 0, True)]
@@ -228,8 +230,10 @@ class Watch:
                 self.past.append(point)
 
     def _keep(self, rows: np.ndarray, lost: int) -> None:
-        """Rows into the captures under way; a capture begins where a fault that trips is new. lost: ticks missing before
-        `rows`, because this process was held up for longer than the ring is."""
+        """Add rows to open captures; begin one where a fault that trips is new.
+
+        lost: ticks missing before `rows`, because this process was held up for longer than the ring is.
+        """
         if lost:
             self._recent.clear()
         for capture in self.captures:

@@ -265,8 +265,8 @@ def run_plain(bench: Bench, seconds: float) -> dict[str, Any]:
 def run_daemon(bench: Bench, seconds: float, ask_hz: float) -> dict[str, Any]:
     """The daemon for `seconds` after it is ready; rows from its own ring, ends of ticks from the probe."""
     from thermoctl.daemon.assemble import shared_name
+    from thermoctl.daemon.control_socket import ask
     from thermoctl.daemon.shared import START_S, Shared
-    from thermoctl.daemon.socket import ask
     from thermoctl.settings import load_settings
     from thermoctl.signals import INDEX
     from thermoctl.yamlfile import InputError

@@ -62,11 +62,11 @@ def configuration(work: Path) -> Path:
 def simulated(work: Path, hours: float) -> list[Sample]:
     """A sample every five minutes of simulated time."""
     from thermoctl.daemon import keep
+    from thermoctl.daemon.command_server import Commands
+    from thermoctl.daemon.journal import Watcher
     from thermoctl.daemon.recorder import make_recorder
     from thermoctl.daemon.shared import Shared
     from thermoctl.daemon.simulate import Simulation
-    from thermoctl.daemon.socket import Commands
-    from thermoctl.daemon.supervisor import _Watcher
     from thermoctl.settings import load_settings
 
     def silent(*_: Any, **__: Any) -> None:
@@ -76,7 +76,7 @@ def simulated(work: Path, hours: float) -> list[Sample]:
     shared = Shared.create(f"thermoctl-steady-{os.getpid()}")
     try:
         simulation = Simulation(settings, publish=shared.ring)
-        recorder, watcher = make_recorder(settings, shared, silent), _Watcher(shared, silent)
+        recorder, watcher = make_recorder(settings, shared, silent), Watcher(shared, silent)
         commands = Commands(shared, settings, silent, silent)
         simulation.arm()
         found = []
@@ -122,7 +122,7 @@ def drivers(bench: Bench, ticks: int) -> list[Sample]:
 
 def daemon(work: Path, minutes: float) -> dict[str, list[Sample]]:
     """A sample of each process every two seconds, from the tenth second on."""
-    from thermoctl.daemon.socket import ask
+    from thermoctl.daemon.control_socket import ask
     from thermoctl.settings import load_settings
     from thermoctl.yamlfile import InputError
 

@@ -1,9 +1,7 @@
-"""The command socket: a Unix socket, one JSON object a line each way, in a process of its own.
+"""The server's side of the command socket, in a process of its own; control_socket.py is the client's side.
 
-A request is {"command": NAME, ...}; the answer {"ok": true, ...} or {"ok": false, "error": TEXT}. The socket's file
-permissions (owner and group) decide who may connect; who gave a command that moves anything is logged from the
-kernel's peer credentials. A status query reads shared memory and never costs the loop a tick. Every size from outside
-is limited.
+The file permissions of the socket (owner and group) decide who may connect. Each command that moves anything is
+logged with the kernel's peer credentials. Every size that a client decides is limited.
 """
 
 from __future__ import annotations
@@ -11,148 +9,45 @@ from __future__ import annotations
 import contextlib
 import grp
 import json
-import math
 import os
-import select
 import selectors
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from hal.make import can_drive
-from thermoctl.channels import CHANNELS, STATUS_NAMES
 from thermoctl.control import arming
-from thermoctl.daemon import arrival, readings
+from thermoctl.control.model import Parameters
+from thermoctl.daemon import arrival
+from thermoctl.daemon.control_socket import settled
+from thermoctl.daemon.display import fault_lines
 from thermoctl.daemon.loop import RELOAD
-from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
-from thermoctl.signals import INDEX, POINTS, SIGNALS
+from thermoctl.daemon.shared import Shared
+from thermoctl.daemon.snapshot import latency, status
+from thermoctl.settings import Settings
+from thermoctl.signals import SIGNALS
 from thermoctl.yamlfile import InputError
 
 MAX_LINE = 65536  # bytes of one request
 MAX_CLIENTS = 32
-ANSWER_S = 1.0  # how long a command may take to show in the loop
-
-
-def status(shared: Shared) -> dict[str, Any]:
-    """The newest row as `thermoctl status --json` gives it: a number whose reading is not valid is null, `readings` has its
-    state, age and the device's words; faults with the cause first."""
-    row = shared.ring.newest()
-    if row is None:
-        return {
-            "state": "OFF",
-            "ticks": 0,
-            "slips": 0,
-            "faults": [],
-            "setpoint_um": None,
-            "position_um": None,
-            "compensation_um": None,
-        }
-    found = readings.readings(shared, row)
-    number = {
-        name: float(row[i]) if math.isfinite(row[i]) and readings.valid(name, found) else None
-        for name, i in INDEX.items()
-    }
-    busy = percentiles(shared.areas["busy"])
-    return {
-        "state": arming.STATES[int(row[INDEX["state"]])],
-        "ticks": int(row[INDEX["tick"]]),
-        "slips": int(row[INDEX["slips"]]),
-        "generation": int(row[INDEX["generation"]]),
-        "uptime_s": number["t_s"],
-        **{
-            name: number[name]
-            for name in (
-                "setpoint_um",
-                "reference_um",
-                "position_um",
-                "compensated_um",
-                "compensation_um",
-                "expansion_um",
-                "output_reference_um",
-                "control_v",
-                "drive",
-                "enable",
-                "voltage_v",
-                "current_a",
-                "power_w",
-                "air_c",
-                "innovation_c",
-                "kalman_gain",
-                "position_age_s",
-                "coil_age_s",
-                "supply_v",
-                "amplifier_state",
-                "amplifier_fault",
-            )
-        },
-        "channels": {role: r["state"] for role, r in found.items()},
-        "readings": found,
-        "estimates_state": "OK" if found["coil_c"]["state"] == "OK" else "NOT CORRECTED",
-        "drive_code": readings.drive_code(shared, row),
-        "temperatures_c": {p: number[f"{p}_c"] for p in POINTS},
-        "estimates_c": {p: number[f"{p}_est_c"] for p in POINTS},
-        "lateness_us": number["lateness_us"],
-        "busy_us": number["busy_us"],
-        "busy_p50_us": _or_none(busy[0]),
-        "tuning_percent": float(shared.counters[TUNING]) - 1.0 if shared.counters[TUNING] else None,
-        "recorder": {
-            "rows": int(shared.counters[RECORDER_ROWS]),
-            "lost": int(shared.counters[RECORDER_LOST]),
-        },
-        "wall_s": number["wall_s"],
-        "faults": readings.standing_faults(shared, row, found),
-    }
-
-
-def settled(now: dict[str, Any]) -> bool:
-    """Whether the loop of this status has warmed up: its state changes no more by itself, but for a fault."""
-    state = now.get("state", "OFF")
-    return state != "OFF" and (state != "SAFE" or any(f["severity"] != "warning" for f in now["faults"]))
-
-
-def channel_states(status_bits: int) -> dict[str, str]:
-    """Each channel's reading: OK, STALE, ERROR or ABSENT, from the signal status_bits."""
-    return {name: STATUS_NAMES[status_bits >> (2 * c) & 3] for c, name in enumerate(CHANNELS)}
-
-
-def latency(shared: Shared, period_s: float) -> dict[str, Any]:
-    """Histograms and percentiles of lateness and busy time, slips, and the reference loop's, us."""
-    row = shared.ring.newest()
-    answer: dict[str, Any] = {
-        "period_us": period_s * 1e6,
-        "ticks": 0 if row is None else int(row[INDEX["tick"]]),
-        "slips": 0 if row is None else int(row[INDEX["slips"]]),
-    }
-    for k, name in enumerate(("lateness", "busy", "reference")):
-        counts = shared.areas[name].copy()  # the loop counts on meanwhile
-        p50, p99, p999 = percentiles(counts)
-        answer[name] = {
-            "count": int(counts.sum()),
-            "p50_us": _or_none(p50),
-            "p99_us": _or_none(p99),
-            "p999_us": _or_none(p999),
-            "largest_us": float(shared.areas["largest"][k]),
-            "bins_us": [[int(i), int(counts[i])] for i in counts.nonzero()[0]],
-        }
-    return answer
-
-
-def _or_none(number: float) -> float | None:
-    return number if math.isfinite(number) else None
+ANSWER_S = 1.0  # time within which the loop must take a command
 
 
 class Commands:
-    """What a request does. `reload_settings(settings in force, settings at the start)` validates the file again and
-    returns (settings, parameters, applied keys, keys that need a restart)."""
+    """Obeys the requests.
+
+    `reload_settings(settings in force, settings at the start)` reads the file again and returns (settings,
+    parameters, applied keys, keys that need a restart).
+    """
 
     def __init__(
         self,
         shared: Shared,
-        settings: Any,
-        reload_settings: Callable[[Any, Any], tuple[Any, Any, list[str], list[str]]],
+        settings: Settings,
+        reload_settings: Callable[[Settings, Settings], tuple[Settings, Parameters, list[str], list[str]]],
         log: Callable[..., None],
     ):
         self.shared, self.settings, self.started = shared, settings, settings
@@ -161,7 +56,7 @@ class Commands:
         self.can_drive = can_drive(settings)
 
     def answer(self, line: bytes, peer: str) -> dict[str, Any]:
-        """The answer to one request line; never raises for what a client sent."""
+        """Answer one request line; nothing that a client sends raises an exception."""
         try:
             request = json.loads(line)
             if not isinstance(request, dict) or not isinstance(request.get("command"), str):
@@ -207,7 +102,7 @@ class Commands:
         return status(self.shared)["state"]
 
     def _send(self, kind: float, value: float = 0.0) -> None:
-        """Hand a command to the loop and wait until it took it."""
+        """Hand a command to the loop and wait until the loop has taken it."""
         if not self.shared.mailbox.push(kind, value):
             raise InputError("the loop does not take commands: its mailbox is full (is it running?)")
         position = self.shared.mailbox.pushed
@@ -222,7 +117,7 @@ class Commands:
         now = status(self.shared)
         if now["state"] == wanted:
             return {"ok": True, "state": now["state"], "setpoint_um": now["setpoint_um"]}
-        lines = readings.fault_lines(now["faults"])
+        lines = fault_lines(now["faults"])
         return {
             "ok": False,
             "state": now["state"],
@@ -231,7 +126,7 @@ class Commands:
             ),
         }
 
-    def _arm(self, request: dict) -> dict[str, Any]:
+    def _arm(self, request: dict[str, Any]) -> dict[str, Any]:
         if not self.can_drive:
             return {
                 "ok": False,
@@ -247,7 +142,7 @@ class Commands:
             return {
                 "ok": False,
                 "state": "ARMED",
-                "error": "not armed for this command: the rig is ARMED already, somebody uses it; `thermoctl disarm` ends that",
+                "error": "not armed for this command: the rig is ARMED already and in use; `thermoctl disarm` ends that",
             }
         if self._state() == "ARMED":
             return {"ok": True, "state": "ARMED", "setpoint_um": status(self.shared)["setpoint_um"]}
@@ -261,19 +156,19 @@ class Commands:
         return {**answer, "held": held and answer["ok"]}
 
     def let_go(self, peer: str) -> None:
-        """Disarm: the connection that the rig was armed for is gone, however its program ended."""
+        """Disarm after the connection that armed the rig has ended, for whatever reason."""
         if self._state() == "ARMED":
             self.log("command", name="disarm", peer=peer, ok=True, why="its connection is gone")
             self._send(arming.DISARM)
 
-    def _disarm(self, request: dict) -> dict[str, Any]:
+    def _disarm(self, request: dict[str, Any]) -> dict[str, Any]:
         self._send(arming.DISARM)
         now = self._state()
         if now in ("SAFE", "READY", "OFF"):
             return {"ok": True, "state": now, "held": False}
         return self._result("SAFE", "the amplifier is disabled, but the fault still stands")
 
-    def _setpoint(self, request: dict) -> dict[str, Any]:
+    def _setpoint(self, request: dict[str, Any]) -> dict[str, Any]:
         value = request.get("value")
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
             raise InputError("setpoint: expected a finite number of micrometres as 'value'")
@@ -288,7 +183,7 @@ class Commands:
         self._send(arming.SETPOINT, float(value))
         return self._result("ARMED", "setpoint not taken")
 
-    def _reload(self, request: dict) -> dict[str, Any]:
+    def _reload(self, request: dict[str, Any]) -> dict[str, Any]:
         settings, parameters, applied, restart = self.reload_settings(self.settings, self.started)
         self.shared.parameters.put(parameters.pack())
         self._send(RELOAD)
@@ -302,7 +197,7 @@ class Commands:
 
 
 class _Client:
-    """One connection; `holds`: the rig was armed for as long as it lasts."""
+    """One connection; `holds`: the rig stays armed only as long as the connection lasts."""
 
     def __init__(self, connection: socket.socket, peer: str):
         self.connection, self.peer, self.received, self.unsent = connection, peer, b"", b""
@@ -310,7 +205,10 @@ class _Client:
 
 
 def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
-    """The listening socket at `path`, for owner and group. Raises InputError where it cannot be made."""
+    """Return a listening socket at `path`, for owner and group.
+
+    Raises InputError where it cannot be made.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileNotFoundError):
         path.unlink()
@@ -333,7 +231,7 @@ def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
 
 
 def serve(listener: socket.socket, commands: Commands, stopping: Callable[[], bool]) -> None:
-    """Answer requests until `stopping()`. A client that sends too much or does not read is dropped."""
+    """Answer requests until `stopping()`; drop a client that sends too much."""
     selector = selectors.DefaultSelector()
     selector.register(listener, selectors.EVENT_READ)
     while not stopping():
@@ -360,8 +258,10 @@ def _accept(listener: socket.socket, selector: selectors.BaseSelector) -> None:
 
 
 def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector, commands: Commands) -> None:
-    """One read, one request, one write at most: no client keeps another waiting. One that does not take its answer is
-    not read from."""
+    """Do at most one read, one request and one write, so that no client delays another.
+
+    Nothing is read from a client that has not taken its answer.
+    """
     try:
         if events & selectors.EVENT_READ:
             data = client.connection.recv(MAX_LINE)
@@ -386,60 +286,3 @@ def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector
         if client.holds:
             with contextlib.suppress(InputError):  # the loop is gone, too
                 commands.let_go(client.peer)
-
-
-class Connection:
-    """A connection to the daemon at `path`: one request after the other. Raises InputError when nobody answers.
-
-    A rig armed with {"command": "arm", "held": true} is disarmed by the daemon when the connection ends, however it ends."""
-
-    def __init__(self, path: Path | str, timeout_s: float = 3.0):
-        self.path, self.timeout_s = path, timeout_s
-        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.socket.settimeout(timeout_s)
-        with self._answering():
-            self.socket.connect(str(path))
-
-    def ask(self, request: dict[str, Any]) -> dict[str, Any]:
-        """The answer to one request."""
-        with self._answering():
-            self.socket.sendall(json.dumps(request).encode() + b"\n")
-            received = b""
-            while not received.endswith(b"\n"):
-                data = self.socket.recv(1 << 16)
-                if not data:
-                    raise InputError(f"{self.path}: the daemon closed the connection; see its log")
-                received += data
-        return json.loads(received)
-
-    def lost(self, wait_s: float) -> bool:
-        """Wait for `wait_s`; True as soon as the daemon closes the connection. Between two requests only."""
-        return bool(select.select([self.socket], [], [], wait_s)[0])
-
-    def __enter__(self) -> Connection:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.socket.close()
-
-    @contextlib.contextmanager
-    def _answering(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as e:
-            self.socket.close()
-            if isinstance(e, PermissionError):
-                text = "not allowed; the socket is for its group (see socket.group)"
-            elif isinstance(e, FileNotFoundError | ConnectionRefusedError):
-                text = "the daemon is not running; `thermoctl start` or `thermoctl run --config FILE`"
-            elif isinstance(e, TimeoutError):
-                text = f"no answer within {self.timeout_s:g} s; see the daemon's log"
-            else:
-                text = "the daemon broke the connection off; see its log"
-            raise InputError(f"{self.path}: {text}") from None
-
-
-def ask(path: Path | str, request: dict[str, Any], timeout_s: float = 3.0) -> dict[str, Any]:
-    """One request to the daemon at `path`. Raises InputError when nobody answers."""
-    with Connection(path, timeout_s) as connection:
-        return connection.ask(request)

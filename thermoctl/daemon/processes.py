@@ -1,0 +1,273 @@
+"""The daemon's processes: the main function of each, and how the supervisor starts, watches and ends them."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hal.backend import HardwareError
+from hal.board import Board
+from hal.make import make_backend, slow_devices
+from hal.poller import run_poller
+from thermoctl.daemon import keep
+from thermoctl.daemon import loop as loops
+from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
+from thermoctl.daemon.command_server import Commands, listen, serve
+from thermoctl.daemon.journal import Log, console_log
+from thermoctl.daemon.reload import reload_settings
+from thermoctl.daemon.shared import BEATS, RESUMED, WARNINGS, Shared
+from thermoctl.settings import Settings
+from thermoctl.yamlfile import InputError
+
+HANG_S = 15.0  # a helper that does no round for this time is killed and started again
+STOP_S = 10.0  # a helper that does not end within this time after the request is killed
+RESTART_S = 0.5  # pause before a child is started again; doubled at each restart
+RESTART_LONGEST_S = 30.0  # longest pause; a child that ran longer than this starts again after RESTART_S
+EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_HARDWARE = 0, 1, 2, 3
+
+RECORDER, COMMANDS, REFERENCE = range(3)
+"""The helpers' places among shared.BEATS."""
+
+_fork = multiprocessing.get_context("fork")
+
+
+class Stop:
+    """Set by SIGTERM; each call also counts a heartbeat of the helper.
+
+    SIGINT is left to the supervisor: the terminal sends it to the children, too.
+    """
+
+    def __init__(self, shared: Shared | None = None, beat: int = 0) -> None:
+        self.asked, self.shared, self.beat = False, shared, beat
+        signal.signal(signal.SIGTERM, self._ask)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+    def _ask(self, *_: Any) -> None:
+        self.asked = True
+
+    def __call__(self) -> bool:
+        if self.shared is not None:
+            self.shared.counters[BEATS + self.beat] += 1  # asked once a round: a round done
+        return self.asked
+
+
+def _loop_process(settings: Settings, shared: Shared, board: Any) -> int:
+    stop = Stop()
+    loops.die_with_parent()
+    backend = make_backend(settings, board)
+    backend.open()
+    try:
+        rig = loops.Rig(
+            backend,
+            compensator(settings),
+            law_parameters(settings),
+            settings.loop.period_s,
+            shared.ring,
+            shared.mailbox,
+            shared.parameters,
+            shared.state,
+            time.monotonic(),
+            shared.make_remarks(settings.loop.period_s),
+        )
+        _resume(settings, shared, rig)
+
+        def warn(text: str) -> None:
+            shared.counters[WARNINGS] += 1
+            console_log("warning", what=text)
+
+        kept = loops.become_real_time(settings, warn)
+        loops.run_loop(settings, shared, rig, stop)
+        for file in kept:
+            os.close(file)
+    finally:
+        backend.write(0.0, False)
+        backend.close()
+    return EXIT_OK
+
+
+def _resume(settings: Settings, shared: Shared, rig: loops.Rig) -> None:
+    """Restore the estimates of the run before, when they are recent and of this model."""
+    state, age_s, why = keep.load(keep.kept_path(settings), rig.law.model)
+    if state is not None:
+        try:
+            rig.law.resume(state, age_s)
+            shared.counters[RESUMED] = 1.0
+            rig.keep_state()  # where a replay of this run begins
+        except ValueError as e:
+            state, why = None, str(e)
+    console_log(
+        "estimates",
+        kept=state is not None,
+        age_s=round(age_s, 1) if state is not None else None,
+        why=why or None,
+    )
+
+
+def _recorder_process(settings: Settings, shared: Shared, board: Any) -> int:
+    from thermoctl.daemon.recorder import make_recorder, record
+
+    stop = Stop(shared, RECORDER)
+    loops.die_with_parent()
+    record(make_recorder(settings, shared, console_log), stop)
+    return EXIT_OK
+
+
+def _command_process(settings: Settings, shared: Shared, board: Any) -> int:
+    stop = Stop(shared, COMMANDS)
+    loops.die_with_parent()
+    path = Path(settings.socket.path)
+    listener = listen(path, settings.socket.group)
+    try:
+        serve(listener, Commands(shared, settings, reload_settings, console_log), stop)
+    finally:
+        listener.close()
+        with contextlib.suppress(FileNotFoundError):
+            path.unlink()
+    return EXIT_OK
+
+
+def _tuner_process(settings: Settings, shared: Shared, board: Any) -> int:
+    from thermoctl.daemon import tuner
+
+    stop = Stop()
+    loops.die_with_parent()
+    tuning = tuner.Tuning(
+        compensator(settings),
+        settings.rig.name,
+        Path(settings.compensation.model),
+        lambda text: console_log("tuned", what=text),
+    )
+    tuner.run(shared, tuning, stop)
+    return EXIT_OK
+
+
+def _reference_process(settings: Settings, shared: Shared, board: Any) -> int:
+    stop = Stop(shared, REFERENCE)
+    loops.die_with_parent()
+    loops.become_real_time(settings, lambda text: None)
+    loops.run_reference(settings, shared, stop)
+    return EXIT_OK
+
+
+def _poller_process(settings: Settings, shared: Shared, board: Any, device: str) -> int:
+    loops.die_with_parent()
+    run_poller(next(d for d in slow_devices(settings) if d.name == device), board.name)
+    return EXIT_OK
+
+
+class Child:
+    """One process: how it is started, and when it may be started again.
+
+    beats: returns the rounds it has done; None: it is not watched.
+    """
+
+    def __init__(
+        self, name: str, main: Callable[..., int], *arguments: Any, beats: Callable[[], float] | None = None
+    ):
+        self.name, self.main, self.arguments, self.beats = name, main, arguments, beats
+        self.heard, self.heard_at = -1.0, 0.0
+        self.process: Any = None
+        self.again_at, self.pause_s = 0.0, RESTART_S
+
+    def start(self) -> None:
+        """Start the process."""
+        self.process = _fork.Process(
+            target=_run_child, args=(self.name, self.main, self.arguments), name=self.name
+        )
+        self.process.start()
+        self.started = self.heard_at = time.monotonic()
+
+    def hangs(self, now: float) -> bool:
+        """Return whether it lives and has not done a round for HANG_S."""
+        if self.beats is None or not self.alive:
+            return False
+        if (beats := self.beats()) != self.heard:
+            self.heard, self.heard_at = beats, now
+        return now - self.heard_at > HANG_S
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self.process is not None and self.process.is_alive()
+
+    def end(self, limit_s: float = STOP_S) -> None:
+        """Ask it to stop; kill it when it does not."""
+        if self.alive:
+            self.process.terminate()
+            self.process.join(limit_s)
+            if self.process.is_alive():
+                self.process.kill()
+                self.process.join()
+
+
+def _run_child(name: str, main: Callable[..., int], arguments: tuple[Any, ...]) -> None:
+    try:
+        code = main(*arguments)
+    except InputError as e:
+        console_log(f"{name} ended", error=e)
+        code = EXIT_INPUT
+    except HardwareError as e:
+        console_log(f"{name} ended", error=e)
+        code = EXIT_HARDWARE
+    sys.exit(code)
+
+
+def restart(children: list[Child], now: float, log: Log) -> None:
+    """Kill each child that hangs, and start each that has ended again after its pause."""
+    for child in children:
+        if child.hangs(now):
+            log(f"{child.name} hangs: killed", seconds=round(now - child.heard_at, 1))
+            child.process.kill()
+            child.heard_at = now  # one kill; it is gone at the next look
+        if child.alive:
+            continue
+        if child.again_at == 0.0:
+            if now - child.started > RESTART_LONGEST_S:
+                child.pause_s = RESTART_S
+            child.again_at = now + child.pause_s
+            log(f"{child.name} ended, started again", exit=child.process.exitcode, after_s=child.pause_s)
+            child.pause_s = min(2.0 * child.pause_s, RESTART_LONGEST_S)
+        elif now >= child.again_at:
+            child.again_at = 0.0
+            child.start()
+
+
+def make_children(settings: Settings, shared: Shared) -> tuple[Board | None, Child, list[Child]]:
+    """Make the board of slow readings (None without slow devices), the loop, and the helpers; start nothing."""
+    slow = slow_devices(settings) if settings.hal.backend == "devices" else []
+    board = Board.create(shared_name(settings) + "-board") if slow else None
+
+    def child(name: str, main: Callable[..., int], beat: int | None = None) -> Child:
+        beats = None if beat is None else partial(shared.beats, beat)
+        return Child(name, main, settings, shared, board, beats=beats)
+
+    others = [
+        Child(
+            f"poller {d.name}",
+            _poller_process,
+            settings,
+            shared,
+            board,
+            d.name,
+            beats=partial(board.beat, d.roles),
+        )
+        for d in slow
+        if board is not None
+    ]
+    if settings.recording.enable:
+        others.append(child("recorder", _recorder_process, RECORDER))
+    others.append(child("commands", _command_process, COMMANDS))
+    if settings.compensation.tune:
+        others.append(child("tuner", _tuner_process))
+    if settings.loop.reference:
+        others.append(child("reference", _reference_process, REFERENCE))
+    return board, child("loop", _loop_process), others

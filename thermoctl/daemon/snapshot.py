@@ -1,0 +1,117 @@
+"""Answers made from shared memory: `status` and `latency`. Reading them never costs the loop a tick."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from thermoctl.channels import CHANNELS, STATUS_NAMES
+from thermoctl.control import arming
+from thermoctl.daemon import readings
+from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
+from thermoctl.signals import INDEX, POINTS
+
+NUMBERS = (
+    "setpoint_um",
+    "reference_um",
+    "position_um",
+    "compensated_um",
+    "compensation_um",
+    "expansion_um",
+    "output_reference_um",
+    "control_v",
+    "drive",
+    "enable",
+    "voltage_v",
+    "current_a",
+    "power_w",
+    "air_c",
+    "innovation_c",
+    "kalman_gain",
+    "position_age_s",
+    "coil_age_s",
+    "supply_v",
+    "amplifier_state",
+    "amplifier_fault",
+)
+"""Signals that a status answer has under their own names."""
+
+
+def status(shared: Shared) -> dict[str, Any]:
+    """Return the newest row as `thermoctl status --json` prints it.
+
+    A number whose reading is invalid is null; `readings` has its state, age and message. Faults have the
+    cause first.
+    """
+    row = shared.ring.newest()
+    if row is None:
+        return {
+            "state": "OFF",
+            "ticks": 0,
+            "slips": 0,
+            "faults": [],
+            "setpoint_um": None,
+            "position_um": None,
+            "compensation_um": None,
+        }
+    found = readings.readings(shared, row)
+    number = {
+        name: float(row[i]) if math.isfinite(row[i]) and readings.valid(name, found) else None
+        for name, i in INDEX.items()
+    }
+    busy = percentiles(shared.areas["busy"])
+    return {
+        "state": arming.STATES[int(row[INDEX["state"]])],
+        "ticks": int(row[INDEX["tick"]]),
+        "slips": int(row[INDEX["slips"]]),
+        "generation": int(row[INDEX["generation"]]),
+        "uptime_s": number["t_s"],
+        **{name: number[name] for name in NUMBERS},
+        "channels": {role: r["state"] for role, r in found.items()},
+        "readings": found,
+        "estimates_state": "OK" if found["coil_c"]["state"] == "OK" else "NOT CORRECTED",
+        "drive_code": readings.drive_code(shared, row),
+        "temperatures_c": {p: number[f"{p}_c"] for p in POINTS},
+        "estimates_c": {p: number[f"{p}_est_c"] for p in POINTS},
+        "lateness_us": number["lateness_us"],
+        "busy_us": number["busy_us"],
+        "busy_p50_us": _or_none(busy[0]),
+        "tuning_percent": float(shared.counters[TUNING]) - 1.0 if shared.counters[TUNING] else None,
+        "recorder": {
+            "rows": int(shared.counters[RECORDER_ROWS]),
+            "lost": int(shared.counters[RECORDER_LOST]),
+        },
+        "wall_s": number["wall_s"],
+        "faults": readings.standing_faults(shared, row, found),
+    }
+
+
+def channel_states(status_bits: int) -> dict[str, str]:
+    """Return each channel's state, OK, STALE, ERROR or ABSENT, from the signal status_bits."""
+    return {name: STATUS_NAMES[status_bits >> (2 * c) & 3] for c, name in enumerate(CHANNELS)}
+
+
+def latency(shared: Shared, period_s: float) -> dict[str, Any]:
+    """Return histograms and percentiles of lateness, busy time and the idle loop's lateness, us."""
+    row = shared.ring.newest()
+    answer: dict[str, Any] = {
+        "period_us": period_s * 1e6,
+        "ticks": 0 if row is None else int(row[INDEX["tick"]]),
+        "slips": 0 if row is None else int(row[INDEX["slips"]]),
+    }
+    for k, name in enumerate(("lateness", "busy", "reference")):
+        counts = shared.areas[name].copy()  # the loop counts on meanwhile
+        p50, p99, p999 = percentiles(counts)
+        answer[name] = {
+            "count": int(counts.sum()),
+            "p50_us": _or_none(p50),
+            "p99_us": _or_none(p99),
+            "p999_us": _or_none(p999),
+            "largest_us": float(shared.areas["largest"][k]),
+            "bins_us": [[int(i), int(counts[i])] for i in counts.nonzero()[0]],
+        }
+    return answer
+
+
+def _or_none(number: float) -> float | None:
+    return number if math.isfinite(number) else None

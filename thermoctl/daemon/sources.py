@@ -1,0 +1,17 @@
+"""Which channels a signal of the record comes from."""
+
+from __future__ import annotations
+
+from thermoctl.channels import SIGNAL
+
+SOURCES: dict[str, tuple[str, ...]] = {
+    **{signal: (role,) for role, signal in SIGNAL.items()},
+    "position_um": ("position_um",),
+    "compensated_um": ("position_um",),
+    "power_w": ("voltage_v", "current_a"),
+    "innovation_c": ("coil_c",),
+    "kalman_gain": ("coil_c",),
+    "air_rate_k_s": ("air_c",),
+}
+"""Channels that must be valid for a signal to be valid. For a computed signal, ABSENT is allowed: the law does
+without that channel."""
