@@ -137,7 +137,7 @@ def extensions(
     singles = [(d,) for d in finalists(kept, limits.shortlist)]
     for added in [*singles, *pairs(kept, looked, limits)]:
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-        if keys in tried or case.budget.spent:
+        if keys in tried or len(keys) > limits.effects or case.budget.spent:
             continue
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
         found = [f for f in _followed(case, parent, looked, added, leader) if not f.absent]
