@@ -20,7 +20,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Drive, Model
 
-SHARES = 10.0 ** np.arange(-3.5, 0.1, 0.5)  # eta
+SHARES = 10.0 ** np.arange(-3.5, -0.9, 0.5)  # eta
 SMALL = 0.02  # mean of eta's exponential prior: what nobody will name is a few per cent of what flows
 CORNERS = 3  # tau', from a fortieth to a quarter of the longest recording: what is faster is late, not lost, and a sensor's slow part
 ABSENT = 0.5  # prior of no remainder

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.diagnose.effects import Candidate, candidates
+from thermoctl.diagnose.effects import candidates
 from thermoctl.diagnose.screen import Direction, Metric, screen
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.coordinates import Coordinates
@@ -131,6 +130,3 @@ def places(case: Case) -> dict[str, set[str]]:
     for c in candidates(rig, case.catalogue):
         out.setdefault(c.effect.name, set()).add(c.place.where)
     return out
-
-
-__all__ = ["Candidate", "Rows", "Screened", "dataclasses", "places", "screened"]

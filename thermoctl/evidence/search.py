@@ -29,7 +29,7 @@ START = 10.0  # times that a start which nobody measured is less certain than th
 
 @dataclass(frozen=True)
 class Weighed:
-    """A fitted hypothesis and its log prior odds; `chance`: family-wise p of what it leaves, None where it was not screened."""
+    """A fitted hypothesis and its log prior odds."""
 
     fitted: Fitted
     log_odds: float
