@@ -101,7 +101,7 @@ def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
 
 def alternatives(posterior: Posterior, named: Sequence[Key], limits: Limits) -> tuple[tuple[Key, float], ...]:
     """The effects beside the named ones in the likeliest hypotheses that together hold the set's probability."""
-    total, found = 0.0, set()
+    total, found = 0.0, set[Key]()
     for keys, p in sorted(posterior.hypotheses.items(), key=lambda item: (-item[1], sorted(item[0]))):
         if total >= limits.set:
             break

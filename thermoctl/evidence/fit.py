@@ -9,7 +9,6 @@ Gauss and Newton's steps with the expected weights E[1/V], which are its exact g
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -21,8 +20,8 @@ from thermoctl.evidence.coordinates import Coordinates
 from thermoctl.evidence.noise import Averaged, Likely, averaged
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit, Problem, Scale
-from thermoctl.plant.simulate import Excitation, SimulationError, compile_plant
+from thermoctl.plant.refit import Fit, Problem
+from thermoctl.plant.simulate import SimulationError, compile_plant
 
 SIGNIFICANT = 2.0  # standard deviations
 BELIEF = 0.3  # standard deviation of the plant's parameters round their beliefs, as a share of their ranges
@@ -252,9 +251,7 @@ def _priors(
             if p.amplitude:
                 sizes[k] = own[q]
         elif q in case.plant.parameters:
-            p = case.plant.parameters[q]
-            assert p.range is not None
-            mean[k] = problem.scales[q].z(p.value)
+            mean[k] = problem.scales[q].z(case.plant.parameters[q].value)
     return sizes, mean, precision
 
 
@@ -374,22 +371,3 @@ def _size(p: EffectParameter, value: float, sd: float) -> float:
     finely than its standard deviation."""
     one_sided = p.low >= p.null or p.high <= p.null
     return -float(np.log(np.log(10.0) * DECADES * (1 if one_sided else 2) * np.hypot(value - p.null, sd)))
-
-
-def with_values(plant: Plant, values: Mapping[str, float]) -> Plant:
-    """The plant with other values of some parameters."""
-    return dataclasses.replace(
-        plant,
-        parameters={
-            k: dataclasses.replace(p, value=values[k]) if k in values else p
-            for k, p in plant.parameters.items()
-        },
-    )
-
-
-def drives_of(case: Case, f: Fitted) -> list[Excitation]:
-    """The recordings as a fitted hypothesis' plant reads them."""
-    return [f.fit.model.excitation(t) for t in case.tables]
-
-
-__all__ = ["Fitted", "Hypothesis", "Placed", "Scale", "fitted"]

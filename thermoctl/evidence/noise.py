@@ -25,7 +25,7 @@ from thermoctl.evidence.coordinates import Channel
 
 STATED = 1.0  # standard deviation of log c^2: a stated noise is wrong by a factor of 1.6 in one case of three
 STEPS, CLOSE = 15, 3e-3  # of Newton's method for log c^2, and the step that ends it
-SIZES = 10.0 ** np.arange(-0.9, 3.1, 0.65)  # a: variance of the slow part over that of the white part
+SIZES = 10.0 ** np.arange(-0.9, 3.7, 0.65)  # a: variance of the slow part over that of the white part
 CORNERS = 4  # tau: from one sampling interval to a quarter of the recording
 RARE = 0.7  # nats that a slow part's standard deviation costs in units of the white part's: most are no larger than that
 PLAIN, FIRST_ORDER = (

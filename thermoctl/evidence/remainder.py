@@ -20,9 +20,9 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation, Model
 
-SHARES = 10.0 ** np.arange(-3.5, 0.1, 0.5)  # eta
+SHARES = 10.0 ** np.arange(-3.5, -0.9, 0.5)  # eta
 SMALL = 0.02  # mean of eta's exponential prior: what nobody will name is a few per cent of what flows
-CORNERS = 4  # tau', from two samples to a quarter of the longest recording
+CORNERS = 3  # tau', from a fortieth to a quarter of the longest recording: what is faster is late, not lost, and a sensor's slow part
 ABSENT = 0.5  # prior of no remainder
 DRAWS = 8  # random forces a node
 
@@ -121,7 +121,7 @@ def remainder(
                 white[k] = mean.reshape(len(nodes), DRAWS, -1).mean(axis=1)
     span = max(float(d.t[-1] - d.t[0]) for d in drives)
     intervals = [float(np.median(np.diff(d.t))) for d in drives]
-    taus = np.geomspace(2 * min(intervals), 0.25 * span, CORNERS)
+    taus = np.geomspace(span / 40, span / 4, CORNERS)
     share, corner = np.meshgrid(SHARES if nodes else SHARES[:0], taus, indexing="ij")
     size = np.log(1 - ABSENT) - share.ravel() / SMALL
     size -= np.log(len(taus)) + np.log(np.exp(-SHARES / SMALL).sum())

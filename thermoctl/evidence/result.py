@@ -131,7 +131,7 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
 def _equation(before: Plant, after: Plant, e: Placed) -> str:
     """The expression that the effect brings or changes."""
     mine = set(e.own.values())
-    for f in reversed(after.flows.values()):
+    for f in reversed(list(after.flows.values())):
         if ex.names(f.rate) & mine:
             return str(f.rate)
     for o in after.outputs.values():

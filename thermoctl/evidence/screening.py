@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.diagnose.effects import Candidate, candidates
+from thermoctl.diagnose.effects import candidates
 from thermoctl.diagnose.screen import Direction, Metric, screen
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.coordinates import Coordinates
@@ -45,6 +44,7 @@ class Rows(Metric):
         basis = np.zeros((sum(map(len, residual)), len(self.problem.unknowns)))
         at = 0
         for r, dy in enumerate(columns):
+            assert dy is not None  # the runs were asked for their sensitivities
             used = np.flatnonzero(self.problem.columns[r] >= 0)
             block = self.rows(r, dy[:, :, used])
             basis[at : at + len(block), self.problem.columns[r, used]] = block
@@ -131,6 +131,3 @@ def places(case: Case) -> dict[str, set[str]]:
     for c in candidates(rig, case.catalogue):
         out.setdefault(c.effect.name, set()).add(c.place.where)
     return out
-
-
-__all__ = ["Candidate", "Rows", "Screened", "dataclasses", "places", "screened"]

@@ -29,7 +29,7 @@ START = 10.0  # times that a start which nobody measured is less certain than th
 
 @dataclass(frozen=True)
 class Weighed:
-    """A fitted hypothesis and its log prior odds; `chance`: family-wise p of what it leaves, None where it was not screened."""
+    """A fitted hypothesis and its log prior odds."""
 
     fitted: Fitted
     log_odds: float
@@ -137,7 +137,7 @@ def extensions(
     singles = [(d,) for d in finalists(kept, limits.shortlist)]
     for added in [*singles, *pairs(kept, looked, limits)]:
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-        if keys in tried or case.budget.spent:
+        if keys in tried or len(keys) > limits.effects or case.budget.spent:
             continue
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
         found = [f for f in _followed(case, parent, looked, added, leader) if not f.absent]
@@ -157,7 +157,7 @@ def pairs(directions: Sequence[Direction], looked: Screened, limits: Limits) -> 
     kept = list(best.values())
     if len(kept) < PAIR:
         return []
-    v = np.stack([d.vector for d in kept]).astype(float)
+    v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
     g = np.maximum(v @ looked.metric.residual, np.finfo(float).tiny)
     c = np.clip(v @ v.T, -ALIKE, ALIKE)
     first = (g[:, None] - c * g[None]) / (
