@@ -88,7 +88,7 @@ def test_files_that_are_bad_do_not_stop_the_others(folder, capsys, tmp_path):
     (tmp_path / "rig" / "bad.csv").write_text("t,x\n0,1\n0,2\n")
     (tmp_path / "rig" / "good.csv").write_text("t,state,fault_bits\n0,3,0\n1,3,0\n2,1,0\n")
     assert main(["fleet", str(tmp_path)]) == 1
-    out = capsys.readouterr().out
+    out = " ".join(capsys.readouterr().out.split())
     assert "stands twice" in out and "67 %" in out
     for words in ([str(tmp_path / "none")], [str(folder / "data"), "--parameters", "H"]):
         assert main(["fleet", *words]) == 2

@@ -191,7 +191,8 @@ def test_a_rig_that_somebody_uses_is_left_alone(folder, running, capsys):
     with Connection(path) as other:  # beside the question before: the daemon itself refuses
         assert not other.ask({"command": "arm", "held": True})["ok"]
     now = status(running.shared)
-    assert now["state"] == "ARMED" and np.ptp([r[INDEX["setpoint_um"]] for r in watched.rows[-100:]]) == 0
+    armed = [r[INDEX["setpoint_um"]] for r in watched.rows if r[INDEX["state"]] == arming.ARMED]
+    assert now["state"] == "ARMED" and np.ptp(armed) == 0
     watched.injector.faults.append(HAZARDS["NaN position"])
     while status(running.shared)["state"] != "FAULT":
         time.sleep(0.01)  # how often we look, not a wait

@@ -16,6 +16,7 @@ from test_dashboard import served
 
 from hal.backend import ERROR, OK, ROLE, STALE
 from hal.drive_errors import describe
+from thermoctl.channels import CHANNELS
 from thermoctl.control import causes, faults
 from thermoctl.control.causes import Standing, in_order
 from thermoctl.daemon import commands, dashboard, monitor
@@ -338,7 +339,7 @@ def written(settings, rig, metadata, wall_s, value):
     rows[:, INDEX["wall_s"]] = wall_s + rows[:, INDEX["t_s"]]
     rows[:, INDEX["compensation_um"]] = value
     rows[:, INDEX["coil_c"]] = 25.0
-    rows[1000:2000, INDEX["status_bits"]] = 2 << 2 * faults.CHANNELS.index("coil_c")
+    rows[1000:2000, INDEX["status_bits"]] = 2 << 2 * CHANNELS.index("coil_c")
     writer = RecordingWriter(settings.recording, metadata, rig, clock=lambda: 0.0, wall=lambda: wall_s)
     writer.write(rows)
     writer.close()
