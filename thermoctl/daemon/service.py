@@ -181,7 +181,7 @@ class Background(subprocess.Popen[bytes]):
         self.log = log
 
     def said(self) -> str:
-        """Return what it wrote into its log."""
+        """Return the lines that the started daemon wrote into its log."""
         with self.log.open("rb") as lines:
             lines.seek(self.began)
             return lines.read().decode(errors="replace")

@@ -46,9 +46,8 @@ from thermoctl.yamlfile import InputError
 READY_S = 60.0  # time limit of the first tick: devices connect before it
 STALL_S = 1.0  # a loop without a tick for this time, or for protection.late_s if longer, is ended
 LOOK_S = 0.1  # time between two checks
-LOOK_LONGEST_S = (
-    0.2  # of a longer time between two checks only this counts: the machine stood still, not the loop
-)
+# A longer time between two checks counts as this much of the loop's silence: the supervisor itself did not run.
+LOOK_LONGEST_S = 0.2
 LOOP_STOP_S = 3.0  # a loop that does not end within this time after the request is killed
 
 

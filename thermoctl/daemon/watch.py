@@ -2,8 +2,8 @@
 
 It only reads shared memory; the loop does not notice. It finds the end of a daemon (the segment is gone)
 and a new start. Around each new fault it keeps the rows of every tick: the capture. It starts with the
-rows that the ring still held, so a fault soon after the dashboard's start has its seconds before, too. The
-last minute is kept in few numbers, so that a page that opens shows it at once.
+rows that the ring still holds: a fault soon after the dashboard's start has its history, too. A page that
+opens shows the last minute at once; it is kept reduced.
 """
 
 from __future__ import annotations

@@ -45,8 +45,10 @@ HEAT_W, HEAT_TAU_S = (
 # The chamber, K: spread of the day's level, swing in SWING_S, wander in WANDER_S.
 AIR_K = (0.25, 0.35, 0.12)
 SWING_S, WANDER_S = (12000.0, 28000.0), 2500.0
-CHAMBER = 0.6  # of that, and of the bench's drift, in the rigs that the report judges: see study.py
-SPREAD = {"C_": 0.08, "G_": 0.15, "H_": 0.15, "a_": 0.10, "N_": 0.15}  # of a seed's parameters, either way
+# Share of the chamber's and the bench's drift in the rigs of the report (study.py).
+CHAMBER = 0.6
+# Largest relative deviation of a seed's parameters from the plant file, by the first letters of their names.
+SPREAD = {"C_": 0.08, "G_": 0.15, "H_": 0.15, "a_": 0.10, "N_": 0.15}
 CONVECTION = 0.06  # spread of a day's convection, share
 NEUTRAL_C, BENCH_K = 22.0, 0.3  # mean of chamber and bench; spread of the bench's day
 ENCODER_STEP_UM, ENCODER_NOISE_UM = 0.005, 0.015  # of the difference of the two encoders
