@@ -29,6 +29,10 @@ class _Loader(yaml.SafeLoader):
     """SafeLoader that reads 1e-9 as a number (YAML 1.2); no dates, no yes/no, no octal numbers."""
 
 
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that quotes text which _Loader would read as a number, such as 0E0."""
+
+
 _Loader.yaml_implicit_resolvers = {}
 _NUMBER = r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
 for _tag, _regex, _first in (
@@ -37,9 +41,15 @@ for _tag, _regex, _first in (
     ("tag:yaml.org,2002:int", r"[-+]?[0-9][0-9_]*", "-+0123456789"),
     ("tag:yaml.org,2002:float", _NUMBER + r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+0123456789."),
 ):
-    _Loader.add_implicit_resolver(
-        _tag, re.compile(f"^(?:{_regex})$"), [*_first, *([""] if _tag.endswith("null") else [])]
-    )
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(
+            _tag, re.compile(f"^(?:{_regex})$"), [*_first, *([""] if _tag.endswith("null") else [])]
+        )
+
+
+def dumps(data: Any) -> str:
+    """Return plain data as YAML text that this module reads back equal."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
 
 
 @dataclass(frozen=True)

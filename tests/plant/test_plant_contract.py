@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.simulated import PlantRig
 from tests.plants import ONE_BLOCK, SPRING_STAGE, TWO_BLOCKS
+from thermoctl import yamlfile
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import FLICKER_DECADES, ROLES, SensorNoise
 from thermoctl.plant.refit import fit, updated
@@ -446,7 +446,7 @@ def plant_files(draw):
 @settings(max_examples=150, deadline=None)
 def test_a_saved_plant_is_read_back_equal(tmp_path_factory, data):
     try:
-        plant = loads(yaml.safe_dump(data, allow_unicode=True))
+        plant = loads(yamlfile.dumps(data))
     except InputError as e:
         assert "dimension" in str(e) or "too large" in str(e) or "[" in str(e), e
         return

@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from thermoctl import yamlfile
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parse import parse
@@ -50,7 +48,7 @@ def save(plant: Plant, path: str | Path, note: str = "") -> None:
     """Write the plant file, whole or not at all; `note` becomes a comment at its head."""
     path = Path(path)
     text = "".join(f"# {line}\n" for line in note.splitlines())
-    text += yaml.safe_dump(plant.plain(), sort_keys=False, allow_unicode=True, width=120)
+    text += yamlfile.dumps(plant.plain())
     temporary = path.with_name(path.name + ".part")
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
