@@ -22,6 +22,7 @@ SLOWEST_S, FASTEST_S, LOSS = 0.3, 0.005, 0.01
 # Two answers of 0.3 s, one of them lost and its 0.5 s waited for, three times in a row: (3 x 0.5 + 2 x 0.3) s and room.
 STALE_S, TIMEOUT_S = 3.0, 0.5
 MOVE_EVERY_S, TRAVEL_UM = 20.0, (60.0, -60.0, 0.0)
+MOST_STALLS = 2  # a machine that stands still more often proves nothing about the rigs
 
 
 def slow_rig(rigs: Rigs, name: str) -> None:
@@ -87,7 +88,7 @@ def _watch(rigs: Rigs, seconds: float) -> tuple[bool, str]:
                     f"{status['state']} after {time.monotonic() - begin:.0f} s: {sorted(fault_names(status))}"
                 )
                 still = seen["stood_s"] > STOOD_S or time.monotonic() < still_until
-                if not still and "loop_late" not in fault_names(status):
+                if not still or stood == MOST_STALLS:
                     wrong = f"rig {name}: {why}"
                     break
                 print(
@@ -136,8 +137,8 @@ def main() -> int:
             f"{os.cpu_count()} processors). Each Modbus answer takes {FASTEST_S * 1e3:.0f} to {SLOWEST_S * 1e3:.0f} ms; one in "
             f"{1 / LOSS:.0f} is lost. Limits are those of config/wire.yaml. Readings of these devices may be {STALE_S:g} s old, "
             "since two slow answers and a lost one take that long. The stage moves every 20 s. The coil is watched behind "
-            f"the wire every millisecond. Where the machine stood still (the emulators fell silent, or loop_late) the rig is armed "
-            f"again and this is counted.\n\n{head}{lines}\n"
+            f"the wire every millisecond. Where the machine stood still (the emulators fell silent for {STOOD_S * 1e3:.0f} ms) the "
+            f"rig is armed again and this is counted; {MOST_STALLS} times at most.\n\n{head}{lines}\n"
         )
     return 0 if good else 1
 

@@ -2,7 +2,7 @@
 """The clock of the loop: CLOCK_MONOTONIC in nanoseconds, and sleeping until a point of it.
 
 Absolute clock_nanosleep keeps the phase whatever a tick took, and is the best of the ways to wait that were measured
-(docs/why-cython.md); the interpreter's lock is released meanwhile.
+(docs/explanation/why-cython.md). The interpreter's lock is released meanwhile.
 """
 from posix.time cimport CLOCK_MONOTONIC, CLOCK_REALTIME, clock_gettime, timespec
 

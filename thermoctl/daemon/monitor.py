@@ -208,7 +208,7 @@ def ramp_of(console: Console) -> str:
 
 
 def look(path: str, with_latency: bool = True) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """Ask the daemon for status and latency; without a daemon return a status that says so."""
+    """Ask the daemon for status and latency; without a daemon return an empty status with the reason."""
     try:
         return ask(path, {"command": "status"}), ask(path, {"command": "latency"}) if with_latency else None
     except InputError as e:

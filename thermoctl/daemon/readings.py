@@ -129,7 +129,7 @@ def _messages(
 
     They come from its channels that are invalid now, or were invalid since the fault began.
     """
-    roles: dict[str, list[str]] = {}  # by what is said: a lost device says the same for each channel
+    roles: dict[str, list[str]] = {}  # by message: a lost device gives each channel the same one
     texts: dict[str, str] = {}
     for role in causes.channels_of(fault.name):
         r = found[role]
