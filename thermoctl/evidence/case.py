@@ -52,7 +52,6 @@ class Case:
     outputs: tuple[tuple[int, ...], ...]  # per measured output its channels
     grids: tuple[Grid, ...]
     remainder: Remainder
-    cells: tuple[np.ndarray, ...]
     budget: Budget
     notes: list[str] = field(default_factory=list)
 
@@ -90,12 +89,20 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
         null,
         coordinates,
         tuple(ks for _, ks in measured),
-        tuple(grid([coordinates.channels[k] for k in ks], ks, noise[j].sigma) for j, ks in measured),
+        tuple(
+            grid([coordinates.channels[k] for k in ks], ks, noise[j].sigma, _swing(drives, j))
+            for j, ks in measured
+        ),
         forces,
-        tuple(forces.cells(coordinates, [ks for _, ks in measured])),
         budget,
         [f"{dropped} single outliers were left out"] if dropped else [],
     )
+
+
+def _swing(drives: Sequence[Excitation], j: int) -> float:
+    """Root mean square of an output about its mean, over all recordings."""
+    values = np.concatenate([d.y[:, j] for d in drives])
+    return float(np.nanstd(values))
 
 
 def _without_outliers(

@@ -20,7 +20,7 @@ def explain(found: Mapping[str, Any]) -> str:
     for h in found["hypotheses"][:SHOWN]:
         name = " + ".join(h["effects"]) or "no effect"
         lines.append(
-            f"{h['log_evidence']:13.1f}{h['log_prior_odds']:12.1f}{h['posterior']:11.3f}{100 * h['remainder']:10.2g}%  {name}"
+            f"{h['log_evidence']:13.1f}{h['log_prior_odds']:12.1f}{h['posterior']:11.3f}{h['remainder']:11.3f}  {name}"
         )
     rest = len(found["hypotheses"]) - SHOWN
     if rest > 0:

@@ -9,6 +9,7 @@ Gauss and Newton's steps with the expected weights E[1/V], which are its exact g
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -17,7 +18,7 @@ import numpy as np
 from thermoctl.diagnose.effects import Candidate, EffectParameter
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.coordinates import Coordinates
-from thermoctl.evidence.noise import Averaged, Likely, averaged
+from thermoctl.evidence.noise import Averaged, averaged
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
@@ -124,12 +125,10 @@ class Posterior:
         c: Coordinates = self.case.coordinates
         return [c.transform(k, e[k.recording][:, k.output]) for k in c.channels]
 
-    def likelihood(
-        self, rows: Sequence[np.ndarray], likely: Likely | None = None
-    ) -> tuple[Averaged, list[np.ndarray]]:
-        """The averaged likelihood of residuals' rows (over likely cells only), and their powers."""
+    def likelihood(self, rows: Sequence[np.ndarray]) -> tuple[Averaged, list[np.ndarray]]:
+        """The averaged likelihood of residuals' rows, and their powers."""
         powers = self.case.coordinates.powers(rows)
-        return averaged(self.case.grids, powers, self.case.cells, self.case.remainder.prior, likely), powers
+        return averaged(self.case.grids, powers), powers
 
     def errors(self, z: np.ndarray) -> list[np.ndarray]:
         """Free-run errors. Raises SimulationError."""
@@ -186,7 +185,7 @@ class Posterior:
         now, powers = self.likelihood(rows)
         gradient, matrix = self.slope(z, rows, now.inverse)
         for left in range(ROUNDS, 0, -1):
-            base = self.likelihood(rows, now.likely)[0].log_likelihood + self.prior(z)
+            base = now.log_likelihood + self.prior(z)
             step, gained = _step(z, gradient, matrix, low, high), 0.0
             for length in LENGTHS:
                 trial = np.clip(z + length * step, low, high)
@@ -195,10 +194,10 @@ class Posterior:
                 except SimulationError:
                     continue
                 trial_rows = self.rows(e)
-                gained = self.likelihood(trial_rows, now.likely)[0].log_likelihood + self.prior(trial) - base
+                then, trial_powers = self.likelihood(trial_rows)
+                gained = then.log_likelihood + self.prior(trial) - base
                 if gained > 0:
-                    z, errors, rows = trial, e, trial_rows
-                    now, powers = self.likelihood(rows)
+                    z, errors, rows, now, powers = trial, e, trial_rows, then, trial_powers
                     gradient, matrix = self.slope(z, rows, now.inverse)
                     break
             if gained < ENOUGH or now.log_likelihood + left * gained < goal:
@@ -336,6 +335,17 @@ def _weighed(
         refit.updated(posterior.plant, rough, posterior.drives),
         rough,
     )
+
+
+def as_refitted(case: Case, f: Fitted) -> Fitted:
+    """The hypothesis as an ordinary refit in white noise leaves it: what the findings are compared with."""
+    rows = [
+        case.coordinates.transform(c, f.rough.residuals[c.recording][:, c.output])
+        for c in case.coordinates.channels
+    ]
+    powers = case.coordinates.powers(rows)
+    average = averaged(case.grids, powers)
+    return dataclasses.replace(f, plant=f.rough_plant, fit=f.rough, powers=tuple(powers), average=average)
 
 
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:

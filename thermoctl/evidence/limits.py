@@ -16,7 +16,6 @@ class Limits:
     shortlist: int
     effects: int
     fits: int
-    alpha: float
     missing: float
     rare: float
     name: float

@@ -1,171 +1,163 @@
-"""Log marginal likelihood of residuals: sensor noise and remainder averaged over a grid of spectra, not chosen.
+"""Log marginal likelihood of residuals: sensor noise and remainder averaged over their spectra, not chosen.
 
-In band b of an output's rows (coordinates.py), with n rows and power P = sum R^2, the variance is
+In band b of an output (coordinates.py; bands of its recordings at the same frequency are one), with n rows and power
+P = sum R^2, the variance of a row is
 
-    V_b = c^2 s^2 (1 + a S_b(tau)) + eta^2 F_b(tau')
-    log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
+    V_b = c^2 s^2 + q exp(u_b),   log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
 
-s: what the plant file states, c: how wrong that is (log-normal, Laplace's method), a and S: a slow part of the sensor's noise,
-first order or 1/f; F: the output's response to small random forces at the plant's nodes (remainder.py), eta their size. A slow
-part is one sensor's own; eta and tau' are common to all outputs:
+s: the noise that the plant file states; c: how wrong that is, log-normal. q exp(u_b): the remainder and every slow error of
+the sensor. Its logarithm is a random walk over the logarithm of frequency, so that its size is learnt at each frequency by
+itself, and smooth: what a wrong plant leaves at one frequency says little about another. What nobody will name is small:
+the share of the remainder's rms in the output's swing has a half-normal prior of width SMALL (q: that share, squared).
 
-    log p(R) = logsumexp_(eta, tau') [log w + sum over outputs of logsumexp_(a, tau) [log w + log p(R | V)]]
+    log p(R) = log [ABSENT p(R | no remainder) + (1 - ABSENT) p(R | remainder)],   each integrated over c and u by Laplace's method
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
-from thermoctl.evidence.coordinates import Channel
+from thermoctl.evidence.coordinates import WIDTH, Channel
 
 STATED = 1.0  # standard deviation of log c^2: a stated noise is wrong by a factor of 1.6 in one case of three
-STEPS, CLOSE = 15, 3e-3  # of Newton's method for log c^2, and the step that ends it
-SIZES = 10.0 ** np.arange(-0.9, 3.7, 0.65)  # a: variance of the slow part over that of the white part
-CORNERS = 4  # tau: from one sampling interval to a quarter of the recording
-RARE = 0.7  # nats that a slow part's standard deviation costs in units of the white part's: most are no larger than that
-PLAIN, FIRST_ORDER = (
-    0.4,
-    0.45,
-)  # prior of white noise, and of white noise with a first-order part; the rest is 1/f
-UNLIKELY = 1e-4  # posterior of a cell that a small step need not look at
+ABSENT = 0.5  # prior of no remainder at an output
+SMALL = 0.05  # of an output's swing: width of the prior of the remainder's rms
+LEVEL = 2 * np.log(10.0)  # standard deviation of u at the lowest frequency: a tenth to ten times SMALL
+DRAWS = 400  # of the random walk, for the prior's normalisation
+WALK = np.log(
+    4.0
+)  # standard deviation of u's step over an octave: 1/f^2, what one storage makes of a white force
+STEPS, CLOSE, LONGEST = 40, 1e-4, 2.0  # of Newton's method: their number, the step that ends it, the longest
 LOG_2PI = float(np.log(2 * np.pi))
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Spectra of one output over the bands of all its recordings. `slow`: (cells, bands) 1 + a S; `weight`: (cells,) log prior."""
+    """The frequencies of one output. `node`: of each band of all its recordings its frequency; `count`: rows at each."""
 
     channels: tuple[int, ...]  # positions in Coordinates.channels
+    node: np.ndarray
     count: np.ndarray
-    slow: np.ndarray
-    weight: np.ndarray
-    variance: float  # s^2
+    rough: np.ndarray  # (nodes, nodes) inverse covariance of u
+    log_rough: float  # its log determinant
+    log_small: float  # log of the half-normal's mean over the random walk
+    sigma: float  # s
+    swing: float
+
+    @property
+    def variance(self) -> float:
+        """s^2"""
+        return self.sigma**2
+
+    @property
+    def small(self) -> float:
+        """q"""
+        return (SMALL * self.swing) ** 2
 
 
-def first_order(frequency: np.ndarray, interval: float, tau: float) -> np.ndarray:
-    """Variance in the rows at these frequencies of a first-order process of unit variance, sampled at an interval."""
-    rho = np.exp(-interval / tau)
-    return (1 - rho**2) / (1 - 2 * rho * np.cos(2 * np.pi * frequency * interval) + rho**2)
-
-
-def flicker(c: Channel) -> np.ndarray:
-    """Variance in the bands of a 1/f process of unit variance over the channel's rows."""
-    n = c.rows * c.block
-    k = np.maximum(2 * c.frequency * c.interval * n, 0.5)
-    return n / (k * (np.log(n) + 0.58))
-
-
-def grid(channels: Sequence[Channel], positions: Sequence[int], sigma: float) -> Grid:
-    """The spectra of one output with a stated noise of `sigma`, `channels` its recordings."""
-    interval = float(np.median([c.interval for c in channels]))
-    span = max(c.interval * c.rows * c.block for c in channels)
-    shapes = [
-        np.concatenate([first_order(c.frequency, c.interval, tau) for c in channels])
-        for tau in np.geomspace(interval, 0.25 * span, CORNERS)
-    ]
-    rare = -RARE * np.sqrt(SIZES)
-    rare -= logsumexp(rare)
-    slow, weight = [np.ones(len(shapes[0]))], [np.log(PLAIN)]
-    for shape in shapes:
-        slow += [1 + a * shape for a in SIZES]
-        weight += list(np.log(FIRST_ORDER / CORNERS) + rare)
-    one_over_f = np.concatenate([flicker(c) for c in channels])
-    slow += [1 + a * one_over_f for a in SIZES]
-    weight += list(np.log(1 - PLAIN - FIRST_ORDER) + rare)
-    count = np.concatenate([c.count for c in channels]).astype(float)
-    return Grid(tuple(positions), count, np.array(slow), np.array(weight), sigma**2)
-
-
-@dataclass(frozen=True)
-class Likely:
-    """The grid's cells that hold nearly all of its posterior: of the remainder, and per output of the noise."""
-
-    remainder: np.ndarray
-    noise: tuple[np.ndarray, ...]
+def grid(channels: Sequence[Channel], positions: Sequence[int], sigma: float, swing: float) -> Grid:
+    """The frequencies of one output with a stated noise of `sigma` and a rms of `swing` about its mean; `channels`: its
+    recordings."""
+    octave = np.concatenate([np.log2(c.frequency) for c in channels])
+    cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)
+    known, node = np.unique(cells, return_inverse=True)
+    count = np.bincount(node, np.concatenate([c.count for c in channels]).astype(float))
+    apart = np.diff(known) * np.log2(WIDTH)
+    rough = np.zeros((len(known), len(known)))
+    rough[0, 0] = LEVEL**-2
+    for k, octaves in enumerate(apart):
+        rough[k : k + 2, k : k + 2] += np.array([[1, -1], [-1, 1]]) / (WALK**2 * octaves)
+    walks = np.linalg.solve(
+        np.linalg.cholesky(rough).T, np.random.default_rng(3).standard_normal((len(known), DRAWS))
+    )
+    log_small = float(logsumexp(-0.5 * count @ np.exp(walks) / count.sum()) - np.log(DRAWS))
+    log_rough = float(np.linalg.slogdet(rough)[1])
+    return Grid(tuple(positions), node, count, rough, log_rough, log_small, sigma, swing)
 
 
 @dataclass(frozen=True)
 class Averaged:
-    """A log marginal likelihood, and what follows from the grid's posterior. `inverse`: per channel E[1/V] in its bands;
-    `cells`: posterior of the remainder's cells; `sensor`: per output E[variance of its noise] in its bands."""
+    """A log marginal likelihood, and what follows. `inverse`: per channel E[1/V] in its bands; `sensor`: per output the
+    variance of its noise; `remainder`: per output the probability that there is one."""
 
     log_likelihood: float
     inverse: list[np.ndarray]
-    cells: np.ndarray
-    sensor: list[np.ndarray]
-    likely: Likely
+    sensor: list[float]
+    remainder: list[float]
 
 
-def averaged(
-    grids: Sequence[Grid],
-    powers: Sequence[np.ndarray],
-    remainder: Sequence[np.ndarray],
-    prior: np.ndarray,
-    likely: Likely | None = None,
-) -> Averaged:
-    """Average the likelihood of banded `powers` (one a channel) over noise and remainder. `remainder`: per output (cells, bands)
-    variance by cell; `prior`: (cells,) log weights of these cells; `likely`: only these cells count, a lower bound."""
-    if likely is not None:
-        remainder, prior = [q[likely.remainder] for q in remainder], prior[likely.remainder]
-        grids = [
-            dataclasses.replace(g, slow=g.slow[c], weight=g.weight[c])
-            for g, c in zip(grids, likely.noise, strict=True)
-        ]
-    parts = [
-        _output(g, np.concatenate([powers[k] for k in g.channels]), q)
-        for g, q in zip(grids, remainder, strict=True)
-    ]
-    by_cell = prior + sum(logsumexp(score, axis=1) for score, _, _ in parts)
-    total = float(logsumexp(by_cell))
-    cells = np.exp(by_cell - total)
+def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
+    """Average the likelihood of banded `powers` (one a channel) over noise and remainder."""
     inverse: list[np.ndarray] = [np.zeros(0)] * sum(len(g.channels) for g in grids)
-    sensor, noise = [], []
-    for g, (score, variance, own) in zip(grids, parts, strict=True):
-        p = cells[:, None] * np.exp(score - logsumexp(score, axis=1)[:, None])
-        mean = np.einsum("gc,gcb->b", p, 1 / variance)
+    total, sensor, present = 0.0, [], []
+    for g in grids:
+        power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels]))
+        none, own = _sensor_only(g, power)
+        some, level, variance = _with_remainder(g, power, own)
+        total += float(np.logaddexp(np.log(ABSENT) + none, np.log(1 - ABSENT) + some))
+        p = 1 / (1 + np.exp(np.clip(none - some, -500, 500)) * ABSENT / (1 - ABSENT))
+        mean = ((1 - p) / own + p / variance)[g.node]
         at = 0
         for k in g.channels:
             inverse[k] = mean[at : at + len(powers[k])]
             at += len(powers[k])
-        sensor.append(np.einsum("gc,gcb->b", p, own))
-        noise.append(np.flatnonzero(p.sum(axis=0) > UNLIKELY))
-    if likely is not None:
-        return Averaged(total, inverse, cells, sensor, likely)
-    return Averaged(total, inverse, cells, sensor, Likely(np.flatnonzero(cells > UNLIKELY), tuple(noise)))
+        sensor.append((1 - p) * own + p * level)
+        present.append(float(p))
+    return Averaged(total, inverse, sensor, present)
 
 
-def _output(g: Grid, power: np.ndarray, remainder: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Log (prior x likelihood) of one output by (remainder's cell, noise's cell), the variances and the noise's share of them."""
-    slow, extra = g.variance * g.slow[None], remainder[:, None, :]
-    fast = slice(len(g.count) // 2, None)  # most rows, and least of what is slow
-    rows = g.count[fast].sum()
-    level = max(float(power[fast].sum()) / rows / g.variance, 1e-9) / (
-        (g.slow[:, fast] * g.count[fast]).sum(axis=1) / rows
-    )
-    u = np.tile(np.log(level), (extra.shape[0], 1))
+def _sensor_only(g: Grid, power: np.ndarray) -> tuple[float, float]:
+    """Log p(R | no remainder), and the noise's variance."""
+    n, ratio = float(g.count.sum()), float(power.sum()) / g.variance
+    v = np.log(max(ratio / n, 1e-6))
     for _ in range(STEPS):
-        own = np.exp(u)[:, :, None] * slow
-        share = own / (own + extra)
-        slope = -0.5 * (share * (g.count - power * share / own)).sum(axis=2) - u / STATED**2
-        step = slope / (0.5 * (g.count * share**2).sum(axis=2) + 1 / STATED**2)
-        u = u + np.clip(step, -1.0, 1.0)
-        if np.max(np.abs(step)) < CLOSE:
+        step = (0.5 * (ratio * np.exp(-v) - n) - v / STATED**2) / (0.5 * n + STATED**-2)
+        v += np.clip(step, -LONGEST, LONGEST)
+        if abs(step) < CLOSE:
             break
-    own = np.exp(u)[:, :, None] * slow
-    variance = own + extra
-    share = own / variance
-    bend = 0.5 * (g.count * share**2).sum(axis=2) + 1 / STATED**2
-    score = (
-        -0.5 * (g.count * np.log(variance) + power / variance).sum(axis=2)
-        - 0.5 * g.count.sum() * LOG_2PI
-        - 0.5 * (u / STATED) ** 2
-        - np.log(STATED)
-        - 0.5 * np.log(bend)
-        + g.weight
-    )
-    return score, variance, own
+    own = g.variance * np.exp(v)
+    score = -0.5 * (n * (LOG_2PI + np.log(own)) + power.sum() / own) - 0.5 * (v / STATED) ** 2
+    return float(score - np.log(STATED) - 0.5 * np.log(0.5 * n + STATED**-2)), float(own)
+
+
+def _with_remainder(g: Grid, power: np.ndarray, own: float) -> tuple[float, float, np.ndarray]:
+    """Log p(R | remainder), the noise's variance, and each frequency's variance: Fisher's scoring for (log c^2, u)."""
+    n, rows, size = g.count, float(g.count.sum()), len(g.count) + 1
+    x = np.concatenate([[0.0], np.log(np.maximum(power / n - own, 0.05 * own) / g.small)])
+
+    def density(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        noise, rest = g.variance * np.exp(x[0]), g.small * np.exp(x[1:])
+        v, parts = noise + rest, n * np.exp(x[1:]) / rows
+        log_p = -0.5 * float(np.sum(n * np.log(v) + power / v + parts)) - 0.5 * (x[0] / STATED) ** 2
+        return log_p - 0.5 * float(x[1:] @ g.rough @ x[1:]), noise / v, v, parts
+
+    now, sensor, v, parts = density(x)
+    for _ in range(STEPS):
+        pull = 0.5 * (power / v - n)
+        push = g.rough @ x[1:] + 0.5 * parts
+        gradient = np.concatenate([[sensor @ pull - x[0] / STATED**2], (1 - sensor) * pull - push])
+        h = np.zeros((size, size))
+        h[0, 0] = 0.5 * (n @ sensor**2) + STATED**-2
+        h[0, 1:] = h[1:, 0] = 0.5 * n * sensor * (1 - sensor)
+        h[1:, 1:] = g.rough
+        h[range(1, size), range(1, size)] += 0.5 * n * (1 - sensor) ** 2 + 0.5 * parts
+        step = np.clip(cho_solve(cho_factor(h), gradient), -LONGEST, LONGEST)
+        for _ in range(8):
+            then = density(x + step)
+            if then[0] >= now:
+                break
+            step *= 0.5
+        else:
+            break
+        gain = then[0] - now
+        x, (now, sensor, v, parts) = x + step, then
+        if gain < CLOSE:
+            break
+    score = now - 0.5 * rows * LOG_2PI - np.log(STATED) + 0.5 * g.log_rough - g.log_small
+    score -= float(np.sum(np.log(np.diag(cho_factor(h)[0]))))
+    return float(score), float(g.variance * np.exp(x[0])), v

@@ -15,16 +15,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoctl.evidence.coordinates import Coordinates
-from thermoctl.evidence.noise import first_order
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation, Model
 
-SHARES = 10.0 ** np.arange(-3.5, -0.9, 0.5)  # eta
+SHARES = 10.0 ** np.arange(-3.5, 1.1, 0.5)  # eta
 SMALL = 0.02  # mean of eta's exponential prior: what nobody will name is a few per cent of what flows
 CORNERS = 3  # tau', from a fortieth to a quarter of the longest recording: what is faster is late, not lost, and a sensor's slow part
 ABSENT = 0.5  # prior of no remainder
 DRAWS = 8  # random forces a node
+
+
+def first_order(frequency: np.ndarray, interval: float, tau: float) -> np.ndarray:
+    """Variance in the rows at these frequencies of a first-order process of unit variance, sampled at an interval."""
+    rho = np.exp(-interval / tau)
+    return (1 - rho**2) / (1 - 2 * rho * np.cos(2 * np.pi * frequency * interval) + rho**2)
 
 
 @dataclass(frozen=True)

@@ -35,15 +35,11 @@ class Diagnosis:
     searched: Searched
     posterior: Posterior
     best: Fitted
+    null: Fitted  # as an ordinary refit leaves it
     left: Left
     before: Left
     worth: Worth
     decision: Decision
-
-    @property
-    def null(self) -> Fitted:
-        """The plant refitted without any effect."""
-        return next(w.fitted for w in self.searched.tried if not w.fitted.hypothesis.effects)
 
     @property
     def shown(self) -> tuple[Placed, ...]:
@@ -171,15 +167,16 @@ def _before(d: Diagnosis) -> dict[str, float]:
 
 def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
     """Every hypothesis that was fitted, the likeliest first."""
-    null = d.null.log_evidence
+    null = next(w.fitted.log_evidence for w in d.searched.tried if not w.fitted.hypothesis.effects)
     return [
         {
             "effects": [f"{e} at {w}" for e, w in sorted(w.fitted.hypothesis.keys)],
             "log_evidence": w.fitted.log_evidence - null,
             "log_prior_odds": w.log_odds,
             "posterior": d.posterior.hypotheses.get(w.fitted.hypothesis.keys, 0.0),
-            "remainder": float(w.fitted.average.cells @ d.case.remainder.share),
+            "remainder": max(w.fitted.average.remainder),
             "rms": w.fitted.fit.rms(),
+            "cost": w.fitted.rough.cost,
             "at_bound": w.fitted.fit.at_bound,
         }
         for w in d.searched.tried

@@ -10,6 +10,7 @@ from typing import Any
 from thermoctl.diagnose.effects import CATALOGUE, Effect, catalogue
 from thermoctl.evidence.case import Budget, case
 from thermoctl.evidence.decide import Facts, decide, weigh
+from thermoctl.evidence.fit import as_refitted
 from thermoctl.evidence.held_out import split, worth
 from thermoctl.evidence.limits import Limits, limits
 from thermoctl.evidence.result import Diagnosis, contract
@@ -33,17 +34,18 @@ def diagnose(
     known = case(plant, chosen_on, entries, Budget(numbers.fits, numbers.fits))
     searched = search(known, numbers)
     posterior = weigh({w.fitted.hypothesis.keys: w.score for w in searched.tried}, numbers)
-    best, null = (
-        searched.tried[0].fitted,
-        next(w.fitted for w in searched.tried if not w.fitted.hypothesis.effects),
-    )
+    best = searched.tried[0].fitted
+    null = as_refitted(known, next(w.fitted for w in searched.tried if not w.fitted.hypothesis.effects))
+    if not best.hypothesis.effects:
+        best = null
     after, before = left(known, best), left(known, null)
     value = worth(known, null, best, reserve)
     named = tuple(e.key for e in best.hypothesis.effects if posterior.effects[e.key] >= numbers.name)
-    ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects else 1.0
+    # what took part in the choice cannot speak against it
+    ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects and value.reserved else 1.0
     facts = Facts(posterior.something, named, max(after.over_noise.values()), closed(before, after), ratio)
     return Diagnosis(
-        known, searched, posterior, best, after, before, value, decide(posterior, facts, numbers)
+        known, searched, posterior, best, null, after, before, value, decide(posterior, facts, numbers)
     )
 
 

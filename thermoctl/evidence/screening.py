@@ -1,8 +1,7 @@
-"""The score test of every catalogue entry at every place, from one fitted hypothesis, in the metric of the sensors' noise."""
+"""The score test of every catalogue entry at every place, from one fitted hypothesis, beside its noise and remainder."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,20 +10,20 @@ from thermoctl.diagnose.effects import candidates
 from thermoctl.diagnose.screen import Direction, Metric, screen
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.coordinates import Coordinates
-from thermoctl.evidence.fit import Fitted
+from thermoctl.evidence.fit import Fitted, as_refitted
+from thermoctl.evidence.noise import averaged, grid
 from thermoctl.evidence.roles import Structure
 from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
 
 ROWS, MOVING_ROWS = 6_000, 16_000  # of all outputs in all recordings; what moves needs the finer ones
-DRAWS = 100  # of noise, for the chance of the best direction
+PROMISED = 30  # directions whose gain in log likelihood is predicted
 
 
 class Rows(Metric):
-    """Whitened rows of a fitted hypothesis: DCT rows over the standard deviation of the sensors' noise in them."""
+    """Whitened rows of a refitted hypothesis: DCT rows over the standard deviation of noise and remainder in them."""
 
-    def __init__(self, case: Case, fitted: Fitted, most: int, share: float):
-        """`share`: of the remainder that counts as noise, too."""
+    def __init__(self, case: Case, fitted: Fitted, most: int):
         self.fit, self.model = fitted.rough, fitted.rough.model
         self.drives = [self.model.excitation(t) for t in case.tables]
         self.problem = Problem(self.model, self.drives, case.noise)
@@ -32,7 +31,13 @@ class Rows(Metric):
             self.model.prepare(d, values)
         self.blocks = 1
         self.coordinates = Coordinates(self.drives, max(most // len(case.coordinates.channels), 32))
-        self.weights = _weights(case, fitted, self.coordinates, share)
+        channels = self.coordinates.channels
+        self.grids = []
+        for g in case.grids:
+            output = case.coordinates.channels[g.channels[0]].output
+            ks = [k for k, c in enumerate(channels) if c.output == output]
+            self.grids.append(grid([channels[k] for k in ks], ks, g.sigma, g.swing))
+        self.weights = _weights(case, fitted, self.coordinates)
         self.runs, columns = [], []
         for r, d in enumerate(self.drives):
             run = self.model.run(d, self.fit.values[r], self.fit.dx0[r], sensitivities=True)
@@ -55,6 +60,7 @@ class Rows(Metric):
         u, s, _ = np.linalg.svd(scaled, full_matrices=False)
         self.basis = u[:, s > 1e-6 * s[0]] if len(s) else u
         self.residual = self.project(np.concatenate(residual))
+        self.now = self.log_likelihood(self.residual)
 
     def rows(self, r: int, e: np.ndarray) -> np.ndarray:
         """(N, outputs, ...) of recording r as whitened rows of all its channels."""
@@ -65,41 +71,47 @@ class Rows(Metric):
                 parts.append(x * w.reshape(-1, *([1] * (x.ndim - 1))))
         return np.concatenate(parts)
 
+    def log_likelihood(self, rows: np.ndarray) -> float:
+        """Of whitened rows (all recordings, one after the other), noise and remainder averaged."""
+        edges = np.cumsum([len(w) for w in self.weights])[:-1]
+        plain = [x / w for x, w in zip(np.split(rows, edges), self.weights, strict=True)]
+        return averaged(self.grids, self.coordinates.powers(plain)).log_likelihood
 
-def _weights(case: Case, fitted: Fitted, coordinates: Coordinates, share: float) -> list[np.ndarray]:
+    def promise(self, d: Direction) -> float:
+        """Gain in log likelihood that the direction's first-order step promises."""
+        if d.vector is None or d.gain <= 0:
+            return 0.0
+        v = d.vector.astype(float)
+        return self.log_likelihood(self.residual - v * (v @ self.residual)) - self.now
+
+
+def _weights(case: Case, fitted: Fitted, coordinates: Coordinates) -> list[np.ndarray]:
     """One over the standard deviation of each row (rows,) of each channel."""
-    noise: dict[tuple[int, int], np.ndarray] = {}
-    for g, variance in zip(case.grids, fitted.average.sensor, strict=True):
-        at = 0
-        for k in g.channels:
-            c = case.coordinates.channels[k]
-            own = variance[at : at + len(c.count)]
-            noise[c.recording, c.output] = (1 - share) * own + share / fitted.average.inverse[k]
-            at += len(c.count)
-    known = {(c.recording, c.output): c for c in case.coordinates.channels}
+    inverse = as_refitted(case, fitted).average.inverse
+    known = {(c.recording, c.output): k for k, c in enumerate(case.coordinates.channels)}
     out = []
     for c in coordinates.channels:
-        full = known[c.recording, c.output]
-        v = np.interp(np.log(c.frequency), np.log(full.frequency), np.log(noise[c.recording, c.output]))
-        out.append(np.exp(-0.5 * v)[c.band])
+        k = known[c.recording, c.output]
+        v = np.interp(np.log(c.frequency), np.log(case.coordinates.channels[k].frequency), np.log(inverse[k]))
+        out.append(np.exp(0.5 * v)[c.band])
     return out
 
 
 @dataclass(frozen=True)
 class Screened:
-    """The entries' best directions, best first, and the chance that noise alone gives one as good as the best."""
+    """The entries' best directions, and what each promises: a gain in log likelihood."""
 
     metric: Rows
     rig: Structure
     directions: list[Direction]
-    p_any: float
+    promises: list[float]
 
 
-def screened(case: Case, fitted: Fitted, share: float = 0.0) -> Screened:
+def screened(case: Case, fitted: Fitted) -> Screened:
     """Screen the catalogue, at the places of the plant as it came: what is missing is the rig's, not an effect's."""
     case.budget.screenings_done += 1
     moving = bool(Structure(case.plant, [], []).velocities) if case.plant.nodes else False
-    metric = Rows(case, fitted, MOVING_ROWS if moving else ROWS, share)
+    metric = Rows(case, fitted, MOVING_ROWS if moving else ROWS)
     rig = Structure(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()
@@ -109,18 +121,8 @@ def screened(case: Case, fitted: Fitted, share: float = 0.0) -> Screened:
         for c in candidates(rig, case.catalogue)
         if c.key not in fitted.hypothesis.keys and not c.place.parts() & added
     ]
-    draws = np.random.default_rng(1).standard_normal((len(metric.sketch(metric.residual[:, None])), DRAWS))
-    ranked, chance = screen(metric, rig, found, draws)
-    return Screened(metric, rig, ranked, _p_any(ranked, chance))
-
-
-def _p_any(ranked: Sequence[Direction], chance: np.ndarray | None) -> float:
-    """Chance of a direction as good as the best: the draws' smallest p tell how many independent ones there are."""
-    if not ranked or chance is None:
-        return 1.0
-    p = np.clip(10.0 ** np.asarray(chance), 0.0, 1 - 1e-9)
-    trials = max(1.0, -len(p) / float(np.sum(np.log1p(-p))))
-    return float(-np.expm1(trials * np.log1p(-min(10.0 ** ranked[0].log_p, 1 - 1e-9))))
+    best = screen(metric, rig, found)[0][:PROMISED]
+    return Screened(metric, rig, best, [metric.promise(d) for d in best])
 
 
 def places(case: Case) -> dict[str, set[str]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from thermoctl.diagnose.effects import PLACES, Candidate
 from thermoctl.diagnose.screen import Direction, sharpened
-from thermoctl.diagnose.search import extend, finalists, sticking, weaker
+from thermoctl.diagnose.search import extend, sticking, weaker
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.fit import Fitted, Placed, fitted
 from thermoctl.evidence.limits import Limits
@@ -23,6 +23,8 @@ from thermoctl.yamlfile import InputError
 
 EVENTS = ("onsets", "windows")  # shapes that happen at one moment
 PAIR = 2
+HALF = 2.0  # times its first-order promise that a refit may gain
+PLACES_EACH = 3  # of one effect in a shortlist
 ALIKE = 0.999  # cosine of two directions, above which they are one
 START = 10.0  # times that a start which nobody measured is less certain than the catalogue says
 
@@ -42,11 +44,10 @@ class Weighed:
 
 @dataclass(frozen=True)
 class Searched:
-    """All hypotheses tried, best first; whether the budget ended the search; the chance of what the null leaves."""
+    """All hypotheses tried, best first; whether the budget ended the search."""
 
     tried: tuple[Weighed, ...]
     truncated: bool
-    p_null: float
 
 
 def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limits) -> float:
@@ -70,27 +71,22 @@ def _class(c: Candidate, limits: Limits) -> float:
 
 
 def search(case: Case, limits: Limits) -> Searched:
-    """Extend the beam's best hypotheses until no extension is significant, or none is better, or the budget is spent."""
+    """Extend the beam's best hypotheses until no extension promises to pay its prior odds, or the budget is spent."""
     where = places(case)
     null = Weighed(fitted(case, case.plant, (), case.null), 0.0)
     tried: dict[frozenset[tuple[str, str]], Weighed] = {frozenset(): null}
-    beam, p_null, seen = [null], 1.0, set()
+    beam, seen = [null], set()
     for _ in range(limits.effects):
         best = beam[0].score
         for parent in beam:
-            if parent.fitted.hypothesis.keys in seen:
-                continue
-            seen.add(parent.fitted.hypothesis.keys)
-            looked = screened(case, parent.fitted)
-            if parent is null:
-                p_null = looked.p_any
-            if looked.p_any < limits.alpha:
-                for w in extensions(case, parent, looked, where, limits, tried):
+            if parent.fitted.hypothesis.keys not in seen:
+                seen.add(parent.fitted.hypothesis.keys)
+                for w in extensions(case, parent, where, limits, tried):
                     tried[w.fitted.hypothesis.keys] = w
         beam = leaders(list(tried.values()), limits)
         if beam[0].score <= best or case.budget.spent:
             break
-    return Searched(tuple(sorted(tried.values(), key=lambda w: -w.score)), case.budget.spent, p_null)
+    return Searched(tuple(sorted(tried.values(), key=lambda w: -w.score)), case.budget.spent)
 
 
 def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
@@ -126,25 +122,64 @@ def _free_member(c: Candidate, side: str) -> bool:
 def extensions(
     case: Case,
     parent: Weighed,
-    looked: Screened,
     where: Mapping[str, set[str]],
     limits: Limits,
     tried: Mapping[frozenset[tuple[str, str]], Weighed],
 ) -> list[Weighed]:
     """The parent with each direction of the shortlist, and with each pair that explains more than its parts, refitted."""
     out: list[Weighed] = []
-    kept = [d for d in looked.directions if not relabels(d.candidate)]
-    singles = [(d,) for d in finalists(kept, limits.shortlist)]
-    for added in [*singles, *pairs(kept, looked, limits)]:
+    looked = screened(case, parent.fitted)
+    leading = max(w.score for w in tried.values())
+    queue = shortlist(looked, where, limits)
+    for added, gain in queue:
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
         if keys in tried or len(keys) > limits.effects or case.budget.spent:
             continue
+        if parent.score + HALF * gain < leading:
+            continue
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
-        found = [f for f in _followed(case, parent, looked, added, leader) if not f.absent]
+        fits = _followed(case, parent, looked, added, leader)
+        found = [f for f in fits if not f.absent]
         if found:
             best = max(found, key=lambda f: f.log_evidence)
             out.append(Weighed(best, odds(best.hypothesis.effects, where, limits)))
+        if len(found) < len(fits):
+            queued = {d.candidate.key for ds, _ in queue for d in ds}
+            queue += [((d,), gain) for d in simpler(added, looked) if d.candidate.key not in queued]
     return out
+
+
+def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
+    """The entries with fewer parameters at the same places: a part that is not significant is left to them."""
+    return [
+        d
+        for d in looked.directions
+        if any(
+            d.candidate.place.where == a.candidate.place.where
+            and len(d.candidate.effect.parameters) < len(a.candidate.effect.parameters)
+            for a in added
+        )
+        and d.gain > 0
+    ]
+
+
+def shortlist(
+    looked: Screened, where: Mapping[str, set[str]], limits: Limits
+) -> list[tuple[tuple[Direction, ...], float]]:
+    """The directions that promise to pay their prior odds, the best first and at most PLACES_EACH of an effect, then pairs; each
+    with the gain in score that it promises."""
+    paying = []
+    for d, promise in zip(looked.directions, looked.promises, strict=True):
+        gain = promise + odds((Placed(d.candidate, {}),), where, limits)
+        if gain > 0 and not relabels(d.candidate):
+            paying.append((d, gain))
+    paying.sort(key=lambda x: -x[1])
+    out: list[tuple[tuple[Direction, ...], float]] = []
+    for d, gain in paying:
+        if sum(o.candidate.effect is d.candidate.effect for (o,), _ in out) < PLACES_EACH:
+            out.append(((d,), gain))
+    out = [(d, gain) for d, gain in out[: limits.shortlist] if HALF * gain > out[0][1]]
+    return [*out, *((p, np.inf) for p in pairs([d for d, _ in paying], looked, limits))]
 
 
 def pairs(directions: Sequence[Direction], looked: Screened, limits: Limits) -> list[tuple[Direction, ...]]:

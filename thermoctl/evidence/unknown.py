@@ -9,17 +9,15 @@ from scipy.special import logsumexp
 
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.fit import Fitted
-from thermoctl.evidence.noise import averaged
-from thermoctl.evidence.remainder import SHARES, signals
+from thermoctl.evidence.remainder import signals
 
 CORRELATED, SHOWN = 0.4, 3  # correlation from which a signal is told, and how many are
 
 
 @dataclass(frozen=True)
 class Left:
-    """The residual beside the sensors' noise. `rms`, `over_noise`: by output; `node`: where forces explain it best, None where
-    errors of the sensors do; `log_odds`: of that node against the second best; `share`: of the node's typical
-    flow; `follows`: signals that the residual goes with."""
+    """The residual beside the sensors' noise. `rms`, `over_noise`: by output; `node`: where forces explain it best;
+    `log_odds`: of that node against the others; `share`: of the node's typical flow; `follows`: signals that the residual goes with."""
 
     rms: dict[str, float]
     noise: dict[str, float]
@@ -33,42 +31,40 @@ class Left:
 def left(case: Case, f: Fitted) -> Left:
     """Measure what a fitted hypothesis leaves, and locate it."""
     rms, noise, over = {}, {}, {}
-    for g, sensor in zip(case.grids, f.average.sensor, strict=True):
+    for g, own in zip(case.grids, f.average.sensor, strict=True):
         name = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) / g.count.sum()
-        own = max(
-            float(sensor.min()), g.variance
-        )  # the white part; a slow part that is not stated is no sensor's
+        own = max(own, g.variance)
         rms[name] = float(np.sqrt(max(power - own, 0.0)))
         noise[name] = float(np.sqrt(own))
         over[name] = float(np.sqrt(power / own))
-    scores, shares = [], []
-    for i in range(-1, len(case.remainder.nodes)):
-        cells = (
-            case.cells
-            if i < 0
-            else case.remainder.cells(case.coordinates, [g.channels for g in case.grids], i)
-        )
-        if i < 0:
-            cells = tuple(c[:1] for c in cells)
-        prior = case.remainder.prior[:1] * 0.0 if i < 0 else np.full(len(cells[0]), -np.log(len(cells[0])))
-        found = averaged(case.grids, f.powers, cells, prior)
-        scores.append(found.log_likelihood)
-        shares.append(float(found.cells @ case.remainder.share[: len(found.cells)]))
-    order = np.argsort(scores)[::-1]
-    best = int(order[0])
-    rest = float(logsumexp([scores[k] for k in order[1:]])) if len(order) > 1 else -np.inf
-    node = case.remainder.nodes[best - 1] if best else None
+    node, log_odds, share = _located(case, f)
     worst = max(over, key=lambda o: over[o]) if over else ""
     return Left(
-        rms,
-        noise,
-        over,
-        node,
-        scores[best] - rest if np.isfinite(rest) else 0.0,
-        min(shares[best], float(SHARES[-1])),
-        follows(case, f, worst) if over and over[worst] > 1 else (),
+        rms, noise, over, node, log_odds, share, follows(case, f, worst) if over and over[worst] > 1 else ()
     )
+
+
+def _located(case: Case, f: Fitted) -> tuple[str | None, float, float]:
+    """The node whose random forces explain the residuals best, its log odds against the others, the forces' typical size."""
+    outputs = [g.channels for g in case.grids]
+    scores, shares = [], []
+    for i in range(len(case.remainder.nodes)):
+        by_cell = np.zeros(len(case.remainder.share))
+        for g, own, cells in zip(
+            case.grids, f.average.sensor, case.remainder.cells(case.coordinates, outputs, i), strict=True
+        ):
+            count = np.concatenate([case.coordinates.channels[k].count for k in g.channels])
+            power = np.concatenate([f.powers[k] for k in g.channels])
+            by_cell -= 0.5 * (count * np.log(own + cells) + power / (own + cells)).sum(axis=1)
+        total = float(logsumexp(by_cell))
+        scores.append(total)
+        shares.append(float(np.exp(by_cell - total) @ case.remainder.share))
+    if not scores:
+        return None, 0.0, 0.0
+    best = int(np.argmax(scores))
+    rest = [s for k, s in enumerate(scores) if k != best]
+    return case.remainder.nodes[best], scores[best] - float(logsumexp(rest)) if rest else 0.0, shares[best]
 
 
 def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:
