@@ -68,7 +68,7 @@ def hour(minutes: float) -> tuple[bool, str]:
 
 
 def _watch(rigs: Rigs, seconds: float) -> tuple[bool, str]:
-    begin, moves, stood, wrong, still_until = time.monotonic(), 0, 0, "", 0.0
+    begin, moves, stood, wrong, still_until, tripped = time.monotonic(), 0, 0, "", 0.0, 0.0
     warned: dict[str, set[str]] = {"A": set(), "B": set()}
     while time.monotonic() < begin + seconds and not wrong:
         if time.monotonic() > begin + moves * MOVE_EVERY_S:
@@ -89,9 +89,8 @@ def _watch(rigs: Rigs, seconds: float) -> tuple[bool, str]:
                     f"{status['state']} after {time.monotonic() - begin:.0f} s: {sorted(fault_names(status))}"
                 )
                 still = seen["stood_s"] > STOOD_S or time.monotonic() < still_until
-                if still and time.monotonic() > still_until:  # else the other rig has shown this stall
-                    stood += 1
-                    still_until = time.monotonic() + 1.0
+                if still and time.monotonic() > tripped + 1.0:  # else the other rig has shown this stall
+                    stood, tripped = stood + 1, time.monotonic()
                 if not still or stood > MOST_STALLS:
                     wrong = f"rig {name}: {why}"
                     break
