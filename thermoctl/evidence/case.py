@@ -13,7 +13,7 @@ from thermoctl.diagnose.effects import Effect
 from thermoctl.evidence.coordinates import Coordinates
 from thermoctl.evidence.noise import Grid, grid
 from thermoctl.evidence.remainder import Remainder, remainder
-from thermoctl.evidence.roles import motions
+from thermoctl.evidence.roles import Structure
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Noise, default_noise, fit
 from thermoctl.plant.simulate import Excitation, Model, compile_plant
@@ -81,7 +81,8 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
         for j in range(len(model.outputs))
     ]
     measured = [(j, ks) for j, ks in enumerate(outputs) if ks]
-    forces = remainder(model, drives, null.values, null.dx0, coordinates, set(motions(plant).values()))
+    rig = Structure(plant, drives, [t.columns for t in tables])
+    forces = remainder(model, drives, null.values, null.dx0, coordinates, set(rig.pairs.values()))
     return Case(
         plant,
         tuple(tables),
@@ -94,7 +95,7 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
         forces,
         tuple(forces.cells(coordinates, [ks for _, ks in measured])),
         budget,
-        [f"{dropped} single outliers were left out"] if dropped else [],
+        [*([f"{dropped} single outliers were left out"] if dropped else []), *rig.guesses()],
     )
 
 
