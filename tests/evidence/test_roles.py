@@ -67,7 +67,8 @@ outputs:
 """
 
 
-def _rig() -> Rig:
+def blocks() -> Rig:
+    """Two heated blocks and a rod, with a column that nothing reads."""
     t = np.arange(0.0, 600.0, 10.0)
     columns = {
         "t": t,
@@ -105,7 +106,7 @@ def _places(rig: Rig) -> set[tuple[str, str, int, tuple[str, ...]]]:
 
 @pytest.mark.parametrize("other", [names, kelvin, milliwatt])
 def test_every_effect_has_the_same_places_whatever_the_names_and_units(other):
-    rig = _rig()
+    rig = blocks()
     assert _places(other(rig)) == _places(rig)
 
 
@@ -113,7 +114,7 @@ def test_the_order_of_keys_decides_nothing_but_the_order_of_pairs():
     def unordered(rig: Rig) -> set:
         return {(e, frozenset(w.split("-")), v, s) for e, w, v, s in _places(rig)}
 
-    assert unordered(order(_rig())) == unordered(_rig())
+    assert unordered(order(blocks())) == unordered(blocks())
 
 
 def _values(c: Candidate) -> dict[str, float]:
@@ -151,7 +152,7 @@ def _changes(rig: Rig) -> dict[tuple, tuple[dict, dict]]:
 
 
 def test_an_effect_changes_a_plant_alike_in_degc_and_in_kelvin():
-    celsius, absolute = _changes(_rig()), _changes(kelvin(_rig()))
+    celsius, absolute = _changes(blocks()), _changes(kelvin(blocks()))
     assert celsius.keys() == absolute.keys() and len(celsius) > 40
     for key, parts in celsius.items():
         for one, other in zip(parts, absolute[key], strict=True):
@@ -162,7 +163,7 @@ def test_an_effect_changes_a_plant_alike_in_degc_and_in_kelvin():
 
 def test_an_effect_of_heat_has_the_unit_of_the_plants_heat_flows():
     for change, unit, capacity in ((lambda r: r, "W/K", "J/K"), (milliwatt, "mW/K", "mJ/K")):
-        _, rig, _ = _read(change(_rig()))
+        _, rig, _ = _read(change(blocks()))
         mass = next(c for c in candidates(rig, catalogue()) if c.key == ("hidden_thermal_mass", "near"))
         parameters = mass.extend({"G": 0.1, "C": 5.0}).parameters
         assert [parameters[mass.own(p)].unit for p in ("G", "C")] == [unit, capacity]
@@ -201,7 +202,7 @@ def test_a_role_stands_above_unit_and_structure():
 
 
 def test_the_ambient_that_most_losses_are_counted_from_is_taken_and_said():
-    for rig in (_rig(), order(_rig())):
+    for rig in (blocks(), order(blocks())):
         structure = _read(rig)[1]
         assert structure.air == "air"
         assert any(n.startswith("'air' is taken as the ambient") and "wall" in n for n in structure.guesses())

@@ -1,8 +1,8 @@
 """The remainder: small random forces at every node that stores something, in every hypothesis.
 
 A force of unit variance, white from sample to sample, at node i gives output j the variance F_ij(b) in band b: measured on the
-plant linearised along its own trajectory (`Model.respond`), by the mean of a few fixed random draws. A slow force (first order,
-time constant tau') and its size eta, a share of the node's typical flow, scale it:
+plant linearised along its own trajectory (`Model.respond`), by a few forces that share out the rows of the DCT among them.
+A slow force (first order, time constant tau') and its size eta, a share of the node's typical flow, scale it:
 
     V_j(b) = eta^2 sum_i F_ij(b) S_b(tau')          eta = 0: no remainder
 """
@@ -13,8 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import idct
 
-from thermoctl.evidence.coordinates import Coordinates
+from thermoctl.evidence.coordinates import Coordinates, band_edges
 from thermoctl.evidence.noise import first_order
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
@@ -24,7 +25,7 @@ SHARES = 10.0 ** np.arange(-3.5, -0.9, 0.5)  # eta
 SMALL = 0.02  # mean of eta's exponential prior: what nobody will name is a few per cent of what flows
 CORNERS = 3  # tau', from a fortieth to a quarter of the longest recording: what is faster is late, not lost, and a sensor's slow part
 ABSENT = 0.5  # prior of no remainder
-DRAWS = 8  # random forces a node
+FORCES = 8  # a node; each holds every eighth band, two octaves apart, so that its bands' responses do not mix
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,14 @@ def signals(model: Model, d: Excitation, values: np.ndarray, x: np.ndarray) -> d
     }
 
 
+def white_forces(n: int) -> np.ndarray:
+    """Return forces (n, FORCES) that together hold each row of the DCT once, with size 1 and a fixed random sign."""
+    band = np.repeat(np.arange(len(band_edges(n)) - 1), np.diff(band_edges(n)))
+    rows = np.zeros((n, FORCES))
+    rows[np.arange(n), band % FORCES] = np.random.default_rng(23).choice([-1.0, 1.0], n)
+    return idct(rows, axis=0, norm="ortho")
+
+
 def remainder(
     model: Model,
     drives: Sequence[Excitation],
@@ -95,21 +104,21 @@ def remainder(
         if n not in skip and any(n in (f.source, f.target) for f in model.plant.flows.values())
     )
     white: dict[int, np.ndarray] = {}
-    random = np.random.default_rng(23)
     trajectories = [
         signals(model, d, values[r], model.run(d, values[r], dx0[r]).x) for r, d in enumerate(drives)
     ]
     size = [typical_flow(model.plant, n, trajectories) for n in nodes]
     for r, d in enumerate(drives):
         forces, q = [], []
+        white_force = white_forces(len(d.t))
         for i, n in enumerate(nodes):
             storage = np.broadcast_to(
                 np.asarray(ex.evaluate(model.plant.nodes[n].storage, trajectories[r]), float), d.t.shape
             )
-            for k in range(DRAWS):
-                forces.append((model.states.index(n), i * DRAWS + k))
-                q.append(random.standard_normal(len(d.t)) * size[i] / storage)
-        count = len(nodes) * DRAWS
+            for k in range(FORCES):
+                forces.append((model.states.index(n), i * FORCES + k))
+                q.append(white_force[:, k] * size[i] / storage)
+        count = len(nodes) * FORCES
         dy = model.respond(d, values[r], dx0[r], forces, np.stack(q, axis=1), count) if count else None
         for k, c in enumerate(coordinates.channels):
             if c.recording != r:
@@ -118,7 +127,7 @@ def remainder(
             if dy is not None:
                 rows = coordinates.transform(c, dy[:, c.output]) ** 2
                 mean = np.stack([np.bincount(c.band, column) for column in rows.T]) / c.count
-                white[k] = mean.reshape(len(nodes), DRAWS, -1).mean(axis=1)
+                white[k] = mean.reshape(len(nodes), FORCES, -1).sum(axis=1)
     span = max(float(d.t[-1] - d.t[0]) for d in drives)
     intervals = [float(np.median(np.diff(d.t))) for d in drives]
     taus = np.geomspace(span / 40, span / 4, CORNERS)
