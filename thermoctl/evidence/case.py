@@ -72,7 +72,7 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
             f"output ({', '.join(o.column for o in plant.outputs.values())}); {LEAST} or more are needed"
         )
     noise = default_noise(plant, drives)
-    null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2)
+    null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
     tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
     drives = [model.excitation(t) for t in tables]
     coordinates = Coordinates(drives)

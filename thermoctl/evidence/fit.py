@@ -271,6 +271,7 @@ def fitted(
             tolerance=ROUGH,
             goal=best.rough.cost if best else np.inf,
             priors=posterior.problem.priors,
+            seconds=np.inf,
         )
     goal = best.log_likelihood - HOPELESS if best else -np.inf
     z, average, powers, matrix, errors = posterior.climb(start.z, goal)

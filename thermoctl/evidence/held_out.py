@@ -96,7 +96,9 @@ def _crossed(case: Case, f: Fitted) -> dict[str, float]:
         model = compile_plant(f.plant)
         drives = [model.excitation(t) for t in train]
         try:
-            found = refit.fit(model, drives, case.noise, iterations=10, tolerance=1e-3, priors=f.fit.priors)
+            found = refit.fit(
+                model, drives, case.noise, iterations=10, tolerance=1e-3, priors=f.fit.priors, seconds=np.inf
+            )
             for r, t in enumerate(case.tables):
                 d = model.excitation(_masked(t, measured, 1 - parity))
                 errors.append(d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y)
