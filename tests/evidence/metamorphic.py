@@ -260,18 +260,22 @@ def thinned(rig: Rig) -> Rig:
     held = [n for n, linear in rig.inputs().items() if not linear]
 
     def change(c: Columns) -> Columns:
-        smooth = {n: v[1:-1] if n == "t" else np.convolve(v, KERNEL, "valid") for n, v in c.items()}
-        rows = slice(0, len(smooth["t"]) - 1, 2)
-        jump = np.zeros(len(c["t"]) - 1, bool)
+        smooth = {n: v if n == "t" else _smooth(v) for n, v in c.items()}
+        jump = np.zeros(len(c["t"]) + 3, bool)
         for n in held:
-            jump |= np.abs(np.diff(c[n])) > JUMP * np.ptp(c[n])
-        beside = np.convolve(jump, np.ones(4), "full")[2 : len(smooth["t"]) + 2] > 0
+            jump[2:-2] |= np.abs(np.diff(c[n])) > JUMP * np.ptp(c[n])
+        beside = jump[:-3] | jump[1:-2] | jump[2:-1] | jump[3:]
         for n in rig.outputs():
             smooth[n] = np.where(beside, np.nan, smooth[n])
         means = {n: 0.5 * (smooth[n][:-1] + smooth[n][1:]) for n in held}
-        return {n: means.get(n, v)[rows] for n, v in smooth.items()}
+        return {n: means.get(n, v)[: len(c["t"]) - 1 : 2] for n, v in smooth.items()}
 
     return _map(rig, change)
+
+
+def _smooth(v: np.ndarray) -> np.ndarray:
+    """A signal (N,) after the filter; its ends as they were, since a recording's start is stated."""
+    return np.concatenate([v[:1], np.convolve(v, KERNEL, "valid"), v[-1:]])
 
 
 def noise_stated(factor: float) -> Callable[[Rig], Rig]:
@@ -336,6 +340,19 @@ CHANGES: dict[str, tuple[Change | None, Change]] = {
     "doubled": (None, noise_stated(2.0)),
     "cut": (one_of_unknown_start, cut),
 }
+
+
+def together(*changes: Change) -> Callable[[Rig], Rig]:
+    """Several changes, one after the other."""
+
+    def change(rig: Rig) -> Rig:
+        for c in changes:
+            changed = c(rig)
+            assert changed is not None
+            rig = Rig(changed.plant, changed.recordings, changed.back or rig.back)
+        return rig
+
+    return change
 
 
 # ------------------------------------------------------------------------------------------------------ diagnosing

@@ -14,6 +14,7 @@ from thermoctl.evidence.held_out import split, worth
 from thermoctl.evidence.limits import Limits, limits
 from thermoctl.evidence.result import Diagnosis, contract
 from thermoctl.evidence.search import search
+from thermoctl.evidence.threads import one_thread
 from thermoctl.evidence.unknown import Left, left
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
@@ -21,6 +22,7 @@ from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 
 
+@one_thread()
 def diagnose(
     plant: Plant,
     tables: Sequence[Table],
