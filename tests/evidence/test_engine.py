@@ -99,6 +99,8 @@ def test_a_lag_is_named_with_its_size_and_nothing_beside_it(lagged):
     (tau,) = found["findings"][0]["parameters"].values()
     assert abs(tau["value"] - 25) < 3 * tau["sd"] + 0.5
     assert found["fit"]["after"]["reading"] == pytest.approx(0.1, rel=0.1)
+    held_out = [found["fit"][f"held_out_{k}"]["reading"] for k in ("before", "refit_only", "after")]
+    assert sorted(held_out, reverse=True) == held_out
 
 
 def test_names_carry_no_meaning(lagged, tmp_path):

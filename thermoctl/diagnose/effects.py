@@ -19,7 +19,7 @@ import numpy as np
 from thermoctl import yamlfile
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
-from thermoctl.plant.language import Flow, Input, Node, Parameter, Plant
+from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
 from thermoctl.plant.refit import Prior
 from thermoctl.plant.simulate import Excitation, Simulation
 from thermoctl.plant.units import dimension
@@ -59,7 +59,9 @@ _SHAPES = (
     "distances",
 )
 STRAIGHT = "_straight"  # what an input that holds is called where it goes on straight lines
-TEMPERATURE = {"degC", "K", "kelvin", "celsius", "degree_Celsius", "delta_degC", "°C"}
+KELVIN = {"K", "kelvin"}
+ZERO_DEGC = 273.15  # K
+TEMPERATURE = {"degC", "celsius", "degree_Celsius", "delta_degC", "°C", *KELVIN}
 
 
 @dataclass(frozen=True)
@@ -213,6 +215,7 @@ _KINDS = {
     "time": "s",
     "rotation": "1/s",
     "voltage": "V",
+    "power": "W",
 }
 
 
@@ -227,6 +230,14 @@ def _dimension(unit: str | None) -> str:
     except ValueError:
         return ""
     return next((kind for kind, like in _KINDS.items() if dimension(like) == found), "")
+
+
+def zero_of(unit: str | None) -> float:
+    """The reading of 0 degC in a unit of temperature."""
+    return ZERO_DEGC if unit in KELVIN else 0.0
+
+
+_ROLE_KINDS = {"ambient": "temperature", "position": "length"}  # the other roles are kinds of their own
 
 
 # Nodes that an effect brought to model a reading (lag, memory of the start): no body, so no physics can sit there.
@@ -254,14 +265,12 @@ class Rig:
         )
         self.physics = p
         self.temperatures = [
-            n.name
-            for n in p.nodes.values()
-            if _dimension(n.unit) == "temperature" and not _READINGS.match(n.name)
+            n.name for n in p.nodes.values() if self.kind(n) == "temperature" and not _READINGS.match(n.name)
         ]
         self.velocities = [
             n.name
             for n in p.nodes.values()
-            if _dimension(n.unit) in ("velocity", "rotation")
+            if self.kind(n) in ("velocity", "rotation")
             and any(f.target == n.name or f.source == n.name for f in p.flows.values())
         ]
         self.position_of: dict[str, str] = {}
@@ -289,7 +298,7 @@ class Rig:
             if i in p.inputs and any(np.ptp(d.u[:, j]) > 0 for d in drives)
         }
         self.moving_inputs = moving
-        self.heat_inputs = [i for i in p.inputs if _dimension(p.inputs[i].unit) == "temperature"]
+        self.heat_inputs = [i for i in p.inputs if self.kind(p.inputs[i]) == "temperature"]
         named = [
             i
             for i in self.heat_inputs
@@ -297,6 +306,10 @@ class Rig:
             and not re.search(r"start|initial", i, re.I)
         ]
         self.air = next(iter(named), None) or self._coolest()
+
+    def kind(self, q: Input | Node | Output) -> str:
+        """Return the kind of a quantity, from its role or else its unit; empty where neither has one."""
+        return _ROLE_KINDS.get(q.role, q.role) if q.role else _dimension(q.unit)
 
     def _coolest(self) -> str | None:
         """The temperature input that losses of heat are counted from."""
@@ -307,6 +320,13 @@ class Rig:
                         return i
         return self.heat_inputs[0] if self.heat_inputs else None
 
+    def first_air(self, d: Excitation) -> float:
+        """The ambient at a recording's start, degC; 0 without one."""
+        air = self.air or ""
+        known = self.plant.parameters.get(air) or self.plant.inputs.get(air)
+        start = d.first.get(air, known.value if isinstance(known, Parameter) else 0.0)
+        return start - zero_of(known.unit) if known else start
+
     def signals(self, kind: str, near: str | None = None) -> list[str]:
         """Names that can stand for v, x, i or T: nodes, inputs, recorded columns (which become inputs)."""
         p = self.physics
@@ -315,7 +335,7 @@ class Rig:
                 return [near]  # type: ignore[list-item]
             found = [
                 *self.velocities,
-                *(i for i in p.inputs if _dimension(p.inputs[i].unit) in ("velocity", "rotation")),
+                *(i for i in p.inputs if self.kind(p.inputs[i]) in ("velocity", "rotation")),
             ]
             return (found or [c for c in self.spare if re.search(r"veloc|speed|^v$", c, re.I)])[:3]
         if kind == "x":
@@ -323,14 +343,12 @@ class Rig:
                 return [self.position_of[near]]  # type: ignore[index]
             if self.position_of:
                 return list(self.position_of.values())
-            found = [
-                i for i in p.inputs if _dimension(p.inputs[i].unit) == "length" and i in self.moving_inputs
-            ]
-            found += [n.name for n in p.nodes.values() if _dimension(n.unit) == "length"]
+            found = [i for i in p.inputs if self.kind(p.inputs[i]) == "length" and i in self.moving_inputs]
+            found += [n.name for n in p.nodes.values() if self.kind(n) == "length"]
             return (found or [c for c in self.spare if re.search(r"posit|stroke|travel|^x$", c, re.I)])[:3]
         if kind == "i":
-            found = [n.name for n in p.nodes.values() if _dimension(n.unit) == "current"]
-            found += [i for i in p.inputs if _dimension(p.inputs[i].unit) == "current"]
+            found = [n.name for n in p.nodes.values() if self.kind(n) == "current"]
+            found += [i for i in p.inputs if self.kind(p.inputs[i]) == "current"]
             return (found or [c for c in self.spare if re.search(r"current|^i$", c, re.I)])[:2]
         found = [*self.temperatures, *(i for i in self.heat_inputs if i in self.moving_inputs)]
         return found + [c for c in self.spare if re.search(r"temp|_c$|^t_", c, re.I)]
@@ -353,8 +371,7 @@ class Rig:
             for i in self.physics.inputs
             if i in ex.names(f.rate)
             and i in self.moving_inputs
-            and _dimension(self.physics.inputs[i].unit)
-            not in ("temperature", "length", "velocity", "rotation")
+            and self.kind(self.physics.inputs[i]) not in ("temperature", "length", "velocity", "rotation")
         ]
 
 
@@ -471,17 +488,17 @@ def _drives(rig: Rig) -> Iterator[Place]:
 
 def _sensors(rig: Rig, dimension: str | None = None) -> Iterator[Place]:
     for o in rig.physics.outputs.values():
-        if dimension is None or _dimension(o.unit) == dimension:
+        if dimension is None or rig.kind(o) == dimension:
             yield Place(o.name, {"y": o.value}, output=o.name)
     for i in rig.physics.inputs.values():
-        if i.name in rig.moving_inputs and (dimension is None or _dimension(i.unit) == dimension):
+        if i.name in rig.moving_inputs and (dimension is None or rig.kind(i) == dimension):
             yield Place(i.name, {"y": name(i.name)}, input=i.name)
 
 
 def _displacements(rig: Rig) -> Iterator[Place]:
     warm = set(rig.temperatures) | set(rig.heat_inputs)
     for o in rig.physics.outputs.values():
-        if _dimension(o.unit) == "length" and ex.names(o.value) & warm:
+        if rig.kind(o) == "length" and ex.names(o.value) & warm:
             yield Place(o.name, {"y": o.value}, output=o.name)
 
 
@@ -501,10 +518,10 @@ def _bending_pairs(rig: Rig) -> Iterator[Place]:
 
 def _voltages(rig: Rig) -> Iterator[Place]:
     for o in rig.physics.outputs.values():
-        if _dimension(o.unit) == "voltage" and not _sources(rig, o.name):
+        if rig.kind(o) == "voltage" and not any(_sources(rig, n) for n in ex.names(o.value)):
             yield Place(o.name, {"y": o.value}, output=o.name)
     for n in rig.physics.nodes.values():
-        if _dimension(n.unit) == "current":
+        if rig.kind(n) == "current":
             yield Place(n.name, {}, {"a": n.name})
 
 
@@ -585,7 +602,7 @@ class Candidate:
 
     def bounds(self, p: EffectParameter) -> tuple[float, float]:
         """Where physics lets a parameter be."""
-        origin = self.rig.drives[0].first.get(self.rig.air or "", 0.0) if p.origin == "first_air" else 0.0
+        origin = self.rig.first_air(self.rig.drives[0]) if p.origin == "first_air" else 0.0
         return origin + p.low, origin + p.high
 
     @property
@@ -606,7 +623,7 @@ class Candidate:
         for d in self.rig.drives:
             known = {
                 "duration": num(float(d.t[-1] - d.t[0])),
-                "first_air": num(d.first.get(self.rig.air or "", 0.0)),
+                "first_air": num(self.rig.first_air(d)),
                 **{
                     p.name: name(self.own(p.name))
                     for p in self.effect.parameters
@@ -711,11 +728,13 @@ class _Builder:
             self.symbols.setdefault("air", name(self.rig.air))
         place = c.place
         y = place.symbols.get("y")
+        for symbol in self.symbols.keys() & {"T", "TA", "TB", "air"}:
+            self.symbols[symbol] = self._celsius(self.symbols[symbol])
         if y is not None:
-            warm = self._unit_of_y() in TEMPERATURE and self.rig.air
-            self.symbols["reference"] = (
-                name(self.rig.air or "") if warm and self.rig.air not in ex.names(y) else num(0.0)
-            )
+            warm = self._unit_of_y() in TEMPERATURE and self.rig.air and self.rig.air not in ex.names(y)
+            air = name(self.rig.air or "")
+            shift = zero_of(self._unit_of_y()) - zero_of(self._signal_unit(air))
+            self.symbols["reference"] = ex.add(air, num(shift)) if warm else num(0.0)
         dts = [float(np.median(np.diff(d.t))) for d in self.rig.drives if len(d.t) > 1]
         self.symbols["duration"] = num(max((float(d.t[-1]) for d in self.rig.drives), default=1.0))
         self.symbols["sample"] = num(float(f"{min(dts):.6g}") if dts else 1.0)
@@ -744,6 +763,10 @@ class _Builder:
         if signal in self.rig.spare and signal not in self.inputs:
             self.inputs[signal] = Input(signal, None, signal, False)
 
+    def _celsius(self, e: Expr) -> Expr:
+        """A temperature as the catalogue's forms count it."""
+        return ex.add(e, num(-zero_of(self._signal_unit(e))))
+
     def _unit_of_y(self) -> str | None:
         p = self.c.place
         return (
@@ -757,7 +780,7 @@ class _Builder:
     def _signal_unit(self, e: Expr | None) -> str | None:
         if e is None or e.op != "name":
             return None
-        for table in (self.base.nodes, self.base.inputs):
+        for table in (self.base.nodes, self.base.inputs, self.base.parameters):
             if e.value in table:
                 return table[e.value].unit  # type: ignore[index]
         return None
@@ -784,7 +807,15 @@ class _Builder:
                 if unit is None:
                     return None
                 text = text.replace(key, "K" if unit in TEMPERATURE and text != key else unit)
-        return text
+        return re.sub(r"\b(?=[WJ]\b)", self._prefix(), text)
+
+    def _prefix(self) -> str:
+        """The m of mW where the heat flows of the place are counted so."""
+        place = self.c.place
+        flow = self.base.flows.get(place.flow or "")
+        ends = {*place.nodes.values(), *((flow.source, flow.target) if flow else ())}
+        units = (f.unit or "" for f in self.base.flows.values() if {f.source, f.target} & ends - {None})
+        return next((u[:-1] for u in units if _dimension(u) == "power" and u.endswith("W")), "")
 
     def expression(self, text: str | float) -> Expr:
         """A form of the catalogue with its symbols filled in."""
@@ -882,7 +913,7 @@ class _Builder:
 
             initial = ex.substitute(source, start)
         elif text == "first_air":
-            initial = name(self.rig.air or "")
+            initial = self.symbols["air"]
         else:
             initial = self.expression(what["initial"])
         self.nodes[label] = Node(

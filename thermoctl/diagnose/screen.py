@@ -402,7 +402,7 @@ def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float
         "s": s[0] if len(s) else 0.0,
         **{f"s{k + 1}": v for k, v in enumerate(s) if k},
         **shape,
-        "first_air": c.rig.drives[0].first.get(c.rig.air or "", 0.0),
+        "first_air": c.rig.first_air(c.rig.drives[0]),
     }
     out = {}
     for p in c.effect.parameters:

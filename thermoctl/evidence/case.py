@@ -12,8 +12,7 @@ from scipy.ndimage import median_filter
 from thermoctl.diagnose.effects import Effect
 from thermoctl.evidence.coordinates import Coordinates
 from thermoctl.evidence.noise import Grid, grid
-from thermoctl.evidence.remainder import Remainder, remainder
-from thermoctl.evidence.roles import motions
+from thermoctl.evidence.roles import Structure
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Noise, default_noise, fit
 from thermoctl.plant.simulate import Excitation, Model, compile_plant
@@ -41,7 +40,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Case:
-    """Everything that hypotheses are compared on. `remainder` and `grids` stay those of the plant as it came, refitted."""
+    """Everything that hypotheses are compared on. `coordinates` and `grids` stay the same for all."""
 
     plant: Plant
     tables: tuple[Table, ...]
@@ -51,7 +50,6 @@ class Case:
     coordinates: Coordinates
     outputs: tuple[tuple[int, ...], ...]  # per measured output its channels
     grids: tuple[Grid, ...]
-    remainder: Remainder
     budget: Budget
     notes: list[str] = field(default_factory=list)
 
@@ -71,7 +69,7 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
             f"output ({', '.join(o.column for o in plant.outputs.values())}); {LEAST} or more are needed"
         )
     noise = default_noise(plant, drives)
-    null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2)
+    null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
     tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
     drives = [model.excitation(t) for t in tables]
     coordinates = Coordinates(drives)
@@ -80,7 +78,7 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
         for j in range(len(model.outputs))
     ]
     measured = [(j, ks) for j, ks in enumerate(outputs) if ks]
-    forces = remainder(model, drives, null.values, null.dx0, coordinates, set(motions(plant).values()))
+    rig = Structure(plant, drives, [t.columns for t in tables])
     return Case(
         plant,
         tuple(tables),
@@ -93,9 +91,8 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
             grid([coordinates.channels[k] for k in ks], ks, noise[j].sigma, _swing(drives, j))
             for j, ks in measured
         ),
-        forces,
         budget,
-        [f"{dropped} single outliers were left out"] if dropped else [],
+        [*([f"{dropped} single outliers were left out"] if dropped else []), *rig.guesses()],
     )
 
 

@@ -42,6 +42,15 @@ class Channel:
         return len(self.band)
 
 
+def band_edges(rows: int) -> np.ndarray:
+    """Return the first row of each band, and the number of rows at the end."""
+    edges = list(range(min(SINGLE, rows)))
+    while edges[-1] < rows:
+        edges.append(max(edges[-1] + 1, int(edges[-1] * WIDTH)))
+    edges[-1] = rows
+    return np.array(edges)
+
+
 def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel | None:
     """Output j of recording r; at most about `most` rows (the lowest). None where too little was measured."""
     index = np.flatnonzero(np.isfinite(d.y[:, j]))
@@ -50,12 +59,9 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
     block = max(1, len(index) // (2 * most)) if most else 1
     n = len(index) // block
     rows = min(n, most or n)
-    edges = list(range(min(SINGLE, rows)))
-    while edges[-1] < rows:
-        edges.append(max(edges[-1] + 1, int(edges[-1] * WIDTH)))
-    edges[-1] = rows
+    edges = band_edges(rows)
     count = np.diff(edges)
-    middle = 0.5 * (np.array(edges[:-1]) + np.array(edges[1:]) - 1)
+    middle = 0.5 * (edges[:-1] + edges[1:] - 1)
     span = float(d.t[index[-1]] - d.t[index[0]]) * n * block / max(len(index) - 1, 1)
     return Channel(
         r,

@@ -34,6 +34,7 @@ ROUNDS = 15  # of Gauss and Newton's steps
 LENGTHS = 1.0, 0.3, 0.1  # of a step that are tried
 FAR = 8.0  # standard deviations that a start may be off
 HOPELESS = 50.0  # nats below the best hypothesis that a refit stays with all its steps still to come
+MOST = 0.9  # of a curvature that not knowing the spectrum may take
 ENOUGH = 0.05  # gain in the log posterior, below which no further step is taken
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -174,6 +175,27 @@ class Posterior:
         _, push, bend = self.problem.prior_terms(values, True)
         return gradient - self.precision * (z - self.mean) - push, matrix + np.diag(self.precision) + bend
 
+    def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
+        """By how much the second derivative falls short of E[1/V] J'J, since V itself is not known: the variance over V of the
+        gradient (Louis 1982)."""
+        out = np.zeros((len(z), len(z)))
+        channels = self.case.coordinates.channels
+        jacobians = [self.problem.jacobian(z, r) for r in range(len(self.drives))]
+        for g, unsure in zip(self.case.grids, average.unsure, strict=True):
+            pull = np.zeros((len(unsure), len(z)))
+            at = 0
+            for k in g.channels:
+                c = channels[k]
+                unknown, jac = jacobians[c.recording]
+                j = self.case.coordinates.transform(c, jac[:, c.output]) * rows[k][:, None]
+                node = g.node[at : at + len(c.count)][c.band]
+                at += len(c.count)
+                part = np.zeros((len(unsure), j.shape[1]))
+                np.add.at(part, node, j)
+                pull[:, unknown] += part
+            out += pull.T @ unsure @ pull
+        return out
+
     def climb(
         self, z: np.ndarray, goal: float
     ) -> tuple[np.ndarray, Averaged, list[np.ndarray], np.ndarray, list[np.ndarray]]:
@@ -270,6 +292,7 @@ def fitted(
             tolerance=ROUGH,
             goal=best.rough.cost if best else np.inf,
             priors=posterior.problem.priors,
+            seconds=np.inf,
         )
     goal = best.log_likelihood - HOPELESS if best else -np.inf
     z, average, powers, matrix, errors = posterior.climb(start.z, goal)
@@ -292,6 +315,7 @@ def _weighed(
     own = np.ones(len(z), bool)
     own[_gaussian(posterior)] = False
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
+    confined = _relieved(confined, posterior.relief(z, posterior.rows(errors), average))
     inverse = np.linalg.pinv(confined, hermitian=True)
     sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     names: dict[str, float] = {}
@@ -335,6 +359,17 @@ def _weighed(
         refit.updated(posterior.plant, rough, posterior.drives),
         rough,
     )
+
+
+def _relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
+    """matrix - relief, where no direction loses more than MOST of its curvature."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    w, q = np.linalg.eigh(matrix / np.outer(size, size))
+    root = q * np.sqrt(np.maximum(w, 1e-12))  # matrix = size root root' size
+    inner = np.linalg.solve(root, (relief / np.outer(size, size))) @ np.linalg.inv(root).T
+    share, p = np.linalg.eigh(0.5 * (inner + inner.T))
+    left = root @ (p * (1 - np.clip(share, 0.0, MOST))) @ p.T @ root.T
+    return left * np.outer(size, size)
 
 
 def as_refitted(case: Case, f: Fitted) -> Fitted:

@@ -21,9 +21,10 @@ BLOCKS = 16  # of recordings that are too few: fitted to every other one, checke
 
 @dataclass(frozen=True)
 class Worth:
-    """Root-mean-square errors per output of the plant refitted and with the findings. `reserved`: on recordings set aside;
-    otherwise cross-validated, on data that did take part in the choice."""
+    """Root-mean-square errors per output of the plant as it came, refitted, and with the findings. `reserved`: on recordings set
+    aside; otherwise cross-validated, on data that did take part in the choice."""
 
+    before: dict[str, float]
     refit_only: dict[str, float]
     after: dict[str, float]
     reserved: bool
@@ -51,12 +52,14 @@ def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> W
     """Errors on the reserve; without one, on every other block, the plants refitted to the rest."""
     if reserve:
         return Worth(
+            _rms([_errors(case, case.plant, t) for t in reserve], null.fit.model),
             _rms([_errors(case, null.plant, t) for t in reserve], null.fit.model),
             _rms([_errors(case, best.plant, t) for t in reserve], null.fit.model),
             True,
             tuple(t.name for t in reserve),
         )
-    return Worth(_crossed(case, null), _crossed(case, best), False, ())
+    before = _rms([_errors(case, case.plant, t) for t in case.tables], null.fit.model)
+    return Worth(before, _crossed(case, null), _crossed(case, best), False, ())
 
 
 def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:
@@ -96,7 +99,9 @@ def _crossed(case: Case, f: Fitted) -> dict[str, float]:
         model = compile_plant(f.plant)
         drives = [model.excitation(t) for t in train]
         try:
-            found = refit.fit(model, drives, case.noise, iterations=10, tolerance=1e-3, priors=f.fit.priors)
+            found = refit.fit(
+                model, drives, case.noise, iterations=10, tolerance=1e-3, priors=f.fit.priors, seconds=np.inf
+            )
             for r, t in enumerate(case.tables):
                 d = model.excitation(_masked(t, measured, 1 - parity, False))
                 errors.append(d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y)

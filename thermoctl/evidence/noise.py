@@ -83,22 +83,24 @@ def grid(channels: Sequence[Channel], positions: Sequence[int], sigma: float, sw
 @dataclass(frozen=True)
 class Averaged:
     """A log marginal likelihood, and what follows. `inverse`: per channel E[1/V] in its bands; `sensor`: per output the
-    variance of its noise; `remainder`: per output the probability that there is one."""
+    variance of its noise; `remainder`: per output the probability that there is one; `unsure`: per output the covariance of
+    1/V over its frequencies."""
 
     log_likelihood: float
     inverse: list[np.ndarray]
     sensor: list[float]
     remainder: list[float]
+    unsure: list[np.ndarray]
 
 
 def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
     """Average the likelihood of banded `powers` (one a channel) over noise and remainder."""
     inverse: list[np.ndarray] = [np.zeros(0)] * sum(len(g.channels) for g in grids)
-    total, sensor, present = 0.0, [], []
+    total, sensor, present, unsure = 0.0, [], [], []
     for g in grids:
         power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels]))
         none, own = _sensor_only(g, power)
-        some, level, variance = _with_remainder(g, power, own)
+        some, level, variance, spread = _with_remainder(g, power, own)
         total += float(np.logaddexp(np.log(ABSENT) + none, np.log(1 - ABSENT) + some))
         p = 1 / (1 + np.exp(np.clip(none - some, -500, 500)) * ABSENT / (1 - ABSENT))
         mean = ((1 - p) / own + p / variance)[g.node]
@@ -108,7 +110,9 @@ def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
             at += len(powers[k])
         sensor.append((1 - p) * own + p * level)
         present.append(float(p))
-    return Averaged(total, inverse, sensor, present)
+        apart = 1 / own - 1 / variance
+        unsure.append(p * spread + p * (1 - p) * np.outer(apart, apart))
+    return Averaged(total, inverse, sensor, present, unsure)
 
 
 def _sensor_only(g: Grid, power: np.ndarray) -> tuple[float, float]:
@@ -125,8 +129,9 @@ def _sensor_only(g: Grid, power: np.ndarray) -> tuple[float, float]:
     return float(score - np.log(STATED) - 0.5 * np.log(0.5 * n + STATED**-2)), float(own)
 
 
-def _with_remainder(g: Grid, power: np.ndarray, own: float) -> tuple[float, float, np.ndarray]:
-    """Log p(R | remainder), the noise's variance, and each frequency's variance: Fisher's scoring for (log c^2, u)."""
+def _with_remainder(g: Grid, power: np.ndarray, own: float) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """Log p(R | remainder), the noise's variance, each frequency's variance V, and the covariance of 1/V: Fisher's scoring for
+    (log c^2, u)."""
     n, rows, size = g.count, float(g.count.sum()), len(g.count) + 1
     x = np.concatenate([[0.0], np.log(np.maximum(power / n - own, 0.05 * own) / g.small)])
 
@@ -160,4 +165,5 @@ def _with_remainder(g: Grid, power: np.ndarray, own: float) -> tuple[float, floa
             break
     score = now - 0.5 * rows * LOG_2PI - np.log(STATED) + 0.5 * g.log_rough - g.log_small
     score -= float(np.sum(np.log(np.diag(cho_factor(h)[0]))))
-    return float(score), float(g.variance * np.exp(x[0])), v
+    moves = np.vstack([sensor / v, np.diag((1 - sensor) / v)])  # -d(1/V) / d(log c^2, u)
+    return (float(score), float(g.variance * np.exp(x[0])), v, moves.T @ cho_solve(cho_factor(h), moves))

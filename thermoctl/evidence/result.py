@@ -84,6 +84,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
                 "before": _before(d),
                 "refit_only": d.null.fit.rms(),
                 "after": (d.best if shown else d.null).fit.rms(),
+                "held_out_before": d.worth.before,
                 "held_out_refit_only": d.worth.refit_only,
                 "held_out_after": d.worth.after,
                 "held_out": "recordings " + ", ".join(d.worth.names)

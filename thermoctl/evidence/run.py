@@ -15,13 +15,15 @@ from thermoctl.evidence.held_out import split, worth
 from thermoctl.evidence.limits import Limits, limits
 from thermoctl.evidence.result import Diagnosis, contract
 from thermoctl.evidence.search import search
-from thermoctl.evidence.unknown import Left, left
+from thermoctl.evidence.threads import one_thread
+from thermoctl.evidence.unknown import Left, left, reached
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 
 
+@one_thread()
 def diagnose(
     plant: Plant,
     tables: Sequence[Table],
@@ -38,7 +40,8 @@ def diagnose(
     null = as_refitted(known, next(w.fitted for w in searched.tried if not w.fitted.hypothesis.effects))
     if not best.hypothesis.effects:
         best = null
-    after, before = left(known, best), left(known, null)
+    reach = reached(known)
+    after, before = left(known, best, reach), left(known, null, reach)
     value = worth(known, null, best, reserve)
     named = tuple(e.key for e in best.hypothesis.effects if posterior.effects[e.key] >= numbers.name)
     # what took part in the choice cannot speak against it
@@ -50,10 +53,12 @@ def diagnose(
 
 
 def closed(before: Left, after: Left) -> float:
-    """Share of the misfit's energy beyond the sensors' noise that is gone, each output in units of its noise."""
+    """Share of the misfit beyond the sensors' noise that is gone: of its energy (each output in units of its noise) or of the log
+    likelihood that it costs, whichever is larger. A slow error of a sensor has much of the one, a fast one of the other."""
     was = sum((before.rms[o] / before.noise[o]) ** 2 for o in before.rms)
     now = sum((after.rms[o] / before.noise[o]) ** 2 for o in after.rms)
-    return 1 - now / was if was > 0 else 1.0
+    energy = 1 - now / was if was > 0 else 1.0
+    return max(energy, 1 - after.loss / before.loss if before.loss > 0 else 1.0)
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:

@@ -79,10 +79,14 @@ def search(case: Case, limits: Limits) -> Searched:
     for _ in range(limits.effects):
         best = beam[0].score
         for parent in beam:
-            if parent.fitted.hypothesis.keys not in seen:
-                seen.add(parent.fitted.hypothesis.keys)
-                for w in extensions(case, parent, where, limits, tried):
-                    tried[w.fitted.hypothesis.keys] = w
+            if parent.fitted.hypothesis.keys in seen:
+                continue
+            seen.add(parent.fitted.hypothesis.keys)
+            found = extensions(case, parent, where, limits, tried)
+            if parent is beam[0] and not found:
+                break  # what nothing can be added to needs no rival with more effects
+            for w in found:
+                tried[w.fitted.hypothesis.keys] = w
         beam = leaders(list(tried.values()), limits)
         if beam[0].score <= best or case.budget.spent:
             break

@@ -9,62 +9,64 @@ from scipy.special import logsumexp
 
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.fit import Fitted
-from thermoctl.evidence.remainder import signals
+from thermoctl.evidence.noise import averaged
+from thermoctl.evidence.roles import Structure
+from thermoctl.evidence.where import Responses, responses, signals
 
 CORRELATED, SHOWN = 0.4, 3  # correlation from which a signal is told, and how many are
 
 
 @dataclass(frozen=True)
 class Left:
-    """The residual beside the sensors' noise. `rms`, `over_noise`: by output; `node`: where forces explain it best;
-    `log_odds`: of that node against the others; `share`: of the node's typical flow; `follows`: signals that the residual goes with."""
+    """The residual beside the sensors' noise. `rms`, `noise`, `over_noise`: by output; `loss`: log likelihood that it costs;
+    `node`: where forces explain it best; `follows`: signals that it goes with."""
 
     rms: dict[str, float]
     noise: dict[str, float]
     over_noise: dict[str, float]
+    loss: float
     node: str | None
-    log_odds: float
-    share: float
     follows: tuple[str, ...]
 
 
-def left(case: Case, f: Fitted) -> Left:
+def left(case: Case, f: Fitted, reach: Responses) -> Left:
     """Measure what a fitted hypothesis leaves, and locate it."""
     rms, noise, over = {}, {}, {}
-    for g, own in zip(case.grids, f.average.sensor, strict=True):
+    ideal = list(f.powers)
+    for g, learnt in zip(case.grids, f.average.sensor, strict=True):
         name = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) / g.count.sum()
-        own = max(own, g.variance)
+        own = max(learnt, g.variance)
         rms[name] = float(np.sqrt(max(power - own, 0.0)))
         noise[name] = float(np.sqrt(own))
         over[name] = float(np.sqrt(power / own))
-    node, log_odds, share = _located(case, f)
+        for k in g.channels:
+            ideal[k] = np.minimum(f.powers[k], learnt * case.coordinates.channels[k].count)
+    loss = averaged(case.grids, ideal).log_likelihood - f.average.log_likelihood
     worst = max(over, key=lambda o: over[o]) if over else ""
-    return Left(
-        rms, noise, over, node, log_odds, share, follows(case, f, worst) if over and over[worst] > 1 else ()
-    )
+    follow = follows(case, f, worst) if over and over[worst] > 1 else ()
+    return Left(rms, noise, over, loss, _node(case, f, reach), follow)
 
 
-def _located(case: Case, f: Fitted) -> tuple[str | None, float, float]:
-    """The node whose random forces explain the residuals best, its log odds against the others, the forces' typical size."""
-    outputs = [g.channels for g in case.grids]
-    scores, shares = [], []
-    for i in range(len(case.remainder.nodes)):
-        by_cell = np.zeros(len(case.remainder.share))
-        for g, own, cells in zip(
-            case.grids, f.average.sensor, case.remainder.cells(case.coordinates, outputs, i), strict=True
-        ):
+def reached(case: Case) -> Responses:
+    """How random forces at the nodes of the plant, refitted as it came, reach its outputs."""
+    model = case.null.model
+    rates = set(Structure(case.plant, [], []).pairs.values())  # positions store nothing
+    return responses(model, case.drives(model), case.null.values, case.null.dx0, case.coordinates, rates)
+
+
+def _node(case: Case, f: Fitted, reach: Responses) -> str | None:
+    """The node whose random forces explain the residuals best."""
+    scores = {}
+    for i, node in enumerate(reach.nodes):
+        by_cell = np.zeros(len(reach.share))
+        found = reach.cells(case.coordinates, [g.channels for g in case.grids], i)
+        for g, own, cells in zip(case.grids, f.average.sensor, found, strict=True):
             count = np.concatenate([case.coordinates.channels[k].count for k in g.channels])
             power = np.concatenate([f.powers[k] for k in g.channels])
             by_cell -= 0.5 * (count * np.log(own + cells) + power / (own + cells)).sum(axis=1)
-        total = float(logsumexp(by_cell))
-        scores.append(total)
-        shares.append(float(np.exp(by_cell - total) @ case.remainder.share))
-    if not scores:
-        return None, 0.0, 0.0
-    best = int(np.argmax(scores))
-    rest = [s for k, s in enumerate(scores) if k != best]
-    return case.remainder.nodes[best], scores[best] - float(logsumexp(rest)) if rest else 0.0, shares[best]
+        scores[node] = float(logsumexp(by_cell))
+    return max(scores, key=lambda n: scores[n]) if scores else None
 
 
 def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:

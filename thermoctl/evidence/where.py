@@ -1,10 +1,10 @@
-"""The remainder: small random forces at every node that stores something, in every hypothesis.
+"""Where a remainder enters: at which node small random forces would explain it best.
 
 A force of unit variance, white from sample to sample, at node i gives output j the variance F_ij(b) in band b: measured on the
-plant linearised along its own trajectory (`Model.respond`), by the mean of a few fixed random draws. A slow force (first order,
-time constant tau') and its size eta, a share of the node's typical flow, scale it:
+plant linearised along its own trajectory (`Model.respond`), by a few forces that share out the rows of the DCT among them.
+A slow force (first order, time constant tau) and its size eta, a share of the node's typical flow, scale it:
 
-    V_j(b) = eta^2 sum_i F_ij(b) S_b(tau')          eta = 0: no remainder
+    V_j(b) = c^2 s^2 + eta^2 F_ij(b) S_b(tau)
 """
 
 from __future__ import annotations
@@ -13,17 +13,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import idct
 
-from thermoctl.evidence.coordinates import Coordinates
+from thermoctl.evidence.coordinates import Coordinates, band_edges
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation, Model
 
 SHARES = 10.0 ** np.arange(-3.5, 1.1, 0.5)  # eta
-SMALL = 0.02  # mean of eta's exponential prior: what nobody will name is a few per cent of what flows
-CORNERS = 3  # tau', from a fortieth to a quarter of the longest recording: what is faster is late, not lost, and a sensor's slow part
-ABSENT = 0.5  # prior of no remainder
-DRAWS = 8  # random forces a node
+CORNERS = 3  # tau, from a fortieth to a quarter of the longest recording
+FORCES = 2  # a node; each holds every second band, so that neighbours' responses do not mix
 
 
 def first_order(frequency: np.ndarray, interval: float, tau: float) -> np.ndarray:
@@ -33,33 +32,28 @@ def first_order(frequency: np.ndarray, interval: float, tau: float) -> np.ndarra
 
 
 @dataclass(frozen=True)
-class Remainder:
-    """Variance of each output by cell (eta, tau') over the bands of its recordings, by node. `share`, `corner`: of each cell; the
-    first cell is no remainder."""
+class Responses:
+    """Variance of each output by node and cell (eta, tau) over the bands of its recordings."""
 
     nodes: tuple[str, ...]
     white: list[np.ndarray]  # per channel (nodes, bands)
-    share: np.ndarray
-    corner: np.ndarray
-    prior: np.ndarray
+    share: np.ndarray  # (cells,) eta
+    corner: np.ndarray  # (cells,) tau
     intervals: list[float]  # of the recordings
 
     def cells(
-        self, coordinates: Coordinates, outputs: Sequence[Sequence[int]], only: int | None = None
+        self, coordinates: Coordinates, outputs: Sequence[Sequence[int]], node: int
     ) -> list[np.ndarray]:
-        """(cells, bands) of each output, whose channels are given; of all nodes' forces, or of one node's only."""
-        out = []
-        for positions in outputs:
-            parts = []
-            for k in positions:
-                c = coordinates.channels[k]
-                white = self.white[k].sum(axis=0) if only is None else self.white[k][only]
-                rows = [np.zeros(len(c.count))]
-                for eta, tau in zip(self.share[1:], self.corner[1:], strict=True):
-                    rows.append(eta**2 * white * first_order(c.frequency, self.intervals[c.recording], tau))
-                parts.append(np.array(rows))
-            out.append(np.concatenate(parts, axis=1))
-        return out
+        """(cells, bands) of each output, whose channels are given, of one node's forces."""
+        return [
+            np.concatenate([self._channel(coordinates, k, node) for k in positions], axis=1)
+            for positions in outputs
+        ]
+
+    def _channel(self, coordinates: Coordinates, k: int, node: int) -> np.ndarray:
+        c = coordinates.channels[k]
+        slow = [first_order(c.frequency, self.intervals[c.recording], tau) for tau in self.corner]
+        return self.share[:, None] ** 2 * self.white[k][node] * np.array(slow)
 
 
 def typical_flow(plant: Plant, node: str, values: Sequence[Mapping[str, np.ndarray | float]]) -> float:
@@ -85,14 +79,22 @@ def signals(model: Model, d: Excitation, values: np.ndarray, x: np.ndarray) -> d
     }
 
 
-def remainder(
+def white_forces(n: int) -> np.ndarray:
+    """Return forces (n, FORCES) that together hold each row of the DCT once, with size 1 and a fixed random sign."""
+    band = np.repeat(np.arange(len(band_edges(n)) - 1), np.diff(band_edges(n)))
+    rows = np.zeros((n, FORCES))
+    rows[np.arange(n), band % FORCES] = np.random.default_rng(23).choice([-1.0, 1.0], n)
+    return idct(rows, axis=0, norm="ortho")
+
+
+def responses(
     model: Model,
     drives: Sequence[Excitation],
     values: np.ndarray,
     dx0: np.ndarray,
     coordinates: Coordinates,
     skip: set[str],
-) -> Remainder:
+) -> Responses:
     """The responses at these parameters (recordings, parameters); `skip`: nodes that store nothing (a position)."""
     nodes = tuple(
         n
@@ -100,21 +102,21 @@ def remainder(
         if n not in skip and any(n in (f.source, f.target) for f in model.plant.flows.values())
     )
     white: dict[int, np.ndarray] = {}
-    random = np.random.default_rng(23)
     trajectories = [
         signals(model, d, values[r], model.run(d, values[r], dx0[r]).x) for r, d in enumerate(drives)
     ]
     size = [typical_flow(model.plant, n, trajectories) for n in nodes]
     for r, d in enumerate(drives):
         forces, q = [], []
+        white_force = white_forces(len(d.t))
         for i, n in enumerate(nodes):
             storage = np.broadcast_to(
                 np.asarray(ex.evaluate(model.plant.nodes[n].storage, trajectories[r]), float), d.t.shape
             )
-            for k in range(DRAWS):
-                forces.append((model.states.index(n), i * DRAWS + k))
-                q.append(random.standard_normal(len(d.t)) * size[i] / storage)
-        count = len(nodes) * DRAWS
+            for k in range(FORCES):
+                forces.append((model.states.index(n), i * FORCES + k))
+                q.append(white_force[:, k] * size[i] / storage)
+        count = len(nodes) * FORCES
         dy = model.respond(d, values[r], dx0[r], forces, np.stack(q, axis=1), count) if count else None
         for k, c in enumerate(coordinates.channels):
             if c.recording != r:
@@ -123,19 +125,11 @@ def remainder(
             if dy is not None:
                 rows = coordinates.transform(c, dy[:, c.output]) ** 2
                 mean = np.stack([np.bincount(c.band, column) for column in rows.T]) / c.count
-                white[k] = mean.reshape(len(nodes), DRAWS, -1).mean(axis=1)
+                white[k] = mean.reshape(len(nodes), FORCES, -1).sum(axis=1)
     span = max(float(d.t[-1] - d.t[0]) for d in drives)
     intervals = [float(np.median(np.diff(d.t))) for d in drives]
     taus = np.geomspace(span / 40, span / 4, CORNERS)
-    share, corner = np.meshgrid(SHARES if nodes else SHARES[:0], taus, indexing="ij")
-    size = np.log(1 - ABSENT) - share.ravel() / SMALL
-    size -= np.log(len(taus)) + np.log(np.exp(-SHARES / SMALL).sum())
-    prior = np.concatenate([[np.log(ABSENT)], size]) if nodes else np.zeros(1)
-    return Remainder(
-        nodes,
-        [white[k] for k in range(len(coordinates.channels))],
-        np.concatenate([[0.0], share.ravel()]),
-        np.concatenate([[0.0], corner.ravel()]),
-        prior,
-        intervals,
+    share, corner = np.meshgrid(SHARES, taus, indexing="ij")
+    return Responses(
+        nodes, [white[k] for k in range(len(coordinates.channels))], share.ravel(), corner.ravel(), intervals
     )

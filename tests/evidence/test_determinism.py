@@ -1,0 +1,55 @@
+"""The same bytes of diagnosis.json on one thread and two, whatever the hash seed, on a loaded machine."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.linalg import blas
+
+from tests.evidence.test_engine import LAGGED, _write
+from thermoctl.evidence import run, threads
+from thermoctl.yamlfile import InputError
+
+
+def test_two_runs_at_once_on_one_and_on_two_threads_write_the_same_bytes(tmp_path):
+    files = _write(tmp_path / "case", LAGGED, 5)
+    plant = str(tmp_path / "case" / "plant.yaml")
+    outs, started = [tmp_path / "1", tmp_path / "2"], []
+    for n, out in enumerate(outs, 1):
+        env = os.environ | {
+            "OPENBLAS_NUM_THREADS": str(n),
+            "OMP_NUM_THREADS": str(n),
+            "PYTHONHASHSEED": str(n),
+        }
+        command = [sys.executable, "-m", "thermoctl.evidence", "--plant", plant, "--out", str(out), *files]
+        started.append(subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL))
+    assert [p.wait(timeout=300) for p in started] == [0, 0]
+    assert len({(out / "diagnosis.json").read_bytes() for out in outs}) == 1
+    assert len({(out / "plant.yaml").read_bytes() for out in outs}) == 1
+
+
+def test_a_diagnosis_runs_on_one_thread_and_gives_the_others_back(monkeypatch):
+    blas.dnrm2(np.ones(3))  # scipy's own copy is loaded
+    controls = threads._controls()
+    before = [get() for get, _ in controls]
+    for _, put in controls:
+        put(2)
+    seen: list[int] = []
+
+    def stop(*_: object) -> None:
+        seen.extend(get() for get, _ in controls)
+        raise InputError("seen enough")
+
+    monkeypatch.setattr(run, "split", stop)
+    try:
+        with pytest.raises(InputError, match="seen enough"):
+            run.diagnose(None, [], {}, None)
+        assert set(seen) == {1}
+        assert {get() for get, _ in controls} == {2}
+    finally:
+        for (_, put), n in zip(controls, before, strict=True):
+            put(n)

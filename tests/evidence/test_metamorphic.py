@@ -1,0 +1,41 @@
+"""Spelling, order, clock, units and lost cells do not change a diagnosis: three small cases of the generator."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.evidence.metamorphic import (
+    cells_lost,
+    clock,
+    columns_added,
+    diagnosed,
+    difference,
+    drawn,
+    kelvin,
+    milliwatt,
+    names,
+    order,
+    rows_lost,
+    together,
+)
+
+
+@pytest.mark.parametrize(
+    ("case", "effects", "changes"),
+    [
+        (("tanks", 1, "one", "open"), [["sensor_delay", "level_lower"]], [together(order, clock, names)]),
+        (("drive", 1, "one", "open"), [["copper_resistance", "joule"]], [together(kelvin, milliwatt)]),
+        (("heater", 2, "none", "closed"), [], [together(rows_lost, cells_lost), columns_added]),
+    ],
+    ids=["order, clock and names", "units", "losses and unrelated columns"],
+)
+def test_a_change_of_form_does_not_change_the_diagnosis(case, effects, changes, tmp_path):
+    rig, answer = drawn(*case)
+    assert answer["effects"] == effects
+    before = diagnosed(rig, tmp_path / "before")
+    named = {(f["effect"], f["where"]) for f in before["findings"]}
+    assert named == {tuple(e) for e in effects}, "a case without its finding shows little"
+    for k, change in enumerate(changes):
+        changed = change(rig)
+        after = diagnosed(changed, tmp_path / str(k))
+        assert difference(before, after, changed.back) == ""

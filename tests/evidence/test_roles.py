@@ -1,0 +1,218 @@
+"""What a quantity is follows from roles, units and structure; a form of the catalogue means the same in any unit."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.evidence.metamorphic import Rig, kelvin, milliwatt, names, order
+from thermoctl.diagnose.effects import Candidate, candidates, catalogue
+from thermoctl.diagnose.screen import Trajectory, changes
+from thermoctl.evidence.roles import Structure
+from thermoctl.plant import from_plain, loads
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
+
+OSCILLATOR = """
+format: thermoctl-plant/1
+title: an electronic oscillator
+inputs: {drive: {unit: V}}
+parameters: {m: {value: 0.01, unit: s**2, range: [0.001, 0.1]}, d: {value: 0.1, unit: s, range: [0, 1]}, k: {value: 1, range: [0.1, 9]}}
+nodes:
+  out: {unit: V, storage: 1, initial: 0}
+  slope: {unit: V/s, storage: m, initial: 0}
+flows:
+  rate: {into: out, rate: slope}
+  drives: {into: slope, rate: drive}
+  damps: {from: slope, rate: d * slope}
+  pulls: {from: slope, rate: k * out}
+outputs: {reading: {value: out, unit: V, noise: 0.001}}
+"""
+BLOCKS = """
+format: thermoctl-plant/1
+title: two blocks and a rod
+inputs:
+  current: {unit: A}
+  heat: {unit: W}
+  speed: {unit: m/s}
+  stroke: {unit: m, between_samples: linear}
+  air: {unit: degC, between_samples: linear}
+  wall: {unit: degC, between_samples: linear}
+parameters:
+  C: {value: 40, unit: J/K, range: [20, 80]}
+  G: {value: 0.3, unit: W/K, range: [0.1, 1]}
+  R: {value: 2, unit: ohm, range: [1, 4]}
+  K: {value: 1, unit: N*s/m, range: [0.5, 2]}
+  A: {value: 2.0e-5, unit: m/K, range: [1.0e-6, 1.0e-4]}
+nodes:
+  near: {unit: degC, storage: C, initial: air, initial_sigma: 0.3}
+  far: {unit: degC, storage: C, initial: air, initial_sigma: 0.3}
+flows:
+  joule: {into: near, rate: R * current**2, unit: W}
+  heater: {into: near, rate: heat, unit: W}
+  rub: {into: far, rate: K * speed**2, unit: W}
+  between: {from: near, into: far, rate: G * (near - far), unit: W}
+  loss: {from: near, rate: G * (near - air), unit: W}
+  far_loss: {from: far, rate: G * (far - air), unit: W}
+  to_wall: {from: far, rate: 0.1 * G * (far - wall), unit: W}
+outputs:
+  near_c: {value: near, unit: degC, noise: 0.1}
+  far_c: {value: far, unit: degC, noise: 0.1}
+  volts: {value: R * current, unit: V, noise: 0.01}
+  length: {value: A * (near - 20) + stroke, unit: m, noise: 1.0e-6}
+"""
+
+
+def blocks() -> Rig:
+    """Two heated blocks and a rod, with a column that nothing reads."""
+    t = np.arange(0.0, 600.0, 10.0)
+    columns = {
+        "t": t,
+        "current": np.repeat([0.0, 2.0, 1.0], 20),
+        "heat": np.repeat([8.0, 0.0, 4.0, 0.0], 15),
+        "speed": np.repeat([0.0, 0.5, -0.2, 0.1, 0.0, 0.3], 10),
+        "stroke": 0.02 * np.sin(t / 90),
+        "air": 21 + np.sin(t / 200),
+        "wall": 23 + np.cos(t / 200),
+        "oil": 30 + 5 * np.sin(t / 100),
+    }
+    return Rig(yaml.safe_load(BLOCKS), {"run": columns})
+
+
+def _read(rig: Rig) -> tuple[Plant, Structure, Table]:
+    plant = from_plain(rig.plant)
+    columns = dict(rig.recordings["run"])
+    table = Table("run", "run", columns.pop("t"), columns)
+    drive = compile_plant(plant).excitation(table)
+    return plant, Structure(plant, [drive], [columns]), table
+
+
+def _places(rig: Rig) -> set[tuple[str, str, int, tuple[str, ...]]]:
+    _, structure, _ = _read(rig)
+    return {
+        (
+            c.effect.name,
+            "-".join(rig.back.get(w, w) for w in c.place.where.split("-")),
+            c.variant,
+            tuple(sorted(rig.back.get(str(s), str(s)) for s in c.symbols.values())),
+        )
+        for c in candidates(structure, catalogue())
+    }
+
+
+@pytest.mark.parametrize("other", [names, kelvin, milliwatt])
+def test_every_effect_has_the_same_places_whatever_the_names_and_units(other):
+    rig = blocks()
+    assert _places(other(rig)) == _places(rig)
+
+
+def test_the_order_of_keys_decides_nothing_but_the_order_of_pairs():
+    def unordered(rig: Rig) -> set:
+        return {(e, frozenset(w.split("-")), v, s) for e, w, v, s in _places(rig)}
+
+    assert unordered(order(blocks())) == unordered(blocks())
+
+
+def _values(c: Candidate) -> dict[str, float]:
+    """Values of an effect's parameters that are felt."""
+    special = {
+        "T0": 100.0,
+        "T1": 300.0,
+        "TAU": 40.0,
+        "TD": 15.0,
+        "N": 0.4,
+        "E": 1.0e-9,
+        "P": 0.01,
+        "YMAX": 25.0,
+    }
+    special |= {f"B{k}": 22.0 + k for k in range(5)}
+    return {p.name: special.get(p.name, 0.02 + p.null) for p in c.effect.parameters}
+
+
+def _changes(rig: Rig) -> dict[tuple, tuple[dict, dict]]:
+    """What each effect at each place changes along the plant's own trajectory: slopes and readings."""
+    plant, structure, table = _read(rig)
+    model = compile_plant(plant)
+    drive = model.prepare(model.excitation(table))
+    fit = SimpleNamespace(values=[model.vector(None)])
+    metric = SimpleNamespace(drives=[drive], runs=[model.run(drive)], model=model, fit=fit)
+    at, out = Trajectory(metric, structure, 0), {}
+    for c in candidates(structure, catalogue()):
+        if not c.place.input:  # an input's fault is in the input's own unit
+            values = _values(c)
+            if rig.plant["outputs"].get(c.place.where, {}).get("unit") == "K":
+                values = {k: v + 273.15 * (k == "YMAX") for k, v in values.items()}  # a level of that reading
+            own = {c.own(k): v for k, v in values.items()}
+            out[c.key, c.variant, c.label] = changes(plant, c.extend(values), own, at)
+    return out
+
+
+def test_an_effect_changes_a_plant_alike_in_degc_and_in_kelvin():
+    celsius, absolute = _changes(blocks()), _changes(kelvin(blocks()))
+    assert celsius.keys() == absolute.keys() and len(celsius) > 40
+    for key, parts in celsius.items():
+        for one, other in zip(parts, absolute[key], strict=True):
+            assert one.keys() == other.keys()
+            for k in one:
+                np.testing.assert_allclose(other[k], one[k], rtol=1e-6, atol=1e-9, err_msg=str(key))
+
+
+def test_an_effect_of_heat_has_the_unit_of_the_plants_heat_flows():
+    for change, unit, capacity in ((lambda r: r, "W/K", "J/K"), (milliwatt, "mW/K", "mJ/K")):
+        _, rig, _ = _read(change(blocks()))
+        mass = next(c for c in candidates(rig, catalogue()) if c.key == ("hidden_thermal_mass", "near"))
+        parameters = mass.extend({"G": 0.1, "C": 5.0}).parameters
+        assert [parameters[mass.own(p)].unit for p in ("G", "C")] == [unit, capacity]
+
+
+def test_a_rate_and_its_integral_are_a_motion_in_any_unit():
+    plain = yaml.safe_load(OSCILLATOR)
+    for change in (lambda p: p, lambda p: p["flows"]["rate"].update(rate="1000 * slope") or p):
+        rig = Structure(from_plain(change(plain)), [], [])
+        assert (rig.velocities, rig.position_of) == (["slope"], {"slope": "out"})
+        assert any(c.key == ("cubic_stiffness", "slope") for c in candidates(rig, catalogue()))
+        assert any("'slope' is its rate" in note for note in rig.guesses())
+
+
+@pytest.mark.parametrize(
+    "rate", ["slope + 1", "abs(slope)", "min(slope, 5)", "slope * step(drive)", "slope * step(out)"]
+)
+def test_what_is_not_the_plain_rate_is_no_motion(rate):
+    plain = yaml.safe_load(OSCILLATOR)
+    plain["flows"]["rate"]["rate"] = rate
+    assert not Structure(from_plain(plain), [], []).velocities
+
+
+def test_a_role_stands_above_unit_and_structure():
+    plain = yaml.safe_load(BLOCKS)
+    plain["inputs"]["wall"]["role"] = "ambient"
+    assert Structure(from_plain(plain), [], []).air == "wall"
+    del plain["inputs"]["speed"]["unit"]
+    plain["inputs"]["speed"]["role"] = "velocity"
+    plain["inputs"]["stroke"]["role"] = "setpoint"
+    rig = Structure(from_plain(plain), [], [])
+    assert (rig.signals("v"), rig.signals("x")) == (["speed"], [])
+    tank = yaml.safe_load(OSCILLATOR)
+    tank["nodes"]["out"]["role"] = "level"
+    assert not Structure(from_plain(tank), [], []).velocities
+
+
+def test_the_ambient_that_most_losses_are_counted_from_is_taken_and_said():
+    for rig in (blocks(), order(blocks())):
+        structure = _read(rig)[1]
+        assert structure.air == "air"
+        assert any(n.startswith("'air' is taken as the ambient") and "wall" in n for n in structure.guesses())
+
+
+def test_a_column_that_nothing_reads_is_no_speed_and_no_position_whatever_its_name():
+    plant = loads(OSCILLATOR)
+    columns = {n: np.arange(5.0) for n in ("drive", "motor_speed", "position", "current", "x", "v")}
+    drive = compile_plant(plant).excitation(Table("run", "run", np.arange(5.0), columns))
+    structure = Structure(plant, [drive], [columns])
+    assert structure.signals("v") == ["slope"]
+    assert structure.signals("x") == ["out"]
+    assert structure.signals("i") == []
