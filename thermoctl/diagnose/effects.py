@@ -325,7 +325,7 @@ class Rig:
         air = self.air or ""
         known = self.plant.parameters.get(air) or self.plant.inputs.get(air)
         start = d.first.get(air, known.value if isinstance(known, Parameter) else 0.0)
-        return start - zero_of(known.unit) if known else start
+        return float(start - zero_of(known.unit) if known else start)
 
     def signals(self, kind: str, near: str | None = None) -> list[str]:
         """Names that can stand for v, x, i or T: nodes, inputs, recorded columns (which become inputs)."""

@@ -36,10 +36,9 @@ def left(case: Case, f: Fitted, reach: Responses) -> Left:
     for g, learnt in zip(case.grids, f.average.sensor, strict=True):
         name = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) / g.count.sum()
-        own = max(learnt, g.variance)
-        rms[name] = float(np.sqrt(max(power - own, 0.0)))
-        noise[name] = float(np.sqrt(own))
-        over[name] = float(np.sqrt(power / own))
+        rms[name] = float(np.sqrt(max(power - learnt, 0.0)))
+        noise[name] = float(np.sqrt(learnt))
+        over[name] = float(np.sqrt(power / learnt))
         for k in g.channels:
             ideal[k] = np.minimum(f.powers[k], learnt * case.coordinates.channels[k].count)
     loss = averaged(case.grids, ideal).log_likelihood - f.average.log_likelihood
