@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.evidence.metamorphic import Rig, kelvin, milliwatt, names, order
+from tests.evidence.changes import Rig, kelvin, milliwatt, names, order
 from thermoctl.diagnose.effects import Candidate, candidates, catalogue
 from thermoctl.diagnose.screen import Trajectory, changes
 from thermoctl.evidence.roles import Structure
