@@ -33,21 +33,21 @@ TIMES = {  # that the recordings of a family are thinned by two at first
     "drive": 3,
     "flexure": 2,
 }
-CASES = (  # family, number, kind, world
+CASES = (  # family, number, kind, world; the quick ones first
     ("tanks", 0, "one", "closed"),
     ("heater", 1, "one", "open"),
-    ("flexure", 2, "none", "closed"),
     ("tanks", 1, "one", "open"),
-    ("drive", 1, "one", "open"),
     ("heater", 2, "none", "closed"),
     ("tanks", 2, "none", "open"),
     ("heater", 3, "pair", "closed"),
     ("tanks", 3, "unknown", "open"),
-    ("flexure", 0, "one", "closed"),
+    ("heater", 4, "unknown", "open"),
+    ("drive", 1, "one", "open"),
     ("drive", 2, "unknown", "closed"),
     ("drive", 0, "none", "open"),
+    ("flexure", 2, "none", "closed"),
+    ("flexure", 0, "one", "closed"),
     ("flexure", 1, "one", "open"),
-    ("heater", 4, "unknown", "open"),
 )
 
 
