@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from tests.evidence.metamorphic import (
+from tests.evidence.changes import (
     cells_lost,
     clock,
     columns_added,
-    diagnosed,
-    difference,
-    drawn,
     kelvin,
     milliwatt,
     names,
@@ -18,6 +15,7 @@ from tests.evidence.metamorphic import (
     rows_lost,
     together,
 )
+from tests.evidence.metamorphic import diagnosed, difference, drawn
 
 
 @pytest.mark.parametrize(

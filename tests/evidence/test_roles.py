@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.evidence.metamorphic import Rig, kelvin, milliwatt, names, order
+from tests.evidence.changes import Rig, kelvin, milliwatt, names, order
 from thermoctl.diagnose.effects import Candidate, candidates, catalogue
 from thermoctl.diagnose.screen import Trajectory, changes
 from thermoctl.evidence.roles import Structure
@@ -199,6 +199,17 @@ def test_a_role_stands_above_unit_and_structure():
     tank = yaml.safe_load(OSCILLATOR)
     tank["nodes"]["out"]["role"] = "level"
     assert not Structure(from_plain(tank), [], []).velocities
+
+
+def test_an_input_with_a_role_that_nothing_reads_serves_effects_and_has_no_faults():
+    rig = blocks()
+    rig.plant["inputs"]["oil"] = {"role": "temperature"}
+    rig.recordings["run"]["fan"] = rig.recordings["run"]["speed"]
+    rig.plant["inputs"]["fan"] = {"role": "velocity"}
+    structure = _read(rig)[1]
+    assert "oil" in structure.signals("T")
+    assert set(structure.signals("v")) == {"speed", "fan"}
+    assert not {"oil", "fan"} & {c.place.input for c in candidates(structure, catalogue())}
 
 
 def test_the_ambient_that_most_losses_are_counted_from_is_taken_and_said():

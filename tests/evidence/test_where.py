@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.fft import dct
 
-from tests.evidence.metamorphic import order
+from tests.evidence.changes import order
 from tests.evidence.test_roles import blocks
 from thermoctl.evidence.coordinates import Coordinates
 from thermoctl.evidence.where import responses, white_forces

@@ -490,8 +490,10 @@ def _sensors(rig: Rig, dimension: str | None = None) -> Iterator[Place]:
     for o in rig.physics.outputs.values():
         if dimension is None or rig.kind(o) == dimension:
             yield Place(o.name, {"y": o.value}, output=o.name)
+    used = [*(f.rate for f in rig.plant.flows.values()), *(o.value for o in rig.plant.outputs.values())]
+    read = set().union(*map(ex.names, used))
     for i in rig.physics.inputs.values():
-        if i.name in rig.moving_inputs and (dimension is None or rig.kind(i) == dimension):
+        if i.name in rig.moving_inputs & read and (dimension is None or rig.kind(i) == dimension):
             yield Place(i.name, {"y": name(i.name)}, input=i.name)
 
 

@@ -306,7 +306,9 @@ def _check_delay(e: Expr, p: _Place, plant: Plant) -> None:
 
 
 def _check_use(plant: Plant, items: Items) -> None:
-    """Refuse a node that no flow touches, and a parameter or input that no expression reads."""
+    """Refuse a node that no flow touches, and a parameter or input that no expression reads.
+
+    An input with a role may wait for an effect that reads it."""
     expressions = [p.expression for p in _places(plant, items)]
     used = set().union(*(ex.names(e) for e in expressions)) | {
         e.value for x in expressions for e in ex.walk(x) if e.op == "first"
@@ -319,5 +321,5 @@ def _check_use(plant: Plant, items: Items) -> None:
         if name not in used:
             raise s.node.error(f"parameter '{name}': nothing uses it; remove it or use it")
     for name, s in items["inputs"].items():
-        if name not in used:
-            raise s.node.error(f"input '{name}': nothing reads it; remove it or use it")
+        if name not in used and plant.inputs[name].role is None:
+            raise s.node.error(f"input '{name}': nothing reads it; remove it, use it, or give it a role")
