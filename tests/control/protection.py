@@ -1272,6 +1272,15 @@ def outputs_say_what_is(module):
     assert law.drive == -4.0
 
 
+@scenario
+def the_second_word_holds_the_later_bits(module):
+    """Faults from bit 53 on, which no table names yet, are shown in the second word, and only there."""
+    bench = Bench(module).armed().tick(external=1 << 60 | 1 << 53 | 1 << faults.BIT["compensation_slewing"])
+    words = OUTPUT["fault_bits"], OUTPUT["fault_bits_2"]
+    assert [bench.law.outputs[w] for w in words] == [1 << faults.BIT["compensation_slewing"], 1 << 7 | 1]
+    assert [bench.tick().law.outputs[w] for w in words] == [0, 0]
+
+
 # ---- the table --------------------------------------------------------------------------------------------------------------
 @scenario
 def the_state_machine(module):
@@ -1345,3 +1354,28 @@ def the_fault_table(module):
     )  # a frozen amplifier is stale
     assert table.mask("fault", "critical", readings=False) == (table.mask("fault", "critical") >> 34 << 34)
     assert (CHANNELS[5:17], TEMPERATURES[0], len(CHANNELS)) == (TEMPERATURES, "coil_c", 20)
+
+
+@scenario
+def names_in_a_recording(module):
+    """A recording's bits keep the names that they had when it was made: its own table, or its law's version."""
+    table = module.faults
+
+    def named(bits, **meta):
+        return table.names(bits, table.recorded_names(meta))
+
+    bits = 1 << 34 | 1 << 31 | 1
+    now = ("position_error", "amplifier_stale", "amplifier_stopped")
+    assert named(bits) == named(bits, law="") == named(bits, law='{"version": 2}') == now
+    assert named(bits, law='{"version": 1}') == (*now[:2], "amplifier_frozen")
+    assert named(1 << 34 | 2, faults='{"34": "other"}', law='{"version": 1}') == ("bit 1", "other")
+    assert table.NAMES_2 == tuple(f.name for f in table.FAULTS[: len(table.NAMES_2)])
+    assert len(table.NAMES_1) == len(table.NAMES_2) == 53
+    assert [k for k in range(53) if table.NAMES_1[k] != table.NAMES_2[k]] == [34]
+    for damaged in ('["a"]', '{"1": 2}'):
+        try:
+            table.recorded_names({"faults": damaged})
+        except ValueError as e:
+            assert "damaged" in str(e)
+        else:
+            raise AssertionError("a damaged table was taken")
