@@ -893,8 +893,6 @@ class Law:
         if self.zeroed == 0.0:
             self.position_zero_um = position - held
             self.zeroed = 1.0 if self.state != _OFF else 0.0
-            self.position_low_um = self.position_high_um = position
-            self.position_low_before_um = self.position_high_before_um = position
         self.position_low_um = min(self.position_low_um, position)
         self.position_high_um = max(self.position_high_um, position)
         if self.fresh[_CURRENT]:
