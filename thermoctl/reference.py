@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from thermoctl.cli import parser
 from thermoctl.control import causes
@@ -205,7 +205,8 @@ def cli() -> str:
     pages: list[str] = []
 
     def walk(p: argparse.ArgumentParser) -> None:
-        p.formatter_class = partial(p.formatter_class, width=_HELP_WIDTH)  # not the terminal's
+        kind = cast(type[argparse.HelpFormatter], p.formatter_class)
+        p.formatter_class = partial(kind, width=_HELP_WIDTH)  # not the terminal's
         pages.append(f"## {p.prog}\n```text\n{p.format_help().rstrip()}\n```\n")
         for action in p._actions:
             if isinstance(action, argparse._SubParsersAction):
