@@ -135,7 +135,7 @@ CAUSES = [
         "following_error",
         "",
     ),
-    ("encoder's cable pulled", WiredRig, unplug("encoder"), "position_error", "reconnecting"),
+    ("encoder's cable pulled", WiredRig, unplug("encoder"), "position_stale", "reconnecting"),
     ("encoder's checksums wrong", WiredRig, spoil, "position_", "position_um"),
     ("encoder mute", WiredRig, silent, "position_stale", "no new"),
     ("CAN adapter pulled", WiredRig, unplug("adapter_port"), "amplifier_error", "reconnecting"),
