@@ -21,8 +21,8 @@ both give the same bits (IEEE doubles, no contraction, one order of operations).
                 between its limits is found so, and in no other way:
                 coil's voltage and R20 (1 + alpha (coil - 20 degC)) current;
                 current and the drive that was asked for since the reading before the last;
-                position and the current that holds it against the flexures, a current being compared with all positions
-                since the reading before the last;  a watched temperature and its estimate;
+                position (all since the reading before the last) and the current that holds it against the flexures;
+                a watched temperature and its estimate;
                 the reference encoder and position + expansion (each encoder's own zero is taken while OFF);
                 two temperatures and their estimates, which must not stand the other way round: y_i > y_j while T_i < T_j
                 by so much that the readings would fit better exchanged, (y_i - y_j)(T_i - T_j) < -order_limit^2;
@@ -47,8 +47,8 @@ While ARMED, an amplifier that reports another state than enabled holds the cont
 stage: nothing integrates against a drive that is off. `amplifier_s` is the time for the enable sequence after arming.
 An amplifier that was enabled since and is no more trips at once. One that still reports enabled keeps READY away.
 
-A slow meter's first reading after disarming may have been sampled before it; its second one cannot: the meter was
-asked for it after the first had arrived. Current while disabled counts from the second one on.
+A slow meter's first reading after disarming may have been sampled before it. The second one cannot: the meter was
+asked for it after the first had arrived. So current while disabled counts from the second reading on.
 """
 
 from __future__ import annotations
@@ -868,8 +868,9 @@ class Law:
                 self.faults |= one << _B_MONITORED
 
     def _compare_drive(self, amperes):
-        """current_apart_a: how far a new current lies outside all that was asked for since the reading before the last.
+        """Compute current_apart_a: distance of a new current from the drives it may belong to.
 
+        These are all drives since the reading before the last.
         A slow meter's reading is older than its arrival: it was sampled somewhere in that time. Compared with the
         present drive, it would accuse an amplifier that follows while the drive changes.
         """
@@ -885,10 +886,11 @@ class Law:
             self.drive_low = self.drive_high = self.drive
 
     def _compare_position(self, position, held):
-        """position_apart_um: how far the positions since the reading before the last lie from where the current holds.
+        """Compute position_apart_um: distance of recent positions from where the current holds.
 
-        held: displacement by the newest current, um. The zero is taken while OFF. As in _compare_drive, the current
-        may have been sampled at any of these positions: the present one would accuse a stage that moves.
+        held: displacement by the newest current, um. Recent: since the reading before the last.
+        As in _compare_drive, the current may have been sampled at any of these positions.
+        The zero is taken while OFF.
         """
         if self.zeroed == 0.0:
             self.position_zero_um = position - held
