@@ -39,6 +39,7 @@ _THROUGH = (
     "drives through that daemon with its law and protection, from READY only, and disarms at its end; a rig that is "
     "ARMED or in FAULT is not touched"
 )
+_MOVED = "0; 1 the answer was not `go`; 2 nobody can be asked; 3 the rig refuses, or it ended early"
 ACTS = (
     Act(
         "run",
@@ -68,7 +69,13 @@ ACTS = (
         "stops it: its purpose; never the rig of another configuration",
         "0, also where nobody holds the rig; 3 it does not end",
     ),
-    Act("restart", "stop, then start", "none", "as stop, then start", "as stop, then start"),
+    Act(
+        "restart",
+        "stop, then start",
+        "none",
+        "as stop, then start",
+        "0; 3 it does not end, or the daemon's own error",
+    ),
     Act(
         "arm",
         "enables the amplifier and holds the measured position",
@@ -97,29 +104,15 @@ ACTS = (
         "its purpose",
         "1 the file is not valid; 2 no daemon",
     ),
-    Act(
-        "tune", "moves the stage by short setpoint ramps", _MOVES, _THROUGH, "0; 2 no `go`; 3 the rig refuses"
-    ),
-    Act(
-        "experiment",
-        "moves the stage by a schedule of setpoints",
-        _MOVES,
-        _THROUGH,
-        "0; 1 ended early; 2 no `go`; 3 the rig refuses",
-    ),
-    Act(
-        "calibrate",
-        "tune, then the tests of experiments.yaml",
-        _MOVES,
-        _THROUGH,
-        "0; 1 ended early; 2 no `go`; 3 the rig refuses",
-    ),
+    Act("tune", "moves the stage by short setpoint ramps", _MOVES, _THROUGH, _MOVED),
+    Act("experiment", "moves the stage by a schedule of setpoints", _MOVES, _THROUGH, _MOVED),
+    Act("calibrate", "tune, then the tests of experiments.yaml", _MOVES, _THROUGH, _MOVED),
     Act(
         "diagnose",
         "with --resolve: runs the proposed experiment",
         _MOVES,
         _THROUGH,
-        "0; 2 no `go`; 3 the rig refuses",
+        "0; 2 the answer was not `go`, or nobody can be asked; 3 the rig refuses, or it ended early",
     ),
     Act(
         "dashboard",

@@ -55,8 +55,13 @@ def run_experiment(
 def record(experiment_file: Path, recording: Path, config: str, plant: str | None, yes: bool = False) -> None:
     """Run an experiment file for `thermoctl diagnose --resolve`.
 
-    Raises HardwareError where it ends early."""
-    if run_experiment(str(experiment_file), config, str(recording), False, False, plant, yes):
+    Raises HardwareError where it ends early, InputError where the person does not say `go`."""
+    status = run_experiment(str(experiment_file), config, str(recording), False, False, plant, yes)
+    if status == 1:
+        raise InputError(
+            f"{experiment_file}: not run, the answer was not `go`; diagnosis.json beside it stands"
+        )
+    if status:
         raise HardwareError(
             f"{experiment_file}: the experiment did not come to its end; what was recorded is in {recording}"
         )

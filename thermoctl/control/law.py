@@ -21,7 +21,8 @@ both give the same bits (IEEE doubles, no contraction, one order of operations).
                 between its limits is found so, and in no other way:
                 coil's voltage and R20 (1 + alpha (coil - 20 degC)) current;
                 current and the drive that was asked for since the reading before the last;
-                position and the current that holds it against the flexures;  a watched temperature and its estimate;
+                position (all since the reading before the last) and the current that holds it against the flexures;
+                a watched temperature and its estimate;
                 the reference encoder and position + expansion (each encoder's own zero is taken while OFF);
                 two temperatures and their estimates, which must not stand the other way round: y_i > y_j while T_i < T_j
                 by so much that the readings would fit better exchanged, (y_i - y_j)(T_i - T_j) < -order_limit^2;
@@ -45,6 +46,9 @@ with heat capacity stays where it jumped to; an outlier does not.
 While ARMED, an amplifier that reports another state than enabled holds the controller at v = 0 and the reference at the
 stage: nothing integrates against a drive that is off. `amplifier_s` is the time for the enable sequence after arming.
 An amplifier that was enabled since and is no more trips at once. One that still reports enabled keeps READY away.
+
+A slow meter's first reading after disarming may have been sampled before it. The second one cannot: the meter was
+asked for it after the first had arrived. So current while disabled counts from the second reading on.
 """
 
 from __future__ import annotations
@@ -157,6 +161,7 @@ _SCALARS = (
     "power_mean_w",
     "following_s",
     "idle_s",
+    "idle_readings",
     "saturation_s",
     "amplifier_s",
     "average_at",
@@ -175,6 +180,11 @@ _SCALARS = (
     "drive_low_before",
     "drive_high_before",
     "displaced_um",
+    "position_apart_um",
+    "position_low_um",
+    "position_high_um",
+    "position_low_before_um",
+    "position_high_before_um",
     "position_zero_um",
     "zeroed",
     "reference_error_um",
@@ -296,11 +306,12 @@ class Law:
         self.air_started = self.resumed = self.model_error_c = 0.0
         self.ohm_v = self.ohm_scale_v = self.current_error_a = self.current_apart_a = 0.0
         self.drive_low = self.drive_high = self.drive_low_before = self.drive_high_before = 0.0
-        self.displaced_um = self.position_zero_um = self.zeroed = 0.0
-        self.reference_error_um = self.reference_zero_um = self.reference_zeroed = 0.0
-        self.exchanged = 0.0
-        self.following_s = self.idle_s = self.saturation_s = self.amplifier_s = self.driving = 0.0
-        self.enable = self.drive = self.control_v = 0.0
+        self.displaced_um = self.position_apart_um = self.position_zero_um = self.zeroed = 0.0
+        self.position_low_um = self.position_high_um = 0.0
+        self.position_low_before_um = self.position_high_before_um = self.reference_error_um = 0.0
+        self.reference_zero_um = self.reference_zeroed = self.exchanged = 0.0
+        self.following_s = self.idle_s = self.idle_readings = self.saturation_s = 0.0
+        self.amplifier_s = self.driving = self.enable = self.drive = self.control_v = 0.0
         self.average_length = 1
         self.out = np.zeros(len(OUTPUTS))
         self.outputs = np.asarray(self.out)
@@ -737,12 +748,19 @@ class Law:
             self.saturation_s = self.saturation_s + self.dt if abs(self.v) >= self.p.output_limit else 0.0
             if self.saturation_s > self.p.saturation_s:
                 found |= one << _B_SATURATED
-            self.idle_s = 0.0
+            self.idle_s = self.idle_readings = 0.0
         else:
             self.following_s = self.saturation_s = 0.0
+            if self.fresh[_CURRENT]:
+                self.idle_readings += 1.0
             driven = (
-                self.verdict[_CURRENT] == 0.0 and abs(self.last[_CURRENT]) > self.p.idle_current_a
-            ) or abs(self.power_w) > self.p.idle_power_w
+                self.verdict[_CURRENT] == 0.0
+                and self.idle_readings > 1.0
+                and (
+                    abs(self.last[_CURRENT]) > self.p.idle_current_a
+                    or abs(self.power_w) > self.p.idle_power_w
+                )
+            )
             self.idle_s = self.idle_s + self.dt if driven else 0.0
             if self.idle_s > self.p.idle_s:
                 found |= one << _B_STUCK
@@ -823,11 +841,8 @@ class Law:
             if abs(self.current_error_a) > self.p.current_tolerance_a:
                 self.faults |= one << _B_NOT_FOLLOWING
         if current and self.verdict[_POSITION] == 0.0 and self.p.flexure_um_per_a != 0.0:
-            s = self.last[_POSITION] - self.p.flexure_um_per_a * amperes
-            if self.zeroed == 0.0:
-                self.position_zero_um = s
-                self.zeroed = 1.0 if self.state != _OFF else 0.0
-            self.displaced_um += part * (s - self.position_zero_um - self.displaced_um)
+            self._compare_position(self.last[_POSITION], self.p.flexure_um_per_a * amperes)
+            self.displaced_um += part * (self.position_apart_um - self.displaced_um)
             if abs(self.displaced_um) > self.p.position_tolerance_um:
                 self.faults |= one << _B_DISPLACED
         if self.corrected == 0.0:
@@ -853,8 +868,9 @@ class Law:
                 self.faults |= one << _B_MONITORED
 
     def _compare_drive(self, amperes):
-        """current_apart_a: how far a new current lies outside all that was asked for since the reading before the last.
+        """Compute current_apart_a: distance of a new current from the drives it may belong to.
 
+        These are all drives since the reading before the last.
         A slow meter's reading is older than its arrival: it was sampled somewhere in that time. Compared with the
         present drive, it would accuse an amplifier that follows while the drive changes.
         """
@@ -868,6 +884,29 @@ class Law:
             )
             self.drive_low_before, self.drive_high_before = self.drive_low, self.drive_high
             self.drive_low = self.drive_high = self.drive
+
+    def _compare_position(self, position, held):
+        """Compute position_apart_um: distance of recent positions from where the current holds.
+
+        held: displacement by the newest current, um. Recent: since the reading before the last.
+        As in _compare_drive, the current may have been sampled at any of these positions.
+        The zero is taken while OFF.
+        """
+        if self.zeroed == 0.0:
+            self.position_zero_um = position - held
+            self.zeroed = 1.0 if self.state != _OFF else 0.0
+        self.position_low_um = min(self.position_low_um, position)
+        self.position_high_um = max(self.position_high_um, position)
+        if self.fresh[_CURRENT]:
+            expected = held + self.position_zero_um
+            low = min(self.position_low_um, self.position_low_before_um)
+            high = max(self.position_high_um, self.position_high_before_um)
+            self.position_apart_um = clip(expected, low, high) - expected
+            self.position_low_before_um, self.position_high_before_um = (
+                self.position_low_um,
+                self.position_high_um,
+            )
+            self.position_low_um = self.position_high_um = position
 
     def _compare_order(self):
         """exchanged: two mean readings would fit their estimates better the other way round."""

@@ -66,7 +66,8 @@ class Commands:
         name = request["command"]
         if name == "status":
             slow = arrival.slow_readings(self.shared, self.expected_hz)
-            return {"ok": True, **status(self.shared), "slow": slow}
+            counted = arrival.device_counters(self.shared)
+            return {"ok": True, **status(self.shared), "slow": slow, "device_counters": counted}
         if name == "latency":
             return {"ok": True, **latency(self.shared, self.settings.loop.period_s)}
         if name == "signals":

@@ -444,7 +444,7 @@ def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
 
 def readings(ticks: int, seed: int = 7) -> dict[str, np.ndarray]:
     """Readings of a warm day in the paper's motion, with the encoder's missing frames and now and then a bad reading."""
-    from thermoctl.channels import CHANNELS
+    from thermoctl.channels import AMP_DISABLED, AMP_ENABLED, CHANNELS
 
     rng = np.random.default_rng(seed)
     n = len(CHANNELS)
@@ -456,7 +456,9 @@ def readings(ticks: int, seed: int = 7) -> dict[str, np.ndarray]:
         0, 0.02, (ticks, 12)
     )
     values[:, 2:5] += rng.normal(0, 1e-3, (ticks, 3))
-    values[:, 17], values[:, 18], values[:, 19] = 24.0, 2.0, 0.0
+    values[:, 17], values[:, 18], values[:, 19] = 24.0, AMP_ENABLED, 0.0
+    disabled = ((np.arange(ticks) - 140) % 1000 < 70) | (np.arange(ticks) < 210)  # around each DISARM and ARM
+    values[disabled, 18] = AMP_DISABLED
     fresh = np.zeros((ticks, n), np.uint8)
     fresh[:, [0, 17, 18, 19]] = rng.random((ticks, 1)) > 0.02
     fresh[::50, 2:4] = 1
