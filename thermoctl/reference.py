@@ -21,7 +21,6 @@ from typing import Any
 from thermoctl.cli import parser
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
-from thermoctl.control.remedies import REMEDIES
 from thermoctl.diagnose.effects import catalogue
 from thermoctl.settings import SECTIONS, options
 from thermoctl.signals import FAULT_WORD_BITS, SIGNALS
@@ -140,7 +139,6 @@ def commands_that_act() -> str:
 
 def fault(f: Fault) -> str:
     """Return the page of one fault."""
-    words = REMEDIES[f.name]
     channels = causes.channels_of(f.name)
     second, place = divmod(f.bit, FAULT_WORD_BITS)
     word = "fault_bits_2" if second else "fault_bits"
@@ -154,8 +152,8 @@ def fault(f: Fault) -> str:
             if channels
             else ""
         )
-        + f"\n\n## Cause\n\n{_sentence(words.cause)}\n\n## How to check\n\n{_sentence(words.check)}\n\n"
-        f"## How to cure\n\n{_sentence(words.cure)}\n\n"
+        + f"\n\n## Cause\n\n{_sentence(f.cause)}\n\n## How to check\n\n{_sentence(f.check)}\n\n"
+        f"## How to cure\n\n{_sentence(f.cure)}\n\n"
         "Then `thermoctl disarm` acknowledges a latched fault, and `thermoctl arm` starts again from the measured "
         "position.\n\n"
         + (

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.control.law import OUTPUTS, Law
+from thermoctl.control.law import Law
 from thermoctl.daemon.recorder import read_law_metadata
 from thermoctl.daemon.ring import unpack_readings
 from thermoctl.recording.reader import info, read_rows
-from thermoctl.signals import INDEX
+from thermoctl.signals import INDEX, OUTPUTS
 from thermoctl.yamlfile import InputError
 
 _CHANNELS, _OUTPUTS = INDEX["position_raw_um"], INDEX["state"]

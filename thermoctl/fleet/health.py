@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermoctl.control import faults
+from thermoctl.control import recorded_faults
 from thermoctl.control.arming import ARMED
 from thermoctl.fleet.recordings import local, rig_of
 from thermoctl.plant import load
@@ -71,7 +71,7 @@ def _health(table: Table, path: str, rig: str) -> Summary:
     armed = state == ARMED
     words = join_fault_words(column("fault_bits", missing), column("fault_bits_2", missing))
     try:
-        names = faults.names(int(np.bitwise_or.reduce(words)), faults.recorded_names(table.meta))
+        names = recorded_faults.names(int(np.bitwise_or.reduce(words)), recorded_faults.table(table.meta))
     except (ValueError, KeyError, TypeError) as e:
         raise InputError(f"{path}: the names of its faults cannot be read: {e}") from None
     error = (column("output_reference_um", missing) - column("reference_um", missing))[armed]
