@@ -2,10 +2,11 @@
 """CAN ports that the tick can use without waiting.
 
 A port is written "interface:channel@bitrate"; the default bitrate is 1000000.
-- slcan:/dev/serial/by-id/...   Lawicel ASCII on a serial port, read and written on the bare descriptor (python-can's
-  own slcan reads one byte a call, 150 us a frame)
-- socketcan:can0                python-can opens it and sets the kernel's filters; frames pass on the bare socket
-- virtual:name and any other interface of python-can: through the library
+
+    slcan:/dev/serial/by-id/...   Lawicel ASCII on a serial port, read and written on the bare descriptor
+                                  (python-can's own slcan reads one byte a call, 150 us a frame)
+    socketcan:can0                python-can opens it and sets the kernel's filters; frames pass on the socket
+    virtual:name, others          through python-can
 
 Identifiers of 29 bits carry the bit EXTENDED everywhere, so that they never match an 11-bit one of the same
 number. Remote frames, error frames and CAN FD frames are counted and otherwise ignored.

@@ -23,9 +23,9 @@ from thermoctl.yamlfile import InputError
 def make_backend(settings: Settings, board: Board | None = None) -> Backend:
     """Make the back end of `settings.hal`, not yet open.
 
-    It is wrapped in a fault injector when `hal.faults` lists any. board: filled by poller processes, or None to
-    poll slow devices from threads of this process. Raises InputError: a mistake in the configuration, a profile
-    or the plant."""
+    It is wrapped in a fault injector when `hal.faults` lists any. board: filled by poller processes, or None
+    to poll slow devices from threads of this process. Raises InputError: a mistake in the configuration, a
+    profile or the plant."""
     kind = settings.hal.backend
     backend: Backend
     if kind == "simulated":

@@ -1,13 +1,14 @@
 """The simulated rig: a plant file as hardware, deterministic, at any speed.
 
-The plant advances in periods of the loop, with the command held. A sensor reads the plant's output plus its
-noise, rounded to its resolution (both from the plant file), at its own rate: the encoders every period, the
-slow ones every `sensor_period_s`. The same seed and the same commands at the same times give the same bits.
+The plant advances in periods of the loop, with the command held. A sensor reads the plant's output plus
+noise, rounded to the sensor's resolution; the plant file gives both. Encoders are read every period, slow
+sensors every `sensor_period_s`. The same seed and the same commands at the same times give the same bits.
 
-The plant that plays the hardware (`hal.truth`) may differ from the one that the compensator was built from,
-to show an effect that the model leaves out. Outputs play the role of their own name, or the one that
-`hal.roles` gives them. The plant's other inputs (the chamber's air) follow `hal.inputs`: mean + swing * sin(2
-pi t / period_s).
+`hal.truth` may name another plant file than the one of the compensator, to simulate an effect that the model
+lacks. An output has the role of its own name, or the one that `hal.roles` gives it. The plant's other inputs
+(the chamber's air) follow `hal.inputs`:
+
+    mean + swing * sin(2 pi t / period_s)
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The command line: makes the parser from the table of commands, runs one command, turns errors into exit statuses."""
+"""The command line: make the parser, run one command, turn errors into exit statuses."""
 
 from __future__ import annotations
 

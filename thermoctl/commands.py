@@ -1,7 +1,7 @@
 """The commands: one row each, with its arguments and the function that does the work.
 
-A row names its function as text, "module:function". `call` imports the module when the command is given, so that
-`thermoctl --help` and `thermoctl status` load nothing that they do not need.
+A row names its function as text, "module:function". `call` imports the module when the command is given, so
+that `thermoctl --help` and `thermoctl status` load nothing that they do not need.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Argument(NamedTuple):
 class Command(NamedTuple):
     """One command; a name of two words is a command below a group.
 
-    takes: the arguments that the function gets, in order, by the names that argparse gives them. `settings` stands for
-    the configuration read from --config, `parser` for the whole command line. Without any the function gets the
-    namespace of all arguments."""
+    takes: the arguments that the function gets, in order, by the names that argparse gives them. `settings`
+    stands for the configuration read from --config, `parser` for the whole command line. Without any the
+    function gets the namespace of all arguments."""
 
     name: str
     help: str

@@ -1,8 +1,9 @@
-"""The configuration: every option once, with unit, range, default, meaning, and whether a change needs a restart.
+"""The configuration: every option with unit, range, default, meaning, and whether a change needs a restart.
 
-One YAML file describes a rig. `load_settings` reads it strictly: an unknown key, a wrong type, a value out of range,
-a unit that does not fit, a duplicate or a missing key is an error. The error names file, line and column, what was
-expected, and the nearest known name. A number may carry a unit ("5 ms", "1 mm/min"); it is converted to the option's unit.
+One YAML file describes a rig. `load_settings` reads it strictly. Errors are: an unknown key, a wrong type, a
+value out of range, a wrong unit, a duplicate key, a missing key. The message names file, line and column, the
+expectation and the nearest known name. A number may carry a unit ("5 ms", "1 mm/min"); it is converted to the
+option's unit.
 
 The dataclasses below are the table; `options()` lists it for the reference page and for `reload`.
 """
@@ -159,8 +160,8 @@ class ReadingLimits:
 class ProtectionSettings(Limits, ReadingLimits):
     """Limits that disable the amplifier when they are exceeded.
 
-    The options `low` to `frozen_s` are mappings of channel: limit. A channel without an entry has no limit. The entry
-    `temperatures_c` sets the limit of every temperature without an entry of its own."""
+    The options `low` to `frozen_s` are mappings of channel: limit. A channel without an entry has no limit.
+    The entry `temperatures_c` sets the limit of every temperature without an entry of its own."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ MAX_NUMBER = 1e300  # squares of larger numbers overflow
 
 
 class InputError(Exception):
-    """An error in the user's input. The message is one line: where, what, what was expected, what to do."""
+    """An error in the user's input. The message is one line: place, problem, expectation, remedy."""
 
 
 class _Loader(yaml.SafeLoader):

@@ -1,13 +1,16 @@
 """The virtual rig: the devices of a configuration at the other end of their wires, in real time.
 
-`hal.devices` says which devices the daemon uses; this program plays those devices by the same profiles: a pty
-with a symbolic link at each serial port's path, a Lawicel adapter with a CiA-402 drive (or the sender of a
-DBC file) behind it, Modbus TCP servers and RTU units. One plant feeds them all; the drive's current moves it.
-It writes to `hal.run_dir`
+`hal.devices` lists the devices that the daemon uses; this program simulates them by the same profiles:
 
-    reference.csv   data that the daemon never gets: the output's reference encoder and the true state, 100 rows a
-                    second, `t` on the machine's monotonic clock
-    control.sock    one command line in, one line out: unplug cables and inject faults (`help` lists them by device)
+- a pty for each serial port, with a symbolic link at the port's path
+- a Lawicel adapter, and behind it a CiA-402 drive or the sender of a DBC file
+- Modbus TCP servers and RTU units
+
+One plant feeds them all; the drive's current moves it. It writes to `hal.run_dir`
+
+    reference.csv   data that the daemon never gets: the output's reference encoder and the true state,
+                    100 rows a second, `t` on the machine's monotonic clock
+    control.sock    one command line in, one line out: unplug cables and inject faults (`help` lists them)
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""The chain from recordings to position residuals, by the paper's method and by the better one.
+"""Compute position residuals from recordings, by the paper's method and by the better one.
 
 `calibrate` fits the estimators to tests 2, 3 and 4A; `estimates` gives each one's position error over test 4.
 The measured error less the estimate is compared over test 4B. Estimators:
-  siso     coil alone, first order, recursion (5)
-  paper    N4SID of order 12 with (26), MKF, recursion (5); one sampling period, as (38) and (39) have one n
-  better   real poles by separable generalised least squares; Kalman filter with the coil alone and the
-           air's rate as input; output error
-  twelve   the same filter and expansion model with all twelve thermometers
+
+    siso     coil alone, first order, recursion (5)
+    paper    N4SID of order 12 with (26), MKF, recursion (5); one sampling period, as (38) and (39) have one n
+    better   real poles by separable generalised least squares; Kalman filter with the coil alone and the
+             air's rate as input; output error
+    twelve   the same filter and expansion model with all twelve thermometers
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ ROW_NOISE = 1e-16  # K^2, which keeps the Riccati equation regular where a state
 FASTEST = 0.05  # smallest real pole of a sampled heat network; smaller ones come from the noise
 AIR_FILTER_S = 60.0
 FIRST_ORDER = 6  # of the better model until the air's changes are taken out; then by BIC where none is given
-# What no input explains, s: forgotten in two hours; above 1/(2 pi 250 s) it is the thermometers' noise.
+# Drift that no input explains, (time constant, corner) in s: it decays over two hours; above 1/(2 pi 250 s)
+# the thermometers' noise exceeds it.
 DRIFT_S = (7200.0, 250.0)
 # Sampling periods, s, and the block rows i tried with each
 PAPER_ROWS = {
@@ -45,9 +47,10 @@ ESTIMATORS = ("siso", "paper", "better", "twelve")
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the calibration gave.
+    """Estimators that a calibration fitted, and their position errors in um.
 
-    `paper_model`, `mkf`, `paper_um`, `siso_um`; `model`, `kalman`, `better_um`, `twelve`, `twelve_um`."""
+    `paper_model`, `mkf`, `paper_um`, `siso_um`; `model`, `kalman`, `better_um`, `twelve`, `twelve_um`.
+    """
 
     paper_model: StateSpace
     mkf: filter.Mkf
@@ -200,8 +203,9 @@ def with_air_alone(model: StateSpace) -> StateSpace:
 def identify_better(tests: list[Recorded], order: int | None) -> StateSpace:
     """Identify a real-pole model from all tests together, without the effect of the air's changes.
 
-    A change of the air shifts every rise by C b_air, which the model gives: it is simulated with the model of
-    the previous round and subtracted. `order` None: by BIC in the last round."""
+    A change of the air shifts every rise by C b_air. This effect is simulated with the model of the previous
+    round and subtracted. `order` None: selected by BIC in the last round.
+    """
     moved: list[np.ndarray] | list[float] = [0.0] * len(tests)
     for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
         model = modal.identify(

@@ -82,10 +82,11 @@ class DaemonRig:
     ) -> Iterator[np.ndarray]:
         """Yield the rows of a test from `at_s` of its schedule on, after those of `earlier`.
 
-        Arms, and disarms on every way out. While paused the setpoint is held and the rows go on: heat does
-        not wait, and the model is fitted to what was measured, not to the schedule. `rest`: wait first until
-        the rig is at rest. Raises Aborted when the law leaves ARMED, the daemon ends or the person ends it;
-        HardwareError where it does not arm."""
+        It arms first, and disarms on every way out. While paused, the setpoint is held and rows continue,
+        because the rig cools meanwhile. The model is fitted to the measured rows, not to the schedule.
+        `rest`: wait first until the rig is at rest. Raises Aborted when the law leaves ARMED, the daemon
+        ends, or the user ends the test. Raises HardwareError when the rig does not arm.
+        """
         if earlier is not None:
             yield rows_of(earlier)
         elif rest:
@@ -215,8 +216,9 @@ def _rig_answers() -> Iterator[None]:
 def at_rest(seen: list[tuple[float, np.ndarray]]) -> bool:
     """Check whether a rig of these temperatures, (s, degC (12,)) oldest first, is at rest.
 
-    All are alike within REST_K, or none moved by more than REST_K in the last REST_S: thermocouples differ by
-    a degree."""
+    At rest: all temperatures are equal within REST_K, or none moved by more than REST_K in the last REST_S.
+    Thermocouples differ by a degree.
+    """
     now, newest = seen[-1]
     if np.nanmax(newest) - np.nanmin(newest) <= REST_K:
         return True

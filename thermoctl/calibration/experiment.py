@@ -66,7 +66,8 @@ def on_rig(
 ) -> int:
     """Describe a test of setpoints, ask, run it on the rig and record it.
 
-    1 when the person said no, ENDED when it ended early."""
+    Returns 1 when the user answered no, ENDED when it ended early.
+    """
     schedules.within_limits(settings, [schedule])
     print(
         f"{schedule.title}: {schedules.span(schedule.duration_s)}, {len(schedule.commands())} moves, "

@@ -1,12 +1,13 @@
 """Positioning accuracy after ISO 230-2.
 
 Deviation x_ij = P_ij - P_i of the j-th approach to target i from one direction; n approaches, m targets:
-  mean unidirectional deviation     x_i = 1/n sum_j x_ij
-  estimator of repeatability        s_i = sqrt(1/(n-1) sum_j (x_ij - x_i)^2)
-  unidirectional repeatability      R_i = 4 s_i, R = max_i R_i            written as x +- 2 s
-  mean bidirectional deviation      (x_up + x_down) / 2;  reversal B_i = x_up - x_down;  M = range of it
-  systematic, unidirectional        E = max x_i - min x_i
-  accuracy, unidirectional          A = max(x_i + 2 s_i) - min(x_i - 2 s_i)
+
+    mean unidirectional deviation     x_i = 1/n sum_j x_ij
+    estimator of repeatability        s_i = sqrt(1/(n-1) sum_j (x_ij - x_i)^2)
+    unidirectional repeatability      R_i = 4 s_i, R = max_i R_i            written as x +- 2 s
+    mean bidirectional deviation      (x_up + x_down) / 2;  reversal B_i = x_up - x_down;  M = range of it
+    systematic, unidirectional        E = max x_i - min x_i
+    accuracy, unidirectional          A = max(x_i + 2 s_i) - min(x_i - 2 s_i)
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""What a test will do, before anything moves.
-
-Its limits, the coil's predicted power and temperature, its spectrum."""
+"""Predict a test before anything moves: its limits, the coil's power and temperature, its spectrum."""
 
 from __future__ import annotations
 

@@ -1,15 +1,16 @@
-"""The calibration wizard: doctor, step, PID, tests 1 to 4A, model, proof.
+"""The calibration wizard: doctor, step, PID, tests 1 to 4A, model, proof, and on request acceptance.
 
-And, only when told so, acceptance.
+Each step writes its result into the calibration's own folder (`--out`). The command can be ended at any time;
+a new call continues with the first step that is not done. Nothing outside that folder is written before
+`--accept`.
 
-Each step leaves its result in a folder of the calibration's own (`--out`), so the command can be ended at any
-time and called again: it goes on with the first step that is not done. Nothing outside that folder is written
-before `--accept`.
+With a running daemon the tests run on it in real time: setpoints through the socket, rows from its shared
+memory. An interrupted test continues from there. The daemon's own recording fills the rows between, because
+the rig cools meanwhile; if that recording has a gap, the test starts again.
 
-Where a daemon answers on the socket, the tests run on it: setpoints by the socket, rows from its shared
-memory, in real time. A test that was ended goes on from there, with the daemon's own recording of the time
-between (heat does not wait); where that has a gap the test starts again. Without a daemon a simulated rig is
-run faster than real time. The same seed gives the same rows, so a test that was ended is simply run again."""
+Without a daemon a simulated rig runs faster than real time. The same seed gives the same rows, so an
+interrupted test is simply run again.
+"""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
     python -m thermoctl.control.typed [--check]
 
-With --check nothing is written; exit status 1 and one line when the file differs. The names come from law.py and from
-Parameters, so a new limit, constant or state variable is declared once.
+With --check nothing is written; exit status 1 and one line when the file differs. The names come from law.py
+and from Parameters, so a new limit, constant or state variable is declared once.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def parts(law: ModuleType) -> dict[str, list[tuple[str, list[str]]]]:
 
 
 def declarations(text: str, law: ModuleType) -> str:
-    """Return the text of law.pxd with its generated parts written anew. Raises KeyError for an unknown part."""
+    """Return the text of law.pxd with its generated parts rewritten. Raises KeyError for an unknown part."""
     made = parts(law)
 
     def write(match: re.Match[str]) -> str:

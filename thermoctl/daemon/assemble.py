@@ -19,7 +19,7 @@ UNNAMED = RigSettings().name
 
 
 def law_parameters(settings: Settings) -> Parameters:
-    """Gains, limits and protection of `settings` as the law takes them. Raises InputError for an unknown channel."""
+    """Return the law's parameters from `settings`. Raises InputError for an unknown channel."""
     given: dict[str, Any] = vars(settings.control) | vars(settings.compensation) | vars(settings.protection)
     given |= {
         "compensate": settings.compensation.enable,

@@ -1,8 +1,8 @@
 # cython: language_level=3, cdivision=True
 """The clock of the loop: CLOCK_MONOTONIC in nanoseconds, and sleeping until a point of it.
 
-Absolute clock_nanosleep keeps the phase whatever a tick took, and is the best of the ways to wait that were measured
-(docs/explanation/why-cython.md). The interpreter's lock is released meanwhile.
+Absolute clock_nanosleep keeps the phase however long a tick took. It was the best of the measured ways to
+wait (`docs/explanation/why-cython.md`). The interpreter's lock is released meanwhile.
 """
 from posix.time cimport CLOCK_MONOTONIC, CLOCK_REALTIME, clock_gettime, timespec
 

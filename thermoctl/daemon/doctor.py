@@ -56,8 +56,8 @@ class _Readings:
 def doctor(settings: Settings, seconds: float = 2.0) -> int:
     """Connect and read every channel for `seconds`; print value, unit and rate. Drives nothing.
 
-    Returns 1 when a channel is bad. Then prints which properties of the machine make ticks late, with remedies
-    (docs/how-to/real-time.md); these do not change the exit status."""
+    Returns 1 when a channel is bad. Then prints which properties of the machine make ticks late, with
+    remedies (docs/how-to/real-time.md); these do not change the exit status."""
     if (pid := holder(settings)) is not None:  # a second master on its buses could disarm it
         raise InputError(
             f"{settings.path}: pid {pid} holds the rig; look with `thermoctl status`, or stop it first"

@@ -4,8 +4,8 @@
     S^2 = R_v / (1 - C K), the variance that the filter expects (35)
     g   = max(0, g +- z - DRIFT);  alarm when g > LIMIT; both signs
 
-While the model fits, z is about standard normal and the sums fall back to zero. When it does not, the sum gives the
-alarm, and its last zero the onset.
+While the model fits, z is about standard normal and the sums fall back to zero. When it does not, the sum
+gives the alarm, and its last zero the onset.
 """
 
 from __future__ import annotations

@@ -242,7 +242,7 @@ def restart(children: list[Child], now: float, log: Log) -> None:
 
 
 def make_children(settings: Settings, shared: Shared) -> tuple[Board | None, Child, list[Child]]:
-    """Make the board of slow readings (None without slow devices), the loop, and the helpers; start nothing."""
+    """Make the board of slow readings (None without slow devices), the loop and the helpers."""
     slow = slow_devices(settings) if settings.hal.backend == "devices" else []
     board = Board.create(shared_name(settings) + "-board") if slow else None
 

@@ -36,7 +36,8 @@ class Replay:
 def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Replay:
     """Run `rows` (ticks, len(SIGNALS)) through a law made from the recording's own metadata.
 
-    A recording of this law's version has its fault bits: a bit is never given to another fault (control/faults.py).
+    A recording of this law's version has its fault bits: a bit is never given to another fault
+    (control/faults.py).
 
     Raises InputError when the metadata is missing or damaged, or ticks are missing.
     """

@@ -27,7 +27,7 @@ STOP_S = 30.0  # the supervisor gives its processes 3 and 10 s before it kills t
 SOURCE = shipped("systemd")
 UNITS = "etc/systemd/system"
 FIRST = "thermoctl.service"  # the unit of the first rig; further ones are thermoctl-RIG.service
-SHARED = {  # what every unit needs
+SHARED = {  # files that every unit needs
     "thermoctl.sysusers": "etc/sysusers.d/thermoctl.conf",
     "thermoctl.tmpfiles": "etc/tmpfiles.d/thermoctl.conf",
     "99-thermoctl.rules": "etc/udev/rules.d/99-thermoctl.rules",
@@ -116,7 +116,7 @@ def stop(settings: Settings) -> int:
         return 0
     with contextlib.suppress(
         InputError
-    ):  # what does not answer is ended all the same; its end disables the amplifier
+    ):  # a process that does not answer is ended all the same; its end disables the amplifier
         ask(settings.socket.path, {"command": "disarm"})
     unit = _unit_of(pid)
     if unit:
@@ -261,7 +261,7 @@ def _socket_of(config: Path) -> str | None:
 def uninstall(config: Path | None, root: Path = Path("/")) -> int:
     """Stop and remove the unit of this configuration (None: the only one).
 
-    With the last unit, what all units share is removed. User and recordings stay. Returns 1 where no such
+    With the last unit the shared files are removed, too. User and recordings stay. Returns 1 when no such
     unit is installed.
     """
     installed = units(root)

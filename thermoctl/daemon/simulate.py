@@ -125,7 +125,8 @@ def run_simulated(
 ) -> np.ndarray:
     """Run `duration_s` of rig time; returns every `every`-th row, (N, len(SIGNALS)).
 
-    schedule: (time_s, command, value) in order of time; command arm, disarm or setpoint (um). seed replaces hal.seed.
+    schedule: (time_s, command, value) in order of time; command arm, disarm or setpoint (um). seed replaces
+    hal.seed.
     """
     if seed is not None:
         settings = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, seed=seed))

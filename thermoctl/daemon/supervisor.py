@@ -7,10 +7,10 @@
               ├── tuner       learns the expansion model, when compensation.tune is on
               └── reference   an idle loop beside it, when loop.reference is on
 
-The loop ends: the supervisor disables the amplifier over its own link, and the daemon ends. systemd starts it again,
-into SAFE, with the estimates that were kept. The loop stands still: it is killed, then as if it had ended. Any other
-process ends or hangs: it is started again while the loop runs on. The supervisor ends: the kernel signals every child
-(PDEATHSIG), and the loop disables the amplifier.
+The loop ends: the supervisor disables the amplifier over its own link, and the daemon ends. systemd starts it
+again, into SAFE, with the estimates that were kept. The loop stands still: it is killed, then as if it had
+ended. Any other process ends or hangs: it is started again while the loop runs on. The supervisor ends: the
+kernel signals every child (PDEATHSIG), and the loop disables the amplifier.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from thermoctl.yamlfile import InputError
 READY_S = 60.0  # time limit of the first tick: devices connect before it
 STALL_S = 1.0  # a loop without a tick for this time, or for protection.late_s if longer, is ended
 LOOK_S = 0.1  # time between two checks
-# A longer time between two checks counts as this much of the loop's silence: the supervisor itself did not run.
+# A longer time between two checks counts as this much of the loop's silence: the supervisor itself did not
+# run.
 LOOK_LONGEST_S = 0.2
 LOOP_STOP_S = 3.0  # a loop that does not end within this time after the request is killed
 

@@ -1,8 +1,8 @@
 """The tuner process: learns the expansion model from the ring while the reference encoder is connected.
 
-compensation.tune starts it. It never touches the loop. A better model becomes a new calibration in the
-folder that compensation.model names, in use from the daemon's next start on; `thermoctl model rollback`
-undoes it. `status` shows the progress in percent.
+compensation.tune starts it. It never touches the loop. A better model becomes a new calibration in the folder
+of compensation.model. The daemon uses it from its next start; `thermoctl model rollback` undoes it. `status`
+shows the progress in percent.
 """
 
 from __future__ import annotations

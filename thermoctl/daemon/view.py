@@ -35,7 +35,7 @@ from thermoctl.settings import Settings, effective, load_settings
 from thermoctl.yamlfile import InputError
 
 MOTION, CYCLE_S = ((0.0, 240.0), (70.0, 200.0)), 90.0
-"""Corners (s in the cycle, setpoint um). 240 um take 0.78 A and 2.9 W: the shaft grows by 2 um in a minute."""
+"""Corners (s in the cycle, setpoint um). 240 um need 0.78 A and 2.9 W: +2 um of shaft in a minute."""
 MEAN_S = 2.0  # averaging time of the displayed growth: a single reading has 0.01 um of noise
 SHOWN_UM = 0.2  # smallest growth that is compared with what compensation leaves; below, noise dominates
 STALL_S = 10.0  # longest stall of the machine that the demo survives

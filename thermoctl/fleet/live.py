@@ -1,10 +1,9 @@
-"""The daemon's own recordings, searched for the stretch where its model no longer fits.
+"""`thermoctl diagnose --live`: find where the daemon's model stopped fitting, in the daemon's own recordings.
 
-`thermoctl diagnose --live`.
-
-The 10 Hz tier of the newest session is read, some hours back, and its innovations go through the same sum as
-in the daemon (daemon/misfit.py). The stretch from BEFORE_S before the onset to now is averaged to seconds and
-written as a CSV whose columns are those of the thermal plant."""
+The last hours of the newest session's 10 Hz tier are read. The innovations go through the same sum as in the
+daemon (daemon/misfit.py). The stretch from BEFORE_S before the onset until now is averaged to seconds. It is
+written as a CSV with the columns of the thermal plant.
+"""
 
 from __future__ import annotations
 

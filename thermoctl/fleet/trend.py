@@ -1,9 +1,9 @@
 """Rigs over time: which parameters drift, which model no longer fits, and what to do about it.
 
-A parameter drifts when the straight line through its estimates has a slope of more than DRIFT_SIGMA standard
-errors and changes it by more than DRIFT_SHARE over the time seen. A model no longer fits when the newest
-recording's misfit is above FIT_LIMIT; the misfit after the refit says whether values are wrong (identify
-again) or physics is missing (diagnose)."""
+A straight line is fitted to a parameter's estimates. The parameter drifts when the slope exceeds DRIFT_SIGMA
+standard errors and the total change exceeds DRIFT_SHARE. A model no longer fits when the newest recording's
+misfit is above FIT_LIMIT. If a refit removes the misfit, identify again; else physics is missing: diagnose.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RigHealth:
 
 
 def judge(summaries: Iterable[Summary]) -> list[RigHealth]:
-    """Group summaries of any rigs in any order by rig, and judge each."""
+    """Group summaries of any rigs in any order by rig, and assess each."""
     by_rig: dict[str, list[Summary]] = {}
     for s in summaries:
         by_rig.setdefault(s.rig, []).append(s)

@@ -1,15 +1,18 @@
 """The expansion model: position error from temperatures, first order, M inputs, one output.
 
-yL(n+1) = f1 yL(n) + sum_m [b_m,1 T_m(n-1) + b_m,2 T_m(n)]                                        (2), (3), (39)
+    yL(n+1) = f1 yL(n) + sum_m [b_m,1 T_m(n-1) + b_m,2 T_m(n)]                               (2), (3), (39)
 
-equation error   block least squares, or recursion (5), with the *measured* yL in the regressor. Noise on yL biases f1
-                 towards 0: with 0.05 um of noise a time constant of 180 s was found as 3.2 s. Kept because it is the paper's.
-output error     the regressor holds the model's own past output. For a given f1 the model is linear in b (inputs filtered
-                 by 1/(z - f1), the decay f1^n of the first output): a search over the one number f1 and a least squares.
-ridge            thermometers are noisy: gains g multiply their noise (quantisation step^2/12 and the sensor's own variance,
-                 less what the filter 1/(z - f1) averages away: (1 - f1)/(1 + f1)). Adding N sigma^2 g'g to the criterion
-                 minimises the expected squared error *with such inputs*: 25 nearly collinear parameters need that.
-With so many parameters the time constant itself is not determined; the prediction is.
+Equation error (the paper's method): block least squares, or recursion (5), with the *measured* yL in the
+regressor. Noise on yL biases f1 towards 0: with 0.05 um of noise a time constant of 180 s was found as 3.2 s.
+
+Output error: the regressor holds the model's own past output. For a given f1 the model is linear in b, with
+inputs filtered by 1/(z - f1) and the decay f1^n of the first output. So one number f1 is searched, with a
+least-squares solution for each.
+
+Ridge: the gains g multiply the noise of the thermometers. Its variance is quantisation step^2/12 plus the
+sensor's own, times (1 - f1)/(1 + f1) after the filter 1/(z - f1). Adding N sigma^2 g'g to the criterion
+minimises the expected squared error *with such inputs*. The 25 nearly collinear parameters need that. The
+time constant itself is not well determined by them; the prediction is.
 
 The output moves with the bodies' absolute temperatures, but the model has rises above the air. T_abs = rise +
 air, so air enters with the sum of all gains: b_air = sum(b1 + b2). Two hours of test do not excite a free air

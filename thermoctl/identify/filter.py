@@ -1,20 +1,26 @@
 """Temperature estimators: the paper's modified Kalman filter, and a steady Kalman filter.
 
-MKF    output as state (33), scalar gain of the coil's row (34), (35), mapped to the other points by zeta:
-       zeta = [1, sigma_2/sigma_1 ...], sigma_j = cov(e_1, e_j) over the identification test's error    (36), (37)
-       R_v = (quantisation step)^2/12 + noise^2 of the thermocouple; R_w = (rms error of the coil in the identification
-       test)^2 + R_v, as the paper takes it from both (its 0.46 degC)
-Kalman x(n+1) = A x + B [power, d(air)/dt] + w, y = C x + v, rises above the air.
+Modified Kalman filter (MKF): output as state (33), scalar gain of the coil's row (34), (35), mapped to the
+other points by zeta:
 
-The air's rate is a known input with a known effect: when only the air warms by 1 K, every rise falls by 1 K,
+    zeta = [1, sigma_2/sigma_1 ...], sigma_j = cov(e_1, e_j), e: error in the identification test   (36), (37)
+    R_v = (quantisation step)^2/12 + noise^2 of the thermocouple
+    R_w = (rms error of the coil in the identification test)^2 + R_v, as in the paper (its 0.46 degC)
+
+Kalman filter:
+
+    x(n+1) = A x + B [power, d(air)/dt] + w, y = C x + v, rises above the air
+
+The air's rate is a known input with a known effect. When only the air warms by 1 K, every rise falls by 1 K,
 so C b_air = -1. The process noise w has four parts:
+
 - an error of the coil's heat (b b')
 - a drift of all points against the air (b_air b_air')
 - outside heat into one body (C+ C+')
 - a slowly decaying outside heat as a disturbance state
 
-Their variances come from the calibration, where all twelve points are measured. They are those with which the
-filter estimates the twelve points best from the coil alone.
+Their variances come from the calibration, where all twelve points are measured. The chosen ones give the best
+estimate of the twelve points from the coil alone.
 """
 
 from __future__ import annotations
@@ -199,9 +205,9 @@ def tune(
 ) -> tuple[Kalman, np.ndarray]:
     """Return the filter whose `sensors` estimate all points best over the calibration: (filter, variances).
 
-    The error is averaged over `smooth` samples, so that the noise of the other thermometers has little weight.
-    `weights` (M,) are those of the points (default: equal). A weak prior on the logarithms keeps a variance that
-    the data do not determine."""
+    The error is averaged over `smooth` samples, so that the noise of the other thermometers has little
+    weight. `weights` (M,) are those of the points (default: equal). A weak prior on the logarithms keeps a
+    variance that the data do not determine."""
     base = np.array([np.log(1e-2), np.log(1e-10), np.log(1e-6), np.log(1e-13)])
     used = 4 if not model.c[:, -1].any() else 3
     w = np.ones(len(model.c)) if weights is None else weights / np.sqrt(np.mean(weights**2))

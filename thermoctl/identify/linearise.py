@@ -1,13 +1,19 @@
 """Compute the compensator's model from a thermal plant file instead of data.
 
 Rises above the air r = T - air of a plant that is linear in its temperatures:
-    dr/dt = A r + b P - 1 d(air)/dt,     readings y = C r,     growth of the output e = a . r + (sum a)(air - air at start)
-At the loop's period h, in delta form so that nothing is lost near 1:
+
+    dr/dt = A r + b P - 1 d(air)/dt,     readings y = C r
+    growth of the output e = a . r + (sum a)(air - air at start)
+
+At the loop's period h, in delta form so that no digits are lost near 1:
+
     A_h - I = A Phi,  B_h = Phi [b, -1],  Phi = integral of exp(A s) over 0..h
-and, where C is square, in the coordinates of the readings: alpha = C A_h C^-1, beta = C B_h (33).
-Process noise is white heat of density q (W^2 s) into every body; it stands for the plant's errors. Measurement
-noise is the thermocouple's noise and its resolution. The steady Kalman gain solves the discrete Riccati equation
-at the sensor's period; `gains` returns the time-varying gain from an uncertain start.
+
+and, for a square C, in the coordinates of the readings: alpha = C A_h C^-1, beta = C B_h (33).
+
+Process noise is white heat of density q (W^2 s) into every body; it represents the plant's errors.
+Measurement noise is the thermocouple's noise and its resolution. The steady Kalman gain solves the discrete
+Riccati equation at the sensor's period; `gains` returns the time-varying gain from an uncertain start.
 """
 
 from __future__ import annotations

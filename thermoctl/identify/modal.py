@@ -1,23 +1,33 @@
 """Thermal models with real poles, from data of any length: reduce first, then separable least squares.
 
-A passive heat network (RC) has real poles, so its response to heat u is y(n) = sum_k R_k s_k(n) + sum_k W_k
-p_k^n with s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only the poles are
-searched.
+A passive heat network (RC) has real poles, so its response to heat u is
 
-1. One pass over the samples reduces them to blocks of q samples: the mean of each output, and the first r
-   moments of each input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block. Its end
-   state and its mean depend on the inputs with weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p). Three moments
-   represent both to 1e-4 of the smallest effect of a block, so averaging 10 000 samples of 1 ms into one of
-   10 s loses no slow dynamics.
-2. Variable projection (Golub and Pereyra 1973) with Kaufman's simplification over x_k = ln(time constant):
-   J'J = (dF' P dF) o (T T'), J'r = -diag(dF' r T'), F (J, K) block responses, T the residues, P the projector off F.
-3. The order is the one with the least BIC.
-4. The residual is not white: the chamber, the bench and unmeasured heat move temperatures for hours. Plain
-   least squares then fits the slowest, most disturbed part of the record hardest. With `drift_s` = (td, tc)
-   the residual is white noise plus a first-order drift of time constant td. The drift exceeds the noise below
-   1/(2 pi tc). Outputs and responses first pass the whitening filter (1 - exp(-T/td) z^-1)/(1 - exp(-T/tc)
-   z^-1) (generalised least squares).
-All models are stable by construction.
+    y(n) = sum_k R_k s_k(n) + sum_k W_k p_k^n,   s_k(n+1) = p_k s_k(n) + u(n)
+
+For given poles the residues R, W are linear: only the poles are searched. All models are stable by
+construction.
+
+1. Reduce. One pass over the samples makes blocks of q samples. Kept are the mean of each output and the first
+r moments of each input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block.
+Its end state and its mean depend on the inputs with weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p). Three moments represent
+both to 1e-4 of the smallest effect of a block. So averaging 10 000 samples of 1 ms into one of 10 s loses no
+slow dynamics.
+
+2. Search. Variable projection (Golub and Pereyra 1973) with Kaufman's simplification over x_k = ln(time
+constant):
+
+    J'J = (dF' P dF) o (T T'),  J'r = -diag(dF' r T')
+    F (J, K) block responses, T the residues, P the projector off F
+
+3. Select the order with the least BIC.
+
+4. Whiten. The chamber, the bench and unmeasured heat move temperatures for hours, so the residual is
+coloured. Plain least squares then fits the slowest, most disturbed part of the recording hardest. With
+`drift_s` = (td, tc) the residual is white noise plus a first-order drift of time constant td. The drift
+exceeds the noise below 1/(2 pi tc). Outputs and responses first pass the whitening filter (generalised least
+squares)
+
+    (1 - exp(-T/td) z^-1) / (1 - exp(-T/tc) z^-1)
 """
 
 from __future__ import annotations

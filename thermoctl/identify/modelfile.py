@@ -1,8 +1,8 @@
 """Calibrations on disk: one YAML file each, in a folder that only the program writes.
 
 A file holds the compensator's coefficients with units and sampling, the fit's figures, the rig's name and the
-date. It lists the SHA-256 of each recording used. `current` in the folder names the one in use; older ones stay
-for a roll back. A file is refused when its checksum, its shape or its rig do not fit."""
+date. It lists the SHA-256 of each recording used. `current` in the folder names the one in use; older ones
+stay for a roll back. A file is refused when its checksum, its shape or its rig do not fit."""
 
 from __future__ import annotations
 

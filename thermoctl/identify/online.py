@@ -1,11 +1,12 @@
 """Tuning the expansion model while a reference encoder is present.
 
-Nothing is proposed before the rig has covered its range. Samples are counted in buckets of coil temperature and
-of its trend (warming, cooling); progress is the share of full buckets. A bank of output-error estimators learns
-from all but the newest samples (`hold_s`). Its proposal is accepted only if it predicts those better.
+Nothing is proposed before the rig has covered its range. Samples are counted in buckets of coil temperature
+and of its trend (warming, cooling); progress is the share of full buckets. A bank of output-error estimators
+learns from all but the newest samples (`hold_s`). Its proposal is accepted only if it predicts those better.
 
-Static gains stay within bounds of the calibrated ones, also after many tunings, because a tuned model carries the
-gains of its first calibration. Every change is a calibration (`modelfile.install`), so it can be rolled back.
+Static gains stay within bounds of the calibrated ones, also after many tunings, because a tuned model carries
+the gains of its first calibration. Every change is a calibration (`modelfile.install`), so it can be rolled
+back.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ class Tuner:
     def update(self, rises_k: np.ndarray, error_um: float, air_k: float = 0.0) -> None:
         """One sample at the expansion model's period.
 
-        Arguments: estimated rises (12,), the measured position error (NaN: no reference), and the rise of the air
-        since the start. Bodies expand with their absolute temperature, hence the air."""
+        Arguments: estimated rises (12,), the measured position error (NaN: no reference), and the rise of the
+        air since the start. Bodies expand with their absolute temperature, hence the air."""
         coil = float(rises_k[0])
         if self.last_coil is not None:
             self.slow += 0.02 * ((coil - self.last_coil) - self.slow)

@@ -1,9 +1,10 @@
-"""A linear thermal model and what can be done with it.
+"""A linear thermal model: output form, resampling, simulation.
 
-x(n+1) = A x(n) + B u(n),   y(n) = C x(n)                                    (31), (32) with D = 0
-output form: y(n+1) = alpha y(n) + beta u(n), alpha = C A C+, beta = C B      (33)
-resampling: [[A, B], [0, I]] at one period is the exponential of [[F, G], [0, 0]] T: its logarithm gives any
-other period
+    x(n+1) = A x(n) + B u(n),   y(n) = C x(n)                                     (31), (32) with D = 0
+    output form: y(n+1) = alpha y(n) + beta u(n), alpha = C A C+, beta = C B      (33)
+
+Resampling: [[A, B], [0, I]] at one period T is the exponential of [[F, G], [0, 0]] T. Its logarithm gives any
+other period.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ class StateSpace:
     def output_form(self, tolerance: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
         """Return alpha (l, l), beta (l, m) of (33).
 
-        The inverse of C omits singular values below `tolerance` of the largest. Order 12 always has noise modes:
-        cond(C) reached 3e5, and the plain inverse amplifies them."""
+        The inverse of C omits singular values below `tolerance` of the largest. Order 12 always has noise
+        modes: cond(C) reached 3e5, and the plain inverse amplifies them."""
         return self.c @ self.a @ np.linalg.pinv(self.c, rcond=tolerance), self.c @ self.b
 
     def resample(self, period_s: float) -> StateSpace:

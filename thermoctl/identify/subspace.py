@@ -1,22 +1,24 @@
-"""Combined deterministic-stochastic subspace identification, the paper's (7) to (26), and what it lacks.
+"""Combined deterministic-stochastic subspace identification: the paper's (7) to (26), and improvements.
 
 Block Hankel matrices Up, Uf, Yp, Yf of i block rows (10); Wp = [Up; Yp] (12).
-oblique projection        O_i = Yf /_Uf Wp                                             (9), (18)
-weighted SVD              W1 O_i W2 = U S V', Gamma_i = W1^-1 U1 S1^1/2                (19), (20)
-  n4sid (`paper`)         W1 = I, W2 = I
-  moesp                   W1 = I, W2 = projector onto the complement of Uf
-  cva                     W1 = (Yf/Uf_perp Yf/Uf_perp')^-1/2, W2 the same projector
-shift invariance          C = first block of Gamma, A = Gamma(without last)+ Gamma(without first)
-the paper's B (`paper`)   Z_i = Yf / [Wp; Uf], Z_{i+1} = Yf- / [Wp+; Uf-]                        (21)
-                          [Gamma_{i-1}+ Z_{i+1}; Y_i] = [A; C] Gamma_i+ Z_i + K Uf + [Rw; Rv]    (24)
-                          K = N [D; B] by least squares, D = 0                                   (25), (26)
-our B and x(0)            simulation least squares: y(n) = C A^n x0 + sum C A^(n-1-k) B u(k) is linear in B and x0; in modal
-                          form its normal matrix is (C'C) o (S'S), S the modal states: no simulation per unknown.
 
-The Hankel matrix H is never formed. Only its Gram matrix H H' of lag correlations is needed. Each block follows
-from its upper left neighbour: G[s+1, t+1] = G[s, t] + z(s+N) z(t+N)' - z(s) z(t)'. One pass over the data
-accumulates them in bounded memory. In H = L Q, L is the Cholesky factor. If that fails (noise-free data), a
-blocked QR gives L and keeps only the triangle.
+    oblique projection        O_i = Yf /_Uf Wp                                             (9), (18)
+    weighted SVD              W1 O_i W2 = U S V', Gamma_i = W1^-1 U1 S1^1/2                (19), (20)
+      n4sid (`paper`)         W1 = I, W2 = I
+      moesp                   W1 = I, W2 = projector onto the complement of Uf
+      cva                     W1 = (Yf/Uf_perp Yf/Uf_perp')^-1/2, W2 the same projector
+    shift invariance          C = first block of Gamma, A = Gamma(without last)+ Gamma(without first)
+    the paper's B (`paper`)   Z_i = Yf / [Wp; Uf], Z_{i+1} = Yf- / [Wp+; Uf-]                        (21)
+                              [Gamma_{i-1}+ Z_{i+1}; Y_i] = [A; C] Gamma_i+ Z_i + K Uf + [Rw; Rv]    (24)
+                              K = N [D; B] by least squares, D = 0                             (25), (26)
+    our B and x(0)            least squares on y(n) = C A^n x0 + sum C A^(n-1-k) B u(k), linear in B and x0.
+                              In modal form its normal matrix is (C'C) o (S'S), S the modal states: no
+                              simulation for each unknown.
+
+The Hankel matrix H is never formed. Only its Gram matrix H H' of lag correlations is needed. Each block
+follows from its upper left neighbour: G[s+1, t+1] = G[s, t] + z(s+N) z(t+N)' - z(s) z(t)'. One pass over the
+data accumulates them in bounded memory. In H = L Q, L is the Cholesky factor. If that fails (noise-free
+data), a blocked QR gives L and keeps only the triangle.
 """
 
 from __future__ import annotations
@@ -334,9 +336,9 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
     z_next = (target @ q) @ q.T
     state = np.hstack([pin_i @ z_i, np.zeros((n, L.shape[1] - np_))])
     left = np.vstack([pin_less @ z_next, yf[:l]]) - np.vstack([a, c]) @ state
-    # Solve (24), and (25), (26), which are linear in B (D = 0), together: min |left - N(B) Uf|. Solving for K first
-    # and then for B without weights is equal without noise. With noise it is far worse, because Uf of long pulses
-    # is nearly singular.
+    # Solve (24), and (25), (26), which are linear in B (D = 0), together: min |left - N(B) Uf|. Solving for K
+    # first and then for B without weights is equal without noise. With noise it is far worse, because Uf of
+    # long pulses is nearly singular.
     nu_factor = uf[:, :nu]
     target = left[:, :nu]  # left, projected on Uf
     lag, lcg = a @ pin_i, c @ pin_i  # (n, i l), (l, i l)

@@ -2,18 +2,19 @@
 
 PID, velocity form (41): D(s) = Kp (1 + 1/(Ti s) + Td s)
 
-Response: K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)), by the direct method of closed-loop identification (Ljung,
-System Identification, 2nd ed., section 13.5): output error least squares from recorded drive to recorded
-position. The loop answers the noise of a sample one period later at the earliest. So white noise of the
-encoder does not bias the fit.
+Response: K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)), by output-error least squares from recorded drive to
+recorded position. This is the direct method of closed-loop identification (Ljung, System Identification, 2nd
+ed., section 13.5). The loop answers the noise of a sample one period later at the earliest. So white noise of
+the encoder does not bias the fit.
 
 Ziegler-Nichols (Table I): Kp = 1.2 tau_c/(K0 tau_d), Ti = 2 tau_d, Td = 0.5 tau_d, from the steepest tangent
 of the fitted step response. The steepest difference of noisy samples is too steep: with 0.15 um of noise Kp
 was 21 % low, fitted 0.1 %.
 
-Lambda / IMC (Rivera, Morari, Skogestad): series form Kc = t1/(K0 (lambda + theta)), tI = t1, tD = t2, with
-the half rule for faster lags than theta. Parallel form: Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI +
-tD).
+Lambda / IMC (Rivera, Morari, Skogestad), with the half rule for faster lags than theta:
+
+    series form     Kc = t1/(K0 (lambda + theta)), tI = t1, tD = t2
+    parallel form   Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI + tD)
 
 Margins are those of the sampled loop L(e^jw) = D(z) G(z). G has a zero-order hold, the dead time and the
 moving average.
@@ -58,7 +59,7 @@ class SecondOrder:
         return self.gain * np.real(y)
 
     def response(self, drive: np.ndarray, period_s: float) -> np.ndarray:
-        """Positions (N,) from rest for drives (N,), each written after its position was read and held for `period_s`."""
+        """Return positions (N,) from rest; each drive (N,) is written after its position and held."""
         impulse = np.diff(self.step(np.arange(len(drive) + 1) * period_s))
         return np.concatenate(([0.0], signal.fftconvolve(drive, impulse)[: len(drive) - 1]))
 
@@ -255,7 +256,7 @@ def difference(present: Gains, proposed: Gains) -> str:
 
 
 def write(config: Path, proposed: Gains) -> None:
-    """Write kp, ti_s, td_s into the control section of a configuration; on request only. Raises InputError as `write_values`."""
+    """Write kp, ti_s, td_s into a configuration. Raises InputError as `write_values`."""
     numbers = {"kp": proposed.kp, "ti_s": proposed.ti_s, "td_s": proposed.td_s}
     write_values(config, "control", {n: f"{v:.6g}" for n, v in numbers.items()})
 

@@ -1,12 +1,15 @@
 """Plants as machine code: C from the expressions, compiled, and cached on disk.
 
     dx/dt = (flows in - flows out) / storage = f(t, x, u, p),    y = g(t, x, u, p)
-    S = d x / d q,  dS/dt = f_x S + f_q,  S(0) = d initial / d q,  q = (active parameters, uncertain initial states)
+    S = d x / d q,  dS/dt = f_x S + f_q,  S(0) = d initial / d q
+    q = (active parameters, uncertain initial states)
 
 C was chosen by measurement (`make bench`): a plant compiles in some tenths of a second, with numba in
-seconds. A jump (sign, step, a comparison) of a state or of time is smoothed to tanh(z / width), so that it
-has a slope. For a state the width is 1e-5 of the range of z, for time half a sampling interval. A jump of
-inputs that are held between samples is not smoothed.
+seconds.
+
+A jump (sign, step, a comparison) of a state or of time is smoothed to tanh(z / width), so that it has a
+slope. For a state the width is 1e-5 of the range of z, for time half a sampling interval. A jump of an input
+that is held between samples is not smoothed.
 """
 
 from __future__ import annotations

@@ -53,14 +53,15 @@ class ExpressionError(ValueError):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Expr:
-    """One node.
+    """One node of an expression. `op` is one of:
 
-    `op` is one of:
     - 'num' and 'name', with `value`; '+', '*', '/', '**', 'neg'; a comparison; a function's name;
     - 'table': args are x, the x points and the y points; value is the number of points;
     - 'delay': args are an expression and seconds; 'first': value is a name;
-    - in derivatives only, 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope' and 'bump' (slope of a smoothed step);
-    - in derivatives only, 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed)."""
+    - only in derivatives: 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope', 'bump' (slope of a smoothed
+      step);
+    - only in derivatives: 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed).
+    """
 
     op: str
     args: tuple[Expr, ...] = ()

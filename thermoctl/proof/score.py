@@ -1,12 +1,10 @@
-"""One diagnosis against its sealed answer.
+"""Score one diagnosis against its sealed answer: detection, name, place, and the gain of the added effect.
 
-What was found, named, placed, and what adding it was worth.
-
-Held-out gain: with e the mean over outputs of (rms / oracle's rms)^2 on data that took no part,
+Held-out gain: with e the mean over outputs of (rms / oracle's rms)^2 on held-out data,
 
     share = (e_refit - e_after) / (e_refit - 1)
 
-It is 1 where the result is as good as the true physics, 0 where it is no better than a refit alone.
+1: as good as the true physics. 0: no better than a refit alone.
 """
 
 from __future__ import annotations
@@ -31,7 +29,8 @@ Named = tuple[str, str]  # an effect and its place
 class Row:
     """One scored case.
 
-    `called` is what the diagnosis said in one word: an effect, `none` or `unknown`."""
+    `called` is the diagnosis in one word: an effect, `none` or `unknown`.
+    """
 
     case: str
     family: str

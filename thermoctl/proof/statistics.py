@@ -8,10 +8,12 @@ Calibration: the expected error over ten bins b of width 0.1
 
     ECE = sum_b (n_b/n) |mean probability_b - share right_b|
 
-Detection over size s, in sigmas of an ideal single test (the curve of MIL-HDBK-1823A), by maximum likelihood
-on a grid; 95 % interval of `half`: where twice the log likelihood has fallen by 3.84
+Detection over size s, in sigmas of an ideal single test, is the curve of MIL-HDBK-1823A
 
     P(found | s) = 1 / (1 + (half / s)^slope)
+
+by maximum likelihood on a grid. The 95 % interval of `half` ends where twice the log likelihood has fallen by
+3.84.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the reproduction promises, measured on many rigs."""
+"""The reproduction's goals, measured on many rigs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Goal(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """What limits the methods on a family of rigs, medians: ratios of 2 s, um, and K."""
+    """Limits of the methods on a family of rigs, medians: ratios of 2 s, um, and K."""
 
     rigs: str
     paper_over_siso: float
@@ -92,7 +92,7 @@ def _goal(what: str, value: float, high: float | None, low: float = 0.0) -> Goal
 
 
 def limits(families: Mapping[str, Sequence[SeedResult]]) -> list[Limit]:
-    """Compare families of rigs: what limits both methods."""
+    """Compare families of rigs by the limits of both methods."""
     out = []
     for name, results in families.items():
         p, s, b = (np.array([r.position[k][1] for r in results]) for k in ("paper", "siso", "better"))

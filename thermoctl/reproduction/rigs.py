@@ -1,14 +1,13 @@
-"""Simulated rigs to prove the method on.
+"""Simulated rigs for the reproduction, each with physics that no identified model has.
 
-Varied from seed to seed and day to day, with physics that no identified model has.
-
-The plant file's truth is used with its fast electromechanics replaced by the quasi-static equivalent
-(plants.py): the position loop settles in milliseconds, heat takes minutes. The current is what holds the
-flexures and drags the eddy damping, i = (k x + b v) / k_T, with x the reference after the rate limiter.
+A rig uses the plant file's truth, with its fast electromechanics replaced by the quasi-static equivalent
+(plants.py). The position loop settles in milliseconds, heat takes minutes. The current holds the flexures and
+overcomes the eddy damping, i = (k x + b v) / k_T, with x the reference after the rate limiter.
 
 Each seed has other heat capacities, conductances and expansions (SPREAD). Each day has another natural
-convection (CONVECTION), bench temperature, chamber drift, and unmeasured heat in three bodies (a random walk
-that is forgotten in HEAT_TAU_S)."""
+convection (CONVECTION), bench temperature and chamber drift. Unmeasured heat in three bodies is a first-order
+random process with time constant HEAT_TAU_S.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +35,10 @@ PAPER_SCALE = {
     "a_shaft_2": 1.5,
     "a_bracket_1": 7.5,
 }
-"""Expansion of the proving rigs over the plant file's: a longer shaft and a long arm under the encoder's head. With these the error
-without compensation (5.7 +- 7.3 um in the paper) and with the coil alone (+-2.3 um) is of the paper's size."""
+"""Factor on the plant file's expansion: a longer shaft, and a long arm under the encoder's head.
+
+It gives errors of the paper's size: 5.7 +- 7.3 um without compensation, +-2.3 um with the coil alone.
+"""
 HEAT_W, HEAT_TAU_S = (
     0.012,
     1800.0,
@@ -72,9 +73,10 @@ def _changed_air(t: np.ndarray, late: np.ndarray, columns: dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """A change of a rig that the methods are not told of.
+    """A change of a rig that the methods do not know.
 
-    Sensors and motion differ always, the rest after calibration."""
+    Sensors and motion differ always, the rest after calibration.
+    """
 
     inputs: Callable[[np.ndarray, np.ndarray, dict[str, np.ndarray]], None] | None = None
     factors: Mapping[str, float] = field(default_factory=dict)  # of parameters whose names start so
@@ -102,9 +104,7 @@ NONE = Disturbance()
 
 @dataclass(frozen=True)
 class _Day:
-    """What a rig goes through on a day.
-
-    Its parameters, the inputs of its thermal plant at 1 s, and its random numbers."""
+    """One day of a rig: parameters, the inputs of its thermal plant at 1 s, random numbers."""
 
     t: np.ndarray
     parameters: dict[str, float]

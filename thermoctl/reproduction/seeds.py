@@ -38,9 +38,10 @@ class SeedResult:
 
 @dataclass(frozen=True)
 class Kept:
-    """What the figures need of one rig.
+    """One rig's data for the figures.
 
-    Its calibration, its tests, the estimates in test 3 and the residuals in test 4."""
+    Its calibration, its tests, the estimates in test 3 and the residuals in test 4.
+    """
 
     calibration: chain.Calibration
     tests: tuple[Recorded, Recorded, Recorded, Recorded]
