@@ -27,7 +27,7 @@ from hal.serial_port import open_port
 from hal.wire import EXTENDED, CanPort, SlcanLine
 
 MAX_TAKEN = 500  # most frames that one tick takes from a bus: bounds the time of a tick on a full bus
-MAX_REFUSED = 100  # frames in a row that the interface does not take, before the bus counts as lost
+MAX_REFUSED = 100  # the bus counts as lost after so many refused frames in a row
 _SLCAN_BITRATES = {
     10_000: 0,
     20_000: 1,

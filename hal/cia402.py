@@ -132,7 +132,7 @@ class Sdo:
 
     def _checked(self, answer: bytes, item: Object, what: str) -> bytes:
         if answer[0] == 0x80:
-            import canopen  # already loaded by Objects
+            import canopen  # Objects has already loaded it
 
             code = int.from_bytes(answer[4:], "little")
             text = canopen.SdoAbortedError.CODES.get(code, "the manual of the drive says what it means")

@@ -1,4 +1,4 @@
-"""From the configuration to the back end and the drivers that it names."""
+"""Make the back end and the drivers that the configuration names."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def driving_devices(settings: Settings) -> list[Device]:
 
 
 def can_drive(settings: Settings) -> bool:
-    """Return whether anything takes the command, so that the rig may be armed. Raises InputError."""
+    """Return whether a device takes the drive command, so that the rig may be armed. Raises InputError."""
     return settings.hal.backend != "devices" or bool(driving_devices(settings))
 
 

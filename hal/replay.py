@@ -25,7 +25,7 @@ STALE_PERIODS = 5  # a channel is stale after this many of its usual (median) pe
 
 
 def replay_backend(settings: Settings) -> ReplayBackend:
-    """Make the back end `replay`. Raises InputError: no such file, no column that plays a role."""
+    """Make the back end `replay`. Raises InputError: no such file, or no column with a role."""
     return ReplayBackend(read_table(Path(settings.path).parent / settings.hal.recording), settings.hal.roles)
 
 

@@ -29,7 +29,7 @@ from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 MAX_CATCH_UP = 1000  # periods in one read; when the clock jumps further (suspend), the plant skips that time
-SLOWEST_S = 3600.0  # longest time constant of a simulated 1/f error: below 1/h it is part of the offset
+SLOWEST_S = 3600.0  # longest time constant of a simulated 1/f error; slower parts count as offset
 _STATE = ROLE["amplifier_state"]
 EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
 
@@ -179,13 +179,13 @@ def _roles_of_outputs(path: str | Path, outputs: Sequence[str], roles: Mapping[s
 
 
 def _draws(random: np.random.Generator) -> Iterator[float]:
-    """Draw standard normal numbers, in blocks: the same numbers in a third of the time."""
+    """Draw standard normal numbers in blocks, which takes a third of the time of single draws."""
     while True:
         yield from random.standard_normal(4096).tolist()
 
 
 def make_rig(settings: Settings) -> PlantRig:
-    """Make the plant that plays the hardware (`hal.truth`, else `hal.plant`). Raises InputError."""
+    """Make the plant that simulates the hardware (`hal.truth`, else `hal.plant`). Raises InputError."""
     hal = settings.hal
     return PlantRig(
         Path(settings.path).parent / (hal.truth or hal.plant),

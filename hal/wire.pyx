@@ -96,8 +96,8 @@ cpdef bint wait_readable(int fd, int64_t until_ns) except -1:
 cdef int _read(int fd, uint8_t *to, int size) except -1:
     """Return the number of bytes read, 0 when none has arrived. Raises OSError when the other end is gone.
 
-    A terminal is asked first: to read an empty one waits, even without blocking, for the kernel's worker that
-    moves bytes to it. On a busy machine that worker comes tens of milliseconds late, and the tick with it.
+    FIONREAD is asked first: a read of an empty terminal waits for a kernel worker, even without blocking. On
+    a busy machine that costs tens of milliseconds.
     """
     cdef int there = 1, got
     if ioctl(fd, FIONREAD, &there) == 0 and there == 0:
@@ -279,7 +279,7 @@ cdef class Framer:
         return <double>bits
 
     def reset(self) -> None:
-        """Forget half a frame and the sequence (after a reconnection)."""
+        """Drop an incomplete frame and the sequence (after a reconnection)."""
         self._length = self._known = 0
         self.quiet_bytes = self.quiet_sums = self.quiet_lengths = 0
 
@@ -326,10 +326,11 @@ cpdef bytes encode_slcan(uint32_t can_id, bytes data):
 
 
 cdef class SlcanParser:
-    """Bytes from an adapter in, data frames out; the id of a 29-bit frame (T) has the bit EXTENDED.
-    Acknowledgements (z, Z, CR) pass silently. `refused` counts BEL, by which the adapter refuses a command,
-    `ignored` remote and CAN FD frames, `bad` what is no valid message. Time stamps after the data are
-    ignored."""
+    """Find data frames in an adapter's bytes; the id of a 29-bit frame (T) has the bit EXTENDED.
+
+    Acknowledgements (z, Z, CR) pass silently. `refused` counts BEL, by which the adapter refuses a command.
+    `ignored` counts remote and CAN FD frames, `bad` invalid messages. Time stamps after the data are ignored.
+    """
 
     @property
     def pending(self) -> int:

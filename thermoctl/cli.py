@@ -14,7 +14,7 @@ from thermoctl.yamlfile import InputError
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(
         _name, "1"
-    )  # before numpy is loaded: BLAS threads on busy cores wait for each other
+    )  # set before numpy is loaded: BLAS threads on busy cores wait for each other
 
 DESCRIPTION = """\
 Holds the output of a precision linear actuator in place while its coil heats up. Finds the physics that a simulation

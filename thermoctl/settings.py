@@ -28,7 +28,7 @@ from thermoctl.option import Option, option
 from thermoctl.yamlfile import InputError, Node, Section, kind_of, load, number_of, suggest
 
 TEMPERATURES = "temperatures_c"
-"""In a mapping of limits: every temperature of the twelve points that has no entry of its own."""
+"""In a mapping of limits: default for the twelve temperatures without an entry of their own."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ class RecordingSettings:
 
 @dataclass(frozen=True)
 class HalSettings:
-    """The hardware, or what simulates it."""
+    """The hardware, or its simulation."""
 
     backend: str = option(
         "where readings come from: a simulated plant, devices, or a recording that is played back",
@@ -390,7 +390,7 @@ def _value(section: Section, key: str, kind: Any, row: Option) -> Any:
         return tuple(section.list(key))
     if origin is tuple:
         return tuple(_channel(label, item.value, item) for item in section.list(key))
-    if origin is types.UnionType:  # Node | None: the reader of that part checks it
+    if origin is types.UnionType:  # Node | None: the reader of that section checks it
         return node
     raise TypeError(f"{label}: no rule for {kind}")
 

@@ -1,10 +1,9 @@
-"""Every signal once: name, unit, meaning, and the limits it stays within when all is well.
+"""Define every signal once: name, unit, meaning, and plausible limits.
 
-A record row is one tick's signals in this order, all float64. The shared memory, the recording's schema,
+A record row holds one tick's signals in this order, all float64. The shared memory, the recording's schema,
 `status`, the dashboard and the reference page derive from this table.
 
-Rows replay: the signals `dt_s` to `delay_bits` are everything the law was given, those from `state` on what
-it gave.
+Rows can be replayed: `dt_s` to `delay_bits` are all inputs of the law, `state` and later ones its outputs.
 """
 
 from __future__ import annotations

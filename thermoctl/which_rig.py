@@ -1,4 +1,4 @@
-"""Which rig a command means: the one rule by which every command finds its configuration.
+"""Find the configuration of a command; every command uses this rule.
 
 `--config FILE`; else `$THERMOCTL_CONFIG`; else `config/simulated.yaml` in the current folder; else
 `/etc/thermoctl/rig.yaml`.
@@ -180,9 +180,7 @@ def choose(args: argparse.Namespace) -> None:
 def _means_a_rig(args: argparse.Namespace) -> bool:
     if args.command == "diagnose":
         return args.live or (args.resolve and not args.rig)
-    if (
-        args.command == "experiment"
-    ):  # a test is found beside the configuration; a file of inputs may need no rig
+    if args.command == "experiment":  # a test lies beside the configuration; a file of inputs may need no rig
         return not (args.plant or (args.dry_run and Path(args.name).suffix in (".yaml", ".yml")))
     return args.command != "service" or args.action == "install"
 

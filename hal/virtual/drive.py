@@ -158,7 +158,7 @@ class Cia402Drive:
         return out
 
     def _watch_stop(self, now_s: float) -> None:
-        """Obey the stop input: quick stop from 'operation enabled', and no way there while it is active."""
+        """Obey the stop input: it causes a quick stop, and prevents 'operation enabled' while active."""
         self._stopping = now_s < self.stop_until_s
         if self._stopping and self.state == ENABLED:
             self.state = QUICK_STOP

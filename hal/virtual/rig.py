@@ -39,7 +39,7 @@ from hal.virtual.text_meter import TextMeter
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, suggest
 
-MAX_STEPS = 50  # periods to catch up at once; after a longer stop of this program the plant skips that time
+MAX_STEPS = 50  # most periods simulated at once; after a longer stop the plant skips the rest
 REFERENCE_HZ = 100
 PRIORITY = 70  # below the daemon's loop
 MAX_COMMAND = 400  # bytes of a line to the control socket
@@ -55,7 +55,7 @@ _KINDS: dict[str, Callable[[Binding, PlantRig], VirtualDevice]] = {
 
 
 def virtual_device(binding: Binding, rig: PlantRig) -> VirtualDevice:
-    """Make the device that plays `binding`. Raises InputError for a CAN port that is not slcan."""
+    """Make the device that simulates `binding`. Raises InputError for a CAN port that is not slcan."""
     if binding.profile.bus.startswith("can") and not binding.port.startswith("slcan:"):
         raise InputError(
             f"{binding.place}: the virtual rig plays CAN devices on slcan ports only, found '{binding.port}'"

@@ -20,9 +20,9 @@ from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 FEWEST = 2  # approaches to a target, by the standard's estimator of repeatability
-SETTLE_S = 2.0  # after arrival, before an approach is read
+SETTLE_S = 2.0  # settling time after arrival, before an approach is read
 SETTLED = 10  # first samples, whose mean error is taken as zero
-AT_TARGET_UM = 1e-6  # between reference and setpoint: the motion has ended
+AT_TARGET_UM = 1e-6  # largest distance of reference and setpoint at rest
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def unidirectional(targets_um: np.ndarray, deviations_um: np.ndarray) -> Directi
 
 
 def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
-    """Compute mean deviation and 2 s of an error that is recorded all the time, as in the paper."""
+    """Compute mean and 2 s of an error that is recorded continuously, as in the paper."""
     e = error_um[np.isfinite(error_um)]
     return float(e.mean()), float(2 * e.std(ddof=1))
 
@@ -75,9 +75,10 @@ def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
 def approaches(
     setpoint_um: np.ndarray, reference_um: np.ndarray, settle: int
 ) -> list[tuple[int, float, int]]:
-    """Find where the motion stands still.
+    """Find the stops of the motion.
 
-    (index `settle` samples after arrival, target, direction +1 or -1)."""
+    Return (index `settle` samples after arrival, target, direction +1 or -1) of each.
+    """
     still = np.concatenate([[False], setpoint_um[1:] == setpoint_um[:-1]])
     out, last = [], 0
     for k in range(1, len(still)):

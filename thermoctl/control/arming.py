@@ -17,7 +17,7 @@ OFF, SAFE, READY, ARMED, FAULT = range(5)
 STATES = ("OFF", "SAFE", "READY", "ARMED", "FAULT")
 
 NONE, ARM, DISARM, SETPOINT = range(4)
-"""Commands. SETPOINT does not move the state machine."""
+"""Commands. SETPOINT does not change the state."""
 COMMANDS = ("none", "arm", "disarm", "setpoint")
 
 
@@ -52,4 +52,4 @@ TABLE = bytes(
     for tripped in (False, True)
     for critical in (False, True)
 )
-"""`next_state` of every input, the last argument running fastest: how the compiled tick asks it."""
+"""Table of `next_state` for every input, the last argument changing fastest; the compiled tick reads it."""

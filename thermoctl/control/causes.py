@@ -65,7 +65,7 @@ FOLLOWS: dict[str, set[str]] = {
     "coil_overtemperature": {"coil_overtemperature_model", "coil_heating_rate"},
     "compensation_bound": {"compensation_slewing"},
 }
-"""Cause -> what follows from it."""
+"""Cause -> the faults that follow from it."""
 for _name in _of(*GROUPS):  # the same reading's other kinds, found later
     _group, _kind = _name.rsplit("_", 1)
     FOLLOWS[_name] = FOLLOWS.get(_name, set()) | {
@@ -87,7 +87,7 @@ class Standing:
 
     @property
     def late_first(self) -> bool:
-        """Whether late ticks are to be named before the fault itself."""
+        """True when late ticks must be named before the fault itself."""
         return self.late_s > 0.0 and self.name in LATE_MAY_CAUSE
 
 
@@ -102,7 +102,7 @@ def _lost(name: str) -> bool:
 
 
 def follows(fault: Standing, cause: Standing) -> bool:
-    """Whether `fault` follows from `cause`."""
+    """Return whether `fault` follows from `cause`."""
     after_s = fault.t_s - cause.t_s
     if _lost(fault.name) and _lost(cause.name) and 0.0 <= after_s <= TOGETHER_S:
         return True
@@ -127,7 +127,7 @@ def in_order(standing: Iterable[Standing], trips: int) -> list[tuple[Standing, s
         for k, f in enumerate(left)
         if not any(follows(f, c) and (j < k or not follows(c, f)) for j, c in enumerate(left) if j != k)
     ]
-    heads = heads or left[:1]  # a circle: the first one of it
+    heads = heads or left[:1]  # faults that cause each other: the first one
     cases: dict[str, list[Standing]] = {h.name: [] for h in heads}
     for f in left:
         if f.name in cases:

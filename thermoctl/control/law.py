@@ -76,12 +76,12 @@ from thermoctl.signals import FAULT_WORD_BITS, OUTPUT, OUTPUTS
 
 MAX_AVERAGE = 64
 WARM_UP_TICKS = 100
-THERMAL_S = 0.1  # a temperature's change counts over at least this time: a bonded sensor's own time constant
+THERMAL_S = 0.1  # least time for a change of temperature: a bonded sensor's own time constant
 # Unit of `delay`: a recording has four bits a temperature, so 15 is 375 ms, above the 300 ms timeout of an
 # answer.
 DELAY_S = 0.025
-MAX_GAP_S = 10.0  # a longer time between two ticks makes the estimate worthless
-RESUME_LIMIT_C = 2.0  # estimates of an earlier run are kept when the coil's first reading is as close as this
+MAX_GAP_S = 10.0  # after a longer time between two ticks the estimate restarts
+RESUME_LIMIT_C = 2.0  # keep the estimates of an earlier run if the coil's first reading is this close
 # Readings of the air averaged into the origin: 0.02 K of noise in a single one would stay as 0.03 um of
 # offset.
 AIR_READINGS = 30.0
@@ -90,7 +90,7 @@ _GAP_S, _RESUME_C, _COPPER, _WARM_UP = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K, WA
 _AIR_READINGS = AIR_READINGS
 _THERMAL_S, _DELAY_S, _NAN = THERMAL_S, DELAY_S, float("nan")
 COMPILED = not __file__.endswith(".py")
-"""False when this module runs interpreted: right for coverage, a hundred times too slow for a rig."""
+"""False when this module runs interpreted: for coverage only, a hundred times too slow for a rig."""
 
 # Constants that the compiler turns into C numbers (typed in law.pxd).
 _OK, _STALE, _ERROR, _ABSENT = OK, STALE, ERROR, ABSENT
@@ -270,13 +270,13 @@ class Law:
         first[0] += 1.0
         self.a1a1 = float(first @ first)
         self.sensors = array("i", model.sensors)
-        # A model that says nothing of a temperature, or of the expansion, cannot disagree with it.
+        # Without a model of a temperature, or of the expansion, nothing can disagree with it.
         self.predicts = array("i", model.C.any(axis=1).astype(int))
         self.expands = bool(model.b1.any() or model.b2.any() or model.b_air != 0.0)
-        # The first correction puts the estimate on the coil's reading: along zeta, or along K.
+        # The first correction sets the estimate to the coil's reading: along zeta, or along K.
         along = float(model.C[0] @ model.gain[:, 0])
         self.first_gain = 1.0 / along if abs(along) > 1e-9 else 0.0
-        # c is advanced once a reading, in steps that the fastest mode allows.
+        # c is advanced once a reading, in steps short enough for the fastest mode.
         self.correction_step_s = (
             0.5 * model.period_s / max(float(np.abs(model.A_minus_I).sum(axis=1).max()), 1e-12)
         )
@@ -363,7 +363,7 @@ class Law:
         for name, end in (
             ("state", len(arming.STATES)),
             ("average_at", MAX_AVERAGE),
-        ):  # both are places in a table
+        ):  # both are indices of a table
             if not 0 <= vector[_SCALARS.index(name)] < end:
                 raise ValueError(
                     f"law: a state whose {name} is {vector[_SCALARS.index(name)]:g}, expected 0 to {end - 1}"
@@ -503,7 +503,7 @@ class Law:
         if not (self.low[c] <= value <= self.high[c]) or not finite(value):
             self.verdict[c] = 1.0 + _K_RANGE
         elif jumped and thermal and self.suspect[c] == 0.0:
-            self.suspect[c] = 1.0  # one reading proves no jump: the next one decides
+            self.suspect[c] = 1.0  # one reading proves no jump; wait for the next one
         else:
             if self.seen[c] > 0.0 and value == self.last[c]:
                 self.same_s[c] += elapsed
@@ -660,7 +660,8 @@ class Law:
                 self.T_before[m] = self.T[m]
             self.expansion_before_um = self.expansion_after_um = s / (1.0 - self.f1)
             self.phase_s = 0.0
-            if self.air_started >= _AIR_READINGS or self.verdict[_AIR] > 0.0:  # else its origin still moves
+            # until then the origin still changes
+            if self.air_started >= _AIR_READINGS or self.verdict[_AIR] > 0.0:
                 self.primed = self.corrected
         self.phase_s += self.dt
         if self.phase_s >= self.expansion_period_s:
@@ -687,7 +688,8 @@ class Law:
             return
         if self.state == _ARMED:
             step = self.p.slew_um_s * self.dt
-            if self.primed > 0.0 and abs(target - self.compensation_um) > 2.0 * step:  # else the origin moves
+            # else the origin still changes
+            if self.primed > 0.0 and abs(target - self.compensation_um) > 2.0 * step:
                 self.faults |= one << _B_SLEWING
             target = clip(target, self.compensation_um - step, self.compensation_um + step)
         self.compensation_um = target
@@ -737,7 +739,7 @@ class Law:
     # ---- protect ------------------------------------------------------------------------------------------------
 
     def protect(self, command, external):
-        """All limits, the arming machine and the last gate; fills `outputs`, `drive` and `enable`."""
+        """Check all limits, run the arming machine; fill `outputs`, `drive` and `enable`."""
         one = 1
         found = external
         if self.state == _ARMED:
@@ -880,7 +882,7 @@ class Law:
             self.drive_low = self.drive_high = self.drive
 
     def _compare_order(self):
-        """exchanged: two mean readings would fit their estimates better the other way round."""
+        """Set `exchanged`: two mean readings would fit their estimates better the other way round."""
         self.exchanged = 0.0
         limit = -self.p.order_limit_c * self.p.order_limit_c
         for m in range(1, _M):

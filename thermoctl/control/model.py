@@ -199,7 +199,7 @@ class Parameters(Limits, Gains):
 
 
 BY_CHANNEL = {f.name: f.metadata["by_channel"] for f in fields(Parameters) if "by_channel" in f.metadata}
-"""The arrays over the channels, each with its value for a channel that the configuration does not name."""
+"""Arrays over the channels, each with its default for a channel without an entry."""
 NAMES = tuple(
     name
     for f in fields(Parameters)

@@ -29,8 +29,8 @@ NAMES_1 = tuple("amplifier_frozen" if name == "amplifier_stopped" else name for 
 def table(meta: Mapping[str, str]) -> dict[int, str]:
     """Return bit -> name for a recording with this metadata.
 
-    Without any metadata of ours (a CSV file) the present table holds. Raises ValueError when the metadata is
-    damaged.
+    A recording of another program (a CSV file) has no metadata: the present table applies. Raises ValueError
+    when the metadata is damaged.
     """
     if "faults" in meta:
         stored = json.loads(meta["faults"])

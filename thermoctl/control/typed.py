@@ -25,7 +25,7 @@ _PART = re.compile(r"^( *)# generated: (.*)\n(?:.*\n)*?\1# end\n", re.MULTILINE)
 
 
 def interpreted_law() -> ModuleType:
-    """Return law.py run by the interpreter: the compiled module hides its constants."""
+    """Return law.py as an interpreted module: the compiled one hides its constants."""
     spec = importlib.util.spec_from_file_location("interpreted_law", HERE / "law.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -84,7 +84,7 @@ def declarations(text: str, law: ModuleType) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Write law.pxd, or with --check say whether it is up to date."""
+    """Write law.pxd, or with --check report whether it is up to date."""
     path = HERE / "law.pxd"
     text = path.read_text(encoding="utf-8")
     made = declarations(text, interpreted_law())

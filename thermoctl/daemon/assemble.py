@@ -1,4 +1,4 @@
-"""Make what the law needs from the configuration: parameters, the model, names of shared memory."""
+"""Make the law's inputs from the configuration: parameters, the model, names of shared memory."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def power_warning(settings: Settings) -> str:
 
 
 def compensator(settings: Settings) -> CompensatorModel:
-    """Load the model that `compensation.model` names; without one, a model that estimates nothing.
+    """Load the model that `compensation.model` names, else a model without rises and expansion.
 
     Raises InputError for a model of another rig.
     """

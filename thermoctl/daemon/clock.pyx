@@ -40,9 +40,9 @@ cpdef int64_t suspended_ns() noexcept:
 
 
 cpdef int64_t sleep_until(int64_t deadline_ns, int64_t spin_ns=0) noexcept:
-    """Sleep until `deadline_ns`, burning the last `spin_ns` of it; returns the time after, ns.
+    """Sleep until `deadline_ns`, busy-waiting for the last `spin_ns`; return the time after, ns.
 
-    Returns early only when a signal came, so that Python's handlers run.
+    Returns early only after a signal, so that Python's handlers run.
     """
     cdef timespec t
     cdef int64_t until = deadline_ns - spin_ns, now

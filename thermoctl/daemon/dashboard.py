@@ -403,7 +403,7 @@ def _dump(value: Any) -> str:
 
 
 def _numbers(array: np.ndarray, digits: int | None = None) -> list[float | None]:
-    """For JSON: seven significant digits (or `digits` after the point), null where there is none."""
+    """Round numbers for JSON: seven significant digits (or `digits` after the point), null for NaN."""
     return [
         None if not math.isfinite(v) else round(v, digits) if digits is not None else float(f"{v:.7g}")
         for v in array.tolist()

@@ -173,7 +173,7 @@ class Rig:
             self.keep_state()
 
     def remark(self, t_s: float, dt_s: float) -> None:
-        """Publish what the row does not hold: ages, verdicts, onsets and the devices' messages.
+        """Publish the remarks: ages, verdicts, onsets and the devices' messages.
 
         One channel a tick is checked for a new message; all are checked when a fault is new. Nothing is a
         fault while the law warms up.

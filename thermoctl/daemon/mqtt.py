@@ -122,7 +122,7 @@ class Bridge:
         if self.connected.is_set():
             with contextlib.suppress(
                 RuntimeError, ValueError
-            ):  # disconnected just now: the last will publishes it
+            ):  # the connection was just lost: the last will publishes it
                 self.client.publish(
                     f"{self.topic}/availability", OFFLINE, qos=1, retain=True
                 ).wait_for_publish(2.0)

@@ -281,7 +281,7 @@ cdef class Remarks:
 
 def unpack_readings(double fresh_bits, double status_bits, double delay_bits, unsigned char[::1] fresh,
                     unsigned char[::1] status, unsigned char[::1] delay):
-    """Unpack what `Record.fill` packed, into the given arrays."""
+    """Unpack the bits that `Record.fill` packed, into the given arrays."""
     cdef uint64_t f = <uint64_t>fresh_bits, s = <uint64_t>status_bits, d = <uint64_t>delay_bits
     cdef int c
     for c in range(fresh.shape[0]):

@@ -1,4 +1,4 @@
-"""Which channels a signal of the record comes from."""
+"""Find the channels that a signal of the recording is computed from."""
 
 from __future__ import annotations
 

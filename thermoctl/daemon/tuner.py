@@ -75,7 +75,8 @@ class Tuning:
             self.air_c = air
         if np.isnan(self.zero_um):
             self.zero_um = error
-        # the estimates are degC: rise and the air's own change together are their distance from the first air
+        # The model needs the distance from the first air temperature: rise + change of the air. The estimates
+        # are degC.
         self.tuner.update(estimates - air, error - self.zero_um, air - self.air_c)
         if rows[-1, _T] - self.proposed_s >= PROPOSE_S:
             self.proposed_s = float(rows[-1, _T])

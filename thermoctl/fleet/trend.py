@@ -18,7 +18,7 @@ from thermoctl.control import faults
 from thermoctl.fleet.health import Summary
 
 DRIFT_SIGMA, DRIFT_SHARE, FIT_LIMIT = 4.0, 0.05, 3.0
-FEWEST = 3  # estimates from which a straight line has a scatter
+FEWEST = 3  # fewest estimates whose scatter about a line can be computed
 MONTH_S = 30 * 86400.0
 
 
@@ -94,8 +94,9 @@ def _advice(newest: Summary, drifts: dict[str, Drift]) -> list[str]:
 def drift(times_s: Sequence[float], estimates: Sequence[tuple[float, float]]) -> Drift:
     """Fit a weighted straight line through (value, standard error) over time.
 
-    The standard error of the slope is widened by the scatter about the line where that is larger than the
-    estimates' own. Fewer than FEWEST estimates never drift."""
+    The slope's standard error comes from the estimates' own, or from the scatter about the line if that is
+    larger. A parameter with fewer than FEWEST estimates never drifts.
+    """
     t = np.asarray(times_s) / MONTH_S
     value, sd = np.array(estimates, dtype=float).reshape(-1, 2).T
     if len(t) < FEWEST or np.ptp(t) == 0.0:

@@ -69,10 +69,11 @@ def recursive(
     q0: float = 1e6,
     own_output: bool = False,
 ) -> Expansion:
-    """Return the paper's recursion (5) with weight lambda and Q(0) = q0 I.
+    """Fit by the paper's recursion (5) with weight lambda and Q(0) = q0 I.
 
-    `own_output` puts the model's own past output in the regressor as (3) is written, else the measured one
-    (which is what equals the block solution)."""
+    `own_output` puts the model's own past output in the regressor as (3) is written, else the measured one.
+    Only the latter equals the block solution.
+    """
     _check(rises, y)
     phi = np.ascontiguousarray(regressors(rises)[:-1])
     p = phi.shape[1] + 1
@@ -217,8 +218,8 @@ class Bank:
     def model(self) -> Expansion:
         """Return the Expansion of the pole with the least criterion so far.
 
-        Squared error and, as in `output_error`, the ridge that the inputs' error asks for, laid under each
-        triangle."""
+        The criterion is the squared error plus, as in `output_error`, the ridge for the inputs' error.
+        """
         m, p = self.inputs, self.r.shape[1]
         best = (np.inf, 0, np.zeros(p))
         for k in range(len(self.poles)):
@@ -243,7 +244,8 @@ class Bank:
     def bounded(self, low: np.ndarray, high: np.ndarray) -> Expansion:
         """Return the best Expansion of one lag whose static gains (M,) um/K lie within low..high.
 
-        Collinear gains that the data do not tell apart are settled inside the bounds, not cut off at them."""
+        Collinear gains that the data cannot separate are fitted within the bounds, not clipped afterwards.
+        """
         m = self.inputs
         free = np.full(2, np.inf)
         best = (np.inf, 0, np.zeros(m + 2))
@@ -268,9 +270,7 @@ class Bank:
         )
 
     def _rows(self, k: int) -> np.ndarray:
-        """Return the triangle of pole k over the ridge that the inputs' error asks for.
-
-        The last column is the right-hand side."""
+        """Return the triangle of pole k with the ridge for the inputs' error; right-hand side last."""
         count = self.samples if self.weight == 1 else (1 - self.weight**self.samples) / (1 - self.weight)
         f, p = self.poles[k], self.r.shape[1]
         ridge = np.append(np.tile(self.sigma2, 2) * (1 - f) / (1 + f) * count, [0, 0])

@@ -84,7 +84,7 @@ def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: f
     sigma = centred[:, :1].T @ centred / len(e)
     r_w = float((e[:, 0] ** 2).mean() + r_v)
     alpha, beta = model.resample(period_s).output_form()
-    # the recursion runs at the filter's period: the residual's variance builds up over the identification's
+    # The recursion runs at the filter's period, but the residual's variance grows over the identification's.
     return Mkf(
         alpha,
         beta[:, :1],
@@ -119,7 +119,7 @@ class Kalman:
     def run(
         self, power_w: np.ndarray, air_rate: np.ndarray, measured_k: np.ndarray, x0: np.ndarray | None = None
     ) -> np.ndarray:
-        """Estimated rises (N, M); measured (N, s) or (N,) with NaN where no reading came."""
+        """Return the estimated rises (N, M) from measured ones (N, s) or (N,), NaN for no reading."""
         measured = np.atleast_2d(measured_k.T).T
         x0 = np.zeros(self.model.order) if x0 is None else x0
         x = kernels.steady_filter(
@@ -135,9 +135,10 @@ class Kalman:
 
 
 def disturbed(model: StateSpace, tau_s: float = 3600.0) -> StateSpace:
-    """Return the model with one disturbance state.
+    """Return the model with one disturbance state: heat from outside into every body, the same K/s in each.
 
-    Outside heat per body (the same K/s everywhere), forgotten over `tau_s`."""
+    It decays with the time constant `tau_s`.
+    """
     n, m = model.b.shape
     into = np.linalg.pinv(model.c, rcond=1e-3) @ np.ones(len(model.c)) * model.period_s
     a = np.zeros((n + 1, n + 1))
@@ -249,10 +250,12 @@ def choose_sensors(
     most: int = 12,
     must: tuple[int, ...] = (),
 ) -> list[tuple[tuple[int, ...], float]]:
-    """For k = 1..`most` sensors the set with the least standard error of the position: [(sensors, um)].
+    """Return the best sensor sets of k = 1..`most` sensors, [(sensors, um)].
 
-    gains_um_k (M,): static position gain of each point. Forward choice with exchange until nothing improves;
-    k = 1, 2 are exhaustive. `must` are always in (the embedded coil sensor)."""
+    The criterion is the standard error of the position, um. gains_um_k (M,): static position gain of each
+    point. Forward selection with exchange until nothing improves; k = 1, 2 are exhaustive. `must` are always
+    in the set (the embedded coil sensor).
+    """
     m = len(model.c)
     out = []
 

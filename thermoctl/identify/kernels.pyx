@@ -14,7 +14,7 @@ from libc.math cimport sqrt, isnan
 
 
 def simulate(double[:, ::1] a, double[:, ::1] b, double[:, ::1] c, double[::1] x0, double[:, ::1] u):
-    """Free run: y (N, l) of x(n+1) = A x + B u, y = C x, from x0 (n,); u (N, m)."""
+    """Return y (N, l) of x(n+1) = A x + B u, y = C x, from x0 (n,), without correction; u (N, m)."""
     cdef Py_ssize_t n = a.shape[0], m = b.shape[1], l = c.shape[0], N = u.shape[0], i, j, k
     y_ = np.empty((N, l))
     cdef double[:, ::1] y = y_
@@ -38,7 +38,7 @@ def simulate(double[:, ::1] a, double[:, ::1] b, double[:, ::1] c, double[::1] x
 
 
 def modal_states(double complex[::1] poles, double[::1] u):
-    """s_k(n+1) = l_k s_k(n) + u(n) from 0 for every pole; returns (n, N) complex."""
+    """Return s_k(n+1) = l_k s_k(n) + u(n) from 0 for every pole, (n, N) complex."""
     cdef Py_ssize_t n = poles.shape[0], N = u.shape[0], i, k
     s_ = np.empty((n, N), dtype=complex)
     cdef double complex[:, ::1] s = s_
@@ -135,7 +135,7 @@ def rls_step(double[::1] theta, double[:, ::1] q, double[::1] f, double y, doubl
 
 
 def rls_run(double[::1] theta, double[:, ::1] q, double[:, ::1] f, double[::1] y, double lam):
-    """(5) over all rows of f (N, p), y (N,), in place; returns the prediction errors (N,)."""
+    """Run (5) over all rows of f (N, p), y (N,), in place; return the prediction errors (N,)."""
     cdef Py_ssize_t N = f.shape[0], k, n = theta.shape[0]
     e_ = np.empty(N)
     cdef double[::1] e = e_, w = np.empty(n)
@@ -273,7 +273,7 @@ def steady_filter(double[:, ::1] a, double[:, ::1] b, double[:, ::1] cs, double[
 
 def steady_filter_modal(double[::1] poles, double[:, ::1] b, double[::1] c, double[::1] gain, double[::1] x0,
                         double[:, ::1] u, double[::1] y):
-    """The same with A diagonal and one sensor: about 4 n operations a step."""
+    """Run the steady Kalman filter with A diagonal and one sensor: about 4 n operations a step."""
     cdef Py_ssize_t n = poles.shape[0], m = b.shape[1], N = u.shape[0], j, k, i
     out_ = np.empty((N, n))
     cdef double[:, ::1] out = out_

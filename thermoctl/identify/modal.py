@@ -8,10 +8,10 @@ For given poles the residues R, W are linear: only the poles are searched. All m
 construction.
 
 1. Reduce. One pass over the samples makes blocks of q samples. Kept are the mean of each output and the first
-r moments of each input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block.
-Its end state and its mean depend on the inputs with weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p). Three moments represent
-both to 1e-4 of the smallest effect of a block. So averaging 10 000 samples of 1 ms into one of 10 s loses no
-slow dynamics.
+r moments of each input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block. Its end
+state and its mean depend on the inputs with weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p). Three moments
+represent both to 1e-4 of the smallest effect of a block. So averaging 10 000 samples of 1 ms into one of
+10 s loses no slow dynamics.
 
 2. Search. Variable projection (Golub and Pereyra 1973) with Kaufman's simplification over x_k = ln(time
 constant):
@@ -116,17 +116,16 @@ def reduce(
 def _responses(
     records: list[Blocks], tau: np.ndarray, rest: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stacked `_response` of several recordings.
-
-    The poles and residues are common, each starts on its own."""
+    """Stack `_response` of several recordings: common poles and residues, separate initial states."""
     parts = [_response(b, tau, rest) for b in records]
     return np.vstack([f for f, _, _ in parts]), np.vstack([d for _, d, _ in parts]), parts[0][2]
 
 
 def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, float] | None) -> np.ndarray:
-    """Stacked rows (J, columns) through the drift's whitening filter, each recording on its own.
+    """Filter stacked rows (J, columns) by the drift's whitening filter, each recording separately.
 
-    As they are without `drift_s`."""
+    Without `drift_s` they are unchanged.
+    """
     if drift_s is None:
         return rows
     forgotten, corner = (np.exp(-records[0].q * records[0].period_s / t) for t in drift_s)
@@ -137,9 +136,10 @@ def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, flo
 
 
 def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Block-mean responses F (J, columns) and their derivative by ln tau, and each column's pole index.
+    """Return block-mean responses F (J, columns), their derivative by ln tau, and each column's pole index.
 
-    Columns by pole: one per input, then (unless `rest`) the free decay."""
+    Columns by pole: one per input, then (unless `rest`) the free decay.
+    """
     q, basis, J = blocks.q, blocks.basis, len(blocks.u)
     i = np.arange(q)
     F, D, owner = [], [], []
@@ -184,9 +184,10 @@ class _Fit:
 
 
 def _project(F: np.ndarray, Y: np.ndarray, ridge: float = 1e-7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Q of F, the residue matrix and the residual.
+    """Return Q of F, the residue matrix and the residual.
 
-    `ridge` of each column's norm keeps nearly equal poles harmless."""
+    `ridge` of each column's norm keeps nearly equal poles harmless.
+    """
     n = F.shape[1]
     norm = np.linalg.norm(F, axis=0)
     norm[norm == 0] = 1
@@ -206,7 +207,7 @@ def _fit(
     ridge: float = 1e-7,
     drift_s: tuple[float, float] | None = None,
 ) -> _Fit:
-    """Levenberg-Marquardt on ln tau. `Y` (J, l) is scaled by each output's noise, `weight` (J,) by row."""
+    """Fit ln tau by Levenberg-Marquardt. `Y` (J, l) is scaled by noise, `weight` (J,) is by row."""
     x = np.log(tau)
     Y = _whitened(Y, blocks, drift_s) * weight[:, None]
     lo, hi = np.log(bounds[0]), np.log(bounds[1])

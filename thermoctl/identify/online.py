@@ -64,11 +64,11 @@ class Tuner:
 
     @property
     def progress(self) -> float:
-        """Percent of the excitation that is asked for."""
+        """Return the percentage of the required excitation."""
         return float(100 * np.minimum(self.counts / self.full, 1).mean())
 
     def proposal(self) -> tuple[CompensatorModel | None, str]:
-        """(model, why): None with the reason while it is too early or no better."""
+        """Return (model, reason); None with the reason while it is too early or no better."""
         if self.progress < 100:
             return (
                 None,
@@ -100,9 +100,7 @@ class Tuner:
         ), f"{after:.3g} um against {before:.3g} um"
 
     def _error(self, e: Expansion) -> float:
-        """Return the standard error over what was kept back, um.
-
-        Where it began (state and offset) is fitted."""
+        """Return the standard error over the held-out samples, um; initial state and offset are fitted."""
         drive = np.array([r for r, _ in self.recent])
         y = np.array([v for _, v in self.recent])
         n = np.arange(len(y))
@@ -115,6 +113,6 @@ class Tuner:
 
 
 def calibrated_gains(model: CompensatorModel) -> np.ndarray:
-    """Return the static gains (12,) um/K of the calibration a model came from, tuned since or not."""
+    """Return the static gains (12,) um/K of the calibration that a model came from, before any tuning."""
     known = model.meta.get("calibrated_gains_um_k")
     return np.array(known, dtype=float) if known is not None else (model.b1 + model.b2) / (1 - model.f1)
