@@ -1,7 +1,4 @@
-"""Simulation of a compiled plant on a recording's inputs.
-
-Free run, sensitivities, and one fixed period at a time.
-"""
+"""Simulate a compiled plant on a recording's inputs: a whole run, or one fixed period at a time."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ MAX_STEPS = 2_000  # steps within one sampling interval
 
 
 class SimulationError(Exception):
-    """The plant could not be integrated (states that run away, a division by zero); says where."""
+    """Integration failed (unstable states, a division by zero); the message gives the place."""
 
 
 @dataclass
@@ -47,9 +44,7 @@ class Excitation:
     width: np.ndarray | None = None  # (jumps,) half width of each smoothed jump
 
     def part(self, start: int, stop: int) -> Excitation:
-        """Return the samples start..stop-1 (scales kept).
-
-        Time goes on counting from the recording's start."""
+        """Return the samples start..stop-1 (scales kept). Time still counts from the recording's start."""
         return dataclasses.replace(self, t=self.t[start:stop], u=self.u[start:stop], y=self.y[start:stop])
 
 
@@ -81,7 +76,8 @@ class _Forces(ctypes.Structure):
 def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array to fill.
 
-    Touching new pages costs more than the arithmetic on them, so a caller may keep them."""
+    Touching new memory pages costs more than the arithmetic on them, so a caller may keep the array.
+    """
     if kept is None:
         return np.empty(shape)
     size = int(np.prod(shape))
@@ -109,9 +105,10 @@ class Model:
     # ------------------------------------------------------------------------------------------------ inputs
 
     def excitation(self, table: Table) -> Excitation:
-        """Return the recording as this plant reads it.
+        """Return the recording's columns as this plant's inputs and outputs.
 
-        Raises InputError where an input's column is missing or empty."""
+        Raises InputError if an input's column is missing or empty.
+        """
         t = np.ascontiguousarray(table.t - table.t[0], float)
         u = np.empty((len(t), len(self.code.inputs)))
         linear = np.zeros(len(self.code.inputs), np.intc)
@@ -158,7 +155,8 @@ class Model:
     def _delayed_inputs(self, excitation: Excitation, p: np.ndarray) -> np.ndarray:
         """Return u with the derived columns of delayed inputs.
 
-        The mean of the held signal over each interval, t - seconds; and the slope of that by the seconds."""
+        They are the mean of the held signal over each interval, delayed, and its derivative by the delay.
+        """
         if not self.code.input_delays:
             return excitation.u
         u = excitation.u.copy()
@@ -179,7 +177,7 @@ class Model:
 
                 def integral(
                     z: np.ndarray, area: np.ndarray = area, s: np.ndarray = s
-                ) -> np.ndarray:  # before the start the first value held
+                ) -> np.ndarray:  # before the start: the first value
                     return np.where(
                         z < excitation.t[0], (z - excitation.t[0]) * s[0], np.interp(z, excitation.t, area)
                     )
@@ -299,7 +297,7 @@ class Model:
         sensitivities: bool = False,
         rtol: float = RTOL,
     ) -> Simulation:
-        """Free run on a recording's inputs. Raises InputError, SimulationError."""
+        """Simulate freely on a recording's inputs. Raises InputError, SimulationError."""
         return self.run(self.excitation(table), parameters, None, sensitivities, rtol)
 
     def measure(self, table: Table, seed: int = 0) -> Table:
@@ -383,10 +381,11 @@ class Model:
         rtol: float = 1e-5,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> np.ndarray:
-        """Return the outputs' first-order response (N, ny, columns) to forces on dx/dt beside the plant's.
+        """Return the outputs' first-order response (N, ny, columns) to additional forces on dx/dt.
 
         Entry e of `forces` is (state, column); its values, per second, are q[:, e] of q (N, entries).
-        `buffers`: as of `run`."""
+        `buffers`: as of `run`.
+        """
         lib, n, nx = self.code.library, len(excitation.t), len(self.states)
         p = self.vector(parameters, excitation.name)
         if excitation.scale is None or excitation.width is None:
@@ -520,7 +519,7 @@ class Model:
         first: Mapping[str, float] | None = None,
         rtol: float = 1e-5,
     ) -> Stepper:
-        """One fixed period at a time, for a simulated rig; `u0` (inputs,) are the inputs at the start."""
+        """Return a Stepper for a simulated rig: one fixed period at a time; `u0` (inputs,) at the start."""
         return Stepper(self, period_s, np.asarray(u0, float), parameters, dict(first or {}), rtol)
 
 
@@ -551,7 +550,7 @@ def _filled(t: np.ndarray, column: np.ndarray, linear: bool, what: str) -> np.nd
 
 @dataclass
 class Stepper:
-    """A plant that lives in steps of one period, its inputs held over each; deterministic."""
+    """A plant that advances in steps of one period, its inputs held over each; deterministic."""
 
     model: Model
     period_s: float
@@ -567,7 +566,7 @@ class Stepper:
         self.reset(self.u0)
 
     def reset(self, u0: np.ndarray) -> None:
-        """Back to the start with these inputs (nu,)."""
+        """Return to the start with these inputs (nu,)."""
         m = self.model
         self._p = m.vector(self.parameters)
         named = dict(zip(m.inputs, u0, strict=True))

@@ -28,7 +28,7 @@ import numpy as np
 
 Z_95 = 1.959964  # standard normal quantile of a two-sided 95 % interval
 CHI2_95 = 3.84  # 95 % point of chi squared with one degree of freedom
-FEWEST_SIZES = 10  # sizes below which no detection curve is fitted
+FEWEST_SIZES = 10  # fewest sizes for a detection curve
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def reliability(
 
 
 def by_chance(pairs: Sequence[tuple[float, bool]], draws: int = 400) -> float | None:
-    """Compute the mean calibration error of so few findings with exact probabilities."""
+    """Compute the mean calibration error that so few findings have with exact probabilities."""
     rng = random.Random(5)
     errors = [reliability([(p, rng.random() < p) for p, _ in pairs])[1] for _ in range(draws)]
     given = [e for e in errors if e is not None]
@@ -115,7 +115,7 @@ def found_by_size(sizes: Sequence[float], found: Sequence[bool]) -> dict[str, fl
 
 
 def quantile(values: Iterable[float | None], q: float) -> float | None:
-    """Interpolate the q quantile of the values that are given; None without any."""
+    """Interpolate the q quantile of the values that are not None; None without any."""
     given = sorted(v for v in values if v is not None)
     if not given:
         return None

@@ -1,6 +1,4 @@
-"""The paper on simulated rigs.
-
-Run all seeds, measure the goals, write the report and its figures."""
+"""Run all seeds of simulated rigs, measure the goals, write the report and its figures."""
 
 from __future__ import annotations
 
