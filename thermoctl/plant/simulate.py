@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -86,8 +86,9 @@ def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]
     return kept[key][:size].reshape(shape)
 
 
-def _p(a: np.ndarray | None) -> int | None:
-    return None if a is None else a.ctypes.data
+def _call(function: Callable[..., int], *arguments: object) -> int:
+    """Call a function of a plant's library; an array is passed as a pointer to its numbers."""
+    return function(*(a.ctypes.data if isinstance(a, np.ndarray) else a for a in arguments))
 
 
 class Model:
@@ -343,24 +344,8 @@ class Model:
                 else np.abs(x0) + 1e-3
             )
             atol = rtol * scale
-            failed = lib.integrate(
-                n,
-                _p(excitation.t),
-                _p(u),
-                _p(excitation.linear),
-                _p(p),
-                _p(width),
-                _p(x0),
-                _p(s0),
-                nq,
-                rtol,
-                _p(atol),
-                MAX_STEPS,
-                _p(x),
-                _p(dx),
-                _p(info),
-                None,
-            )
+            start = (n, excitation.t, u, excitation.linear, p, width, x0, s0)
+            failed = _call(lib.integrate, *start, nq, rtol, atol, MAX_STEPS, x, dx, info, None)
             if failed:
                 at = max(failed - 1, 0)
                 raise SimulationError(
@@ -396,28 +381,13 @@ class Model:
         rows = np.array([f[0] for f in forces], np.intc)
         cols = np.array([f[1] for f in forces], np.intc)
         q = np.ascontiguousarray(q, float)
-        force = _Forces(len(rows), _p(rows), _p(cols), _p(q))
+        force = _Forces(len(rows), rows.ctypes.data, cols.ctypes.data, q.ctypes.data)
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
         dx = _buffer(buffers, "dx", (n, nx, columns))
         atol = rtol * excitation.scale
-        if nx and lib.integrate(
-            n,
-            _p(excitation.t),
-            _p(u),
-            _p(excitation.linear),
-            _p(p),
-            _p(excitation.width),
-            _p(x0),
-            _p(s0),
-            columns,
-            rtol,
-            _p(atol),
-            MAX_STEPS,
-            _p(x),
-            _p(dx),
-            _p(info),
-            ctypes.addressof(force),
-        ):
+        start = (n, excitation.t, u, excitation.linear, p, excitation.width, x0, s0)
+        limits = (rtol, atol, MAX_STEPS)
+        if nx and _call(lib.integrate, *start, columns, *limits, x, dx, info, ctypes.addressof(force)):
             raise SimulationError(f"{excitation.name}: the plant cannot be simulated")
         _, dy = self._observe(excitation, u, p, excitation.width, x, dx, columns, True, buffers, 0)
         assert dy is not None
@@ -437,45 +407,16 @@ class Model:
         own: int = 1,
     ) -> tuple[np.ndarray, np.ndarray | None]:
         lib, n, ny, nd = self.code.library, len(excitation.t), len(self.outputs), len(self.code.output_delays)
+        known = (n, excitation.t, u, p, width, x, dx, nq)
         delayed = slopes = None
         if nd:
             g = np.empty((n, nd))
             dg = np.empty((n, nd, nq)) if sensitivities else None
-            lib.observe(
-                1,
-                n,
-                _p(excitation.t),
-                _p(u),
-                _p(p),
-                _p(width),
-                _p(x),
-                _p(dx),
-                nq,
-                None,
-                None,
-                _p(g),
-                _p(dg),
-                own,
-            )
+            _call(lib.observe, 1, *known, None, None, g, dg, own)
             delayed, slopes = self._shift(excitation.t, g, dg, p, own)
         y = np.empty((n, ny))
         dy = _buffer(buffers, f"dy {id(excitation)}", (n, ny, nq)) if sensitivities else None
-        lib.observe(
-            0,
-            n,
-            _p(excitation.t),
-            _p(u),
-            _p(p),
-            _p(width),
-            _p(x),
-            _p(dx),
-            nq,
-            _p(delayed),
-            _p(slopes),
-            _p(y),
-            _p(dy),
-            own,
-        )
+        _call(lib.observe, 0, *known, delayed, slopes, y, dy, own)
         return y, dy
 
     def _shift(
@@ -589,7 +530,9 @@ class Stepper:
         size = ctypes.c_int.in_dll(m.code.library, "memory_size").value
         self._memory = np.zeros(size)  # the matrix of the exponential method, see integrator.h
         tail = (self._atol, self.x, self._y, self._want, self._memory)
-        self._pointers = [_p(a) for a in (self._u, self._p, self._width)], [_p(a) for a in tail]
+        self._pointers = tuple(
+            [a.ctypes.data for a in part] for part in ((self._u, self._p, self._width), tail)
+        )
 
     def step(self, u: np.ndarray) -> np.ndarray:
         """Advance one period with inputs `u` (nu,) held.
