@@ -126,7 +126,7 @@ class ModbusDevice(Device):
             if tcp:
                 self._client = ModbusTcpClient(tcp[1].strip("[]"), port=int(tcp[2]), **common)
             elif port.startswith("rtu:"):
-                open_port(port[4:], line).close()  # for its error messages, and for the latency timer
+                open_port(port[4:], line).close()  # its errors give the remedy, and it sets the latency timer
                 self._client = ModbusSerialClient(
                     port[4:], baudrate=line.baud, parity=line.parity, stopbits=line.stop_bits, **common
                 )

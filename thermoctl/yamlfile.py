@@ -104,7 +104,7 @@ def load(path: str | Path) -> Node:
 
 
 def loads(text: str, file: str = "<text>") -> Node:
-    """Return the same from a string; `file` names it in messages."""
+    """Read one YAML document from a string; `file` names it in messages."""
     loader = None
     try:
         loader = _Loader(text)

@@ -192,7 +192,7 @@ def _listen(path: Path) -> socket.socket:
         server.close()
         raise InputError(f"{path}: another virtual rig is running; stop it first")
     if path.exists():
-        path.unlink()  # of a virtual rig that was killed
+        path.unlink()  # left by a virtual rig that was killed
     server.bind(str(path))
     server.listen(4)
     server.setblocking(False)

@@ -161,8 +161,9 @@ def calibrate_refined(
 ) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion, str]:
     """Calibrate with and without refining the thermal model by its prediction errors.
 
-    The model is refined on all tests but the last. Return the one whose filter follows
-    the thermometers of the last test better, and that comparison in words."""
+    The model is refined on all tests but the last. Return the one that predicts the thermometers of the last
+    test better, and a sentence that compares both.
+    """
     plain = calibrate_better(tests, order)
     refined_model = refine(plain[0], tests[:-1])
     if refined_model is plain[0]:
@@ -356,7 +357,7 @@ def _at_period(model: StateSpace, period_s: float) -> StateSpace:
 
 
 def _without_noise_poles(model: StateSpace) -> StateSpace:
-    """Move modes that no sampled heat network has (real poles below FASTEST) to FASTEST."""
+    """Move poles that no sampled heat network has (real, below FASTEST) to FASTEST."""
     values, vectors = np.linalg.eig(model.a)
     keep = np.where((np.abs(values.imag) < 1e-12) & (values.real <= FASTEST), FASTEST, values)
     return replace(model, a=np.real(vectors @ np.diag(keep) @ np.linalg.inv(vectors)))

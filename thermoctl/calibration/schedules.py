@@ -69,9 +69,10 @@ def within_limits(settings: Settings, schedules: Sequence[Schedule]) -> tuple[fl
 
 
 def check_predicted(inputs: experiments.Inputs, settings: Settings) -> None:
-    """Refuse an experiment that a diagnosis predicts to leave the rig's protection.
+    """Refuse an experiment whose predicted readings leave the rig's protection.
 
-    Raises InputError with the reading."""
+    Raises InputError that names the reading.
+    """
     p = settings.protection
     for column, (low, high) in inputs.predicted.items():
         channel = "position_um" if column == "position_raw_um" else column

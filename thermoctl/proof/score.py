@@ -114,7 +114,7 @@ class Truth:
         )
 
     def holds(self, found: Named) -> bool:
-        """Check whether effect and place are exactly true: hypotheses exclude each other."""
+        """Check whether effect and place are exactly true; equivalents do not count."""
         effect, place = found
         right = any(effect == e and same_place(e, place, w) for e, w in self.effects)
         return right or found in self.also_right
