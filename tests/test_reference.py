@@ -1,5 +1,6 @@
 """The reference pages say what the code says."""
 
+import os
 import shutil
 
 from thermoctl.control.faults import FAULTS, KINDS
@@ -8,7 +9,9 @@ from thermoctl.settings import options
 
 
 def test_pages_are_not_stale():
+    before = dict(os.environ)
     assert stale() == [], "run python -m thermoctl.reference"
+    assert dict(os.environ) == before, "the pages' width is not the terminal's"
 
 
 def test_a_changed_page_and_a_page_too_many_are_noticed(tmp_path):

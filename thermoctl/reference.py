@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import math
-import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -28,6 +28,7 @@ from thermoctl.which_rig import ACTS
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 _HEAD = "<!-- Written by `python -m thermoctl.reference`; change the table in the code, not this page. -->\n"
+_WIDTH = 108  # columns of a help text, whatever the terminal
 _SEVERITY = {
     "warning": "a warning: shown and recorded, drives nothing off.",
     "fault": "a fault: disables the amplifier when armed, and keeps the rig from being armed.",
@@ -198,11 +199,11 @@ def _numbers(*values: object) -> bool:
 
 def cli() -> str:
     """Return the page of every command's help."""
-    os.environ["COLUMNS"] = "110"
     top = parser()
     pages: list[str] = []
 
     def walk(p: argparse.ArgumentParser) -> None:
+        p.formatter_class = functools.partial(p.formatter_class, width=_WIDTH)  # type: ignore[assignment]
         pages.append(f"## {p.prog}\n```text\n{p.format_help().rstrip()}\n```\n")
         for action in p._actions:
             if isinstance(action, argparse._SubParsersAction):
