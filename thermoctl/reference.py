@@ -203,7 +203,7 @@ def cli() -> str:
     pages: list[str] = []
 
     def walk(p: argparse.ArgumentParser) -> None:
-        p.formatter_class = functools.partial(p.formatter_class, width=_WIDTH)  # type: ignore[assignment]
+        p.formatter_class = functools.partial(p.formatter_class, width=_WIDTH)  # type: ignore[call-arg]
         pages.append(f"## {p.prog}\n```text\n{p.format_help().rstrip()}\n```\n")
         for action in p._actions:
             if isinstance(action, argparse._SubParsersAction):
