@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
 import math
 import sys
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from thermoctl.cli import parser
 from thermoctl.control import causes
@@ -28,7 +28,7 @@ from thermoctl.which_rig import ACTS
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 _HEAD = "<!-- Written by `python -m thermoctl.reference`; change the table in the code, not this page. -->\n"
-_WIDTH = 108  # columns of a help text, whatever the terminal
+_HELP_WIDTH = 108  # columns of a command's help: argparse's own for a terminal of 110
 _SEVERITY = {
     "warning": "a warning: shown and recorded, drives nothing off.",
     "fault": "a fault: disables the amplifier when armed, and keeps the rig from being armed.",
@@ -198,12 +198,13 @@ def _numbers(*values: object) -> bool:
 
 
 def cli() -> str:
-    """Return the page of every command's help."""
+    """Every command's help."""
     top = parser()
     pages: list[str] = []
 
     def walk(p: argparse.ArgumentParser) -> None:
-        p.formatter_class = functools.partial(p.formatter_class, width=_WIDTH)  # type: ignore[call-arg]
+        kind = cast(type[argparse.HelpFormatter], p.formatter_class)
+        p.formatter_class = partial(kind, width=_HELP_WIDTH)  # not the terminal's
         pages.append(f"## {p.prog}\n```text\n{p.format_help().rstrip()}\n```\n")
         for action in p._actions:
             if isinstance(action, argparse._SubParsersAction):

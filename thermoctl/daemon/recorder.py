@@ -27,8 +27,7 @@ from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 
 INTERVAL_S = 0.1
-# version of the law's inputs, state and arithmetic: only the same version replays bit for bit
-LAW_VERSION = 2
+LAW_VERSION = 2  # of the law's inputs, state and arithmetic: a replay is bit for bit only within one
 _TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
 
 

@@ -106,10 +106,9 @@ class Model:
     # ------------------------------------------------------------------------------------------------ inputs
 
     def excitation(self, table: Table) -> Excitation:
-        """Return the recording's columns as this plant's inputs and outputs.
+        """Return the recording as this plant reads it.
 
-        Raises InputError if an input's column is missing or empty.
-        """
+        Raises InputError where an input's column is missing or empty."""
         t = np.ascontiguousarray(table.t - table.t[0], float)
         u = np.empty((len(t), len(self.code.inputs)))
         linear = np.zeros(len(self.code.inputs), np.intc)

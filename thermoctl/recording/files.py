@@ -325,7 +325,7 @@ def _read_parquet(path: Path, want: list[str] | None) -> _Raw:
 
 
 def _read_arrow(path: Path, want: list[str] | None) -> _Raw:
-    """Return an IPC file, or an IPC stream up to the place where a power loss truncated it."""
+    """Return an IPC file, or an IPC stream up to where it was cut (a recorder that lost power leaves one)."""
     with pa.memory_map(str(path)) as source:
         if source.size() >= 6 and source.read(6) == b"ARROW1":
             with pa.ipc.open_file(source) as f:
