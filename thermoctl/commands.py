@@ -1,7 +1,7 @@
 """The commands: one row each, with its arguments and the function that does the work.
 
-A row names its function as text, "module:function". `call` imports the module when the command is given, so that
-`thermoctl --help` and `thermoctl status` load nothing that they do not need.
+A row names its function as text, "module:function". `call` imports the module when the command is given, so
+that `thermoctl --help` and `thermoctl status` load nothing that they do not need.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Argument(NamedTuple):
 class Command(NamedTuple):
     """One command; a name of two words is a command below a group.
 
-    takes: the arguments that the function gets, in order, by the names that argparse gives them. `settings` stands for
-    the configuration read from --config, `parser` for the whole command line. Without any the function gets the
-    namespace of all arguments."""
+    takes: the arguments that the function gets, in order, by the names that argparse gives them. `settings`
+    stands for the configuration read from --config, `parser` for the whole command line. Without any the
+    function gets the namespace of all arguments."""
 
     name: str
     help: str
@@ -47,7 +47,7 @@ CONFIG = _arg(
     metavar="FILE",
     help="configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, /etc/thermoctl/rig.yaml)",
 )
-"""The option of every command that means a rig; `which_rig.choose` puts the file that it found into it."""
+"""The option of every command that needs a rig; `which_rig.choose` stores the path that it found."""
 _FILE = _arg("file", nargs="?", metavar="CONFIG", help="the same as --config CONFIG")
 _YES = _arg(
     "--yes", action="store_true", help="start without asking; without a terminal, required to move a rig"
@@ -68,7 +68,7 @@ GROUPS = {
     "recordings": "list, inspect, export or recover recordings",
     "plant": "check, show or linearise a plant file",
 }
-"""Commands that have commands below them."""
+"""Groups of commands, such as `plant`, with their help."""
 
 _DAEMON = (
     _command(
@@ -676,7 +676,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def virtual_rig(settings: Any, line: str) -> int:
-    """Simulate the devices of a configuration, or hand `line` to a virtual rig that runs."""
+    """Simulate the devices of a configuration, or send `line` to a running virtual rig."""
     from hal.virtual.rig import main
     from thermoctl.yamlfile import InputError
 
@@ -689,7 +689,7 @@ def virtual_rig(settings: Any, line: str) -> int:
 
 
 def service(args: argparse.Namespace) -> int:
-    """Install or remove the unit; manual page and completions go with the last unit."""
+    """Install or remove the unit. Removing the last unit removes manual page and completions, too."""
     from thermoctl import manual
     from thermoctl.daemon.service import install, uninstall, units
 

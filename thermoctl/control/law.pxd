@@ -1,4 +1,4 @@
-# C types for law.py; see there. What stands between "generated" and "end" is written by `python -m thermoctl.control.typed`.
+# C types for law.py. `python -m thermoctl.control.typed` writes the parts between "generated" and "end".
 cimport cython
 from libc.stdint cimport uint8_t
 

@@ -1,4 +1,4 @@
-"""Commands that ask a running daemon: status, latency, arm, disarm, setpoint, reload.
+"""Commands to a running daemon: status, latency, arm, disarm, setpoint, reload.
 
 They load neither numpy nor drivers, so they answer at once.
 """

@@ -4,10 +4,10 @@
     sample -> estimate -> compensate -> control -> protect -> actuate -> publish
 
 Nothing in a tick waits, parses, logs or touches a disk. A tick that takes too long skips the ticks it
-covered; they are counted and published, and the phase is kept (policy `skip`). A tick of real devices runs
-in C from end to end (loop.pxd has the types): after a sleep Python's objects are out of the cache, and
-each costs a miss. Priority, locked memory, processor and latency request are asked for one by one. Each
-refusal is one warning, never a crash.
+covered. They are counted and published, and the phase is kept (policy `skip`). A tick of real devices runs in
+C from end to end (loop.pxd has the types). After a sleep, Python's objects are no longer in the cache. Each
+of priority, locked memory, processor and latency limit is requested from the kernel. A refusal is a warning,
+not an error.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class Rig:
             self.keep_state()
 
     def remark(self, t_s: float, dt_s: float) -> None:
-        """Publish what the row does not hold: ages, verdicts, onsets and the devices' messages.
+        """Publish the remarks: ages, verdicts, onsets and the devices' messages.
 
         One channel a tick is checked for a new message; all are checked when a fault is new. Nothing is a
         fault while the law warms up.

@@ -1,8 +1,9 @@
 """The shared memory of one daemon: the loop's output and its commands.
 
-One segment, named after the rig's socket, with version and layout in its header. The supervisor creates and removes
-it; a segment left behind by a killed daemon is replaced. It is a mapped file in SHARED_MEMORY. multiprocessing's own
-class is not used: it starts one more process, which removes the segment of a killed daemon at any later time.
+One segment, named after the rig's socket, with version and layout in its header. The supervisor creates and
+removes it; a segment left behind by a killed daemon is replaced. It is a mapped file in SHARED_MEMORY.
+multiprocessing's own class is not used: it starts one more process, which removes the segment of a killed
+daemon at any later time.
 
     ring        the record of every tick (rows in the order of signals.SIGNALS)
     mailbox     commands to the loop;  parameters: the block that a RELOAD command applies
@@ -66,10 +67,12 @@ _AREAS = (
     ("device_counters", "f8", (COUNTER_WORDS,)),
 )
 START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED, RUN_S = range(8)
-"""Places in `counters`. TUNING: 1 + percent, 0 without tuning. RESUMED: 1 when the law started with the estimates
-of an earlier run. RUN_S: start of this run, seconds since 1970."""
+"""Indices in `counters`. TUNING: 1 + percent, 0 without tuning. RUN_S: start of this run, seconds since 1970.
+
+RESUMED: 1 when the law started with the estimates of an earlier run.
+"""
 BEATS = 8
-"""First place in `counters` where each helper process counts its rounds; the supervisor detects one that hangs."""
+"""First index in `counters` of the helpers' round counts; the supervisor detects one that hangs."""
 _LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES, faults.NAMES]).encode())
 
 

@@ -19,14 +19,15 @@ from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
-RENEWAL = 0.1  # how far, as a share of its range, a state may have strayed from the plant within a block
+RENEWAL = 0.1  # largest error of a state, as a share of its range, allowed at the start of a block
 RECENT = 0.25  # share of a block from which its data count in full; older ones fade exponentially
 
 
 def simulate(args: argparse.Namespace) -> int:
-    """Free run, or predictions `--horizon` seconds ahead, on one recording or several.
+    """Simulate freely, or predict `--horizon` seconds ahead, on one recording or several.
 
-    figures, file and plot."""
+    Prints figures; writes a file and a plot on request.
+    """
     plant = load(args.plant)
     runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
     model = compile_plant(_all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
@@ -79,11 +80,12 @@ def _all_uncertain(plant: Plant) -> Plant:
 
 
 def ahead(model: Model, excitation: Excitation, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`.
+    """Predict states (N, nx) and outputs (N, ny) in blocks of `horizon_s`.
 
     An extended Kalman filter estimates the states at the start of each block from the data before it. So a
     sample is predicted from data up to `horizon_s` older. The model must have every state uncertain and no
-    active parameter."""
+    active parameter.
+    """
     if not model.states:
         run = model.run(excitation)
         return run.x, run.y
@@ -236,7 +238,7 @@ def _estimates(plant: Plant, rows: list[Estimate]) -> Grid:
 
 
 def _errors(plant: Plant, table: Table) -> dict[str, float]:
-    """Free-run rms error per output; uncertain initial states fitted, parameters held."""
+    """Return the free-run rms error per output; uncertain initial states fitted, parameters held."""
     model = compile_plant(plant, ())
     excitation = model.excitation(table)
     if not np.isfinite(excitation.y).any():

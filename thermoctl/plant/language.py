@@ -26,7 +26,7 @@ ROLES = (
     "level",
     "time_of_day",
 )
-"""Kinds of quantities, for where the unit does not determine the kind."""
+"""Kinds of quantities, for units that fit several kinds."""
 FLICKER_DECADES = 4  # 20 000 samples: from one over the recording's length to half the sampling rate
 
 
@@ -74,7 +74,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of the physics; `range` is where a refit may move it (None: known); `values` per recording."""
+    """A parameter; `range`: bounds of a refit (None: known); `values`: per recording."""
 
     name: str
     value: float
@@ -100,7 +100,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Flow:
-    """A flow from node `source` to node `target`; None stands for the outside, for one of the two."""
+    """A flow from node `source` to node `target`; one of them may be None, the surroundings."""
 
     name: str
     rate: Expr
@@ -142,7 +142,7 @@ class Plant:
     file: str = field(default="<plant>", compare=False)
 
     def plain(self) -> dict[str, Any]:
-        """Return plain dicts and lists, as the file holds them; `files.from_plain` reads them back."""
+        """Return the file's content as plain dicts and lists; `files.from_plain` is the inverse."""
         content: dict[str, Any] = {
             "format": FORMAT,
             "title": self.title,

@@ -1,7 +1,7 @@
-"""A plant file's text to a `Plant`: keys, numbers, names and what each expression may read.
+"""Parse a plant file's text to a `Plant`: keys, numbers, names, and the names that an expression may use.
 
-Units are checked afterwards (units.py); files.py puts both together. Every error names file, line and column,
-the name at fault and what is allowed.
+Units are checked afterwards (units.py); files.py does both. Every error gives file, line and column, the
+faulty name and the allowed ones.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _NAME = re.compile(r"[A-Za-z_]\w{0,79}$", re.ASCII)
 _RESERVED = {"pi", "t", *ex.FUNCTIONS, *ex.SPECIAL}
 
 Items = dict[str, dict[str, Section]]
-"""Section of the file: name: its entry."""
+"""Entries of each section of the file, by section and name."""
 
 
 def parse(root: YamlNode) -> Plant:
@@ -236,9 +236,10 @@ def _expression(s: Section, key: str) -> Expr:
 
 @dataclass(frozen=True)
 class _Place:
-    """An expression of the file and what may stand in it.
+    """An expression of the file, and the names and functions allowed in it.
 
-    `delays`: whether delay() may, and on what it may work."""
+    `delays`: the arguments allowed in delay(): 'no', 'inputs' or 'all'.
+    """
 
     what: str
     expression: Expr

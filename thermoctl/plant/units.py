@@ -21,7 +21,7 @@ from thermoctl.yamlfile import InputError
 Dimension = tuple[tuple[str, Fraction], ...]
 """Sorted (base unit, exponent) pairs; () is dimensionless. None stands for 'fits anywhere'."""
 
-# The symbols of most plant files: with these nobody waits for pint, which takes half a second to import.
+# The symbols of most plant files: they do not need pint, whose import takes half a second.
 _COMMON = {
     "1": "",
     "%": "",
@@ -254,7 +254,7 @@ def _raised(base: Dimension, exponent: float) -> Dimension:
 
 
 def _text(d: Dimension) -> str:
-    """Return kg m2 s-3 and the like, with the derived unit where there is one."""
+    """Return text such as kg m2 s-3, with the derived unit if there is one."""
     order = {b: i for i, b in enumerate(_BASES.values())}
     written = " ".join(
         f"{base}{'' if q == 1 else q if q.denominator == 1 else f'^({q})'}"

@@ -15,11 +15,11 @@ from thermoctl.recording.writer import FULL, TIER, recording_files
 from thermoctl.yamlfile import InputError
 
 UNKNOWN_RIG = "unknown rig"
-"""Recordings of before they named their rig."""
+"""Label of old recordings, which do not name their rig."""
 
 
 def list_recordings(args: argparse.Namespace) -> int:
-    """One line a recording, by rig and run: begin, length, size, and whether it was closed."""
+    """Print one line a recording, by rig and run: begin, length, size, and whether it was closed."""
     folder = Path(args.directory)
     if not folder.is_dir():
         raise InputError(
@@ -88,7 +88,7 @@ def show_info(args: argparse.Namespace) -> int:
 
 
 def export_recording(args: argparse.Namespace) -> int:
-    """Return a recording in another format."""
+    """Write a recording in another format."""
     rows = export(
         args.file, args.out, args.columns.split(",") if args.columns else None, args.begin, args.end
     )
@@ -97,7 +97,7 @@ def export_recording(args: argparse.Namespace) -> int:
 
 
 def recover_recording(args: argparse.Namespace) -> int:
-    """Return a closed copy of a cut recording."""
+    """Write a closed copy of a truncated recording."""
     path = Path(args.file)
     i = recover(path, args.out or path.with_name(path.stem + ".recovered.arrows"))
     print(

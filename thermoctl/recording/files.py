@@ -105,7 +105,7 @@ def to_arrow(table: Table) -> pa.Table:
 
 
 class whole_file:  # noqa: N801 used as a function
-    """A temporary file beside `path` that takes its name when the block ends well and vanishes otherwise."""
+    """Write to a temporary file; rename it to `path` when the block ends without error, else delete it."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -168,7 +168,7 @@ def _limit(path: Path, rows: int, columns: int) -> None:
 
 
 def _picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
-    """Return the time column and those asked for."""
+    """Return the time column and the requested columns."""
     if want is None:
         return names
     for name in want:
@@ -205,7 +205,8 @@ def _read_csv(path: Path, want: list[str] | None) -> _Raw:
             )
             columns = {n: _numpy(arrow[n]) for n in chosen}
         except pa.ArrowInvalid:
-            columns = None  # the exact place, or what Arrow refuses and Python reads: below
+            # go on below: for the exact place of an error, and for text that only Python parses
+            columns = None
     if columns is None:
         columns = _slow_csv(path, data, names)
         columns = {n: columns[n] for n in _picked(path, names, want)}
@@ -234,7 +235,7 @@ def _header(path: Path, head: bytes) -> list[str]:
 
 
 def _csv_rows(data: bytes) -> Iterable[tuple[int, list[str]]]:
-    """(line counted from 1, cells) of the header and each row, without comments and empty lines."""
+    """Yield (line counted from 1, cells) of the header and each row, without comments and empty lines."""
     lines = io.StringIO(data.decode("utf-8", errors="replace"), newline="")
     number = 0
 
@@ -257,7 +258,7 @@ def _csv_line(data: bytes, row: int) -> int:
 
 
 def _slow_csv(path: Path, data: bytes, names: list[str]) -> dict[str, np.ndarray]:
-    """Cell by cell, for the exact place of what is wrong."""
+    """Read cell by cell, for the exact place of an error."""
     values: list[list[float]] = []
     for i, (line, cells) in enumerate(_csv_rows(data)):
         if i == 0:

@@ -35,7 +35,7 @@ def _damaged(path: Path, kind: str, e: Exception) -> InputError:
 
 
 def _united(path: Path, channels: list[tuple[str, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
-    """(name, times (n,), values (n,)) of each channel as columns over the union of all times."""
+    """Merge channels (name, times (n,), values (n,)) into columns over the union of all times."""
     if not channels:
         raise InputError(f"{path}: no channels with a time; at least one was expected")
     for name, t, values in channels:
@@ -66,13 +66,13 @@ def _united(path: Path, channels: list[tuple[str, np.ndarray, np.ndarray]]) -> d
 
 
 def read_mdf(path: Path) -> dict[str, np.ndarray]:
-    """Columns of an ASAM MDF file by channel name, with `t`. Raises InputError."""
+    """Read the columns of an ASAM MDF file by channel name, with `t`. Raises InputError."""
     asammdf = _library("asammdf", path)
     path.stat()
     try:
         with asammdf.MDF(str(path)) as mdf:
             found = [(s.name, np.asarray(s.timestamps), np.asarray(s.samples)) for s in mdf.iter_channels()]
-    except Exception as e:  # asammdf raises what its parsing of damaged bytes happens to raise
+    except Exception as e:  # asammdf raises any error on damaged bytes
         raise _damaged(path, "MDF", e) from None
     return _united(path, [c for c in found if c[0] not in ("t", "time")])
 
@@ -119,7 +119,7 @@ def read_tdms(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_mdf(path: str, table: Table) -> None:
-    """MDF 4.10, one channel group, zipped; units of our signals."""
+    """Write MDF 4.10, one channel group, zipped; units of our signals."""
     asammdf = _library("asammdf", Path(path))
     with asammdf.MDF(version="4.10") as mdf:
         mdf.append(
@@ -133,9 +133,10 @@ def write_mdf(path: str, table: Table) -> None:
 
 
 def write_mcap(path: str, table: Table) -> None:
-    """MCAP with one JSON message a row on /thermoctl (Foxglove and PlotJuggler plot its fields).
+    """Write MCAP with one JSON message a row on /thermoctl (Foxglove and PlotJuggler plot its fields).
 
-    a missing sample is left out of its message. Log time is `wall_s` where it is recorded, else `t`."""
+    A missing sample is left out of its message. Log time is `wall_s` if it is recorded, else `t`.
+    """
     writer_module = _library("mcap.writer", Path(path))
     clock = table.columns.get("wall_s", table.t - min(table.t[0], 0.0))
     names, values = ["t", *table.columns], np.column_stack([table.t, *table.columns.values()])

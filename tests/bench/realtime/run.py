@@ -160,25 +160,10 @@ def run_cyclictest(bench: Bench, seconds: float) -> np.ndarray:
     """Its wake-up latencies, us (from a histogram of nanoseconds)."""
     out = bench.work / "cyclictest.txt"
     subprocess.run(
-        [
-            "cyclictest",
-            "-p",
-            str(PRIORITY),
-            "-a",
-            str(bench.cpu),
-            "-t",
-            "1",
-            "-m",
-            "-i",
-            str(PERIOD_NS // 1000),
-            "-D",
-            str(max(1, round(seconds))),
-            "-q",
-            "-N",
-            "-h",
-            "1000000",
-            f"--histfile={out}",
-        ],
+        (
+            f"cyclictest -p {PRIORITY} -a {bench.cpu} -t 1 -m -i {PERIOD_NS // 1000} -D "
+            f"{max(1, round(seconds))} -q -N -h 1000000 --histfile={out}"
+        ).split(),
         check=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -610,22 +595,9 @@ def bench_law(bench: Bench, ticks: int = 20000, repeats: int = 15) -> dict[str, 
 def stress(work: Path):
     """stress-ng on all processors, on memory and on the disk."""
     load = subprocess.Popen(
-        [
-            "stress-ng",
-            "--cpu",
-            "0",
-            "--vm",
-            "1",
-            "--vm-bytes",
-            "128M",
-            "--hdd",
-            "1",
-            "--hdd-bytes",
-            "128M",
-            "--temp-path",
-            str(work),
-            "--quiet",
-        ],
+        (
+            f"stress-ng --cpu 0 --vm 1 --vm-bytes 128M --hdd 1 --hdd-bytes 128M --temp-path {work} --quiet"
+        ).split(),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
