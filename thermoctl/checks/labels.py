@@ -33,7 +33,7 @@ from thermoctl.recording.table import Table
 RARITY = 1000.0  # prior odds against a wrong label
 CLOSE = 2.0  # residual over noise below which nothing is left to explain by labels
 FOLLOWS = 0.5  # a corrected column has to be followed to within this share of its spread
-ROWS = 8_000  # of each recording, from its start
+ROWS = 10_000  # of all recordings together, of each from its start
 DRAWS = 6  # parameter draws of the screening
 REFITTED = 6  # best screened hypotheses that are refitted
 ROUNDS = 3  # corrections in a row
@@ -59,7 +59,7 @@ class Hypothesis:
 
 def label_findings(model: Model, tables: Sequence[Table]) -> tuple[list[Finding], list[Table]]:
     """Return the findings, and the tables after the corrections that they suggest."""
-    tables = [_cut(t) for t in tables]
+    tables = [_cut(t, ROWS // len(tables)) for t in tables]
     found: list[Finding] = []
     for _ in range(ROUNDS):
         best = _best(model, tables)
@@ -73,10 +73,10 @@ def label_findings(model: Model, tables: Sequence[Table]) -> tuple[list[Finding]
     return found, tables
 
 
-def _cut(table: Table) -> Table:
-    if len(table) <= ROWS:
+def _cut(table: Table, rows: int) -> Table:
+    if len(table) <= rows:
         return table
-    return replace(table, t=table.t[:ROWS], columns={n: v[:ROWS] for n, v in table.columns.items()})
+    return replace(table, t=table.t[:rows], columns={n: v[:rows] for n, v in table.columns.items()})
 
 
 def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
