@@ -12,6 +12,7 @@ import numpy as np
 from thermoctl.plant import expression as ex
 from thermoctl.plant.compile import Code, machine_code
 from thermoctl.plant.language import Plant
+from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.sensor import error
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError, suggest
@@ -109,6 +110,7 @@ class Model:
         """Return the recording as this plant reads it.
 
         Raises InputError where an input's column is missing or empty."""
+        table = in_plant_units(self.plant, table)
         t = np.ascontiguousarray(table.t - table.t[0], float)
         u = np.empty((len(t), len(self.code.inputs)))
         linear = np.zeros(len(self.code.inputs), np.intc)
@@ -303,8 +305,9 @@ class Model:
     def measure(self, table: Table, seed: int = 0) -> Table:
         """Return a simulated recording: the inputs of `table` and the readings of the sensors.
 
-        Draws noise and uncertain initial values, and rounds to the resolution. Raises InputError and
-        SimulationError."""
+        Draws noise and uncertain initial values, and rounds to the resolution. All in the plant's units.
+        Raises InputError and SimulationError."""
+        table = in_plant_units(self.plant, table)
         rng, excitation = np.random.default_rng(seed), self.excitation(table)
         dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(
             size=len(self.uncertain)

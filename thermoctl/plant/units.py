@@ -104,6 +104,12 @@ def check_units(plant: Plant) -> None:
         units[item.name] = readings[item.name] = _declared(plant, item.name, item.unit, item.at)
     for output in plant.outputs.values():
         readings[output.name] = _declared(plant, output.name, output.unit, output.at)
+    for read in plant.readings():
+        if read.conversion and read.conversion.unit and read.unit:
+            try:
+                conversion(read.conversion.unit, read.unit)
+            except ValueError as error:
+                raise InputError(f"{plant.file}:{read.at}: column of '{read.name}': {error}") from None
     check = _Check(plant, units, readings)
     second = (("s", Fraction(1)),)
     rates: dict[str, tuple[Dimension, str]] = {}
@@ -305,6 +311,26 @@ def dimension(unit: str) -> Dimension:
     return result
 
 
+def conversion(given: str, wanted: str) -> tuple[float, float]:
+    """Return (scale, offset) from a unit to another: wanted = scale * given + offset. Raises ValueError.
+
+    C and F are degrees where a temperature is wanted."""
+    if dimension(wanted) == dimension("K"):
+        given = {"C": "degC", "F": "degF"}.get(given, given)
+    if dimension(given) != dimension(wanted):
+        raise ValueError(f"{given} [{_text(dimension(given))}] is no {wanted} [{_text(dimension(wanted))}]")
+    if given == wanted:
+        return 1.0, 0.0
+    registry = _registry()
+    ends = [float(registry.Quantity(x, _spelled(given)).to(_spelled(wanted)).magnitude) for x in (0.0, 1.0)]
+    return ends[1] - ends[0], ends[0]
+
+
+def _spelled(unit: str) -> str:
+    plain = unit.replace("°C", "degC").replace("°", "deg").translate(_RAISED)
+    return "dimensionless" if plain == "1" else plain
+
+
 Tokens = list[tuple[str, str]]
 
 
@@ -370,11 +396,17 @@ def _symbol(symbol: str) -> Dimension:
 
 
 @cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+@cache
 def _pint() -> tuple[Callable[[str], Mapping[str, Any]], tuple[type[Exception], ...]]:
     import pint
 
-    registry: pint.UnitRegistry[float] = pint.UnitRegistry()
-    return registry.get_dimensionality, (
+    return _registry().get_dimensionality, (
         pint.errors.UndefinedUnitError,
         pint.errors.DefinitionSyntaxError,
         AttributeError,

@@ -1,13 +1,16 @@
-"""Recordings of other programs: MDF4 (asammdf) and TDMS (npTDMS) read, MDF4 and MCAP (mcap) written.
+"""Recordings of other programs: MDF4, TDMS and Excel read, MDF4 and MCAP written.
 
-The libraries are an extra, `pip install 'thermoctl[formats]'`. Channels with different rates are merged by
-time, so most cells of a slow channel are empty.
+The libraries (asammdf, npTDMS, openpyxl, mcap) are an extra, `pip install 'thermoctl[formats]'`. Channels
+with different rates are merged by time, so most cells of a slow channel are empty.
 """
 
 from __future__ import annotations
 
+import csv
 import importlib
+import io
 import json
+from datetime import date, time
 from pathlib import Path
 from types import ModuleType
 
@@ -116,6 +119,23 @@ def read_tdms(path: Path) -> dict[str, np.ndarray]:
                 )
             found.append((name if names.count(name) == 1 else f"{group}_{name}", t, values))
     return _united(path, found)
+
+
+def read_excel(path: Path) -> bytes:
+    """Return the first sheet of an Excel file as comma-separated text, row for row. Raises InputError."""
+    openpyxl = _library("openpyxl", path)
+    path.stat()
+    try:
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        for row in book.worksheets[0].iter_rows(values_only=True):
+            cells = [c.isoformat() if isinstance(c, date | time) else "" if c is None else c for c in row]
+            writer.writerow(cells)
+        book.close()
+    except Exception as e:  # openpyxl likewise
+        raise _damaged(path, "Excel", e) from None
+    return out.getvalue().encode()
 
 
 def write_mdf(path: str, table: Table) -> None:
