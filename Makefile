@@ -1,12 +1,12 @@
-# Two commands matter: `make run` and `make test`; `make help` lists the rest. Everything they need beyond Python 3.11+, venv,
-# make and a C compiler is installed into .venv: what running needs by `install`, what tests need besides by `develop`.
+# Two commands matter: `make run` and `make test`; `make help` lists the rest. All that they need beyond Python 3.11+, venv,
+# make and a C compiler is installed into .venv: by `install` for running, by `develop` for tests.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 TYPED := $(shell find thermoctl hal -name '*.pxd')
 SOURCES := pyproject.toml setup.py $(shell find thermoctl hal -name '*.pyx') $(TYPED) $(wildcard $(TYPED:.pxd=.py))
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq install
-# Lines of requirements from pyproject.toml: $(call listed,KEY...) of what it holds.
+# Requirements from pyproject.toml, one a line: $(call listed,KEY...).
 listed = $(BIN)/python -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb')); print(*($(1)), sep='\n')"
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
@@ -26,7 +26,7 @@ rig-hour: install                  # an hour of rig time in the paper's trapezoi
 	$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1
 	-$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1 --no-compensation
 
-bench-law: develop                 # what a call of the law costs, by compiler
+bench-law: develop                 # cost of a call of the law, by compiler
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/law_call.py
 
@@ -49,7 +49,7 @@ format: develop                    # ruff's fixes and format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-install: $(VENV)/.installed        # what running needs, into .venv
+install: $(VENV)/.installed        # dependencies of the program, and its compiled parts, into .venv
 $(VENV)/.installed: $(SOURCES)
 	@echo "[1/3] a virtual environment in $(VENV)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -60,7 +60,7 @@ $(VENV)/.installed: $(SOURCES)
 	@$(PIP) --no-deps --no-build-isolation --editable .
 	@touch $@
 
-develop: $(VENV)/.developed        # what tests need besides, into .venv
+develop: $(VENV)/.developed        # dependencies of the tests, into .venv
 $(VENV)/.developed: $(VENV)/.installed pyproject.toml
 	@echo "pytest, hypothesis, mypy and the other tools that tests need"
 	@$(call listed,p['project']['optional-dependencies']['test']) > $(VENV)/needs
@@ -105,7 +105,7 @@ test-resolve: develop              # two equally good effects, separated by the 
 
 .PHONY: test-wire
 test-wire: develop                 # pulled cables and killed programs, with the daemon and the virtual rig as two programs
-	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py
+	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py tests/people/test_driving.py
 
 .PHONY: test-browser
 test-browser: develop              # the dashboard in headless Chromium (Debian: apt-get install chromium)
@@ -160,12 +160,12 @@ bench-realtime: develop            # the loop beside cyclictest, C twins and pys
 	$(BIN)/python -m tests.bench.realtime.run
 	$(BIN)/python -m tests.bench.realtime.steady
 
-.PHONY: systemd-test
-systemd-test: develop              # the unit in a booted systemd (root; Debian: systemd-container, mmdebstrap)
+.PHONY: test-systemd
+test-systemd: develop              # the unit in a booted systemd (root; Debian: systemd-container, mmdebstrap)
 	$(BIN)/python -m pytest -q -s -m slow tests/systemd
 
-.PHONY: qemu-test
-qemu-test: develop                 # SocketCAN in a qemu guest (root; Debian: qemu-system-x86, mmdebstrap)
+.PHONY: test-qemu
+test-qemu: develop                 # SocketCAN in a qemu guest (root; Debian: qemu-system-x86, mmdebstrap)
 	$(BIN)/python -m pytest -q -s -m slow tests/qemu
 
 .PHONY: diagnose-recordings

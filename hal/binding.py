@@ -18,7 +18,7 @@ from hal.units import role_units
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 EXCLUSIVE = ("slcan:", "rtu:", "/")
-"""Beginnings of ports that only one program can open at a time."""
+"""Prefixes of ports that only one program can open at a time."""
 _MANUAL_BASES = ((30001, "input"), (40001, "holding"))
 _MANUAL_REGISTERS = 9999
 """Manuals often number input registers 30001..39999 and holding registers 40001..49999, from address 0."""

@@ -2,10 +2,11 @@
 """CAN ports that the tick can use without waiting.
 
 A port is written "interface:channel@bitrate"; the default bitrate is 1000000.
-- slcan:/dev/serial/by-id/...   Lawicel ASCII on a serial port, read and written on the bare descriptor (python-can's
-  own slcan reads one byte a call, 150 us a frame)
-- socketcan:can0                python-can opens it and sets the kernel's filters; frames pass on the bare socket
-- virtual:name and any other interface of python-can: through the library
+
+    slcan:/dev/serial/by-id/...   Lawicel ASCII on a serial port, read and written on the bare descriptor
+                                  (python-can's own slcan reads one byte a call, 150 us a frame)
+    socketcan:can0                python-can opens it and sets the kernel's filters; frames pass on the socket
+    virtual:name, others          through python-can
 
 Identifiers of 29 bits carry the bit EXTENDED everywhere, so that they never match an 11-bit one of the same
 number. Remote frames, error frames and CAN FD frames are counted and otherwise ignored.
@@ -26,7 +27,7 @@ from hal.serial_port import open_port
 from hal.wire import EXTENDED, CanPort, SlcanLine
 
 MAX_TAKEN = 500  # most frames that one tick takes from a bus: bounds the time of a tick on a full bus
-MAX_REFUSED = 100  # frames in a row that the interface does not take, before the bus counts as lost
+MAX_REFUSED = 100  # the bus counts as lost after so many refused frames in a row
 _SLCAN_BITRATES = {
     10_000: 0,
     20_000: 1,

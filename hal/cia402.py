@@ -132,7 +132,7 @@ class Sdo:
 
     def _checked(self, answer: bytes, item: Object, what: str) -> bytes:
         if answer[0] == 0x80:
-            import canopen  # already loaded by Objects
+            import canopen  # Objects has already loaded it
 
             code = int.from_bytes(answer[4:], "little")
             text = canopen.SdoAbortedError.CODES.get(code, "the manual of the drive says what it means")
@@ -167,7 +167,8 @@ def foreign_heartbeat(master: int, where: str) -> HardwareError:
 def set_up(sdo: Sdo, spec: Cia402, formats: dict[Object, str], where: str) -> int:
     """Configure heartbeats, mode and PDOs of a drive and start its node; return its error code.
 
-    The drive stays disabled. formats: struct letters of the objects of both PDOs and of start_up. Raises HardwareError."""
+    The drive stays disabled. formats: struct letters of the objects of both PDOs and of start_up. Raises
+    HardwareError."""
     node, port = sdo.node, sdo.port
     sdo.listen(max(LISTEN_S, LISTEN_BEATS * spec.heartbeat_s))
     if 0x700 + spec.master_id in sdo.heartbeats:

@@ -1,12 +1,12 @@
 # cython: annotation_typing=False, cdivision=True
-"""What every driver shares: the bound channels of one device, the check of each reading, and the counters.
+"""Base of every driver: the bound channels of one device, the check of each reading, the counters.
 
-A driver knows one protocol. Its `connect` may block (opening, configuring); `read` and `write`, called in the
-tick, may not.
+A driver implements one protocol. Its `connect` may block (opening, configuring). Its `read` and `write` may
+not: the tick calls them.
 
 A channel is ERROR when the device reports a fault: a sentinel, a bad status flag, a refused register. After a
-lost answer, a damaged frame or a lost link the last value is kept until it is stale. The device that drives
-is the exception: without its link the state of the amplifier is unknown, so its channels are ERROR at once.
+lost answer, a damaged frame or a lost link the last value is kept until it is stale. The amplifier is the
+exception: without its link its state is unknown, so its channels are ERROR at once.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # cython: annotation_typing=False, cdivision=True
-"""Real devices as one back end, and the keeping up of their links.
+"""Real devices as one back end, with reconnection.
 
-A link that fails is closed, and a thread connects it again while the tick goes on.
+A failed link is closed. A thread connects it again while the ticks continue.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class DevicesBackend:
             self._threads, self.board = [], None
 
     def problem(self, role: str) -> str:
-        """Say in one line why `role` is not OK; '' when it is."""
+        """Return in one line why `role` is not OK; '' when it is."""
         i = ROLE[role]
         if i not in self._owner:
             return f"{role}: no device of hal.devices has this role"

@@ -160,7 +160,7 @@ class Cia402Device(Device):
             raise HardwareError(f"{self.binding.port} node {self._node}: set-up failed: {e}") from None
         self._port = port
         self._status_word = 0
-        self._watch_state(_OFFLINE)  # it was lost while it drove: not enabled again by itself
+        self._watch_state(_OFFLINE)  # lost while it drove: it must not be enabled again by itself
         self._odd_size, self._odd = -1, 0
         self._heard_s = time.monotonic()
         self._beat_s = self._reset_s = -math.inf
@@ -177,7 +177,7 @@ class Cia402Device(Device):
         """Send the drive back to its power-on state and close the port."""
         port, self._port = self._port, None
         if port is not None:
-            with contextlib.suppress(OSError):  # the drive forgets PDOs and watchdog, and is off
+            with contextlib.suppress(OSError):  # the drive resets PDOs and watchdog, and is off
                 port.send((NMT_ID, bytes((NMT_RESET_COMMUNICATION, self._node))))
             port.close()
 

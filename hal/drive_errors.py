@@ -1,7 +1,7 @@
 """Error codes of drives in words: CiA 301 table 26 (emergency error codes) and CiA 402-2 (object 0x603F).
 
-A code that is not in the table is named by its class. The class is in the first digits: 0x32xx is a voltage
-inside the device, whatever the vendor puts into the last two. 0xFFxx is free for the vendor.
+A code that is not in the table is named by its class, which the first digits give. 0x32xx is a voltage inside
+the device; the last two digits are the vendor's. 0xFFxx is free for the vendor.
 """
 
 from __future__ import annotations

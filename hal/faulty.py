@@ -219,7 +219,7 @@ class FaultInjector:
             value, _ = late.popleft()
             self._held[number, role] = value
             out.fresh[role] = True
-            out.time_s[role] = now_s  # a late reading looks new: that is what makes it a hazard
+            out.time_s[role] = now_s  # a delayed reading appears new: this is the hazard
         out.value[role] = self._held.get((number, role), self._value[role])
 
     def _duplicate(self, fault: Fault, number: int, role: int, now_s: float) -> None:

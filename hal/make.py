@@ -1,4 +1,4 @@
-"""From the configuration to the back end and the drivers that it names."""
+"""Make the back end and the drivers that the configuration names."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from thermoctl.yamlfile import InputError
 def make_backend(settings: Settings, board: Board | None = None) -> Backend:
     """Make the back end of `settings.hal`, not yet open.
 
-    It is wrapped in a fault injector when `hal.faults` lists any. board: filled by poller processes, or None to
-    poll slow devices from threads of this process. Raises InputError: a mistake in the configuration, a profile
-    or the plant."""
+    It is wrapped in a fault injector when `hal.faults` lists any. board: filled by poller processes, or None
+    to poll slow devices from threads of this process. Raises InputError: a mistake in the configuration, a
+    profile or the plant."""
     kind = settings.hal.backend
     backend: Backend
     if kind == "simulated":
@@ -100,7 +100,7 @@ def driving_devices(settings: Settings) -> list[Device]:
 
 
 def can_drive(settings: Settings) -> bool:
-    """Return whether anything takes the command, so that the rig may be armed. Raises InputError."""
+    """Return whether a device takes the drive command, so that the rig may be armed. Raises InputError."""
     return settings.hal.backend != "devices" or bool(driving_devices(settings))
 
 

@@ -6,7 +6,7 @@ Ports: "tcp:host:port" or "rtu:/dev/serial/by-id/...". Channels are registers; n
 block. The profile gives the word order of a value of several words; bytes inside a word are big-endian, by
 the protocol. Sentinel numbers, such as an open thermocouple's, make the channel an ERROR while the others
 stay OK. After a lost or damaged answer, or while the device is busy, the last values are kept. A refused
-block is read register by register, so that one illegal address does not cost its neighbours.
+block is read register by register, so that one illegal address does not invalidate its neighbours.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ EXCEPTIONS = {
     ),
 }
 """Modbus exception codes: the text, and what to do."""
-BUSY, PASSING = (5, 6), (5, 6, 10, 11)  # asked again at once; never an ERROR of the channel itself
+BUSY, PASSING = (5, 6), (5, 6, 10, 11)  # requests repeated at once; never an ERROR of the channel itself
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
 REFUSED = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)  # one register may be the cause: the block is read one by one
 FUNCTIONS = {"holding": 3, "input": 4}  # Modbus function code of a kind of register
@@ -126,7 +126,7 @@ class ModbusDevice(Device):
             if tcp:
                 self._client = ModbusTcpClient(tcp[1].strip("[]"), port=int(tcp[2]), **common)
             elif port.startswith("rtu:"):
-                open_port(port[4:], line).close()  # for its error messages, and for the latency timer
+                open_port(port[4:], line).close()  # its errors give the remedy, and it sets the latency timer
                 self._client = ModbusSerialClient(
                     port[4:], baudrate=line.baud, parity=line.parity, stopbits=line.stop_bits, **common
                 )
@@ -169,7 +169,7 @@ class ModbusDevice(Device):
                 return
 
     def silence(self) -> str:
-        """Say that the poller has posted no reading and no problem yet."""
+        """Report that the poller has posted no reading and no problem yet."""
         return "its poller has posted nothing"
 
     def _read(self, sample: Sample, block: Block) -> None:

@@ -1,7 +1,7 @@
-"""What a device profile says: vendor, model, bus and channels.
+"""Hold a device profile: vendor, model, bus and channels.
 
-A device is described, not programmed. A profile (`format: thermoctl-device/1`) describes what the vendor
-made; a binding (hal.binding) says where the device is on this rig. Every channel has
+A device is described, not programmed. A profile (`format: thermoctl-device/1`) describes the product; a
+binding (hal.binding) says where the device is on this rig. Every channel has
 
     reading = raw * scale + offset      in `unit`; outside `range`: error; older than `stale_after_s`: stale
 

@@ -37,7 +37,8 @@ from thermoctl import yamlfile
 from thermoctl.yamlfile import Node, Section, integer_of, kind_of, number_of, suggest
 
 FORMAT = "thermoctl-device/1"
-MAX_SYNC, MAX_FIELDS, MAX_PAYLOAD = 8, 64, 255  # bytes, fields, bytes: the sizes of wire.Framer; uint8 length
+# limits of wire.Framer: sync bytes, fields, payload bytes (a uint8 length)
+MAX_SYNC, MAX_FIELDS, MAX_PAYLOAD = 8, 64, 255
 REGISTERS = 65536  # addresses of a Modbus unit
 MAX_SUB_INDEX = 255
 

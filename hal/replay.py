@@ -1,8 +1,8 @@
 """A recording as hardware: its samples arrive when the clock reaches their times; commands are ignored.
 
-Columns play the role of their own name, or what `hal.roles` says: `column: role`, with its unit in brackets
-where it differs from the role's, as `q: position_um [m]`. A missing cell means: no new reading of that
-sensor. After the last row every channel is stale and `finished` is True.
+A column has the role of its own name, unless `hal.roles` maps it as `column: role`. A unit that differs from
+the role's is given in brackets, as `q: position_um [m]`. A missing cell means: no new reading of that sensor.
+After the last row every channel is stale and `finished` is True.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STALE_PERIODS = 5  # a channel is stale after this many of its usual (median) pe
 
 
 def replay_backend(settings: Settings) -> ReplayBackend:
-    """Make the back end `replay`. Raises InputError: no such file, no column that plays a role."""
+    """Make the back end `replay`. Raises InputError: no such file, or no column with a role."""
     return ReplayBackend(read_table(Path(settings.path).parent / settings.hal.recording), settings.hal.roles)
 
 

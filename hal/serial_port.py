@@ -53,7 +53,7 @@ class LineReader:
         return MAX_LINE if self._dropping else len(self._buffer)
 
     def reset(self) -> None:
-        """Forget half a line."""
+        """Drop an incomplete line."""
         self._buffer.clear()
         self._dropping = False
 

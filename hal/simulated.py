@@ -1,13 +1,14 @@
 """The simulated rig: a plant file as hardware, deterministic, at any speed.
 
-The plant advances in periods of the loop, with the command held. A sensor reads the plant's output plus its
-noise, rounded to its resolution (both from the plant file), at its own rate: the encoders every period, the
-slow ones every `sensor_period_s`. The same seed and the same commands at the same times give the same bits.
+The plant advances in periods of the loop, with the command held. A sensor reads the plant's output plus
+noise, rounded to the sensor's resolution; the plant file gives both. Encoders are read every period, slow
+sensors every `sensor_period_s`. The same seed and the same commands at the same times give the same bits.
 
-The plant that plays the hardware (`hal.truth`) may differ from the one that the compensator was built from,
-to show an effect that the model leaves out. Outputs play the role of their own name, or the one that
-`hal.roles` gives them. The plant's other inputs (the chamber's air) follow `hal.inputs`: mean + swing * sin(2
-pi t / period_s).
+`hal.truth` may name another plant file than the one of the compensator, to simulate an effect that the model
+lacks. An output has the role of its own name, or the one that `hal.roles` gives it. The plant's other inputs
+(the chamber's air) follow `hal.inputs`:
+
+    mean + swing * sin(2 pi t / period_s)
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 MAX_CATCH_UP = 1000  # periods in one read; when the clock jumps further (suspend), the plant skips that time
-SLOWEST_S = 3600.0  # longest time constant of a simulated 1/f error: below 1/h it is part of the offset
+SLOWEST_S = 3600.0  # longest time constant of a simulated 1/f error; slower parts count as offset
 _STATE = ROLE["amplifier_state"]
 EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
 
@@ -178,13 +179,13 @@ def _roles_of_outputs(path: str | Path, outputs: Sequence[str], roles: Mapping[s
 
 
 def _draws(random: np.random.Generator) -> Iterator[float]:
-    """Draw standard normal numbers, in blocks: the same numbers in a third of the time."""
+    """Draw standard normal numbers in blocks, which takes a third of the time of single draws."""
     while True:
         yield from random.standard_normal(4096).tolist()
 
 
 def make_rig(settings: Settings) -> PlantRig:
-    """Make the plant that plays the hardware (`hal.truth`, else `hal.plant`). Raises InputError."""
+    """Make the plant that simulates the hardware (`hal.truth`, else `hal.plant`). Raises InputError."""
     hal = settings.hal
     return PlantRig(
         Path(settings.path).parent / (hal.truth or hal.plant),

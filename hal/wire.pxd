@@ -8,7 +8,7 @@ cdef enum:
     MAX_MESSAGE = 64            # the longest Lawicel message has 30 bytes
     MAX_FRAMES = 1024           # of a read: the shortest Lawicel frame has 6 bytes
     MAX_QUEUED = 32             # frames of one send
-    MAX_PENDING = 4096          # bytes that wait for a line which takes none: then it counts as lost
+    MAX_PENDING = 4096  # unsent bytes of a line that takes none; with more, it counts as lost
     EXTENDED_FLAG = 1 << 31      # of a can_id: 29 bits (as in the kernel's struct can_frame)
 
 cdef class Framer:

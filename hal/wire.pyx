@@ -1,13 +1,15 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-"""The bytes of a tick: frames with a CRC, Lawicel CAN in ASCII, checked readings.
+"""Encode and decode the bytes of a tick: frames with a CRC, Lawicel CAN in ASCII, checked readings.
 
 Compiled, because interpreted code is slow in a tick: it runs once a period, with cold caches.
 
-A binary frame on the wire:   sync (1..8 bytes) | length (uint8, optional) | payload | CRC-16 over all that follows sync (optional)
+A binary frame on the wire:
 
-Framing resynchronises after garbage: a frame whose length or CRC is wrong costs its first byte, and the
-search goes on from the next one, so a true frame behind a false sync is never lost. Nothing here waits, and
-what a sender can fill is bounded: a frame by its profile, a Lawicel message by 64 bytes.
+    sync (1..8 bytes) | length (uint8, optional) | payload | CRC-16 over all that follows sync (optional)
+
+Framing resynchronises after garbage: a frame whose length or CRC is wrong is dropped by its first byte only.
+The search continues at the next byte, so a true frame behind a false sync is never lost. Nothing here waits.
+The buffers are bounded: a frame by its profile, a Lawicel message by 64 bytes.
 """
 import errno
 import os
@@ -94,8 +96,8 @@ cpdef bint wait_readable(int fd, int64_t until_ns) except -1:
 cdef int _read(int fd, uint8_t *to, int size) except -1:
     """Return the number of bytes read, 0 when none has arrived. Raises OSError when the other end is gone.
 
-    A terminal is asked first: to read an empty one waits, even without blocking, for the kernel's worker that moves
-    bytes to it. On a busy machine that worker comes tens of milliseconds late, and the tick with it.
+    FIONREAD is asked first: a read of an empty terminal waits for a kernel worker, even without blocking. On
+    a busy machine that costs tens of milliseconds.
     """
     cdef int there = 1, got
     if ioctl(fd, FIONREAD, &there) == 0 and there == 0:
@@ -118,10 +120,11 @@ def read_available(int fd) -> bytes:
 
 
 cdef class Framer:
-    """Bytes in, frames out. `newest` is the payload tuple of the last good frame (() before the first);
-    `frames`, `bad` (wrong lengths and CRCs), `skipped` (bytes outside frames) and `lost` (gaps of the
-    sequence counter) count. The `quiet_` counters start again at every good frame: bytes that came, wrong
-    CRCs (`sums`) and wrong length bytes since then.
+    """Find frames in a stream of bytes. `newest` is the payload of the last good frame, () before the first.
+
+    Counters: `frames`; `bad` (wrong length or CRC); `skipped` (bytes outside frames); `lost` (gaps of the
+    sequence counter). The `quiet_` counters restart at every good frame: bytes received, wrong CRCs (`sums`)
+    and wrong length bytes since then.
 
     spec: hal.profile.BinaryFrame.
     """
@@ -276,7 +279,7 @@ cdef class Framer:
         return <double>bits
 
     def reset(self) -> None:
-        """Forget half a frame and the sequence (after a reconnection)."""
+        """Drop an incomplete frame and the sequence (after a reconnection)."""
         self._length = self._known = 0
         self.quiet_bytes = self.quiet_sums = self.quiet_lengths = 0
 
@@ -323,10 +326,11 @@ cpdef bytes encode_slcan(uint32_t can_id, bytes data):
 
 
 cdef class SlcanParser:
-    """Bytes from an adapter in, data frames out; the id of a 29-bit frame (T) has the bit EXTENDED.
-    Acknowledgements (z, Z, CR) pass silently. `refused` counts BEL, by which the adapter refuses a command,
-    `ignored` remote and CAN FD frames, `bad` what is no valid message. Time stamps after the data are
-    ignored."""
+    """Find data frames in an adapter's bytes; the id of a 29-bit frame (T) has the bit EXTENDED.
+
+    Acknowledgements (z, Z, CR) pass silently. `refused` counts BEL, by which the adapter refuses a command.
+    `ignored` counts remote and CAN FD frames, `bad` invalid messages. Time stamps after the data are ignored.
+    """
 
     @property
     def pending(self) -> int:
@@ -366,7 +370,8 @@ cdef class SlcanParser:
         cdef uint32_t can_id = 0
         cdef uint64_t body = 0
         if m[0] != b't' and m[0] != b'T':
-            if m[0] in (b'r', b'R', b'd', b'D', b'b', b'B'):    # remote frames; CAN FD as CANable 2 writes them
+            # Remote frames; CAN FD as CANable 2 writes them.
+            if m[0] in (b'r', b'R', b'd', b'D', b'b', b'B'):
                 self.ignored += 1
             else:
                 self.bad += not (m[0] == b'z' or m[0] == b'Z' or m[0] == b'F' or m[0] == b'V' or m[0] == b'N')
@@ -402,11 +407,10 @@ cdef tuple _pair(Frame *frame):
 
 
 cdef class CanPort:
-    """A CAN bus that the tick uses without waiting. A frame's data is one whole number, its first byte
-    lowest.
+    """A CAN bus that the tick uses without waiting. A frame's data is one whole number, first byte lowest.
 
-    Subclasses implement `take`, which receives frames for `can_id`, `size` and `data`, and `flush`, which
-    sends the queued frames; both raise OSError when the bus is gone. `receive` and `send` do the same with
+    Subclasses implement `take` and `flush`. `take` receives frames for `can_id`, `size` and `data`; `flush`
+    sends the queued frames. Both raise OSError when the bus is gone. `receive` and `send` do the same with
     bytes.
     """
 

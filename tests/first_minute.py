@@ -51,17 +51,7 @@ def main():
     for run in range(int(sys.argv[1]) if len(sys.argv) > 1 else 1):
         before = set(recordings.glob("*.arrows"))
         subprocess.run(
-            [
-                sys.executable,
-                "-P",
-                "-m",
-                "thermoctl.cli",
-                "demo",
-                "--config",
-                CONFIG,
-                "--seconds",
-                f"{AT_S[-1] + 5:g}",
-            ],
+            f"{sys.executable} -P -m thermoctl.cli demo --config {CONFIG} --seconds {AT_S[-1] + 5:g}".split(),
             check=True,
             stdout=subprocess.DEVNULL,
         )

@@ -1,6 +1,7 @@
-"""Every channel once: what a device may report to the controller, in the order of all arrays over channels.
+"""Define every channel once; a channel is one reading from a device.
 
-Back ends, protection limits, fault bits, the law's indices, the record's signals and `status` derive from this table.
+All arrays over channels have the order of TABLE. Back ends, protection limits, fault bits, the law's indices,
+the recording's signals and `status` derive from it.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ from math import inf
 
 OK, STALE, ERROR, ABSENT = range(4)
 STATUS_NAMES = ("OK", "STALE", "ERROR", "ABSENT")
-"""Status of a reading: valid; too old; reported as invalid by its device, or device lost; no device has this role."""
+"""Status of a reading. ERROR: its device reports it as invalid, or is lost. ABSENT: no device has this role.
+"""
 
 AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_QUICK_STOP = (float(k) for k in range(5))
 AMPLIFIER_STATES = ("offline", "disabled", "enabled", "fault", "quick stop")
-"""Values of `amplifier_state`: starting up or lost; powered and not driving; driving; fault of its own; quick stop."""
+"""Values of `amplifier_state`. Offline: starting up, or lost. Disabled: powered and not driving."""
 
 GROUPS = {
     "position": "position encoder",
@@ -25,17 +27,20 @@ GROUPS = {
     "coil": "coil temperature",
     "amplifier": "the amplifier's report of itself",
 }
-"""Groups of channels that share their fault bits, with the words of their faults. `monitored` holds the channels that
-the law only watches, when the coil's sensor alone corrects the estimate."""
+"""Groups of channels that share their fault bits, with the group's name in messages.
+
+The law only watches the `monitored` channels when the coil's sensor alone corrects the estimate.
+"""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One channel: `role` in the configuration, `unit` as pint reads it ('1' for a number), `group` of its faults.
+    """One channel: `role` in the configuration, `unit` as pint reads it ('1' for a number), fault `group`.
 
-    `low` and `high` bound a plausible reading. `signal` is its column in a recording (default: the role). `point` is
-    the place of a temperature on the actuator. A `thermal` sensor follows its body slowly and its delay is recorded.
-    A `code` is a state or an error number: it does not change while all is well, so it is never judged as frozen.
+    `low` and `high` bound a plausible reading. `signal` is its column in a recording (default: the role).
+    `point` is the place of a temperature on the actuator. A `thermal` sensor follows its body slowly, and its
+    delay is recorded. A `code` is a state or an error number: it is constant in normal operation, so it is
+    never checked for `frozen`.
     """
 
     role: str
@@ -94,8 +99,11 @@ TABLE = (
     ),
     Channel("amplifier_fault", "1", "amplifier", "the amplifier's own error code; 0 none", 0.0, code=True),
 )
-"""The channels. Append a new one at the end: the bits of `fresh_bits` and `status_bits` in recordings keep their places.
-Thermal channels must be neighbours, air first, then the points; `delay_bits` holds 13 of them."""
+"""The channels. Append a new one at the end: `fresh_bits` and `status_bits` of recordings hold one bit a
+channel.
+
+Thermal channels must be neighbours, air first, then the points; `delay_bits` holds 13 of them.
+"""
 
 CHANNELS = tuple(c.role for c in TABLE)
 INDEX = {role: i for i, role in enumerate(CHANNELS)}

@@ -1,4 +1,4 @@
-"""The command line: makes the parser from the table of commands, runs one command, turns errors into exit statuses."""
+"""The command line: make the parser, run one command, turn errors into exit statuses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from thermoctl.yamlfile import InputError
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(
         _name, "1"
-    )  # before numpy is loaded: BLAS threads on busy cores wait for each other
+    )  # set before numpy is loaded: BLAS threads on busy cores wait for each other
 
 DESCRIPTION = """\
 Holds the output of a precision linear actuator in place while its coil heats up. Finds the physics that a simulation

@@ -1,7 +1,7 @@
 """The commands: one row each, with its arguments and the function that does the work.
 
-A row names its function as text, "module:function". `call` imports the module when the command is given, so that
-`thermoctl --help` and `thermoctl status` load nothing that they do not need.
+A row names its function as text, "module:function". `call` imports the module when the command is given, so
+that `thermoctl --help` and `thermoctl status` load nothing that they do not need.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Argument(NamedTuple):
 class Command(NamedTuple):
     """One command; a name of two words is a command below a group.
 
-    takes: the arguments that the function gets, in order, by the names that argparse gives them. `settings` stands for
-    the configuration read from --config, `parser` for the whole command line. Without any the function gets the
-    namespace of all arguments."""
+    takes: the arguments that the function gets, in order, by the names that argparse gives them. `settings`
+    stands for the configuration read from --config, `parser` for the whole command line. Without any the
+    function gets the namespace of all arguments."""
 
     name: str
     help: str
@@ -47,7 +47,7 @@ CONFIG = _arg(
     metavar="FILE",
     help="configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, /etc/thermoctl/rig.yaml)",
 )
-"""The option of every command that means a rig; `which_rig.choose` puts the file that it found into it."""
+"""The option of every command that needs a rig; `which_rig.choose` stores the path that it found."""
 _FILE = _arg("file", nargs="?", metavar="CONFIG", help="the same as --config CONFIG")
 _YES = _arg(
     "--yes", action="store_true", help="start without asking; without a terminal, required to move a rig"
@@ -55,7 +55,20 @@ _YES = _arg(
 _JSON = _arg("--json", action="store_true", help="print one JSON object, for programs")
 _PLANT = _arg("--plant", required=True, metavar="PLANT", help="the plant file")
 _RECORDINGS = _arg(
-    "recordings", nargs="+", metavar="REC", help="recordings (.csv, .parquet, .arrow, .mf4, .tdms)"
+    "recordings",
+    nargs="+",
+    metavar="REC",
+    help="recordings (.csv, .txt, .xlsx, .parquet, .arrow, .mf4, .tdms)",
+)
+_TIME = _arg(
+    "--time",
+    metavar="COLUMN",
+    help="the column of times (default: by its name, else the first that increases)",
+)
+_COLUMNS = _arg(
+    "--columns",
+    metavar="NAME=COLUMN,...",
+    help="names that the plant reads, and the recordings' columns that they stand for",
 )
 _EFFECTS = _arg(
     "--effects", action="append", metavar="DIR", help="a further folder of effect files (repeatable)"
@@ -65,10 +78,10 @@ _ORDER = _arg("--order", type=int, default=0, help="number of real poles (defaul
 _ROOT = _arg("--root", default="/", metavar="DIR", help="install below this directory")
 
 GROUPS = {
-    "recordings": "list, inspect, export or recover recordings",
-    "plant": "check, show or linearise a plant file",
+    "recordings": "list, inspect, import, export or recover recordings",
+    "plant": "start, check, show or linearise a plant file",
 }
-"""Commands that have commands below them."""
+"""Groups of commands, such as `plant`, with their help."""
 
 _DAEMON = (
     _command(
@@ -233,6 +246,16 @@ _RECORDING = (
         _arg("--to", dest="end", type=float, default=float("inf"), metavar="S", help="before this t"),
     ),
     _command(
+        "recordings import",
+        "read the files of any logger and write Parquet with units; several files are parts of one recording",
+        "thermoctl.recording.commands:import_recordings",
+        "",
+        _arg("files", nargs="+", metavar="FILE", help="CSV of any dialect, .xlsx, .mf4, .tdms, .parquet"),
+        _arg("--out", required=True, metavar="OUT", help="OUT.parquet (or .csv, .arrow: without units)"),
+        _TIME,
+        _COLUMNS,
+    ),
+    _command(
         "recordings recover",
         "write a complete copy of a recording that was cut off",
         "thermoctl.recording.commands:recover_recording",
@@ -250,6 +273,8 @@ _PLANTS = (
         "",
         _PLANT,
         _RECORDINGS,
+        _TIME,
+        _COLUMNS,
         _arg(
             "--horizon",
             type=float,
@@ -266,6 +291,8 @@ _PLANTS = (
         "",
         _PLANT,
         _RECORDINGS,
+        _TIME,
+        _COLUMNS,
         _arg("--out", metavar="PLANT2", help="write the refitted plant"),
         _arg("--held-out", nargs="+", metavar="REC", help="recordings for validation; not used in the fit"),
         _arg(
@@ -284,10 +311,39 @@ _PLANTS = (
     ),
     _command(
         "plant check",
-        "read plant files with every check",
-        "thermoctl.plant.commands:check",
+        "read plant files with every check; with --data compare one with recordings, in seconds",
+        "thermoctl.checks.commands:check",
         "",
         _arg("plants", nargs="+", metavar="PLANT"),
+        _arg(
+            "--data",
+            nargs="+",
+            metavar="REC",
+            help="recordings to check with the plant; exit 1 on a severe fault",
+        ),
+        _TIME,
+        _COLUMNS,
+    ),
+    _command(
+        "plant new",
+        "write a first plant file: from a recording of temperatures, or from a template",
+        "thermoctl.plant.new:new",
+        "",
+        _arg("file", metavar="FILE", help="the plant file to write"),
+        _arg(
+            "--from-csv",
+            metavar="REC",
+            help="a recording: one body for each thermometer, links to be confirmed",
+        ),
+        _arg(
+            "--inputs", metavar="A,B", help="columns of inputs (default: powers, and the air's temperature)"
+        ),
+        _arg("--outputs", metavar="A,B", help="columns of sensors (default: the other temperatures)"),
+        _TIME,
+        _COLUMNS,
+        _arg(
+            "--template", metavar="NAME", help="block, motor, hot-end, room, tank, stage, flexure or actuator"
+        ),
     ),
     _command(
         "plant show",
@@ -440,9 +496,16 @@ _DIAGNOSIS = (
             "recordings",
             nargs="*",
             metavar="REC",
-            help="recordings (.csv, .parquet, .arrow), or folders of many rigs' recordings: one diagnosis a rig",
+            help="recordings (.csv, .xlsx, .parquet, .arrow), or folders of many rigs' recordings: one diagnosis a rig",
         ),
         _arg("--plant", required=True, metavar="FILE", help="the plant file"),
+        _TIME,
+        _COLUMNS,
+        _arg(
+            "--anyway",
+            action="store_true",
+            help="diagnose although the checks of the data found a severe fault",
+        ),
         _arg(
             "--out",
             required=True,
@@ -676,7 +739,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def virtual_rig(settings: Any, line: str) -> int:
-    """Simulate the devices of a configuration, or hand `line` to a virtual rig that runs."""
+    """Simulate the devices of a configuration, or send `line` to a running virtual rig."""
     from hal.virtual.rig import main
     from thermoctl.yamlfile import InputError
 
@@ -689,7 +752,7 @@ def virtual_rig(settings: Any, line: str) -> int:
 
 
 def service(args: argparse.Namespace) -> int:
-    """Install or remove the unit; manual page and completions go with the last unit."""
+    """Install or remove the unit. Removing the last unit removes manual page and completions, too."""
     from thermoctl import manual
     from thermoctl.daemon.service import install, uninstall, units
 
@@ -704,6 +767,7 @@ def service(args: argparse.Namespace) -> int:
 def diagnose(args: argparse.Namespace) -> int:
     """Diagnose recordings, folders of rigs or a live rig; with --resolve the experiments run on the rig."""
     from thermoctl.diagnose import commands
+    from thermoctl.yamlfile import InputError
 
     if args.live:
         from thermoctl.fleet.commands import live_recordings
@@ -712,6 +776,11 @@ def diagnose(args: argparse.Namespace) -> int:
         if not args.recordings:
             return 0
     if any(Path(r).is_dir() for r in args.recordings):
+        if args.time or args.columns:
+            raise InputError(
+                "diagnose: --time and --columns go with recordings, not with folders; make the folder's files with "
+                "`thermoctl recordings import`"
+            )
         from thermoctl.fleet.commands import diagnose_folders
 
         return diagnose_folders(args)

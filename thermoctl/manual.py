@@ -11,7 +11,7 @@ import shtab
 from thermoctl import __version__
 from thermoctl.yamlfile import InputError
 
-PLACES = {  # below the root, where man and the shells look for what is not from a distribution
+PLACES = {  # places below the root where man and the shells look for local files
     "man": "usr/local/share/man/man1/thermoctl.1",
     "bash": "usr/local/share/bash-completion/completions/thermoctl",
     "zsh": "usr/local/share/zsh/site-functions/_thermoctl",
@@ -32,7 +32,7 @@ _STATUS = (
 
 
 def manual_page(parser: argparse.ArgumentParser) -> str:
-    """thermoctl(1) in roff (man macros): every command with its options."""
+    """Return thermoctl(1) in roff (man macros): every command with its options."""
     first = (parser.description or "").split("\n\n")[0]
     lines = [
         f'.TH {parser.prog.upper()} 1 "" "{parser.prog} {__version__}" "User Commands"',
@@ -64,7 +64,7 @@ def manual_page(parser: argparse.ArgumentParser) -> str:
 
 
 def _commands(parser: argparse.ArgumentParser) -> list[tuple[argparse.ArgumentParser, str]]:
-    """Every command without a further one below it, with its line of help."""
+    """Return every command that is no group, with its line of help."""
     found: list[tuple[argparse.ArgumentParser, str]] = []
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -89,9 +89,10 @@ def _option(action: argparse.Action) -> str:
 
 
 def install(parser: argparse.ArgumentParser, root: str | Path = "/") -> list[Path]:
-    """Write the manual page and the completions of bash and zsh below `root`; their paths.
+    """Write the manual page and the completions of bash and zsh below `root`; return their paths.
 
-    Raises InputError where one cannot be written."""
+    Raises InputError when one cannot be written.
+    """
     texts = {
         "man": manual_page(parser),
         "bash": shtab.complete(parser, "bash"),
@@ -112,9 +113,7 @@ def install(parser: argparse.ArgumentParser, root: str | Path = "/") -> list[Pat
 
 
 def uninstall(root: str | Path = "/") -> list[Path]:
-    """Remove what `install` wrote; the paths that were there.
-
-    Raises InputError where one cannot be removed."""
+    """Remove the files of `install`; return their paths. Raises InputError when one cannot be removed."""
     there = [p for p in (Path(root, place) for place in PLACES.values()) if p.exists()]
     for path in there:
         try:

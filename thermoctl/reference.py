@@ -12,16 +12,15 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import os
 import sys
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from thermoctl.cli import parser
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
-from thermoctl.control.remedies import REMEDIES
 from thermoctl.diagnose.effects import catalogue
 from thermoctl.settings import SECTIONS, options
 from thermoctl.signals import FAULT_WORD_BITS, SIGNALS
@@ -29,6 +28,7 @@ from thermoctl.which_rig import ACTS
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 _HEAD = "<!-- Written by `python -m thermoctl.reference`; change the table in the code, not this page. -->\n"
+_HELP_WIDTH = 108  # columns of a command's help: argparse's own for a terminal of 110
 _SEVERITY = {
     "warning": "a warning: shown and recorded, drives nothing off.",
     "fault": "a fault: disables the amplifier when armed, and keeps the rig from being armed.",
@@ -70,7 +70,7 @@ def _default(field: dataclasses.Field[Any]) -> str:
 
 
 def configuration() -> str:
-    """Every option: unit, range, default, whether it needs a restart, meaning."""
+    """Return the page of options: unit, range, default, whether a change needs a restart, meaning."""
     text = (
         _HEAD + "# Configuration\n\nOne YAML file describes a rig. `thermoctl check FILE` says whether it is "
         "right; `thermoctl reload` applies the options that need no restart between two ticks.\n"
@@ -94,7 +94,7 @@ def configuration() -> str:
 
 
 def signals() -> str:
-    """Every column of a recording."""
+    """Return the page of signals, the columns of a recording."""
     return (
         _HEAD
         + "# Signals\n\nOne record row a tick, in this order, float64. A recording's 10 Hz tier holds the "
@@ -121,7 +121,7 @@ def faults() -> str:
 
 
 def commands_that_act() -> str:
-    """Every command that can move, arm, disarm or stop a rig."""
+    """Return the page of commands that can move, arm, disarm or stop a rig."""
     return (
         _HEAD + "# Commands that act on a rig\n\nEvery command that can move, arm, disarm or stop a rig.\n\n"
         "**Which rig.** `--config FILE`, else `$THERMOCTL_CONFIG`, else `config/simulated.yaml` in the current folder, else "
@@ -140,7 +140,6 @@ def commands_that_act() -> str:
 
 def fault(f: Fault) -> str:
     """Return the page of one fault."""
-    words = REMEDIES[f.name]
     channels = causes.channels_of(f.name)
     second, place = divmod(f.bit, FAULT_WORD_BITS)
     word = "fault_bits_2" if second else "fault_bits"
@@ -154,8 +153,8 @@ def fault(f: Fault) -> str:
             if channels
             else ""
         )
-        + f"\n\n## Cause\n\n{_sentence(words.cause)}\n\n## How to check\n\n{_sentence(words.check)}\n\n"
-        f"## How to cure\n\n{_sentence(words.cure)}\n\n"
+        + f"\n\n## Cause\n\n{_sentence(f.cause)}\n\n## How to check\n\n{_sentence(f.check)}\n\n"
+        f"## How to cure\n\n{_sentence(f.cure)}\n\n"
         "Then `thermoctl disarm` acknowledges a latched fault, and `thermoctl arm` starts again from the measured "
         "position.\n\n"
         + (
@@ -172,7 +171,7 @@ def _sentence(text: str) -> str:
 
 
 def effects() -> str:
-    """Return the catalogue of left-out physics."""
+    """Return the catalogue of physics that a plant may lack."""
     entries = catalogue().values()
     text = (
         _HEAD + "# Catalogue of left-out physics\n\nWhat `thermoctl diagnose` can name; one file each in "
@@ -200,11 +199,12 @@ def _numbers(*values: object) -> bool:
 
 def cli() -> str:
     """Every command's help."""
-    os.environ["COLUMNS"] = "110"
     top = parser()
     pages: list[str] = []
 
     def walk(p: argparse.ArgumentParser) -> None:
+        kind = cast(type[argparse.HelpFormatter], p.formatter_class)
+        p.formatter_class = partial(kind, width=_HELP_WIDTH)  # not the terminal's
         pages.append(f"## {p.prog}\n```text\n{p.format_help().rstrip()}\n```\n")
         for action in p._actions:
             if isinstance(action, argparse._SubParsersAction):
@@ -216,7 +216,7 @@ def cli() -> str:
 
 
 def pages() -> dict[Path, str]:
-    """Every generated page by its path below docs/."""
+    """Return every generated page by its path below docs/."""
     made = {
         Path("reference", f"{make.__name__.replace('_', '-')}.md"): make()
         for make in (configuration, signals, faults, effects, cli, commands_that_act)
@@ -225,7 +225,7 @@ def pages() -> dict[Path, str]:
 
 
 def stale(docs: Path = DOCS) -> list[str]:
-    """Return the pages that differ from what the code says, and pages of faults that there are no more."""
+    """Return the pages that differ from the code, and pages of faults that no longer exist."""
     wanted = pages()
     wrong = [
         str(p) for p, text in wanted.items() if not (docs / p).is_file() or (docs / p).read_text() != text
@@ -236,7 +236,7 @@ def stale(docs: Path = DOCS) -> list[str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the pages, or with --check say which are stale (exit status 1)."""
+    """Write the pages, or with --check list the stale ones (exit status 1)."""
     parser = argparse.ArgumentParser(prog="python -m thermoctl.reference", description=__doc__)
     parser.add_argument(
         "--check", action="store_true", help="write nothing; exit status 1 when a page is stale"

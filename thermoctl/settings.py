@@ -1,8 +1,9 @@
-"""The configuration: every option once, with unit, range, default, meaning, and whether a change needs a restart.
+"""The configuration: every option with unit, range, default, meaning, and whether a change needs a restart.
 
-One YAML file describes a rig. `load_settings` reads it strictly: an unknown key, a wrong type, a value out of range,
-a unit that does not fit, a duplicate or a missing key is an error. The error names file, line and column, what was
-expected, and the nearest known name. A number may carry a unit ("5 ms", "1 mm/min"); it is converted to the option's unit.
+One YAML file describes a rig. `load_settings` reads it strictly. Errors are: an unknown key, a wrong type, a
+value out of range, a wrong unit, a duplicate key, a missing key. The message names file, line and column, the
+expectation and the nearest known name. A number may carry a unit ("5 ms", "1 mm/min"); it is converted to the
+option's unit.
 
 The dataclasses below are the table; `options()` lists it for the reference page and for `reload`.
 """
@@ -27,7 +28,7 @@ from thermoctl.option import Option, option
 from thermoctl.yamlfile import InputError, Node, Section, kind_of, load, number_of, suggest
 
 TEMPERATURES = "temperatures_c"
-"""In a mapping of limits: every temperature of the twelve points that has no entry of its own."""
+"""In a mapping of limits: default for the twelve temperatures without an entry of their own."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +160,8 @@ class ReadingLimits:
 class ProtectionSettings(Limits, ReadingLimits):
     """Limits that disable the amplifier when they are exceeded.
 
-    The options `low` to `frozen_s` are mappings of channel: limit. A channel without an entry has no limit. The entry
-    `temperatures_c` sets the limit of every temperature without an entry of its own."""
+    The options `low` to `frozen_s` are mappings of channel: limit. A channel without an entry has no limit.
+    The entry `temperatures_c` sets the limit of every temperature without an entry of its own."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +197,7 @@ class RecordingSettings:
 
 @dataclass(frozen=True)
 class HalSettings:
-    """The hardware, or what simulates it."""
+    """The hardware, or its simulation."""
 
     backend: str = option(
         "where readings come from: a simulated plant, devices, or a recording that is played back",
@@ -389,7 +390,7 @@ def _value(section: Section, key: str, kind: Any, row: Option) -> Any:
         return tuple(section.list(key))
     if origin is tuple:
         return tuple(_channel(label, item.value, item) for item in section.list(key))
-    if origin is types.UnionType:  # Node | None: the reader of that part checks it
+    if origin is types.UnionType:  # Node | None: the reader of that section checks it
         return node
     raise TypeError(f"{label}: no rule for {kind}")
 

@@ -1,6 +1,6 @@
-"""Where the files lie that come with the program.
+"""Find the files that come with the program.
 
-Beside the package in a checkout, under share/thermoctl where a wheel put them.
+They lie beside the package in a checkout, and under share/thermoctl after installation from a wheel.
 """
 
 from __future__ import annotations
@@ -12,6 +12,6 @@ _CHECKOUT = Path(__file__).resolve().parents[1]
 
 
 def shipped(folder: str) -> Path:
-    """Return a folder of the distribution's, such as `config/effects` or `systemd`."""
+    """Return a folder of these files, such as `config/effects` or `systemd`."""
     here = _CHECKOUT / folder
     return here if here.is_dir() else Path(sys.prefix) / "share/thermoctl" / folder

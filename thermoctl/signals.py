@@ -1,9 +1,9 @@
-"""Every signal once: name, unit, meaning, and the limits it stays within when all is well.
+"""Define every signal once: name, unit, meaning, and plausible limits.
 
-A record row is one tick's signals in this order, all float64. The shared memory, the recording's schema, `status`, the
-dashboard and the reference page derive from this table.
+A record row holds one tick's signals in this order, all float64. The shared memory, the recording's schema,
+`status`, the dashboard and the reference page derive from this table.
 
-Rows replay: the signals `dt_s` to `delay_bits` are everything the law was given, those from `state` on what it gave.
+Rows can be replayed: `dt_s` to `delay_bits` are all inputs of the law, `state` and later ones its outputs.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from thermoctl.channels import POINTS as POINTS
 from thermoctl.channels import STATUS_NAMES, TABLE
 
 FAULT_WORD_BITS = 53
-"""Bits of `fault_bits`: a float64 holds so many exactly. The faults from this bit on are in `fault_bits_2`."""
+"""A float64 holds 53 bits exactly: the faults from this bit on are in `fault_bits_2`."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """One column of the record: `unit` as pint reads it ('1' for a number), plausible values from `low` to `high`.
+    """One column of a recording: `unit` as pint reads it ('1' for a number), plausible from `low` to `high`.
 
-    `bits`: a word of bits, to be or-ed where rows are merged. `before`: its value in every recording made before the
-    signal existed; None where no value can be known.
+    `bits`: a word of bits; rows are merged by OR. `before`: its value in every recording made before the
+    signal existed; None when it is unknown.
     """
 
     name: str
@@ -45,7 +45,7 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("busy_us", "us", "from wake-up until the amplifier was written", 0.0),
     Signal("slips", "1", "ticks skipped because an earlier one took too long, since the start", 0.0),
     Signal("generation", "1", "how many reloads the parameters have seen", 0.0),
-    # What the law was given.
+    # Inputs of the law, with the time and the command.
     Signal("dt_s", "s", "measured time since the tick before", 0.0, 1.0),
     Signal("command", "1", "command taken in this tick: 0 none, 1 arm, 2 disarm, 3 setpoint", 0.0, 3.0),
     Signal("command_value", "1", "the command's value: the setpoint in um"),
@@ -66,7 +66,7 @@ SIGNALS: tuple[Signal, ...] = (
         0.0,
         bits=True,
     ),
-    # What the law gave.
+    # Outputs of the law.
     Signal("state", "1", "0 OFF, 1 SAFE, 2 READY, 3 ARMED, 4 FAULT", 0.0, 4.0),
     Signal(
         "fault_bits",
@@ -107,7 +107,7 @@ SIGNALS: tuple[Signal, ...] = (
 NAMES = tuple(s.name for s in SIGNALS)
 INDEX = {name: i for i, name in enumerate(NAMES)}
 OUTPUTS = NAMES[INDEX["state"] :]
-"""What the law gives in a tick, in the order of its array."""
+"""Names of the law's outputs in a tick, in the order of its array."""
 OUTPUT = {name: i for i, name in enumerate(OUTPUTS)}
 BIT_WORDS = frozenset(s.name for s in SIGNALS if s.bits)
 
@@ -118,7 +118,7 @@ def fault_word(row: np.ndarray) -> int:
 
 
 def join_fault_words(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the fault bits (uint64) of the columns `fault_bits` and `fault_bits_2`; NaN counts as no fault."""
+    """Return the fault bits (uint64) of both columns of fault bits; NaN counts as no fault."""
     words = [np.nan_to_num(column).astype(np.uint64) for column in (low, high)]
     return words[0] | words[1] << np.uint64(FAULT_WORD_BITS)
 

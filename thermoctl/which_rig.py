@@ -1,4 +1,4 @@
-"""Which rig a command means: the one rule by which every command finds its configuration.
+"""Find the configuration of a command; every command uses this rule.
 
 `--config FILE`; else `$THERMOCTL_CONFIG`; else `config/simulated.yaml` in the current folder; else
 `/etc/thermoctl/rig.yaml`.
@@ -19,9 +19,10 @@ FALLBACKS = ("config/simulated.yaml", "/etc/thermoctl/rig.yaml")
 
 @dataclass(frozen=True)
 class Act:
-    """What a command may do to a rig; one row of docs/reference/commands-that-act.md.
+    """Describe how a command may act on a rig; one row of docs/reference/commands-that-act.md.
 
-    question: what it asks first; beside: what it does when another process holds the rig."""
+    question: asked before it acts; beside: its behaviour when another process holds the rig.
+    """
 
     command: str
     does: str
@@ -39,6 +40,7 @@ _THROUGH = (
     "drives through that daemon with its law and protection, from READY only, and disarms at its end; a rig that is "
     "ARMED or in FAULT is not touched"
 )
+_MOVED = "0; 1 the answer was not `go`; 2 nobody can be asked; 3 the rig refuses, or it ended early"
 ACTS = (
     Act(
         "run",
@@ -68,7 +70,13 @@ ACTS = (
         "stops it: its purpose; never the rig of another configuration",
         "0, also where nobody holds the rig; 3 it does not end",
     ),
-    Act("restart", "stop, then start", "none", "as stop, then start", "as stop, then start"),
+    Act(
+        "restart",
+        "stop, then start",
+        "none",
+        "as stop, then start",
+        "0; 3 it does not end, or the daemon's own error",
+    ),
     Act(
         "arm",
         "enables the amplifier and holds the measured position",
@@ -97,29 +105,15 @@ ACTS = (
         "its purpose",
         "1 the file is not valid; 2 no daemon",
     ),
-    Act(
-        "tune", "moves the stage by short setpoint ramps", _MOVES, _THROUGH, "0; 2 no `go`; 3 the rig refuses"
-    ),
-    Act(
-        "experiment",
-        "moves the stage by a schedule of setpoints",
-        _MOVES,
-        _THROUGH,
-        "0; 1 ended early; 2 no `go`; 3 the rig refuses",
-    ),
-    Act(
-        "calibrate",
-        "tune, then the tests of experiments.yaml",
-        _MOVES,
-        _THROUGH,
-        "0; 1 ended early; 2 no `go`; 3 the rig refuses",
-    ),
+    Act("tune", "moves the stage by short setpoint ramps", _MOVES, _THROUGH, _MOVED),
+    Act("experiment", "moves the stage by a schedule of setpoints", _MOVES, _THROUGH, _MOVED),
+    Act("calibrate", "tune, then the tests of experiments.yaml", _MOVES, _THROUGH, _MOVED),
     Act(
         "diagnose",
         "with --resolve: runs the proposed experiment",
         _MOVES,
         _THROUGH,
-        "0; 2 no `go`; 3 the rig refuses",
+        "0; 2 the answer was not `go`, or nobody can be asked; 3 the rig refuses, or it ended early",
     ),
     Act(
         "dashboard",
@@ -150,7 +144,8 @@ ACTING = frozenset(act.command for act in ACTS)
 def find_config(given: str | None) -> tuple[str, str]:
     """Return (the configuration's path, how it was found). Raises InputError when there is none.
 
-    A file that is named but missing is returned: reading it gives the error. Another rig never takes its place.
+    A file that is named but missing is returned: reading it gives the error. Another rig never takes its
+    place.
     """
     if given:
         return given, "--config"
@@ -166,7 +161,7 @@ def find_config(given: str | None) -> tuple[str, str]:
 
 
 def choose(args: argparse.Namespace) -> None:
-    """Put the configuration's path into `args.config`, where the command means a rig, and print what was chosen."""
+    """Put the configuration's path into `args.config` of a command that needs a rig; print the choice."""
     if "config" not in args or not _means_a_rig(args):
         return
     given = args.config or getattr(args, "file", None)
@@ -178,9 +173,7 @@ def choose(args: argparse.Namespace) -> None:
 def _means_a_rig(args: argparse.Namespace) -> bool:
     if args.command == "diagnose":
         return args.live or (args.resolve and not args.rig)
-    if (
-        args.command == "experiment"
-    ):  # a test is found beside the configuration; a file of inputs may need no rig
+    if args.command == "experiment":  # a test lies beside the configuration; a file of inputs may need no rig
         return not (args.plant or (args.dry_run and Path(args.name).suffix in (".yaml", ".yml")))
     return args.command != "service" or args.action == "install"
 

@@ -1,7 +1,7 @@
 """YAML with places: every value knows its file, line and column, and a duplicate key is an error.
 
-`load` gives a `Node`; a `Section` reads a mapping key by key and refuses the keys that nobody asked for. Only
-PyYAML's safe constructors are used.
+`load` gives a `Node`. A `Section` reads a mapping key by key and refuses unknown keys. Only PyYAML's safe
+constructors are used.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any, Literal, overload
 
 import yaml
 
-MAX_BYTES = 4_000_000  # a larger file is not one a person wrote
+MAX_BYTES = 4_000_000  # a larger file was not written by a person
 MAX_DEPTH = 60
 MAX_NUMBER = 1e300  # squares of larger numbers overflow
 
 
 class InputError(Exception):
-    """An error in the user's input. The message is one line: where, what, what was expected, what to do."""
+    """An error in the user's input. The message is one line: place, problem, expectation, remedy."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -79,7 +79,7 @@ class Node:
 
     def error(self, message: str) -> InputError:
         """Return an InputError that begins with the place; to be raised by the caller."""
-        return InputError(f"{self.place}: {message}".replace("\n", "\\n"))  # a name may hold anything
+        return InputError(f"{self.place}: {message}".replace("\n", "\\n"))  # a name may contain line breaks
 
 
 def suggest(name: str, allowed: Iterable[str]) -> str:
@@ -104,7 +104,7 @@ def load(path: str | Path) -> Node:
 
 
 def loads(text: str, file: str = "<text>") -> Node:
-    """Return the same from a string; `file` names it in messages."""
+    """Read one YAML document from a string; `file` names it in messages."""
     loader = None
     try:
         loader = _Loader(text)
@@ -161,10 +161,11 @@ def _convert(node: yaml.Node, loader: _Loader, file: str, depth: int) -> Node:
 
 
 class Section:
-    """A YAML mapping read key by key; `end()` refuses the keys that nobody asked for.
+    """A YAML mapping read key by key; `end()` refuses the keys that were not read.
 
-    `what` names the mapping in errors; `of`, where given, names the item that its keys belong to ("noise of
-    'y'")."""
+    `what` names the mapping in errors; `of`, if given, names the item that its keys belong to ("noise of
+    'y'").
+    """
 
     def __init__(self, node: Node, what: str, of: str = "") -> None:
         if not isinstance(node.value, dict):
@@ -280,7 +281,7 @@ class Section:
         return {name: Section(node, name) for name, node in inner.node.value.items()}
 
     def end(self) -> None:
-        """Raise InputError at a key that nobody asked for."""
+        """Raise InputError at a key that was not read."""
         for key, node in self.node.value.items():
             if key not in self.asked:
                 raise node.error(
@@ -293,7 +294,7 @@ _NAME = re.compile(r"[A-Za-z_]\w{0,59}$", re.ASCII)
 
 
 def kind_of(node: Node) -> str:
-    """Return what a node holds, in words for an error."""
+    """Return the kind of a node's value in words, for an error."""
     v = node.value
     if isinstance(v, dict | list):
         return "a mapping" if isinstance(v, dict) else "a list"

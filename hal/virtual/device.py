@@ -1,4 +1,4 @@
-"""What the devices of the virtual rig share: the pseudo-terminal, and the readings of the plant."""
+"""Base of the virtual rig's devices: the pseudo-terminal, and the readings of the plant."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""A CiA-402 drive and a Lawicel adapter, as bytes on a wire. Pure: frames and time in, frames out.
+"""Simulate a CiA-402 drive and a Lawicel adapter at byte level. Pure: frames and time in, frames out.
 
-The drive has its own object dictionary, SDO server (expedited), NMT slave, heartbeat producer and consumer,
-SYNC-driven PDOs whose mapping the master writes, and the CiA-402 state machine. When the master's heartbeat
-(0x1016) is missing it stops by itself: error 0x8130, fault state, pre-operational.
+The drive has its own object dictionary, an expedited SDO server, an NMT slave, a heartbeat producer and
+consumer, and the CiA-402 state machine. SYNC triggers its PDOs, whose mapping the master writes. When the
+master's heartbeat (0x1016) is missing it stops by itself: error 0x8130, fault state, pre-operational.
 """
 
 from __future__ import annotations
@@ -76,8 +76,9 @@ def _dictionary(node: int) -> dict[tuple[int, int], Entry]:
 class Cia402Drive:
     """The drive. The rig sets readings in `od[index, 0].value` and takes `command` (counts of the target).
 
-    `command_object` is the target object (0x2071, 0x6071); `alive` False: unpowered, mute; `heartbeat` False:
-    its own heartbeat is off; `stop_until_s`: end of the time in which its stop input is active."""
+    `command_object` is the target object (0x2071 or 0x6071). With `alive` False the drive is unpowered and
+    mute. With `heartbeat` False it sends no heartbeat. Its stop input is active until `stop_until_s`.
+    """
 
     node: int
     command_object: int = 0x2071
@@ -157,7 +158,7 @@ class Cia402Drive:
         return out
 
     def _watch_stop(self, now_s: float) -> None:
-        """Obey the stop input: quick stop from 'operation enabled', and no way there while it is active."""
+        """Obey the stop input: it causes a quick stop, and prevents 'operation enabled' while active."""
         self._stopping = now_s < self.stop_until_s
         if self._stopping and self.state == ENABLED:
             self.state = QUICK_STOP

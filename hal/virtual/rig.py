@@ -1,13 +1,16 @@
 """The virtual rig: the devices of a configuration at the other end of their wires, in real time.
 
-`hal.devices` says which devices the daemon uses; this program plays those devices by the same profiles: a pty
-with a symbolic link at each serial port's path, a Lawicel adapter with a CiA-402 drive (or the sender of a
-DBC file) behind it, Modbus TCP servers and RTU units. One plant feeds them all; the drive's current moves it.
-It writes to `hal.run_dir`
+`hal.devices` lists the devices that the daemon uses; this program simulates them by the same profiles:
 
-    reference.csv   data that the daemon never gets: the output's reference encoder and the true state, 100 rows a
-                    second, `t` on the machine's monotonic clock
-    control.sock    one command line in, one line out: unplug cables and inject faults (`help` lists them by device)
+- a pty for each serial port, with a symbolic link at the port's path
+- a Lawicel adapter, and behind it a CiA-402 drive or the sender of a DBC file
+- Modbus TCP servers and RTU units
+
+One plant feeds them all; the drive's current moves it. It writes to `hal.run_dir`
+
+    reference.csv   data that the daemon never gets: the output's reference encoder and the true state,
+                    100 rows a second, `t` on the machine's monotonic clock
+    control.sock    one command line in, one line out: unplug cables and inject faults (`help` lists them)
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ from hal.virtual.text_meter import TextMeter
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, suggest
 
-MAX_STEPS = 50  # periods to catch up at once; after a longer stop of this program the plant skips that time
+MAX_STEPS = 50  # most periods simulated at once; after a longer stop the plant skips the rest
 REFERENCE_HZ = 100
 PRIORITY = 70  # below the daemon's loop
 MAX_COMMAND = 400  # bytes of a line to the control socket
@@ -52,7 +55,7 @@ _KINDS: dict[str, Callable[[Binding, PlantRig], VirtualDevice]] = {
 
 
 def virtual_device(binding: Binding, rig: PlantRig) -> VirtualDevice:
-    """Make the device that plays `binding`. Raises InputError for a CAN port that is not slcan."""
+    """Make the device that simulates `binding`. Raises InputError for a CAN port that is not slcan."""
     if binding.profile.bus.startswith("can") and not binding.port.startswith("slcan:"):
         raise InputError(
             f"{binding.place}: the virtual rig plays CAN devices on slcan ports only, found '{binding.port}'"
@@ -189,7 +192,7 @@ def _listen(path: Path) -> socket.socket:
         server.close()
         raise InputError(f"{path}: another virtual rig is running; stop it first")
     if path.exists():
-        path.unlink()  # of a virtual rig that was killed
+        path.unlink()  # left by a virtual rig that was killed
     server.bind(str(path))
     server.listen(4)
     server.setblocking(False)

@@ -255,17 +255,9 @@ def test_an_experiment_at_the_wire_is_ended_and_goes_on(tmp_path):
     chain = Chain(tmp_path)
     try:
         out = tmp_path / "short.parquet"
-        command = [
-            *CLI,
-            "experiment",
-            "short",
-            "--config",
-            str(chain.config),
-            "--out",
-            str(out),
-            "--resume",
-            "--yes",
-        ]
+        command = (
+            f"{' '.join(CLI)} experiment short --config {chain.config} --out {out} --resume --yes".split()
+        )
         first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         chain.until(lambda s: s.get("state") == "ARMED" and (s.get("position_um") or 0) > 10, 60)
         first.send_signal(signal.SIGINT)

@@ -284,17 +284,7 @@ def test_a_set_of_600_holds_every_effect_in_every_size_and_150_of_nothing():
 
 
 def test_the_listing_counts_what_was_planned_and_made(tmp_path, capsys):
-    argv = [
-        "--out",
-        str(tmp_path / "c"),
-        "--seed",
-        "3",
-        "--smoke",
-        "--kind",
-        "none",
-        "--families",
-        "tanks,heater",
-    ]
+    argv = f"--out {tmp_path / 'c'} --seed 3 --smoke --kind none --families tanks,heater".split()
     generate.main([*argv, "--number", "2"])
     capsys.readouterr()
     generate.main([*argv, "--number", "4", "--list"])

@@ -69,7 +69,7 @@ WHY: dict[str, str] = {
     "law.py:_watch_amplifier: `1.0` + 1 in `self.driving = 1.0`": _FLAG,
     "law.py:_compare_order: `1.0` + 1 in `self.exchanged = 1.0`": _FLAG,
     "law.py:_agree: `1.0` + 1 in `self.reference_zeroed = 1.0 if self.state != _OFF else 0.0`": _FLAG,
-    "law.py:_agree: `1.0` + 1 in `self.zeroed = 1.0 if self.state != _OFF else 0.0`": _FLAG,
+    "law.py:_compare_position: `1.0` + 1 in `self.zeroed = 1.0 if self.state != _OFF else 0.0`": _FLAG,
     "law.py:_arm: `0 <= command < _COMMANDS` LtE -> Lt in `before, known = self.state, command if 0 <= command < _COMMANDS else _NONE`": "command 0 is _NONE itself",
     "law.py:_arm: `0` + 1 in `before, known = self.state, command if 0 <= command < _COMMANDS else _NONE`": "command 0 is _NONE itself",
     "law.py:_arm: `(((before * _COMMANDS + known) * 2 + started) * 2 + tripped)` Add -> Sub in "

@@ -553,6 +553,26 @@ def idle_to_the_tick(module):
 
 
 @scenario
+def current_from_before_disarming(module):
+    """A slow meter's last reading of the drive, and one sampled before DISARM that arrives after it, prove nothing."""
+    for readings in ({"current_a": 0.75}, {"voltage_v": 5.0, "current_a": 0.5}):
+        bench = Bench(module, idle_current_a=0.5, idle_power_w=2.0, idle_s=4 * P).armed()
+        bench.set(**readings).tick().silent("current_a").tick().tick(command=arming.DISARM).tick(20)
+        assert bench.state == arming.READY and bench.shown == set()
+        bench.set(**readings).tick().silent("current_a").tick(20)
+        assert bench.state == arming.READY and bench.shown == set()
+        bench.set(**readings).tick().silent("current_a").tick(3)
+        assert bench.state == arming.READY and bench.shown == set()
+        bench.tick().safe("coil_stuck_on")
+        bench.set(current_a=0.0).tick().tick(command=arming.DISARM).tick()
+        bench.tick(command=arming.ARM).tick(3).well()
+        bench.silent("current_a").tick(command=arming.DISARM).set(**readings).tick().silent("current_a").tick(
+            9
+        )
+        assert bench.shown == set()  # counted from the newest DISARM
+
+
+@scenario
 def times_count_from_arming(module):
     """What lasted for a while before DISARM does not count after the next ARM."""
 
@@ -603,7 +623,7 @@ def all_at_once(module):
     bench.law.configure(bench.parameters)
     bench.law.v, bench.law.x[0] = 4.0, 99.0
     bench.set(
-        position_um=20.0, voltage_v=9.0, current_a=1.0, coil_c=40.0, bobbin_c=60.0, amplifier_fault=1.0
+        position_um=20.0, voltage_v=-30.0, current_a=-2.5, coil_c=40.0, bobbin_c=60.0, amplifier_fault=1.0
     ).say(2, "shaft_1_c")
     bench.tick(external=1 << faults.BIT["amplifier_write"])
     bench.safe(
@@ -959,13 +979,32 @@ def position_and_current(module):
         ).armed()
 
     for sign in (1.0, -1.0):
-        bench().set(position_um=8.0 + sign * 8.0, current_a=sign).tick(2).well()
-        bench().set(position_um=8.0 + sign * 4.0).tick(2).well()
-        bench().set(position_um=8.0 + sign * 4.25).tick().safe("position_disagrees")
+        bench().set(position_um=8.0 + sign * 8.0, current_a=sign).tick(3).well()
+        bench().set(position_um=8.0 + sign * 4.0).tick(4).well()
+        b = (
+            bench().set(position_um=8.0 + sign * 4.25).tick(2).well()
+        )  # as far as the current may be that of 8 um
+        b.tick().safe("position_disagrees")
+        bench().set(current_a=sign * 0.5).tick().well()
         bench().set(current_a=sign).tick().safe("position_disagrees")
-    b = bench(agree_time_s=4 * P).set(position_um=16.0).tick(2).well()  # 2, 3.5, 4.6 um
+    b = bench(agree_time_s=4 * P).set(current_a=1.0).tick(2).well()  # 2, 3.5, 4.6 um
     b.tick().safe("position_disagrees")
     bench(flexure_um_per_a=0.0).set(position_um=99.0).tick(3).well()
+
+    # A slow meter: its reading is older than its arrival, and the stage may have been anywhere since the reading before the last.
+    def moving(sign):
+        b = bench().tick(2).silent("current_a").set(position_um=8.0 + sign * 8.0).tick(5)
+        return b.set(position_um=8.0 + sign * 16.0).tick(5).well()
+
+    for sign in (1.0, -1.0):
+        for at in (0.0, 1.0, 2.0, 2.5):  # 8, 16, 24 um, and 4 um beyond
+            moving(sign).set(current_a=sign * at).tick().well()
+        moving(sign).set(current_a=sign * 2.625).tick().safe("position_disagrees")
+        moving(sign).set(current_a=sign * -0.5).tick().well()
+        moving(sign).set(current_a=sign * -0.625).tick().safe("position_disagrees")
+        b = moving(sign).set(current_a=0.0).tick().silent("current_a").tick(5).well()
+        b.set(current_a=0.0).tick().well().silent("current_a").tick(5).well()  # one more interval
+        b.set(current_a=0.0).tick().safe("position_disagrees")
     # The zero is where the stage stands, with the current that holds it there, until OFF is left; not later.
     b = Bench(
         module,
@@ -977,7 +1016,7 @@ def position_and_current(module):
     )
     b.set(position_um=40.0, current_a=3.0).tick(module.WARM_UP_TICKS // 2).set(position_um=60.0).warm()
     assert b.law.position_zero_um == 60.0 - 24.0 and b.shown == set()
-    b.set(position_um=65.0).tick(2)
+    b.set(position_um=65.0).tick(4)
     assert b.shown == {"position_disagrees"} and b.state == arming.SAFE
     for name in ("position_um", "current_a"):
         b = bench(required=channels(0)).say(2, name)
@@ -1272,6 +1311,15 @@ def outputs_say_what_is(module):
     assert law.drive == -4.0
 
 
+@scenario
+def the_second_word_holds_the_later_bits(module):
+    """Faults from bit 53 on, which no table names yet, are shown in the second word, and only there."""
+    bench = Bench(module).armed().tick(external=1 << 60 | 1 << 53 | 1 << faults.BIT["compensation_slewing"])
+    words = OUTPUT["fault_bits"], OUTPUT["fault_bits_2"]
+    assert [bench.law.outputs[w] for w in words] == [1 << faults.BIT["compensation_slewing"], 1 << 7 | 1]
+    assert [bench.tick().law.outputs[w] for w in words] == [0, 0]
+
+
 # ---- the table --------------------------------------------------------------------------------------------------------------
 @scenario
 def the_state_machine(module):
@@ -1345,3 +1393,28 @@ def the_fault_table(module):
     )  # a frozen amplifier is stale
     assert table.mask("fault", "critical", readings=False) == (table.mask("fault", "critical") >> 34 << 34)
     assert (CHANNELS[5:17], TEMPERATURES[0], len(CHANNELS)) == (TEMPERATURES, "coil_c", 20)
+
+
+@scenario
+def names_in_a_recording(module):
+    """A recording's bits keep the names that they had when it was made: its own table, or its law's version."""
+    table = module.faults
+
+    def named(bits, **meta):
+        return table.names(bits, table.recorded_names(meta))
+
+    bits = 1 << 34 | 1 << 31 | 1
+    now = ("position_error", "amplifier_stale", "amplifier_stopped")
+    assert named(bits) == named(bits, law="") == named(bits, law='{"version": 2}') == now
+    assert named(bits, law='{"version": 1}') == (*now[:2], "amplifier_frozen")
+    assert named(1 << 34 | 2, faults='{"34": "other"}', law='{"version": 1}') == ("bit 1", "other")
+    assert tuple(f.name for f in table.FAULTS[: len(table.NAMES_2)]) == table.NAMES_2
+    assert len(table.NAMES_1) == len(table.NAMES_2) == 53
+    assert [k for k in range(53) if table.NAMES_1[k] != table.NAMES_2[k]] == [34]
+    for damaged in ('["a"]', '{"1": 2}'):
+        try:
+            table.recorded_names({"faults": damaged})
+        except ValueError as e:
+            assert "damaged" in str(e)
+        else:
+            raise AssertionError("a damaged table was taken")

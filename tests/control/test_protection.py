@@ -17,6 +17,7 @@ PROTECTION = (
     "_watch_amplifier",
     "_agree",
     "_compare_drive",
+    "_compare_position",
     "_compare_order",
     "protect",
     "_arm",

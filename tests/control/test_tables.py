@@ -12,9 +12,8 @@ import pytest
 
 import thermoctl
 from thermoctl.channels import CHANNELS, GROUPS, POINTS, TABLE, THERMAL
-from thermoctl.control import faults, typed
+from thermoctl.control import faults, recorded_faults, typed
 from thermoctl.control.model import CompensatorModel, zero_model
-from thermoctl.control.remedies import REMEDIES
 from thermoctl.daemon.keep import _fingerprint
 from thermoctl.signals import INDEX, NAMES, fault_word, fault_words
 
@@ -61,13 +60,12 @@ def test_tables_are_consistent():
     assert len(set(faults.BIT.values())) == len(faults.FAULTS) == len(faults.BIT)
     assert set(faults.BIT.values()) <= set(range(64))
     assert set(faults.READING_BITS) == set(GROUPS) == {c.group for c in TABLE}
-    assert set(REMEDIES) == set(faults.BIT)
     assert faults.BIT["amplifier_write"] < 53, "external_bits is one float64"
 
 
 def test_the_faults_of_old_recordings_keep_their_bits():
     """No bit that a recording of version 2 holds has got another meaning."""
-    assert {bit: faults.NAMES[bit] for bit in range(53)} == dict(enumerate(faults.NAMES_2))
+    assert {bit: faults.NAMES[bit] for bit in range(53)} == dict(enumerate(recorded_faults.NAMES_2))
 
 
 def test_types_of_the_law_are_up_to_date(capsys):
@@ -149,18 +147,14 @@ def test_a_fault_is_added_in_one_row():
     found = run_with(
         {
             "thermoctl.control.faults": (
-                "\n)\n\nFAULTS = ",
-                '\n    Fault(53, "door_open", "critical", "the chamber\'s door is open"),\n)\n\nFAULTS = ',
-            ),
-            "thermoctl.control.remedies": (
-                "REMEDIES = {",
-                'REMEDIES = {"door_open": Remedy("Somebody opened it.", "look", "close it"),',
-            ),
+                "_ROWS = (",
+                '_ROWS = (Fault(53, "door_open", "critical", "its door is open", "Somebody.", "look", "close it"),',
+            )
         },
         """
 import numpy as np
 from thermoctl import reference, signals
-from thermoctl.control import arming, faults, law
+from thermoctl.control import arming, faults, law, recorded_faults
 from thermoctl.control.model import Parameters, zero_model
 tick = law.Law(zero_model(), Parameters(0.0, 1.0, 0.0, 1.0), 0.001)
 for k in range(law.WARM_UP_TICKS + 3):
@@ -170,7 +164,7 @@ row[-len(law.OUTPUTS):] = tick.outputs
 print(json.dumps({
     "state": arming.STATES[tick.state], "shown": "door_open" in [f.name for f in faults.decode(signals.fault_word(row))],
     "second word": row[signals.INDEX["fault_bits_2"]], "page": "`fault_bits_2` (value 1)" in reference.fault(faults.BY_NAME["door_open"]),
-    "recorded": faults.NAMES[53], "others": all(faults.NAMES[b] == n for b, n in enumerate(faults.NAMES_2)),
+    "recorded": faults.NAMES[53], "others": all(faults.NAMES[b] == n for b, n in enumerate(recorded_faults.NAMES_2)),
 }))""",
     )
     assert found == {
@@ -210,13 +204,13 @@ print(json.dumps({
 def test_an_old_recording_decodes_to_its_own_faults(version, name):
     """Without a table in the metadata the names are those of the law's version; with one, its own."""
     law = json.dumps({"version": version})
-    assert faults.names(1 << 34 | 1, faults.recorded_names({"law": law})) == ("position_error", name)
+    assert recorded_faults.names(1 << 34 | 1, recorded_faults.table({"law": law})) == ("position_error", name)
     stored = {"law": law, "faults": json.dumps({34: "lamp_broken", 60: "of_a_newer_program"})}
-    assert faults.names(1 << 34 | 1 << 60, faults.recorded_names(stored)) == (
+    assert recorded_faults.names(1 << 34 | 1 << 60, recorded_faults.table(stored)) == (
         "lamp_broken",
         "of_a_newer_program",
     )
-    assert faults.names(1 << 59, faults.recorded_names(stored)) == ("bit 59",)
+    assert recorded_faults.names(1 << 59, recorded_faults.table(stored)) == ("bit 59",)
 
 
 def test_two_words_hold_every_bit():

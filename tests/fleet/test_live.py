@@ -74,42 +74,14 @@ def test_live_says_that_the_model_fits(tmp_path, capsys):
     path, settings = rig(tmp_path)
     recorded(settings, 10)
     plant = ROOT / "config" / "plants" / "actuator_thermal.yaml"
-    assert (
-        main(
-            [
-                "diagnose",
-                "--live",
-                "--config",
-                str(path),
-                "--plant",
-                str(plant),
-                "--out",
-                str(tmp_path / "out"),
-            ]
-        )
-        == 0
-    )
+    assert main(f"diagnose --live --config {path} --plant {plant} --out {tmp_path / 'out'}".split()) == 0
     assert "The model fits" in capsys.readouterr().out and not (tmp_path / "out").exists()
 
 
 def test_live_without_recordings_is_one_line(tmp_path, capsys):
     path, _ = rig(tmp_path)
     plant = ROOT / "config" / "plants" / "actuator_thermal.yaml"
-    assert (
-        main(
-            [
-                "diagnose",
-                "--live",
-                "--config",
-                str(path),
-                "--plant",
-                str(plant),
-                "--out",
-                str(tmp_path / "out"),
-            ]
-        )
-        == 2
-    )
+    assert main(f"diagnose --live --config {path} --plant {plant} --out {tmp_path / 'out'}".split()) == 2
     assert "no recording of the rig 'simulated'" in capsys.readouterr().err
 
 
@@ -118,21 +90,7 @@ def test_live_diagnoses_the_stretch_that_the_model_does_not_fit(tmp_path):
     path, settings = rig(tmp_path, "1.2 * step(t - 1500)")
     rows = recorded(settings, 45)
     plant = ROOT / "config" / "plants" / "actuator_thermal.yaml"
-    assert (
-        main(
-            [
-                "diagnose",
-                "--live",
-                "--config",
-                str(path),
-                "--plant",
-                str(plant),
-                "--out",
-                str(tmp_path / "out"),
-            ]
-        )
-        == 0
-    )
+    assert main(f"diagnose --live --config {path} --plant {plant} --out {tmp_path / 'out'}".split()) == 0
     found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     (finding,) = [f for f in found["findings"] if f["where"] == "coil"]
     assert finding["effect"] == "external_heat_source" and finding["when"][0][0] == pytest.approx(

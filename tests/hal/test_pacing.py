@@ -20,7 +20,10 @@ from tests.hal.conftest import CONFIG
 from tests.limits import OFF
 from thermoctl import yamlfile
 from thermoctl.control.model import Parameters, zero_model
+from thermoctl.daemon.arrival import device_counters, put_counters
 from thermoctl.daemon.clock import now_ns
+from thermoctl.daemon.command_server import Commands
+from thermoctl.daemon.display import counter_lines
 from thermoctl.daemon.loop import Rig, run_loop
 from thermoctl.daemon.shared import Shared
 from thermoctl.settings import load_settings
@@ -112,6 +115,28 @@ def test_ticks_follow_the_frames_and_go_on_without_them(encoder):
     assert fresh[5:150][by_frame].all() and by_frame.mean() > 0.5
     assert 0.5 * PERIOD_S < np.median(dt[5:150]) < 1.5 * PERIOD_S
     assert not fresh[160:].any() and np.median(dt[160:]) >= 1.99 * PERIOD_S
+
+
+def test_status_has_the_counters_of_the_devices(encoder):
+    """Frames and damaged frames are in `status --json` while the daemon runs, and a line of `status` names what was bad."""
+    shared = Shared.create(f"thermoctl-counters-{os.getpid()}")
+    settings = SimpleNamespace(loop=SimpleNamespace(period_s=0.001, spin_s=0.0, pace="clock"))
+    parameters = Parameters(kp=0.01, ti_s=0.01, td_s=0.0, output_limit=1.0, **OFF)
+    rig = Rig(encoder.backend, zero_model(), parameters, 0.001, shared.ring, start_s=time.monotonic())
+    good = encoder.frame()
+    os.write(encoder.master, good + good[:-1] + bytes([good[-1] ^ 1]) + encoder.frame())
+    try:
+        run_loop(settings, shared, rig, lambda: rig.law.tick >= 510)
+        commands = Commands(shared, load_settings(CONFIG / "simulated.yaml"), None, lambda *a, **k: None)
+        answer = commands.answer(b'{"command": "status"}', "test")
+        assert answer["device_counters"] == {"encoder": encoder.backend.fast[0].counters()}
+        assert answer["device_counters"]["encoder"]["frames"] == 2
+        assert counter_lines(answer) == ["encoder: 2 frames, 1 errors"]
+        before = answer["device_counters"]
+        put_counters(shared, {f"device{k}.frames": k for k in range(1000)})  # do not fit: the old ones stay
+        assert device_counters(shared) == before
+    finally:
+        shared.remove()
 
 
 def test_who_cannot_give_the_time_is_told_so(tmp_path):

@@ -33,7 +33,7 @@ ERROR_FRAME = FRAME.pack(0x2000_0040, 8, bytes(8))  # CAN_ERR_FLAG | CAN_ERR_BUS
 
 class KernelBus:
     """SocketCAN's frames through a pair of sockets, with what Wires asks of a terminal and of an adapter; `off`: bus-off, nothing
-    passes either way. (The kernel's own CAN runs in a guest: make qemu-test.)"""
+    passes either way. (The kernel's own CAN runs in a guest: make test-qemu.)"""
 
     def __init__(self):
         self.off, self.master = False, -1

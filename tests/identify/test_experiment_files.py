@@ -45,19 +45,7 @@ def test_inputs_follow_straight_lines_between_their_corners(folder):
 
 def test_a_plant_file_in_the_rigs_place_gives_a_recording(folder):
     out = folder / "r.csv"
-    assert (
-        main(
-            [
-                "experiment",
-                str(folder / "next.yaml"),
-                "--plant",
-                str(folder / "plant.yaml"),
-                "--out",
-                str(out),
-            ]
-        )
-        == 0
-    )
+    assert main(f"experiment {folder / 'next.yaml'} --plant {folder / 'plant.yaml'} --out {out}".split()) == 0
     made = read_table(out)
     assert set(made.columns) == {"heat", "air", "T_block"} and len(made.t) == 121
     k = np.arange(

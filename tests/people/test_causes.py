@@ -4,6 +4,7 @@
 simulated time (tests/hazards), as are the spoiled readings of hal.faulty.
 """
 
+import math
 import os
 import re
 from pathlib import Path
@@ -17,7 +18,8 @@ from thermoctl.daemon.display import fault_lines, message_lines
 from thermoctl.daemon.shared import Shared
 from thermoctl.daemon.snapshot import status
 
-ROWS: list[tuple[str, str, str]] = []
+ROWS: list[tuple[str, str, str, str]] = []
+COUNT_UM = 0.005  # of config/devices/encoder-serial.yaml
 TEMPERATURES = tuple(r for r in ROLE if r.endswith("_c") and r != "air_c")
 
 
@@ -45,6 +47,28 @@ def unplug(port):
     return lambda rig: getattr(rig.wires, port).unplug()
 
 
+def encoder_counts(change):
+    """The encoder's frames hold change(counts), with a right checksum: its head is wrong, not the line."""
+
+    def breaks(rig):
+        wires = rig.wires
+
+        def spoiled(frame):
+            sequence, counts = (
+                int.from_bytes(frame[a:b], "little", signed=a == 5) for a, b in ((3, 5), (5, 9))
+            )
+            return wires.framer.encode(sequence, change(counts), frame[9])
+
+        wires.spoil_frame = spoiled
+
+    return breaks
+
+
+def hangs(rig):
+    held = round(rig["position_raw_um"] / COUNT_UM)
+    encoder_counts(lambda counts: held)(rig)
+
+
 def spoil(rig):
     rig.wires.spoil_frame = lambda frame: frame[:-1] + bytes([frame[-1] ^ 0xFF])
 
@@ -63,8 +87,8 @@ def bus_off(rig):
 
 
 def switched_off(rig):
-    """The drive's enable input opens: it leaves `operation enabled` and stays out."""
-    rig.inject("set", "amplifier_state", by=1.0)
+    """The drive's stop input closes: quick stop, and it stays out of `operation enabled`."""
+    rig.wires.drive.stop_until_s = math.inf
 
 
 CAUSES = [
@@ -99,23 +123,11 @@ CAUSES = [
         "electrical_disagrees",
         "",
     ),
-    ("encoder hangs", HazardRig, injected("freeze", "position_um"), "position_frozen", "without a change"),
-    (
-        "encoder jumps by 60 um",
-        HazardRig,
-        injected("step", "position_um", by=60.0),
-        "position_rate",
-        "jumped",
-    ),
-    (
-        "encoder lost its zero by 900 um",
-        HazardRig,
-        injected("set", "position_um", by=900.0),
-        "position_range",
-        "900",
-    ),
+    ("encoder hangs", WiredRig, hangs, "position_frozen", "without a change"),
+    ("encoder jumps by 60 um", WiredRig, encoder_counts(lambda n: n + 12000), "position_rate", "jumped"),
+    ("encoder reads 900 um", WiredRig, encoder_counts(lambda n: 180000), "position_range", "900"),
     ("machine late by 40 ms", HazardRig, late(0.040), "late by 40 ms", "position_um"),
-    ("drive's enable input opened", HazardRig, switched_off, "amplifier_not_following", ""),
+    ("drive's stop input closed", WiredRig, switched_off, "amplifier_stopped", ""),
     (
         "amplifier drives 0.3 A, whatever it is told",
         HazardRig,
@@ -123,7 +135,7 @@ CAUSES = [
         "following_error",
         "",
     ),
-    ("encoder's cable pulled", WiredRig, unplug("encoder"), "position_error", "reconnecting"),
+    ("encoder's cable pulled", WiredRig, unplug("encoder"), "position_stale", "reconnecting"),
     ("encoder's checksums wrong", WiredRig, spoil, "position_", "position_um"),
     ("encoder mute", WiredRig, silent, "position_stale", "no new"),
     ("CAN adapter pulled", WiredRig, unplug("adapter_port"), "amplifier_error", "reconnecting"),
@@ -181,7 +193,8 @@ def test_the_first_line_names_the_cause(
         assert device in "\n".join([*lines, *message_lines(now)]), (lines, message_lines(now))
         assert lines[1].startswith("    -> ")
         line = re.sub(r" at \d\d:\d\d:\d\d, tick \d+", "", lines[0]).replace(f"{tmp_path}/", "/dev/")
-        ROWS.append((what, line, lines[1][7:]))
+        place = "wire" if kind is WiredRig else "reading"
+        ROWS.append((what, place, line, lines[1][7:]))
     finally:
         rig.close()
 
@@ -196,6 +209,7 @@ def page():
         Path(path).write_text(
             "<!-- Written by `make causes`; each row is a test in tests/people/test_causes.py. -->\n# Causes\n\nOne thing is "
             "broken on an armed rig in simulated time; this is the first line that `thermoctl status`, `arm`, monitor and "
-            "dashboard then show, and its remedy. The relation of causes is in `thermoctl/control/causes.py`.\n\n"
-            f"| broken | first line | remedy |\n| --- | --- | --- |\n{rows}"
+            "dashboard then show, and its remedy. The relation of causes is in `thermoctl/control/causes.py`. `wire`: the "
+            "device's other end is played, and its driver reads it. `reading`: the reading is spoiled behind the driver.\n\n"
+            f"| broken | where | first line | remedy |\n| --- | --- | --- | --- |\n{rows}"
         )

@@ -15,8 +15,10 @@ import pytest
 
 from hal.backend import ROLE
 from hal.faulty import Fault, FaultInjector
+from tests.daemon.process import LIMIT_S, Daemon, patient, wait
 from thermoctl import cli
 from thermoctl.calibration import drive
+from thermoctl.calibration.commands import record
 from thermoctl.calibration.schedules import forecast
 from thermoctl.calibration.simulated_rig import SimulatedRig
 from thermoctl.control import arming
@@ -134,6 +136,32 @@ def test_kill_9_of_the_command_disarms(command, folder, running):
     print(f"{command}: {first - watched.at} ticks from kill -9 to the disarm command")
 
 
+@pytest.mark.parametrize("event", ["SIGTERM of the daemon", "SIGKILL of the loop"])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_command_ends_with_its_daemon(command, event, folder):
+    """Exit status 3 and one line. That the drive is off is judged at the wire, in the last test of this file."""
+    Path("rig.yaml").write_text(patient(Path("rig.yaml").read_text()))
+    daemon = Daemon(folder / "rig.yaml")
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "thermoctl.cli", *COMMANDS[command]],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        wait(lambda: daemon.ask("status")["state"] == "ARMED", "ARMED")
+        if event == "SIGTERM of the daemon":
+            daemon.process.terminate()
+        else:
+            os.kill(daemon.child("loop"), signal.SIGKILL)
+        _, err = process.communicate(timeout=LIMIT_S)
+        assert process.returncode == 3 and err.count("\n") == 1 and "ended after" in err, err
+        assert daemon.process.wait(LIMIT_S) == (0 if event == "SIGTERM of the daemon" else 1)
+    finally:
+        daemon.kill()
+
+
 def test_the_rig_without_its_daemon_is_not_driven(folder, capsys):
     """A rig of devices is driven only through the daemon: nothing is opened, one line, status 3."""
     text = Path("rig.yaml").read_text()
@@ -178,6 +206,20 @@ def test_nobody_is_moved_without_a_yes(folder, running, capsys, monkeypatch):
         monkeypatch.undo()
         monkeypatch.chdir(folder)
     assert not any(watched.enabled)
+
+
+def test_an_experiment_of_a_diagnosis_that_is_declined_never_began(folder, running, monkeypatch):
+    """`diagnose --resolve` said of it that it had not come to its end, and named a recording that there was not."""
+    watched = Watched(running)
+    Path("next.yaml").write_text(
+        "format: thermoctl-experiments/1\nexperiments:\n  next:\n    title: next\n    sample_s: 1\n    inputs:\n"
+        "      setpoint_um: {corners: [[0, 0], [6, 20]]}\n"
+    )
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: "no")
+    with pytest.raises(InputError, match="next.yaml: not run, the answer was not `go`"):
+        record(Path("next.yaml"), Path("round_1.csv"), "rig.yaml", None)
+    assert not any(watched.enabled) and not Path("round_1.csv").exists()
 
 
 def test_a_rig_that_somebody_uses_is_left_alone(folder, running, capsys):
@@ -313,13 +355,15 @@ def test_the_drive_itself_is_off_whatever_is_killed(tmp_path):
             chain.tell("encoder plug")
             scenario(command, "SIGTERM of the command", lambda p: p.terminate())
             scenario(command, "kill -9 of the command", lambda p: p.kill())
-            loop = int(_loop_pid(chain))
-            scenario(command, "kill -9 of the loop", lambda p, pid=loop: os.kill(pid, signal.SIGKILL))
-            assert chain.daemon.wait(60) == 1
-            chain.daemon = subprocess.Popen(
-                [*CLI, "run", "--config", str(chain.config)], stderr=subprocess.DEVNULL
-            )
-            chain.until(lambda s: s.get("state") == "READY", 60)
+            for what, status in (("kill -9 of the loop", 1), ("SIGTERM of the daemon", 0)):
+                pid = int(_loop_pid(chain)) if status else chain.daemon.pid
+                number = signal.SIGKILL if status else signal.SIGTERM
+                scenario(command, what, lambda p, pid=pid, number=number: os.kill(pid, number))
+                assert chain.daemon.wait(60) == status
+                chain.daemon = subprocess.Popen(
+                    [*CLI, "run", "--config", str(chain.config)], stderr=subprocess.DEVNULL
+                )
+                chain.until(lambda s: s.get("state") == "READY", 60)
     finally:
         chain.stop()
 

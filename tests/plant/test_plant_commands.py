@@ -103,19 +103,9 @@ def test_shipped_models_are_those_of_the_plant_file(plant, rig):
 
 def test_linearise_writes_a_model_and_its_gains(tmp_path):
     out = tmp_path / "m.yaml"
-    arguments = [
-        "plant",
-        "linearise",
-        THERMAL,
-        "--out",
-        str(out),
-        "--kind",
-        "mkf",
-        "--gains",
-        str(tmp_path / "g.csv"),
-        "--samples",
-        "50",
-    ]
+    arguments = (
+        f"plant linearise {THERMAL} --out {out} --kind mkf --gains {tmp_path / 'g.csv'} --samples 50".split()
+    )
     assert main(arguments) == 0
     assert load_model(out, "simulated").kind == "mkf" and len(read_table(tmp_path / "g.csv")) == 50
     assert main(arguments) == 2  # a calibration is never overwritten unasked
@@ -170,16 +160,7 @@ def test_simulate_writes_plots_and_predicts_ahead(block, capsys):
     both = [str(block / "a.csv"), str(block / "b.csv")]
     assert (
         main(
-            [
-                "simulate",
-                "--plant",
-                str(block / "p.yaml"),
-                *both,
-                "--out",
-                str(block / "o.csv"),
-                "--plot",
-                str(block / "o.png"),
-            ]
+            f"simulate --plant {block / 'p.yaml'} {' '.join(both)} --out {block / 'o.csv'} --plot {block / 'o.png'}".split()
         )
         == 0
     )
@@ -210,18 +191,10 @@ def test_simulate_writes_plots_and_predicts_ahead(block, capsys):
 def test_refit_finds_the_truth_and_judges_on_held_out_data(block, capsys, noise):
     assert (
         main(
-            [
-                "refit",
-                "--plant",
-                str(block / "p.yaml"),
-                str(block / "a.csv"),
-                "--held-out",
-                str(block / "b.csv"),
-                "--out",
-                str(block / "p2.yaml"),
-                "--noise",
-                noise,
-            ]
+            (
+                f"refit --plant {block / 'p.yaml'} {block / 'a.csv'} --held-out {block / 'b.csv'} --out {block / 'p2.yaml'} "
+                f"--noise {noise}"
+            ).split()
         )
         == 0
     )

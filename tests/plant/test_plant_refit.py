@@ -94,14 +94,7 @@ def test_the_command_says_all_of_it(tmp_path, capsys):
         write_table(tmp_path / f"{name}.csv", recorded(TRUTH, name=name, seed=seed))
     assert (
         main(
-            [
-                "refit",
-                "--plant",
-                str(tmp_path / "p.yaml"),
-                str(tmp_path / "a.csv"),
-                "--held-out",
-                str(tmp_path / "b.csv"),
-            ]
+            f"refit --plant {tmp_path / 'p.yaml'} {tmp_path / 'a.csv'} --held-out {tmp_path / 'b.csv'}".split()
         )
         == 0
     )

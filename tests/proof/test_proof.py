@@ -315,19 +315,7 @@ def a_dask_by_hand(folder: Path):
         "env": {**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
     }  # the task of this file must be found there
     file = folder / "scheduler.json"
-    command = [
-        sys.executable,
-        "-m",
-        "dask",
-        "scheduler",
-        "--host",
-        "127.0.0.1",
-        "--port",
-        "0",
-        "--no-dashboard",
-        "--scheduler-file",
-        str(file),
-    ]
+    command = f"{sys.executable} -m dask scheduler --host 127.0.0.1 --port 0 --no-dashboard --scheduler-file {file}".split()
     started = [subprocess.Popen(command, **quiet)]
     try:
         limit = time.monotonic() + 120
@@ -335,17 +323,7 @@ def a_dask_by_hand(folder: Path):
             assert time.monotonic() < limit and started[0].poll() is None, "no scheduler"
             time.sleep(0.05)
         address = json.loads(file.read_text())["address"]
-        worker = [
-            sys.executable,
-            "-m",
-            "dask",
-            "worker",
-            address,
-            "--no-nanny",
-            "--nthreads",
-            "1",
-            "--no-dashboard",
-        ]
+        worker = f"{sys.executable} -m dask worker {address} --no-nanny --nthreads 1 --no-dashboard".split()
         started += [subprocess.Popen([*worker, "--local-directory", str(folder)], **quiet) for _ in range(2)]
         yield address, started[1:]
     finally:
@@ -362,19 +340,7 @@ def test_a_remote_scheduler_loses_nothing_when_one_of_two_workers_is_killed(tmp_
 
     from tests.concealed import generate
 
-    generate.main(
-        [
-            "--out",
-            str(tmp_path / "cases"),
-            "--number",
-            "3",
-            "--families",
-            "tanks",
-            "--kind",
-            "none",
-            "--smoke",
-        ]
-    )
+    generate.main(f"--out {tmp_path / 'cases'} --number 3 --families tanks --kind none --smoke".split())
     jobs = find_jobs(tmp_path / "cases")
     with a_dask_by_hand(tmp_path) as (address, workers):
         with Client(address) as client:
@@ -407,21 +373,7 @@ def test_diagnose_over_a_folder_of_rigs(tmp_path, capsys):
     from tests.concealed import generate
     from thermoctl.cli import main
 
-    generate.main(
-        [
-            "--out",
-            str(tmp_path / "c"),
-            "--number",
-            "1",
-            "--families",
-            "tanks",
-            "--kind",
-            "none",
-            "--smoke",
-            "--seed",
-            "4",
-        ]
-    )
+    generate.main(f"--out {tmp_path / 'c'} --number 1 --families tanks --kind none --smoke --seed 4".split())
     case = tmp_path / "c" / "0001"
     for rig in ("north", "south"):
         (tmp_path / "fleet" / rig).mkdir(parents=True)
@@ -429,16 +381,9 @@ def test_diagnose_over_a_folder_of_rigs(tmp_path, capsys):
             (tmp_path / "fleet" / rig / run).write_bytes((case / run).read_bytes())
     (tmp_path / "fleet" / "east").mkdir()
     (tmp_path / "fleet" / "east" / "bad.csv").write_text("t,pump\n0,1\n0,2\n")
-    words = [
-        "diagnose",
-        str(tmp_path / "fleet"),
-        "--plant",
-        str(case / "plant.yaml"),
-        "--out",
-        str(tmp_path / "out"),
-        "--workers",
-        "2",
-    ]
+    words = (
+        f"diagnose {tmp_path / 'fleet'} --plant {case / 'plant.yaml'} --out {tmp_path / 'out'} --workers 2"
+    ).split()
     assert main([*words, "--json"]) == 0
     told = {x["rig"]: x for x in json.loads(capsys.readouterr().out)}
     assert set(told) == {"north", "south", "east"}
@@ -510,23 +455,10 @@ def test_smoke_set_is_diagnosed_and_scored(tmp_path):
 
     for kind, first, family in (("none", 1, "tanks"), ("one", 0, "heater")):
         generate.main(
-            [
-                "--out",
-                str(tmp_path / "cases"),
-                "--answers",
-                str(tmp_path / "answers"),
-                "--first",
-                str(first),
-                "--number",
-                "1",
-                "--seed",
-                "33",
-                "--smoke",
-                "--families",
-                family,
-                "--kind",
-                kind,
-            ]
+            (
+                f"--out {tmp_path / 'cases'} --answers {tmp_path / 'answers'} --first {first} --number 1 "
+                f"--seed 33 --smoke --families {family} --kind {kind}"
+            ).split()
         )
     content = prove(tmp_path / "cases", tmp_path / "out", tmp_path / "answers", workers=1)
     assert content["figures"]["failed"] == 0 and content["figures"]["cases"] == 2
@@ -548,19 +480,7 @@ def test_bench_counts_a_peer_by_the_same_scoring(tmp_path, capsys):
 
     cases = str(tmp_path / "cases")
     generate.main(
-        [
-            "--out",
-            cases,
-            "--answers",
-            "inside",
-            "--number",
-            "2",
-            "--families",
-            "tanks,heater",
-            "--kind",
-            "none",
-            "--smoke",
-        ]
+        f"--out {cases} --answers inside --number 2 --families tanks,heater --kind none --smoke".split()
     )
     argv = [cases, "--methods", "latent", "--out", str(tmp_path)]
     assert bench.main(argv) == 0

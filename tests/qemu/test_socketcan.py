@@ -1,4 +1,4 @@
-"""SocketCAN for real: Debian's kernel in a qemu guest, vcan and two emulated CAN cards (issue 7). Slow: `make qemu-test`.
+"""SocketCAN for real: Debian's kernel in a qemu guest, vcan and two emulated CAN cards (issue 7). Slow: `make test-qemu`.
 
 The guest boots the rootfs of tests/systemd (made once, build/) from a disk image, mounts this checkout read-only over 9p and
 runs tests/qemu/guest.py. Emulated in software by default, which runs everywhere;

@@ -1,7 +1,7 @@
 """A Debian rootfs with this checkout installed, booted by systemd-nspawn: systemd as it runs on a rig, in a directory.
 
 The rootfs is made once by mmdebstrap from Debian's packages and kept under build/ (24 s and 650 MB; it holds the kernel that
-`make qemu-test` boots). The checkout and the packages of its .venv are mounted read-only; the program itself runs on Debian's
+`make test-qemu` boots). The checkout and the packages of its .venv are mounted read-only; the program itself runs on Debian's
 own python3 from /opt/thermoctl, as an installation would.
 """
 

@@ -1,5 +1,5 @@
 """The unit in a booted systemd, the virtual rig behind its wires: after everything that can happen to the daemon, what was the
-amplifier told? (issue 7). Slow: `make systemd-test`.
+amplifier told? (issue 7). Slow: `make test-systemd`.
 
 The amplifier's own record is the virtual rig's reference.csv (CLOCK_MONOTONIC, shared with the container): `enabled` is the
 drive's state, 100 rows a second. Every scenario's figures are printed in one table at the end.

@@ -1,12 +1,13 @@
-"""The chain from recordings to position residuals, by the paper's method and by the better one.
+"""Compute position residuals from recordings, by the paper's method and by the better one.
 
 `calibrate` fits the estimators to tests 2, 3 and 4A; `estimates` gives each one's position error over test 4.
 The measured error less the estimate is compared over test 4B. Estimators:
-  siso     coil alone, first order, recursion (5)
-  paper    N4SID of order 12 with (26), MKF, recursion (5); one sampling period, as (38) and (39) have one n
-  better   real poles by separable generalised least squares; Kalman filter with the coil alone and the
-           air's rate as input; output error
-  twelve   the same filter and expansion model with all twelve thermometers
+
+    siso     coil alone, first order, recursion (5)
+    paper    N4SID of order 12 with (26), MKF, recursion (5); one sampling period, as (38) and (39) have one n
+    better   real poles by separable generalised least squares; Kalman filter with the coil alone and the
+             air's rate as input; output error
+    twelve   the same filter and expansion model with all twelve thermometers
 """
 
 from __future__ import annotations
@@ -24,11 +25,13 @@ from thermoctl.yamlfile import InputError
 
 STEP_K, NOISE_K = 0.25, 0.06  # resolution and noise of a thermocouple's reading
 LONGEST_S = 36000.0  # no expansion takes longer than ten hours
-ROW_NOISE = 1e-16  # K^2, which keeps the Riccati equation regular where a state has no noise
-FASTEST = 0.05  # smallest real pole of a sampled heat network; smaller ones come from the noise
+ROW_NOISE = 1e-16  # K^2: keeps the Riccati equation regular for a state without noise
+FASTEST = 0.05  # smallest real pole of a sampled heat network; smaller ones are fits of noise
 AIR_FILTER_S = 60.0
-FIRST_ORDER = 6  # of the better model until the air's changes are taken out; then by BIC where none is given
-# What no input explains, s: forgotten in two hours; above 1/(2 pi 250 s) it is the thermometers' noise.
+# order of the better model in the first rounds; the last round selects it by BIC if none is given
+FIRST_ORDER = 6
+# Drift that no input explains, (time constant, corner) in s: it decays over two hours; above 1/(2 pi 250 s)
+# the thermometers' noise exceeds it.
 DRIFT_S = (7200.0, 250.0)
 # Sampling periods, s, and the block rows i tried with each
 PAPER_ROWS = {
@@ -45,9 +48,10 @@ ESTIMATORS = ("siso", "paper", "better", "twelve")
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the calibration gave.
+    """Estimators that a calibration fitted, and their position errors in um.
 
-    `paper_model`, `mkf`, `paper_um`, `siso_um`; `model`, `kalman`, `better_um`, `twelve`, `twelve_um`."""
+    `paper_model`, `mkf`, `paper_um`, `siso_um`; `model`, `kalman`, `better_um`, `twelve`, `twelve_um`.
+    """
 
     paper_model: StateSpace
     mkf: filter.Mkf
@@ -88,18 +92,19 @@ def block_mean(v: np.ndarray, q: int) -> np.ndarray:
 def calibrate(test_2: Recorded, test_3: Recorded, test_4a: Recorded, order: int | None = None) -> Calibration:
     """Calibrate all estimators from the three calibration tests at 1 s."""
     r_v = filter.sensor_variance(STEP_K, NOISE_K)
-    # the paper's way
+    # the paper's method
     paper_model, mkf = identify_paper(test_2, test_4a)
     y4 = test_4a.error_um
     paper_um = expansion.recursive(
         _mkf_steps(mkf, test_4a), block_mean(y4[:, None], round(mkf.period_s))[:, 0], mkf.period_s
     )
-    if paper_um.f1 >= 1:  # unstable at the model's period: as fast as is measured, as the paper advises
+    # unstable at the model's period: use the fastest measured period, as the paper advises
+    if paper_um.f1 >= 1:
         paper_um = expansion.recursive(estimate_mkf(mkf, test_4a), y4, 1.0)
     paper_um = replace(paper_um, f1=min(paper_um.f1, float(np.exp(-paper_um.period_s / LONGEST_S))))
     coil = filled(rises(test_4a)[:, :1])
     siso_um = expansion.recursive(coil, y4, 1.0)
-    # the better way
+    # the better method
     tests = [test_2, test_3, test_4a]
     model, kalman, variances, better_um = calibrate_better(tests, order)
     plant = filter.disturbed(filter.with_air(model))
@@ -124,7 +129,7 @@ def identify_paper(test_2: Recorded, check: Recorded) -> tuple[StateSpace, filte
         try:
             model = subspace.identify(u, y, float(period_s), 12, i, "paper")
             mkf = filter.mkf(model, u, y, r_v, float(period_s))
-        except InputError:  # too few samples for so many rows
+        except InputError:  # too few samples for this number of rows
             continue
         with np.errstate(over="ignore", invalid="ignore"):
             left = float(np.sqrt(np.mean((estimate_mkf(mkf, check) - measured) ** 2)))
@@ -142,9 +147,8 @@ def calibrate_better(
 ) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion]:
     """Calibrate the better estimator alone, from any tests.
 
-    Return model, filter, its variances and expansion.
-
-    `model`: one that is known already."""
+    Return model, filter, its variances and expansion. `model`: a given thermal model, else it is identified.
+    """
     model = model or identify_better(tests, order)
     plant = filter.disturbed(filter.with_air(model))
     records = [filter.Record(t.power_w, air_rate(t.air_c), rises(t)) for t in tests]
@@ -157,8 +161,9 @@ def calibrate_refined(
 ) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion, str]:
     """Calibrate with and without refining the thermal model by its prediction errors.
 
-    The model is refined on all tests but the last. Return the one whose filter follows
-    the thermometers of the last test better, and that comparison in words."""
+    The model is refined on all tests but the last. Return the one that predicts the thermometers of the last
+    test better, and a sentence that compares both.
+    """
     plain = calibrate_better(tests, order)
     refined_model = refine(plain[0], tests[:-1])
     if refined_model is plain[0]:
@@ -200,8 +205,9 @@ def with_air_alone(model: StateSpace) -> StateSpace:
 def identify_better(tests: list[Recorded], order: int | None) -> StateSpace:
     """Identify a real-pole model from all tests together, without the effect of the air's changes.
 
-    A change of the air shifts every rise by C b_air, which the model gives: it is simulated with the model of
-    the previous round and subtracted. `order` None: by BIC in the last round."""
+    A change of the air shifts every rise by C b_air. This effect is simulated with the model of the previous
+    round and subtracted. `order` None: selected by BIC in the last round.
+    """
     moved: list[np.ndarray] | list[float] = [0.0] * len(tests)
     for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
         model = modal.identify(
@@ -276,13 +282,12 @@ def estimates(c: Calibration, r: Recorded, starts_anew: bool = False) -> dict[st
 def compensator(
     c: Calibration, kind: str, period_s: float = 0.001, sensor_s: float = 0.1
 ) -> CompensatorModel:
-    """Build what the daemon runs, at its own period.
+    """Build the daemon's compensator model at its own period.
 
-    Kind 'paper' (MKF and recursion (5)) or 'better'.
-
-    Sensor readings come every `sensor_s`. Process noise is per second, so it scales with the period. A
-    quantised reading ten times a second brings no more information than one a second, so its variance grows
-    in proportion."""
+    Kind: 'paper' (MKF and recursion (5)) or 'better'. Sensor readings come every `sensor_s`. Process noise is
+    per second, so it scales with the period. A quantised reading ten times a second brings no more
+    information than one a second, so its variance grows in proportion.
+    """
     if kind == "paper":
         model = c.paper_model
         alpha, _ = model.output_form()
@@ -343,15 +348,16 @@ def better_compensator(
 
 
 def _at_period(model: StateSpace, period_s: float) -> StateSpace:
-    """Resampled, the air's effect (K per K/s over one period) kept exact.
+    """Resample the model; keep the air's effect (K per K/s over one period) exact.
 
-    It is no rate held into a network but a shift of all rises."""
+    The air's change is a shift of all rises, not a rate that is held into the network.
+    """
     fast = model.resample(period_s)
     return replace(fast, b=np.column_stack([fast.b[:, 0], model.b[:, 1] * period_s / model.period_s]))
 
 
 def _without_noise_poles(model: StateSpace) -> StateSpace:
-    """Move modes that no sampled heat network has (real poles below FASTEST) to FASTEST."""
+    """Move poles that no sampled heat network has (real, below FASTEST) to FASTEST."""
     values, vectors = np.linalg.eig(model.a)
     keep = np.where((np.abs(values.imag) < 1e-12) & (values.real <= FASTEST), FASTEST, values)
     return replace(model, a=np.real(vectors @ np.diag(keep) @ np.linalg.inv(vectors)))

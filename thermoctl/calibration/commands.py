@@ -32,9 +32,10 @@ def run_experiment(
 ) -> int:
     """Run `thermoctl experiment`: record a test of experiments.yaml, or the experiment of a file.
 
-    It runs on the daemon that answers, in real time and under its protections, else on the simulated back
-    end, faster than real time. An experiment of inputs can run on a plant file instead. 1 when the person
-    said no, 3 when it ended early: the rows are kept, and --resume goes on from there."""
+    With a running daemon it runs in real time under the daemon's protections. Without one it runs on the
+    simulated back end, faster than real time. An experiment of inputs can also run on a plant file. Returns 1
+    when the user answered no, 3 when it ended early: the rows are kept, and --resume continues from there.
+    """
     if experiment.lists_inputs(name):
         inputs = experiment.of_inputs(name)
         if dry_run or plant:
@@ -55,8 +56,13 @@ def run_experiment(
 def record(experiment_file: Path, recording: Path, config: str, plant: str | None, yes: bool = False) -> None:
     """Run an experiment file for `thermoctl diagnose --resolve`.
 
-    Raises HardwareError where it ends early."""
-    if run_experiment(str(experiment_file), config, str(recording), False, False, plant, yes):
+    Raises HardwareError where it ends early, InputError where the person does not say `go`."""
+    status = run_experiment(str(experiment_file), config, str(recording), False, False, plant, yes)
+    if status == 1:
+        raise InputError(
+            f"{experiment_file}: not run, the answer was not `go`; diagnosis.json beside it stands"
+        )
+    if status:
         raise HardwareError(
             f"{experiment_file}: the experiment did not come to its end; what was recorded is in {recording}"
         )
@@ -122,9 +128,8 @@ def model(action: str, models: str, name: str | None) -> int:
 def tune(config: str, method: str, write: bool, yes: bool) -> int:
     """Run `thermoctl tune`: propose gains from the response to short setpoint ramps.
 
-    Write them only when asked.
-
-    1 when the person said no."""
+    It writes them only on request. Returns 1 when the user answered no.
+    """
     settings = load_settings(config)
     c = settings.control
     rig = drive.rig_of(settings)
@@ -172,8 +177,9 @@ def calibrate(
 ) -> int:
     """Run `thermoctl calibrate`: 0 when every step is done (and accepted, when asked).
 
-    1 when the person said no, 3 when a test ended early. Raises InputError for a rig that cannot be
-    calibrated, HardwareError for one that refuses."""
+    Returns 1 when the user answered no, 3 when a test ended early. Raises InputError for a rig that cannot be
+    calibrated, HardwareError for one that refuses.
+    """
     settings = load_settings(config)
     rig = drive.rig_of(settings)
     folder = Path(out or Path("calibration") / settings.rig.name)

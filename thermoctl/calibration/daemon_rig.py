@@ -1,4 +1,4 @@
-"""The rig that a running daemon holds, driven in real time through its command socket.
+"""Drive the rig of a running daemon in real time through its command socket.
 
 It is armed for this command's connection, so the daemon disarms it however the command ends.
 """
@@ -33,8 +33,9 @@ from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
 
 POLL_S = 0.01  # between two polls of the rig and of the keyboard
-STALL_S = 1.0  # without a tick: the loop has ended (the supervisor's STALL_S; at least protection.late_s)
-RESTART_S = 5.0  # within which the supervisor restarts a command process that alone has ended
+# after this time without a tick the loop has ended (the supervisor's STALL_S; at least protection.late_s)
+STALL_S = 1.0
+RESTART_S = 5.0  # time for the supervisor to restart a command process that ended
 REST_K, REST_S = 0.5, 600.0  # at rest: all points within REST_K, or none moved by more in REST_S
 REPORT_S = 60.0  # between two reports while the rig cools
 GAP_S = 2.0  # a longer gap in the daemon's own recording makes a test start again
@@ -82,10 +83,11 @@ class DaemonRig:
     ) -> Iterator[np.ndarray]:
         """Yield the rows of a test from `at_s` of its schedule on, after those of `earlier`.
 
-        Arms, and disarms on every way out. While paused the setpoint is held and the rows go on: heat does
-        not wait, and the model is fitted to what was measured, not to the schedule. `rest`: wait first until
-        the rig is at rest. Raises Aborted when the law leaves ARMED, the daemon ends or the person ends it;
-        HardwareError where it does not arm."""
+        It arms first, and disarms on every way out. While paused, the setpoint is held and rows continue,
+        because the rig cools meanwhile. The model is fitted to the measured rows, not to the schedule.
+        `rest`: wait first until the rig is at rest. Raises Aborted when the law leaves ARMED, the daemon
+        ends, or the user ends the test. Raises HardwareError when the rig does not arm.
+        """
         if earlier is not None:
             yield rows_of(earlier)
         elif rest:
@@ -141,7 +143,7 @@ class DaemonRig:
                 raise Aborted("ended on request", done)
 
     def _disarm(self, daemon: Connection, shared: Shared) -> None:
-        """Disarm where it is still armed; a fault stays latched for the person to read."""
+        """Disarm if it is still armed; a fault stays latched for the user to read."""
         newest = shared.ring.newest()
         if newest is None or newest[INDEX["state"]] != arming.ARMED:
             return
@@ -158,9 +160,7 @@ class DaemonRig:
             time.sleep(0.1)
 
     def _rest(self, keyboard: Keyboard) -> None:
-        """Wait until the rig is at rest: the models are fitted from there.
-
-        Raises Aborted when the person ends it."""
+        """Wait until the rig is at rest, the models' initial state. Raises Aborted when the user ends it."""
         seen: list[tuple[float, np.ndarray]] = []
         reported = -math.inf
         while True:
@@ -182,9 +182,7 @@ class DaemonRig:
             time.sleep(1.0)
 
     def meanwhile(self, earlier: Table) -> Table | None:
-        """Append to `earlier` what the daemon recorded since.
-
-        None when that has a gap longer than GAP_S."""
+        """Append to `earlier` the daemon's own rows since then; None if they have a gap above GAP_S."""
         parts = [rows_of(earlier)]
         wall, folder = INDEX["wall_s"], Path(self.settings.recording.directory)
         for path in recording_files(folder, TIER) if folder.is_dir() else ():
@@ -215,8 +213,9 @@ def _rig_answers() -> Iterator[None]:
 def at_rest(seen: list[tuple[float, np.ndarray]]) -> bool:
     """Check whether a rig of these temperatures, (s, degC (12,)) oldest first, is at rest.
 
-    All are alike within REST_K, or none moved by more than REST_K in the last REST_S: thermocouples differ by
-    a degree."""
+    At rest: all temperatures are equal within REST_K, or none moved by more than REST_K in the last REST_S.
+    Thermocouples differ by a degree.
+    """
     now, newest = seen[-1]
     if np.nanmax(newest) - np.nanmin(newest) <= REST_K:
         return True

@@ -1,10 +1,10 @@
 """Drive a rig for a test.
 
-Only through the daemon's law, armed, with all protections, and only after a yes.
+Only through the daemon's law, armed, with all protections, and only after the user's consent.
 
-Two rigs run a schedule of setpoints alike: `DaemonRig`, which a running daemon holds, and `SimulatedRig`, in
-this process. Raises hal.backend.HardwareError (exit status 3, one line) where the rig refuses or is not
-there."""
+Two rigs run the same schedules of setpoints: `DaemonRig` through a running daemon, `SimulatedRig` in this
+process. Both raise hal.backend.HardwareError (exit status 3, one line) when the rig refuses or is absent.
+"""
 
 from __future__ import annotations
 
@@ -47,12 +47,11 @@ def rig_of(settings: Settings) -> DrivenRig:
 
 
 def agreed(rig: DrivenRig, schedules: Sequence[Schedule], yes: bool) -> bool:
-    """Report which rig will move, how far, how long and how warm it becomes.
+    """Report which rig will move, how far, how long, and the coil's predicted temperature.
 
-    Ask before a daemon's rig moves, unless `yes`.
-
-    Raises InputError for setpoints outside the configuration's limits, for a coil that would become too hot,
-    and where nobody can be asked."""
+    Ask before a daemon's rig moves, unless `yes`. Raises InputError for setpoints outside the configuration's
+    limits, for a coil that would become too hot, and when nobody can be asked.
+    """
     settings = rig.settings
     p = settings.protection
     low, high = within_limits(settings, schedules)

@@ -66,7 +66,8 @@ def on_rig(
 ) -> int:
     """Describe a test of setpoints, ask, run it on the rig and record it.
 
-    1 when the person said no, ENDED when it ended early."""
+    Returns 1 when the user answered no, ENDED when it ended early.
+    """
     schedules.within_limits(settings, [schedule])
     print(
         f"{schedule.title}: {schedules.span(schedule.duration_s)}, {len(schedule.commands())} moves, "
@@ -82,9 +83,7 @@ def on_rig(
 
 
 def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, resume: bool) -> int:
-    """Run a schedule and write the rows.
-
-    While it is not at its end, a file beside them says how far it came."""
+    """Run a schedule and write the rows. Until its end, a file beside them holds the time reached."""
     progress_path = path.with_name(path.name + ".progress")
     earlier, at_s = _earlier(rig, path, progress_path) if resume else (None, 0.0)
     keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())
@@ -120,7 +119,7 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
 
 
 def _earlier(rig: drive.DrivenRig, path: Path, progress_path: Path) -> tuple[Table | None, float]:
-    """Read what was recorded of a test that was ended on a daemon, and how far it came."""
+    """Read the rows of an interrupted test on a daemon, and the time that it reached."""
     if not (path.exists() and progress_path.exists() and isinstance(rig, DaemonRig)):
         return None, 0.0
     earlier = rig.meanwhile(read_table(path))

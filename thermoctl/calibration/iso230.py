@@ -1,12 +1,13 @@
 """Positioning accuracy after ISO 230-2.
 
 Deviation x_ij = P_ij - P_i of the j-th approach to target i from one direction; n approaches, m targets:
-  mean unidirectional deviation     x_i = 1/n sum_j x_ij
-  estimator of repeatability        s_i = sqrt(1/(n-1) sum_j (x_ij - x_i)^2)
-  unidirectional repeatability      R_i = 4 s_i, R = max_i R_i            written as x +- 2 s
-  mean bidirectional deviation      (x_up + x_down) / 2;  reversal B_i = x_up - x_down;  M = range of it
-  systematic, unidirectional        E = max x_i - min x_i
-  accuracy, unidirectional          A = max(x_i + 2 s_i) - min(x_i - 2 s_i)
+
+    mean unidirectional deviation     x_i = 1/n sum_j x_ij
+    estimator of repeatability        s_i = sqrt(1/(n-1) sum_j (x_ij - x_i)^2)
+    unidirectional repeatability      R_i = 4 s_i, R = max_i R_i            written as x +- 2 s
+    mean bidirectional deviation      (x_up + x_down) / 2;  reversal B_i = x_up - x_down;  M = range of it
+    systematic, unidirectional        E = max x_i - min x_i
+    accuracy, unidirectional          A = max(x_i + 2 s_i) - min(x_i - 2 s_i)
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 FEWEST = 2  # approaches to a target, by the standard's estimator of repeatability
-SETTLE_S = 2.0  # after arrival, before an approach is read
+SETTLE_S = 2.0  # settling time after arrival, before an approach is read
 SETTLED = 10  # first samples, whose mean error is taken as zero
-AT_TARGET_UM = 1e-6  # between reference and setpoint: the motion has ended
+AT_TARGET_UM = 1e-6  # largest distance of reference and setpoint at rest
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def unidirectional(targets_um: np.ndarray, deviations_um: np.ndarray) -> Directi
 
 
 def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
-    """Compute mean deviation and 2 s of an error that is recorded all the time, as in the paper."""
+    """Compute mean and 2 s of an error that is recorded continuously, as in the paper."""
     e = error_um[np.isfinite(error_um)]
     return float(e.mean()), float(2 * e.std(ddof=1))
 
@@ -74,9 +75,10 @@ def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
 def approaches(
     setpoint_um: np.ndarray, reference_um: np.ndarray, settle: int
 ) -> list[tuple[int, float, int]]:
-    """Find where the motion stands still.
+    """Find the stops of the motion.
 
-    (index `settle` samples after arrival, target, direction +1 or -1)."""
+    Return (index `settle` samples after arrival, target, direction +1 or -1) of each.
+    """
     still = np.concatenate([[False], setpoint_um[1:] == setpoint_um[:-1]])
     out, last = [], 0
     for k in range(1, len(still)):

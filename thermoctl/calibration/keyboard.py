@@ -1,4 +1,4 @@
-"""The person at the keyboard during a test."""
+"""Keyboard input of the user during a test."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from collections.abc import Iterator
 class Keyboard:
     """Pause and end a test from the keyboard.
 
-    Ctrl-C pauses, Enter goes on, a second Ctrl-C (or SIGTERM) ends it."""
+    Ctrl-C pauses, Enter continues, a second Ctrl-C (or SIGTERM) ends it.
+    """
 
     def __init__(self, interactive: bool):
         self.interactive, self.paused, self.ended = interactive, False, False
 
     def interrupt(self, number: int, _: object = None) -> None:
-        """Take a signal."""
+        """Handle a signal."""
         if number == signal.SIGINT and self.interactive and not self.paused:
             self.paused = True
             print(
@@ -37,7 +38,7 @@ class Keyboard:
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
-        """Take the signals as long as the context lasts."""
+        """Handle the signals within the context."""
         before = {n: signal.signal(n, self.interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield

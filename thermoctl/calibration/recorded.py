@@ -103,6 +103,7 @@ def as_table(rows: np.ndarray, path: str | Path) -> Table:
 def causes(row: np.ndarray) -> str:
     """Name the faults of a record row that trip, with their remedies.
 
-    Without any, somebody disarmed the rig."""
+    Without any fault, a user disarmed the rig.
+    """
     found = [f for f in faults.decode(fault_word(row)) if f.severity != "warning"]
     return "; ".join(f"{f.name}: {f.meaning} -> {f.remedy}" for f in found) or "somebody disarmed it"

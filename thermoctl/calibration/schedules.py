@@ -1,6 +1,4 @@
-"""What a test will do, before anything moves.
-
-Its limits, the coil's predicted power and temperature, its spectrum."""
+"""Predict a test before anything moves: its limits, the coil's power and temperature, its spectrum."""
 
 from __future__ import annotations
 
@@ -20,10 +18,8 @@ from thermoctl.yamlfile import InputError, suggest
 
 CUTOFF_HZ = 4.3e-4  # 1 / (2 pi 370 s): the coil's time constant in test 1 of the paper
 RAMPS_S = 8 * (0.1, 0.2, 0.1, 0.3)  # 11 s: phase margins repeat within 1 degree on the simulated rig
-TRAVEL_UM = 10.0  # of a ramp for tuning, at most
-ROOM_C = (
-    20.0  # a coil that is not measured yet; the temperature of the coil's resistance in the configuration
-)
+TRAVEL_UM = 10.0  # longest ramp for tuning
+ROOM_C = 20.0  # coil temperature when it is not measured: that of protection.resistance_ohm
 
 
 def of_config(config: str | Path) -> Path:
@@ -73,9 +69,10 @@ def within_limits(settings: Settings, schedules: Sequence[Schedule]) -> tuple[fl
 
 
 def check_predicted(inputs: experiments.Inputs, settings: Settings) -> None:
-    """Refuse an experiment that a diagnosis predicts to leave the rig's protection.
+    """Refuse an experiment whose predicted readings leave the rig's protection.
 
-    Raises InputError with the reading."""
+    Raises InputError that names the reading.
+    """
     p = settings.protection
     for column, (low, high) in inputs.predicted.items():
         channel = "position_um" if column == "position_raw_um" else column
@@ -102,7 +99,7 @@ def forecast(settings: Settings, schedule: Schedule, coil_c: float) -> tuple[np.
     um = np.abs(schedule.at(np.arange(10 * seconds) / 10)).reshape(seconds, 10).max(axis=1)
     model = compensator(settings)
     n = len(model.A_minus_I)
-    one = np.zeros((n + 1, n + 1))  # the model's step with its power as a state that stays
+    one = np.zeros((n + 1, n + 1))  # the model's step, with its power as a constant state
     one[:n, :n], one[:n, n], one[n, n] = np.eye(n) + model.A_minus_I, model.B[:, 0], 1.0
     second = np.linalg.matrix_power(one, round(1.0 / model.period_s))
     power, rise, x = np.zeros(seconds), np.zeros(seconds), np.zeros(n + 1)
@@ -116,7 +113,7 @@ def forecast(settings: Settings, schedule: Schedule, coil_c: float) -> tuple[np.
 
 
 def power_lines(settings: Settings, schedule: Schedule) -> list[str]:
-    """Describe the coil's power over a schedule and its spectrum, as far as they are known."""
+    """Describe the coil's power over a schedule and its spectrum, if they can be predicted."""
     power, peak = forecast(settings, schedule, ROOM_C)
     if power is None:
         return ["power is not predicted: protection.resistance_ohm and flexure_um_per_a are not set"]

@@ -24,16 +24,12 @@ from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, POINTS
 
 EVERY_S = 0.1  # between the rows that are kept
-READY_S = 20.0  # of simulated time, within which the law must be READY
-ANY_INNOVATION_C = (
-    1e3  # limit that no coil reaches: without a model there is nothing to compare the coil with
-)
+READY_S = 20.0  # longest simulated time until the law is READY
+ANY_INNOVATION_C = 1e3  # unreachable limit: without a model there is nothing to compare the coil with
 
 
 def with_model(settings: Settings, model: CompensatorModel | None) -> Settings:
-    """Set up the compensation for a simulated test.
-
-    `model` acts when given, else nothing is compensated or compared."""
+    """Set up the compensation for a simulated test: with `model`, or none and no comparison."""
     compensation = dataclasses.replace(settings.compensation, enable=model is not None, model="")
     protection = settings.protection
     if model is None:
@@ -79,10 +75,11 @@ class SimulatedRig:
         every_s: float = EVERY_S,
         rest: bool = True,
     ) -> Iterator[np.ndarray]:
-        """Yield the rows of a test, one every `every_s`, with `model` acting when given.
+        """Yield the rows of a test, one every `every_s`, compensated by `model` if given.
 
-        `earlier`, `at_s` and `rest` are not used: the same rows come again, and the rig starts at rest.
-        Raises Aborted when the law leaves ARMED or the person ends it."""
+        `earlier`, `at_s` and `rest` are not used: the rows are reproducible, and the rig starts at rest.
+        Raises Aborted when the law leaves ARMED or the user ends it.
+        """
         simulation = Simulation(with_model(self.settings, model), model)
 
         def stop() -> bool:

@@ -1,8 +1,6 @@
-"""The steps of a calibration between its tests.
+"""The steps of a calibration between its tests. Each uses the rig or recordings and returns its result.
 
-Each takes the rig or recordings and returns its result.
-
-`summary` of a result is the line for the person; the series are thinned for the report's figures.
+`summary` of a result is one line for the user; the series are thinned for the report's figures.
 """
 
 from __future__ import annotations
@@ -29,10 +27,10 @@ from thermoctl.signals import INDEX, POINTS
 from thermoctl.yamlfile import InputError
 
 FITTED = ("test_2", "test_3", "test_4a")  # the tests that the model is fitted to
-SHOWN_S = 3.0  # of the ramps' recording, in the report
-SHOWN = 2000  # points of a curve in the report, about
+SHOWN_S = 3.0  # part of the ramps' recording in the report
+SHOWN = 2000  # approximate number of points of a curve in the report
 SETTLED = 5  # first samples, whose mean error is the origin of the thermal growth
-AT_TARGET_UM = 1e-6  # between reference and setpoint: the motion has ended
+AT_TARGET_UM = 1e-6  # largest distance of reference and setpoint at rest
 NEEDED = (
     "position_raw_um",
     "output_reference_um",
@@ -48,7 +46,7 @@ MeanTwoS = tuple[float, float]  # mean and 2 s, um, after ISO 230-2
 
 @dataclass(frozen=True)
 class Doctor:
-    """Every channel that a calibration needs reads well."""
+    """Result of the doctor: every channel that a calibration needs is valid."""
 
     summary: str
     channels: dict[str, str]
@@ -56,9 +54,10 @@ class Doctor:
 
 @dataclass(frozen=True)
 class Response:
-    """The position's response to short ramps, fitted by a second order with dead time.
+    """The position's response to short ramps: a fitted second-order system with dead time.
 
-    `t1`, `t2`: real, imaginary, s."""
+    `t1`, `t2`: real and imaginary part of the time constants, s.
+    """
 
     summary: str
     t: list[float]
@@ -134,7 +133,7 @@ Result = Doctor | Response | Pid | Test | Model | Proof
 
 
 def doctor(states: Mapping[str, str]) -> Doctor:
-    """Check the channels. Raises InputError with those that do not read well."""
+    """Check the channels. Raises InputError with the invalid ones."""
     found = {n: states.get("position_um" if n == "position_raw_um" else n, "ABSENT") for n in NEEDED}
     if bad := [f"{n} is {s}" for n, s in found.items() if s != "OK"]:
         raise InputError(

@@ -1,15 +1,16 @@
-"""The calibration wizard: doctor, step, PID, tests 1 to 4A, model, proof.
+"""The calibration wizard: doctor, step, PID, tests 1 to 4A, model, proof, and on request acceptance.
 
-And, only when told so, acceptance.
+Each step writes its result into the calibration's own folder (`--out`). The command can be ended at any time;
+a new call continues with the first step that is not done. Nothing outside that folder is written before
+`--accept`.
 
-Each step leaves its result in a folder of the calibration's own (`--out`), so the command can be ended at any
-time and called again: it goes on with the first step that is not done. Nothing outside that folder is written
-before `--accept`.
+With a running daemon the tests run on it in real time: setpoints through the socket, rows from its shared
+memory. An interrupted test continues from there. The daemon's own recording fills the rows between, because
+the rig cools meanwhile; if that recording has a gap, the test starts again.
 
-Where a daemon answers on the socket, the tests run on it: setpoints by the socket, rows from its shared
-memory, in real time. A test that was ended goes on from there, with the daemon's own recording of the time
-between (heat does not wait); where that has a gap the test starts again. Without a daemon a simulated rig is
-run faster than real time. The same seed gives the same rows, so a test that was ended is simply run again."""
+Without a daemon a simulated rig runs faster than real time. The same seed gives the same rows, so an
+interrupted test is simply run again.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +56,7 @@ RESULTS: dict[str, type[steps.Result]] = {
     "proof": steps.Proof,
 }
 STEPS = tuple(RESULTS)
-EVERY_PERCENT = 10.0  # of a test between two lines of progress where there is no terminal
+EVERY_PERCENT = 10.0  # progress of a test between two lines, without a terminal
 
 _R = TypeVar("_R", bound=steps.Result)
 
@@ -80,7 +81,7 @@ class Wizard:
         self.experiments = of_config(settings.path)
         self.fingerprint = self._fingerprint()
         self.done: dict[str, steps.Result] = {}
-        self.at_s: dict[str, float] = {}  # how far an ended test came
+        self.at_s: dict[str, float] = {}  # time reached by an interrupted test
         self._used_s, self._tested_s = (
             0.0,
             0.0,
@@ -163,9 +164,7 @@ class Wizard:
         return steps.proof(recordings, self.order, acting=not self.rig.real)
 
     def _test(self, number: int, name: str, keyboard: Keyboard) -> bool:
-        """Run a test to its end, or to where it is ended.
-
-        Then False, and the same command goes on from there."""
+        """Run a test to its end; return False if it was interrupted: a new call continues from there."""
         schedule, part = self.tests[name], self.folder / f"{name}.part.parquet"
         earlier, at_s = self._earlier(name, part)
         self.say(f"{number:2d}/{len(STEPS)} {name}: {schedule.title}, {span(schedule.duration_s)}")
@@ -206,7 +205,7 @@ class Wizard:
         return True
 
     def _earlier(self, name: str, part: Path) -> tuple[Table | None, float]:
-        """Read what a daemon recorded of a test that was ended, and how far it came."""
+        """Read the daemon's rows of an interrupted test, and the time that it reached."""
         if name not in self.at_s or not part.exists() or not isinstance(self.rig, DaemonRig):
             return None, 0.0
         earlier = self.rig.meanwhile(read_table(part))
@@ -217,7 +216,7 @@ class Wizard:
         return earlier, self.at_s[name]
 
     def _time_left(self, p: Progress, left_s: float) -> tuple[float, float]:
-        """Seconds left of this test and of all, at the pace of the tests so far."""
+        """Estimate the seconds left of this test and of all, at the pace of the tests so far."""
         pace = (self._used_s + p.used_s) / max(self._tested_s + p.done_s, 1e-9)
         return pace * (p.duration_s - p.done_s), pace * (p.duration_s - p.done_s + left_s)
 
@@ -245,7 +244,7 @@ class Wizard:
         self.say(f"before and after: {path}")
 
     def changes(self, models: Path, gains: bool) -> list[str]:
-        """List what an acceptance would do, as lines."""
+        """List the changes of an acceptance, as lines."""
         lines = [f"install {self._model_path} as the current calibration of {models}/"]
         if gains:
             difference = tuning.difference(*self.result("pid", steps.Pid).gains())
@@ -261,7 +260,7 @@ class Wizard:
         return Path(self.settings.compensation.model or ".").resolve() == models.resolve()
 
     def _model_option(self, models: Path) -> str:
-        """Name the folder of calibrations relative to the configuration, as it does itself."""
+        """Return the folder of calibrations relative to the configuration, as the configuration names it."""
         return os.path.relpath(models.resolve(), Path(self.settings.path).resolve().parent)
 
     def accept(self, models: Path, gains: bool) -> None:
@@ -287,7 +286,7 @@ class Wizard:
             try:
                 values = {"model": self._model_option(models)}
                 tuning.write_values(Path(self.settings.path), "compensation", values)
-            except InputError as e:  # the model is installed; the person names it
+            except InputError as e:  # the model is installed; the user has to enter its name
                 self.say(str(e))
         self.fingerprint = self._fingerprint()
         self._save()
@@ -297,9 +296,7 @@ class Wizard:
 
 
 def _progress_line(time_left: Callable[[Progress], tuple[float, float]]) -> Callable[[Progress], None]:
-    """Show progress.
-
-    One line that is written over on a terminal, a line every EVERY_PERCENT elsewhere."""
+    """Show progress: a line that is overwritten on a terminal, else a new line every EVERY_PERCENT."""
     shown = [-1.0]
 
     def show(p: Progress) -> None:

@@ -1,14 +1,14 @@
 """Arming: OFF -> SAFE -> READY -> ARMED, and FAULT, which latches. A pure state machine, one call per tick.
 
-    state   what it means                           leaves to
-    OFF     warming up, nothing is believed yet      SAFE when the law has run its self-test (`started`)
-    SAFE    amplifier disabled                       READY when nothing speaks against arming
-    READY   amplifier disabled, may be armed         ARMED on the ARM command; SAFE when a trip stands
-    ARMED   amplifier enabled, position controlled   SAFE on DISARM; FAULT on a trip
+    state   meaning                                  leaves to
+    OFF     starting, no estimate is valid yet       SAFE when the law has run its self-test (`started`)
+    SAFE    amplifier disabled                       READY when no fault forbids arming
+    READY   amplifier disabled, may be armed         ARMED on the ARM command; SAFE when a fault trips
+    ARMED   amplifier enabled, position controlled   SAFE on DISARM; FAULT when a fault trips
     FAULT   amplifier disabled, latched              SAFE on DISARM (acknowledged) once the cause is gone
 
-A critical fault leads to FAULT from every state but OFF. Only READY can become ARMED, only by a command that arrives in
-READY: a command given earlier is not remembered, so power-up, restart and cleared faults never arm by themselves.
+A critical fault leads to FAULT from every state but OFF. Only a command that arrives in READY can arm. An
+earlier command is not remembered, so power-up, restart and cleared faults never arm by themselves.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ OFF, SAFE, READY, ARMED, FAULT = range(5)
 STATES = ("OFF", "SAFE", "READY", "ARMED", "FAULT")
 
 NONE, ARM, DISARM, SETPOINT = range(4)
-"""Commands. SETPOINT does not move the state machine."""
+"""Commands. SETPOINT does not change the state."""
 COMMANDS = ("none", "arm", "disarm", "setpoint")
 
 
 def next_state(state: int, command: int, started: bool, tripped: bool, critical: bool) -> int:
     """Return the state after this tick.
 
-    started: the law has run long enough to be believed. tripped: a fault stands that forbids driving. critical: one of
-    them latches from every state (implies tripped).
+    started: the law has run its self-test. tripped: an active fault forbids driving. critical: an active
+    fault latches from every state (implies tripped).
     """
     if not started or state == OFF:
         return SAFE if started else OFF
@@ -52,4 +52,4 @@ TABLE = bytes(
     for tripped in (False, True)
     for critical in (False, True)
 )
-"""`next_state` of every input, the last argument running fastest: how the compiled tick asks it."""
+"""Table of `next_state` for every input, the last argument changing fastest; the compiled tick reads it."""

@@ -1,15 +1,16 @@
-"""Which standing fault is the cause, and which follow from it. Pure; the onsets come from the loop (ring.Remarks).
+"""Find which active fault is the cause, and which follow from it. Pure.
 
-A fault follows from a cause that FOLLOWS names, or from one that a device's loss brought in the same moment:
+The loop gives the onsets (ring.Remarks). A fault follows from a cause that FOLLOWS lists, or from a lost
+device's fault of the same moment:
 
-    late ticks            -> whatever is judged over time: ages, jumps, following, saturation, the amplifier's answers
+    late ticks            -> all that is measured over time: ages, jumps, following, saturation, amplifier
     a lost reading        -> its own other kinds, and all that is computed from it
-    the amplifier         -> what it no longer drives: following, saturation, current, voltage
-    any trip              -> the amplifier is disabled and the stage swings back: position and electrical_disagrees
+    the amplifier         -> all that it drives: following, saturation, current, voltage
+    any trip              -> the amplifier is disabled, the stage moves: position_ and electrical_disagrees
     two readings together -> readings lost within TOGETHER_S have one cause (a module, a bus, a supply)
 
-A cause may show after its consequence (a filter, a slower bus): up to BEFORE_S later. A fault more than WITHIN_S after a
-cause is a case of its own.
+A cause may be detected up to BEFORE_S after its consequence (a filter, a slower bus). A fault more than
+WITHIN_S after a cause is a case of its own.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ FOLLOWS: dict[str, set[str]] = {
     "coil_overtemperature": {"coil_overtemperature_model", "coil_heating_rate"},
     "compensation_bound": {"compensation_slewing"},
 }
-"""Cause -> what follows from it."""
+"""Cause -> the faults that follow from it."""
 for _name in _of(*GROUPS):  # the same reading's other kinds, found later
     _group, _kind = _name.rsplit("_", 1)
     FOLLOWS[_name] = FOLLOWS.get(_name, set()) | {
@@ -72,12 +73,12 @@ for _name in _of(*GROUPS):  # the same reading's other kinds, found later
     }
 
 LATE_MAY_CAUSE = FOLLOWS["loop_late"]
-"""Faults that late ticks in the second before may have caused."""
+"""Faults that late ticks of the second before may have caused."""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """A standing fault: its name, when it began (t_s, tick), and by how much the machine was late in the second before, s."""
+    """An active fault: name, onset (t_s, tick), and the machine's largest delay in the second before, s."""
 
     name: str
     t_s: float
@@ -86,7 +87,7 @@ class Standing:
 
     @property
     def late_first(self) -> bool:
-        """Whether late ticks are to be named before the fault itself."""
+        """True when late ticks must be named before the fault itself."""
         return self.late_s > 0.0 and self.name in LATE_MAY_CAUSE
 
 
@@ -101,7 +102,7 @@ def _lost(name: str) -> bool:
 
 
 def follows(fault: Standing, cause: Standing) -> bool:
-    """Whether `fault` follows from `cause`."""
+    """Return whether `fault` follows from `cause`."""
     after_s = fault.t_s - cause.t_s
     if _lost(fault.name) and _lost(cause.name) and 0.0 <= after_s <= TOGETHER_S:
         return True
@@ -115,16 +116,18 @@ def _trips(name: str, trips: int) -> bool:
 
 
 def in_order(standing: Iterable[Standing], trips: int) -> list[tuple[Standing, str]]:
-    """(fault, name of its cause or '') : causes by time, those that tripped first; what follows stands behind its cause.
+    """Return (fault, name of its cause or ''), each cause followed by its consequences.
 
-    trips: the bits of the faults that disabled the amplifier, or keep it disabled."""
+    Causes are ordered by time, those that tripped first. trips: the bits of the faults that disabled the
+    amplifier, or keep it disabled.
+    """
     left = sorted(standing, key=lambda f: (f.t_s, -_reach(f.name), BIT[f.name]))
     heads = [
         f
         for k, f in enumerate(left)
         if not any(follows(f, c) and (j < k or not follows(c, f)) for j, c in enumerate(left) if j != k)
     ]
-    heads = heads or left[:1]  # a circle: the first one of it
+    heads = heads or left[:1]  # faults that cause each other: the first one
     cases: dict[str, list[Standing]] = {h.name: [] for h in heads}
     for f in left:
         if f.name in cases:
@@ -138,7 +141,7 @@ def in_order(standing: Iterable[Standing], trips: int) -> list[tuple[Standing, s
 
 
 def _reach(name: str) -> int:
-    """Of faults of one tick the one from which more follows is the cause."""
+    """Rank the faults of one tick: the cause is the one with the most consequences."""
     return len(FOLLOWS.get(name, ())) + (100 if name == "loop_late" else name.startswith("coil_"))
 
 

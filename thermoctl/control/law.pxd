@@ -1,4 +1,4 @@
-# C types for law.py; see there. What stands between "generated" and "end" is written by `python -m thermoctl.control.typed`.
+# C types for law.py. `python -m thermoctl.control.typed` writes the parts between "generated" and "end".
 cimport cython
 from libc.stdint cimport uint8_t
 
@@ -57,9 +57,11 @@ cdef class Law:
     cdef public double expansion_um, power_w, air_c, air_start_c, air_known, air_rate_k_s, innovation_c
     cdef public double innovation_mean_c, kalman_gain, P, corrected, primed, expansion_before_um
     cdef public double expansion_after_um, phase_s, coil_slow_c, coil_rate_k_s, coil_elapsed_s, power_mean_w
-    cdef public double following_s, idle_s, saturation_s, amplifier_s, enable, drive, air_started, resumed
-    cdef public double model_error_c, ohm_v, ohm_scale_v, current_error_a, current_apart_a, drive_low
-    cdef public double drive_high, drive_low_before, drive_high_before, displaced_um, position_zero_um, zeroed
+    cdef public double following_s, idle_s, idle_readings, saturation_s, amplifier_s, enable, drive
+    cdef public double air_started, resumed, model_error_c, ohm_v, ohm_scale_v, current_error_a
+    cdef public double current_apart_a, drive_low, drive_high, drive_low_before, drive_high_before
+    cdef public double displaced_um, position_apart_um, position_low_um, position_high_um
+    cdef public double position_low_before_um, position_high_before_um, position_zero_um, zeroed
     cdef public double reference_error_um, reference_zero_um, reference_zeroed, exchanged, driving
     cdef public double[::1] x, T, T_before, average, age, since_s, suspect, last, same_s, seen, verdict
     cdef public double[::1] corrections, apart_c
@@ -96,6 +98,8 @@ cdef class Law:
     cdef void _agree(self) noexcept
     @cython.locals(low=cython.double, high=cython.double)
     cdef void _compare_drive(self, double amperes) noexcept
+    @cython.locals(low=cython.double, high=cython.double, expected=cython.double)
+    cdef void _compare_position(self, double position, double held) noexcept
     @cython.locals(m=cython.int, k=cython.int, s=cython.double, limit=cython.double)
     cdef void _compare_order(self) noexcept
     @cython.locals(coil_new=cython.bint, i=cython.int, j=cython.int, k=cython.int, c=cython.int, s=cython.double,

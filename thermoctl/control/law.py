@@ -1,50 +1,51 @@
 # cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False, freethreading_compatible=True
-"""The law of one tick: estimate, compensate, control, protect. Pure: no I/O, no clock, no configuration, no allocation.
+"""The law of one tick: estimate, compensate, control, protect. Pure: no I/O, clock, files, allocation.
 
-This file is plain Python; `law.pxd` gives every name a C type and Cython compiles both into the module that runs. The
-same source runs compiled in the loop, in simulation and in replay, and interpreted under coverage and mutation tests;
-both give the same bits (IEEE doubles, no contraction, one order of operations).
+This file is plain Python. `law.pxd` gives every name a C type, and Cython compiles both into the module that
+runs. The same source runs compiled in the loop, in simulation and in replay, and interpreted under coverage
+and mutation tests. Both give the same bits (IEEE doubles, no contraction, one order of operations).
 
-    estimate    x(n+1) = x(n) + (dt/T) [(A-I) x(n) + B q(n)],  q = [V I, d(air)/dt]           (33), delta form
+    estimate    x(n+1) = x(n) + (dt/T) [(A-I) x(n) + B q(n)],  q = [V I, d(air)/dt]      (33), delta form
                 on a new reading: P- = (a1 a1') P + R_w,  k = P-/(P- + R_v),  P = P-(1 - k)    (34), (35)
                 x = x + k zeta (y1 - C1 x)            kind 'mkf'  (36)
                 x = x + K (y - C x)                   kind 'kalman', all new readings at once
     compensate  yL(n+1) = f1 yL(n) + b1 T(n-1) + b2 T(n) + b_air (air - air at start)          (39)
-                a straight line between its samples, bounded, slewed, frozen while a reading it needs is at fault
+                a straight line between its samples; bounded; slew-limited; frozen while an input is at fault
     control     reference follows the setpoint at a limited rate; eps = reference - (position + compensation)
                 v(n) = v(n-1) + Kp [(eps - eps1) + (dt/Ti) eps + Td (d - d1)],  d = (eps - eps1)/dt      (41)
-                With dt constant this is (41) term by term; with a late tick the differences still add up to the state.
-                v is clipped where it is stored, so nothing winds up; gains may change without a jump.
-    protect     every reading's range, rate, age and liveness; following error, coil temperature and heating rate,
-                power, idle current, innovation, saturation, amplifier; arming; and last: every number finite.
-    agree       what two readings say of one thing must agree in the mean; a sensor that drifts, is swapped or hangs
-                between its limits is found so, and in no other way:
-                coil's voltage and R20 (1 + alpha (coil - 20 degC)) current;
-                current and the drive that was asked for since the reading before the last;
-                position and the current that holds it against the flexures;  a watched temperature and its estimate;
-                the reference encoder and position + expansion (each encoder's own zero is taken while OFF);
-                two temperatures and their estimates, which must not stand the other way round: y_i > y_j while T_i < T_j
-                by so much that the readings would fit better exchanged, (y_i - y_j)(T_i - T_j) < -order_limit^2;
-                the coil's reading and what the model says of it alone, x - c with the sum of all corrections
-                c(n+1) = c(n) + (dt/T) (A-I) c(n) + k zeta e: a drifting sensor takes the estimate along, not this.
+                With dt constant this is (41) term by term; after a late tick the differences still add up.
+                v is clipped where it is stored: no wind-up. Gains may change without a jump.
+    protect     range, rate, age and liveness of every reading; following error; coil temperature and its
+                rate; power; idle current; innovation; saturation; amplifier; arming; finite numbers
+    agree       two measures of one quantity must agree in the mean. Only this finds a sensor that drifts, is
+                swapped, or hangs between its limits:
+                - coil voltage and R20 (1 + alpha (coil - 20 degC)) current
+                - current and the drive requested since the reading before the last
+                - position, all since the reading before the last, and the current that holds it against the flexures
+                - a watched temperature and its estimate
+                - reference encoder and position + expansion (zero of each encoder taken while OFF)
+                - two temperatures, exchanged: y_i > y_j while T_i < T_j, and the readings would fit better
+                  the other way round, (y_i - y_j)(T_i - T_j) < -order_limit^2
+                - the coil's reading and the open-loop model, x - c, with c the sum of all corrections,
+                  c(n+1) = c(n) + (dt/T) (A-I) c(n) + k zeta e; a drifting sensor moves x, but not x - c
 
-After a gap of more than MAX_GAP_S (suspend) the estimate starts again on the coil's next reading. `resume` starts from
-the estimates of an earlier run, advanced over the pause without power; when the coil's first reading is more than
-RESUME_LIMIT_C from them they are dropped, and the start is as without.
+After a gap of more than MAX_GAP_S (suspend) the estimate restarts on the coil's next reading. `resume` starts
+from the estimates of an earlier run, advanced over the pause without power. They are dropped when the coil's
+first reading is more than RESUME_LIMIT_C from them.
 
-A reading that is not valid is never used (`last` holds the newest valid one). The encoder's reading is held for a
-tick without a new frame (1 to 3 % of the ticks of a polled encoder): the differences then come one tick later and
-nothing is lost.
+An invalid reading is never used (`last` holds the newest valid one). A tick without a new encoder frame holds
+the last position; the differences come one tick later. This happens in 1 to 3 % of a polled encoder's ticks.
 
-The rate of a reading is its change over the time between the samples, not between their arrivals. A temperature is
-given at least THERMAL_S for a change: a bonded sensor follows no faster, so that two answers of a bus in close order
-say nothing of the rate, and one digit up to rate x THERMAL_S is no jump (2 K at 20 K/s). A temperature that exceeds its
-rate is not used; it trips when the next reading still exceeds it, counted from the last one that was believed. A body
-with heat capacity stays where it jumped to; an outlier does not.
+The rate of a reading is its change over the time between the samples, not between their arrivals. For a
+temperature this time is at least THERMAL_S, because a bonded sensor follows no faster. So two answers in
+close order, or one digit up to rate x THERMAL_S (2 K at 20 K/s), are no jump. A temperature that exceeds its
+rate is not used. It trips when the next reading still exceeds the rate, counted from the last valid one. A
+body with heat capacity stays at its new temperature, an outlier does not.
 
-While ARMED, an amplifier that reports another state than enabled holds the controller at v = 0 and the reference at the
-stage: nothing integrates against a drive that is off. `amplifier_s` is the time for the enable sequence after arming.
-An amplifier that was enabled since and is no more trips at once. One that still reports enabled keeps READY away.
+While ARMED, an amplifier that reports another state than enabled holds v = 0 and the reference at the stage.
+So nothing integrates against a drive that is off. `amplifier_s` is the time for the enable sequence after
+arming. An amplifier that was enabled since and no longer is trips at once. One that still reports enabled
+prevents READY.
 """
 
 from __future__ import annotations
@@ -75,17 +76,21 @@ from thermoctl.signals import FAULT_WORD_BITS, OUTPUT, OUTPUTS
 
 MAX_AVERAGE = 64
 WARM_UP_TICKS = 100
-THERMAL_S = 0.1  # a temperature's change counts over at least this time: a bonded sensor's own time constant
-DELAY_S = 0.025  # unit of `delay`: four bits a temperature are recorded, 15 is 375 ms, above an answer's 300 ms timeout
-MAX_GAP_S = 10.0  # a longer time between two ticks makes the estimate worthless
-RESUME_LIMIT_C = 2.0  # estimates of an earlier run are kept when the coil's first reading is as close as this
-AIR_READINGS = 30.0  # of the air's first ones, whose mean is the origin: 0.02 K of noise in one would be 0.03 um for good
+THERMAL_S = 0.1  # least time for a change of temperature: a bonded sensor's own time constant
+# Unit of `delay`: a recording has four bits a temperature, so 15 is 375 ms, above the 300 ms timeout of an
+# answer.
+DELAY_S = 0.025
+MAX_GAP_S = 10.0  # after a longer time between two ticks the estimate restarts
+RESUME_LIMIT_C = 2.0  # keep the estimates of an earlier run if the coil's first reading is this close
+# Readings of the air averaged into the origin: 0.02 K of noise in a single one would stay as 0.03 um of
+# offset.
+AIR_READINGS = 30.0
 COPPER_1_K = 0.00393  # temperature coefficient of the coil's resistance, from 20 degC
 _GAP_S, _RESUME_C, _COPPER, _WARM_UP = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K, WARM_UP_TICKS
 _AIR_READINGS = AIR_READINGS
 _THERMAL_S, _DELAY_S, _NAN = THERMAL_S, DELAY_S, float("nan")
 COMPILED = not __file__.endswith(".py")
-"""False when this module runs interpreted: right for coverage, a hundred times too slow for a rig."""
+"""False when this module runs interpreted: for coverage only, a hundred times too slow for a rig."""
 
 # Constants that the compiler turns into C numbers (typed in law.pxd).
 _OK, _STALE, _ERROR, _ABSENT = OK, STALE, ERROR, ABSENT
@@ -157,6 +162,7 @@ _SCALARS = (
     "power_mean_w",
     "following_s",
     "idle_s",
+    "idle_readings",
     "saturation_s",
     "amplifier_s",
     "average_at",
@@ -175,6 +181,11 @@ _SCALARS = (
     "drive_low_before",
     "drive_high_before",
     "displaced_um",
+    "position_apart_um",
+    "position_low_um",
+    "position_high_um",
+    "position_low_before_um",
+    "position_high_before_um",
     "position_zero_um",
     "zeroed",
     "reference_error_um",
@@ -236,7 +247,7 @@ def clip(value, low, high):
 
 
 class Typed:
-    """The single numbers of Parameters, by the same names, with C types: the fields in law.pxd are generated."""
+    """The scalar fields of Parameters with C types; law.pxd's fields are generated."""
 
     def __init__(self, parameters: Parameters):
         for f in fields(parameters):
@@ -247,9 +258,9 @@ class Typed:
 class Law:
     """The state of the law and its four stages, called in order once per tick; `step` calls all four.
 
-    model: CompensatorModel; parameters: Parameters; period_s: the loop's nominal period, s.
-    `bind` gives the arrays that the readings arrive in. After a tick, `outputs` (float64, order of OUTPUTS) and the
-    attributes of the same names hold the results; `drive` and `enable` are what the amplifier gets.
+    model: CompensatorModel; parameters: Parameters; period_s: the loop's nominal period, s. `bind` sets the
+    arrays in which the readings arrive. After a tick, `outputs` (float64, order of OUTPUTS) and the
+    attributes of the same names hold the results. `drive` and `enable` go to the amplifier.
     """
 
     def __init__(self, model: CompensatorModel, parameters: Parameters, period_s: float):
@@ -265,13 +276,13 @@ class Law:
         first[0] += 1.0
         self.a1a1 = float(first @ first)
         self.sensors = array("i", model.sensors)
-        # A model that says nothing of a temperature, or of the expansion, cannot disagree with it.
+        # Without a model of a temperature, or of the expansion, nothing can disagree with it.
         self.predicts = array("i", model.C.any(axis=1).astype(int))
         self.expands = bool(model.b1.any() or model.b2.any() or model.b_air != 0.0)
-        # The first correction puts the estimate on the coil's reading: along zeta, or along K.
+        # The first correction sets the estimate to the coil's reading: along zeta, or along K.
         along = float(model.C[0] @ model.gain[:, 0])
         self.first_gain = 1.0 / along if abs(along) > 1e-9 else 0.0
-        # c is advanced once a reading, in steps that the fastest mode allows.
+        # c is advanced once a reading, in steps short enough for the fastest mode.
         self.correction_step_s = (
             0.5 * model.period_s / max(float(np.abs(model.A_minus_I).sum(axis=1).max()), 1e-12)
         )
@@ -296,11 +307,12 @@ class Law:
         self.air_started = self.resumed = self.model_error_c = 0.0
         self.ohm_v = self.ohm_scale_v = self.current_error_a = self.current_apart_a = 0.0
         self.drive_low = self.drive_high = self.drive_low_before = self.drive_high_before = 0.0
-        self.displaced_um = self.position_zero_um = self.zeroed = 0.0
-        self.reference_error_um = self.reference_zero_um = self.reference_zeroed = 0.0
-        self.exchanged = 0.0
-        self.following_s = self.idle_s = self.saturation_s = self.amplifier_s = self.driving = 0.0
-        self.enable = self.drive = self.control_v = 0.0
+        self.displaced_um = self.position_apart_um = self.position_zero_um = self.zeroed = 0.0
+        self.position_low_um = self.position_high_um = 0.0
+        self.position_low_before_um = self.position_high_before_um = self.reference_error_um = 0.0
+        self.reference_zero_um = self.reference_zeroed = self.exchanged = 0.0
+        self.following_s = self.idle_s = self.idle_readings = self.saturation_s = 0.0
+        self.amplifier_s = self.driving = self.enable = self.drive = self.control_v = 0.0
         self.average_length = 1
         self.out = np.zeros(len(OUTPUTS))
         self.outputs = np.asarray(self.out)
@@ -358,7 +370,7 @@ class Law:
         for name, end in (
             ("state", len(arming.STATES)),
             ("average_at", MAX_AVERAGE),
-        ):  # both are places in a table
+        ):  # both are indices of a table
             if not 0 <= vector[_SCALARS.index(name)] < end:
                 raise ValueError(
                     f"law: a state whose {name} is {vector[_SCALARS.index(name)]:g}, expected 0 to {end - 1}"
@@ -372,9 +384,10 @@ class Law:
             start += length
 
     def resume(self, vector: np.ndarray, gap_s: float):
-        """Start from the estimates in `vector`, the snapshot of an earlier run `gap_s` seconds ago without power since.
+        """Start from the estimates of a run that ended `gap_s` seconds ago, without power since.
 
-        Arming, controller and fault timers start anew. Raises ValueError as `restore` does.
+        `vector` is its snapshot. Arming, controller and fault timers start anew. Raises ValueError as
+        `restore` does.
         """
         earlier = Law(self.model, self.parameters, self.period_s)
         earlier.restore(vector)
@@ -406,7 +419,7 @@ class Law:
         self.phase_s, self.expansion_before_um, self.expansion_after_um = phase, before, after
 
     def _forget(self):
-        """Restart the estimate on the coil's next reading; keep the air at the start as the expansion's origin."""
+        """Restart the estimate on the coil's next reading; keep the expansion's origin."""
         for i in range(self.n):
             self.x[i] = 0.0
             self.corrections[i] = 0.0
@@ -416,7 +429,7 @@ class Law:
         self.P = 1e3 * self.R_v
 
     def step(self, dt, command=0, command_value=0.0, external=0):
-        """One tick, four stages: dt measured, s; command one of arming's; external: fault bits from outside the law."""
+        """Run one tick. dt: measured, s; command: of arming; external: fault bits from outside the law."""
         self.estimate(dt)
         self.compensate()
         self.control(command, command_value)
@@ -425,7 +438,7 @@ class Law:
     # ---- estimate -----------------------------------------------------------------------------------------------
 
     def estimate(self, dt):
-        """Judge the readings, predict the temperatures over the measured dt (s), correct them with new readings."""
+        """Check the readings, predict the temperatures over the measured dt (s), correct them."""
         self.dt = clip(dt, 0.0, 1.0) if finite(dt) else 0.0
         self.tick += 1
         self.coil_elapsed_s += self.dt
@@ -451,7 +464,7 @@ class Law:
             self.T[m] = s
 
     def _judge_readings(self, dt):
-        """verdict[c] = 1 + kind of fault, 0 good; a fresh reading that is out of range or jumped is not used."""
+        """Set verdict[c]: 0 good, else 1 + kind of fault. Readings out of range or jumped are not used."""
         self.faults = 0
         one = 1
         self.trips = 0
@@ -488,7 +501,7 @@ class Law:
         self.enabled = self.reports and self.value[_AMPLIFIER_STATE] == _AMPLIFIER_ENABLED
 
     def _judge_reading(self, c, value):
-        """Range, rate and liveness of a new reading; `last` and `since_s` are of the newest one that was believed."""
+        """Check range, rate and liveness of a new reading; `last` and `since_s`: the newest valid one."""
         late = _DELAY_S * self.delay[c]
         elapsed = max(self.since_s[c] - late, self.period_s)
         thermal = _THERMAL <= c < _THERMAL_END
@@ -497,7 +510,7 @@ class Law:
         if not (self.low[c] <= value <= self.high[c]) or not finite(value):
             self.verdict[c] = 1.0 + _K_RANGE
         elif jumped and thermal and self.suspect[c] == 0.0:
-            self.suspect[c] = 1.0  # one reading proves no jump: the next one decides
+            self.suspect[c] = 1.0  # one reading proves no jump; wait for the next one
         else:
             if self.seen[c] > 0.0 and value == self.last[c]:
                 self.same_s[c] += elapsed
@@ -513,9 +526,9 @@ class Law:
             self.since_s[c] = late
 
     def _power_and_air(self):
-        """q(n): electrical power, rate of the low-passed air; the last good value while a reading is at fault.
+        """Set q(n): electrical power, rate of the low-passed air. Holds the last good value during a fault.
 
-        Without a voltage meter the power is R I^2. `powered`: some power can be known; else its output is NaN.
+        Without a voltage meter the power is R I^2. `powered`: the power is known; else its output is NaN.
         """
         self.powered = self.status[_CURRENT] != _ABSENT and (
             self.status[_VOLTAGE] != _ABSENT or self.p.resistance_ohm > 0.0
@@ -537,7 +550,7 @@ class Law:
             self.air_c += self.air_rate_k_s * self.dt
 
     def _resistance(self):
-        """Return the coil's resistance, ohm, at its estimated or else measured temperature (20 degC if unknown)."""
+        """Return the coil's resistance, ohm, at its estimated, else measured temperature, else 20 degC."""
         s = 20.0
         if self.predicts[0] and self.air_known > 0.0:
             s = self.T[0] + self.air_c
@@ -546,7 +559,7 @@ class Law:
         return self.p.resistance_ohm * (1.0 + _COPPER * (s - 20.0))
 
     def _start_air(self, value):
-        """Start the air's low-pass at this reading; the first reading of all is the origin of the expansion."""
+        """Start the air's low-pass at this reading; the very first one is the expansion's origin."""
         self.air_c = value
         self.air_known = 1.0
         if self.air_started == 0.0:
@@ -554,7 +567,7 @@ class Law:
             self.air_started = 1.0
 
     def _average_air_start(self):
-        """Average the first air readings into the origin of the expansion, and shift the estimates with it."""
+        """Average the first air readings into the expansion's origin; shift the estimates, too."""
         self.air_started += 1.0
         s = (self.last[_AIR] - self.air_c) / self.air_started
         self.air_c += s
@@ -564,7 +577,7 @@ class Law:
                 self.x[i] += self.B[i, 1] / self.model_period_s * s
 
     def _correct(self):
-        """(35): every new valid reading of a correcting sensor moves the state; the coil's first one starts it."""
+        """Correct the state with every new valid reading (35); the coil's first reading starts it."""
         coil_new = self.fresh[_COIL] and self.verdict[_COIL] == 0.0 and self.suspect[_COIL] == 0.0
         if self.resumed > 0.0 and coil_new:  # do the kept estimates still fit?
             s = self.value[_COIL] - self.air_c
@@ -642,7 +655,10 @@ class Law:
     # ---- compensate ---------------------------------------------------------------------------------------------
 
     def compensate(self):
-        """Compute the estimated thermal error, um: expansion model, bound, slew; frozen while a needed reading is at fault."""
+        """Compute the estimated thermal error, um: expansion model, bound, slew limit.
+
+        It is frozen while a needed reading is at fault.
+        """
         one = 1
         if self.primed == 0.0:  # quasi-steady start at the first temperatures
             s = self.b_air * (self.air_c - self.air_start_c)
@@ -651,7 +667,8 @@ class Law:
                 self.T_before[m] = self.T[m]
             self.expansion_before_um = self.expansion_after_um = s / (1.0 - self.f1)
             self.phase_s = 0.0
-            if self.air_started >= _AIR_READINGS or self.verdict[_AIR] > 0.0:  # else its origin still moves
+            # until then the origin still changes
+            if self.air_started >= _AIR_READINGS or self.verdict[_AIR] > 0.0:
                 self.primed = self.corrected
         self.phase_s += self.dt
         if self.phase_s >= self.expansion_period_s:
@@ -678,7 +695,8 @@ class Law:
             return
         if self.state == _ARMED:
             step = self.p.slew_um_s * self.dt
-            if self.primed > 0.0 and abs(target - self.compensation_um) > 2.0 * step:  # else the origin moves
+            # else the origin still changes
+            if self.primed > 0.0 and abs(target - self.compensation_um) > 2.0 * step:
                 self.faults |= one << _B_SLEWING
             target = clip(target, self.compensation_um - step, self.compensation_um + step)
         self.compensation_um = target
@@ -686,9 +704,10 @@ class Law:
     # ---- control ------------------------------------------------------------------------------------------------
 
     def control(self, command, command_value):
-        """Run moving average, setpoint limiter, velocity-form PID (41). Not armed: the setpoint follows the stage.
+        """Run moving average, setpoint limiter and velocity-form PID (41). Not armed: setpoint = stage.
 
-        The reference follows the stage, and v stays 0, also while an armed amplifier reports that it does not drive.
+        While an armed amplifier reports that it does not drive, the reference follows the stage and v stays
+        0.
         """
         if self.fresh[_POSITION] and self.verdict[_POSITION] == 0.0:
             if self.averaged == 0.0:
@@ -727,7 +746,7 @@ class Law:
     # ---- protect ------------------------------------------------------------------------------------------------
 
     def protect(self, command, external):
-        """All limits, the arming machine and the last gate; fills `outputs`, `drive` and `enable`."""
+        """Check all limits, run the arming machine; fill `outputs`, `drive` and `enable`."""
         one = 1
         found = external
         if self.state == _ARMED:
@@ -737,12 +756,19 @@ class Law:
             self.saturation_s = self.saturation_s + self.dt if abs(self.v) >= self.p.output_limit else 0.0
             if self.saturation_s > self.p.saturation_s:
                 found |= one << _B_SATURATED
-            self.idle_s = 0.0
+            self.idle_s = self.idle_readings = 0.0
         else:
             self.following_s = self.saturation_s = 0.0
+            if self.fresh[_CURRENT]:
+                self.idle_readings += 1.0
             driven = (
-                self.verdict[_CURRENT] == 0.0 and abs(self.last[_CURRENT]) > self.p.idle_current_a
-            ) or abs(self.power_w) > self.p.idle_power_w
+                self.verdict[_CURRENT] == 0.0
+                and self.idle_readings > 1.0
+                and (
+                    abs(self.last[_CURRENT]) > self.p.idle_current_a
+                    or abs(self.power_w) > self.p.idle_power_w
+                )
+            )
             self.idle_s = self.idle_s + self.dt if driven else 0.0
             if self.idle_s > self.p.idle_s:
                 found |= one << _B_STUCK
@@ -823,11 +849,8 @@ class Law:
             if abs(self.current_error_a) > self.p.current_tolerance_a:
                 self.faults |= one << _B_NOT_FOLLOWING
         if current and self.verdict[_POSITION] == 0.0 and self.p.flexure_um_per_a != 0.0:
-            s = self.last[_POSITION] - self.p.flexure_um_per_a * amperes
-            if self.zeroed == 0.0:
-                self.position_zero_um = s
-                self.zeroed = 1.0 if self.state != _OFF else 0.0
-            self.displaced_um += part * (s - self.position_zero_um - self.displaced_um)
+            self._compare_position(self.last[_POSITION], self.p.flexure_um_per_a * amperes)
+            self.displaced_um += part * (self.position_apart_um - self.displaced_um)
             if abs(self.displaced_um) > self.p.position_tolerance_um:
                 self.faults |= one << _B_DISPLACED
         if self.corrected == 0.0:
@@ -853,10 +876,10 @@ class Law:
                 self.faults |= one << _B_MONITORED
 
     def _compare_drive(self, amperes):
-        """current_apart_a: how far a new current lies outside all that was asked for since the reading before the last.
+        """Set current_apart_a: distance of a new current from all drives since the reading before the last.
 
-        A slow meter's reading is older than its arrival: it was sampled somewhere in that time. Compared with the
-        present drive, it would accuse an amplifier that follows while the drive changes.
+        A slow meter samples at some time before its reading arrives. Compared with the present drive alone,
+        it would trip on an amplifier that works while the drive changes.
         """
         self.drive_low = min(self.drive_low, self.drive)
         self.drive_high = max(self.drive_high, self.drive)
@@ -869,8 +892,31 @@ class Law:
             self.drive_low_before, self.drive_high_before = self.drive_low, self.drive_high
             self.drive_low = self.drive_high = self.drive
 
+    def _compare_position(self, position, held):
+        """Compute position_apart_um: distance of recent positions from where the current holds.
+
+        held: displacement by the newest current, um. Recent: since the reading before the last.
+        As in _compare_drive, the current may have been sampled at any of these positions.
+        The zero is taken while OFF.
+        """
+        if self.zeroed == 0.0:
+            self.position_zero_um = position - held
+            self.zeroed = 1.0 if self.state != _OFF else 0.0
+        self.position_low_um = min(self.position_low_um, position)
+        self.position_high_um = max(self.position_high_um, position)
+        if self.fresh[_CURRENT]:
+            expected = held + self.position_zero_um
+            low = min(self.position_low_um, self.position_low_before_um)
+            high = max(self.position_high_um, self.position_high_before_um)
+            self.position_apart_um = clip(expected, low, high) - expected
+            self.position_low_before_um, self.position_high_before_um = (
+                self.position_low_um,
+                self.position_high_um,
+            )
+            self.position_low_um = self.position_high_um = position
+
     def _compare_order(self):
-        """exchanged: two mean readings would fit their estimates better the other way round."""
+        """Set `exchanged`: two mean readings would fit their estimates better the other way round."""
         self.exchanged = 0.0
         limit = -self.p.order_limit_c * self.p.order_limit_c
         for m in range(1, _M):

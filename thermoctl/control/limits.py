@@ -1,7 +1,7 @@
 """Protection limits that are one number each: the table of the configuration and of the law.
 
-`settings.ProtectionSettings` and `control.model.Parameters` inherit these fields, and the law reads them by the same
-names. A new limit is one row here and its condition in law.py.
+`settings.ProtectionSettings` and `control.model.Parameters` inherit these fields, and the law reads them by
+the same names. A new limit is one row here and its condition in law.py.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from thermoctl.option import option
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits and time constants of the protection; the default is what a configuration gets that names none."""
+    """Limits and time constants of the protection, with the defaults of a configuration."""
 
     following_um: float = option(
         "largest following error (position minus reference) for longer than following_s; twice this value trips at "

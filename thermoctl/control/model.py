@@ -1,9 +1,8 @@
 """Inputs of the law besides its readings: the compensator's model and the parameters.
 
-The model comes from identification, the parameters come from the configuration.
-
-Both are plain arrays and numbers. Neither knows a file; `Parameters.pack` turns the parameters into one flat vector so
-that they cross from the process that validated them to the loop through shared memory, and are stored in recordings.
+The model comes from identification, the parameters come from the configuration. Both are plain arrays and
+numbers; neither knows a file. `Parameters.pack` makes one flat vector of the parameters. As such they cross
+to the loop through shared memory, and are stored in recordings.
 """
 
 from __future__ import annotations
@@ -34,19 +33,23 @@ def _number(unit: str = "", default: Any = MISSING, positive: bool = False) -> A
 class CompensatorModel:
     """Thermal state space model, gain of its estimator, and the expansion model.
 
-    State (33), in delta form so that no digits are lost near 1: x(n+1) = x(n) + A_minus_I x(n) + B q(n), every
-    `period_s`; q = [electrical power W, rate of the air temperature K/s]; C x are the twelve rises above the air, K.
+    State (33), in delta form so that no digits are lost near 1, every `period_s`:
 
-    kind      'mkf': the scalar Riccati recursion (34), (35) with first row of A, R_w, R_v and gain = the map zeta (36);
-              'kalman': gain K of a steady Kalman filter, one column per sensor.
-    gain      (n, s): one column per correcting sensor, K (or zeta) per K of innovation.
-    sensors   (s,) indices among the twelve temperatures; the first must be the coil (0). 'mkf' has just the coil.
-    f1, b1, b2, b_air: yL(n+1) = f1 yL(n) + b1 . T(n-1) + b2 . T(n) + b_air (air - air at start) (39), um, every
-              `expansion_period_s`; offset_um is added to its output.
-    air_filter_s: time constant of the low-pass filter that gives the rate of the air temperature.
-    Raises ValueError when shapes or numbers do not fit together.
+        x(n+1) = x(n) + A_minus_I x(n) + B q(n),   q = [electrical power W, rate of the air temperature K/s]
 
-    Files of models, recordings and the warm start's fingerprint derive from these fields.
+    C x are the twelve rises above the air, K. Expansion (39), um, every `expansion_period_s`:
+
+        yL(n+1) = f1 yL(n) + b1 . T(n-1) + b2 . T(n) + b_air (air - air at start)
+
+    kind: 'kalman' or 'mkf'. With 'kalman' the gain is K of a steady Kalman filter. With 'mkf' it is the map
+    zeta (36) of the scalar Riccati recursion (34), (35), which uses the first row of A, R_w and R_v. gain:
+    (n, s), one column per correcting sensor, K (or zeta) per K of innovation. sensors: (s,) indices among the
+    twelve temperatures; the first must be the coil (0). 'mkf' has only the coil. offset_um: added to the
+    expansion model's output. air_filter_s: time constant of the low-pass filter that gives the rate of the
+    air temperature.
+
+    Raises ValueError when shapes or numbers do not fit together. Files of models, recordings and the warm
+    start's fingerprint derive from these fields.
     """
 
     kind: str
@@ -196,7 +199,7 @@ class Parameters(Limits, Gains):
 
 
 BY_CHANNEL = {f.name: f.metadata["by_channel"] for f in fields(Parameters) if "by_channel" in f.metadata}
-"""The arrays over the channels, each with its value for a channel that the configuration does not name."""
+"""Arrays over the channels, each with its default for a channel without an entry."""
 NAMES = tuple(
     name
     for f in fields(Parameters)

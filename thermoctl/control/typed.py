@@ -2,8 +2,8 @@
 
     python -m thermoctl.control.typed [--check]
 
-With --check nothing is written; exit status 1 and one line when the file differs. The names come from law.py and from
-Parameters, so a new limit, constant or state variable is declared once.
+With --check nothing is written; exit status 1 and one line when the file differs. The names come from law.py
+and from Parameters, so a new limit, constant or state variable is declared once.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PART = re.compile(r"^( *)# generated: (.*)\n(?:.*\n)*?\1# end\n", re.MULTILINE)
 
 
 def interpreted_law() -> ModuleType:
-    """Return law.py run by the interpreter: the compiled module hides its constants."""
+    """Return law.py as an interpreted module: the compiled one hides its constants."""
     spec = importlib.util.spec_from_file_location("interpreted_law", HERE / "law.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -72,7 +72,7 @@ def parts(law: ModuleType) -> dict[str, list[tuple[str, list[str]]]]:
 
 
 def declarations(text: str, law: ModuleType) -> str:
-    """Return the text of law.pxd with its generated parts written anew. Raises KeyError for an unknown part."""
+    """Return the text of law.pxd with its generated parts rewritten. Raises KeyError for an unknown part."""
     made = parts(law)
 
     def write(match: re.Match[str]) -> str:
@@ -84,7 +84,7 @@ def declarations(text: str, law: ModuleType) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Write law.pxd, or with --check say whether it is up to date."""
+    """Write law.pxd, or with --check report whether it is up to date."""
     path = HERE / "law.pxd"
     text = path.read_text(encoding="utf-8")
     made = declarations(text, interpreted_law())

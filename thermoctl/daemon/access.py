@@ -1,4 +1,4 @@
-"""Who may read and command through the dashboard: address, host name, origin and token of a request."""
+"""Access control of the dashboard: address, host name, origin and token of a request."""
 
 from __future__ import annotations
 
@@ -24,10 +24,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Policy:
-    """Decides who may do what.
-
-    names: host names, besides addresses and localhost, by which the page may be requested.
-    """
+    """Access policy. names: host names, besides addresses and localhost, that may serve the page."""
 
     token: str
     token_to_look: bool

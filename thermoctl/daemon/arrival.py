@@ -1,15 +1,18 @@
-"""How many readings a second arrive, against `rate_hz` of the devices' profiles.
+"""How many readings a second arrive, against `rate_hz` of the devices' profiles; counters of the devices.
 
-A sensor that sends at a tenth of its rate passes every limit on age that a slow machine needs. But its readings
+A sensor that sends at a tenth of its rate passes every age limit that suits a slow machine. But its readings
 are older than the control loop and the limits on jumps assume. So `doctor` and `status` compare both rates.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 
+import numpy as np
+
 from thermoctl.channels import CHANNELS
-from thermoctl.daemon.shared import Shared
+from thermoctl.daemon.shared import COUNTER_WORDS, Shared
 from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 
@@ -17,6 +20,7 @@ SLOW_SHARE = (
     0.5  # of rate_hz: a lower rate is reported; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3
 )
 LOOK_ROWS = 4000  # newest ticks in which `status` counts readings
+ATTEMPTS = 3  # to read the counters while the loop writes them, once a second
 FEWEST = 10  # expected readings in that time, below which no rate is reported
 
 
@@ -44,6 +48,26 @@ def slow(role: str, found_hz: float, expected: Mapping[str, float], reads_hz: fl
         f"slow, {found_hz:.3g} of {expected[role]:.4g} Hz arrive: set the device faster, "
         "or rate_hz in its profile to what it can do"
     )
+
+
+def put_counters(shared: Shared, counters: Mapping[str, int]) -> None:
+    """Publish a back end's counters by `<device>.<counter>`; those that do not fit are left as they were."""
+    by_device: dict[str, dict[str, int]] = {}
+    for name, count in counters.items():
+        device, _, counter = name.rpartition(".")
+        by_device.setdefault(device, {})[counter] = int(count)
+    text = json.dumps(by_device).encode()
+    if by_device and len(text) <= 8 * (COUNTER_WORDS - 1):
+        shared.device_counters.put(np.frombuffer(text.ljust(-(-len(text) // 8) * 8), "f8").copy())
+
+
+def device_counters(shared: Shared) -> dict[str, dict[str, int]]:
+    """Return the newest counters by device: frames, errors, lost, reconnections and the driver's own."""
+    for _ in range(ATTEMPTS):
+        if (words := shared.device_counters.get()) is not None:
+            found: dict[str, dict[str, int]] = json.loads(np.asarray(words).tobytes())
+            return found
+    return {}
 
 
 def slow_readings(shared: Shared, expected: Mapping[str, float]) -> list[str]:

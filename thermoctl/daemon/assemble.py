@@ -1,4 +1,4 @@
-"""Make what the law needs from the configuration: parameters, the model, names of shared memory."""
+"""Make the law's inputs from the configuration: parameters, the model, names of shared memory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UNNAMED = RigSettings().name
 
 
 def law_parameters(settings: Settings) -> Parameters:
-    """Gains, limits and protection of `settings` as the law takes them. Raises InputError for an unknown channel."""
+    """Return the law's parameters from `settings`. Raises InputError for an unknown channel."""
     given: dict[str, Any] = vars(settings.control) | vars(settings.compensation) | vars(settings.protection)
     given |= {
         "compensate": settings.compensation.enable,
@@ -68,7 +68,7 @@ def power_warning(settings: Settings) -> str:
 
 
 def compensator(settings: Settings) -> CompensatorModel:
-    """Load the model that `compensation.model` names; without one, a model that estimates nothing.
+    """Load the model that `compensation.model` names, else a model without rises and expansion.
 
     Raises InputError for a model of another rig.
     """

@@ -1,8 +1,8 @@
 # cython: language_level=3, cdivision=True
 """The clock of the loop: CLOCK_MONOTONIC in nanoseconds, and sleeping until a point of it.
 
-Absolute clock_nanosleep keeps the phase whatever a tick took, and is the best of the ways to wait that were measured
-(docs/explanation/why-cython.md). The interpreter's lock is released meanwhile.
+Absolute clock_nanosleep keeps the phase however long a tick took. It was the best of the measured ways to
+wait (`docs/explanation/why-cython.md`). The interpreter's lock is released meanwhile.
 """
 from posix.time cimport CLOCK_MONOTONIC, CLOCK_REALTIME, clock_gettime, timespec
 
@@ -40,9 +40,9 @@ cpdef int64_t suspended_ns() noexcept:
 
 
 cpdef int64_t sleep_until(int64_t deadline_ns, int64_t spin_ns=0) noexcept:
-    """Sleep until `deadline_ns`, burning the last `spin_ns` of it; returns the time after, ns.
+    """Sleep until `deadline_ns`, busy-waiting for the last `spin_ns`; return the time after, ns.
 
-    Returns early only when a signal came, so that Python's handlers run.
+    Returns early only after a signal, so that Python's handlers run.
     """
     cdef timespec t
     cdef int64_t until = deadline_ns - spin_ns, now

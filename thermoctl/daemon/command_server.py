@@ -1,7 +1,7 @@
 """The server's side of the command socket, in a process of its own; control_socket.py is the client's side.
 
-The file permissions of the socket (owner and group) decide who may connect. Each command that moves anything is
-logged with the kernel's peer credentials. Every size that a client decides is limited.
+The file permissions of the socket (owner and group) decide who may connect. Each command that moves anything
+is logged with the kernel's peer credentials. Every size that a client decides is limited.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ class Commands:
         name = request["command"]
         if name == "status":
             slow = arrival.slow_readings(self.shared, self.expected_hz)
-            return {"ok": True, **status(self.shared), "slow": slow}
+            counted = arrival.device_counters(self.shared)
+            return {"ok": True, **status(self.shared), "slow": slow, "device_counters": counted}
         if name == "latency":
             return {"ok": True, **latency(self.shared, self.settings.loop.period_s)}
         if name == "signals":

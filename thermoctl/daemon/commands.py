@@ -1,4 +1,4 @@
-"""Commands that ask a running daemon: status, latency, arm, disarm, setpoint, reload.
+"""Commands to a running daemon: status, latency, arm, disarm, setpoint, reload.
 
 They load neither numpy nor drivers, so they answer at once.
 """
@@ -9,7 +9,7 @@ import json
 import sys
 
 from thermoctl.daemon.control_socket import ask
-from thermoctl.daemon.display import fault_lines, value_lines
+from thermoctl.daemon.display import counter_lines, fault_lines, value_lines
 from thermoctl.daemon.lock import holder
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
@@ -59,7 +59,7 @@ def status(settings: Settings, as_json: bool = False) -> int:
         f"busy {answer['busy_us']:.0f} us"
     )
     print("\n".join([*fault_lines(answer["faults"]), *value_lines(answer)]))
-    for line in answer.get("slow", ()):
+    for line in (*answer.get("slow", ()), *counter_lines(answer)):
         print(line)
     if answer.get("tuning_percent") is not None:
         print(f"tuning of the expansion model: {answer['tuning_percent']:.0f} % of the excitation seen")

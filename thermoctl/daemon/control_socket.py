@@ -1,7 +1,7 @@
 """The client's side of the command socket: one JSON object a line each way over a Unix socket.
 
-A request is {"command": NAME, ...}; the answer is {"ok": true, ...} or {"ok": false, "error": TEXT}. The server is
-command_server.py. This module loads nothing slow: `thermoctl status` starts with it.
+A request is {"command": NAME, ...}; the answer is {"ok": true, ...} or {"ok": false, "error": TEXT}. The
+server is command_server.py. This module loads nothing slow: `thermoctl status` starts with it.
 """
 
 from __future__ import annotations

@@ -9,10 +9,10 @@
     GET  /metrics           with --metrics
     POST /api/command       arm, disarm, setpoint; with --commands only
 
-Access: on loopback every user of this machine may read. On other addresses, and for every command, the token is
-needed ("Authorization: Bearer TOKEN"; the page takes it from the address's #token=). Requests of other web pages
-are refused (Host, Origin, Sec-Fetch-Site). So are requests that are too large, too slow or too many. The protocol
-is plain HTTP: beyond the machine, use an ssh tunnel or a TLS proxy.
+Access: on loopback every user of this machine may read. On other addresses, and for every command, the token
+is needed ("Authorization: Bearer TOKEN"; the page takes it from the address's #token=). Requests of other web
+pages are refused (Host, Origin, Sec-Fetch-Site). So are requests that are too large, too slow or too many.
+The protocol is plain HTTP: beyond the machine, use an ssh tunnel or a TLS proxy.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class Handler(BaseHTTPRequestHandler):
             self._json({"ok": False, "error": str(e)}, HTTPStatus.BAD_REQUEST)
 
     def _receive(self) -> tuple[bytes, bytes]:
-        """(head with its empty line, what came after it). Raises Refused when it is too large or too slow."""
+        """Return (head with its empty line, bytes after it). Raises Refused when too large or too slow."""
         data, deadline = b"", time.monotonic() + REQUEST_S
         while b"\r\n\r\n" not in data:
             if len(data) > MAX_HEAD:
@@ -403,7 +403,7 @@ def _dump(value: Any) -> str:
 
 
 def _numbers(array: np.ndarray, digits: int | None = None) -> list[float | None]:
-    """For JSON: seven significant digits (or `digits` after the point), null where there is none."""
+    """Round numbers for JSON: seven significant digits (or `digits` after the point), null for NaN."""
     return [
         None if not math.isfinite(v) else round(v, digits) if digits is not None else float(f"{v:.7g}")
         for v in array.tolist()

@@ -12,6 +12,7 @@ from typing import Any
 from thermoctl.daemon.sources import SOURCES
 
 LATE_REMEDY = "docs/how-to/real-time.md: stop other programs on the loop's processor; `thermoctl latency` shows the lateness"
+_NORMAL = ("frames", "rows")  # counters of devices that count what is well
 
 
 def shown(reading: Mapping[str, Any] | None, digits: int = 2) -> str:
@@ -113,6 +114,15 @@ def message_lines(status: Mapping[str, Any]) -> list[str]:
         reset = "" if code["stands"] else ", reset since"
         lines.append(f"the drive's error code {code['text']} at {clock(code['wall_s'])}{reset}")
     return lines
+
+
+def counter_lines(status: Mapping[str, Any]) -> list[str]:
+    """List a line for each device that counted errors, lost frames or reconnections."""
+    return [
+        f"{device}: " + ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        for device, counts in status.get("device_counters", {}).items()
+        if any(count for name, count in counts.items() if name not in _NORMAL)
+    ]
 
 
 def clock(wall_s: float) -> str:

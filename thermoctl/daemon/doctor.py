@@ -1,7 +1,7 @@
-"""Commands that examine a rig that no daemon holds: `check` reads files only, `doctor` connects and reads.
+"""Examine a rig while no daemon holds it: `check` reads files only, `doctor` connects and reads.
 
-The checks of real time read /proc and /sys below `root` and change nothing. docs/how-to/real-time.md
-explains each.
+The checks of real time read /proc and /sys below `root` and change nothing. docs/how-to/real-time.md explains
+them.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ class _Readings:
 def doctor(settings: Settings, seconds: float = 2.0) -> int:
     """Connect and read every channel for `seconds`; print value, unit and rate. Drives nothing.
 
-    Returns 1 when a channel is bad. Then prints which properties of the machine make ticks late, with remedies
-    (docs/how-to/real-time.md); these do not change the exit status."""
-    if (pid := holder(settings)) is not None:  # a second master on its buses could disarm it
+    Returns 1 when a channel is bad. Then prints which properties of the machine make ticks late, with
+    remedies (docs/how-to/real-time.md); these do not change the exit status."""
+    if (pid := holder(settings)) is not None:  # a second master on the buses could disarm the rig
         raise InputError(
             f"{settings.path}: pid {pid} holds the rig; look with `thermoctl status`, or stop it first"
         )
@@ -94,7 +94,7 @@ def _read_for(backend: Backend, seconds: float, period_s: float) -> _Readings:
         for role, fresh in zip(ROLES, sample.fresh, strict=True):
             counts[role] += int(fresh)
         reads += 1
-        backend.write(0.0, False)  # a drive answers to its SYNC; it stays disabled
+        backend.write(0.0, False)  # a drive sends readings after each SYNC; it stays disabled
         time.sleep(period_s)
         now = time.monotonic()
     return _Readings(reads, counts, sample)

@@ -1,4 +1,4 @@
-"""The daemon's log: lines on stderr, and the watcher that writes what the loop itself cannot."""
+"""The daemon's log: lines on stderr, and the watcher that logs for the loop."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from thermoctl.daemon.display import LATE_REMEDY
 from thermoctl.daemon.shared import Shared
 from thermoctl.signals import INDEX, fault_words
 
-TELL_AGAIN_S = 10.0  # a fault that comes and goes is logged at most once in this time
+TELL_AGAIN_S = 10.0  # an intermittent fault is logged at most once in this time
 Log = Callable[..., None]
 
 

@@ -1,10 +1,11 @@
-"""The law's estimates across a restart: saved by the supervisor, restored by the next loop.
+"""Keep the law's estimates across a restart: the supervisor saves them, the next loop restores them.
 
-Saved are temperatures, expansion, compensation and the encoders' zeros. Arming, setpoint and controller
-are not: a restarted daemon is as safe as a new one. The estimates are restored when they are of this boot
-of the machine and of this model, and not older than KEEP_S. The coil's first reading must also lie within
-RESUME_LIMIT_C of them (law.resume); otherwise the estimate starts at that reading. The time in between is
-advanced without power.
+Saved are temperatures, expansion, compensation and the encoders' zeros. Arming, setpoint and controller are
+not: a restarted daemon is as safe as a new one.
+
+They are restored only within KEEP_S, after no reboot, and for the same model. The coil's first reading must
+also lie within RESUME_LIMIT_C of them (law.resume); otherwise the estimate starts at that reading. The pause
+is simulated without power.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.recorder import decode, encode
 from thermoctl.settings import Settings
 
-KEEP_S = 600.0  # older estimates say little about the rig's slow parts
-EVERY_S = 5.0  # between two times that the supervisor keeps them
+KEEP_S = 600.0  # older estimates are useless for the rig's slow parts
+EVERY_S = 5.0  # time between two savings by the supervisor
 MAX_BYTES = 65536
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
 def kept_path(settings: Settings) -> Path:
-    """Where a daemon keeps its estimates: beside its socket."""
+    """Return the file of a daemon's saved estimates, beside its socket."""
     return Path(settings.socket.path).with_suffix(".state")
 
 

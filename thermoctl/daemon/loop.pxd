@@ -6,7 +6,7 @@ from thermoctl.control.law cimport Law
 from thermoctl.daemon.clock cimport now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring cimport Histogram, Mailbox, Record, Remarks, Ring
 
-cdef int _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS, _THERMAL, _THERMAL_END, _LATEST, _N, _OFF, _STATE, _CODE, _ABSENT
+cdef int _STATE_EVERY, _COUNTERS_AT, _SUSPEND_EVERY, _SUSPEND_NS, _THERMAL, _THERMAL_END, _LATEST, _N, _OFF, _STATE, _CODE, _ABSENT
 cdef double _DELAY_S
 
 cdef class Rig:

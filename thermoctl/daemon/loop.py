@@ -4,10 +4,10 @@
     sample -> estimate -> compensate -> control -> protect -> actuate -> publish
 
 Nothing in a tick waits, parses, logs or touches a disk. A tick that takes too long skips the ticks it
-covered; they are counted and published, and the phase is kept (policy `skip`). A tick of real devices runs
-in C from end to end (loop.pxd has the types): after a sleep Python's objects are out of the cache, and
-each costs a miss. Priority, locked memory, processor and latency request are asked for one by one. Each
-refusal is one warning, never a crash.
+covered. They are counted and published, and the phase is kept (policy `skip`). A tick of real devices runs in
+C from end to end (loop.pxd has the types). After a sleep, Python's objects are no longer in the cache. Each
+of priority, locked memory, processor and latency limit is requested from the kernel. A refusal is a warning,
+not an error.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from thermoctl.channels import CHANNELS, THERMAL
 from thermoctl.control import arming, faults
 from thermoctl.control.law import DELAY_S, Law
 from thermoctl.control.model import CompensatorModel, Parameters
+from thermoctl.daemon.arrival import put_counters
 from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring import Mailbox, Record, Remarks, Ring
 from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
@@ -37,13 +38,14 @@ RELOAD = float(len(arming.COMMANDS))
 """The mailbox command that applies the parameter block; the others are arming's."""
 SUSPEND_NS = 1_000_000  # a smaller difference is no suspend: the two clocks are read one after the other
 SUSPEND_EVERY = 16  # ticks between two checks for a suspend
-STATE_EVERY = 1000  # ticks between two snapshots of the law's state
+STATE_EVERY = 1000  # ticks between two snapshots of the law's state, and between two of the devices' counters
 _HEAD = INDEX["position_raw_um"]  # numbers of a row before the channels, in the order of `publish`
 _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = (
     STATE_EVERY,
     SUSPEND_EVERY,
     SUSPEND_NS,
 )  # numbers of C, by loop.pxd
+_COUNTERS_AT = STATE_EVERY // 2  # not in the tick of the law's state
 _THERMAL, _THERMAL_END = CHANNELS.index(THERMAL[0]), CHANNELS.index(THERMAL[0]) + len(THERMAL)
 _DELAY_S, _LATEST = DELAY_S, 15
 _N, _OFF, _STATE, _CODE = len(CHANNELS), arming.OFF, INDEX["state"], INDEX["amplifier_fault"]
@@ -173,7 +175,7 @@ class Rig:
             self.keep_state()
 
     def remark(self, t_s: float, dt_s: float) -> None:
-        """Publish what the row does not hold: ages, verdicts, onsets and the devices' messages.
+        """Publish the remarks: ages, verdicts, onsets and the devices' messages.
 
         One channel a tick is checked for a new message; all are checked when a fault is new. Nothing is a
         fault while the law warms up.
@@ -252,6 +254,8 @@ def run_loop(
             rig.tick(rig.start_s + (rig.law.tick + 1) * rig.law.period_s, rig.law.period_s, lateness_us)
         else:
             rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)
+        if rig.law.tick % _STATE_EVERY == _COUNTERS_AT:
+            put_counters(shared, rig.backend.counters())
         if rig.law.tick > warm_up_ticks:
             lateness.add(lateness_us)
             busy.add(rig.busy_us)

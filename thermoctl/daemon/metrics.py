@@ -1,8 +1,8 @@
 """The daemon's numbers in Prometheus' text format (version 0.0.4).
 
-Every number of the newest row becomes `thermoctl_<signal>`, in the signal's unit; temperatures have the point as a
-label. An invalid number is NaN; `thermoctl_reading_ok` and `thermoctl_reading_age_seconds` give state and age by role.
-Lateness and busy time are histograms in seconds, faults are 0 or 1 each.
+Every number of the newest row becomes `thermoctl_<signal>`, in the signal's unit; temperatures have the point
+as a label. An invalid number is NaN; `thermoctl_reading_ok` and `thermoctl_reading_age_seconds` give state
+and age by role. Lateness and busy time are histograms in seconds, faults are 0 or 1 each.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
     S^2 = R_v / (1 - C K), the variance that the filter expects (35)
     g   = max(0, g +- z - DRIFT);  alarm when g > LIMIT; both signs
 
-While the model fits, z is about standard normal and the sums fall back to zero. When it does not, the sum gives the
-alarm, and its last zero the onset.
+While the model fits, z is about standard normal and the sums fall back to zero. When it does not, the sum
+gives the alarm, and its last zero the onset.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 
 from thermoctl.control.model import CompensatorModel
 
-BLOCK_S = 20.0  # of innovations in one value
-DRIFT = 1.0  # tuned to a lasting shift of two standard errors of a block
+BLOCK_S = 20.0  # duration of the innovations averaged to one z
+DRIFT = 1.0  # half of the shift to detect, which is two standard errors of a block
 LIMIT = 15.0
 CLIP = 4.0  # limit of |z|, so that no single block raises an alarm
 CORRELATED = 4.0  # samples that count as one: quantisation correlates neighbours
@@ -51,7 +51,8 @@ class Misfit:
         self._rows = np.empty((3, 0))  # of the block that is not complete: t, innovation, gain
         self._last_t, self._last_c = -math.inf, math.nan
         self.sums = [0.0, 0.0]
-        self._since, self._total, self._blocks = [0.0, 0.0], [0.0, 0.0], [0, 0]  # of a sum since it was zero
+        # since each sum was zero: start time, total, number of blocks
+        self._since, self._total, self._blocks = [0.0, 0.0], [0.0, 0.0], [0, 0]
         self.alarmed = False
 
     def add(self, t_s: np.ndarray, innovation_c: np.ndarray, kalman_gain: np.ndarray) -> Alarm | None:
@@ -63,7 +64,7 @@ class Misfit:
         found = None
         if not self._watches or not rows.shape[1]:
             return found
-        begins = np.flatnonzero(np.diff(rows[0], prepend=self._last_t) < 0.0)  # the clock began again
+        begins = np.flatnonzero(np.diff(rows[0], prepend=self._last_t) < 0.0)  # the clock restarted
         for k, part in enumerate(np.split(rows, begins, axis=1)):
             if k > 0:
                 self.restart()
@@ -102,7 +103,8 @@ class Misfit:
             self._blocks[side] += 1
             if self.sums[side] > LIMIT:
                 found = Alarm(self._since[side], float(rows[0, -1]), self._total[side] / self._blocks[side])
-                self.sums[side] = LIMIT  # so that it falls back soon after the model fits again
+                # so that the sum soon falls below the limit when the model fits again
+                self.sums[side] = LIMIT
         new = found is not None and not self.alarmed
         if found is not None:
             self.alarmed = True

@@ -32,7 +32,7 @@ _READINGS = {
     "innovation": "coil_c",
     "air": "air_c",
 }
-"""Rows of the numbers and the channel that they stand or fall with."""
+"""Rows of the numbers, and the channel that must be valid for each."""
 TRAILS = (
     ("compensated", "compensated_um", "um", 3),
     ("error with", "with", "um", 3),
@@ -157,7 +157,7 @@ def _temperatures(status: dict[str, Any]) -> Table:
     estimated = status["estimates_state"] == "OK"
     for title in ("meas.", "est." if estimated else "est.?", "diff."):
         table.add_column(title, justify="right")
-    table.add_column(no_wrap=True)  # age of what is not valid
+    table.add_column(no_wrap=True)  # age of an invalid reading
     for name, measured in status["temperatures_c"].items():
         estimate, reading = status["estimates_c"][name], status["readings"][f"{name}_c"]
         difference = None if measured is None or estimate is None else measured - estimate

@@ -1,12 +1,12 @@
 """Publish the rig's state to an MQTT broker; it accepts no commands. Needs `pip install 'thermoctl[mqtt]'`.
 
-    TOPIC/availability   `online` while the daemon answers, else `offline`. The broker publishes `offline` when
-                         this program is gone (last will). Retained.
+    TOPIC/availability   `online` while the daemon answers, else `offline`. The broker publishes `offline`
+                         when this program is gone (last will). Retained.
     TOPIC/status         the output of `thermoctl status --json`, RATE times a second
     TOPIC/faults         active faults with meaning and remedy, when they change. Retained.
 
-The default TOPIC is thermoctl/RIG. Messages that cannot be sent while the broker is away are dropped: only the newest
-state matters, and the recording has the rest.
+The default TOPIC is thermoctl/RIG. While the broker is away, messages are dropped: only the newest state
+matters, and the recording has the rest.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Bridge:
         if self.connected.is_set():
             with contextlib.suppress(
                 RuntimeError, ValueError
-            ):  # disconnected just now: the last will publishes it
+            ):  # the connection was just lost: the last will publishes it
                 self.client.publish(
                     f"{self.topic}/availability", OFFLINE, qos=1, retain=True
                 ).wait_for_publish(2.0)

@@ -27,14 +27,14 @@ from thermoctl.daemon.shared import BEATS, RESUMED, WARNINGS, Shared
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
-HANG_S = 15.0  # a helper that does no round for this time is killed and started again
+HANG_S = 15.0  # a helper without a round for this time is killed and started again
 STOP_S = 10.0  # a helper that does not end within this time after the request is killed
 RESTART_S = 0.5  # pause before a child is started again; doubled at each restart
 RESTART_LONGEST_S = 30.0  # longest pause; a child that ran longer than this starts again after RESTART_S
 EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_HARDWARE = 0, 1, 2, 3
 
 RECORDER, COMMANDS, REFERENCE = range(3)
-"""The helpers' places among shared.BEATS."""
+"""The helpers' indices among shared.BEATS."""
 
 _fork = multiprocessing.get_context("fork")
 
@@ -56,7 +56,7 @@ class Stop:
 
     def __call__(self) -> bool:
         if self.shared is not None:
-            self.shared.counters[BEATS + self.beat] += 1  # asked once a round: a round done
+            self.shared.counters[BEATS + self.beat] += 1  # called once a round, so this counts the rounds
         return self.asked
 
 
@@ -95,13 +95,13 @@ def _loop_process(settings: Settings, shared: Shared, board: Any) -> int:
 
 
 def _resume(settings: Settings, shared: Shared, rig: loops.Rig) -> None:
-    """Restore the estimates of the run before, when they are recent and of this model."""
+    """Restore the previous run's estimates, when they are recent and of this model."""
     state, age_s, why = keep.load(keep.kept_path(settings), rig.law.model)
     if state is not None:
         try:
             rig.law.resume(state, age_s)
             shared.counters[RESUMED] = 1.0
-            rig.keep_state()  # where a replay of this run begins
+            rig.keep_state()  # start of a replay of this run
         except ValueError as e:
             state, why = None, str(e)
     console_log(
@@ -187,7 +187,7 @@ class Child:
         self.started = self.heard_at = time.monotonic()
 
     def hangs(self, now: float) -> bool:
-        """Return whether it lives and has not done a round for HANG_S."""
+        """Return whether the process runs without a completed round for HANG_S."""
         if self.beats is None or not self.alive:
             return False
         if (beats := self.beats()) != self.heard:
@@ -227,7 +227,7 @@ def restart(children: list[Child], now: float, log: Log) -> None:
         if child.hangs(now):
             log(f"{child.name} hangs: killed", seconds=round(now - child.heard_at, 1))
             child.process.kill()
-            child.heard_at = now  # one kill; it is gone at the next look
+            child.heard_at = now  # kill it only once
         if child.alive:
             continue
         if child.again_at == 0.0:
@@ -242,7 +242,7 @@ def restart(children: list[Child], now: float, log: Log) -> None:
 
 
 def make_children(settings: Settings, shared: Shared) -> tuple[Board | None, Child, list[Child]]:
-    """Make the board of slow readings (None without slow devices), the loop, and the helpers; start nothing."""
+    """Make the board of slow readings (None without slow devices), the loop and the helpers."""
     slow = slow_devices(settings) if settings.hal.backend == "devices" else []
     board = Board.create(shared_name(settings) + "-board") if slow else None
 

@@ -1,10 +1,11 @@
 """The recorder process: moves the ring's rows into a recording, ten times a second.
 
-Nothing waits for it. When it falls behind by more than the ring holds, the lost ticks are counted and
-shown by `status`. A recording holds the effective configuration, the model, the law's parameters, and a
-state of the law where a replay starts. A reload starts a new file, so that a file has one set of
-parameters. The recorder also tests the innovations: when the model no longer fits, it writes so into the
-log.
+Nothing waits for it. When it falls behind by more than the ring's length, the lost ticks are counted and
+shown by `status`.
+
+A recording holds the effective configuration, the model, the law's parameters, and a state of the law where a
+replay starts. A reload starts a new file, so that a file has one set of parameters. The recorder also tests
+the innovations, and logs when the model no longer fits.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from thermoctl.settings import Settings
 from thermoctl.signals import INDEX
 
 INTERVAL_S = 0.1
-LAW_VERSION = 2  # of the law's inputs, state and arithmetic: a replay is bit for bit only within one
+LAW_VERSION = 3  # of the law's inputs, state and arithmetic: a replay is bit for bit only within one
 _TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
 
 
@@ -36,7 +37,7 @@ def encode(array: np.ndarray) -> str:
 
 
 def decode(text: str) -> np.ndarray:
-    """Return the array that `encode` made into text, flat."""
+    """Return the flat array of a text from `encode`."""
     return np.frombuffer(base64.b64decode(text, validate=True))
 
 
@@ -48,7 +49,7 @@ def law_metadata(
     tick: int,
     state: np.ndarray | None,
 ) -> str:
-    """Return what a replay needs besides the rows, as JSON.
+    """Return the data that a replay needs besides the rows, as JSON.
 
     These are the model, the parameters, and the law's state after `tick` (None: a new law).
     """
@@ -72,7 +73,7 @@ def law_metadata(
 
 
 def read_law_metadata(text: str) -> dict[str, Any]:
-    """Read what `law_metadata` wrote.
+    """Read the text of `law_metadata`.
 
     Keys: period_s, generation, tick, state (or None), parameters (Parameters), model (CompensatorModel).
     """
@@ -113,13 +114,13 @@ class Recorder:
         self.shared, self.model, self.parameters, self.period_s = shared, model, parameters, period_s
         self.open_writer = open_writer
         kept = shared.state.get()
-        # Row k of the ring is tick k + 1. A recorder that was started again begins after the last kept state.
+        # Row k of the ring is tick k + 1. A restarted recorder begins after the last saved state.
         self.position = min(shared.ring.head, int(kept[0])) if kept is not None else 0
         self.generation = -1
         self.writer: Any = None
 
     def move(self) -> int:
-        """Write what the ring has; returns the rows written."""
+        """Write the ring's new rows; return their number."""
         rows, self.position, lost = self.shared.ring.read(self.position)
         self.shared.counters[RECORDER_LOST] += lost
         written, all_rows = len(rows), rows
@@ -215,7 +216,7 @@ def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) 
 
 
 def record(recorder: Recorder, stopping: Callable[[], bool]) -> None:
-    """Record until `stopping()`, then write what is left in the ring."""
+    """Record until `stopping()`, then write the rest of the ring."""
     while not stopping():
         recorder.move()
         time.sleep(INTERVAL_S)

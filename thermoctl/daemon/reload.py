@@ -1,4 +1,4 @@
-"""Reload: the whole file is validated again; what may change while running is applied between two ticks."""
+"""Reload: validate the whole file again; apply the options that need no restart between two ticks."""
 
 from __future__ import annotations
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.control.law import OUTPUTS, Law
+from thermoctl.control.law import Law
 from thermoctl.daemon.recorder import read_law_metadata
 from thermoctl.daemon.ring import unpack_readings
 from thermoctl.recording.reader import info, read_rows
-from thermoctl.signals import INDEX
+from thermoctl.signals import INDEX, OUTPUTS
 from thermoctl.yamlfile import InputError
 
 _CHANNELS, _OUTPUTS = INDEX["position_raw_um"], INDEX["state"]
@@ -36,7 +36,8 @@ class Replay:
 def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Replay:
     """Run `rows` (ticks, len(SIGNALS)) through a law made from the recording's own metadata.
 
-    A recording of this law's version has its fault bits: a bit is never given to another fault (control/faults.py).
+    A recording of this law's version has its fault bits: a bit is never given to another fault
+    (control/faults.py).
 
     Raises InputError when the metadata is missing or damaged, or ticks are missing.
     """

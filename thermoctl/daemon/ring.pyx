@@ -1,12 +1,13 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
-"""The structures in shared memory that the loop writes and others read without making it wait.
+"""Structures in shared memory that the loop writes and others read; a reader never makes the loop wait.
 
-Ring: rows of float64, one a tick. The writer fills a slot, then publishes it by raising `head`; a reader copies rows and
-reads `head` again: rows that may have been overwritten meanwhile are dropped and counted. The newest row is the last one.
-Mailbox: (kind, value) commands from one producer to the loop, lock-free, oldest refused when full.
-Box: one vector with a sequence number (odd while written): parameters to the loop, the law's state from it.
-Histogram: counts of whole microseconds.
-Remarks: what the row does not hold: age and verdict of each reading, onset of each active fault, messages of the devices.
+- Ring: rows of float64, one a tick; the newest row is the last one. The writer fills a slot, then raises
+  `head`. A reader copies rows and reads `head` again. Rows that may have been overwritten meanwhile are
+  dropped and counted.
+- Mailbox: (kind, value) commands from one producer to the loop, lock-free; refuses when full.
+- Box: one vector with a sequence number (odd while written): parameters to the loop, the law's state from it.
+- Histogram: counts of whole microseconds.
+- Remarks: age and verdict of each reading, onset of each active fault, messages of the devices.
 """
 from libc.stdint cimport uint64_t
 from libc.string cimport memcpy
@@ -50,7 +51,7 @@ cdef class Ring:
         store_release(&self.counter[0], head + 1)
 
     def read(self, uint64_t position, int limit=1 << 30):
-        """Read from `position` on; return (rows (n, columns), next position, rows lost before the first one)."""
+        """Return (rows (n, columns) from `position` on, next position, rows lost before them)."""
         cdef uint64_t head = load_acquire(&self.counter[0]), first, k, after, keep, lost = 0
         cdef double[:, ::1] out
         if position > head:
@@ -122,7 +123,7 @@ cdef class Mailbox:
 
 
 cdef class Box:
-    """One vector that is replaced whole: `counter` uint64 (1,), `vector` float64 (n,); the first number is its length."""
+    """One vector, replaced whole. `counter`: uint64 (1,); `vector`: float64 (n,), its length first."""
     cdef uint64_t[::1] counter
     cdef double[::1] vector
 
@@ -152,7 +153,8 @@ cdef class Box:
 
 
 cdef class Histogram:
-    """`counts` uint64 (bins + 1,): whole microseconds, the last bin takes everything longer; `extremes` float64 (1,)."""
+    """Histogram of whole microseconds: `counts` uint64 (bins + 1,), last one open; `extremes` float64 (1,).
+    """
 
     def __init__(self, uint64_t[::1] counts, double[::1] largest):
         self.counts, self.largest = counts, largest
@@ -167,17 +169,22 @@ cdef class Histogram:
 
 
 cdef class Record:
-    """The record row of a tick. The loop writes the first `head` scalars itself; `fill` copies the rest from bound arrays.
+    """The record row of a tick. The loop writes the first `head` scalars itself; `fill` copies the rest.
 
-    Layout (signals.SIGNALS): head scalars | values of the channels | fresh bits (one a channel) | status bits (two) |
-    delay bits (four a temperature) | outputs of the law; the bits as whole float64 numbers.
+    Layout (signals.SIGNALS), with bits as whole float64 numbers:
+
+        head scalars | values of the channels | fresh bits (one a channel) | status bits (two a channel) |
+        delay bits (four a temperature) | outputs of the law
     """
     def __init__(self, double[::1] row, int head):
         self.row, self.head = row, head
 
     def bind(self, double[::1] value, unsigned char[::1] fresh, unsigned char[::1] status, unsigned char[::1] delay,
              double[::1] outputs):
-        """Set the arrays to copy from, of the back end's sample and of the law. Raises ValueError where they do not make up a row."""
+        """Set the arrays to copy from: the back end's sample and the law's outputs.
+
+        Raises ValueError when they do not make up a row.
+        """
         if self.head + value.shape[0] + 3 + outputs.shape[0] != self.row.shape[0] or value.shape[0] > 26:
             raise ValueError(f"{self.head} + {value.shape[0]} + 3 + {outputs.shape[0]} numbers are not a row of {self.row.shape[0]}")
         self.value, self.fresh, self.status, self.delay, self.outputs = value, fresh, status, delay, outputs
@@ -197,18 +204,22 @@ cdef class Record:
 
 
 TRIPS, CODE, CODE_S = range(3)
-"""Places in `Remarks.numbers`: fault bits that trip; the drive's newest error code other than 0, and when it came (t_s)."""
+"""Indices in `Remarks.numbers`: fault bits that trip; the drive's last nonzero error code, its t_s."""
 LATE_TICKS = 5.0    # a gap of more periods than this is reported beside a fault
 LATE_FOR_S = 1.0    # time after the gap for which it is reported
 
 
 cdef class Remarks:
-    """What the loop publishes besides the row. Channels are channels.CHANNELS.
+    """Data that the loop publishes besides the row. Channels are channels.CHANNELS.
 
-    ages, verdicts float64 (channels,): of every tick, as in the law;  numbers float64 (3,): TRIPS, CODE, CODE_S;
-    onsets float64 (64, 3): t_s and tick of each fault bit's onset, longest tick of the second before where late, s, else 0;
-    sequences uint64, times float64 (channels,), texts uint8 (channels, n): one message a channel and the t_s of its onset,
-    a seqlock each, written when the message changes. The message is kept when the channel is valid again.
+        ages, verdicts   float64 (channels,): of every tick, as in the law
+        numbers          float64 (3,): TRIPS, CODE, CODE_S
+        onsets           float64 (64, 3): t_s and tick of each fault bit's onset; longest late tick in the
+                         second before, s, else 0
+        messages         one a channel, with the t_s of its onset and a seqlock: sequences uint64, times
+                         float64 (channels,), texts uint8 (channels, n)
+
+    A message is written when it changes. It is kept when the channel is valid again.
     """
 
     def __init__(self, double[::1] ages, double[::1] verdicts, double[::1] numbers, double[:, ::1] onsets,
@@ -252,7 +263,10 @@ cdef class Remarks:
         store_release(&self.sequences[channel], before + 2)
 
     def get(self, int channel):
-        """Return (changes so far, t_s of the onset, message); (0, NaN, '') before the first. None while it is being written."""
+        """Return (number of changes, t_s of the onset, message), or None while it is being written.
+
+        It is (0, NaN, '') before the first message.
+        """
         cdef uint64_t before = load_acquire(&self.sequences[channel])
         if before == 0:
             return 0, float("nan"), ""
@@ -267,7 +281,7 @@ cdef class Remarks:
 
 def unpack_readings(double fresh_bits, double status_bits, double delay_bits, unsigned char[::1] fresh,
                     unsigned char[::1] status, unsigned char[::1] delay):
-    """Unpack what `Record.fill` packed, into the given arrays."""
+    """Unpack the bits that `Record.fill` packed, into the given arrays."""
     cdef uint64_t f = <uint64_t>fresh_bits, s = <uint64_t>status_bits, d = <uint64_t>delay_bits
     cdef int c
     for c in range(fresh.shape[0]):

@@ -27,12 +27,12 @@ STOP_S = 30.0  # the supervisor gives its processes 3 and 10 s before it kills t
 SOURCE = shipped("systemd")
 UNITS = "etc/systemd/system"
 FIRST = "thermoctl.service"  # the unit of the first rig; further ones are thermoctl-RIG.service
-SHARED = {  # what every unit needs
+SHARED = {  # files that every unit needs
     "thermoctl.sysusers": "etc/sysusers.d/thermoctl.conf",
     "thermoctl.tmpfiles": "etc/tmpfiles.d/thermoctl.conf",
     "99-thermoctl.rules": "etc/udev/rules.d/99-thermoctl.rules",
 }
-LIVE = Path("/run/systemd/system")  # there where systemd runs the machine
+LIVE = Path("/run/systemd/system")  # exists if systemd runs the machine
 
 
 def _systemctl(*arguments: str) -> int:
@@ -116,7 +116,7 @@ def stop(settings: Settings) -> int:
         return 0
     with contextlib.suppress(
         InputError
-    ):  # what does not answer is ended all the same; its end disables the amplifier
+    ):  # a process that does not answer is ended all the same; its end disables the amplifier
         ask(settings.socket.path, {"command": "disarm"})
     unit = _unit_of(pid)
     if unit:
@@ -126,7 +126,7 @@ def stop(settings: Settings) -> int:
         try:
             os.kill(pid, signal.SIGTERM)
         except ProcessLookupError:
-            pass  # it ends already
+            pass  # it is already ending
         except PermissionError:
             print(f"thermoctl: pid {pid} is another user's: stop it as that user or root", file=sys.stderr)
             return 3
@@ -146,7 +146,7 @@ def restart(settings: Settings) -> int:
 
 
 def log_path(settings: Settings) -> Path:
-    """Where a daemon that `start` put in the background writes its log: beside its socket."""
+    """Return the log file of a daemon that `start` put in the background, beside its socket."""
     return Path(settings.socket.path).with_suffix(".log")
 
 
@@ -162,7 +162,7 @@ class Background(subprocess.Popen[bytes]):
         with log.open("ab") as out:
             self.began = out.tell()
             super().__init__(
-                # -P: a folder here that is called thermoctl is not taken for the installed package
+                # -P: a folder `thermoctl` in the working directory must not hide the installed package
                 [
                     sys.executable,
                     "-P",
@@ -254,14 +254,14 @@ def _unit_name(settings: Settings, config: Path, root: Path) -> str:
 def _socket_of(config: Path) -> str | None:
     try:
         return load_settings(config).socket.path
-    except InputError:  # gone or broken: it collides with nothing
+    except InputError:  # missing or broken: no collision
         return None
 
 
 def uninstall(config: Path | None, root: Path = Path("/")) -> int:
     """Stop and remove the unit of this configuration (None: the only one).
 
-    With the last unit, what all units share is removed. User and recordings stay. Returns 1 where no such
+    With the last unit the shared files are removed, too. User and recordings stay. Returns 1 when no such
     unit is installed.
     """
     installed = units(root)

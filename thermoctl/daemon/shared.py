@@ -1,14 +1,16 @@
 """The shared memory of one daemon: the loop's output and its commands.
 
-One segment, named after the rig's socket, with version and layout in its header. The supervisor creates and removes
-it; a segment left behind by a killed daemon is replaced. It is a mapped file in SHARED_MEMORY. multiprocessing's own
-class is not used: it starts one more process, which removes the segment of a killed daemon at any later time.
+One segment, named after the rig's socket, with version and layout in its header. The supervisor creates and
+removes it; a segment left behind by a killed daemon is replaced. It is a mapped file in SHARED_MEMORY.
+multiprocessing's own class is not used: it starts one more process, which removes the segment of a killed
+daemon at any later time.
 
     ring        the record of every tick (rows in the order of signals.SIGNALS)
     mailbox     commands to the loop;  parameters: the block that a RELOAD command applies
     remarks     age and verdict of every reading, onset of every active fault, messages of the devices
     state       the law's state at intervals, with tick and generation: where a recording's replay starts
     lateness, busy, reference   histograms, microseconds
+    device_counters   frames, errors, reconnections of each device
     counters    start time, ticks of the reference loop, process ids
 """
 
@@ -36,6 +38,7 @@ ROWS = 8192  # ticks a reader may lag behind
 BINS = 4096  # us
 STATE_NUMBERS = 1024
 TEXT_WORDS = 40  # of 8 bytes each, for a device's message
+COUNTER_WORDS = 512  # of 8 bytes each, for the counters of all devices as text
 SHARED_MEMORY = Path("/dev/shm")
 
 _AREAS = (
@@ -60,12 +63,16 @@ _AREAS = (
     ("text_sequences", "u8", (len(CHANNELS),)),
     ("text_times", "f8", (len(CHANNELS),)),
     ("texts", "u8", (len(CHANNELS), TEXT_WORDS)),
+    ("device_counters_sequence", "u8", (1,)),
+    ("device_counters", "f8", (COUNTER_WORDS,)),
 )
 START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED, RUN_S = range(8)
-"""Places in `counters`. TUNING: 1 + percent, 0 without tuning. RESUMED: 1 when the law started with the estimates
-of an earlier run. RUN_S: start of this run, seconds since 1970."""
+"""Indices in `counters`. TUNING: 1 + percent, 0 without tuning. RUN_S: start of this run, seconds since 1970.
+
+RESUMED: 1 when the law started with the estimates of an earlier run.
+"""
 BEATS = 8
-"""First place in `counters` where each helper process counts its rounds; the supervisor detects one that hangs."""
+"""First index in `counters` of the helpers' round counts; the supervisor detects one that hangs."""
 _LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES, faults.NAMES]).encode())
 
 
@@ -88,6 +95,7 @@ class Shared:
         self.lateness = Histogram(a["lateness"], a["largest"][0:1])
         self.busy = Histogram(a["busy"], a["largest"][1:2])
         self.reference = Histogram(a["reference"], a["largest"][2:3])
+        self.device_counters = Box(a["device_counters_sequence"], a["device_counters"])
         self.counters = a["counters"]
         self.remarks = self.make_remarks()
 

@@ -125,7 +125,8 @@ def run_simulated(
 ) -> np.ndarray:
     """Run `duration_s` of rig time; returns every `every`-th row, (N, len(SIGNALS)).
 
-    schedule: (time_s, command, value) in order of time; command arm, disarm or setpoint (um). seed replaces hal.seed.
+    schedule: (time_s, command, value) in order of time; command arm, disarm or setpoint (um). seed replaces
+    hal.seed.
     """
     if seed is not None:
         settings = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, seed=seed))
@@ -146,16 +147,15 @@ def run_simulated(
     return rows
 
 
-SETTLE_S = 0.5  # time after the reference has reached the setpoint
+SETTLE_S = 0.5  # settling time at the setpoint before the deviation counts
 STROKE_UM, CYCLE_S = 200.0, 75.0
 
 
 def trapezoids(settings: Settings, hours: float, compensate: bool, out: str | None = None) -> int:
-    """Move in trapezoids of 75 s (the paper's test 4B) and print the output's deviation.
+    """Move in trapezoids of 75 s (the paper's test 4B); print mean and largest deviation of the output.
 
-    The reference encoder measures it, which the law never reads, whenever the reference has stood for
-    SETTLE_S. Prints mean and largest deviation. out: file of ten rows a second, Parquet. Returns 0 when
-    all deviations are within 0.5 um, else 1.
+    The reference encoder, which the law never reads, measures it while the reference has stood for SETTLE_S.
+    out: file of ten rows a second, Parquet. Returns 0 when all deviations are within 0.5 um, else 1.
     """
     parameters = dataclasses.replace(law_parameters(settings), compensate=float(compensate))
     simulation = Simulation(settings, parameters=parameters)

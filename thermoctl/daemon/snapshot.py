@@ -34,7 +34,7 @@ NUMBERS = (
     "amplifier_state",
     "amplifier_fault",
 )
-"""Signals that a status answer has under their own names."""
+"""Signals that a status answer contains under their own names."""
 
 
 def status(shared: Shared) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def latency(shared: Shared, period_s: float) -> dict[str, Any]:
         "slips": 0 if row is None else int(row[INDEX["slips"]]),
     }
     for k, name in enumerate(("lateness", "busy", "reference")):
-        counts = shared.areas[name].copy()  # the loop counts on meanwhile
+        counts = shared.areas[name].copy()  # the loop continues to count
         p50, p99, p999 = percentiles(counts)
         answer[name] = {
             "count": int(counts.sum()),

@@ -1,4 +1,4 @@
-"""Which channels a signal of the record comes from."""
+"""Find the channels that a signal of the recording is computed from."""
 
 from __future__ import annotations
 
@@ -13,5 +13,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "kalman_gain": ("coil_c",),
     "air_rate_k_s": ("air_c",),
 }
-"""Channels that must be valid for a signal to be valid. For a computed signal, ABSENT is allowed: the law does
-without that channel."""
+"""Channels that must be valid for a signal to be valid.
+
+A computed signal may have ABSENT channels: the law does without them.
+"""

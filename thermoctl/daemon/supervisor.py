@@ -7,10 +7,10 @@
               ├── tuner       learns the expansion model, when compensation.tune is on
               └── reference   an idle loop beside it, when loop.reference is on
 
-The loop ends: the supervisor disables the amplifier over its own link, and the daemon ends. systemd starts it again,
-into SAFE, with the estimates that were kept. The loop stands still: it is killed, then as if it had ended. Any other
-process ends or hangs: it is started again while the loop runs on. The supervisor ends: the kernel signals every child
-(PDEATHSIG), and the loop disables the amplifier.
+The loop ends: the supervisor disables the amplifier over its own link, and the daemon ends. systemd starts it
+again, into SAFE, with the estimates that were kept. The loop stands still: it is killed, then as if it had
+ended. Any other process ends or hangs: it is started again while the loop runs on. The supervisor ends: the
+kernel signals every child (PDEATHSIG), and the loop disables the amplifier.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from thermoctl.yamlfile import InputError
 READY_S = 60.0  # time limit of the first tick: devices connect before it
 STALL_S = 1.0  # a loop without a tick for this time, or for protection.late_s if longer, is ended
 LOOK_S = 0.1  # time between two checks
-# A longer time between two checks counts as this much of the loop's silence: the supervisor itself did not run.
+# At most this much time between two checks counts as silence of the loop: beyond it, the supervisor itself
+# was stopped.
 LOOK_LONGEST_S = 0.2
 LOOP_STOP_S = 3.0  # a loop that does not end within this time after the request is killed
 
@@ -65,7 +66,7 @@ def safe_amplifier(settings: Settings, log: Log) -> bool:
 
 
 class _Notify:
-    """Sends sd_notify messages without a library; does nothing where systemd did not start us."""
+    """Sends sd_notify messages without a library; does nothing when systemd did not start the daemon."""
 
     def __init__(self) -> None:
         self.address = os.environ.get("NOTIFY_SOCKET", "")
@@ -92,7 +93,7 @@ def run(settings: Settings, log: Log = console_log) -> int:
     lock = hold(settings)
     compensator(settings)
     law_parameters(settings)
-    if settings.compensation.tune:  # loaded only then: it brings scipy with it
+    if settings.compensation.tune:  # loaded only on demand, because it loads scipy
         from thermoctl.daemon import tuner
 
         tuner.check(settings)
@@ -145,7 +146,7 @@ class _Supervision:
         return EXIT_OK if code is None else code
 
     def _count_ticks(self, now: float) -> None:
-        """Feed systemd's watchdog when ticks were done; measure for how long none was."""
+        """Feed systemd's watchdog after new ticks; measure the time without any."""
         self.stood_s, self.looked = self.stood_s + min(now - self.looked, LOOK_LONGEST_S), now
         head = self.shared.ring.head
         if head != self.ticks:
@@ -158,7 +159,7 @@ class _Supervision:
             self.log("ready", ticks=head, seconds=round(now - self.started, 2))
 
     def _loop_failure(self) -> int | None:
-        """Return the exit status when the loop has ended or stands still (it is killed then), else None."""
+        """Return the exit status when the loop has ended or hangs (then it is killed), else None."""
         if not self.loop.alive and not self.asked:  # a signal to the whole group ends both
             code = self.loop.process.exitcode
             self.log("the loop ended", exit=code)

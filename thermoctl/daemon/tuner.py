@@ -1,8 +1,8 @@
 """The tuner process: learns the expansion model from the ring while the reference encoder is connected.
 
-compensation.tune starts it. It never touches the loop. A better model becomes a new calibration in the
-folder that compensation.model names, in use from the daemon's next start on; `thermoctl model rollback`
-undoes it. `status` shows the progress in percent.
+compensation.tune starts it. It never touches the loop. A better model becomes a new calibration in the folder
+of compensation.model. The daemon uses it from its next start; `thermoctl model rollback` undoes it. `status`
+shows the progress in percent.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ class Tuning:
             self.air_c = air
         if np.isnan(self.zero_um):
             self.zero_um = error
-        # the estimates are degC: rise and the air's own change together are their distance from the first air
+        # The model needs the distance from the first air temperature: rise + change of the air. The estimates
+        # are degC.
         self.tuner.update(estimates - air, error - self.zero_um, air - self.air_c)
         if rows[-1, _T] - self.proposed_s >= PROPOSE_S:
             self.proposed_s = float(rows[-1, _T])

@@ -35,10 +35,10 @@ from thermoctl.settings import Settings, effective, load_settings
 from thermoctl.yamlfile import InputError
 
 MOTION, CYCLE_S = ((0.0, 240.0), (70.0, 200.0)), 90.0
-"""Corners (s in the cycle, setpoint um). 240 um take 0.78 A and 2.9 W: the shaft grows by 2 um in a minute."""
+"""Corners (s in the cycle, setpoint um). 240 um need 0.78 A and 2.9 W: +2 um of shaft in a minute."""
 MEAN_S = 2.0  # averaging time of the displayed growth: a single reading has 0.01 um of noise
-SHOWN_UM = 0.2  # smallest growth that is compared with what compensation leaves; below, noise dominates
-STALL_S = 10.0  # longest stall of the machine that the demo survives
+SHOWN_UM = 0.2  # smallest growth that is compared with the residual of compensation; below it noise dominates
+STALL_S = 10.0  # longest stall of the machine without a fault in the demo
 DASHBOARD = "127.0.0.1:8765"
 
 
@@ -98,7 +98,7 @@ def _own(settings: Settings) -> Any:
 
 @contextlib.contextmanager
 def _stopped_by_signals() -> Iterator[None]:
-    """SIGTERM and SIGHUP end the demo as Ctrl-C does."""
+    """Let SIGTERM and SIGHUP end the demo as Ctrl-C does."""
 
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -114,7 +114,7 @@ def _stopped_by_signals() -> Iterator[None]:
 
 def _ignore_signals() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the way out is not interrupted
+        signal.signal(number, signal.SIG_IGN)  # shutting down must not be interrupted
 
 
 class _Demo:
@@ -287,7 +287,7 @@ class Growth:
             self.values.popleft()
 
     def sentence(self) -> str:
-        """Return the growth and what compensation leaves of it, in one sentence."""
+        """Return the growth and its uncompensated part in one sentence."""
         if not self.values:
             return f"Moving to {MOTION[0][1]:g} um; holding it takes 3 W, which warm the coil and lengthen the shaft."
         left, grown = (abs(float(v)) for v in np.mean(np.array(self.values)[:, 1:], axis=0))

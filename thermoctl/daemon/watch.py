@@ -1,9 +1,11 @@
 """Frames for the dashboard: a thread that follows the ring and makes a frame a few times a second.
 
-It only reads shared memory; the loop does not notice. It finds the end of a daemon (the segment is gone)
-and a new start. Around each new fault it keeps the rows of every tick: the capture. It starts with the
-rows that the ring still holds: a fault soon after the dashboard's start has its history, too. A page that
-opens shows the last minute at once; it is kept reduced.
+It only reads shared memory; the loop does not notice. It detects the end of a daemon (the segment is gone)
+and a new start.
+
+A capture holds the rows of every tick around a new fault. It begins with the rows that the ring still holds,
+so a fault soon after the dashboard's start has its history, too. A newly opened page shows the last minute at
+once, from reduced rows.
 """
 
 from __future__ import annotations
@@ -28,10 +30,10 @@ from thermoctl.settings import Settings
 from thermoctl.signals import INDEX, fault_words
 from thermoctl.yamlfile import InputError
 
-BEFORE_S, AFTER_S = 2.0, 2.0  # of a capture
+BEFORE_S, AFTER_S = 2.0, 2.0  # span of a capture before and after the fault
 CAPTURES = 16
-SILENT_S = 2.0  # without a tick for this time the rows are shown as old
-PAST_S, PAST_STEP_S = 60.0, 0.1  # the last minute that a page gets when it opens
+SILENT_S = 2.0  # rows are shown as old after this time without a tick
+PAST_S, PAST_STEP_S = 60.0, 0.1  # length and step of the history sent to a newly opened page
 PAST = (
     "wall_s",
     "reference_um",
@@ -51,7 +53,7 @@ RANGED = (
     "power_w",
     "innovation_c",
 )
-"""Signals whose least and largest value since the previous frame is in each frame."""
+"""Signals whose minimum and maximum since the previous frame are in each frame."""
 LATENESS_EDGES_US = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
 _T, _WALL = INDEX["t_s"], INDEX["wall_s"]
@@ -109,7 +111,7 @@ class Watch:
         self._gain = float(model.C[0] @ model.gain[:, 0])
 
     def run(self) -> None:
-        """Look `rate_hz` times a second until `stop()`."""
+        """Call `look` `rate_hz` times a second until `stop()`."""
         while not self._stopping.wait(1.0 / self.rate_hz):
             self.look()
 
@@ -121,7 +123,7 @@ class Watch:
 
     @property
     def stopping(self) -> bool:
-        """Whether `stop` was called."""
+        """Return whether `stop` was called."""
         return self._stopping.is_set()
 
     def wait(self, seen: int, timeout_s: float) -> tuple[int, dict[str, Any]]:
@@ -131,7 +133,7 @@ class Watch:
             return self.number, self.frame
 
     def look(self) -> None:
-        """Read what the loop has done since the last look; make a frame."""
+        """Read the rows since the last look; make a frame."""
         shared = self._attached()
         frame = _down() if shared is None else self._follow(shared)
         with self._changed:
@@ -167,7 +169,7 @@ class Watch:
             memory = self.shared._memory
             vars(self.shared).clear()
             self.shared = None
-            with contextlib.suppress(BufferError):  # a request still reads it: it goes with that
+            with contextlib.suppress(BufferError):  # a request still reads it and frees it afterwards
                 memory.close()
         if self.shared is None and inode:
             try:
@@ -211,7 +213,7 @@ class Watch:
         return _finite(math.sqrt(self._noise_c2 / (1.0 - share))) if 0.0 <= share < 1.0 else None
 
     def _remember(self, rows: np.ndarray) -> None:
-        """Put the last row of each PAST_STEP_S of the newest minute into `past`."""
+        """Append the last row of each PAST_STEP_S to `past`, and drop rows older than a minute."""
         rows = rows[rows[:, _WALL] > rows[-1, _WALL] - PAST_S]
         step = np.floor(rows[:, _WALL] / PAST_STEP_S)
         rows = rows[np.append(np.diff(step) != 0, True)]
@@ -230,9 +232,9 @@ class Watch:
                 self.past.append(point)
 
     def _keep(self, rows: np.ndarray, lost: int) -> None:
-        """Add rows to open captures; begin one where a fault that trips is new.
+        """Add rows to open captures; begin one for each new fault that trips.
 
-        lost: ticks missing before `rows`, because this process was held up for longer than the ring is.
+        lost: ticks missing before `rows`, because this process fell behind by more than the ring's length.
         """
         if lost:
             self._recent.clear()

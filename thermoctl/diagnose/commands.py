@@ -15,11 +15,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from thermoctl.checks.commands import checked, report
 from thermoctl.diagnose import run
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.experiment_file import peaks
 from thermoctl.diagnose.outcome import sentence
 from thermoctl.diagnose.resolve import resolve
+from thermoctl.plant import load
+from thermoctl.plant.recordings import read_recordings
 from thermoctl.yamlfile import InputError, suggest
 
 # Share of a diagnosis that is done when a stage starts, roughly: for the time left.
@@ -53,10 +56,21 @@ def diagnose(args: argparse.Namespace) -> int:
     if not args.recordings:
         raise InputError("no recording was given; one or more were expected, or --live")
 
+    plant = load(args.plant)
+    given, found_before = checked(plant, args.recordings, args.time, args.columns)
+    report(found_before, sys.stderr)
+    if any(f.severe for f in found_before) and not args.anyway:
+        raise InputError(
+            f"{args.plant}: not diagnosed: the checks above would make any name doubtful; correct the data or the "
+            "plant, or diagnose with --anyway"
+        )
+
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
+        added = read_recordings(plant, recordings[len(given) :])  # of --resolve: written by thermoctl
+        tables: list[Any] = [*given, *added]
         return run.diagnose(
             args.plant,
-            recordings,
+            tables,
             args.out,
             [Path(e) for e in args.effects or ()],
             None if args.quiet else StageReporter(),

@@ -101,7 +101,7 @@ def _number(value: float, text: str) -> str:
 
 @dataclass(frozen=True)
 class RigDiagnosis:
-    """The diagnosis of one rig of a folder; `error` where it could not be diagnosed."""
+    """The diagnosis of one rig of a folder; `error` if it could not be diagnosed."""
 
     rig: str
     recordings: list[str]
@@ -112,12 +112,11 @@ class RigDiagnosis:
 
 
 def diagnose_folders(args: argparse.Namespace) -> int:
-    """Run `thermoctl diagnose` over folders.
-
-    Every rig's newest recordings by themselves, into OUT/RIG each.
+    """Run `thermoctl diagnose` over folders: every rig's newest recordings, with the result in OUT/RIG.
 
     The rigs are spread over processes or a Dask cluster. A rig that cannot be diagnosed is reported and does
-    not stop the others; rigs that are done are not run again."""
+    not stop the others; completed rigs are not run again.
+    """
     if not Path(args.plant).is_file():
         raise InputError(f"{args.plant}: no such file; the plant of the fleet's rigs was expected")
     jobs, out = _jobs(args), Path(args.out)
@@ -132,7 +131,7 @@ def diagnose_folders(args: argparse.Namespace) -> int:
 
 
 def _jobs(args: argparse.Namespace) -> list[Job]:
-    """One job a rig: the newest `--last` of its recordings."""
+    """List one job a rig: the newest `--last` of its recordings."""
     rigs: dict[str, list[str]] = {}
     for path in (p for r in args.recordings for p in (find_recordings(r) if Path(r).is_dir() else [r])):
         rigs.setdefault(rig_of(path), []).append(path)
@@ -169,11 +168,10 @@ def _diagnoses(found: Sequence[RigDiagnosis]) -> Table:
 
 
 def live_recordings(args: argparse.Namespace) -> list[str]:
-    """Extract what `thermoctl diagnose --live` diagnoses.
+    """Extract the data of `thermoctl diagnose --live` into OUT/live.csv, from the onset of the misfit on.
 
-    OUT/live.csv, from where the daemon's model no longer fits.
-
-    None where the model fits. Raises InputError where recordings were given, too."""
+    None if the model fits. Raises InputError if recordings were given, too.
+    """
     if args.recordings:
         raise InputError(
             "diagnose --live reads the daemon's own recordings; no recording was expected beside it"

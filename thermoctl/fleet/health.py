@@ -1,4 +1,4 @@
-"""One recording of a rig in numbers, by itself: many can be spread over processes.
+"""Summarise one recording of a rig, independent of all others, so that many can be spread over processes.
 
 - health: share of time armed, faults, slipped ticks, mean innovation, error at the reference encoder;
 - fit: the plant with its written values against the recording: rms residual / noise of the worst output;
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermoctl.control import faults
+from thermoctl.control import recorded_faults
 from thermoctl.control.arming import ARMED
 from thermoctl.fleet.recordings import local, rig_of
 from thermoctl.plant import load
@@ -24,7 +24,7 @@ from thermoctl.recording.table import Table
 from thermoctl.signals import join_fault_words
 from thermoctl.yamlfile import InputError
 
-ROWS = 4000  # to which a recording is thinned before a fit
+ROWS = 4000  # rows of a recording that is thinned for a fit
 SECONDS_PER_HOUR = 3600.0
 
 
@@ -53,7 +53,8 @@ class Summary:
 def summarise(path: str, plant_path: str | None, names: tuple[str, ...]) -> Summary:
     """Summarise one recording.
 
-    A file that cannot be read or simulated gives a Summary with `error`: the others go on."""
+    A file that cannot be read or simulated gives a Summary with `error`, so the other files are still read.
+    """
     rig = rig_of(path)
     try:
         with local(path) as here:
@@ -71,7 +72,7 @@ def _health(table: Table, path: str, rig: str) -> Summary:
     armed = state == ARMED
     words = join_fault_words(column("fault_bits", missing), column("fault_bits_2", missing))
     try:
-        names = faults.names(int(np.bitwise_or.reduce(words)), faults.recorded_names(table.meta))
+        names = recorded_faults.names(int(np.bitwise_or.reduce(words)), recorded_faults.table(table.meta))
     except (ValueError, KeyError, TypeError) as e:
         raise InputError(f"{path}: the names of its faults cannot be read: {e}") from None
     error = (column("output_reference_um", missing) - column("reference_um", missing))[armed]
@@ -121,5 +122,5 @@ def _model(summary: Summary, table: Table, plant_path: str, names: tuple[str, ..
 
 
 def _misfits(found: Fit, sigma: Mapping[str, float]) -> dict[str, float]:
-    """Rms residual of each recorded output over its noise."""
+    """Return the rms residual of each recorded output over its noise."""
     return {o: r / sigma[o] for o, r in found.rms().items() if math.isfinite(r)}

@@ -1,10 +1,9 @@
-"""The daemon's own recordings, searched for the stretch where its model no longer fits.
+"""`thermoctl diagnose --live`: find where the daemon's model stopped fitting, in the daemon's own recordings.
 
-`thermoctl diagnose --live`.
-
-The 10 Hz tier of the newest session is read, some hours back, and its innovations go through the same sum as
-in the daemon (daemon/misfit.py). The stretch from BEFORE_S before the onset to now is averaged to seconds and
-written as a CSV whose columns are those of the thermal plant."""
+The last hours of the newest session's 10 Hz tier are read. The innovations go through the same sum as in the
+daemon (daemon/misfit.py). The stretch from BEFORE_S before the onset until now is averaged to seconds. It is
+written as a CSV with the columns of the thermal plant.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from thermoctl.recording.writer import TIER, recording_files
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
-BEFORE_S = 1800.0  # taken along from before the alarm, when the model still fitted
+BEFORE_S = 1800.0  # length of the part before the alarm, when the model still fitted
 STRIDE = 10  # rows of the 10 Hz tier in a second
 _STEP_S = 1.0
 
@@ -38,7 +37,7 @@ def newest(directory: str | Path, rig: str, hours: float) -> Table:
     for path in reversed(files):
         part = read_table(path)
         if parts and (part.t[-1] > parts[-1].t[0] or parts[0].t[-1] - part.t[0] > hours * 3600):
-            break  # an earlier session, whose clock ran on, or far enough back
+            break  # an earlier session with another clock, or too far back
         parts.append(part)
     if not parts:
         raise InputError(
@@ -59,7 +58,7 @@ def alarms(settings: Settings, table: Table) -> list[Alarm]:
     watch = Misfit(compensator(settings))
     out = []
     for k in range(0, len(table.t), STRIDE):
-        rows = slice(k, k + STRIDE)  # in pieces as in the daemon: an alarm that came and went is not lost
+        rows = slice(k, k + STRIDE)  # in pieces as in the daemon, so that a temporary alarm is not lost
         found = watch.add(
             table.t[rows], table.columns["innovation_c"][rows], table.columns["kalman_gain"][rows]
         )

@@ -1,6 +1,4 @@
-"""Recordings of many rigs in a folder or an object store.
-
-Find them, fetch one, say which rig it is of."""
+"""Recordings of many rigs in a folder or an object store: find them, fetch one, name its rig."""
 
 from __future__ import annotations
 
@@ -38,9 +36,7 @@ def find_recordings(folder: str | Path) -> list[str]:
 
 
 def _store(url: str) -> tuple[Any, str]:
-    """(file system, path in it) of an address.
-
-    The library of the store finds its own credentials."""
+    """Return (file system, path in it) of an address. The store's library finds its own credentials."""
     try:
         import fsspec
     except ImportError:
@@ -53,7 +49,7 @@ def _store(url: str) -> tuple[Any, str]:
 
 @contextmanager
 def local(path: str) -> Iterator[str]:
-    """Give a path that can be read here: itself, or a temporary copy out of an object store."""
+    """Yield a local path: the file itself, or a temporary copy of one in an object store."""
     if "://" not in path:
         yield path
         return
@@ -68,8 +64,6 @@ def local(path: str) -> Iterator[str]:
 
 
 def rig_of(path: str) -> str:
-    """Name the rig of a recording.
-
-    By the name that the program gives its recordings, else by its folder."""
+    """Name the rig of a recording by the file's name, if this program gave it, else by its folder."""
     match = NAME.match(Path(path).name)
     return match["rig"] if match else Path(path).parent.name

@@ -1,9 +1,9 @@
 """Rigs over time: which parameters drift, which model no longer fits, and what to do about it.
 
-A parameter drifts when the straight line through its estimates has a slope of more than DRIFT_SIGMA standard
-errors and changes it by more than DRIFT_SHARE over the time seen. A model no longer fits when the newest
-recording's misfit is above FIT_LIMIT; the misfit after the refit says whether values are wrong (identify
-again) or physics is missing (diagnose)."""
+A straight line is fitted to a parameter's estimates. The parameter drifts when the slope exceeds DRIFT_SIGMA
+standard errors and the total change exceeds DRIFT_SHARE. A model no longer fits when the newest recording's
+misfit is above FIT_LIMIT. If a refit removes the misfit, identify again; else physics is missing: diagnose.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from thermoctl.control import faults
 from thermoctl.fleet.health import Summary
 
 DRIFT_SIGMA, DRIFT_SHARE, FIT_LIMIT = 4.0, 0.05, 3.0
-FEWEST = 3  # estimates from which a straight line has a scatter
+FEWEST = 3  # fewest estimates whose scatter about a line can be computed
 MONTH_S = 30 * 86400.0
 
 
@@ -45,7 +45,7 @@ class RigHealth:
 
 
 def judge(summaries: Iterable[Summary]) -> list[RigHealth]:
-    """Group summaries of any rigs in any order by rig, and judge each."""
+    """Group summaries of any rigs in any order by rig, and assess each."""
     by_rig: dict[str, list[Summary]] = {}
     for s in summaries:
         by_rig.setdefault(s.rig, []).append(s)
@@ -94,8 +94,9 @@ def _advice(newest: Summary, drifts: dict[str, Drift]) -> list[str]:
 def drift(times_s: Sequence[float], estimates: Sequence[tuple[float, float]]) -> Drift:
     """Fit a weighted straight line through (value, standard error) over time.
 
-    The standard error of the slope is widened by the scatter about the line where that is larger than the
-    estimates' own. Fewer than FEWEST estimates never drift."""
+    The slope's standard error comes from the estimates' own, or from the scatter about the line if that is
+    larger. A parameter with fewer than FEWEST estimates never drifts.
+    """
     t = np.asarray(times_s) / MONTH_S
     value, sd = np.array(estimates, dtype=float).reshape(-1, 2).T
     if len(t) < FEWEST or np.ptp(t) == 0.0:

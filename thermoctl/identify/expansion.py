@@ -1,15 +1,18 @@
 """The expansion model: position error from temperatures, first order, M inputs, one output.
 
-yL(n+1) = f1 yL(n) + sum_m [b_m,1 T_m(n-1) + b_m,2 T_m(n)]                                        (2), (3), (39)
+    yL(n+1) = f1 yL(n) + sum_m [b_m,1 T_m(n-1) + b_m,2 T_m(n)]                               (2), (3), (39)
 
-equation error   block least squares, or recursion (5), with the *measured* yL in the regressor. Noise on yL biases f1
-                 towards 0: with 0.05 um of noise a time constant of 180 s was found as 3.2 s. Kept because it is the paper's.
-output error     the regressor holds the model's own past output. For a given f1 the model is linear in b (inputs filtered
-                 by 1/(z - f1), the decay f1^n of the first output): a search over the one number f1 and a least squares.
-ridge            thermometers are noisy: gains g multiply their noise (quantisation step^2/12 and the sensor's own variance,
-                 less what the filter 1/(z - f1) averages away: (1 - f1)/(1 + f1)). Adding N sigma^2 g'g to the criterion
-                 minimises the expected squared error *with such inputs*: 25 nearly collinear parameters need that.
-With so many parameters the time constant itself is not determined; the prediction is.
+Equation error (the paper's method): block least squares, or recursion (5), with the *measured* yL in the
+regressor. Noise on yL biases f1 towards 0: with 0.05 um of noise a time constant of 180 s was found as 3.2 s.
+
+Output error: the regressor holds the model's own past output. For a given f1 the model is linear in b, with
+inputs filtered by 1/(z - f1) and the decay f1^n of the first output. So one number f1 is searched, with a
+least-squares solution for each.
+
+Ridge: the gains g multiply the noise of the thermometers. Its variance is quantisation step^2/12 plus the
+sensor's own, times (1 - f1)/(1 + f1) after the filter 1/(z - f1). Adding N sigma^2 g'g to the criterion
+minimises the expected squared error *with such inputs*. The 25 nearly collinear parameters need that. The
+time constant itself is not well determined by them; the prediction is.
 
 The output moves with the bodies' absolute temperatures, but the model has rises above the air. T_abs = rise +
 air, so air enters with the sum of all gains: b_air = sum(b1 + b2). Two hours of test do not excite a free air
@@ -66,10 +69,11 @@ def recursive(
     q0: float = 1e6,
     own_output: bool = False,
 ) -> Expansion:
-    """Return the paper's recursion (5) with weight lambda and Q(0) = q0 I.
+    """Fit by the paper's recursion (5) with weight lambda and Q(0) = q0 I.
 
-    `own_output` puts the model's own past output in the regressor as (3) is written, else the measured one
-    (which is what equals the block solution)."""
+    `own_output` puts the model's own past output in the regressor as (3) is written, else the measured one.
+    Only the latter equals the block solution.
+    """
     _check(rises, y)
     phi = np.ascontiguousarray(regressors(rises)[:-1])
     p = phi.shape[1] + 1
@@ -214,8 +218,8 @@ class Bank:
     def model(self) -> Expansion:
         """Return the Expansion of the pole with the least criterion so far.
 
-        Squared error and, as in `output_error`, the ridge that the inputs' error asks for, laid under each
-        triangle."""
+        The criterion is the squared error plus, as in `output_error`, the ridge for the inputs' error.
+        """
         m, p = self.inputs, self.r.shape[1]
         best = (np.inf, 0, np.zeros(p))
         for k in range(len(self.poles)):
@@ -240,7 +244,8 @@ class Bank:
     def bounded(self, low: np.ndarray, high: np.ndarray) -> Expansion:
         """Return the best Expansion of one lag whose static gains (M,) um/K lie within low..high.
 
-        Collinear gains that the data do not tell apart are settled inside the bounds, not cut off at them."""
+        Collinear gains that the data cannot separate are fitted within the bounds, not clipped afterwards.
+        """
         m = self.inputs
         free = np.full(2, np.inf)
         best = (np.inf, 0, np.zeros(m + 2))
@@ -265,9 +270,7 @@ class Bank:
         )
 
     def _rows(self, k: int) -> np.ndarray:
-        """Return the triangle of pole k over the ridge that the inputs' error asks for.
-
-        The last column is the right-hand side."""
+        """Return the triangle of pole k with the ridge for the inputs' error; right-hand side last."""
         count = self.samples if self.weight == 1 else (1 - self.weight**self.samples) / (1 - self.weight)
         f, p = self.poles[k], self.r.shape[1]
         ridge = np.append(np.tile(self.sigma2, 2) * (1 - f) / (1 + f) * count, [0, 0])

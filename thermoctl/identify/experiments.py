@@ -39,11 +39,11 @@ class Schedule:
     duration_s: float
 
     def at(self, t_s: np.ndarray) -> np.ndarray:
-        """Setpoint at times (the ramps drawn as the rate limiter makes them)."""
+        """Return the setpoint at times; the rate limiter makes the ramps."""
         return np.interp(t_s, self.t_s, self.setpoint_um)
 
     def commands(self) -> list[tuple[float, str, float]]:
-        """(time s, 'setpoint', um) for the daemon: the target of every ramp at the ramp's start."""
+        """Return (time s, 'setpoint', um) for the daemon: the target of every ramp at the ramp's start."""
         out, now = [], None
         for k in range(len(self.t_s) - 1):
             target = float(self.setpoint_um[k + 1])
@@ -70,7 +70,7 @@ class Inputs:
     predicted: dict[str, tuple[float, float]]
 
     def schedule(self) -> Schedule:
-        """Return the same for the daemon. Raises InputError where it drives more than the setpoint."""
+        """Return it as a schedule for the daemon. Raises InputError if it drives more than the setpoint."""
         if set(self.corners) != {SETPOINT}:
             raise InputError(
                 f"experiment '{self.name}' drives {', '.join(self.corners)}; the daemon commands {SETPOINT} only. Run it "
@@ -251,7 +251,7 @@ def design_pulses(
 
 
 def _pulse_power(widths: Sequence[float], gaps: Sequence[float], f: np.ndarray) -> np.ndarray:
-    """|Fourier transform|^2 of rectangular pulses of height 1 at frequencies f."""
+    """Return |Fourier transform|^2 of rectangular pulses of height 1 at frequencies f."""
     total, t = np.zeros(len(f), complex), 0.0
     for w, g in zip(widths, gaps, strict=True):
         total += (np.exp(-2j * np.pi * f * t) - np.exp(-2j * np.pi * f * (t + w))) / (2j * np.pi * f)
@@ -269,7 +269,7 @@ def spectrum(t_s: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def share_below(t_s: np.ndarray, power: np.ndarray, cutoff_hz: float) -> float:
-    """Part of the alternating power that lies below `cutoff_hz`."""
+    """Return the share of the alternating power below `cutoff_hz`."""
     f, s = spectrum(t_s, power)
     return float(s[f <= cutoff_hz].sum() / s.sum())
 
@@ -284,12 +284,12 @@ class Progress:
 
     @property
     def percent(self) -> float:
-        """Share of the duration that is done, %."""
+        """Completed share of the duration, %."""
         return 100 * self.done_s / self.duration_s
 
     @property
     def eta_s(self) -> float:
-        """Wall seconds left at the pace so far."""
+        """Estimated wall seconds left."""
         return self.used_s * (self.duration_s - self.done_s) / max(self.done_s, 1e-9)
 
 
@@ -306,11 +306,11 @@ class ScheduleTarget(Protocol):
 
     @property
     def row(self) -> np.ndarray:
-        """The newest record row."""
+        """Return the newest record row."""
 
     @property
     def period_s(self) -> float:
-        """Period of a tick, s."""
+        """Return the period of a tick, s."""
 
     def arm(self) -> object:
         """Arm the law."""

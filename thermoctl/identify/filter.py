@@ -1,20 +1,26 @@
 """Temperature estimators: the paper's modified Kalman filter, and a steady Kalman filter.
 
-MKF    output as state (33), scalar gain of the coil's row (34), (35), mapped to the other points by zeta:
-       zeta = [1, sigma_2/sigma_1 ...], sigma_j = cov(e_1, e_j) over the identification test's error    (36), (37)
-       R_v = (quantisation step)^2/12 + noise^2 of the thermocouple; R_w = (rms error of the coil in the identification
-       test)^2 + R_v, as the paper takes it from both (its 0.46 degC)
-Kalman x(n+1) = A x + B [power, d(air)/dt] + w, y = C x + v, rises above the air.
+Modified Kalman filter (MKF): output as state (33), scalar gain of the coil's row (34), (35), mapped to the
+other points by zeta:
 
-The air's rate is a known input with a known effect: when only the air warms by 1 K, every rise falls by 1 K,
+    zeta = [1, sigma_2/sigma_1 ...], sigma_j = cov(e_1, e_j), e: error in the identification test   (36), (37)
+    R_v = (quantisation step)^2/12 + noise^2 of the thermocouple
+    R_w = (rms error of the coil in the identification test)^2 + R_v, as in the paper (its 0.46 degC)
+
+Kalman filter:
+
+    x(n+1) = A x + B [power, d(air)/dt] + w, y = C x + v, rises above the air
+
+The air's rate is a known input with a known effect. When only the air warms by 1 K, every rise falls by 1 K,
 so C b_air = -1. The process noise w has four parts:
+
 - an error of the coil's heat (b b')
 - a drift of all points against the air (b_air b_air')
 - outside heat into one body (C+ C+')
 - a slowly decaying outside heat as a disturbance state
 
-Their variances come from the calibration, where all twelve points are measured. They are those with which the
-filter estimates the twelve points best from the coil alone.
+Their variances come from the calibration, where all twelve points are measured. The chosen ones give the best
+estimate of the twelve points from the coil alone.
 """
 
 from __future__ import annotations
@@ -78,7 +84,7 @@ def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: f
     sigma = centred[:, :1].T @ centred / len(e)
     r_w = float((e[:, 0] ** 2).mean() + r_v)
     alpha, beta = model.resample(period_s).output_form()
-    # the recursion runs at the filter's period: the residual's variance builds up over the identification's
+    # The recursion runs at the filter's period, but the residual's variance grows over the identification's.
     return Mkf(
         alpha,
         beta[:, :1],
@@ -113,7 +119,7 @@ class Kalman:
     def run(
         self, power_w: np.ndarray, air_rate: np.ndarray, measured_k: np.ndarray, x0: np.ndarray | None = None
     ) -> np.ndarray:
-        """Estimated rises (N, M); measured (N, s) or (N,) with NaN where no reading came."""
+        """Return the estimated rises (N, M) from measured ones (N, s) or (N,), NaN for no reading."""
         measured = np.atleast_2d(measured_k.T).T
         x0 = np.zeros(self.model.order) if x0 is None else x0
         x = kernels.steady_filter(
@@ -129,9 +135,10 @@ class Kalman:
 
 
 def disturbed(model: StateSpace, tau_s: float = 3600.0) -> StateSpace:
-    """Return the model with one disturbance state.
+    """Return the model with one disturbance state: heat from outside into every body, the same K/s in each.
 
-    Outside heat per body (the same K/s everywhere), forgotten over `tau_s`."""
+    It decays with the time constant `tau_s`.
+    """
     n, m = model.b.shape
     into = np.linalg.pinv(model.c, rcond=1e-3) @ np.ones(len(model.c)) * model.period_s
     a = np.zeros((n + 1, n + 1))
@@ -199,9 +206,9 @@ def tune(
 ) -> tuple[Kalman, np.ndarray]:
     """Return the filter whose `sensors` estimate all points best over the calibration: (filter, variances).
 
-    The error is averaged over `smooth` samples, so that the noise of the other thermometers has little weight.
-    `weights` (M,) are those of the points (default: equal). A weak prior on the logarithms keeps a variance that
-    the data do not determine."""
+    The error is averaged over `smooth` samples, so that the noise of the other thermometers has little
+    weight. `weights` (M,) are those of the points (default: equal). A weak prior on the logarithms keeps a
+    variance that the data do not determine."""
     base = np.array([np.log(1e-2), np.log(1e-10), np.log(1e-6), np.log(1e-13)])
     used = 4 if not model.c[:, -1].any() else 3
     w = np.ones(len(model.c)) if weights is None else weights / np.sqrt(np.mean(weights**2))
@@ -243,10 +250,12 @@ def choose_sensors(
     most: int = 12,
     must: tuple[int, ...] = (),
 ) -> list[tuple[tuple[int, ...], float]]:
-    """For k = 1..`most` sensors the set with the least standard error of the position: [(sensors, um)].
+    """Return the best sensor sets of k = 1..`most` sensors, [(sensors, um)].
 
-    gains_um_k (M,): static position gain of each point. Forward choice with exchange until nothing improves;
-    k = 1, 2 are exhaustive. `must` are always in (the embedded coil sensor)."""
+    The criterion is the standard error of the position, um. gains_um_k (M,): static position gain of each
+    point. Forward selection with exchange until nothing improves; k = 1, 2 are exhaustive. `must` are always
+    in the set (the embedded coil sensor).
+    """
     m = len(model.c)
     out = []
 

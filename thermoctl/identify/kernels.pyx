@@ -1,20 +1,20 @@
 # cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-"""The loops of identification that must be fast. Pure arithmetic on float64 arrays; the equations:
+"""The loops of identification that must be fast. Pure arithmetic on float64 arrays.
 
-linear simulation         x(n+1) = A x(n) + B u(n),  y(n) = C x(n)                                     (31), (32)
-modal states              s_k(n+1) = l_k s_k(n) + u(n)                 one row of the regression for B and x(0)
-block moments             means of the outputs and Gram-polynomial moments of the inputs over blocks of q samples
-recursive least squares   (5) with weight lambda: gain L = Q f/(lambda + f'Q f); Q = (Q - L f'Q)/lambda
-square-root RLS           R, z of the information form, updated by Givens rotations (never loses symmetry)
-steady-state filter       x = A x + B u; x += K (y - C_s x)            also with A diagonal (modal form)
-MKF                       (34), (35) with the scalar gain
+    linear simulation         x(n+1) = A x(n) + B u(n),  y(n) = C x(n)                          (31), (32)
+    modal states              s_k(n+1) = l_k s_k(n) + u(n): one row of the regression for B and x(0)
+    block moments             means of the outputs and Gram moments of the inputs over blocks of q samples
+    recursive least squares   (5) with weight lambda: L = Q f/(lambda + f'Q f); Q = (Q - L f'Q)/lambda
+    square-root RLS           R, z of the information form, updated by Givens rotations (stays symmetric)
+    steady-state filter       x = A x + B u; x += K (y - C_s x)            also with A diagonal (modal form)
+    MKF                       (34), (35) with the scalar gain
 """
 import numpy as np
 from libc.math cimport sqrt, isnan
 
 
 def simulate(double[:, ::1] a, double[:, ::1] b, double[:, ::1] c, double[::1] x0, double[:, ::1] u):
-    """Free run: y (N, l) of x(n+1) = A x + B u, y = C x, from x0 (n,); u (N, m)."""
+    """Return y (N, l) of x(n+1) = A x + B u, y = C x, from x0 (n,), without correction; u (N, m)."""
     cdef Py_ssize_t n = a.shape[0], m = b.shape[1], l = c.shape[0], N = u.shape[0], i, j, k
     y_ = np.empty((N, l))
     cdef double[:, ::1] y = y_
@@ -38,7 +38,7 @@ def simulate(double[:, ::1] a, double[:, ::1] b, double[:, ::1] c, double[::1] x
 
 
 def modal_states(double complex[::1] poles, double[::1] u):
-    """s_k(n+1) = l_k s_k(n) + u(n) from 0 for every pole; returns (n, N) complex."""
+    """Return s_k(n+1) = l_k s_k(n) + u(n) from 0 for every pole, (n, N) complex."""
     cdef Py_ssize_t n = poles.shape[0], N = u.shape[0], i, k
     s_ = np.empty((n, N), dtype=complex)
     cdef double complex[:, ::1] s = s_
@@ -53,7 +53,7 @@ def modal_states(double complex[::1] poles, double[::1] u):
 
 
 def decays(double[::1] poles, double[:, ::1] u):
-    """s_k(n+1) = l_k s_k(n) + u_k(n) from 0, with its derivative by l_k; u (K, N) -> s, ds of shape (K, N)."""
+    """Simulate s_k(n+1) = l_k s_k(n) + u_k(n) from 0 and its derivative by l_k; u (K, N) -> s, ds (K, N)."""
     cdef Py_ssize_t K = poles.shape[0], N = u.shape[1], i, k
     s_ = np.empty((K, N))
     d_ = np.empty((K, N))
@@ -73,9 +73,11 @@ def decays(double[::1] poles, double[:, ::1] u):
 
 def block_moments(double[:, ::1] z, Py_ssize_t m, double[:, ::1] weights, double[:, :, ::1] u_moment,
                   double[:, ::1] y_sum, double[:, ::1] y_count, Py_ssize_t start):
-    """Add the samples z (N, m + l) = [inputs, outputs] to block sums. weights (r, q): row p is the p-th polynomial at the
-    q places of a block; u_moment (J, m, r), y_sum and y_count (J, l) are added to; `start` is the first row's index.
-    A missing output (NaN) is left out; a missing input counts as 0 (the caller fills inputs first)."""
+    """Add the samples z (N, m + l) = [inputs, outputs] to the sums u_moment (J, m, r), y_sum, y_count (J, l).
+
+    weights (r, q): row p is the p-th polynomial at the q places of a block. `start` is the first row's index.
+    A missing output (NaN) is left out. A missing input counts as 0; the caller fills inputs first.
+    """
     cdef Py_ssize_t N = z.shape[0], l = z.shape[1] - m, r = weights.shape[0], q = weights.shape[1]
     cdef Py_ssize_t k, j, i, p, place
     cdef double v
@@ -125,12 +127,15 @@ cdef extern from *:
 
 
 def rls_step(double[::1] theta, double[:, ::1] q, double[::1] f, double y, double lam, double[::1] work):
-    """One step of (5) in place: theta (p,), q (p, p), regressor f (p,), work (p,); returns the prediction error."""
+    """Do one step of (5) in place: theta (p,), q (p, p), regressor f (p,), work (p,).
+
+    Return the prediction error.
+    """
     return rls_c(&theta[0], &q[0, 0], &f[0], y, lam, &work[0], theta.shape[0])
 
 
 def rls_run(double[::1] theta, double[:, ::1] q, double[:, ::1] f, double[::1] y, double lam):
-    """(5) over all rows of f (N, p), y (N,), in place; returns the prediction errors (N,)."""
+    """Run (5) over all rows of f (N, p), y (N,), in place; return the prediction errors (N,)."""
     cdef Py_ssize_t N = f.shape[0], k, n = theta.shape[0]
     e_ = np.empty(N)
     cdef double[::1] e = e_, w = np.empty(n)
@@ -141,7 +146,10 @@ def rls_run(double[::1] theta, double[:, ::1] q, double[:, ::1] f, double[::1] y
 
 
 def rls_own_output(double[::1] theta, double[:, ::1] q, double[:, ::1] f, double[::1] y, double lam, double y0):
-    """(5) with the model's own past output as the last regressor, as (3) is written; f (N, p - 1) are the inputs."""
+    """Run (5) with the model's own past output as the last regressor, as in (3).
+
+    f (N, p - 1) are the inputs.
+    """
     cdef Py_ssize_t N = f.shape[0], k, i, n = theta.shape[0]
     e_ = np.empty(N)
     cdef double[::1] e = e_, w = np.empty(n), phi = np.empty(n)
@@ -158,7 +166,7 @@ def rls_own_output(double[::1] theta, double[:, ::1] q, double[:, ::1] f, double
 
 
 cdef inline double _givens(double* r, double* row, Py_ssize_t n, double root_lam) noexcept nogil:
-    """Rotate `row` (n + 1 numbers, the last is the measurement) into the triangle r (n, n + 1); returns what is left of it."""
+    """Rotate `row` (n + 1 numbers, measurement last) into the triangle r (n, n + 1); return its residual."""
     cdef Py_ssize_t i, j
     cdef double a, b, h, c, s, t
     for i in range(n * (n + 1)):
@@ -179,7 +187,8 @@ cdef inline double _givens(double* r, double* row, Py_ssize_t n, double root_lam
 
 
 def triangle_run(double[:, ::1] r, double[:, ::1] rows, double lam):
-    """Square-root RLS: rotate rows (N, p + 1) = [regressors, measurement] into the triangle r (p, p + 1), in place."""
+    """Rotate rows (N, p + 1) = [regressors, measurement] into the triangle r (p, p + 1) of square-root RLS.
+    """
     cdef Py_ssize_t N = rows.shape[0], n = r.shape[0], k
     cdef double[::1] w = np.empty(n + 1)
     cdef double root = sqrt(lam), left = 0
@@ -191,11 +200,16 @@ def triangle_run(double[:, ::1] r, double[:, ::1] rows, double lam):
 
 def bank_run(double[:, :, ::1] r, double[::1] cost, double[:, ::1] state, double[::1] poles, double[::1] prior,
              double[:, ::1] t, double[::1] y, double lam, double[:, ::1] last):
-    """Online output error: for every fixed pole f1 its own square-root RLS on inputs filtered by 1/(z - f1).
+    """Update online output-error models in place: for every fixed pole f1 its own square-root RLS.
 
-    r (P, p, p + 1) triangles, cost (P,) weighted sums of squared errors, state (P, p - 1) filtered inputs and the decay
-    of the initial output, last (1, M) the previous temperatures; t (N, M) temperature rises, y (N,) measured (NaN: none).
-    p = 2 M + 2: [t(n-1), t(n)] filtered, the constant, the initial output's decay. All in place.
+    The inputs are filtered by 1/(z - f1). p = 2 M + 2 regressors: [t(n-1), t(n)] filtered, the constant, the
+    initial output's decay.
+
+        r       (P, p, p + 1) triangles
+        cost    (P,) weighted sums of squared errors
+        state   (P, p - 1) filtered inputs and the decay of the initial output
+        last    (1, M) the previous temperatures
+        t, y    (N, M) temperature rises; (N,) measured output (NaN: none)
     """
     cdef Py_ssize_t P = poles.shape[0], M = t.shape[1], N = y.shape[0], p = 2 * M + 2, k, i, j
     cdef double[::1] w = np.empty(p + 1)
@@ -222,7 +236,10 @@ def bank_run(double[:, :, ::1] r, double[::1] cost, double[:, ::1] state, double
 
 def steady_filter(double[:, ::1] a, double[:, ::1] b, double[:, ::1] cs, double[:, ::1] gain, double[::1] x0,
                   double[:, ::1] u, double[:, ::1] y):
-    """Steady Kalman filter, filtered states (N, n): correct with y(n) (NaN: no sample), then predict with u(n)."""
+    """Return the filtered states (N, n) of a steady Kalman filter.
+
+    Each step corrects with y(n) (NaN: no sample), then predicts with u(n).
+    """
     cdef Py_ssize_t n = a.shape[0], m = b.shape[1], s = cs.shape[0], N = u.shape[0], i, j, k
     out_ = np.empty((N, n))
     cdef double[:, ::1] out = out_
@@ -256,7 +273,7 @@ def steady_filter(double[:, ::1] a, double[:, ::1] b, double[:, ::1] cs, double[
 
 def steady_filter_modal(double[::1] poles, double[:, ::1] b, double[::1] c, double[::1] gain, double[::1] x0,
                         double[:, ::1] u, double[::1] y):
-    """The same with A diagonal and one sensor: about 4 n operations a step."""
+    """Run the steady Kalman filter with A diagonal and one sensor: about 4 n operations a step."""
     cdef Py_ssize_t n = poles.shape[0], m = b.shape[1], N = u.shape[0], j, k, i
     out_ = np.empty((N, n))
     cdef double[:, ::1] out = out_
@@ -281,7 +298,10 @@ def steady_filter_modal(double[::1] poles, double[:, ::1] b, double[::1] c, doub
 
 def mkf_run(double[:, ::1] alpha, double[:, ::1] beta, double[::1] zeta, double rw, double rv, double[::1] t0,
             double[:, ::1] u, double[::1] coil):
-    """MKF (34), (35): filtered temperatures (N, M) and gains (N,). u (N, m), coil (N,) with NaN where no sample came."""
+    """Return filtered temperatures (N, M) and gains (N,) of the MKF (34), (35).
+
+    u (N, m); coil (N,), NaN where there is no sample.
+    """
     cdef Py_ssize_t n = alpha.shape[0], m = beta.shape[1], N = u.shape[0], i, j, k
     out_ = np.empty((N, n))
     gain_ = np.zeros(N)

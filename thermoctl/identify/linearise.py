@@ -1,13 +1,19 @@
 """Compute the compensator's model from a thermal plant file instead of data.
 
 Rises above the air r = T - air of a plant that is linear in its temperatures:
-    dr/dt = A r + b P - 1 d(air)/dt,     readings y = C r,     growth of the output e = a . r + (sum a)(air - air at start)
-At the loop's period h, in delta form so that nothing is lost near 1:
+
+    dr/dt = A r + b P - 1 d(air)/dt,     readings y = C r
+    growth of the output e = a . r + (sum a)(air - air at start)
+
+At the loop's period h, in delta form so that no digits are lost near 1:
+
     A_h - I = A Phi,  B_h = Phi [b, -1],  Phi = integral of exp(A s) over 0..h
-and, where C is square, in the coordinates of the readings: alpha = C A_h C^-1, beta = C B_h (33).
-Process noise is white heat of density q (W^2 s) into every body; it stands for the plant's errors. Measurement
-noise is the thermocouple's noise and its resolution. The steady Kalman gain solves the discrete Riccati equation
-at the sensor's period; `gains` returns the time-varying gain from an uncertain start.
+
+and, for a square C, in the coordinates of the readings: alpha = C A_h C^-1, beta = C B_h (33).
+
+Process noise is white heat of density q (W^2 s) into every body; it represents the plant's errors.
+Measurement noise is the thermocouple's noise and its resolution. The steady Kalman gain solves the discrete
+Riccati equation at the sensor's period; `gains` returns the time-varying gain from an uncertain start.
 """
 
 from __future__ import annotations
@@ -69,7 +75,7 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
     Columns of its inputs and outputs must be the program's signals (air_c, voltage_v and current_a or
     power_w, coil_c ... bracket_2_c, position_error_um). Raises InputError."""
     inputs, outputs, powered = _signals(plant)
-    nodes = list(plant.nodes)  # those that are states: the rest stays where it was
+    nodes = list(plant.nodes)  # those that are states; the others keep their start
     point: dict[str, float] = (
         {p.name: p.value for p in plant.parameters.values()}
         | {i: 0.0 for i in plant.inputs}
@@ -83,7 +89,7 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
             net = ex.add(
                 net, f.rate if f.target == n.name else ex.neg(f.rate) if f.source == n.name else ex.ZERO
             )
-        if net is ex.ZERO:  # nothing flows: it remembers the start, from which growth is counted anyway
+        if net is ex.ZERO:  # no flow: the node keeps its start, to which growth is relative
             nodes.remove(n.name)
             continue
         slopes.append(ex.div(net, n.storage))
@@ -117,7 +123,7 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
 def discrete(
     model: Thermal, period_s: float, density: float = HEAT_DENSITY
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A_h - I (n, n), B_h (n, 2) and the process noise's covariance (n, n) K^2 over one period."""
+    """Return A_h - I (n, n), B_h (n, 2) and the process noise's covariance (n, n) K^2 over one period."""
     n = len(model.A)
     phi = expm(np.block([[model.A, np.eye(n)], [np.zeros((n, 2 * n))]]) * period_s)[:n, n:]
     heat = np.diag(density / model.capacity**2)

@@ -1,23 +1,33 @@
 """Thermal models with real poles, from data of any length: reduce first, then separable least squares.
 
-A passive heat network (RC) has real poles, so its response to heat u is y(n) = sum_k R_k s_k(n) + sum_k W_k
-p_k^n with s_k(n+1) = p_k s_k(n) + u(n). For given poles the residues R, W are linear: only the poles are
-searched.
+A passive heat network (RC) has real poles, so its response to heat u is
 
-1. One pass over the samples reduces them to blocks of q samples: the mean of each output, and the first r
-   moments of each input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block. Its end
-   state and its mean depend on the inputs with weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p). Three moments
-   represent both to 1e-4 of the smallest effect of a block, so averaging 10 000 samples of 1 ms into one of
-   10 s loses no slow dynamics.
-2. Variable projection (Golub and Pereyra 1973) with Kaufman's simplification over x_k = ln(time constant):
-   J'J = (dF' P dF) o (T T'), J'r = -diag(dF' r T'), F (J, K) block responses, T the residues, P the projector off F.
-3. The order is the one with the least BIC.
-4. The residual is not white: the chamber, the bench and unmeasured heat move temperatures for hours. Plain
-   least squares then fits the slowest, most disturbed part of the record hardest. With `drift_s` = (td, tc)
-   the residual is white noise plus a first-order drift of time constant td. The drift exceeds the noise below
-   1/(2 pi tc). Outputs and responses first pass the whitening filter (1 - exp(-T/td) z^-1)/(1 - exp(-T/tc)
-   z^-1) (generalised least squares).
-All models are stable by construction.
+    y(n) = sum_k R_k s_k(n) + sum_k W_k p_k^n,   s_k(n+1) = p_k s_k(n) + u(n)
+
+For given poles the residues R, W are linear: only the poles are searched. All models are stable by
+construction.
+
+1. Reduce. One pass over the samples makes blocks of q samples. Kept are the mean of each output and the first
+r moments of each input in discrete orthogonal (Gram) polynomials. A pole moves p^q over a block. Its end
+state and its mean depend on the inputs with weights p^(q-1-i) and (1 - p^(q-1-i))/(1 - p). Three moments
+represent both to 1e-4 of the smallest effect of a block. So averaging 10 000 samples of 1 ms into one of
+10 s loses no slow dynamics.
+
+2. Search. Variable projection (Golub and Pereyra 1973) with Kaufman's simplification over x_k = ln(time
+constant):
+
+    J'J = (dF' P dF) o (T T'),  J'r = -diag(dF' r T')
+    F (J, K) block responses, T the residues, P the projector off F
+
+3. Select the order with the least BIC.
+
+4. Whiten. The chamber, the bench and unmeasured heat move temperatures for hours, so the residual is
+coloured. Plain least squares then fits the slowest, most disturbed part of the recording hardest. With
+`drift_s` = (td, tc) the residual is white noise plus a first-order drift of time constant td. The drift
+exceeds the noise below 1/(2 pi tc). Outputs and responses first pass the whitening filter (generalised least
+squares)
+
+    (1 - exp(-T/td) z^-1) / (1 - exp(-T/tc) z^-1)
 """
 
 from __future__ import annotations
@@ -106,17 +116,16 @@ def reduce(
 def _responses(
     records: list[Blocks], tau: np.ndarray, rest: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stacked `_response` of several recordings.
-
-    The poles and residues are common, each starts on its own."""
+    """Stack `_response` of several recordings: common poles and residues, separate initial states."""
     parts = [_response(b, tau, rest) for b in records]
     return np.vstack([f for f, _, _ in parts]), np.vstack([d for _, d, _ in parts]), parts[0][2]
 
 
 def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, float] | None) -> np.ndarray:
-    """Stacked rows (J, columns) through the drift's whitening filter, each recording on its own.
+    """Filter stacked rows (J, columns) by the drift's whitening filter, each recording separately.
 
-    As they are without `drift_s`."""
+    Without `drift_s` they are unchanged.
+    """
     if drift_s is None:
         return rows
     forgotten, corner = (np.exp(-records[0].q * records[0].period_s / t) for t in drift_s)
@@ -127,9 +136,10 @@ def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, flo
 
 
 def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Block-mean responses F (J, columns) and their derivative by ln tau, and each column's pole index.
+    """Return block-mean responses F (J, columns), their derivative by ln tau, and each column's pole index.
 
-    Columns by pole: one per input, then (unless `rest`) the free decay."""
+    Columns by pole: one per input, then (unless `rest`) the free decay.
+    """
     q, basis, J = blocks.q, blocks.basis, len(blocks.u)
     i = np.arange(q)
     F, D, owner = [], [], []
@@ -174,9 +184,10 @@ class _Fit:
 
 
 def _project(F: np.ndarray, Y: np.ndarray, ridge: float = 1e-7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Q of F, the residue matrix and the residual.
+    """Return Q of F, the residue matrix and the residual.
 
-    `ridge` of each column's norm keeps nearly equal poles harmless."""
+    `ridge` of each column's norm keeps nearly equal poles harmless.
+    """
     n = F.shape[1]
     norm = np.linalg.norm(F, axis=0)
     norm[norm == 0] = 1
@@ -196,7 +207,7 @@ def _fit(
     ridge: float = 1e-7,
     drift_s: tuple[float, float] | None = None,
 ) -> _Fit:
-    """Levenberg-Marquardt on ln tau. `Y` (J, l) is scaled by each output's noise, `weight` (J,) by row."""
+    """Fit ln tau by Levenberg-Marquardt. `Y` (J, l) is scaled by noise, `weight` (J,) is by row."""
     x = np.log(tau)
     Y = _whitened(Y, blocks, drift_s) * weight[:, None]
     lo, hi = np.log(bounds[0]), np.log(bounds[1])

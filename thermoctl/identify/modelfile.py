@@ -1,8 +1,8 @@
 """Calibrations on disk: one YAML file each, in a folder that only the program writes.
 
 A file holds the compensator's coefficients with units and sampling, the fit's figures, the rig's name and the
-date. It lists the SHA-256 of each recording used. `current` in the folder names the one in use; older ones stay
-for a roll back. A file is refused when its checksum, its shape or its rig do not fit."""
+date. It lists the SHA-256 of each recording used. `current` in the folder names the one in use; older ones
+stay for a roll back. A file is refused when its checksum, its shape or its rig do not fit."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}")
 
 @dataclass(frozen=True)
 class Calibration:
-    """A model with what it came from.
+    """A model and its origin.
 
-    Rig name, `created` (UTC), fingerprints {file name: sha256}, figures {name: number}."""
+    Rig name, `created` (UTC), fingerprints {file name: sha256}, figures {name: number}.
+    """
 
     model: CompensatorModel
     rig: str
@@ -154,14 +155,12 @@ def current(folder: str | Path) -> Path:
 
 
 def history(folder: str | Path) -> list[Path]:
-    """All calibrations of a folder, oldest first."""
+    """Return all calibrations of a folder, oldest first."""
     return sorted(Path(folder).glob("[0-9]*-*.yaml"))
 
 
 def roll_back(folder: str | Path, name: str | None = None) -> Path:
-    """Make an older calibration current: `name`, or the one before the present.
-
-    It is read and checked first."""
+    """Make an older calibration current: `name`, or the one before the present. It is checked first."""
     files = history(folder)
     now = current(folder)
     if name is None:
@@ -208,7 +207,7 @@ def _checksum(content: dict[str, Any]) -> str:
 
 
 def _canonical(v: Any) -> Any:
-    """Numbers by value (1 equals 1.0), mappings in order of key."""
+    """Return data in canonical form: numbers by value (1 equals 1.0), mappings in order of key."""
     if isinstance(v, dict):
         return [(k, _canonical(v[k])) for k in sorted(v)]
     if isinstance(v, list):

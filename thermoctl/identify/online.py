@@ -1,11 +1,12 @@
 """Tuning the expansion model while a reference encoder is present.
 
-Nothing is proposed before the rig has covered its range. Samples are counted in buckets of coil temperature and
-of its trend (warming, cooling); progress is the share of full buckets. A bank of output-error estimators learns
-from all but the newest samples (`hold_s`). Its proposal is accepted only if it predicts those better.
+Nothing is proposed before the rig has covered its range. Samples are counted in buckets of coil temperature
+and of its trend (warming, cooling); progress is the share of full buckets. A bank of output-error estimators
+learns from all but the newest samples (`hold_s`). Its proposal is accepted only if it predicts those better.
 
-Static gains stay within bounds of the calibrated ones, also after many tunings, because a tuned model carries the
-gains of its first calibration. Every change is a calibration (`modelfile.install`), so it can be rolled back.
+Static gains stay within bounds of the calibrated ones, also after many tunings, because a tuned model carries
+the gains of its first calibration. Every change is a calibration (`modelfile.install`), so it can be rolled
+back.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ class Tuner:
     def update(self, rises_k: np.ndarray, error_um: float, air_k: float = 0.0) -> None:
         """One sample at the expansion model's period.
 
-        Arguments: estimated rises (12,), the measured position error (NaN: no reference), and the rise of the air
-        since the start. Bodies expand with their absolute temperature, hence the air."""
+        Arguments: estimated rises (12,), the measured position error (NaN: no reference), and the rise of the
+        air since the start. Bodies expand with their absolute temperature, hence the air."""
         coil = float(rises_k[0])
         if self.last_coil is not None:
             self.slow += 0.02 * ((coil - self.last_coil) - self.slow)
@@ -63,11 +64,11 @@ class Tuner:
 
     @property
     def progress(self) -> float:
-        """Percent of the excitation that is asked for."""
+        """Return the percentage of the required excitation."""
         return float(100 * np.minimum(self.counts / self.full, 1).mean())
 
     def proposal(self) -> tuple[CompensatorModel | None, str]:
-        """(model, why): None with the reason while it is too early or no better."""
+        """Return (model, reason); None with the reason while it is too early or no better."""
         if self.progress < 100:
             return (
                 None,
@@ -99,9 +100,7 @@ class Tuner:
         ), f"{after:.3g} um against {before:.3g} um"
 
     def _error(self, e: Expansion) -> float:
-        """Return the standard error over what was kept back, um.
-
-        Where it began (state and offset) is fitted."""
+        """Return the standard error over the held-out samples, um; initial state and offset are fitted."""
         drive = np.array([r for r, _ in self.recent])
         y = np.array([v for _, v in self.recent])
         n = np.arange(len(y))
@@ -114,6 +113,6 @@ class Tuner:
 
 
 def calibrated_gains(model: CompensatorModel) -> np.ndarray:
-    """Return the static gains (12,) um/K of the calibration a model came from, tuned since or not."""
+    """Return the static gains (12,) um/K of the calibration that a model came from, before any tuning."""
     known = model.meta.get("calibrated_gains_um_k")
     return np.array(known, dtype=float) if known is not None else (model.b1 + model.b2) / (1 - model.f1)

@@ -1,9 +1,10 @@
-"""A linear thermal model and what can be done with it.
+"""A linear thermal model: output form, resampling, simulation.
 
-x(n+1) = A x(n) + B u(n),   y(n) = C x(n)                                    (31), (32) with D = 0
-output form: y(n+1) = alpha y(n) + beta u(n), alpha = C A C+, beta = C B      (33)
-resampling: [[A, B], [0, I]] at one period is the exponential of [[F, G], [0, 0]] T: its logarithm gives any
-other period
+    x(n+1) = A x(n) + B u(n),   y(n) = C x(n)                                     (31), (32) with D = 0
+    output form: y(n+1) = alpha y(n) + beta u(n), alpha = C A C+, beta = C B      (33)
+
+Resampling: [[A, B], [0, I]] at one period T is the exponential of [[F, G], [0, 0]] T. Its logarithm gives any
+other period.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class StateSpace:
 
     @property
     def stable(self) -> bool:
-        """Whether every eigenvalue of A lies inside the unit circle."""
+        """Return whether every eigenvalue of A lies inside the unit circle."""
         return bool(np.abs(self.poles).max() < 1)
 
     @property
@@ -59,7 +60,7 @@ class StateSpace:
         return kernels.simulate(_c(self.a), _c(self.b), _c(self.c), _c(x0), _c(np.atleast_2d(u.T).T))
 
     def initial_state(self, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Least-squares x0 (n,) so that a free run over u (N, m) meets y (N, l); NaN in y is left out."""
+        """Return the least-squares x0 (n,) of a free run over u (N, m) for y (N, l); NaN in y is left out."""
         free = self.simulate(u)
         columns = np.stack(
             [
@@ -77,16 +78,17 @@ class StateSpace:
     def output_form(self, tolerance: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
         """Return alpha (l, l), beta (l, m) of (33).
 
-        The inverse of C omits singular values below `tolerance` of the largest. Order 12 always has noise modes:
-        cond(C) reached 3e5, and the plain inverse amplifies them."""
+        The inverse of C omits singular values below `tolerance` of the largest. Order 12 always has noise
+        modes: cond(C) reached 3e5, and the plain inverse amplifies them."""
         return self.c @ self.a @ np.linalg.pinv(self.c, rcond=tolerance), self.c @ self.b
 
     def resample(self, period_s: float) -> StateSpace:
         """Return the same continuous system, inputs held, at another period.
 
         Exact (2e-15 in A - I from 10 s to 1 ms); a linear scaling of A - I would be 25 % off. Identification
-        itself runs at 1 to 10 s: at 1 ms a pole of 4000 s lies 2.5e-7 from 1, below what noise leaves of it.
-        Raises InputError where no real logarithm exists."""
+        itself runs at 1 to 10 s. At 1 ms a pole of 4000 s lies 2.5e-7 from 1, closer than noise can resolve.
+        Raises InputError when no real logarithm exists.
+        """
         if period_s == self.period_s:
             return self
         bad = [p for p in self.poles if abs(p.imag) < 1e-12 and p.real <= 1e-12]
@@ -108,11 +110,12 @@ class StateSpace:
         return replace(self, a=new[:n, :n], b=new[:n, n:], period_s=period_s)
 
     def minus_identity(self, period_s: float) -> np.ndarray:
-        """Return A - I at a (short) period, formed without the subtraction from 1 that loses digits.
+        """Return A - I at a (short) period by the series of exp(F T) - I.
 
-        The series of exp(F T) - I."""
+        The subtraction from 1 would lose digits.
+        """
         if self.poles.real.min() <= 0:
-            self.resample(period_s)  # raises with the pole's name
+            self.resample(period_s)  # for its error, which names the pole
         f = np.real(linalg.logm(self.a)) * (period_s / self.period_s)
         total = term = f
         for k in range(2, 30):
@@ -148,7 +151,7 @@ def _c(v: np.ndarray) -> np.ndarray:
 
 
 def _ridge(f: np.ndarray, y: np.ndarray, relative: float = 1e-12) -> np.ndarray:
-    """Least squares by the normal equations with a ridge `relative` to each column's own size."""
+    """Solve least squares by the normal equations, with a ridge `relative` to each column's size."""
     g = f.T @ f
     d = np.sqrt(np.maximum(np.diag(g), 1e-300))
     g = g / d / d[:, None] + relative * np.eye(len(g))

@@ -1,22 +1,24 @@
-"""Combined deterministic-stochastic subspace identification, the paper's (7) to (26), and what it lacks.
+"""Combined deterministic-stochastic subspace identification: the paper's (7) to (26), and improvements.
 
 Block Hankel matrices Up, Uf, Yp, Yf of i block rows (10); Wp = [Up; Yp] (12).
-oblique projection        O_i = Yf /_Uf Wp                                             (9), (18)
-weighted SVD              W1 O_i W2 = U S V', Gamma_i = W1^-1 U1 S1^1/2                (19), (20)
-  n4sid (`paper`)         W1 = I, W2 = I
-  moesp                   W1 = I, W2 = projector onto the complement of Uf
-  cva                     W1 = (Yf/Uf_perp Yf/Uf_perp')^-1/2, W2 the same projector
-shift invariance          C = first block of Gamma, A = Gamma(without last)+ Gamma(without first)
-the paper's B (`paper`)   Z_i = Yf / [Wp; Uf], Z_{i+1} = Yf- / [Wp+; Uf-]                        (21)
-                          [Gamma_{i-1}+ Z_{i+1}; Y_i] = [A; C] Gamma_i+ Z_i + K Uf + [Rw; Rv]    (24)
-                          K = N [D; B] by least squares, D = 0                                   (25), (26)
-our B and x(0)            simulation least squares: y(n) = C A^n x0 + sum C A^(n-1-k) B u(k) is linear in B and x0; in modal
-                          form its normal matrix is (C'C) o (S'S), S the modal states: no simulation per unknown.
 
-The Hankel matrix H is never formed. Only its Gram matrix H H' of lag correlations is needed. Each block follows
-from its upper left neighbour: G[s+1, t+1] = G[s, t] + z(s+N) z(t+N)' - z(s) z(t)'. One pass over the data
-accumulates them in bounded memory. In H = L Q, L is the Cholesky factor. If that fails (noise-free data), a
-blocked QR gives L and keeps only the triangle.
+    oblique projection        O_i = Yf /_Uf Wp                                             (9), (18)
+    weighted SVD              W1 O_i W2 = U S V', Gamma_i = W1^-1 U1 S1^1/2                (19), (20)
+      n4sid (`paper`)         W1 = I, W2 = I
+      moesp                   W1 = I, W2 = projector onto the complement of Uf
+      cva                     W1 = (Yf/Uf_perp Yf/Uf_perp')^-1/2, W2 the same projector
+    shift invariance          C = first block of Gamma, A = Gamma(without last)+ Gamma(without first)
+    the paper's B (`paper`)   Z_i = Yf / [Wp; Uf], Z_{i+1} = Yf- / [Wp+; Uf-]                        (21)
+                              [Gamma_{i-1}+ Z_{i+1}; Y_i] = [A; C] Gamma_i+ Z_i + K Uf + [Rw; Rv]    (24)
+                              K = N [D; B] by least squares, D = 0                             (25), (26)
+    our B and x(0)            least squares on y(n) = C A^n x0 + sum C A^(n-1-k) B u(k), linear in B and x0.
+                              In modal form its normal matrix is (C'C) o (S'S), S the modal states: no
+                              simulation for each unknown.
+
+The Hankel matrix H is never formed. Only its Gram matrix H H' of lag correlations is needed. Each block
+follows from its upper left neighbour: G[s+1, t+1] = G[s, t] + z(s+N) z(t+N)' - z(s) z(t)'. One pass over the
+data accumulates them in bounded memory. In H = L Q, L is the Cholesky factor. If that fails (noise-free
+data), a blocked QR gives L and keeps only the triangle.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ class Correlations:
     l: int  # noqa: E741
     samples: int
     period_s: float
-    qr: np.ndarray | None = None  # triangle from the blocked QR, where it was asked for
+    qr: np.ndarray | None = None  # triangle from the blocked QR, if requested
 
 
 def correlate(
@@ -57,10 +59,11 @@ def correlate(
     i: int = 20,
     qr: bool = False,
 ) -> Correlations:
-    """One pass over (u (N, m), y (N, l)) or pieces of it.
+    """Accumulate the correlations in one pass over (u (N, m), y (N, l)) or pieces of it.
 
-    `qr` carries the triangle of a blocked QR instead (40 times the work, for data without noise). Raises
-    InputError for a missing sample or fewer than 4i samples."""
+    `qr` keeps the triangle of a blocked QR instead (40 times the work, for data without noise). Raises
+    InputError for a missing sample or fewer than 4i samples.
+    """
     if isinstance(chunks, tuple):
         chunks = [chunks]
     lags = 2 * i
@@ -104,7 +107,7 @@ def correlate(
 
 
 def _add_lags(sums: np.ndarray, z: np.ndarray, starts: int) -> None:
-    """sums[t] += sum over n < starts of z(n) z(n+t)'."""
+    """Add to sums[t] the sum over n < starts of z(n) z(n+t)'."""
     lags, w = len(sums), z.shape[1]
     blocks = starts // _ROWS
     if blocks:
@@ -156,7 +159,7 @@ def _append_qr(triangle: np.ndarray | None, z: np.ndarray, lags: int) -> np.ndar
 
 
 def _factor(c: Correlations) -> np.ndarray:
-    """Lower triangular L of H = L Q / sqrt(N) with rows ordered [Uf; Up; Yp; Yf]."""
+    """Return the lower triangular L of H = L Q / sqrt(N), rows ordered [Uf; Up; Yp; Yf]."""
     i, m, w = c.i, c.m, c.m + c.l
     index = np.arange(2 * i * w).reshape(2 * i, w)
     order = np.concatenate(
@@ -187,7 +190,7 @@ class Subspace:
 
 
 def project(c: Correlations, weighting: str = "cva") -> Subspace:
-    """Oblique projection and weighted SVD, (18) to (20). Raises InputError for an unknown weighting."""
+    """Compute oblique projection and weighted SVD, (18) to (20). InputError: unknown weighting."""
     if weighting not in WEIGHTINGS:
         raise InputError(f"weighting '{weighting}' is not known; {', '.join(WEIGHTINGS)} are")
     L = _factor(c)
@@ -221,7 +224,7 @@ def project(c: Correlations, weighting: str = "cva") -> Subspace:
 
 
 def choose_order(s: np.ndarray, largest: int = 12) -> int:
-    """Order by the singular values: the largest drop on a log scale among the first `largest` + 1."""
+    """Choose the order: the largest drop on a log scale among the first `largest` + 1 singular values."""
     with np.errstate(divide="ignore"):
         logs = np.log(np.maximum(s[: largest + 1], 1e-300 + s[0] * 1e-14))
     return int(np.argmax(logs[:-1] - logs[1:])) + 1
@@ -236,11 +239,11 @@ def identify(
     weighting: str = "cva",
     rest: bool = True,
 ) -> StateSpace:
-    """Model of `order` (None: by the singular values) from u (N, m), y (N, l).
+    """Identify a model of `order` (None: by the singular values) from u (N, m), y (N, l).
 
     weighting `paper`: A, C from W1 = W2 = I and B from (26), as printed; it may be unstable. Else A is made
-    stable and B, x(0) come from simulation least squares (`rest`: x(0) = 0 is not assumed, it is estimated,
-    unless True)."""
+    stable, and B, x(0) come from simulation least squares (`rest`: with x(0) = 0).
+    """
     u, y = np.atleast_2d(u.T).T, np.atleast_2d(y.T).T
     c = correlate((u, y), period_s, i)
     sub = project(c, weighting)
@@ -287,7 +290,7 @@ def stabilise(a: np.ndarray, margin: float = 1e-6) -> np.ndarray:
 def input_matrix(
     a: np.ndarray, c: np.ndarray, u: np.ndarray, y: np.ndarray, rest: bool = False, ridge: float = 1e-11
 ) -> tuple[np.ndarray, np.ndarray]:
-    """B (n, m) and x0 (n,) by simulation least squares in modal coordinates (rest: x0 = 0)."""
+    """Return B (n, m) and x0 (n,) by simulation least squares in modal coordinates (rest: x0 = 0)."""
     values, vectors = np.linalg.eig(a)
     values = np.ascontiguousarray(values, dtype=complex)
     cm = c @ vectors
@@ -319,7 +322,7 @@ def input_matrix(
 
 
 def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
-    """B by the paper's (21) to (26) with D = 0: the weak step, kept as printed."""
+    """Return B by the paper's (21) to (26) with D = 0, as printed: the inaccurate step of the method."""
     k, L = sub.correlations, sub.l_factor
     i, m, l = k.i, k.m, k.l  # noqa: E741
     nu, np_ = i * m, i * (2 * m + l)
@@ -334,9 +337,9 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
     z_next = (target @ q) @ q.T
     state = np.hstack([pin_i @ z_i, np.zeros((n, L.shape[1] - np_))])
     left = np.vstack([pin_less @ z_next, yf[:l]]) - np.vstack([a, c]) @ state
-    # Solve (24), and (25), (26), which are linear in B (D = 0), together: min |left - N(B) Uf|. Solving for K first
-    # and then for B without weights is equal without noise. With noise it is far worse, because Uf of long pulses
-    # is nearly singular.
+    # Solve (24), and (25), (26), which are linear in B (D = 0), together: min |left - N(B) Uf|. Solving for K
+    # first and then for B without weights is equal without noise. With noise it is far worse, because Uf of
+    # long pulses is nearly singular.
     nu_factor = uf[:, :nu]
     target = left[:, :nu]  # left, projected on Uf
     lag, lcg = a @ pin_i, c @ pin_i  # (n, i l), (l, i l)
@@ -374,7 +377,10 @@ def real_poles(model: StateSpace, u: np.ndarray, y: np.ndarray, rest: bool = Tru
 
 
 def innovations(model: StateSpace, u: np.ndarray, y: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """One-step prediction errors (N, l) of x(n+1) = A x + B u + K e, e = y - C x  (6), K = `gain` (n, l)."""
+    """Return one-step prediction errors (N, l) of (6), with K = `gain` (n, l).
+
+    x(n+1) = A x + B u + K e, e = y - C x
+    """
     closed = model.a - gain @ model.c
     predicted = kernels.simulate(
         _c(closed), _c(np.hstack([model.b, gain])), _c(model.c), _c(model.x0), _c(np.hstack([u, y]))
@@ -401,11 +407,12 @@ def prediction_gain(model: StateSpace, u: np.ndarray, y: np.ndarray) -> np.ndarr
 def refine_prediction_error(
     model: StateSpace, u: np.ndarray, y: np.ndarray, iterations: int = 6
 ) -> tuple[StateSpace, np.ndarray]:
-    """Prediction-error refinement of C, B, K and the (real) poles by Gauss-Newton: (model, K (n, l)).
+    """Refine C, B, K and the (real) poles by prediction errors (Gauss-Newton); return (model, K (n, l)).
 
     The model must be diagonal (from `modal` or `real_poles`). Minimises the whitened innovations' sum of
     squares; a step that would leave the stable region or raise the cost is halved. Returns the start
-    unchanged where nothing improves."""
+    unchanged if nothing improves.
+    """
     if np.abs(model.a - np.diag(np.diag(model.a))).max() > 1e-12:
         raise InputError("prediction-error refinement starts from a model with real poles (diagonal A)")
     n, m = model.b.shape

@@ -2,18 +2,19 @@
 
 PID, velocity form (41): D(s) = Kp (1 + 1/(Ti s) + Td s)
 
-Response: K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)), by the direct method of closed-loop identification (Ljung,
-System Identification, 2nd ed., section 13.5): output error least squares from recorded drive to recorded
-position. The loop answers the noise of a sample one period later at the earliest. So white noise of the
-encoder does not bias the fit.
+Response: K0 e^(-s theta)/((t1 s + 1)(t2 s + 1)), by output-error least squares from recorded drive to
+recorded position. This is the direct method of closed-loop identification (Ljung, System Identification, 2nd
+ed., section 13.5). The loop answers the noise of a sample one period later at the earliest. So white noise of
+the encoder does not bias the fit.
 
 Ziegler-Nichols (Table I): Kp = 1.2 tau_c/(K0 tau_d), Ti = 2 tau_d, Td = 0.5 tau_d, from the steepest tangent
 of the fitted step response. The steepest difference of noisy samples is too steep: with 0.15 um of noise Kp
 was 21 % low, fitted 0.1 %.
 
-Lambda / IMC (Rivera, Morari, Skogestad): series form Kc = t1/(K0 (lambda + theta)), tI = t1, tD = t2, with
-the half rule for faster lags than theta. Parallel form: Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI +
-tD).
+Lambda / IMC (Rivera, Morari, Skogestad), with the half rule for faster lags than theta:
+
+    series form     Kc = t1/(K0 (lambda + theta)), tI = t1, tD = t2
+    parallel form   Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI + tD)
 
 Margins are those of the sampled loop L(e^jw) = D(z) G(z). G has a zero-order hold, the dead time and the
 moving average.
@@ -31,9 +32,7 @@ from scipy import optimize, signal
 
 from thermoctl.yamlfile import InputError
 
-UNCERTAIN_DEG = (
-    5.0  # standard error of the response's phase near the crossover, above which no gains are proposed
-)
+UNCERTAIN_DEG = 5.0  # no gains are proposed when the phase near the crossover has a larger standard error
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class SecondOrder:
     residual: float = 0.0
 
     def step(self, t: np.ndarray) -> np.ndarray:
-        """Response to a unit step at t = 0."""
+        """Return the response to a unit step at t = 0."""
         s = np.maximum(np.asarray(t, float) - self.theta_s, 0.0)
         t1, t2 = complex(self.t1), complex(self.t2)
         if abs(t1 - t2) < 1e-9 * abs(t1):
@@ -58,7 +57,7 @@ class SecondOrder:
         return self.gain * np.real(y)
 
     def response(self, drive: np.ndarray, period_s: float) -> np.ndarray:
-        """Positions (N,) from rest for drives (N,), each written after its position was read and held for `period_s`."""
+        """Return positions (N,) from rest; each drive (N,) is written after its position and held."""
         impulse = np.diff(self.step(np.arange(len(drive) + 1) * period_s))
         return np.concatenate(([0.0], signal.fftconvolve(drive, impulse)[: len(drive) - 1]))
 
@@ -70,7 +69,7 @@ class SecondOrder:
 
 @dataclass(frozen=True)
 class Gains:
-    """Kp (drive per um), Ti s, Td s, and how they came about."""
+    """Kp (drive per um), Ti s, Td s, and the method that gave them."""
 
     kp: float
     ti_s: float
@@ -118,7 +117,7 @@ def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s:
     w = np.geomspace(0.1, 1 / period_s, 400)
     phases = np.unwrap(np.angle(model(best.x).frequency(w)))
     k = min(int(np.searchsorted(-phases, np.pi * 2 / 3)), len(w) - 1)
-    w = w[k : k + 1]  # where 60 degrees are left
+    w = w[k : k + 1]  # the crossover with 60 degrees left
     slope = [
         np.angle(model(best.x + d).frequency(w) / model(best.x - d).frequency(w))[0] / 2e-3
         for d in 1e-3 * np.eye(3)
@@ -184,9 +183,10 @@ class Margins:
 
 
 def margins(model: SecondOrder, gains: Gains, period_s: float, moving_average: int = 1) -> Margins:
-    """Margins of PID (41) at `period_s` on the model with a zero-order hold.
+    """Return the margins of PID (41) at `period_s` on the model with a zero-order hold.
 
-    The moving average of `moving_average` samples counted."""
+    The moving average of `moving_average` samples is included.
+    """
     w = np.geomspace(1e-2, np.pi / period_s, 40_000)
     z = np.exp(1j * w * period_s)
     k, ti, td, ts = gains.kp, gains.ti_s, gains.td_s, period_s
@@ -210,7 +210,7 @@ def margins(model: SecondOrder, gains: Gains, period_s: float, moving_average: i
 
 
 def _held(model: SecondOrder, w: np.ndarray, period_s: float) -> np.ndarray:
-    """G(z) with a zero-order hold on |z| = 1, from the step response's samples: G = (1 - 1/z) Z{step}."""
+    """Return G(z) with a zero-order hold on |z| = 1: G = (1 - 1/z) Z{step}, from the step's samples."""
     slowest = max(abs(model.t1), abs(model.t2))
     n = int(min(20_000, np.ceil((model.theta_s + 16 * slowest) / period_s) + 2))
     impulse = np.diff(model.step(np.arange(n + 1) * period_s))
@@ -242,7 +242,7 @@ def robust(
 
 
 def difference(present: Gains, proposed: Gains) -> str:
-    """Return the change as lines of text, for people; nothing is written."""
+    """Return the change as lines of text; nothing is written."""
     rows = [
         ("kp", present.kp, proposed.kp),
         ("ti_s", present.ti_s, proposed.ti_s),
@@ -255,7 +255,7 @@ def difference(present: Gains, proposed: Gains) -> str:
 
 
 def write(config: Path, proposed: Gains) -> None:
-    """Write kp, ti_s, td_s into the control section of a configuration; on request only. Raises InputError as `write_values`."""
+    """Write kp, ti_s, td_s into a configuration. Raises InputError as `write_values`."""
     numbers = {"kp": proposed.kp, "ti_s": proposed.ti_s, "td_s": proposed.td_s}
     write_values(config, "control", {n: f"{v:.6g}" for n, v in numbers.items()})
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,25 +15,27 @@ from rich.table import Table as Grid
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant import show as drawing
 from thermoctl.plant.noise import coloured
+from thermoctl.plant.recordings import as_recorded, read_recordings
 from thermoctl.plant.refit import Estimate, fit, report, updated
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
-from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.files import write_table
+from thermoctl.recording.logger import parsed_columns
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
-RENEWAL = 0.1  # how far, as a share of its range, a state may have strayed from the plant within a block
+RENEWAL = 0.1  # largest error of a state, as a share of its range, allowed at the start of a block
 RECENT = 0.25  # share of a block from which its data count in full; older ones fade exponentially
 
 
 def simulate(args: argparse.Namespace) -> int:
-    """Free run, or predictions `--horizon` seconds ahead, on one recording or several.
+    """Simulate freely, or predict `--horizon` seconds ahead, on one recording or several.
 
-    figures, file and plot."""
+    Prints figures; writes a file and a plot on request.
+    """
     plant = load(args.plant)
     runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
     model = compile_plant(_all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
-    for path in args.recordings:
-        table = read_table(path)
+    for path, table in zip(args.recordings, _read(plant, args.recordings, args), strict=True):
         excitation = model.excitation(table)
         try:
             if args.horizon:
@@ -71,6 +75,15 @@ def simulate(args: argparse.Namespace) -> int:
     return 0
 
 
+def _read(plant: Plant, paths: Sequence[str], args: argparse.Namespace) -> list[Table]:
+    """Read recordings with the options --time and --columns; print their notes."""
+    tables = read_recordings(plant, paths, args.time, parsed_columns(args.columns))
+    for table in tables:
+        for note in table.notes:
+            print(f"note: {table.path}: {note}", file=sys.stderr)
+    return tables
+
+
 def _all_uncertain(plant: Plant) -> Plant:
     nodes = {
         n.name: dataclasses.replace(n, initial_sigma=n.initial_sigma or 1.0) for n in plant.nodes.values()
@@ -79,11 +92,12 @@ def _all_uncertain(plant: Plant) -> Plant:
 
 
 def ahead(model: Model, excitation: Excitation, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions of states (N, nx) and outputs (N, ny) in blocks of `horizon_s`.
+    """Predict states (N, nx) and outputs (N, ny) in blocks of `horizon_s`.
 
     An extended Kalman filter estimates the states at the start of each block from the data before it. So a
     sample is predicted from data up to `horizon_s` older. The model must have every state uncertain and no
-    active parameter."""
+    active parameter.
+    """
     if not model.states:
         run = model.run(excitation)
         return run.x, run.y
@@ -140,11 +154,12 @@ def _write(
     name: Path, model: Model, table: Table, excitation: Excitation, x: np.ndarray, y: np.ndarray
 ) -> None:
     columns = {f"{o.column}_simulated": y[:, j] for j, o in enumerate(model.plant.outputs.values())}
-    columns |= {
+    measured = {
         o.column: excitation.y[:, j]
         for j, o in enumerate(model.plant.outputs.values())
         if o.column in table.columns
     }
+    columns |= as_recorded(model.plant, measured)
     columns |= {f"{s}_state": x[:, i] for i, s in enumerate(model.states)}
     write_table(name, Table(name.stem, str(name), table.t, columns))
 
@@ -180,8 +195,9 @@ def refit(args: argparse.Namespace) -> int:
     model = compile_plant(plant)
     if not any(p.range for p in plant.parameters.values()):
         raise InputError(f"{plant.file}: no parameter has a 'range', so there is nothing to refit")
-    excitations = [model.excitation(read_table(r)) for r in args.recordings]
-    held = [read_table(r) for r in args.held_out or []]
+    trained = _read(plant, args.recordings, args)
+    excitations = [model.excitation(t) for t in trained]
+    held = _read(plant, args.held_out or [], args)
     try:
         found = fit(model, excitations, tries=args.tries)
         if args.noise == "ar1":
@@ -199,7 +215,7 @@ def refit(args: argparse.Namespace) -> int:
         grid = Grid(title="rms error", title_justify="left")
         for head in ("recording", "took part", "output", "before", "after"):
             grid.add_column(head, justify="right" if head in ("before", "after") else "left")
-        for part, tables in (("yes", [read_table(r) for r in args.recordings]), ("no", held)):
+        for part, tables in (("yes", trained), ("no", held)):
             for table in tables:
                 before, after = _errors(plant, table), _errors(fitted, table)
                 for o in plant.outputs:
@@ -236,7 +252,7 @@ def _estimates(plant: Plant, rows: list[Estimate]) -> Grid:
 
 
 def _errors(plant: Plant, table: Table) -> dict[str, float]:
-    """Free-run rms error per output; uncertain initial states fitted, parameters held."""
+    """Return the free-run rms error per output; uncertain initial states fitted, parameters held."""
     model = compile_plant(plant, ())
     excitation = model.excitation(table)
     if not np.isfinite(excitation.y).any():
@@ -261,16 +277,4 @@ def show(args: argparse.Namespace) -> int:
         console.print(f"[bold]{plant.title}[/bold]  ({plant.file})")
         for part in drawing.table(plant):
             console.print(part)
-    return 0
-
-
-def check(args: argparse.Namespace) -> int:
-    """Load each plant file with all its checks."""
-    for path in args.plants:
-        p = load(path)
-        free = sum(1 for q in p.parameters.values() if q.range)
-        print(
-            f"{path}: good; {len(p.inputs)} inputs, {len(p.parameters)} parameters ({free} free), {len(p.nodes)} nodes, "
-            f"{len(p.flows)} flows, {len(p.outputs)} outputs"
-        )
     return 0

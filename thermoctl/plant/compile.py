@@ -1,12 +1,15 @@
 """Plants as machine code: C from the expressions, compiled, and cached on disk.
 
     dx/dt = (flows in - flows out) / storage = f(t, x, u, p),    y = g(t, x, u, p)
-    S = d x / d q,  dS/dt = f_x S + f_q,  S(0) = d initial / d q,  q = (active parameters, uncertain initial states)
+    S = d x / d q,  dS/dt = f_x S + f_q,  S(0) = d initial / d q
+    q = (active parameters, uncertain initial states)
 
 C was chosen by measurement (`make bench`): a plant compiles in some tenths of a second, with numba in
-seconds. A jump (sign, step, a comparison) of a state or of time is smoothed to tanh(z / width), so that it
-has a slope. For a state the width is 1e-5 of the range of z, for time half a sampling interval. A jump of
-inputs that are held between samples is not smoothed.
+seconds.
+
+A jump (sign, step, a comparison) of a state or of time is smoothed to tanh(z / width), so that it has a
+slope. For a state the width is 1e-5 of the range of z, for time half a sampling interval. A jump of an input
+that is held between samples is not smoothed.
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ _LOADED: dict[str, Code] = {}
 
 
 def argument(jump: Expr) -> Expr:
-    """Return the expression whose sign a jump looks at."""
+    """Return the expression whose sign decides a jump."""
     a = jump.args
     if jump.op in (">", ">="):
         return add(a[0], neg(a[1]))
@@ -44,7 +47,7 @@ def argument(jump: Expr) -> Expr:
 
 
 class Code:
-    """A compiled plant: the equations it stands for and the library that computes them."""
+    """A compiled plant: its equations and the library that computes them."""
 
     def __init__(self, plant: Plant, active: tuple[str, ...]):
         self.plant = plant
@@ -71,7 +74,7 @@ class Code:
         self.library = _library(self.key, self.source)
 
     def _take_out_delays(self) -> None:
-        """Delays become names: of derived inputs in rates, of delayed values in outputs."""
+        """Replace delays by names: of derived inputs in rates, of delayed values in outputs."""
         self.input_delays: dict[str, tuple[Expr, Expr]] = {}
         self.output_delays: dict[str, tuple[Expr, Expr]] = {}
 
@@ -103,7 +106,7 @@ class Code:
             _,
         ) in (
             self.output_delays.values()
-        ):  # a file cannot say it (language.py), an effect laid over a plant could
+        ):  # a file cannot contain it (language.py), but an effect added to a plant can
             if ex.names(signal) & self.output_delays.keys():
                 raise InputError(
                     f"{self.plant.file}: a delay() within a delay() is not part of the language; add the seconds"
@@ -129,7 +132,7 @@ class Code:
     # --------------------------------------------------------------------------------------------- writing C
 
     def _by_parameter(self, e: Expr, q: str) -> Expr:
-        """Return d e / d parameter, also through the seconds of delayed inputs."""
+        """Return de/d(parameter), also through the seconds of delayed inputs."""
         total = derivative(e, q)
         used = ex.names(e)
         for d, (_, seconds) in self.input_delays.items():
@@ -199,7 +202,7 @@ class Code:
         return "\n".join([*parts, lu, '#include "integrator.h"\n'])
 
     def _emit(self, exprs: list[Expr]) -> str:
-        """Statements that put each expression into out[]; shared parts once."""
+        """Return the statements that compute each expression into out[]; shared parts once."""
         place = {
             **{s: f"x[{i}]" for i, s in enumerate(self.states)},
             **{s: f"u[{i}]" for i, s in enumerate(self.inputs)},
@@ -346,7 +349,7 @@ def _sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, int]:
 
 @cache
 def _compiler() -> tuple[list[str], str]:
-    """Return the C compiler's command and what identifies its result (version, processor)."""
+    """Return the C compiler's command and a text that identifies its result (version, processor)."""
     for candidate in (os.environ.get("CC"), "cc", "gcc", "clang"):
         if candidate and (path := shutil.which(candidate.split()[0])):
             version = subprocess.run([path, "--version"], capture_output=True, text=True).stdout.splitlines()[
@@ -380,7 +383,7 @@ def _compiler() -> tuple[list[str], str]:
 
 
 def cache_directory() -> Path:
-    """Where compiled plants are kept: $THERMOCTL_CACHE, else thermoctl/plants in the user's cache."""
+    """Return the folder of compiled plants: $THERMOCTL_CACHE, else thermoctl/plants in the user's cache."""
     own = os.environ.get("THERMOCTL_CACHE")
     return (
         Path(own)
@@ -402,15 +405,16 @@ def _library(key: str, source: str) -> ctypes.CDLL:
             with tempfile.TemporaryDirectory() as work:
                 _build(Path(work), source)
                 return _typed(ctypes.CDLL(str(Path(work) / "plant.so")))
-        if key[0] == "0":  # one build in sixteen: a full folder takes half a second to list
+        if key[0] == "0":  # only one build in sixteen: listing a full folder takes half a second
             _trim(folder)
     return _typed(ctypes.CDLL(str(path)))
 
 
 def _build(work: Path, source: str) -> None:
     (work / "plant.c").write_text(source)
-    # -O1 compiles a large file's straight-line code as well as -O3 in a fraction of the time. A small plant
-    # runs a tenth slower with -O1 and is ready in less than half of the time: a diagnosis compiles many.
+    # -O1 compiles a large file's straight-line code as well as -O3, in a fraction of the time. A small plant
+    # runs a tenth slower with -O1, and compiles in less than half of the time. A diagnosis compiles many
+    # plants.
     command = [("-O1" if a == "-O3" and not 10_000 < len(source) < 400_000 else a) for a in _compiler()[0]]
     done = subprocess.run(
         [*command, f"-I{_TEMPLATE.parent}", "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],
@@ -422,9 +426,7 @@ def _build(work: Path, source: str) -> None:
 
 
 def _trim(folder: Path, keep: int = 2000, age_s: float = 86_400.0) -> None:
-    """Forget the oldest beyond `keep`, but none made within a day.
-
-    Another process may be about to load it."""
+    """Delete the oldest beyond `keep`, but none made within a day: a process may be about to load it."""
     made = []
     for path in folder.glob("*.so"):
         with contextlib.suppress(OSError):  # another process trims, too
@@ -462,7 +464,7 @@ def machine_code(plant: Plant, active: tuple[str, ...]) -> Code:
 
 
 def _structure(plant: Plant) -> Mapping[str, object]:
-    """Return all that the code depends on: not values, ranges, units or noise."""
+    """Return everything that the code depends on: not values, ranges, units or noise."""
     return {
         "i": list(plant.inputs),
         "p": list(plant.parameters),

@@ -34,7 +34,7 @@ FUNCTIONS = {
 SPECIAL = ("table", "delay", "first")
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 MAX_LENGTH, MAX_DEPTH, MAX_TOKENS = 20_000, 80, 5_000
-MAX_LEVELS = 250  # of the tree that is read: of brackets, and of terms and factors in a row
+MAX_LEVELS = 250  # deepest tree: levels of brackets, and of terms and factors in a row
 ALLOWED = (
     "+ - * / **, comparisons, numbers, pi, t, the names of the file, and "
     + " ".join(FUNCTIONS)
@@ -53,14 +53,15 @@ class ExpressionError(ValueError):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Expr:
-    """One node.
+    """One node of an expression. `op` is one of:
 
-    `op` is one of:
     - 'num' and 'name', with `value`; '+', '*', '/', '**', 'neg'; a comparison; a function's name;
     - 'table': args are x, the x points and the y points; value is the number of points;
     - 'delay': args are an expression and seconds; 'first': value is a name;
-    - in derivatives only, 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope' and 'bump' (slope of a smoothed step);
-    - in derivatives only, 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed)."""
+    - only in derivatives: 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope', 'bump' (slope of a smoothed
+      step);
+    - only in derivatives: 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed).
+    """
 
     op: str
     args: tuple[Expr, ...] = ()
@@ -78,7 +79,7 @@ def make(op: str, *args: Expr, value: Any = None) -> Expr:
     key = (op, tuple(map(id, args)), value)
     found = _INTERNED.get(key)
     if found is None:
-        if len(_INTERNED) > 2_000_000:  # a long-lived process that reads very many plants
+        if len(_INTERNED) > 2_000_000:  # only a process that reads very many plants gets here
             _INTERNED.clear()
             _INTERNED.update({("num", (), 0.0): ZERO, ("num", (), 1.0): ONE})
         found = _INTERNED[key] = Expr(op, args, value)
@@ -160,7 +161,7 @@ def power(a: Expr, b: Expr) -> Expr:
 
 
 def parse(text: str | int | float) -> Expr:
-    """Read an expression. Raises ExpressionError with what stands at fault and what would be allowed."""
+    """Read an expression. Raises ExpressionError with the faulty text and the allowed alternatives."""
     if isinstance(text, bool) or not isinstance(text, (str, int, float)):
         raise ExpressionError(f"an expression was expected, not {text!r}")
     if not isinstance(text, str):
@@ -349,7 +350,7 @@ class _Reader:
 
 @lru_cache(maxsize=20_000)
 def walk(expr: Expr) -> tuple[Expr, ...]:
-    """Every distinct node, arguments before their users."""
+    """Yield every distinct node, arguments before their users."""
     seen: set[int] = set()
     stack, out = [(expr, False)], []
     while stack:
@@ -370,7 +371,7 @@ def names(expr: Expr) -> frozenset[str]:
 
 
 def substitute(expr: Expr, change: Callable[[Expr], Expr | None]) -> Expr:
-    """Return a copy in which each node for which `change` returns something is replaced by it (bottom up)."""
+    """Return a copy where `change(node)` replaces each node for which it is not None (bottom up)."""
     done: dict[int, Expr] = {}
     for node in walk(expr):
         rebuilt = node
@@ -419,7 +420,7 @@ def _text(e: Expr, outer: int) -> str:
     elif e.op == "**":
         text = f"{_text(e.args[0], p + 1)}**{_text(e.args[1], p)}"
     else:
-        left = p + 1 if e.op in COMPARISONS else p  # a comparison of a comparison needs its brackets
+        left = p + 1 if e.op in COMPARISONS else p  # a comparison inside a comparison needs brackets
         text = f"{_text(e.args[0], left)} {e.op} {_text(e.args[1], p + 1)}"
     return f"({text})" if p < outer else text
 
@@ -431,7 +432,8 @@ def _text(e: Expr, outer: int) -> str:
 def derivative(expr: Expr, by: str) -> Expr:
     """Return d expr / d name, exact.
 
-    kinks (abs, min, max, table) take one side, jumps the slope of their smooth form."""
+    At kinks (abs, min, max, table) it is one-sided; a jump has the slope of its smooth form.
+    """
     done: dict[int, Expr] = {}
     for node in walk(expr):
         done[id(node)] = _derive(node, by, done)
@@ -479,7 +481,7 @@ def _derive(e: Expr, by: str, done: Mapping[int, Expr]) -> Expr:
         case "tanh":
             return mul(add(ONE, neg(mul(e, e))), d[0])
         case "min" | "max":
-            use = make("le", *(a if e.op == "min" else a[::-1]))  # 1 where the first is taken
+            use = make("le", *(a if e.op == "min" else a[::-1]))  # 1 if the first argument is the result
             return add(mul(use, d[0]), mul(add(ONE, neg(use)), d[1]))
         case "sign":
             return mul(mul(num(2.0), make("bump", a[0])), d[0])
@@ -591,7 +593,7 @@ def _value(
             return np.interp(x, xs, ys)
         slopes = np.concatenate([[0.0], np.diff(ys) / np.diff(xs), [0.0]])
         return slopes[np.searchsorted(xs, x, side="right")]
-    if op == "delay" and "t" in values:  # over samples at values["t"], on straight lines
+    if op == "delay" and "t" in values:  # interpolate linearly between samples at values["t"]
         t = np.asarray(values["t"], float)
         return np.interp(t - a[1], t, np.broadcast_to(a[0], t.shape))
     raise ExpressionError(f"'{op}' cannot stand here")

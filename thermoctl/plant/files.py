@@ -1,4 +1,4 @@
-"""Plant files: `load` is parse, then check the units. The one place where the two are put together."""
+"""Plant files: parse, then check the units. The only module that does both."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ ROLES = (
     "level",
     "time_of_day",
 )
-"""Kinds of quantities, for where the unit does not determine the kind."""
+"""Kinds of quantities, for units that fit several kinds."""
 FLICKER_DECADES = 4  # 20 000 samples: from one over the recording's length to half the sampling rate
 
 
@@ -61,6 +61,15 @@ class SensorNoise:
 
 
 @dataclass(frozen=True)
+class Conversion:
+    """From a recorded column to the plant's unit: by the column's `unit`, else scale * column + offset."""
+
+    unit: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
 class Input:
     """A recorded column that drives the simulation; `linear`: straight lines between samples, else held."""
 
@@ -69,12 +78,13 @@ class Input:
     column: str = ""
     linear: bool = False
     role: str | None = None
+    conversion: Conversion | None = None
     at: str = _place()
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of the physics; `range` is where a refit may move it (None: known); `values` per recording."""
+    """A parameter; `range`: bounds of a refit (None: known); `values`: per recording."""
 
     name: str
     value: float
@@ -100,7 +110,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Flow:
-    """A flow from node `source` to node `target`; None stands for the outside, for one of the two."""
+    """A flow from node `source` to node `target`; one of them may be None, the surroundings."""
 
     name: str
     rate: Expr
@@ -121,6 +131,7 @@ class Output:
     noise: float | SensorNoise | None = None
     resolution: float | None = None
     role: str | None = None
+    conversion: Conversion | None = None
     at: str = _place()
 
     @property
@@ -141,8 +152,12 @@ class Plant:
     outputs: Mapping[str, Output]
     file: str = field(default="<plant>", compare=False)
 
+    def readings(self) -> tuple[Input | Output, ...]:
+        """Return everything that has a column in a recording: inputs, then outputs."""
+        return (*self.inputs.values(), *self.outputs.values())
+
     def plain(self) -> dict[str, Any]:
-        """Return plain dicts and lists, as the file holds them; `files.from_plain` reads them back."""
+        """Return the file's content as plain dicts and lists; `files.from_plain` is the inverse."""
         content: dict[str, Any] = {
             "format": FORMAT,
             "title": self.title,
@@ -160,9 +175,17 @@ def _given(**items: Any) -> dict[str, Any]:
 
 
 def _input(i: Input) -> dict[str, Any]:
-    column = None if i.column == i.name else i.column
+    column = _column(i)
     between = "linear" if i.linear else None
     return _given(unit=i.unit, column=column, between_samples=between, role=i.role)
+
+
+def _column(item: Input | Output) -> str | dict[str, Any] | None:
+    c = item.conversion
+    if c is None:
+        return None if item.column == item.name else item.column
+    parts = {"unit": c.unit} if c.unit else {"scale": c.scale, "offset": c.offset}
+    return {"name": item.column, **parts}
 
 
 def _parameter(p: Parameter) -> dict[str, Any]:
@@ -192,7 +215,7 @@ def _flow(f: Flow) -> dict[str, Any]:
 def _output(o: Output) -> dict[str, Any]:
     return _given(
         value=_scalar(o.value),
-        column=None if o.column == o.name else o.column,
+        column=_column(o),
         unit=o.unit,
         noise=_given(**asdict(o.noise)) if isinstance(o.noise, SensorNoise) else o.noise,
         resolution=o.resolution,

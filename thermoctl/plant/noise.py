@@ -25,12 +25,16 @@ from thermoctl.plant.refit import Fit, Noise, Problem
 from thermoctl.plant.simulate import Excitation
 
 CLIP = 6.0  # residuals are clipped to this many robust standard deviations
-MIN_CORRELATION, MAX_CORRELATION = 1e-3, 0.995  # of neighbouring samples; below: white noise
-MIN_SAMPLES = 20  # of a channel, below which its noise is not estimated
+# limits of the correlation of neighbouring samples; below the first: white noise
+MIN_CORRELATION, MAX_CORRELATION = 1e-3, 0.995
+MIN_SAMPLES = 20  # fewest samples of a channel for an estimate of its noise
 
 
 def innovations(phi: float, white: float, total: float) -> Noise:
-    """AR(1) with correlation phi of which `white` (a variance) of `total` is uncorrelated, as Noise."""
+    """Return AR(1) noise with correlation phi and an uncorrelated part, as Noise.
+
+    `white` is the variance of the uncorrelated part, `total` that of the whole.
+    """
     coloured = max(total - white, 0.02 * total)
     if phi < MIN_CORRELATION:
         return Noise(float(np.sqrt(total)))
@@ -83,7 +87,7 @@ class _Restricted:
         return _Moments(gram, gradient, square, log_size)
 
     def choose(self, j: int) -> Noise:
-        """Return channel j's noise of the greatest restricted likelihood, the others' noise held."""
+        """Return channel j's noise of the greatest restricted likelihood; the others' noise is held."""
         old = self.found.noise[j]
         best = minimize_scalar(
             lambda phi: self._score(j, phi)[0],
@@ -102,9 +106,10 @@ class _Restricted:
         return sum(len(rows[j][0]) for rows in self.problem.rows)
 
     def _score(self, j: int, phi: float) -> tuple[float, Noise]:
-        """-2 log restricted likelihood of channel j at a correlation phi, and its noise.
+        """Return -2 log restricted likelihood of channel j at a correlation phi, and its noise.
 
-        The size by three iterations."""
+        Three iterations determine the standard deviation.
+        """
         output = list(self.found.model.plant.outputs.values())[j]
         white = (output.resolution or 0.0) ** 2 / 12
         residuals = np.concatenate([r[np.isfinite(r[:, j]), j] for r in self.found.residuals])

@@ -1,7 +1,7 @@
-"""A plant file's text to a `Plant`: keys, numbers, names and what each expression may read.
+"""Parse a plant file's text to a `Plant`: keys, numbers, names, and the names that an expression may use.
 
-Units are checked afterwards (units.py); files.py puts both together. Every error names file, line and column,
-the name at fault and what is allowed.
+Units are checked afterwards (units.py); files.py does both. Every error gives file, line and column, the
+faulty name and the allowed ones.
 """
 
 from __future__ import annotations
@@ -12,7 +12,18 @@ from dataclasses import dataclass
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
-from thermoctl.plant.language import FORMAT, ROLES, Flow, Input, Node, Output, Parameter, Plant, SensorNoise
+from thermoctl.plant.language import (
+    FORMAT,
+    ROLES,
+    Conversion,
+    Flow,
+    Input,
+    Node,
+    Output,
+    Parameter,
+    Plant,
+    SensorNoise,
+)
 from thermoctl.yamlfile import Node as YamlNode
 from thermoctl.yamlfile import Section, kind_of, number_of, suggest
 
@@ -22,7 +33,7 @@ _NAME = re.compile(r"[A-Za-z_]\w{0,79}$", re.ASCII)
 _RESERVED = {"pi", "t", *ex.FUNCTIONS, *ex.SPECIAL}
 
 Items = dict[str, dict[str, Section]]
-"""Section of the file: name: its entry."""
+"""Entries of each section of the file, by section and name."""
 
 
 def parse(root: YamlNode) -> Plant:
@@ -97,7 +108,8 @@ def _check_name(name: str, item: YamlNode, section: str) -> None:
 
 def _input(name: str, s: Section) -> Input:
     between = s.text("between_samples", "hold", ("hold", "linear"))
-    found = Input(name, _unit(s), _column(s, name), between == "linear", _role(s), _at(s))
+    column, conversion = _column(s, name)
+    found = Input(name, _unit(s), column, between == "linear", _role(s), conversion, _at(s))
     s.end()
     return found
 
@@ -163,14 +175,16 @@ def _end(s: Section, key: str, nodes: list[str]) -> str | None:
 
 
 def _output(name: str, s: Section) -> Output:
+    column, conversion = _column(s, name)
     found = Output(
         name,
         _expression(s, "value"),
         _unit(s),
-        _column(s, name),
+        column,
         _noise(s),
         s.optional_number("resolution", low=0.0),
         _role(s),
+        conversion,
         _at(s),
     )
     s.end()
@@ -214,13 +228,29 @@ def _unit(s: Section) -> str | None:
     return node.value
 
 
-def _column(s: Section, name: str) -> str:
+def _column(s: Section, name: str) -> tuple[str, Conversion | None]:
+    """Return the column's name, and how its numbers become the plant's."""
     node = s.get("column", False)
     if node is None:
-        return name
+        return name, None
+    if isinstance(node.value, dict):
+        c = Section(node, f"column '{name}'", of=f"column of {s.of}")
+        column = c.text("name", name)
+        unit = _unit(c)
+        if unit is not None and s.given("unit") is None:
+            raise node.error(
+                f"{s.what}: the column's unit is given, its own is not; a 'unit' beside it was expected"
+            )
+        found = Conversion(unit, c.number("scale", 1.0), c.number("offset", 0.0))
+        c.end()
+        if found.scale == 0 or (unit and {"scale", "offset"} & set(node.value)):
+            raise node.error(
+                f"{s.label('column')}: either 'unit', or 'scale' (not 0) and 'offset' were expected"
+            )
+        return column, found
     if not isinstance(node.value, str) or not node.value:
         raise node.error(f"{s.label('column')}: a column's name was expected, found {kind_of(node)}")
-    return node.value
+    return node.value, None
 
 
 def _expression(s: Section, key: str) -> Expr:
@@ -236,9 +266,10 @@ def _expression(s: Section, key: str) -> Expr:
 
 @dataclass(frozen=True)
 class _Place:
-    """An expression of the file and what may stand in it.
+    """An expression of the file, and the names and functions allowed in it.
 
-    `delays`: whether delay() may, and on what it may work."""
+    `delays`: the arguments allowed in delay(): 'no', 'inputs' or 'all'.
+    """
 
     what: str
     expression: Expr

@@ -32,19 +32,19 @@ from thermoctl.plant.residuals import (
 )
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
 
-STEPS_TO_GOAL = 20.0  # a step is slow if `goal` is further away than this many like it
+STEPS_TO_GOAL = 20.0  # a step is slow if the `goal` is more than this many such steps away
 SLOW_STEPS = 3  # give up after so many slow steps in a row
-AT_BOUND = 1e-6  # a parameter this near to its bound, as a share of its range, is reported at it
+AT_BOUND = 1e-6  # a parameter counts as at its bound within this share of its range
 MAX_ACCELERATION = 0.75  # use the geodesic acceleration only up to this share of the step
-MAX_SHIFT = 8.0  # of an uncertain initial state, in its standard deviations
-KEPT_STARTS = 2  # random starts that are followed
+MAX_SHIFT = 8.0  # largest shift of an uncertain initial state, in its standard deviations
+KEPT_STARTS = 2  # number of random starts that are refined
 PREVIEW = (
     12  # iterations after which another start must be better than PREVIEW_SHARE of the best sum of squares
 )
 PREVIEW_SHARE = 0.98
-RELIMITS = 4  # times that the outlier limits are set anew
-DEAD = 0.1  # the whole range moves the residuals by less than this many standard deviations
-FLAT = 0.5  # standard error as a share of the range
+RELIMITS = 4  # number of times that the outlier limits are set anew
+DEAD = 0.1  # `dead`: a parameter's whole range changes the residuals by fewer standard deviations
+FLAT = 0.5  # `flat`: a parameter's standard error exceeds this share of its range
 CORRELATED = 0.95
 
 
@@ -90,10 +90,11 @@ class Fit:
 
 @dataclass(frozen=True)
 class _Limits:
-    """When a descent ends.
+    """Limits of a descent.
 
     `tolerance`: least gain in cost; `deadline`: clock of the thread, s; `goal`: a cost that must stay in
-    reach."""
+    reach.
+    """
 
     iterations: int
     tolerance: float
@@ -147,7 +148,7 @@ def fit(
 
 
 def _random_starts(problem: Problem, z0: np.ndarray, tries: int, seed: int) -> list[np.ndarray]:
-    """Return the starts of least cost among `tries` drawn over the ranges."""
+    """Return the starts of least cost among `tries` random ones within the ranges."""
     random = np.random.default_rng(seed)
     tried = []
     for _ in range(tries):
@@ -161,9 +162,7 @@ def _random_starts(problem: Problem, z0: np.ndarray, tries: int, seed: int) -> l
 
 
 def _follow(problem: Problem, z: np.ndarray, limits: _Limits, best: Fit | None) -> Fit | None:
-    """Descend from a start, setting the outlier limits anew.
-
-    None where a few steps do not come below `best`."""
+    """Descend from a start, setting the outlier limits anew; None if it is soon not below `best`."""
     problem.set_outlier_limits(problem.evaluate(z, False).residuals)
     if best is not None:
         z = _descend(problem, z, dataclasses.replace(limits, iterations=PREVIEW)).z
@@ -189,7 +188,7 @@ def _sum_of_squares(problem: Problem, residuals: Sequence[np.ndarray]) -> float:
 
 
 def _descend(problem: Problem, z: np.ndarray, limits: _Limits) -> Fit:
-    """Gauss-Newton steps with Levenberg's damping inside the bounds, from z to the end that `limits` set."""
+    """Do Gauss-Newton steps with Levenberg's damping inside the bounds, from z until `limits` are reached."""
     n_states = len(z) - problem.n_parameters
     low = np.concatenate([np.zeros(problem.n_parameters), np.full(n_states, -MAX_SHIFT)])
     high = np.concatenate([np.ones(problem.n_parameters), np.full(n_states, MAX_SHIFT)])
@@ -248,7 +247,7 @@ def _improve(
 def _bounded_step(
     z: np.ndarray, now: Evaluation, free: np.ndarray, damping: float, bounds: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the damped Gauss-Newton step within the bounds, and the unknowns that did not meet one."""
+    """Return the damped Gauss-Newton step within the bounds, and the unknowns that stay inside."""
     low, high = bounds
     step, left = np.zeros_like(z), free
     for _ in range(
@@ -277,9 +276,10 @@ def _acceleration(
     free: np.ndarray,
     kept: Sequence[Rows],
 ) -> np.ndarray:
-    """Half the geodesic acceleration, zeros where it is not small beside the step.
+    """Return half the geodesic acceleration, or zeros if it is not small beside the step.
 
-    The cost's valleys are curved: a straight step leaves them (Transtrum & Sethna 2012, arXiv:1201.5885)."""
+    The cost's valleys are curved, and a straight step leaves them (Transtrum & Sethna 2012, arXiv:1201.5885).
+    """
     out = np.zeros_like(step)
     if len(free):
         sub = matrix[np.ix_(free, free)]

@@ -29,7 +29,7 @@ HUBER = 4.0  # residuals beyond this many standard deviations count linearly
 PRIOR_WEIGHT = 0.02  # moving a parameter over its whole range costs as much as one residual of 0.02 sigma
 PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
 DOWNDATE_SHARE = 0.25  # up to this share of down-weighted rows, their excess is subtracted from J'J
-MIN_DIFFERENCED = 4  # samples of a recording whose second differences are used
+MIN_DIFFERENCED = 4  # fewest samples of a recording for second differences
 LOG_RATIO = 3.0  # a range that spans this factor is fitted on a log scale
 
 
@@ -47,7 +47,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Prior:
-    """-2 log of a prior density: an expression of the parameters' values in `recording`, nowhere concave."""
+    """-2 log of a prior density: a convex expression of the parameters' values in `recording`."""
 
     recording: str
     neg2_log: ex.Expr
@@ -63,7 +63,7 @@ class Scale:
         self.span = np.log(self.high / self.low) if self.log else self.high - self.low
 
     def z(self, value: float) -> float:
-        """Return the coordinate of a value."""
+        """Return the coordinate z of a value."""
         return float(np.log(value / self.low) / self.span if self.log else (value - self.low) / self.span)
 
     def value(self, z: float) -> float:
@@ -78,9 +78,7 @@ class Scale:
 
 
 def default_noise(plant: Plant, excitations: Sequence[Excitation] = ()) -> tuple[Noise, ...]:
-    """Return the noise that the plant file states.
-
-    Where it states none, the white part of the second differences."""
+    """Return the noise of the plant file, else the white part of the second differences."""
     out = []
     for j, o in enumerate(plant.outputs.values()):
         sigma = np.hypot(o.noise_sd, (o.resolution or 0.0) / np.sqrt(12))
@@ -97,7 +95,7 @@ def default_noise(plant: Plant, excitations: Sequence[Excitation] = ()) -> tuple
 
 
 def _rows(d: Excitation, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return output j's measured samples, each one's correlation with the one before, and its sigma."""
+    """Return output j's measured samples, each one's correlation with its predecessor, and sigma."""
     dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
     index = np.flatnonzero(np.isfinite(d.y[:, j]))
     gaps = np.diff(d.t[index]) / dt if len(index) > 1 else np.zeros(0)
@@ -110,7 +108,7 @@ def _rows(d: Excitation, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.n
 
 @dataclass(frozen=True)
 class Rows:
-    """Whitened residuals of one output in one recording, and what a step needs of them.
+    """Whitened residuals of one output in one recording, for one step.
 
     `w` (M,) residuals, `weight` (M,) Huber's weights, `jac` (M, k) = -dw / (slope d unknowns), `slope` (k,).
     """
@@ -233,12 +231,11 @@ class Problem:
         return part / scale.reshape(shape)
 
     def set_outlier_limits(self, residuals: Sequence[np.ndarray]) -> bool:
-        """Set Huber's limit of each output from the spread of its residuals.
+        """Set Huber's limit of each output from its residuals; True if one changed by more than a half.
 
-        True where one changed by more than a half.
-
-        Residuals of missing physics must not count as outliers, nor what occurs in more than one sample of
-        fifty."""
+        Residuals of missing physics must not count as outliers, nor anything that affects more than one
+        sample in fifty.
+        """
         new = np.full(len(self.noise), HUBER)
         for j in range(len(self.noise)):
             w = np.concatenate([self.whiten(r, j, e[:, j]) for r, e in enumerate(residuals)])
@@ -264,9 +261,10 @@ class Problem:
         return k, run.dy[:, :, used] * slope
 
     def evaluate(self, z: np.ndarray, jacobian: bool, keep: list[Rows] | None = None) -> Evaluation:
-        """Evaluate the cost, with `jacobian` its derivatives, too. Raises SimulationError.
+        """Evaluate the cost, and with `jacobian` its derivatives. Raises SimulationError.
 
-        The rows that `curvature` needs are appended to `keep`."""
+        The rows that `curvature` needs are appended to `keep`.
+        """
         values, dx0 = self.unpack(z)
         cost, gradient, matrix = 0.0, np.zeros(len(z)), np.zeros((len(z), len(z)))
         residuals = []
@@ -341,7 +339,7 @@ class Problem:
         return out * (2 / PROBE)
 
     def _slopes(self, r: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return which sensitivities of recording r are unknowns, their numbers, and d q / d z."""
+        """Return the indices of recording r's sensitivities to unknowns, the unknowns' numbers, and dq/dz."""
         used = np.flatnonzero(self.columns[r] >= 0)
         active = self.model.active
         slopes = [
@@ -364,8 +362,9 @@ class Problem:
     ) -> Rows:
         """Return output j's rows from its whitened residuals, their weights and sensitivities (N, k).
 
-        White noise of one size only scales the sensitivities: they are not copied, and a missing sample gets
-        weight 0."""
+        White noise of one standard deviation only scales the sensitivities: they are not copied, and a
+        missing sample gets weight 0.
+        """
         index, phi, _ = self.rows[r][j]
         noise, n = self.noise[j], len(jac)
         if len(noise.ar) > 1 or phi.any() or len(index) < (1 - DOWNDATE_SHARE) * n:
@@ -375,7 +374,7 @@ class Problem:
         )
 
     def _spread(self, r: int, j: int, w: np.ndarray, n: int) -> np.ndarray:
-        """Values (M,) of output j's measured samples as `n` rows, 0 where a sample is missing."""
+        """Spread values (M,) of output j's measured samples over `n` rows, 0 for a missing sample."""
         if len(w) == n:
             return w
         out = np.zeros(n)
@@ -384,7 +383,10 @@ class Problem:
 
 
 def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Weighted normal matrix J'WJ. If few rows are down-weighted, compute J'J and subtract their excess."""
+    """Return the weighted normal matrix J'WJ.
+
+    If few rows are down-weighted, compute J'J and subtract their excess.
+    """
     lowered = np.flatnonzero(weight != 1.0)
     if len(lowered) > DOWNDATE_SHARE * len(jac):
         jac = jac * np.sqrt(weight)[:, None]

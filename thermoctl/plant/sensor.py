@@ -1,4 +1,4 @@
-"""Draw the random error of a simulated sensor: white noise, and the slow part that its plant file states."""
+"""Draw the random error of a simulated sensor: white noise, and the slow part of its plant file."""
 
 from __future__ import annotations
 

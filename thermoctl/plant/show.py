@@ -31,10 +31,11 @@ Edge = tuple[int, int, str, str]
 
 
 def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
-    """Vertices (kind, key, label) and edges (from, to, kind, label).
+    """Return vertices (kind, key, label) and edges (from, to, kind, label).
 
-    One satellite for a node's inflows, one for its outflows, one for its readings; a reading of several nodes
-    is a vertex of its own."""
+    A node has one satellite for its inflows, one for its outflows and one for its readings. A reading of
+    several nodes is a vertex of its own.
+    """
     vertices = [("node", n.name, f"{n.name}\n[{n.unit}]" if n.unit else n.name) for n in plant.nodes.values()]
     index = {n: i for i, n in enumerate(plant.nodes)}
     edges: list[Edge] = []
@@ -67,7 +68,7 @@ def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
         i = len(vertices)
         vertices.append(("read", ",".join(nodes), "\n".join(names)))
         edges += [(index[n], i, "read", "") for n in nodes]
-        if not nodes:  # a static reading: the inputs it is made of stand beside it
+        if not nodes:  # a static reading: draw its inputs beside it
             used = sorted(set().union(*(ex.names(plant.outputs[o].value) for o in names)) & set(plant.inputs))
             edges += [(len(vertices) + k, i, "read", "") for k in range(len(used))]
             vertices += [("in", n, n) for n in used]
@@ -75,23 +76,24 @@ def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
 
 
 def _outline(text: Text) -> np.ndarray:
-    """[[left, bottom], [right, top]] of a drawn text's box, in pixels."""
+    """Return [[left, bottom], [right, top]] of a drawn text's box, in pixels."""
     patch = text.get_bbox_patch()
     assert patch is not None  # every text here is drawn with a box
     return patch.get_window_extent().get_points()
 
 
 def _edge(box: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
-    """Return where the line from `outside` (2,) to `inside` (2,) meets the box round `inside`.
+    """Return the intersection of the line from `outside` (2,) to `inside` (2,) with the box round `inside`.
 
-    box: [[left, bottom], [right, top]]."""
+    box: [[left, bottom], [right, top]].
+    """
     way = outside - inside
     room = np.where(way > 0, box[1] - inside, inside - box[0]) / np.maximum(np.abs(way), 1e-12)
     return inside + way * min(float(room.min()), 1.0)
 
 
 def layout(count: int, edges: list[tuple[int, int, float]], rounds: int = 400) -> np.ndarray:
-    """Positions (count, 2) of vertices joined by edges of given lengths."""
+    """Return positions (count, 2) of vertices joined by edges of given lengths."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import shortest_path
 
@@ -139,8 +141,9 @@ def draw(plant: Plant, path: str | Path) -> None:
 def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Figure:
     """Return the network as a matplotlib Figure of at most `widest` inches.
 
-    Nodes, flows and outputs named in `marked` stand out. A network that would be wider is drawn closer,
-    without the words on its lines."""
+    Nodes, flows and outputs named in `marked` are highlighted. A network that would be wider is compressed,
+    without labels on its edges.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -156,7 +159,7 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) ->
     margin = 0.45
     axes.set_xlim(x[:, 0].min() - margin, x[:, 0].max() + margin)
     axes.set_ylim(x[:, 1].min() - margin, x[:, 1].max() + margin)
-    figure.canvas.draw()  # gives the boxes their sizes, at which the arrows end
+    figure.canvas.draw()  # computes the boxes' sizes, which the arrows need
     sizes = [axes.transData.inverted().transform(_outline(q)) for q in boxes]
     for a, b, kind, label in edges:
         _arrow(axes, _edge(sizes[a], x[a], x[b]), _edge(sizes[b], x[b], x[a]), kind)
@@ -166,7 +169,7 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) ->
     return figure
 
 
-CLOSE = 0.9  # below this share of the natural size the lines have no words
+CLOSE = 0.9  # edges have no labels below this share of the natural size
 WIDE_IN = 11.0  # from this width on the legend stands beside the title
 _STYLE = {  # edge, face, font size, word of the legend
     "node": ("#1b3a5c", "#dce8f5", 9.5, "stored quantity"),
@@ -193,7 +196,7 @@ def _places(vertices: list[Vertex], edges: list[Edge], widest: float) -> tuple[n
     x = layout(len(vertices), lengths)
     span = np.maximum(np.ptp(x, axis=0), 0.5) if len(x) else np.ones(2)
     closer = min(1.0, widest / (2.0 + 1.75 * span[0]))
-    if closer < CLOSE:  # the words keep their size: a satellite needs more room beside its node
+    if closer < CLOSE:  # text does not shrink, so a satellite needs more room beside its node
         x = layout(len(vertices), [(a, b, q * 1.45 if q < 1.0 else q) for a, b, q in lengths])
     return x, closer
 

@@ -1,13 +1,10 @@
-"""Simulation of a compiled plant on a recording's inputs.
-
-Free run, sensitivities, and one fixed period at a time.
-"""
+"""Simulate a compiled plant on a recording's inputs: a whole run, or one fixed period at a time."""
 
 from __future__ import annotations
 
 import ctypes
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +12,7 @@ import numpy as np
 from thermoctl.plant import expression as ex
 from thermoctl.plant.compile import Code, machine_code
 from thermoctl.plant.language import Plant
+from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.sensor import error
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError, suggest
@@ -25,7 +23,7 @@ MAX_STEPS = 2_000  # steps within one sampling interval
 
 
 class SimulationError(Exception):
-    """The plant could not be integrated (states that run away, a division by zero); says where."""
+    """Integration failed (unstable states, a division by zero); the message gives the place."""
 
 
 @dataclass
@@ -47,9 +45,7 @@ class Excitation:
     width: np.ndarray | None = None  # (jumps,) half width of each smoothed jump
 
     def part(self, start: int, stop: int) -> Excitation:
-        """Return the samples start..stop-1 (scales kept).
-
-        Time goes on counting from the recording's start."""
+        """Return the samples start..stop-1 (scales kept). Time still counts from the recording's start."""
         return dataclasses.replace(self, t=self.t[start:stop], u=self.u[start:stop], y=self.y[start:stop])
 
 
@@ -81,7 +77,8 @@ class _Forces(ctypes.Structure):
 def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array to fill.
 
-    Touching new pages costs more than the arithmetic on them, so a caller may keep them."""
+    Touching new memory pages costs more than the arithmetic on them, so a caller may keep the array.
+    """
     if kept is None:
         return np.empty(shape)
     size = int(np.prod(shape))
@@ -90,8 +87,9 @@ def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]
     return kept[key][:size].reshape(shape)
 
 
-def _p(a: np.ndarray | None) -> int | None:
-    return None if a is None else a.ctypes.data
+def _call(function: Callable[..., int], *arguments: object) -> int:
+    """Call a function of a plant's library; an array is passed as a pointer to its numbers."""
+    return function(*(a.ctypes.data if isinstance(a, np.ndarray) else a for a in arguments))
 
 
 class Model:
@@ -112,6 +110,7 @@ class Model:
         """Return the recording as this plant reads it.
 
         Raises InputError where an input's column is missing or empty."""
+        table = in_plant_units(self.plant, table)
         t = np.ascontiguousarray(table.t - table.t[0], float)
         u = np.empty((len(t), len(self.code.inputs)))
         linear = np.zeros(len(self.code.inputs), np.intc)
@@ -158,7 +157,8 @@ class Model:
     def _delayed_inputs(self, excitation: Excitation, p: np.ndarray) -> np.ndarray:
         """Return u with the derived columns of delayed inputs.
 
-        The mean of the held signal over each interval, t - seconds; and the slope of that by the seconds."""
+        They are the mean of the held signal over each interval, delayed, and its derivative by the delay.
+        """
         if not self.code.input_delays:
             return excitation.u
         u = excitation.u.copy()
@@ -179,7 +179,7 @@ class Model:
 
                 def integral(
                     z: np.ndarray, area: np.ndarray = area, s: np.ndarray = s
-                ) -> np.ndarray:  # before the start the first value held
+                ) -> np.ndarray:  # before the start: the first value
                     return np.where(
                         z < excitation.t[0], (z - excitation.t[0]) * s[0], np.interp(z, excitation.t, area)
                     )
@@ -299,14 +299,15 @@ class Model:
         sensitivities: bool = False,
         rtol: float = RTOL,
     ) -> Simulation:
-        """Free run on a recording's inputs. Raises InputError, SimulationError."""
+        """Simulate freely on a recording's inputs. Raises InputError, SimulationError."""
         return self.run(self.excitation(table), parameters, None, sensitivities, rtol)
 
     def measure(self, table: Table, seed: int = 0) -> Table:
         """Return a simulated recording: the inputs of `table` and the readings of the sensors.
 
-        Draws noise and uncertain initial values, and rounds to the resolution. Raises InputError and
-        SimulationError."""
+        Draws noise and uncertain initial values, and rounds to the resolution. All in the plant's units.
+        Raises InputError and SimulationError."""
+        table = in_plant_units(self.plant, table)
         rng, excitation = np.random.default_rng(seed), self.excitation(table)
         dx0 = np.array([self.plant.nodes[n].initial_sigma or 0.0 for n in self.uncertain]) * rng.normal(
             size=len(self.uncertain)
@@ -345,24 +346,8 @@ class Model:
                 else np.abs(x0) + 1e-3
             )
             atol = rtol * scale
-            failed = lib.integrate(
-                n,
-                _p(excitation.t),
-                _p(u),
-                _p(excitation.linear),
-                _p(p),
-                _p(width),
-                _p(x0),
-                _p(s0),
-                nq,
-                rtol,
-                _p(atol),
-                MAX_STEPS,
-                _p(x),
-                _p(dx),
-                _p(info),
-                None,
-            )
+            start = (n, excitation.t, u, excitation.linear, p, width, x0, s0)
+            failed = _call(lib.integrate, *start, nq, rtol, atol, MAX_STEPS, x, dx, info, None)
             if failed:
                 at = max(failed - 1, 0)
                 raise SimulationError(
@@ -383,10 +368,11 @@ class Model:
         rtol: float = 1e-5,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> np.ndarray:
-        """Return the outputs' first-order response (N, ny, columns) to forces on dx/dt beside the plant's.
+        """Return the outputs' first-order response (N, ny, columns) to additional forces on dx/dt.
 
         Entry e of `forces` is (state, column); its values, per second, are q[:, e] of q (N, entries).
-        `buffers`: as of `run`."""
+        `buffers`: as of `run`.
+        """
         lib, n, nx = self.code.library, len(excitation.t), len(self.states)
         p = self.vector(parameters, excitation.name)
         if excitation.scale is None or excitation.width is None:
@@ -397,28 +383,13 @@ class Model:
         rows = np.array([f[0] for f in forces], np.intc)
         cols = np.array([f[1] for f in forces], np.intc)
         q = np.ascontiguousarray(q, float)
-        force = _Forces(len(rows), _p(rows), _p(cols), _p(q))
+        force = _Forces(len(rows), rows.ctypes.data, cols.ctypes.data, q.ctypes.data)
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
         dx = _buffer(buffers, "dx", (n, nx, columns))
         atol = rtol * excitation.scale
-        if nx and lib.integrate(
-            n,
-            _p(excitation.t),
-            _p(u),
-            _p(excitation.linear),
-            _p(p),
-            _p(excitation.width),
-            _p(x0),
-            _p(s0),
-            columns,
-            rtol,
-            _p(atol),
-            MAX_STEPS,
-            _p(x),
-            _p(dx),
-            _p(info),
-            ctypes.addressof(force),
-        ):
+        start = (n, excitation.t, u, excitation.linear, p, excitation.width, x0, s0)
+        limits = (rtol, atol, MAX_STEPS)
+        if nx and _call(lib.integrate, *start, columns, *limits, x, dx, info, ctypes.addressof(force)):
             raise SimulationError(f"{excitation.name}: the plant cannot be simulated")
         _, dy = self._observe(excitation, u, p, excitation.width, x, dx, columns, True, buffers, 0)
         assert dy is not None
@@ -438,45 +409,16 @@ class Model:
         own: int = 1,
     ) -> tuple[np.ndarray, np.ndarray | None]:
         lib, n, ny, nd = self.code.library, len(excitation.t), len(self.outputs), len(self.code.output_delays)
+        known = (n, excitation.t, u, p, width, x, dx, nq)
         delayed = slopes = None
         if nd:
             g = np.empty((n, nd))
             dg = np.empty((n, nd, nq)) if sensitivities else None
-            lib.observe(
-                1,
-                n,
-                _p(excitation.t),
-                _p(u),
-                _p(p),
-                _p(width),
-                _p(x),
-                _p(dx),
-                nq,
-                None,
-                None,
-                _p(g),
-                _p(dg),
-                own,
-            )
+            _call(lib.observe, 1, *known, None, None, g, dg, own)
             delayed, slopes = self._shift(excitation.t, g, dg, p, own)
         y = np.empty((n, ny))
         dy = _buffer(buffers, f"dy {id(excitation)}", (n, ny, nq)) if sensitivities else None
-        lib.observe(
-            0,
-            n,
-            _p(excitation.t),
-            _p(u),
-            _p(p),
-            _p(width),
-            _p(x),
-            _p(dx),
-            nq,
-            _p(delayed),
-            _p(slopes),
-            _p(y),
-            _p(dy),
-            own,
-        )
+        _call(lib.observe, 0, *known, delayed, slopes, y, dy, own)
         return y, dy
 
     def _shift(
@@ -520,7 +462,7 @@ class Model:
         first: Mapping[str, float] | None = None,
         rtol: float = 1e-5,
     ) -> Stepper:
-        """One fixed period at a time, for a simulated rig; `u0` (inputs,) are the inputs at the start."""
+        """Return a Stepper for a simulated rig: one fixed period at a time; `u0` (inputs,) at the start."""
         return Stepper(self, period_s, np.asarray(u0, float), parameters, dict(first or {}), rtol)
 
 
@@ -551,7 +493,7 @@ def _filled(t: np.ndarray, column: np.ndarray, linear: bool, what: str) -> np.nd
 
 @dataclass
 class Stepper:
-    """A plant that lives in steps of one period, its inputs held over each; deterministic."""
+    """A plant that advances in steps of one period, its inputs held over each; deterministic."""
 
     model: Model
     period_s: float
@@ -567,7 +509,7 @@ class Stepper:
         self.reset(self.u0)
 
     def reset(self, u0: np.ndarray) -> None:
-        """Back to the start with these inputs (nu,)."""
+        """Return to the start with these inputs (nu,)."""
         m = self.model
         self._p = m.vector(self.parameters)
         named = dict(zip(m.inputs, u0, strict=True))
@@ -590,7 +532,9 @@ class Stepper:
         size = ctypes.c_int.in_dll(m.code.library, "memory_size").value
         self._memory = np.zeros(size)  # the matrix of the exponential method, see integrator.h
         tail = (self._atol, self.x, self._y, self._want, self._memory)
-        self._pointers = [_p(a) for a in (self._u, self._p, self._width)], [_p(a) for a in tail]
+        self._pointers = tuple(
+            [a.ctypes.data for a in part] for part in ((self._u, self._p, self._width), tail)
+        )
 
     def step(self, u: np.ndarray) -> np.ndarray:
         """Advance one period with inputs `u` (nu,) held.

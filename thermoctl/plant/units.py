@@ -21,7 +21,7 @@ from thermoctl.yamlfile import InputError
 Dimension = tuple[tuple[str, Fraction], ...]
 """Sorted (base unit, exponent) pairs; () is dimensionless. None stands for 'fits anywhere'."""
 
-# The symbols of most plant files: with these nobody waits for pint, which takes half a second to import.
+# The symbols of most plant files: they do not need pint, whose import takes half a second.
 _COMMON = {
     "1": "",
     "%": "",
@@ -104,6 +104,12 @@ def check_units(plant: Plant) -> None:
         units[item.name] = readings[item.name] = _declared(plant, item.name, item.unit, item.at)
     for output in plant.outputs.values():
         readings[output.name] = _declared(plant, output.name, output.unit, output.at)
+    for read in plant.readings():
+        if read.conversion and read.conversion.unit and read.unit:
+            try:
+                conversion(read.conversion.unit, read.unit)
+            except ValueError as error:
+                raise InputError(f"{plant.file}:{read.at}: column of '{read.name}': {error}") from None
     check = _Check(plant, units, readings)
     second = (("s", Fraction(1)),)
     rates: dict[str, tuple[Dimension, str]] = {}
@@ -254,7 +260,7 @@ def _raised(base: Dimension, exponent: float) -> Dimension:
 
 
 def _text(d: Dimension) -> str:
-    """Return kg m2 s-3 and the like, with the derived unit where there is one."""
+    """Return text such as kg m2 s-3, with the derived unit if there is one."""
     order = {b: i for i, b in enumerate(_BASES.values())}
     written = " ".join(
         f"{base}{'' if q == 1 else q if q.denominator == 1 else f'^({q})'}"
@@ -303,6 +309,26 @@ def dimension(unit: str) -> Dimension:
     if rest != len(tokens):
         raise ValueError(f"'{unit}' is not a unit: '{tokens[rest][1]}' was not expected")
     return result
+
+
+def conversion(given: str, wanted: str) -> tuple[float, float]:
+    """Return (scale, offset) from a unit to another: wanted = scale * given + offset. Raises ValueError.
+
+    C and F are degrees where a temperature is wanted."""
+    if dimension(wanted) == dimension("K"):
+        given = {"C": "degC", "F": "degF"}.get(given, given)
+    if dimension(given) != dimension(wanted):
+        raise ValueError(f"{given} [{_text(dimension(given))}] is no {wanted} [{_text(dimension(wanted))}]")
+    if given == wanted:
+        return 1.0, 0.0
+    registry = _registry()
+    ends = [float(registry.Quantity(x, _spelled(given)).to(_spelled(wanted)).magnitude) for x in (0.0, 1.0)]
+    return ends[1] - ends[0], ends[0]
+
+
+def _spelled(unit: str) -> str:
+    plain = unit.replace("°C", "degC").replace("°", "deg").translate(_RAISED)
+    return "dimensionless" if plain == "1" else plain
 
 
 Tokens = list[tuple[str, str]]
@@ -370,11 +396,17 @@ def _symbol(symbol: str) -> Dimension:
 
 
 @cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+@cache
 def _pint() -> tuple[Callable[[str], Mapping[str, Any]], tuple[type[Exception], ...]]:
     import pint
 
-    registry: pint.UnitRegistry[float] = pint.UnitRegistry()
-    return registry.get_dimensionality, (
+    return _registry().get_dimensionality, (
         pint.errors.UndefinedUnitError,
         pint.errors.DefinitionSyntaxError,
         AttributeError,

@@ -1,9 +1,8 @@
-"""The cases of a proof.
-
-Where each lies, whether it has been run by this program, and its sealed answer.
+"""The cases of a proof: folder, state and sealed answer of each.
 
 A case is a folder with plant.yaml and recordings. Answers lie apart (DIR/NAME.yaml, checked against
-manifest.sha256) or as answer.yaml inside the case."""
+manifest.sha256) or as answer.yaml inside the case.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +20,7 @@ RECORDINGS = (".csv", ".parquet", ".arrow")
 
 
 class Run(TypedDict):
-    """How the diagnosis of one case went, as in its run.json.
-
-    `error` is None when it came to a result."""
+    """Outcome of the diagnosis of one case, as in its run.json. `error` is None when it has a result."""
 
     name: str
     fingerprint: str
@@ -101,7 +98,7 @@ def find_jobs(folder: str | Path, number: int | None = None, apart: Sequence[str
 
 
 def done(job: Job, out: Path) -> bool:
-    """Check whether this job has been run into `out` by this program."""
+    """Check whether `out` holds this job's result by this version of the program."""
     try:
         run = json.loads((out / "run.json").read_text())
     except (OSError, ValueError):
@@ -110,7 +107,7 @@ def done(job: Job, out: Path) -> bool:
 
 
 def outcome(job: Job, cases: Path) -> tuple[dict[str, Any] | None, Run]:
-    """Read a job's diagnosis (None where it failed) and how it went, from CASES/NAME."""
+    """Read a job's diagnosis (None if it failed) and its outcome, from CASES/NAME."""
     folder = cases / job.name
     run: Run = json.loads((folder / "run.json").read_text())
     path = folder / "diagnosis.json"
@@ -120,7 +117,8 @@ def outcome(job: Job, cases: Path) -> tuple[dict[str, Any] | None, Run]:
 def read_answers(jobs: Sequence[Job], answers: Path | None) -> dict[str, dict[str, Any]]:
     """Read the answer of each case. Answers that lie apart must match their manifest.sha256.
 
-    Raises InputError."""
+    Raises InputError.
+    """
     sealed: dict[str, str] = {}
     if answers is not None and (answers / "manifest.sha256").exists():
         for line in (answers / "manifest.sha256").read_text().splitlines():

@@ -1,6 +1,4 @@
-"""The page of a proof.
-
-Figures, plots, confusion, by rig family and effect, and each case that is not right."""
+"""The page of a proof: figures, plots, confusion, results by rig family and effect, each wrong case."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def _scored(job: Job, cases: Path, answer: Mapping[str, Any]) -> Row:
 
 
 def _duration(recordings: Sequence[str]) -> float | None:
-    """Length of the first recording, s; None where it cannot be read."""
+    """Return the length of the first recording, s; None if it cannot be read."""
     try:
         t = read_table(recordings[0], columns=["t"]).t
     except InputError:

@@ -1,6 +1,7 @@
-"""Diagnose real recordings, for which no answer is known.
+"""Diagnose real recordings without a known answer.
 
-Verdict, places and held-out error beside what was published."""
+The result shows verdict, places and held-out error beside the published figures.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ _PUBLISHED = re.compile(r"publish|publication|benchmark's|upstream reports", re.
 class Entry:
     """One folder of real recordings.
 
-    Held_out: output -> rms on data that took no part: as it was, refitted, extended."""
+    held_out: output -> rms on held-out data: plant as it was, refitted, extended.
+    """
 
     name: str
     verdict: str

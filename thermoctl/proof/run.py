@@ -1,6 +1,4 @@
-"""Run the diagnosis over many cases.
-
-Through Dask in separate processes, none twice, past workers that die."""
+"""Run the diagnosis over many cases through Dask, each once, in separate processes that may die."""
 
 from __future__ import annotations
 
@@ -18,22 +16,20 @@ from thermoctl.diagnose.run import diagnose
 from thermoctl.proof.jobs import Job, Run, done
 from thermoctl.yamlfile import InputError
 
-RETRIES = 3  # workers that may die over one case before it counts as failed
+RETRIES = 3  # number of workers that may die on one case before it counts as failed
 
 OnCase = Callable[[int, int, Run], None]  # cases done, cases to do, the newest
 
 
 def run_one(job: Job, out: str) -> Run:
-    """Diagnose one case in this process; OUT/run.json is written last.
-
-    Never raises for a bad case."""
+    """Diagnose one case in this process; OUT/run.json is written last. A bad case raises nothing."""
     started, cpu = time.monotonic(), time.process_time()
     error = None
     try:
         diagnose(job.plant, list(job.recordings), out, [Path(e) for e in job.effects])
     except InputError as e:
         error = str(e)
-    except Exception as e:  # a crash is a result of the proof, not the end of it
+    except Exception as e:  # a crash is a result of the proof
         error = f"{type(e).__name__}: {e}"
     run = _run(job, error, round(time.monotonic() - started, 2))
     run["cpu_s"] = round(time.process_time() - cpu, 2)
@@ -56,9 +52,7 @@ def _run(job: Job, error: str | None, seconds: float | None) -> Run:
 
 @contextmanager
 def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
-    """Open a Dask client.
-
-    Of the scheduler at the address, else of local single-threaded processes."""
+    """Open a Dask client of the scheduler at the address, else of local single-threaded processes."""
     import dask
     from distributed import Client, LocalCluster
 

@@ -1,12 +1,10 @@
-"""One diagnosis against its sealed answer.
+"""Score one diagnosis against its sealed answer: detection, name, place, and the gain of the added effect.
 
-What was found, named, placed, and what adding it was worth.
-
-Held-out gain: with e the mean over outputs of (rms / oracle's rms)^2 on data that took no part,
+Held-out gain: with e the mean over outputs of (rms / oracle's rms)^2 on held-out data,
 
     share = (e_refit - e_after) / (e_refit - 1)
 
-It is 1 where the result is as good as the true physics, 0 where it is no better than a refit alone.
+1: as good as the true physics. 0: no better than a refit alone.
 """
 
 from __future__ import annotations
@@ -31,13 +29,14 @@ Named = tuple[str, str]  # an effect and its place
 class Row:
     """One scored case.
 
-    `called` is what the diagnosis said in one word: an effect, `none` or `unknown`."""
+    `called` is the diagnosis in one word: an effect, `none` or `unknown`.
+    """
 
     case: str
     family: str
     kind: str
     band: str | None
-    size: float | None  # of the effect that a refit cannot absorb, in sigmas of an ideal single test
+    size: float | None  # part of the effect that a refit cannot absorb, in sigmas of an ideal single test
     colour: str | None  # of the noise
     truth: list[Named]
     verdict: str
@@ -45,9 +44,9 @@ class Row:
     findings: list[Named]
     detected: bool
     named: bool
-    exact: bool  # the findings are the true effects by name, none more and none less
-    alike: bool  # the same, where an equivalent name counts as the true one
-    placed: bool | None  # every rightly named finding is at the right place; None without one
+    exact: bool  # the findings are exactly the true effects by name
+    alike: bool  # the same, counting an equivalent name as the true one
+    placed: bool | None  # every correctly named finding is at the right place; None without one
     inside: bool | None  # every true effect (or an equivalent) is among findings and alternatives
     inside_exact: bool | None
     set_size: int
@@ -56,7 +55,7 @@ class Row:
     gain: float | None
     seconds: float | None
     error: str | None
-    world: str = "closed"  # open: with small misfits that nobody will name
+    world: str = "closed"  # open: with small misfits of no known name
     strays: int = 0  # findings that are neither a true effect nor an equivalent one
     calibration: list[tuple[float, bool]] = field(default_factory=list)
     parameters: list[dict[str, Any]] = field(default_factory=list)
@@ -71,7 +70,7 @@ def same_place(effect: str, a: str, b: str) -> bool:
 
 @dataclass(frozen=True)
 class Truth:
-    """The true effects of a case, and what the data cannot tell from them."""
+    """The true effects of a case, and the effects that the data cannot distinguish from them."""
 
     effects: list[Named]
     kind: str  # none, one, pair, cancel, unknown
@@ -81,7 +80,7 @@ class Truth:
 
     @classmethod
     def of(cls, case: str, answer: Mapping[str, Any]) -> Truth:
-        """Read it from an answer. Raises InputError where a key is missing."""
+        """Read the truth from an answer. Raises InputError if a key is missing."""
         for key in ("verdict", "effects", "nearly_the_same"):
             if key not in answer:
                 raise InputError(
@@ -115,7 +114,7 @@ class Truth:
         )
 
     def holds(self, found: Named) -> bool:
-        """Check whether effect and place are exactly true: hypotheses exclude each other."""
+        """Check whether effect and place are exactly true; equivalents do not count."""
         effect, place = found
         right = any(effect == e and same_place(e, place, w) for e, w in self.effects)
         return right or found in self.also_right
@@ -229,7 +228,7 @@ def _parameters(
     true: Sequence[Mapping[str, float]],
     findings: Sequence[Mapping[str, Any]],
 ) -> list[dict[str, Any]]:
-    """Compare the parameters of rightly named findings: error, coverage (`A_1` is `A`)."""
+    """Compare the parameters of correctly named findings: error, coverage (`A_1` is `A`)."""
     rows = []
     for (effect, _), values in zip(truth, true, strict=False):
         found = next((f for f in findings if f["effect"] == effect), None)

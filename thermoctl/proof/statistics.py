@@ -8,10 +8,12 @@ Calibration: the expected error over ten bins b of width 0.1
 
     ECE = sum_b (n_b/n) |mean probability_b - share right_b|
 
-Detection over size s, in sigmas of an ideal single test (the curve of MIL-HDBK-1823A), by maximum likelihood
-on a grid; 95 % interval of `half`: where twice the log likelihood has fallen by 3.84
+Detection over size s, in sigmas of an ideal single test, is the curve of MIL-HDBK-1823A
 
     P(found | s) = 1 / (1 + (half / s)^slope)
+
+by maximum likelihood on a grid. The 95 % interval of `half` ends where twice the log likelihood has fallen by
+3.84.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ import numpy as np
 
 Z_95 = 1.959964  # standard normal quantile of a two-sided 95 % interval
 CHI2_95 = 3.84  # 95 % point of chi squared with one degree of freedom
-FEWEST_SIZES = 10  # sizes below which no detection curve is fitted
+FEWEST_SIZES = 10  # fewest sizes for a detection curve
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ def reliability(
 
 
 def by_chance(pairs: Sequence[tuple[float, bool]], draws: int = 400) -> float | None:
-    """Compute the mean calibration error of so few findings with exact probabilities."""
+    """Compute the mean calibration error that so few findings have with exact probabilities."""
     rng = random.Random(5)
     errors = [reliability([(p, rng.random() < p) for p, _ in pairs])[1] for _ in range(draws)]
     given = [e for e in errors if e is not None]
@@ -113,7 +115,7 @@ def found_by_size(sizes: Sequence[float], found: Sequence[bool]) -> dict[str, fl
 
 
 def quantile(values: Iterable[float | None], q: float) -> float | None:
-    """Interpolate the q quantile of the values that are given; None without any."""
+    """Interpolate the q quantile of the values that are not None; None without any."""
     given = sorted(v for v in values if v is not None)
     if not given:
         return None

@@ -1,6 +1,4 @@
-"""The figures of a scored set.
-
-One number each with its interval and goal, and tables by family and effect."""
+"""Figures of a scored set: numbers with interval and goal, and tables by family and effect."""
 
 from __future__ import annotations
 
@@ -12,9 +10,9 @@ from thermoctl.proof.score import NAMING, Row
 from thermoctl.proof.statistics import Share, by_chance, found_by_size, quantile, reliability, share
 
 BANDS = ("large", "middle", "small")  # of an effect's size: above 15, 6 to 15, 3 to 6 sigmas
-ONSET_SHARE = 0.02  # of the recording's length: an onset that is off by less counts as right
+ONSET_SHARE = 0.02  # share of the recording's length: an onset with a smaller error counts as right
 
-# the figures to reach (issue "The proof"): name -> (figure, at least / at most)
+# goals: name -> (figure, at least / at most)
 GOALS = {
     "false_alarms": (0.02, "most"),
     "detected_large": (0.98, "least"),
@@ -35,9 +33,9 @@ GOALS = {
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Compute all figures of a set for JSON.
 
-    `figures` (one number each), `shares` (with intervals) and tables.
-
-    The cases with small misfits that nobody will name are apart, under `open_world`."""
+    `figures` (one number each), `shares` (with intervals) and tables. Cases with small misfits of no known
+    name are separate, under `open_world`.
+    """
     opened = open_world([r for r in rows if r.world == "open"])
     rows = [r for r in rows if r.world != "open"]
     single = [r for r in rows if r.kind == "one"]
@@ -101,7 +99,7 @@ def _shares(rows: Sequence[Row]) -> dict[str, Share]:
 
 
 def _by_size(single: Sequence[Row]) -> dict[str, dict[str, float] | None]:
-    """Fit the size found half of the time, in all noise, in white and in coloured noise."""
+    """Fit the size that is found half of the time, in all, in white and in coloured noise."""
     sized = [r for r in single if r.size]
     groups = {
         "all": sized,
@@ -129,7 +127,7 @@ def _numbers(rows: Sequence[Row]) -> dict[str, float | None]:
 
 
 def _confusion(rows: Sequence[Row]) -> dict[str, dict[str, int]]:
-    """How often each true effect was called what."""
+    """Count the diagnosed names of each true effect (confusion matrix)."""
     counts: dict[str, Counter[str]] = {}
     for r in rows:
         called = ("ambiguous: " if r.verdict == "ambiguous" else "") + r.called
@@ -152,9 +150,7 @@ def _grouped(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, dict[str, in
 
 
 def open_world(rows: Sequence[Row]) -> dict[str, Any]:
-    """Compute the figures of the cases with small misfits that nobody will name.
-
-    Empty without any."""
+    """Compute the figures of the cases with small misfits of no known name; empty without any."""
     if not rows:
         return {}
     visible = [r for r in rows if r.kind == "one" and r.band in ("large", "middle")]

@@ -11,7 +11,7 @@ from thermoctl.proof.recordings import Entry
 
 Line = tuple[
     str, str, str, str, str, bool | None
-]  # figure, is, 95 % interval, of, goal, whether it is reached
+]  # figure, value, 95 % interval, of, goal, whether it is reached
 
 _TITLES = {
     "false_alarms": "false alarms on nothing missing",
@@ -93,7 +93,7 @@ def lines(content: Mapping[str, Any]) -> Iterator[Line]:
 
 
 def _open_lines(found: Mapping[str, Any]) -> Iterator[Line]:
-    """Yield the lines of the cases with small misfits that nobody will name."""
+    """Yield the lines of the cases with small misfits of no known name."""
     for key, s in found.get("shares", {}).items():
         if s["n"]:
             wide = f"{100 * s['low']:.0f}–{100 * s['high']:.0f} %"

@@ -6,20 +6,23 @@ import argparse
 import dataclasses
 import json
 import math
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from thermoctl.recording.files import write_table
+from thermoctl.recording.logger import joined, parsed_columns, read_recording
 from thermoctl.recording.reader import export, info, recover
 from thermoctl.recording.writer import FULL, TIER, recording_files
 from thermoctl.yamlfile import InputError
 
 UNKNOWN_RIG = "unknown rig"
-"""Recordings of before they named their rig."""
+"""Label of old recordings, which do not name their rig."""
 
 
 def list_recordings(args: argparse.Namespace) -> int:
-    """One line a recording, by rig and run: begin, length, size, and whether it was closed."""
+    """Print one line a recording, by rig and run: begin, length, size, and whether it was closed."""
     folder = Path(args.directory)
     if not folder.is_dir():
         raise InputError(
@@ -88,7 +91,7 @@ def show_info(args: argparse.Namespace) -> int:
 
 
 def export_recording(args: argparse.Namespace) -> int:
-    """Return a recording in another format."""
+    """Write a recording in another format."""
     rows = export(
         args.file, args.out, args.columns.split(",") if args.columns else None, args.begin, args.end
     )
@@ -96,8 +99,21 @@ def export_recording(args: argparse.Namespace) -> int:
     return 0
 
 
+def import_recordings(args: argparse.Namespace) -> int:
+    """Write the recording of any logger as Parquet, with units; several files are parts of one recording."""
+    parts = [read_recording(p, args.time, parsed_columns(args.columns)) for p in args.files]
+    for part in parts:
+        for note in part.notes:
+            print(f"note: {part.path}: {note}", file=sys.stderr)
+    table = joined(parts)
+    write_table(args.out, table)
+    units = ", ".join(f"{n} [{table.units[n]}]" if n in table.units else n for n in table.columns)
+    print(f"{args.out}: {len(table)} rows, {table.t[-1] - table.t[0]:.6g} s; {units}")
+    return 0
+
+
 def recover_recording(args: argparse.Namespace) -> int:
-    """Return a closed copy of a cut recording."""
+    """Write a closed copy of a truncated recording."""
     path = Path(args.file)
     i = recover(path, args.out or path.with_name(path.stem + ".recovered.arrows"))
     print(

@@ -28,11 +28,11 @@ from thermoctl.yamlfile import InputError, suggest
 MAX_CELLS = 250_000_000  # 2 GB of float64; a longer recording is read a few columns or hours at a time
 MAX_CSV_BYTES = 4_000_000_000
 _MISSING = ["", "NaN", "nan", "NAN"]
-_COMMENT = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)
+COMMENT = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)
 
 
 @dataclass(frozen=True)
-class _Raw:
+class Raw:
     """The result of a reader: columns by name, with t, and a function that names data row k (from 0)."""
 
     columns: dict[str, np.ndarray]
@@ -40,23 +40,26 @@ class _Raw:
     place: Callable[[int], str]
 
 
-def read_table(path: str | Path, columns: Iterable[str] | None = None) -> Table:
+def read_table(path: str | Path | Table, columns: Iterable[str] | None = None) -> Table:
     """Read a recording; the suffix selects the format (`FORMATS`), `columns` the columns beside the time.
 
+    A table is returned as it is, so that a caller may have read it himself (`logger.read_recording`).
     The time column is `t`, in our own recordings `t_s`. Raises InputError with file and row (CSV: line) for:
     - text in a number column, or an infinite value
     - a time that is missing, equal to the one before, or earlier
     - a ragged row, a repeated column, no time column, no rows
     - a file that is too large, truncated, or not of its format"""
+    if isinstance(path, Table):
+        return path
     path = Path(path)
-    reader = _READERS.get(path.suffix.lower())
+    reader = READERS.get(path.suffix.lower())
     if path.is_dir():
         raise InputError(f"{path}: a folder; one recording file ({FORMATS}) was expected")
     if reader is None:
         raise InputError(f"{path}: the format '{path.suffix}' is not known; {FORMATS} are")
     want = None if columns is None else list(dict.fromkeys(columns))
     try:
-        return _checked(path, reader(path, want))
+        return checked(path, reader(path, want))
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
     except pa.ArrowException as e:
@@ -96,16 +99,19 @@ def write_table(path: str | Path, table: Table) -> None:
 
 
 def to_arrow(table: Table) -> pa.Table:
-    """Return the table as Arrow: `t` first, float64, null for a missing sample, `meta` as metadata."""
+    """Return the table as Arrow: `t` first, float64, null for a missing sample; `meta`, units."""
     arrays = {"t": table.t, **table.columns}
     arrow = pa.table(
         {k: pa.array(np.asarray(v, dtype=np.float64), from_pandas=True) for k, v in arrays.items()}
     )
-    return arrow.replace_schema_metadata(table.meta or None)
+    fields = [
+        f.with_metadata({"unit": table.units[f.name]}) if f.name in table.units else f for f in arrow.schema
+    ]
+    return arrow.cast(pa.schema(fields, table.meta or None))
 
 
 class whole_file:  # noqa: N801 used as a function
-    """A temporary file beside `path` that takes its name when the block ends well and vanishes otherwise."""
+    """Write to a temporary file; rename it to `path` when the block ends without error, else delete it."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -125,7 +131,8 @@ class whole_file:  # noqa: N801 used as a function
             os.unlink(self.temporary)
 
 
-def _checked(path: Path, raw: _Raw) -> Table:
+def checked(path: Path, raw: Raw) -> Table:
+    """Return the table of a reader's result: finite, times increasing. Raises InputError with the place."""
     columns = dict(raw.columns)
     clock = _clock(columns)
     if clock is None:
@@ -151,7 +158,7 @@ def _checked(path: Path, raw: _Raw) -> Table:
         raise InputError(
             f"{raw.place(row)}: the time {t[row]:.17g} {what}; strictly increasing seconds were expected"
         )
-    return Table(path.stem, str(path), t, columns, raw.meta)
+    return Table(path.stem, str(path), t, columns, raw.meta, recorded=True)
 
 
 def _clock(names: Iterable[str]) -> str | None:
@@ -168,7 +175,7 @@ def _limit(path: Path, rows: int, columns: int) -> None:
 
 
 def _picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
-    """Return the time column and those asked for."""
+    """Return the time column and the requested columns."""
     if want is None:
         return names
     for name in want:
@@ -180,14 +187,14 @@ def _picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
 
 
 # ------------------------------------------------------------------------------------------------------- CSV
-def _read_csv(path: Path, want: list[str] | None) -> _Raw:
+def _read_csv(path: Path, want: list[str] | None) -> Raw:
     if path.stat().st_size > MAX_CSV_BYTES:
         raise InputError(
             f"{path}: {path.stat().st_size} bytes; a CSV file of at most {MAX_CSV_BYTES} was expected "
             "(convert it to Parquet)"
         )
     data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
-    bare = _COMMENT.sub(b"", data) if b"#" in data else data
+    bare = COMMENT.sub(b"", data) if b"#" in data else data
     bare = bare.lstrip(b"\r\n")
     head, _, body = bare.partition(b"\n")
     names = _header(path, head)
@@ -203,13 +210,14 @@ def _read_csv(path: Path, want: list[str] | None) -> _Raw:
                     column_types=dict.fromkeys(names, pa.float64()), null_values=_MISSING, check_utf8=False
                 ),
             )
-            columns = {n: _numpy(arrow[n]) for n in chosen}
+            columns = {n: to_numpy(arrow[n]) for n in chosen}
         except pa.ArrowInvalid:
-            columns = None  # the exact place, or what Arrow refuses and Python reads: below
+            # go on below: for the exact place of an error, and for text that only Python parses
+            columns = None
     if columns is None:
         columns = _slow_csv(path, data, names)
         columns = {n: columns[n] for n in _picked(path, names, want)}
-    return _Raw(columns, {}, lambda row: f"{path}:{_csv_line(data, row)}")
+    return Raw(columns, {}, lambda row: f"{path}:{_csv_line(data, row)}")
 
 
 def _header(path: Path, head: bytes) -> list[str]:
@@ -234,7 +242,7 @@ def _header(path: Path, head: bytes) -> list[str]:
 
 
 def _csv_rows(data: bytes) -> Iterable[tuple[int, list[str]]]:
-    """(line counted from 1, cells) of the header and each row, without comments and empty lines."""
+    """Yield (line counted from 1, cells) of the header and each row, without comments and empty lines."""
     lines = io.StringIO(data.decode("utf-8", errors="replace"), newline="")
     number = 0
 
@@ -257,7 +265,7 @@ def _csv_line(data: bytes, row: int) -> int:
 
 
 def _slow_csv(path: Path, data: bytes, names: list[str]) -> dict[str, np.ndarray]:
-    """Cell by cell, for the exact place of what is wrong."""
+    """Read cell by cell, for the exact place of an error."""
     values: list[list[float]] = []
     for i, (line, cells) in enumerate(_csv_rows(data)):
         if i == 0:
@@ -282,11 +290,12 @@ def _slow_csv(path: Path, data: bytes, names: list[str]) -> dict[str, np.ndarray
 
 
 # -------------------------------------------------------------------------------------------- Parquet, Arrow
-def _numpy(column: pa.ChunkedArray) -> np.ndarray:
+def to_numpy(column: pa.ChunkedArray) -> np.ndarray:
+    """Return a column as float64, NaN for null."""
     return np.ascontiguousarray(column.to_numpy(), dtype=np.float64)
 
 
-def _from_arrow(path: Path, arrow: pa.Table, want: list[str] | None) -> _Raw:
+def _from_arrow(path: Path, arrow: pa.Table, want: list[str] | None) -> Raw:
     names = arrow.column_names
     for i, name in enumerate(names):
         if name in names[:i]:
@@ -306,16 +315,16 @@ def _from_arrow(path: Path, arrow: pa.Table, want: list[str] | None) -> _Raw:
                 f"{path}: row {row + 1}: column '{name}': {str(value)[:40]!r} ({kind}) stands where a "
                 "number belongs" + (" (seconds)" if name == "t" else "")
             )
-        columns[name] = _numpy(column.cast(pa.float64(), safe=False))
+        columns[name] = to_numpy(column.cast(pa.float64(), safe=False))
     meta = {
         k.decode(errors="replace"): v.decode(errors="replace")
         for k, v in (arrow.schema.metadata or {}).items()
         if k not in (b"pandas", b"ARROW:schema")
     }
-    return _Raw(columns, meta, lambda row: f"{path}: row {row + 1}")
+    return Raw(columns, meta, lambda row: f"{path}: row {row + 1}")
 
 
-def _read_parquet(path: Path, want: list[str] | None) -> _Raw:
+def _read_parquet(path: Path, want: list[str] | None) -> Raw:
     with pa.parquet.ParquetFile(path) as f:
         names = f.schema_arrow.names
         chosen = _picked(path, names, want)
@@ -323,7 +332,7 @@ def _read_parquet(path: Path, want: list[str] | None) -> _Raw:
         return _from_arrow(path, f.read(columns=chosen) if len(set(names)) == len(names) else f.read(), want)
 
 
-def _read_arrow(path: Path, want: list[str] | None) -> _Raw:
+def _read_arrow(path: Path, want: list[str] | None) -> Raw:
     """Return an IPC file, or an IPC stream up to where it was cut (a recorder that lost power leaves one)."""
     with pa.memory_map(str(path)) as source:
         if source.size() >= 6 and source.read(6) == b"ARROW1":
@@ -341,21 +350,21 @@ def _read_arrow(path: Path, want: list[str] | None) -> _Raw:
     return _from_arrow(path, pa.Table.from_batches(batches, schema), want)
 
 
-def _read_mdf(path: Path, want: list[str] | None) -> _Raw:
+def _read_mdf(path: Path, want: list[str] | None) -> Raw:
     return _foreign(path, formats.read_mdf(path), want)
 
 
-def _read_tdms(path: Path, want: list[str] | None) -> _Raw:
+def _read_tdms(path: Path, want: list[str] | None) -> Raw:
     return _foreign(path, formats.read_tdms(path), want)
 
 
-def _foreign(path: Path, columns: dict[str, np.ndarray], want: list[str] | None) -> _Raw:
-    return _Raw(
+def _foreign(path: Path, columns: dict[str, np.ndarray], want: list[str] | None) -> Raw:
+    return Raw(
         {n: columns[n] for n in _picked(path, list(columns), want)}, {}, lambda row: f"{path}: row {row + 1}"
     )
 
 
-_READERS: dict[str, Callable[[Path, list[str] | None], _Raw]] = {
+READERS: dict[str, Callable[[Path, list[str] | None], Raw]] = {
     ".csv": _read_csv,
     ".parquet": _read_parquet,
     ".arrow": _read_arrow,
@@ -365,4 +374,4 @@ _READERS: dict[str, Callable[[Path, list[str] | None], _Raw]] = {
     ".mdf": _read_mdf,
     ".tdms": _read_tdms,
 }
-FORMATS = ", ".join(_READERS)
+FORMATS = ", ".join(READERS)

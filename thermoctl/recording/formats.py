@@ -1,13 +1,16 @@
-"""Recordings of other programs: MDF4 (asammdf) and TDMS (npTDMS) read, MDF4 and MCAP (mcap) written.
+"""Recordings of other programs: MDF4, TDMS and Excel read, MDF4 and MCAP written.
 
-The libraries are an extra, `pip install 'thermoctl[formats]'`. Channels with different rates are merged by
-time, so most cells of a slow channel are empty.
+The libraries (asammdf, npTDMS, openpyxl, mcap) are an extra, `pip install 'thermoctl[formats]'`. Channels
+with different rates are merged by time, so most cells of a slow channel are empty.
 """
 
 from __future__ import annotations
 
+import csv
 import importlib
+import io
 import json
+from datetime import date, time
 from pathlib import Path
 from types import ModuleType
 
@@ -35,7 +38,7 @@ def _damaged(path: Path, kind: str, e: Exception) -> InputError:
 
 
 def _united(path: Path, channels: list[tuple[str, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
-    """(name, times (n,), values (n,)) of each channel as columns over the union of all times."""
+    """Merge channels (name, times (n,), values (n,)) into columns over the union of all times."""
     if not channels:
         raise InputError(f"{path}: no channels with a time; at least one was expected")
     for name, t, values in channels:
@@ -66,13 +69,13 @@ def _united(path: Path, channels: list[tuple[str, np.ndarray, np.ndarray]]) -> d
 
 
 def read_mdf(path: Path) -> dict[str, np.ndarray]:
-    """Columns of an ASAM MDF file by channel name, with `t`. Raises InputError."""
+    """Read the columns of an ASAM MDF file by channel name, with `t`. Raises InputError."""
     asammdf = _library("asammdf", path)
     path.stat()
     try:
         with asammdf.MDF(str(path)) as mdf:
             found = [(s.name, np.asarray(s.timestamps), np.asarray(s.samples)) for s in mdf.iter_channels()]
-    except Exception as e:  # asammdf raises what its parsing of damaged bytes happens to raise
+    except Exception as e:  # asammdf raises any error on damaged bytes
         raise _damaged(path, "MDF", e) from None
     return _united(path, [c for c in found if c[0] not in ("t", "time")])
 
@@ -118,8 +121,25 @@ def read_tdms(path: Path) -> dict[str, np.ndarray]:
     return _united(path, found)
 
 
+def read_excel(path: Path) -> bytes:
+    """Return the first sheet of an Excel file as comma-separated text, row for row. Raises InputError."""
+    openpyxl = _library("openpyxl", path)
+    path.stat()
+    try:
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        for row in book.worksheets[0].iter_rows(values_only=True):
+            cells = [c.isoformat() if isinstance(c, date | time) else "" if c is None else c for c in row]
+            writer.writerow(cells)
+        book.close()
+    except Exception as e:  # openpyxl likewise
+        raise _damaged(path, "Excel", e) from None
+    return out.getvalue().encode()
+
+
 def write_mdf(path: str, table: Table) -> None:
-    """MDF 4.10, one channel group, zipped; units of our signals."""
+    """Write MDF 4.10, one channel group, zipped; units of our signals."""
     asammdf = _library("asammdf", Path(path))
     with asammdf.MDF(version="4.10") as mdf:
         mdf.append(
@@ -133,9 +153,10 @@ def write_mdf(path: str, table: Table) -> None:
 
 
 def write_mcap(path: str, table: Table) -> None:
-    """MCAP with one JSON message a row on /thermoctl (Foxglove and PlotJuggler plot its fields).
+    """Write MCAP with one JSON message a row on /thermoctl (Foxglove and PlotJuggler plot its fields).
 
-    a missing sample is left out of its message. Log time is `wall_s` where it is recorded, else `t`."""
+    A missing sample is left out of its message. Log time is `wall_s` if it is recorded, else `t`.
+    """
     writer_module = _library("mcap.writer", Path(path))
     clock = table.columns.get("wall_s", table.t - min(table.t[0], 0.0))
     names, values = ["t", *table.columns], np.column_stack([table.t, *table.columns.values()])

@@ -1,9 +1,9 @@
-"""History for a plot: least, mean and largest value of a signal in each pixel's span.
+"""Return a signal's history for a plot: minimum, mean and maximum in each pixel's span.
 
 Only recordings of one rig are drawn, by the name in their metadata; those without a name belong to no rig. A
 reading that was stale or in error is not a sample. Long spans come from the 10 Hz tier, short ones
-(FULL_SPAN_S and less) from the full rate. Files that are complete are reduced to one second once and kept in
-memory, so that a day is drawn again in milliseconds.
+(FULL_SPAN_S and less) from the full rate. Closed files are reduced to one second once and kept in memory, so
+a day is drawn again in milliseconds.
 """
 
 from __future__ import annotations
@@ -53,11 +53,10 @@ def history(
 ) -> History:
     """Return the rig's signal from begin_s to end_s (seconds since 1970) in at most `points` buckets.
 
-    invalid(status_bits, signal) says which samples are none (daemon.readings.invalid); None takes all.
-
-    Empty where nothing is recorded.
-
-    Raises InputError for an unknown signal, a span that is empty, or points out of 2..MAX_POINTS."""
+    invalid(status_bits, signal) marks the samples to omit (daemon.readings.invalid); None keeps all. Empty
+    when nothing is recorded. Raises InputError for an unknown signal, an empty span, or points outside
+    2..MAX_POINTS.
+    """
     if signal not in INDEX:
         raise InputError(f"history: no signal '{signal[:60]}'{suggest(signal, NAMES)}")
     if not (np.isfinite([begin_s, end_s]).all() and 0.0 <= begin_s < end_s <= 1e11):
@@ -85,9 +84,10 @@ def history(
 
 
 def reduce(bucket: np.ndarray, low: np.ndarray, mean: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Reduce samples of the same bucket number to (numbers, least, mean, largest).
+    """Reduce samples of the same bucket to (bucket numbers, minimum, mean, maximum).
 
-    The buckets need not be in order: the clock may have stepped."""
+    The buckets need not be in order, because the clock may step.
+    """
     if not len(bucket):
         return bucket, low, mean, high
     if (np.diff(bucket) < 0).any():
@@ -114,7 +114,7 @@ def _start_s(path: Path) -> float:
 
 
 def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Path]:
-    """Return the files that may hold a part of the span: a file lasts at most until it was written last."""
+    """Return the files that may overlap the span: from the start in a file's name to its last write."""
     try:
         paths = recording_files(directory, kind)
     except OSError:
@@ -124,7 +124,7 @@ def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Pa
         try:
             if _start_s(path) <= end_s and path.stat().st_mtime + 1.0 >= begin_s:
                 chosen.append(path)
-        except FileNotFoundError:  # went with the budget meanwhile
+        except FileNotFoundError:  # the disk budget deleted it meanwhile
             continue
     return chosen
 
@@ -146,7 +146,7 @@ Invalid = Callable[[np.ndarray, str], np.ndarray] | None
 
 
 def _samples(path: Path, signal: str, kind: str, step_s: float, invalid: Invalid) -> tuple[np.ndarray, ...]:
-    """(wall, low, mean, high) of one file, reduced to `step_s` (0: as recorded); [] if broken."""
+    """Return (wall, low, mean, high) of one file, reduced to `step_s` (0: as recorded); [] if broken."""
     try:
         size = path.stat().st_size
         return (

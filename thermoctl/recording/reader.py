@@ -24,7 +24,7 @@ from thermoctl.yamlfile import InputError, suggest
 
 @dataclass(frozen=True)
 class Info:
-    """A recording in short. `whole`: it was closed; else its writer was killed or is still writing."""
+    """Summary of a recording. `whole`: it was closed; else its writer was killed or is still writing."""
 
     path: str
     rows: int
@@ -39,7 +39,7 @@ class Info:
 
 
 def info(path: str | Path) -> Info:
-    """Look through a recording, decoding its times only. Raises InputError."""
+    """Summarise a recording, decoding its times only. Raises InputError."""
     path = Path(path)
     fields = open_stream(path).schema
     clock = next((n for n in ("t", "t_s") if n in fields.names), None)
@@ -77,9 +77,10 @@ def info(path: str | Path) -> Info:
 
 
 def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
-    """(ticks (n, signals) in the order of signals.SIGNALS, the text `law` of the metadata) for a replay.
+    """Return (ticks (n, signals) in the order of signals.SIGNALS, text `law` of the metadata) for a replay.
 
-    Raises InputError when a signal is missing (a tier, or a recording of another version)."""
+    Raises InputError when a signal is missing (a tier, or a recording of another version).
+    """
     table = read_table(path)
     if "10 Hz" in table.meta.get("tier", ""):
         raise InputError(f"{path}: no full-rate recording but its 10 Hz tier; a replay needs every tick")
@@ -95,10 +96,11 @@ def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
 
 
 def recover(path: str | Path, out: str | Path) -> Info:
-    """Copy the whole batches of a cut recording to `out` and end it properly.
+    """Copy the complete batches of a truncated recording to `out` and close it properly.
 
     Any Arrow reader opens the copy; its summary is returned. Raises InputError when nothing can be read or
-    `out` exists."""
+    `out` exists.
+    """
     path, out = Path(path), Path(out)
     stream = open_stream(path)
     for _ in stream:
@@ -159,7 +161,7 @@ def _export_table(
     if kind == ".mcap":
         formats.write_mcap(out, table)
     elif kind == ".mf4":
-        with TemporaryDirectory(dir=Path(out).parent) as folder:  # asammdf insists on its own suffix
+        with TemporaryDirectory(dir=Path(out).parent) as folder:  # asammdf requires its own suffix
             formats.write_mdf(f"{folder}/export.mf4", table)
             Path(folder, "export.mf4").replace(out)
     elif kind == ".csv":
@@ -172,7 +174,7 @@ def _export_table(
 def _export_stream(
     path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float
 ) -> int:
-    if want is not None:  # also says which column there is not
+    if want is not None:  # its error lists the columns
         read_names = open_stream(path).schema.names
         for name in want:
             if name not in read_names:
@@ -198,7 +200,7 @@ def _export_stream(
 def _pieces(
     batches: Iterable[pa.RecordBatch], clock: str, begin_s: float, end_s: float
 ) -> Iterator[pa.Table]:
-    """Tables of many batches (a row group each), cut to the times asked for, NaN as null."""
+    """Yield tables of many batches (a row group each), cut to the given times, NaN as null."""
     held: list[pa.RecordBatch] = []
     rows = 0
     for batch in batches:

@@ -24,7 +24,7 @@ CRC = b"crc32"
 
 
 def checksums(batch: pa.RecordBatch) -> bytes:
-    """CRC-32 of every column's numbers (float64 without nulls), 4 bytes each, little endian."""
+    """Return the CRC-32 of every column's numbers (float64 without nulls), 4 bytes each, little endian."""
     return np.array([zlib.crc32(column.to_numpy()) for column in batch.columns], dtype="<u4").tobytes()
 
 

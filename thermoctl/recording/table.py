@@ -14,13 +14,18 @@ import numpy as np
 class Table:
     """A recording: time `t` (N,) in seconds and `columns`, each (N,) float64, NaN where missing.
 
-    `name`: the file's stem; `path`: its path; `meta`: texts of the file (configuration, model)."""
+    `name`: the file's stem; `path`: its path; `meta`: texts of the file (configuration, model). `units`: unit
+    of a column, where the file states it. `notes`: the reader's guesses and conversions, for people.
+    `recorded`: the numbers are as in the file, not yet in the units of a plant."""
 
     name: str
     path: str
     t: np.ndarray
     columns: dict[str, np.ndarray]
     meta: dict[str, str] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    recorded: bool = False
 
     def __len__(self) -> int:
         return len(self.t)

@@ -27,10 +27,10 @@ import pyarrow as pa
 from thermoctl.recording.stream import CRC, END, checksums
 from thermoctl.signals import SIGNALS, Signal
 
-BATCH_S = 0.5  # of ticks in one batch of the full rate, the most that a power cut loses
-BATCH_ROWS = 4096  # ... and no more than this where time runs faster
+BATCH_S = 0.5  # of ticks in one batch of the full rate; a power loss costs at most this
+BATCH_ROWS = 4096  # most rows in one batch, for simulated time that runs faster
 TIER_HZ = 10.0
-TIER_BATCH_ROWS = 100  # 10 s: the full rate holds what a cut costs the tier
+TIER_BATCH_ROWS = 100  # 10 s; after a power loss the full rate still has these rows
 RETRY_S = 5.0
 FULL, TIER = ".arrows", ".10hz.arrows"
 NAME = re.compile(r"^(?P<rig>.+)-(?P<start>\d{8}T\d{6}\.\d{3}Z)(?P<again>-\d+)?(?P<kind>\.10hz)?\.arrows$")
@@ -38,7 +38,7 @@ _COMPRESSED = pa.ipc.IpcWriteOptions(compression="zstd")
 
 
 def schema(signals: Sequence[Signal], metadata: Mapping[str, str]) -> pa.Schema:
-    """float64 columns named as the signals, with unit and meaning; `metadata` is kept in the file."""
+    """Return the schema: float64 columns with unit and meaning of the signals; `metadata` is stored."""
     return pa.schema(
         [pa.field(s.name, pa.float64(), metadata={"unit": s.unit, "meaning": s.meaning}) for s in signals],
         metadata=dict(metadata),
@@ -46,7 +46,7 @@ def schema(signals: Sequence[Signal], metadata: Mapping[str, str]) -> pa.Schema:
 
 
 class StreamFile:
-    """One Arrow stream on disk: a batch is there and synced, or it is not there at all. Raises OSError."""
+    """One Arrow stream on disk; a batch is written and synced whole, or absent. Raises OSError."""
 
     def __init__(self, path: Path, columns: pa.Schema):
         self.path, self.schema = path, columns
@@ -55,7 +55,7 @@ class StreamFile:
         self._buffer = io.BytesIO()
         try:
             self._stream = pa.ipc.new_stream(self._buffer, columns, options=_COMPRESSED)
-            self._stream.write_table(columns.empty_table())  # brings the schema message out
+            self._stream.write_table(columns.empty_table())  # writes the schema message
             self._put()
             folder = os.open(path.parent, os.O_RDONLY)
             try:
@@ -83,7 +83,7 @@ class StreamFile:
             _write_all(self._fd, data)
             os.fdatasync(self._fd)
         except OSError:
-            os.ftruncate(self._fd, self.bytes)  # no half batch stays behind
+            os.ftruncate(self._fd, self.bytes)  # remove the incomplete batch
             os.lseek(self._fd, self.bytes, os.SEEK_SET)
             raise
         self.bytes += len(data)
@@ -103,9 +103,10 @@ def _write_all(fd: int, data: bytes) -> None:
 
 
 class Tier:
-    """min, mean and max over each tenth of a second; words of bits (`*_bits`) are or-ed.
+    """Reduce rows to min, mean and max over each tenth of a second; words of bits are or-ed.
 
-    NaN is a missing sample."""
+    NaN is a missing sample.
+    """
 
     def __init__(self, signals: Sequence[Signal]):
         names = [s.name for s in signals]
@@ -125,9 +126,10 @@ class Tier:
         self._open = np.empty((0, len(names)))
 
     def add(self, rows: np.ndarray, last: bool = False) -> np.ndarray:
-        """Rows (k, signals) in, finished rows (m, len(self.signals)) out.
+        """Return the rows (m, len(self.signals)) that `rows` (k, signals) complete.
 
-        `last` finishes the one under way."""
+        `last` completes the row in progress.
+        """
         rows = np.concatenate((self._open, rows))
         bins = np.floor(rows[:, self.clock] * TIER_HZ + 1e-6)
         ends = np.flatnonzero(np.diff(bins)) + 1
@@ -159,7 +161,7 @@ class Limits(Protocol):
 
     @property
     def directory(self) -> str | Path:
-        """Folder of the recordings."""
+        """The folder of the recordings."""
 
     @property
     def file_mb(self) -> float:
@@ -245,7 +247,7 @@ class RecordingWriter:
     append = write
 
     def flush(self) -> None:
-        """Bring what waits to the disk now."""
+        """Write the waiting rows to the disk now."""
         if not self._waiting:
             return
         rows = np.concatenate(self._waiting)
@@ -261,7 +263,7 @@ class RecordingWriter:
                     self.directory, FULL, 0, self.path, 1
                 ):
                     raise
-                self._full_file.write(rows)  # the oldest file made room
+                self._full_file.write(rows)  # the oldest file was deleted
             self._tier_rows.append(self._tier.add(rows))
             self._flush_tier(TIER_BATCH_ROWS)
             if self._full_file.bytes - self._pruned_at > self.budget / 64:
@@ -326,13 +328,13 @@ class RecordingWriter:
             if f is not None:
                 try:
                     f.close()
-                except OSError as e:  # without its end mark it opens all the same
+                except OSError as e:  # the file is readable without its end mark
                     self.log(f"{f.path}: left without an end mark: {e.strerror or e}")
         self._full_file = self._tier_file = None
 
 
 def recording_files(directory: Path, kind: str) -> list[Path]:
-    """Our files of one kind (FULL or TIER) in a folder, oldest first."""
+    """Return our files of one kind (FULL or TIER) in a folder, oldest first."""
     found = [
         p for p in directory.iterdir() if (m := NAME.match(p.name)) and bool(m["kind"]) == (kind == TIER)
     ]

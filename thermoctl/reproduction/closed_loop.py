@@ -1,9 +1,8 @@
-"""The whole chain at the loop's own period.
-
-The daemon's law and the full electromechanical plant, in simulated time.
+"""Run the whole chain at the loop's own period: the daemon's law and the full plant, in simulated time.
 
 Phase 1 (two processes): test 2; test 3 and test 4A, without compensation. Phase 2: test 4B with the paper's
-and with the better compensator."""
+and with the better compensator.
+"""
 
 from __future__ import annotations
 
@@ -41,9 +40,7 @@ def of_rows(rows: np.ndarray) -> Recorded:
 def run_test(
     config: str, truth: str, name: str, model: CompensatorModel | None, every: int = 1000, part: float = 1.0
 ) -> np.ndarray:
-    """Run one test from rest; record rows once every `every` ticks.
-
-    The compensator `model` acts when given."""
+    """Run one test from rest; record one row every `every` ticks. `model` compensates, if given."""
     settings = load_settings(config)
     settings = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, truth=truth))
     test = experiments.load_experiments(of_config(config))[name]
@@ -56,9 +53,7 @@ def run_test(
 
 
 def scaled_truth(plant_file: str | Path, path: Path) -> Path:
-    """Write the truth plant with the proving rigs' expansions to `path`.
-
-    Return its absolute form."""
+    """Write the truth plant with the rigs' larger expansions to `path`; return the absolute path."""
     p = plant.load(plant_file)
 
     def change(data: dict[str, Any]) -> None:
@@ -145,9 +140,10 @@ def agreement(full: Recorded, quasi: Recorded) -> dict[str, float]:
 def run(
     config: str, plant_file: str, folder: Path, say: Callable[[str], object] = print, part: float = 1.0
 ) -> dict[str, Any]:
-    """Run every test and return `judge`'s figures; the recordings go into FOLDER/full_run.npz.
+    """Run every test and return the figures; the recordings go into FOLDER/full_run.npz.
 
-    `part` < 1 is for tests of this module: only that part of each test."""
+    `part` < 1: only that part of each test, for tests of this module.
+    """
     truth = scaled_truth(plant_file, folder / "truth.yaml")
     with ProcessPoolExecutor(2) as pool:
 
@@ -175,11 +171,12 @@ def judge(
     calibration: chain.Calibration,
     tests: dict[str, experiments.Schedule],
 ) -> dict[str, Any]:
-    """Compute (mean, 2 s) of test 4B wherever the reference stands at its target.
+    """Compute (mean, 2 s) of test 4B over all samples at rest at the target.
 
     `paper`, `better`: the output's error under each compensator. `..._estimator`: the growth in the better
-    one's run less each estimate. `still_...`: the same from the quasi-static plant. `agreement`: of the two
-    plants over tests 2, 4A and 4B."""
+    compensator's run less each estimate. `still_...`: the same for the quasi-static plant. `agreement`: of
+    the two plants over tests 2, 4A and 4B.
+    """
     figures: dict[str, Any] = {}
     r = {k: of_rows(v) for k, v in rows.items()}
     for k in ("paper", "better"):

@@ -17,7 +17,7 @@ from thermoctl.reproduction.seeds import Kept
 from thermoctl.signals import POINTS
 
 SHOWN = (0, 2, 5, 8, 10)  # points whose rises are drawn
-REACHED = 1 - np.exp(-1)  # of a first-order step after its time constant
+REACHED = 1 - np.exp(-1)  # share of a first-order step after one time constant
 
 
 def figures(kept: Kept) -> list[str]:

@@ -1,4 +1,4 @@
-"""What the reproduction promises, measured on many rigs."""
+"""The reproduction's goals, measured on many rigs."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from thermoctl.reproduction import tables
 from thermoctl.reproduction.rigs import DISTURBANCES
 from thermoctl.reproduction.seeds import SeedResult
 
-THREEFOLD = 0.4  # of SISO's repeatability: SISO's over the paper's rounds to three from 2.5 on
+THREEFOLD = 0.4  # of SISO's repeatability: a ratio of 2.5 or more rounds to the paper's threefold
 
 
 class Goal(NamedTuple):
-    """One promised figure.
-
-    The value measured, the range wanted in words, and whether it is met, as yes or NO."""
+    """One goal: the measured value, the required range in words, and whether it is met (yes or NO)."""
 
     what: str
     measured: float
@@ -26,7 +24,7 @@ class Goal(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """What limits the methods on a family of rigs, medians: ratios of 2 s, um, and K."""
+    """Limits of the methods on a family of rigs, medians: ratios of 2 s, um, and K."""
 
     rigs: str
     paper_over_siso: float
@@ -37,7 +35,7 @@ class Limit(NamedTuple):
 
 
 def goals(seeds: Sequence[SeedResult], disturbed: Sequence[SeedResult]) -> list[Goal]:
-    """Measure every figure that is promised."""
+    """Measure every goal."""
 
     def two_s(k: str) -> np.ndarray:
         return np.array([s.position[k][1] for s in seeds])
@@ -72,7 +70,7 @@ def goals(seeds: Sequence[SeedResult], disturbed: Sequence[SeedResult]) -> list[
 
 
 def _disturbed_goals(disturbed: Sequence[SeedResult]) -> list[Goal]:
-    """On disturbed rigs the better method must not be worse than the paper's."""
+    """Require that the better method is not worse than the paper's on disturbed rigs."""
     rows = []
     for name in DISTURBANCES:
         found = [d.position for d in disturbed if d.disturbance == name]
@@ -84,7 +82,7 @@ def _disturbed_goals(disturbed: Sequence[SeedResult]) -> list[Goal]:
 
 
 def _goal(what: str, value: float, high: float | None, low: float = 0.0) -> Goal:
-    """One goal; `high` None: the value is only printed."""
+    """Make one goal; `high` None: the value is only printed."""
     if high is None:
         return Goal(what, float(value), "printed", "yes")
     wanted = f"{low:g} to {high:g}" if low else f"<= {high:g}"
@@ -92,7 +90,7 @@ def _goal(what: str, value: float, high: float | None, low: float = 0.0) -> Goal
 
 
 def limits(families: Mapping[str, Sequence[SeedResult]]) -> list[Limit]:
-    """Compare families of rigs: what limits both methods."""
+    """Compare families of rigs by the limits of both methods."""
     out = []
     for name, results in families.items():
         p, s, b = (np.array([r.position[k][1] for r in results]) for k in ("paper", "siso", "better"))

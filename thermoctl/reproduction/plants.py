@@ -1,4 +1,4 @@
-"""The plants of the proving rigs, made from a plant file's truth."""
+"""Make the plants of the simulated rigs from a plant file's truth."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ FAST = ("i_coil", "u_integral", "velocity", "position")  # states that settle in
 
 
 def quasi_static(plant: Plant) -> Plant:
-    """Replace amplifier and motion by the inputs coil current and eddy heat.
-
-    Add inputs of unmeasured heat."""
+    """Replace amplifier and motion by inputs: coil current, eddy heat, and unmeasured heat."""
     data = plant.plain()
     data["nodes"] = {k: v for k, v in data["nodes"].items() if k not in FAST}
     flows: dict[str, Any] = {}

@@ -1,6 +1,4 @@
-"""The report of the reproduction.
-
-The paper's numbers, ours by its method, ours by the better method."""
+"""Write the report: the paper's numbers, ours by its method, ours by the better method."""
 
 from __future__ import annotations
 
@@ -39,9 +37,10 @@ def report(
     whole: Mapping[str, Any] | None,
     seconds: float,
 ) -> str:
-    """Write the page.
+    """Return the page.
 
-    `before`: the goals on the seeds that choices were made on; `whole`: the full run's figures."""
+    `before`: the goals on the seeds that choices were made on; `whole`: the full run's figures.
+    """
     sections = [
         _positions(results),
         _how_to_read(results),

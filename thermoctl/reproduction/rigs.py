@@ -1,14 +1,13 @@
-"""Simulated rigs to prove the method on.
+"""Simulated rigs for the reproduction, each with physics that no identified model has.
 
-Varied from seed to seed and day to day, with physics that no identified model has.
-
-The plant file's truth is used with its fast electromechanics replaced by the quasi-static equivalent
-(plants.py): the position loop settles in milliseconds, heat takes minutes. The current is what holds the
-flexures and drags the eddy damping, i = (k x + b v) / k_T, with x the reference after the rate limiter.
+A rig uses the plant file's truth, with its fast electromechanics replaced by the quasi-static equivalent
+(plants.py). The position loop settles in milliseconds, heat takes minutes. The current holds the flexures and
+overcomes the eddy damping, i = (k x + b v) / k_T, with x the reference after the rate limiter.
 
 Each seed has other heat capacities, conductances and expansions (SPREAD). Each day has another natural
-convection (CONVECTION), bench temperature, chamber drift, and unmeasured heat in three bodies (a random walk
-that is forgotten in HEAT_TAU_S)."""
+convection (CONVECTION), bench temperature and chamber drift. Unmeasured heat in three bodies is a first-order
+random process with time constant HEAT_TAU_S.
+"""
 
 from __future__ import annotations
 
@@ -36,22 +35,21 @@ PAPER_SCALE = {
     "a_shaft_2": 1.5,
     "a_bracket_1": 7.5,
 }
-"""Expansion of the proving rigs over the plant file's: a longer shaft and a long arm under the encoder's head. With these the error
-without compensation (5.7 +- 7.3 um in the paper) and with the coil alone (+-2.3 um) is of the paper's size."""
-HEAT_W, HEAT_TAU_S = (
-    0.012,
-    1800.0,
-)  # unmeasured heat in each of HEATED: rms, and the time in which it is forgotten
-# The chamber, K: spread of the day's level, swing in SWING_S, wander in WANDER_S.
+"""Factor on the plant file's expansion: a longer shaft, and a long arm under the encoder's head.
+
+It gives errors of the paper's size: 5.7 +- 7.3 um without compensation, +-2.3 um with the coil alone.
+"""
+HEAT_W, HEAT_TAU_S = (0.012, 1800.0)  # unmeasured heat in each of HEATED: rms, and correlation time
+# The chamber, K: spread of the day's level, amplitude over SWING_S, random drift over WANDER_S.
 AIR_K = (0.25, 0.35, 0.12)
 SWING_S, WANDER_S = (12000.0, 28000.0), 2500.0
-# Share of the chamber's and the bench's drift in the rigs of the report (study.py).
+# Factor on the chamber's and the bench's drift in the report's rigs (study.py).
 CHAMBER = 0.6
-# Largest relative deviation of a seed's parameters from the plant file, by the first letters of their names.
+# Largest relative deviation of a seed's parameters from the plant file, by prefix of their names.
 SPREAD = {"C_": 0.08, "G_": 0.15, "H_": 0.15, "a_": 0.10, "N_": 0.15}
 CONVECTION = 0.06  # spread of a day's convection, share
 NEUTRAL_C, BENCH_K = 22.0, 0.3  # mean of chamber and bench; spread of the bench's day
-ENCODER_STEP_UM, ENCODER_NOISE_UM = 0.005, 0.015  # of the difference of the two encoders
+ENCODER_STEP_UM, ENCODER_NOISE_UM = 0.005, 0.015  # of the difference between the two encoders
 AIR_STEP_C, AIR_NOISE_C = 0.01, 0.02
 METER_SPREAD, METER_NOISE_W = 0.005, 0.002  # of the power meter: gain from rig to rig, and noise
 PROOF_DAY = 4  # test 4: disturbances come after its calibration part
@@ -72,17 +70,19 @@ def _changed_air(t: np.ndarray, late: np.ndarray, columns: dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """A change of a rig that the methods are not told of.
+    """A change of a rig that the methods do not know.
 
-    Sensors and motion differ always, the rest after calibration."""
+    Sensors and motion differ always, the rest after calibration.
+    """
 
     inputs: Callable[[np.ndarray, np.ndarray, dict[str, np.ndarray]], None] | None = None
-    factors: Mapping[str, float] = field(default_factory=dict)  # of parameters whose names start so
+    # factors on parameters, by prefix of their names
+    factors: Mapping[str, float] = field(default_factory=dict)
     speed: float = 1.0  # factor of the velocity
     friction_w: float = 0.0  # heat while it moves faster than 1 um/s
-    lag_s: float = 0.0  # of the thermocouples
-    coarse_k: float = 0.0  # step to which the thermocouples' readings are rounded once more
-    missing: float = 0.0  # share of readings that do not come
+    lag_s: float = 0.0  # additional lag of the thermocouples
+    coarse_k: float = 0.0  # additional rounding step of the thermocouples' readings
+    missing: float = 0.0  # share of missing readings
 
 
 DISTURBANCES = {
@@ -102,15 +102,13 @@ NONE = Disturbance()
 
 @dataclass(frozen=True)
 class _Day:
-    """What a rig goes through on a day.
-
-    Its parameters, the inputs of its thermal plant at 1 s, and its random numbers."""
+    """One day of a rig: parameters, the inputs of its thermal plant at 1 s, random numbers."""
 
     t: np.ndarray
     parameters: dict[str, float]
     columns: dict[str, np.ndarray]
     rng: np.random.Generator
-    calibrated_s: float | None  # after which the rig changes; None: it does not
+    calibrated_s: float | None  # time after which the rig changes; None: it does not
 
     @property
     def changed_from(self) -> int:
@@ -120,10 +118,9 @@ class _Day:
 class ProvingRig:
     """One seed's rig.
 
-    `run(schedule, day)` simulates a test on a day; the same arguments give the same recording.
-
-    `air`, `bench` and `heat` multiply the chamber's drift, the bench's and the unmeasured heat: 0 takes them
-    away."""
+    `run(schedule, day)` simulates a test on a day; the same arguments give the same recording. `air`, `bench`
+    and `heat` are factors on the chamber's drift, the bench's drift and the unmeasured heat.
+    """
 
     def __init__(
         self,
@@ -184,7 +181,7 @@ class ProvingRig:
         return _Day(t, p, columns, rng, change if self.disturbance.factors else None)
 
     def _motion(self, schedule: Schedule, n: int) -> dict[str, np.ndarray]:
-        """Coil current, rms, and eddy heat of each second."""
+        """Compute coil current, rms, and eddy heat of each second."""
         e, d = self.electrical, self.disturbance
         x = schedule.at(np.arange(0, n * FINE) / FINE)
         v = d.speed * np.gradient(x, 1 / FINE)
@@ -207,13 +204,13 @@ class ProvingRig:
         before = self.model.stepper(1.0, u[0], day.parameters)
         after = self.model.stepper(1.0, u[0], changed)
         for k in range(len(day.t)):
-            if k == day.changed_from:  # the changed plant goes on from the state of the first one
+            if k == day.changed_from:  # the changed plant continues from the first one's state
                 after.x[:] = before.x
             rows[k] = (before if k < day.changed_from else after).step(u[k])
         return rows
 
     def _read(self, day: _Day, schedule: Schedule, noise: bool) -> Recorded:
-        """Read the plant's outputs by the rig's instruments."""
+        """Return the readings of the rig's instruments from the plant's outputs."""
         y, rng, d = self._simulated(day), day.rng, self.disturbance
         true_c, true_um = y[:, self.order[:-1]], y[:, self.order[-1]] - y[0, self.order[-1]]
         measured = true_c.copy()
@@ -236,12 +233,11 @@ class ProvingRig:
         return Recorded(day.t, power, air, measured, error, true_c, true_um, schedule.at(day.t))
 
     def bayes(self, schedule: Schedule, day: int, recorded: Recorded) -> np.ndarray:
-        """Estimate the position error (N,) as well as it can be.
+        """Estimate the position error (N,) with the best possible filter: a bound for all methods.
 
-        A Kalman filter about the true plant's own run.
-
-        It has the day's true parameters and air, the true statistics of the unmeasured heat, and the same one
-        coil sensor."""
+        A Kalman filter about the true plant's own run. It has the day's true parameters and air, the true
+        statistics of the unmeasured heat, and the same single coil sensor.
+        """
         today = self._day(schedule, day, noise=False)
         nominal = self._read(today, schedule, noise=False)
         a, b, c = self._linearised(today)
@@ -272,7 +268,7 @@ class ProvingRig:
         inputs = list(self.model.inputs)
         u0 = np.array([float(np.mean(day.columns[k])) for k in inputs])
         stepper = self.model.stepper(1.0, u0, day.parameters)
-        for _ in range(3000):  # to rest
+        for _ in range(3000):  # run to rest
             stepper.step(u0)
         x0 = stepper.x.copy()
 
@@ -299,7 +295,7 @@ def _stepped(values: np.ndarray, step: float) -> np.ndarray:
 
 
 def _walk(rng: np.random.Generator, n: int, tau_s: float) -> np.ndarray:
-    """Ornstein-Uhlenbeck of unit variance at 1 s."""
+    """Return an Ornstein-Uhlenbeck process of unit variance at 1 s."""
     f = np.exp(-1 / tau_s)
     w = rng.standard_normal(n) * np.sqrt(1 - f * f)
     w[0] = rng.standard_normal()

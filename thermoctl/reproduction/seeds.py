@@ -1,6 +1,4 @@
-"""All estimators on one simulated rig.
-
-Calibrated on its tests 2, 3 and 4A, compared over its test 4B."""
+"""Run all estimators on one simulated rig: calibrated on tests 2, 3 and 4A, compared over test 4B."""
 
 from __future__ import annotations
 
@@ -38,9 +36,10 @@ class SeedResult:
 
 @dataclass(frozen=True)
 class Kept:
-    """What the figures need of one rig.
+    """One rig's data for the figures.
 
-    Its calibration, its tests, the estimates in test 3 and the residuals in test 4."""
+    Its calibration, its tests, the estimates in test 3 and the residuals in test 4.
+    """
 
     calibration: chain.Calibration
     tests: tuple[Recorded, Recorded, Recorded, Recorded]
@@ -59,9 +58,10 @@ def one_seed(
     bench: float = CHAMBER,
     heat: float = 1.0,
 ) -> tuple[SeedResult, Kept | None]:
-    """Run one rig; `keep`: also return what the figures need.
+    """Run one rig; `keep`: also return the data for the figures.
 
-    `air`, `bench`, `heat`: as ProvingRig takes them."""
+    `air`, `bench`, `heat`: as for ProvingRig.
+    """
     tests = experiments.load_experiments(tests_file)
     rig = ProvingRig(plant.load(plant_file), seed, disturbance, PAPER_SCALE, air, bench, heat)
     run4 = joined(tests["test_4a"], tests["test_4b"], "test_4")

@@ -1,6 +1,4 @@
-"""The paper on simulated rigs.
-
-Run all seeds, measure the goals, write the report and its figures."""
+"""Run all seeds of simulated rigs, measure the goals, write the report and its figures."""
 
 from __future__ import annotations
 
@@ -20,8 +18,9 @@ from thermoctl.reproduction.rigs import CHAMBER, DISTURBANCES
 from thermoctl.reproduction.seeds import Kept, SeedResult, one_seed
 
 SEEN, FRESH = (*range(12), *range(1000, 1012)), tuple(range(2000, 2012))
-"""Seeds. Methods and rigs (rigs.PAPER_SCALE, rigs.HEAT_W, rigs.CHAMBER, chain.PAPER_CHOICES, chain.DRIFT_S) were chosen on the first.
-Every promise is judged on the others, on which nothing was chosen."""
+"""Seeds. The methods and the rigs (rigs.PAPER_SCALE, rigs.HEAT_W, rigs.CHAMBER, chain.PAPER_CHOICES,
+chain.DRIFT_S) were chosen on the first. Every goal is checked on the others, on which nothing was chosen.
+"""
 DISTURBED_SEEDS = 4
 
 Waiting = Future[tuple[SeedResult, Kept | None]]

@@ -1,4 +1,4 @@
-"""The paper's printed figures, and ours beside them."""
+"""Tables of the paper's printed figures with ours."""
 
 from __future__ import annotations
 
@@ -45,9 +45,10 @@ RANGE_K = LARGEST_K / 0.018
 def temperature_rows(
     estimate: dict[str, np.ndarray], truth: np.ndarray
 ) -> tuple[list[list[Any]], list[list[Any]]]:
-    """Return the rows of Tables V and VI.
+    """Return the rows of Tables V and VI: point, the paper's, then the errors of every estimate.
 
-    Point, the paper's, then the largest and the mean error of every estimate (N, 12)."""
+    Errors are the largest and the mean; estimates are (N, 12).
+    """
     largest = {k: np.nanmax(np.abs(v - truth), axis=0) for k, v in estimate.items()}
     mean = {k: np.nanmean(np.abs(v - truth), axis=0) for k, v in estimate.items()}
     five = [

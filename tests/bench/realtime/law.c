@@ -5,17 +5,20 @@
 
 enum { OK, STALE, ERROR, ABSENT };
 enum { POSITION = 0, REFERENCE = 1, VOLTAGE = 2, CURRENT = 3, AIR = 4, COIL = 5, AMPLIFIER_STATE = 18 };
+enum { THERMAL = AIR, THERMAL_END = COIL + M };
 enum { K_ERROR, K_STALE, K_RANGE, K_RATE, K_FROZEN };
-enum { B_FOLLOWING = 35, B_HOT, B_HOT_MODEL, B_HEATING, B_DISAGREES, B_POWER, B_STUCK, B_BOUND, B_SLEWING, B_SATURATED,
+enum { B_STOPPED = 34, B_FOLLOWING = 35, B_HOT, B_HOT_MODEL, B_HEATING, B_DISAGREES, B_POWER, B_STUCK, B_BOUND, B_SLEWING, B_SATURATED,
        B_AMPLIFIER, B_NOT_FOLLOWING, B_LATE, B_WRITE, B_NOT_FINITE, B_ELECTRICAL, B_DISPLACED,
        B_MONITORED };
 enum { OFF, SAFE, READY, ARMED, FAULT };
 enum { NONE, ARM, DISARM, SETPOINT };
+#define AIR_READINGS 30.0
 #define BIT(b) ((uint64_t)1 << (b))
 
 static int finite_(double v) { return v - v == 0.0; }
 static double clip(double v, double low, double high) { return v < low ? low : v > high ? high : v; }
 static double least(double a, double b) { return b < a ? b : a; }
+static double most(double a, double b) { return b > a ? b : a; }
 
 static const double *take(const double *p, double *to, int count) {
     memcpy(to, p, count * sizeof(double));
@@ -59,11 +62,34 @@ int law_load(law_t *l, const char *path) {
     return (size_t)(p - numbers) == count ? 0 : -2;
 }
 
+static void judge_reading(law_t *l, int c, double value) {
+    double late = 0.025 * l->delay[c], elapsed = l->since_s[c] - late;
+    if (elapsed < l->period_s) elapsed = l->period_s;
+    int thermal = c >= THERMAL && c < THERMAL_END;
+    double allowed = l->rate[c] * (thermal && elapsed < 0.1 ? 0.1 : elapsed);
+    int jumped = l->seen[c] > 0.0 && fabs(value - l->last[c]) > allowed;
+    if (!(l->low[c] <= value && value <= l->high[c]) || !finite_(value)) {
+        l->verdict[c] = 1.0 + K_RANGE;
+    } else if (jumped && thermal && l->suspect[c] == 0.0) {
+        l->suspect[c] = 1.0;
+    } else {
+        if (l->seen[c] > 0.0 && value == l->last[c]) l->same_s[c] += elapsed;
+        else l->same_s[c] = 0.0;
+        if (jumped) l->verdict[c] = 1.0 + K_RATE;
+        else l->verdict[c] = l->same_s[c] > l->frozen_s[c] ? 1.0 + K_FROZEN : 0.0;
+        l->last[c] = value;
+        l->seen[c] = 1.0;
+        l->suspect[c] = 0.0;
+        l->since_s[c] = late;
+    }
+}
+
 static void judge_readings(law_t *l, double dt) {
     l->faults = l->trips = 0;
     l->hold = 0;
     for (int c = 0; c < N; c++) {
         l->age[c] += l->dt;
+        l->since_s[c] += l->dt;
         int status = l->status[c];
         if (status == ABSENT && l->required[c] == 0.0) {
             l->verdict[c] = 1.0 + K_ERROR;
@@ -74,19 +100,7 @@ static void judge_readings(law_t *l, double dt) {
         } else if (status == STALE) {
             l->verdict[c] = 1.0 + K_STALE;
         } else if (l->fresh[c]) {
-            double value = l->value[c], elapsed = l->age[c] < l->period_s ? l->period_s : l->age[c];
-            if (!(l->low[c] <= value && value <= l->high[c]) || !finite_(value)) {
-                l->verdict[c] = 1.0 + K_RANGE;
-            } else if (l->seen[c] > 0.0 && fabs(value - l->last[c]) > l->rate[c] * elapsed) {
-                l->verdict[c] = 1.0 + K_RATE;
-                l->last[c] = value;
-            } else {
-                if (l->seen[c] > 0.0 && value == l->last[c]) l->same_s[c] += elapsed;
-                else l->same_s[c] = 0.0;
-                l->verdict[c] = l->same_s[c] > l->frozen_s[c] ? 1.0 + K_FROZEN : 0.0;
-                l->last[c] = value;
-                l->seen[c] = 1.0;
-            }
+            judge_reading(l, c, l->value[c]);
             l->age[c] = 0.0;
         } else if (l->age[c] > l->stale_s[c] || (l->seen[c] == 0.0 && l->verdict[c] == 0.0)) {
             l->verdict[c] = 1.0 + K_STALE;
@@ -102,6 +116,8 @@ static void judge_readings(law_t *l, double dt) {
         }
     }
     if (dt > l->late_s) l->faults |= BIT(B_LATE);
+    l->reports = l->status[AMPLIFIER_STATE] == OK;
+    l->enabled = l->reports && l->value[AMPLIFIER_STATE] == 2.0;
 }
 
 static void forget(law_t *l) {
@@ -116,13 +132,33 @@ static void start_air(law_t *l, double value) {
     if (l->air_started == 0.0) l->air_start_c = value, l->air_started = 1.0;
 }
 
+static void average_air_start(law_t *l) {
+    l->air_started += 1.0;
+    double s = (l->last[AIR] - l->air_c) / l->air_started;
+    l->air_c += s;
+    l->air_start_c = l->air_c;
+    if (l->corrected > 0.0)
+        for (int i = 0; i < l->n; i++) l->x[i] += l->B[2 * i + 1] / l->model_period_s * s;
+}
+
+static double resistance(law_t *l) {
+    double s = 20.0;
+    if (l->predicts[0] && l->air_known > 0.0) s = l->T[0] + l->air_c;
+    else if (l->verdict[COIL] == 0.0) s = l->last[COIL];
+    return l->resistance_ohm * (1.0 + 0.00393 * (s - 20.0));
+}
+
 static void power_and_air(law_t *l) {
+    l->powered = l->status[CURRENT] != ABSENT && (l->status[VOLTAGE] != ABSENT || l->resistance_ohm > 0.0);
     if (l->verdict[VOLTAGE] == 0.0 && l->verdict[CURRENT] == 0.0) l->power_w = l->last[VOLTAGE] * l->last[CURRENT];
+    else if (l->status[VOLTAGE] == ABSENT && l->verdict[CURRENT] == 0.0)
+        l->power_w = resistance(l) * l->last[CURRENT] * l->last[CURRENT];
     else if (l->enable == 0.0) l->power_w = 0.0;
     l->power_mean_w += (l->power_w - l->power_mean_w) * least(1.0, l->dt / l->power_time_s);
     l->air_rate_k_s = 0.0;
     if (l->verdict[AIR] == 0.0) {
         if (l->air_known == 0.0) start_air(l, l->last[AIR]);
+        else if (l->air_started < AIR_READINGS && l->fresh[AIR]) average_air_start(l);
         l->air_rate_k_s = (l->last[AIR] - l->air_c) / l->air_filter_s;
         l->air_c += l->air_rate_k_s * l->dt;
     }
@@ -147,7 +183,7 @@ static void predict_corrections(law_t *l, double elapsed) {
 }
 
 static void correct(law_t *l) {
-    int coil_new = l->fresh[COIL] && l->verdict[COIL] == 0.0, n = l->n;
+    int coil_new = l->fresh[COIL] && l->verdict[COIL] == 0.0 && l->suspect[COIL] == 0.0, n = l->n;
     if (l->resumed > 0.0 && coil_new) {
         double s = l->value[COIL] - l->air_c;
         for (int j = 0; j < n; j++) s -= l->C[j] * l->x[j];
@@ -164,7 +200,7 @@ static void correct(law_t *l) {
     for (int k = 0; k < l->sensors_used; k++) {
         int c = COIL + l->sensors[k];
         l->e[k] = 0.0;
-        if (l->fresh[c] && l->verdict[c] == 0.0) {
+        if (l->fresh[c] && l->verdict[c] == 0.0 && l->suspect[c] == 0.0) {
             double s = l->value[c] - l->air_c;
             for (int j = 0; j < n; j++) s -= l->C[l->sensors[k] * n + j] * l->x[j];
             l->e[k] = s;
@@ -235,7 +271,7 @@ static void compensate(law_t *l) {
         }
         l->expansion_before_um = l->expansion_after_um = s / (1.0 - l->f1);
         l->phase_s = 0.0;
-        l->primed = l->corrected;
+        if (l->air_started >= AIR_READINGS || l->verdict[AIR] > 0.0) l->primed = l->corrected;
     }
     l->phase_s += l->dt;
     if (l->phase_s >= l->expansion_period_s) {
@@ -258,7 +294,7 @@ static void compensate(law_t *l) {
     if (l->hold) return;
     if (l->state == ARMED) {
         double step = l->slew_um_s * l->dt;
-        if (fabs(target - l->compensation_um) > 2.0 * step) l->faults |= BIT(B_SLEWING);
+        if (l->primed > 0.0 && fabs(target - l->compensation_um) > 2.0 * step) l->faults |= BIT(B_SLEWING);
         target = clip(target, l->compensation_um - step, l->compensation_um + step);
     }
     l->compensation_um = target;
@@ -277,12 +313,16 @@ static void control(law_t *l, int command, double command_value) {
     }
     l->compensated_um = l->position_um + l->compensation_um;
     if (l->state != ARMED) {
-        l->setpoint_um = l->reference_um = l->compensated_um;
+        l->setpoint_um = l->compensated_um;
+    } else {
+        if (command == SETPOINT && finite_(command_value)) l->setpoint_um = command_value;
+        l->setpoint_um = clip(l->setpoint_um, l->setpoint_low_um, l->setpoint_high_um);
+    }
+    if (l->state != ARMED || (l->reports && !l->enabled)) {
+        l->reference_um = l->compensated_um;
         l->v = l->eps1 = l->d1 = 0.0;
         return;
     }
-    if (command == SETPOINT && finite_(command_value)) l->setpoint_um = command_value;
-    l->setpoint_um = clip(l->setpoint_um, l->setpoint_low_um, l->setpoint_high_um);
     double step = l->setpoint_rate_um_s * l->dt;
     l->reference_um = clip(l->setpoint_um, l->reference_um - step, l->reference_um + step);
     double eps = l->reference_um - l->compensated_um, change = eps - l->eps1;
@@ -311,29 +351,58 @@ static void compare_order(law_t *l) {
             }
 }
 
+static void compare_drive(law_t *l, double amperes) {
+    l->drive_low = least(l->drive_low, l->drive);
+    l->drive_high = most(l->drive_high, l->drive);
+    if (l->fresh[CURRENT] && l->current_per_drive != 0.0) {
+        double low = least(l->drive_low, l->drive_low_before), high = most(l->drive_high, l->drive_high_before);
+        l->current_apart_a = amperes - l->current_per_drive * clip(amperes / l->current_per_drive, low, high);
+        l->drive_low_before = l->drive_low;
+        l->drive_high_before = l->drive_high;
+        l->drive_low = l->drive_high = l->drive;
+    }
+}
+
+static void compare_position(law_t *l, double position, double held) {
+    if (l->zeroed == 0.0) {
+        l->position_zero_um = position - held;
+        l->zeroed = l->state != OFF ? 1.0 : 0.0;
+    }
+    l->position_low_um = least(l->position_low_um, position);
+    l->position_high_um = most(l->position_high_um, position);
+    if (l->fresh[CURRENT]) {
+        double expected = held + l->position_zero_um;
+        double low = least(l->position_low_um, l->position_low_before_um);
+        double high = most(l->position_high_um, l->position_high_before_um);
+        l->position_apart_um = clip(expected, low, high) - expected;
+        l->position_low_before_um = l->position_low_um;
+        l->position_high_before_um = l->position_high_um;
+        l->position_low_um = l->position_high_um = position;
+    }
+}
+
 static void agree(law_t *l) {
     double part = least(1.0, l->dt / l->agree_time_s), s;
     int current = l->verdict[CURRENT] == 0.0;
     double amperes = current ? l->last[CURRENT] : 0.0;
     int estimated = l->predicts[0] && l->air_known > 0.0;
     if (current && l->verdict[VOLTAGE] == 0.0 && l->resistance_ohm > 0.0 && (estimated || l->verdict[COIL] == 0.0)) {
-        s = estimated ? l->T[0] + l->air_c : l->last[COIL];
-        s = l->resistance_ohm * amperes * (1.0 + 0.00393 * (s - 20.0));
+        s = resistance(l) * amperes;
         l->ohm_v += part * (l->last[VOLTAGE] - s - l->ohm_v);
         double a = fabs(l->last[VOLTAGE]), b = fabs(s);
         l->ohm_scale_v += part * ((b > a ? b : a) - l->ohm_scale_v);
         if (fabs(l->ohm_v) > l->resistance_tolerance * l->ohm_scale_v + l->resistance_v) l->faults |= BIT(B_ELECTRICAL);
     }
+    compare_drive(l, amperes);
     if (l->state != ARMED || !current || l->current_per_drive == 0.0) {
         l->current_error_a = 0.0;
     } else {
-        l->current_error_a += part * (amperes - l->current_per_drive * l->drive - l->current_error_a);
+        l->current_error_a += part * (l->current_apart_a - l->current_error_a);
         if (fabs(l->current_error_a) > l->current_tolerance_a) l->faults |= BIT(B_NOT_FOLLOWING);
     }
     if (current && l->verdict[POSITION] == 0.0 && l->flexure_um_per_a != 0.0) {
-        s = l->last[POSITION] - l->flexure_um_per_a * amperes;
-        if (l->zeroed == 0.0) l->position_zero_um = s, l->zeroed = l->state != OFF ? 1.0 : 0.0;
-        l->displaced_um += part * (s - l->position_zero_um - l->displaced_um);
+        compare_position(l, l->last[POSITION], l->flexure_um_per_a * amperes);
+        l->displaced_um += part * (l->position_apart_um - l->displaced_um);
         if (fabs(l->displaced_um) > l->position_tolerance_um) l->faults |= BIT(B_DISPLACED);
     }
     if (l->corrected == 0.0) return;
@@ -354,6 +423,17 @@ static void agree(law_t *l) {
     }
 }
 
+static void watch_amplifier(law_t *l) {
+    int told = l->state == ARMED;
+    if (!told) l->driving = 0.0;
+    if (l->reports && l->value[AMPLIFIER_STATE] == 3.0) l->faults |= BIT(B_AMPLIFIER);
+    else if (l->reports && !l->enabled && l->driving > 0.0) l->faults |= BIT(B_STOPPED);
+    if (told && l->enabled) l->driving = 1.0;
+    int waits = l->reports && l->enabled != told && l->driving == 0.0;
+    l->amplifier_s = waits ? l->amplifier_s + l->dt : 0.0;
+    if (l->amplifier_s > l->amplifier_limit_s) l->faults |= BIT(B_NOT_FOLLOWING);
+}
+
 static void protect(law_t *l, int command, uint64_t external) {
     uint64_t found = external;
     if (l->state == ARMED) {
@@ -361,18 +441,15 @@ static void protect(law_t *l, int command, uint64_t external) {
         if (l->following_s > l->following_limit_s || fabs(l->eps1) > 2.0 * l->following_um) found |= BIT(B_FOLLOWING);
         l->saturation_s = fabs(l->v) >= l->output_limit ? l->saturation_s + l->dt : 0.0;
         if (l->saturation_s > l->saturation_limit_s) found |= BIT(B_SATURATED);
-        int reports = l->status[AMPLIFIER_STATE] == OK && l->value[AMPLIFIER_STATE] != 2.0;
-        l->amplifier_s = reports ? l->amplifier_s + l->dt : 0.0;
-        if (l->amplifier_s > l->amplifier_limit_s) found |= BIT(B_NOT_FOLLOWING);
-        l->idle_s = 0.0;
+        l->idle_s = l->idle_readings = 0.0;
     } else {
-        l->following_s = l->saturation_s = l->amplifier_s = 0.0;
-        int driven = (l->verdict[CURRENT] == 0.0 && fabs(l->last[CURRENT]) > l->idle_current_a)
-                     || fabs(l->power_w) > l->idle_power_w;
+        l->following_s = l->saturation_s = 0.0;
+        if (l->fresh[CURRENT]) l->idle_readings += 1.0;
+        int driven = l->verdict[CURRENT] == 0.0 && l->idle_readings > 1.0
+                     && (fabs(l->last[CURRENT]) > l->idle_current_a || fabs(l->power_w) > l->idle_power_w);
         l->idle_s = driven ? l->idle_s + l->dt : 0.0;
         if (l->idle_s > l->idle_limit_s) found |= BIT(B_STUCK);
     }
-    if (l->status[AMPLIFIER_STATE] == OK && l->value[AMPLIFIER_STATE] == 3.0) found |= BIT(B_AMPLIFIER);
     if (l->verdict[COIL] == 0.0 && l->last[COIL] > l->coil_limit_c) found |= BIT(B_HOT);
     if (l->T[0] + l->air_c > l->coil_limit_c) found |= BIT(B_HOT_MODEL);
     if (l->coil_rate_k_s > l->coil_rate_limit) found |= BIT(B_HEATING);
@@ -381,11 +458,13 @@ static void protect(law_t *l, int command, uint64_t external) {
     if (l->power_mean_w > l->power_limit_w) found |= BIT(B_POWER);
     if (!(finite_(l->v) && finite_(l->reference_um) && finite_(l->compensated_um) && finite_(l->T[0])
           && finite_(l->expansion_um) && finite_(l->power_w))) found |= BIT(B_NOT_FINITE);
+    watch_amplifier(l);
     agree(l);
     l->faults |= found;
     l->trips |= l->faults & l->trip_others;
     int64_t before = l->state;
-    l->state = next_state(before, command, l->tick > 100, l->trips != 0, (l->trips & l->critical) != 0);
+    int tripped = l->trips != 0 || (before < ARMED && l->amplifier_s > 0.0);
+    l->state = next_state(before, command, l->tick > 100, tripped, (l->trips & l->critical) != 0);
     l->latched = l->state == FAULT ? l->latched | l->trips : 0;
     if (before == ARMED && l->state != ARMED) l->v = l->eps1 = l->d1 = 0.0;
     l->control_v = l->v;
@@ -395,7 +474,7 @@ static void protect(law_t *l, int command, uint64_t external) {
     uint64_t bits = l->faults | l->latched;
     o[0] = l->state, o[1] = bits & (BIT(53) - 1), o[2] = bits >> 53, o[3] = l->setpoint_um, o[4] = l->reference_um;
     o[5] = l->position_um, o[6] = l->compensated_um, o[7] = l->compensation_um, o[8] = l->expansion_um;
-    o[9] = l->control_v, o[10] = l->drive, o[11] = l->enable, o[12] = l->power_w, o[13] = l->air_rate_k_s;
+    o[9] = l->control_v, o[10] = l->drive, o[11] = l->enable, o[12] = l->powered ? l->power_w : NAN, o[13] = l->air_rate_k_s;
     for (int m = 0; m < M; m++) o[14 + m] = l->T[m] + l->air_c;
     o[26] = l->innovation_c, o[27] = l->kalman_gain, o[28] = l->age[POSITION], o[29] = l->age[COIL];
 }

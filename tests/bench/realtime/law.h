@@ -23,17 +23,19 @@ typedef struct {
     uint64_t trip_others, critical;
     /* readings */
     double value[N];
-    uint8_t fresh[N], status[N];
+    uint8_t fresh[N], status[N], delay[N];
     /* state */
     int64_t state, tick, average_at, averaged;
     uint64_t latched, faults, trips;
-    int hold;
+    int hold, reports, enabled, powered;
     double dt, v, eps1, d1, setpoint_um, reference_um, position_um, compensated_um, compensation_um, expansion_um;
     double power_w, air_c, air_start_c, air_rate_k_s, air_known, innovation_c, innovation_mean_c, kalman_gain, P;
     double corrected, primed, expansion_before_um, expansion_after_um, phase_s, coil_slow_c, coil_rate_k_s;
     double coil_elapsed_s, power_mean_w, following_s, idle_s, saturation_s, amplifier_s, enable, drive, control_v;
     double air_started, resumed, model_error_c, ohm_v, ohm_scale_v, current_error_a, displaced_um, position_zero_um, zeroed;
-    double reference_error_um, reference_zero_um, reference_zeroed, exchanged;
+    double reference_error_um, reference_zero_um, reference_zeroed, exchanged, driving, idle_readings, current_apart_a;
+    double drive_low, drive_high, drive_low_before, drive_high_before, position_apart_um, position_low_um, position_high_um;
+    double position_low_before_um, position_high_before_um, since_s[N], suspect[N];
     double x[ORDER], dx[ORDER], corrections[ORDER], apart_c[M], e[M], T[M], T_before[M], average[AVERAGE], age[N], last[N], same_s[N], seen[N], verdict[N];
     double out[OUTPUTS];
 } law_t;

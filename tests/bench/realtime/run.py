@@ -160,25 +160,10 @@ def run_cyclictest(bench: Bench, seconds: float) -> np.ndarray:
     """Its wake-up latencies, us (from a histogram of nanoseconds)."""
     out = bench.work / "cyclictest.txt"
     subprocess.run(
-        [
-            "cyclictest",
-            "-p",
-            str(PRIORITY),
-            "-a",
-            str(bench.cpu),
-            "-t",
-            "1",
-            "-m",
-            "-i",
-            str(PERIOD_NS // 1000),
-            "-D",
-            str(max(1, round(seconds))),
-            "-q",
-            "-N",
-            "-h",
-            "1000000",
-            f"--histfile={out}",
-        ],
+        (
+            f"cyclictest -p {PRIORITY} -a {bench.cpu} -t 1 -m -i {PERIOD_NS // 1000} -D "
+            f"{max(1, round(seconds))} -q -N -h 1000000 --histfile={out}"
+        ).split(),
         check=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -444,7 +429,7 @@ def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
 
 def readings(ticks: int, seed: int = 7) -> dict[str, np.ndarray]:
     """Readings of a warm day in the paper's motion, with the encoder's missing frames and now and then a bad reading."""
-    from thermoctl.channels import CHANNELS
+    from thermoctl.channels import AMP_DISABLED, AMP_ENABLED, CHANNELS
 
     rng = np.random.default_rng(seed)
     n = len(CHANNELS)
@@ -456,7 +441,9 @@ def readings(ticks: int, seed: int = 7) -> dict[str, np.ndarray]:
         0, 0.02, (ticks, 12)
     )
     values[:, 2:5] += rng.normal(0, 1e-3, (ticks, 3))
-    values[:, 17], values[:, 18], values[:, 19] = 24.0, 2.0, 0.0
+    values[:, 17], values[:, 18], values[:, 19] = 24.0, AMP_ENABLED, 0.0
+    disabled = ((np.arange(ticks) - 140) % 1000 < 70) | (np.arange(ticks) < 210)  # around each DISARM and ARM
+    values[disabled, 18] = AMP_DISABLED
     fresh = np.zeros((ticks, n), np.uint8)
     fresh[:, [0, 17, 18, 19]] = rng.random((ticks, 1)) > 0.02
     fresh[::50, 2:4] = 1
@@ -608,22 +595,9 @@ def bench_law(bench: Bench, ticks: int = 20000, repeats: int = 15) -> dict[str, 
 def stress(work: Path):
     """stress-ng on all processors, on memory and on the disk."""
     load = subprocess.Popen(
-        [
-            "stress-ng",
-            "--cpu",
-            "0",
-            "--vm",
-            "1",
-            "--vm-bytes",
-            "128M",
-            "--hdd",
-            "1",
-            "--hdd-bytes",
-            "128M",
-            "--temp-path",
-            str(work),
-            "--quiet",
-        ],
+        (
+            f"stress-ng --cpu 0 --vm 1 --vm-bytes 128M --hdd 1 --hdd-bytes 128M --temp-path {work} --quiet"
+        ).split(),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )

@@ -5,7 +5,7 @@
 #include "rt.h"
 #include <math.h>
 
-enum { COLUMNS = 62, ROWS = 8192, BINS = 4096, NODE = 5, MASTER = 127 };
+enum { COLUMNS = 64, ROWS = 8192, BINS = 4096, NODE = 5, MASTER = 127 };
 static double ring[ROWS][COLUMNS];
 static uint64_t head, lateness[BINS + 1], busy[BINS + 1];
 static double time_s[N], limit_s[N];
@@ -150,8 +150,8 @@ int main(int argc, char **argv) {
                             0, 0};
         memcpy(row, first, sizeof first);
         memcpy(row + 11, law.value, sizeof law.value);
-        row[31] = fresh, row[32] = status;
-        memcpy(row + 33, law.out, sizeof law.out);
+        row[31] = fresh, row[32] = status, row[33] = 0;
+        memcpy(row + 34, law.out, sizeof law.out);
         __atomic_store_n(&head, head + 1, __ATOMIC_RELEASE);
         lateness[late_us < 0 ? 0 : late_us > BINS ? BINS : (int)late_us]++;
         busy[busy_us > BINS ? BINS : (int)busy_us]++;

@@ -1,0 +1,244 @@
+"""Damaged and mislabelled recordings are found before any refit; sound ones, also with missing physics, are not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.checks.rigs import PLANTS, rig
+from thermoctl.checks import checks
+from thermoctl.plant import loads
+from thermoctl.recording.table import Table
+
+
+def column(name, change):
+    return lambda table: dataclasses.replace(
+        table, columns=table.columns | {name: change(table.columns[name])}
+    )
+
+
+def both(*names, change):
+    def done(table):
+        for n in names:
+            table = column(n, change)(table)
+        return table
+
+    return done
+
+
+def swap(a, b):
+    return lambda t: dataclasses.replace(t, columns=t.columns | {a: t.columns[b], b: t.columns[a]})
+
+
+def timed(factor):
+    return lambda table: dataclasses.replace(table, t=table.t * factor)
+
+
+def rows(keep):
+    def done(table):
+        index = keep(len(table))
+        return dataclasses.replace(
+            table, t=table.t[index], columns={n: v[index] for n, v in table.columns.items()}
+        )
+
+    return done
+
+
+def stretched(table, pick):
+    """Every fourth sample only, and the three between made up."""
+    index = np.arange(len(table)) // 4 * 4
+    made = {n: pick(table.t, table.t[::4], v[::4], v[index]) for n, v in table.columns.items() if "temp" in n}
+    return dataclasses.replace(table, columns=table.columns | made)
+
+
+def twice(table):
+    """The first 300 rows, and again from row 100 on under later times."""
+    index = np.concatenate([np.arange(300), np.arange(100, 600)])
+    return dataclasses.replace(table, columns={n: v[index] for n, v in table.columns.items()})
+
+
+def frozen(a, b):
+    def change(v):
+        v = v.copy()
+        v[a:b] = v[a]
+        return v
+
+    return change
+
+
+def fahrenheit(v):
+    return 1.8 * v + 32
+
+
+TWO, STAGE = "two blocks", "stage"
+DAMAGES = {
+    # name: rig, damage, kind of the finding, words in it
+    "temperatures swapped": (TWO, swap("temperature_1", "temperature_2"), "swapped", "temperature_1", True),
+    "heat and air swapped": (TWO, swap("heat", "air_temperature"), "swapped", "air_temperature", True),
+    "air and sensor swapped": ("one block", swap("air", "temperature"), "swapped", "'air'", True),
+    "heat in mW": (TWO, column("heat", lambda v: 1e3 * v), "unit", "1000 times too large", True),
+    "heat in kW": (TWO, column("heat", lambda v: 1e-3 * v), "unit", "1000 times too small", True),
+    "heat of the other sign": (TWO, column("heat", lambda v: -v), "sign", "'heat'", True),
+    "one sensor in degF": (TWO, column("temperature_1", fahrenheit), "unit", "degF", True),
+    "both sensors in degF": (TWO, both("temperature_1", "temperature_2", change=fahrenheit), "unit", "degF", True),
+    "one sensor in K": (TWO, column("temperature_2", lambda v: v + 273.15), "unit", "in K", True),
+    "both sensors in K": (TWO, both("temperature_1", "temperature_2", change=lambda v: v + 273.15), "unit", "in K", True),
+    "air in degF": (TWO, column("air_temperature", fahrenheit), "unit", "degF", True),
+    "air in K": (TWO, column("air_temperature", lambda v: v + 273.15), "unit", "in K", True),
+    "sensor in millidegrees": (TWO, column("temperature_1", lambda v: 1e3 * v), "unit", "1000 times", True),
+    "sensor in tenths": ("one block", column("temperature", lambda v: 10 * v), "unit", "tenths", True),
+    "clock in ms": (TWO, timed(1e3), "clock", "ms", True),
+    "clock in us": ("one block", timed(1e6), "clock", "us", True),
+    "clock in minutes": ("one block", timed(1 / 60), "clock", "in min", True),
+    "clock of a stage in ms": (STAGE, timed(1e3), "clock", "ms", True),
+    "force of the other sign": (STAGE, column("force", lambda v: -v), "sign", "", True),
+    "position in mm": (STAGE, column("encoder", lambda v: 1e3 * v), "unit", "1000 times", True),
+    "position in um": ("carriage", column("encoder", lambda v: 1e6 * v), "unit", "1e+06 times", True),
+    "force in kN": ("carriage", column("force", lambda v: 1e-3 * v), "unit", "1000 times", True),
+    "angle in deg": ("pendulum", column("encoder", np.degrees), "unit", "deg instead of rad", True),
+    "pump in litres": ("tank", column("pump", lambda v: 1e3 * v), "unit", "1000 times too large", True),
+    "level in mm": ("tank", column("gauge", lambda v: 1e3 * v), "unit", "1000 times too large", True),
+    "first sample far from initial": ("tank", rows(lambda n: np.arange(260, n)), "start", "gauge", False),
+    "dead sensor": (TWO, column("temperature_2", lambda v: 0 * v + 21.5), "still", "temperature_2", True),
+    "dead input": (TWO, column("heat", lambda v: 0 * v), "still", "no input moves", True),
+    "sensor that hangs": (TWO, column("temperature_1", frozen(420, 540)), "stuck", "temperature_1", True),
+    "gap": (TWO, rows(lambda n: np.r_[0:300, 420:n]), "gap", "t = 598 to 840", False),
+    "copied twice": (TWO, twice, "repeated", "digit for digit", True),
+    "held": (TWO, lambda t: stretched(t, lambda now, at, v, last: last), "resampled", "held between every 4th", False),
+    "interpolated": (
+        TWO,
+        lambda t: stretched(t, lambda now, at, v, last: np.round(np.interp(now, at, v), 4)),
+        "resampled",
+        "interpolated between every 4th",
+        False,
+    ),
+    "sampled too slowly": ("carriage", rows(lambda n: np.arange(0, n, 1000 // 4)), "sampling", "miss", False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_recording_is_found(case):
+    name, damage, kind, words, severe = case
+    plant, table = rig(name)
+    found = checks(plant, [damage(table)])
+    assert [f for f in found if f.kind == kind and words in f.what + f.suggestion and f.severe == severe], [
+        str(f) for f in found
+    ]
+    assert all(f.suggestion for f in found)
+
+
+def test_thirty_damages_are_tried():
+    assert len(DAMAGES) >= 30
+
+
+WRONG = {
+    "loss of the wrong sign": ("rate: G_1 * (one - air)", "rate: G_1 * (air - one)", "unstable", "'loss_1'"),
+    "other loss of the wrong sign": ("rate: G_2 * (two - air)", "rate: G_2 * (air - two)", "unstable", "'loss_2'"),
+    "negative storage": ("storage: C_1", "storage: -C_1", "storage", "'one' is -6"),
+    "storage of zero": ("storage: C_2", "storage: C_2 - 6", "storage", "'two' is 0"),
+    "storages in kJ/K": ("C_1: {value: 6, unit: J/K, range: [2, 14]}", "C_1: {value: 6e-6, unit: J/K}", "sampling", "miss"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG.values(), ids=WRONG)
+def test_a_wrong_plant_is_found(case):
+    old, new, kind, words = case
+    _, table = rig(TWO)
+    assert old in PLANTS[TWO]
+    found = checks(loads(PLANTS[TWO].replace(old, new)), [table])
+    assert [f for f in found if f.kind == kind and words in f.what + f.suggestion], [str(f) for f in found]
+
+
+def test_a_plant_without_units_is_found():
+    import re
+
+    _, table = rig("one block")
+    bare = re.sub(r",? ?unit: [^,}]+", "", PLANTS["one block"]).replace("{,", "{").replace("{ ", "{")
+    assert [f.kind for f in checks(loads(bare), [table])] == ["no units"]
+
+
+RADIATION = (
+    "  radiation: {from: one, rate: 2e-10 * ((one + 273.15)**4 - (air + 273.15)**4), unit: W}\noutputs:"
+)
+SOURCE = "  sun: {into: two, rate: 0.3 * step(t - 500), unit: W}\noutputs:"
+SOUND = {
+    "nothing missing": (TWO, None),
+    "nothing missing, one block": ("one block", None),
+    "nothing missing, stage": (STAGE, None),
+    "nothing missing, carriage": ("carriage", None),
+    "nothing missing, pendulum": ("pendulum", None),
+    "nothing missing, tank": ("tank", None),
+    "radiation": (TWO, PLANTS[TWO].replace("outputs:", RADIATION)),
+    "heat source": (TWO, PLANTS[TWO].replace("outputs:", SOURCE)),
+    "sensor lag": ("one block", PLANTS["one block"].replace("value: block,", "value: 'delay(block, 8)',")),
+    "Coulomb friction": (
+        "carriage",
+        PLANTS["carriage"].replace("outputs:", "  dry: {from: velocity, rate: 6 * sign(velocity), unit: N}\noutputs:"),
+    ),
+    "cubic spring": (
+        STAGE,
+        PLANTS[STAGE].replace("outputs:", "  cubic: {from: velocity, rate: 4e5 * position**3, unit: N}\noutputs:"),
+    ),
+    "quadratic drag": (
+        "pendulum",
+        PLANTS["pendulum"].replace(
+            "outputs:", "  drag: {from: speed, rate: 0.004 * speed * abs(speed), unit: N*m}\noutputs:"
+        ).replace("0.004 *", "drag_c *").replace("nodes:", "  drag_c: {value: 0.004}\nnodes:"),
+    ),
+    "overflow": (
+        "tank",
+        PLANTS["tank"].replace("outputs:", "  spill: {from: level, rate: \"1e-3 * max(level - 0.12, 0)\"}\noutputs:"),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("case", SOUND.values(), ids=SOUND)
+def test_a_sound_recording_gives_no_finding(case, seed):
+    name, text = case
+    plant, table = rig(name, seed, text)
+    assert [str(f) for f in checks(plant, [table])] == []
+
+
+def test_slow_sensors_and_irregular_samples_are_sound():
+    plant, table = rig(TWO)
+    rng = np.random.default_rng(3)
+    slow = table.columns["temperature_2"].copy()
+    slow[np.arange(len(slow)) % 5 != 0] = np.nan
+    table = dataclasses.replace(table, columns=table.columns | {"temperature_2": slow})
+    table = rows(lambda n: np.flatnonzero(rng.random(n) < 0.4))(table)
+    assert [str(f) for f in checks(plant, [table])] == []
+
+
+def test_a_saturated_sensor_is_physics():
+    plant, table = rig(TWO)
+    clipped = column("temperature_1", lambda v: np.minimum(v, np.quantile(v, 0.8)))(table)
+    assert not [f for f in checks(plant, [clipped]) if f.severe]
+
+
+def test_an_ambient_in_fahrenheit_beside_sensors_in_fahrenheit():
+    """Nothing but the climate tells it: the plant follows in any linear scale of temperature."""
+    _, table = rig("one block")
+    plant = loads(PLANTS["one block"].replace("air: {unit: degC,", "air: {unit: degC, role: ambient,"))
+    found = checks(plant, [both("air", "temperature", change=fahrenheit)(table)])
+    assert [(f.kind, f.severe) for f in found] == [("unit", False)] and "if it is in degF" in found[0].what
+
+
+def test_an_input_that_only_sets_the_start_is_no_drive():
+    """Found on recordings of a free pendulum and of a temperature laboratory."""
+    text = PLANTS["pendulum"].replace(
+        "angle: {unit: rad, storage: 1, initial: 0}", "angle: {unit: rad, storage: 1, initial: start}"
+    )
+    plant = loads(text.replace("torque: {unit: N*m}}", "torque: {unit: N*m}, start: {unit: rad}}"))
+    table = rig("pendulum")[1]
+    table = dataclasses.replace(table, columns=table.columns | {"start": np.full(len(table), 0.0)})
+    assert [str(f) for f in checks(plant, [table])] == []
+
+
+def test_two_recordings_share_a_finding():
+    plant, one = rig(TWO, 1)
+    _, two = rig(TWO, 1)
+    two = dataclasses.replace(two, name="run_2", path="run_2.csv")
+    wrong: list[Table] = [swap("temperature_1", "temperature_2")(t) for t in (one, two)]
+    found = checks(plant, wrong)
+    assert [f.kind for f in found] == ["swapped"] and "and 1 more" in found[0].where

@@ -1,0 +1,150 @@
+"""Columns in other units: by `column` of the plant file, by the recording's header; each said aloud, none twice."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.plants import ONE_BLOCK
+from thermoctl import cli
+from thermoctl.plant import load, loads, save
+from thermoctl.plant.language import Conversion
+from thermoctl.plant.recordings import as_recorded, in_plant_units, read_recordings
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.units import conversion
+from thermoctl.recording.files import read_table
+from thermoctl.recording.logger import read_recording
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+T = np.arange(0.0, 400.0, 2.0)
+HEAT, AIR = np.where(T < 200, 3.0, 1.0), 22 + T / 400
+
+
+@pytest.mark.parametrize(
+    "given, wanted, scale, offset",
+    [
+        ("kW", "W", 1e3, 0),
+        ("mm", "m", 1e-3, 0),
+        ("degF", "degC", 1 / 1.8, -32 / 1.8),
+        ("F", "degC", 1 / 1.8, -32 / 1.8),
+        ("K", "degC", 1, -273.15),
+        ("C", "degC", 1, 0),
+        ("deg", "rad", np.pi / 180, 0),
+        ("%", "1", 0.01, 0),
+        ("L/min", "m^3/s", 1e-3 / 60, 0),
+        ("W", "W", 1, 0),
+    ],
+)
+def test_units_convert(given, wanted, scale, offset):
+    assert conversion(given, wanted) == pytest.approx((scale, offset))
+
+
+def test_units_that_do_not_convert():
+    for given, wanted in (("W", "K"), ("bananas", "m"), ("C", "A")):
+        with pytest.raises(ValueError):
+            conversion(given, wanted)
+
+
+def written(folder, header, heat=HEAT, air=AIR):
+    rows = "\n".join(f"{t:g},{h:.9g},{a:.9g}" for t, h, a in zip(T, heat, air, strict=True))
+    path = folder / "run.csv"
+    path.write_text(f"{header}\n{rows}\n")
+    return path
+
+
+def plant_with(heat="{unit: W}", air="{unit: degC, between_samples: linear}"):
+    return loads(
+        ONE_BLOCK.replace("heat: {unit: W}", f"heat: {heat}").replace(
+            "air: {unit: degC, between_samples: linear}", f"air: {air}"
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    "heat, air, header, values",
+    [
+        ("{unit: W, column: {name: P, unit: kW}}", "{unit: degC}", "t,P,air", (HEAT / 1e3, AIR)),
+        ("{unit: W, column: {name: P, scale: -0.5, offset: 1}}", "{unit: degC}", "t,P,air", ((HEAT - 1) / -0.5, AIR)),
+        ("{unit: W}", "{unit: degC, column: {unit: degF}}", "t,heat,air", (HEAT, 1.8 * AIR + 32)),
+        ("{unit: W}", "{unit: degC}", "t,heat [mW],air [K]", (1e3 * HEAT, AIR + 273.15)),
+        ("{unit: W, column: P}", "{unit: degC, column: 'air [degF]'}", "t,P [kW],air [degF]", (HEAT / 1e3, 1.8 * AIR + 32)),
+    ],
+)  # fmt: skip
+def test_a_column_is_converted_once(tmp_path, heat, air, header, values):
+    plant = plant_with(heat, air)
+    path = written(tmp_path, header, *values)
+    (table,) = read_recordings(plant, [path])
+    assert table.notes and not table.recorded
+    model = compile_plant(plant)
+    for t in (table, read_recording(path), in_plant_units(plant, table)):
+        np.testing.assert_allclose(model.excitation(t).u, np.column_stack([HEAT, AIR]), rtol=1e-6)
+
+
+def test_what_read_table_reads_is_converted_too(tmp_path):
+    plant = plant_with("{unit: W, column: {name: P, unit: kW}}")
+    table = read_table(written(tmp_path, "t,P,air", HEAT / 1e3))
+    np.testing.assert_allclose(compile_plant(plant).excitation(table).u[:, 0], HEAT)
+    made = Table("made", "made", T, {"P": HEAT, "air": AIR})  # in memory: in the plant's units
+    np.testing.assert_allclose(compile_plant(plant).excitation(made).u[:, 0], HEAT)
+
+
+def test_a_conversion_survives_saving(tmp_path):
+    plant = plant_with(
+        "{unit: W, column: {name: P, unit: kW}}", "{unit: degC, column: {name: a, scale: 2, offset: -1}}"
+    )
+    save(plant, tmp_path / "p.yaml")
+    again = load(tmp_path / "p.yaml")
+    assert again == dataclasses.replace(plant, file=again.file)
+    assert again.inputs["heat"].conversion == Conversion("kW") and again.inputs["air"].column == "a"
+    back = as_recorded(again, {"P": HEAT, "a": AIR})
+    np.testing.assert_allclose(back["P"], HEAT / 1e3)
+    np.testing.assert_allclose(back["a"], (AIR + 1) / 2)
+
+
+@pytest.mark.parametrize(
+    "heat, says",
+    [
+        ("{unit: W, column: {name: P, unit: K}}", "no W"),
+        ("{column: {name: P, unit: kW}}", "a 'unit' beside it was expected"),
+        (
+            "{unit: W, column: {name: P, unit: kW, scale: 2}}",
+            "either 'unit', or 'scale' (not 0) and 'offset'",
+        ),
+        ("{unit: W, column: {name: P, scale: 0}}", "either 'unit', or 'scale' (not 0)"),
+        ("{unit: W, column: {name: P, faktor: 2}}", "unknown key 'faktor'"),
+        ("{unit: W, column: [P]}", "a column's name was expected"),
+    ],
+)
+def test_a_wrong_column_is_one_line_with_its_place(heat, says):
+    with pytest.raises(InputError) as e:
+        plant_with(heat)
+    assert says in str(e.value) and "<text>:4:" in str(e.value)
+
+
+def test_a_header_that_cannot_be_the_plants_unit(tmp_path):
+    with pytest.raises(InputError, match=r"run.csv: column 'heat' .* is no W .*; correct the header"):
+        read_recordings(plant_with(), [written(tmp_path, "t,heat [degC],air")])
+
+
+def test_commands_take_time_and_columns(tmp_path, capsys):
+    (tmp_path / "p.yaml").write_text(ONE_BLOCK)
+    rows = "\n".join(
+        f"{1e3 * t:g};{h:g};{a:g}".replace(".", ",") for t, h, a in zip(T, HEAT, AIR, strict=True)
+    )
+    (tmp_path / "run.csv").write_text(f"clock [ms];P [W];T_air [degC]\n{rows}\n")
+    options = ["--plant", str(tmp_path / "p.yaml"), str(tmp_path / "run.csv"), "--time", "clock"]
+    assert (
+        cli.main(["simulate", *options, "--columns", "heat=P,air=T_air", "--out", str(tmp_path / "o.csv")])
+        == 0
+    )
+    printed = capsys.readouterr()
+    assert f"note: {tmp_path / 'run.csv'}: separator ';', decimal comma" in printed.err
+    assert "time converted from ms to s" in printed.err
+    model = compile_plant(load(tmp_path / "p.yaml"))
+    expected = model.simulate(Table("x", "x", T, {"heat": HEAT, "air": np.round(AIR, 3)})).y[:, 0]
+    np.testing.assert_allclose(
+        read_table(tmp_path / "o.csv").columns["temperature_simulated"], expected, atol=2e-3
+    )
+    assert cli.main(["simulate", *options, "--columns", "heat=P"]) == 2
+    assert "no column 'air'" in capsys.readouterr().err

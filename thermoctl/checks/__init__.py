@@ -1,0 +1,38 @@
+"""Checks of a plant and its recordings before any refit: wrong labels, units, clocks and signs, damaged data.
+
+`checks` takes seconds. Each finding has a suggestion. A severe finding means that a diagnosis of these data
+would name the mistake as physics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from thermoctl.checks.data import data_findings
+from thermoctl.checks.finding import Finding
+from thermoctl.checks.labels import label_findings
+from thermoctl.checks.model import plant_findings, start_findings
+from thermoctl.plant import Plant
+from thermoctl.plant.recordings import in_plant_units
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
+
+__all__ = ["Finding", "checks"]
+
+
+def checks(plant: Plant, recordings: Sequence[Table]) -> list[Finding]:
+    """Return what is wrong with a plant and its recordings, severe findings first.
+
+    Raises InputError where a recording lacks an input of the plant."""
+    model = compile_plant(plant)
+    tables = [in_plant_units(plant, t) for t in recordings]
+    excitations = [model.excitation(t) for t in tables]
+    found = plant_findings(model, excitations)
+    for table, excitation in zip(tables, excitations, strict=True):
+        found += data_findings(model, table, excitation)
+    if not any(f.severe for f in found):
+        labels, cleared = label_findings(model, tables)
+        found += labels
+        for table in cleared:
+            found += start_findings(model, model.excitation(table))
+    return sorted(found, key=lambda f: not f.severe)

@@ -1,0 +1,54 @@
+"""The command `plant check`, and the checks that `diagnose` makes first."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import TextIO
+
+from thermoctl.checks import Finding, checks
+from thermoctl.plant import Plant, load
+from thermoctl.plant.recordings import read_recordings
+from thermoctl.recording.logger import parsed_columns
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+
+def check(args: argparse.Namespace) -> int:
+    """Load each plant file with all its checks; with --data compare one with recordings.
+
+    Returns 1 for a severe finding."""
+    if args.data and len(args.plants) != 1:
+        raise InputError("plant check --data: one plant file was expected")
+    for path in args.plants:
+        p = load(path)
+        free = sum(1 for q in p.parameters.values() if q.range)
+        print(
+            f"{path}: good; {len(p.inputs)} inputs, {len(p.parameters)} parameters ({free} free), {len(p.nodes)} nodes, "
+            f"{len(p.flows)} flows, {len(p.outputs)} outputs"
+        )
+        if args.data:
+            _, found = checked(p, args.data, args.time, args.columns)
+            report(found, sys.stdout)
+            if not found:
+                print("the recordings fit the plant's labels, units and clock")
+            return int(any(f.severe for f in found))
+    return 0
+
+
+def checked(
+    plant: Plant, paths: Sequence[str], time: str | None, columns: str | None
+) -> tuple[list[Table], list[Finding]]:
+    """Read recordings for a plant, print the reader's notes, and return the tables and the findings."""
+    tables = read_recordings(plant, paths, time, parsed_columns(columns))
+    for table in tables:
+        for note in table.notes:
+            print(f"note: {table.path}: {note}", file=sys.stderr)
+    return tables, checks(plant, tables)
+
+
+def report(found: Sequence[Finding], out: TextIO) -> None:
+    """Print each finding on a line of its own."""
+    for finding in found:
+        print(finding, file=out)

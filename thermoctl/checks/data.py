@@ -1,0 +1,225 @@
+"""Checks of one recording by itself: gaps, repeated and resampled data, columns that do not move."""
+
+from __future__ import annotations
+
+from math import gcd, log
+
+import numpy as np
+
+from thermoctl.checks.finding import Finding
+from thermoctl.plant import Plant
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Input
+from thermoctl.plant.residuals import default_noise
+from thermoctl.plant.simulate import Excitation, Model, SimulationError
+from thermoctl.recording.table import Table
+
+ALARM = 1e-6  # false alarms a column and recording
+SIGMAS = 6.0
+FEW = 8  # samples of which nothing can be stated
+
+
+def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
+    """Check the columns that the plant reads."""
+    found = _gaps(table)
+    read = [i for i in model.plant.readings() if i.column in table.columns]
+    for item in read:
+        there = np.isfinite(table.columns[item.column])
+        values = table.columns[item.column][there]
+        if not there.any():
+            found.append(_empty(table, item.name, item.column))
+        elif len(values) >= FEW:
+            found += _copies(table, item.column, values, table.t[there])
+            if item.name in model.plant.outputs:
+                found += _resampled(table, item.column, values)
+    return found + _dead(model, table, excitation)
+
+
+def _empty(table: Table, name: str, column: str) -> Finding:
+    return Finding(
+        "empty",
+        table.path,
+        f"column '{column}' has no value at all",
+        f"Check how '{name}' was logged.",
+        severe=False,
+    )
+
+
+def _gaps(table: Table) -> list[Finding]:
+    """Report intervals without samples, beyond the longest of as many random (exponential) ones.
+
+    Of n such intervals with median m, one is longer than m log2(n / ALARM) with probability ALARM. Intervals
+    that a logger leaves on purpose (more than one in a hundred) are its sampling."""
+    steps = np.diff(table.t)
+    if len(steps) < FEW:
+        return []
+    limit = float(np.median(steps)) * log(len(steps) / ALARM) / log(2)
+    long = np.flatnonzero(steps > limit)
+    if not 0 < len(long) <= max(1, len(steps) // 100):
+        return []
+    k = long[np.argmax(steps[long])]
+    more = f" and {len(long) - 1} more" if len(long) > 1 else ""
+    return [
+        Finding(
+            "gap",
+            table.path,
+            f"no samples from t = {table.t[k]:.6g} to {table.t[k + 1]:.6g} s{more}; they are "
+            f"{np.median(steps):.3g} s apart elsewhere",
+            "The inputs are unknown there: cut the recording at the gap and give both parts.",
+            severe=False,
+        )
+    ]
+
+
+def _quantum(values: np.ndarray) -> float:
+    steps = np.abs(np.diff(values))
+    return float(steps[steps > 0].min(initial=np.inf))
+
+
+def _resampled(table: Table, column: str, values: np.ndarray) -> list[Finding]:
+    """Find readings that change at every k-th sample only, or on straight lines between them.
+
+    Changes at free instants are all multiples of k apart with probability k^(1 - changes)."""
+    quantum = _quantum(values)
+    if not np.isfinite(quantum):
+        return []
+    for difference, tolerance, how in ((1, 0.0, "held"), (2, 2.001 * quantum, "interpolated")):
+        jumps = np.flatnonzero(np.abs(np.diff(values, difference)) > tolerance)
+        if len(jumps) < FEW or (difference == 2 and np.ptp(values) < 100 * quantum):
+            continue
+        every = gcd(*np.diff(jumps).tolist())
+        if every > 1 and (len(jumps) - 1) * log(every) > -log(ALARM):
+            return [
+                Finding(
+                    "resampled",
+                    table.path,
+                    f"'{column}' is {how} between every {every}th sample: its {len(values)} values hold "
+                    f"{len(values) // every} readings",
+                    "Leave the cells between two readings empty; else their errors count several times.",
+                    severe=False,
+                )
+            ]
+    return []
+
+
+def _copies(table: Table, column: str, values: np.ndarray, t: np.ndarray) -> list[Finding]:
+    """Find a stretch of noisy readings that stands twice.
+
+    Two independent second differences of noise agree with the probability of their commonest value. Smooth
+    or coarse readings repeat by themselves and are left out."""
+    second = np.round(np.diff(values, 2) / max(_quantum(values), 1e-300))
+    if not np.isfinite(second).all() or len(second) < FEW:
+        return []
+    _, counts = np.unique(second, return_counts=True)
+    likeliest = float(counts.max()) / len(second)
+    moving = np.abs(second) > 2
+    if likeliest > 0.2 or moving.mean() < 0.5:
+        return []
+    length = max(FEW, int(np.ceil((2 * log(len(second)) - log(ALARM)) / -log(likeliest))))
+    seen: dict[bytes, int] = {}
+    still = np.concatenate([[0], np.cumsum(np.diff(values) == 0)])
+    for k in range(len(second) - length + 1):
+        if still[k + length + 1] > still[k]:  # a reading at its limit repeats by itself
+            continue
+        key = np.ascontiguousarray(values[k : k + length + 2]).tobytes()
+        first = seen.setdefault(key, k)
+        if k - first >= length:
+            return [
+                Finding(
+                    "repeated",
+                    table.path,
+                    f"'{column}' from t = {t[k]:.6g} s on repeats its readings from {t[first]:.6g} s, digit for digit",
+                    "Part of the file was copied twice: cut it out.",
+                )
+            ]
+    return []
+
+
+def _dead(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
+    """Find readings that stand still while the plant moves, and inputs that never move."""
+    try:
+        run = model.run(excitation)
+    except SimulationError:
+        return []
+    found = []
+    explained = total = 0.0
+    noises = default_noise(model.plant, [excitation])
+    for j, (o, noise) in enumerate(zip(model.plant.outputs.values(), noises, strict=True)):
+        there = np.isfinite(excitation.y[:, j])
+        y, simulated = excitation.y[there, j], run.y[there, j]
+        if len(y) < FEW or not np.isfinite(simulated).all():
+            continue
+        sd = float(np.hypot(o.noise_sd, (o.resolution or 0.0) / 12**0.5))
+        if np.ptp(y) == 0 and np.ptp(simulated) > SIGMAS * max(sd, 1e-3 * np.ptp(simulated)):
+            found.append(
+                Finding(
+                    "still",
+                    table.path,
+                    f"'{o.column}' stands at {y[0]:.6g} throughout; the plant moves it by {np.ptp(simulated):.3g}",
+                    "Is the sensor connected, and is it this column?",
+                )
+            )
+            continue
+        found += _stuck(table, o.column, y, simulated, table.t[there], max(sd, noise.sigma))
+        scale = max(sd, noise.sigma)
+        if np.ptp(y) > 2 * SIGMAS * scale:
+            total += float(np.var(y)) / scale**2
+            explained += (float(np.var(y)) - float(np.var(y - simulated))) / scale**2
+    driving = [i for i in driving_inputs(model.plant) if not _surroundings(i)]
+    if driving and total and explained < 0.5 * total and not any(moves(table, i.column) for i in driving):
+        names = ", ".join(f"'{i.column}'" for i in driving)
+        found.append(
+            Finding(
+                "still",
+                table.path,
+                f"no input moves ({names}), but the readings do, far beyond the plant",
+                "Was the right column logged? Without the inputs any effect could be named.",
+            )
+        )
+    return found
+
+
+def driving_inputs(plant: Plant) -> list[Input]:
+    """Return the inputs that a flow, an output or a storage reads; others only set the start."""
+    read = [f.rate for f in plant.flows.values()] + [o.value for o in plant.outputs.values()]
+    names = set().union(*(ex.names(e) for e in [*read, *(n.storage for n in plant.nodes.values())]))
+    return [i for i in plant.inputs.values() if i.name in names]
+
+
+def moves(table: Table, column: str) -> bool:
+    """Return whether a column has two different values."""
+    return bool(np.nanmax(table.columns[column]) > np.nanmin(table.columns[column]))
+
+
+def _surroundings(i: Input) -> bool:
+    return i.role == "ambient" or (i.role is None and i.unit in ("degC", "K", "degF"))
+
+
+def _stuck(
+    table: Table, column: str, y: np.ndarray, simulated: np.ndarray, t: np.ndarray, sd: float
+) -> list[Finding]:
+    """Find a run of one value, longer than chance has it, over which the plant moves.
+
+    At the end of the readings' range it is a sensor at its limit, which is physics."""
+    edges = np.flatnonzero(np.diff(y) != 0)
+    begins, ends = np.concatenate([[0], edges + 1]), np.concatenate([edges, [len(y) - 1]])
+    k = int(np.argmax(ends - begins))
+    a, b = int(begins[k]), int(ends[k])
+    length = b - a
+    rest = max(len(y) - 1 - length, 1)
+    same = max((len(y) - 1 - len(edges) - length) / rest, 1 / (len(y) + 1))
+    # Two readings of a body at rest agree with probability q / (2 sqrt(pi) sd), q the step of the readings.
+    resting = 1.4826 * float(np.median(np.abs(np.diff(y, 2)))) / 6**0.5
+    same = max(same, _quantum(y) / (2 * np.pi**0.5 * max(min(sd, resting), 1e-300)))
+    if same > 0.5 or length < FEW or y[a] in (y.min(), y.max()):
+        return []
+    if length * -log(same) < log(len(y) / ALARM) or np.ptp(simulated[a : b + 1]) < 2 * SIGMAS * sd:
+        return []
+    return [
+        Finding(
+            "stuck",
+            table.path,
+            f"'{column}' stands at {y[a]:.6g} from t = {t[a]:.6g} to {t[b]:.6g} s while the plant moves",
+            "The sensor or its bus hung: empty those cells, or cut the recording.",
+        )
+    ]

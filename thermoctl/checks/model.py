@@ -1,0 +1,199 @@
+"""Checks of the plant itself, at the start of its recordings: storages, stability, time constants.
+
+The linearised plant is dx/dt = J x. An eigenvalue l of J is a time constant 1/|l|; it grows where Re l > 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from thermoctl.checks.finding import Finding
+from thermoctl.plant import expression as ex
+from thermoctl.plant.residuals import default_noise
+from thermoctl.plant.simulate import Excitation, Model, SimulationError
+
+GROWTH = 1.0  # e-folds over the recording from which an unstable plant cannot follow it
+NYQUIST = np.pi  # sampling interval over time constant from which a mode lies beyond the Nyquist frequency
+SIGMAS = 6.0  # two-sided false alarm of 2e-9 a sample for normal errors
+
+
+def plant_findings(model: Model, excitations: Sequence[Excitation]) -> list[Finding]:
+    """Check units, storages, stability and time constants."""
+    plant = model.plant
+    found = []
+    units = [i.unit for i in plant.readings()] + [p.unit for p in plant.parameters.values()]
+    if not any([*units, *(n.unit for n in plant.nodes.values())]):
+        found.append(
+            Finding(
+                "no units",
+                plant.file,
+                "no quantity has a unit, so no expression could be checked",
+                "Give inputs, parameters, nodes and outputs their units.",
+                severe=False,
+            )
+        )
+    for excitation in excitations:
+        found += _storages(model, excitation)
+        if found and found[-1].kind == "storage":
+            return found
+        found += _stability(model, excitation)
+        if found and found[-1].kind == "unstable":
+            return found
+        found += _time_constants(model, excitation)
+    return _once(found)
+
+
+def _once(found: list[Finding]) -> list[Finding]:
+    """Return one finding a kind and text, of the first recording that shows it."""
+    return list({(f.kind, f.what): f for f in reversed(found)}.values())[::-1]
+
+
+def start_values(model: Model, excitation: Excitation) -> dict[str, float]:
+    """Return every name's value at the start of a recording."""
+    p = model.vector(None, excitation.name)
+    x0, _ = model.start(excitation, p)
+    return {
+        **dict(zip(model.inputs, excitation.u[0], strict=False)),
+        **dict(zip(model.parameters, map(float, p), strict=True)),
+        **dict(zip(model.states, map(float, x0), strict=True)),
+        "t": 0.0,
+    }
+
+
+def _value(e: ex.Expr, values: dict[str, float]) -> float:
+    undelayed = ex.substitute(e, lambda part: part.args[0] if part.op == "delay" else None)
+    return float(ex.evaluate(undelayed, values))
+
+
+def _storages(model: Model, excitation: Excitation) -> list[Finding]:
+    values = start_values(model, excitation)
+    found = []
+    for node in model.plant.nodes.values():
+        storage = _value(node.storage, values)
+        if not storage > 0:
+            found.append(
+                Finding(
+                    "storage",
+                    f"{model.plant.file}:{node.at}",
+                    f"the storage of node '{node.name}' is {storage:g}; a positive one was expected",
+                    "A negative heat capacity or mass turns every flow around: correct the sign.",
+                )
+            )
+    return found
+
+
+def jacobian(model: Model, values: dict[str, float], flip: str | None = None) -> np.ndarray:
+    """Return d(dx/dt)/dx (nx, nx) per second; `flip` names a flow that is taken with the other sign."""
+    plant = model.plant
+    index = {n: i for i, n in enumerate(plant.nodes)}
+    out = np.zeros((len(index), len(index)))
+    for flow in plant.flows.values():
+        sign = -1.0 if flow.name == flip else 1.0
+        for name in ex.names(flow.rate) & set(index):
+            slope = sign * _value(ex.derivative(flow.rate, name), values)
+            for end, way in ((flow.target, 1.0), (flow.source, -1.0)):
+                if end is not None:
+                    out[index[end], index[name]] += way * slope
+    storages = np.array([_value(n.storage, values) for n in plant.nodes.values()])
+    return out / storages[:, None]
+
+
+def _eigenvalues(matrix: np.ndarray) -> np.ndarray:
+    return np.linalg.eigvals(matrix) if len(matrix) and np.isfinite(matrix).all() else np.zeros(0)
+
+
+def _growth(matrix: np.ndarray) -> float:
+    values = _eigenvalues(matrix)
+    return float(values.real.max()) if len(values) else 0.0
+
+
+def _stability(model: Model, excitation: Excitation) -> list[Finding]:
+    """Find a mode that grows by more than e over the recording, and the flows whose sign would stop it."""
+    plant, span = model.plant, float(excitation.t[-1] - excitation.t[0])
+    values = start_values(model, excitation)
+    growth = _growth(jacobian(model, values))
+    if growth * span <= GROWTH:
+        return []
+    suspects = [f for f in plant.flows if _growth(jacobian(model, values, f)) * span <= GROWTH]
+    turn = f"Is the sign of the rate of {' or '.join(repr(s) for s in suspects)} right, or its 'from' and 'into'?"
+    return [
+        Finding(
+            "unstable",
+            plant.file,
+            f"the plant is unstable at the start of '{excitation.name}': a deviation doubles every "
+            f"{np.log(2) / growth:.3g} s, and the recording lasts {span:.4g} s",
+            turn if suspects else "A free run cannot follow such a plant: check the signs of its flows.",
+        )
+    ]
+
+
+def rates_of(model: Model, excitation: Excitation) -> np.ndarray:
+    """Return the plant's eigenvalues at the start, absolute, 1/s; an integrator has none."""
+    rates = np.abs(_eigenvalues(jacobian(model, start_values(model, excitation))))
+    return rates[rates > 1e-9 * rates.max(initial=0.0)]
+
+
+def _time_constants(model: Model, excitation: Excitation) -> list[Finding]:
+    """Compare the sampling with the plant's time constants."""
+    if len(excitation.t) < 2:
+        return []
+    step = float(np.median(np.diff(excitation.t)))
+    rates = rates_of(model, excitation)
+    if not len(rates):
+        return []
+    slow, fast = 1 / rates.min(), 1 / rates.max()
+    integrates = len(rates) < len(model.states)
+    if step <= NYQUIST * fast:
+        return []
+    none = step > NYQUIST * slow and not integrates
+    seen = f"slowest time constant of {slow:.3g} s" if none else f"time constant of {fast:.3g} s"
+    ask = (
+        "Is the time in another unit? Then state it in the header: t [ms]. Otherwise sample faster, or "
+        if none
+        else ("Effects of that mode cannot be seen: sample faster, or ")
+    )
+    return [
+        Finding(
+            "sampling",
+            excitation.name,
+            f"the samples are {step:.4g} s apart and miss the plant's {seen}",
+            ask + "make that part of the plant static.",
+            severe=False,
+        )
+    ]
+
+
+def start_findings(model: Model, excitation: Excitation) -> list[Finding]:
+    """Compare first samples with the plant's start, within noise, initial_sigma and parameter ranges."""
+    plant = model.plant
+    if not model.states:
+        return []
+    try:
+        run = model.run(excitation, sensitivities=True)
+    except SimulationError:
+        return []
+    assert run.dy is not None
+    spread = [np.ptp(p.range) / 12**0.5 if (p := plant.parameters[q]).range else 0.0 for q in model.active]
+    spread += [plant.nodes[n].initial_sigma or 0.0 for n in model.uncertain]
+    found = []
+    for j, (o, noise) in enumerate(
+        zip(plant.outputs.values(), default_noise(plant, [excitation]), strict=True)
+    ):
+        if not ex.names(o.value) & set(model.states) or not np.isfinite(excitation.y[0, j]):
+            continue
+        error = excitation.y[0, j] - run.y[0, j]
+        sd = float(np.hypot(noise.sigma, np.linalg.norm(run.dy[0, j] * spread)))
+        if abs(error) > SIGMAS * sd:
+            found.append(
+                Finding(
+                    "start",
+                    excitation.name,
+                    f"'{o.name}' starts at {excitation.y[0, j]:.5g}, where the plant starts at {run.y[0, j]:.5g}: "
+                    f"{abs(error) / sd:.0f} standard deviations apart",
+                    f"Start the node from the data (initial: first({o.name})), or give it an initial_sigma.",
+                    severe=False,
+                )
+            )
+    return found
