@@ -21,7 +21,8 @@ and mutation tests. Both give the same bits (IEEE doubles, no contraction, one o
                 swapped, or hangs between its limits:
                 - coil voltage and R20 (1 + alpha (coil - 20 degC)) current
                 - current and the drive requested since the reading before the last
-                - position, all since the reading before the last, and the current that holds it against the flexures
+                - position, all since the reading before the last, and the current that holds it
+                  against the flexures
                 - a watched temperature and its estimate
                 - reference encoder and position + expansion (zero of each encoder taken while OFF)
                 - two temperatures, exchanged: y_i > y_j while T_i < T_j, and the readings would fit better
