@@ -41,7 +41,7 @@ LOG_2PI = float(np.log(2 * np.pi))
 
 @dataclass(frozen=True)
 class Placed:
-    """An effect at a place: what a result names, and how it is laid over the plant."""
+    """An effect at a place, and the parameters that it adds to the plant."""
 
     candidate: Candidate
     own: Mapping[str, str]  # its parameter: the plant's name
@@ -54,7 +54,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What is assumed missing: placed effects, by what a result names. The remainder is in all of them."""
+    """The placed effects that are assumed to be missing. Every hypothesis holds a remainder besides."""
 
     effects: tuple[Placed, ...] = ()
 
@@ -373,7 +373,7 @@ def _relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
 
 
 def as_refitted(case: Case, f: Fitted) -> Fitted:
-    """The hypothesis as an ordinary refit in white noise leaves it: what the findings are compared with."""
+    """The hypothesis as an ordinary refit in white noise leaves it, for comparison."""
     rows = [
         case.coordinates.transform(c, f.rough.residuals[c.recording][:, c.output])
         for c in case.coordinates.channels

@@ -5,12 +5,14 @@ P = sum R^2, the variance of a row is
 
     V_b = c^2 s^2 + q exp(u_b),   log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
 
-s: the noise that the plant file states; c: how wrong that is, log-normal. q exp(u_b): the remainder and every slow error of
-the sensor. Its logarithm is a random walk over the logarithm of frequency, so that its size is learnt at each frequency by
-itself, and smooth: what a wrong plant leaves at one frequency says little about another. What nobody will name is small:
-the share of the remainder's rms in the output's swing has a half-normal prior of width SMALL (q: that share, squared).
+s is the noise that the plant file states, c its error, log-normal. q exp(u_b) is the remainder and every slow error of the
+sensor. u is a random walk over log frequency: smooth, and its size is learnt at each frequency by itself. So an error of
+the plant at one frequency says little about another. Errors that nobody will name are small: the remainder's share of the
+output's swing has a half-normal prior of width SMALL, and q is that share squared.
 
-    log p(R) = log [ABSENT p(R | no remainder) + (1 - ABSENT) p(R | remainder)],   each integrated over c and u by Laplace's method
+    log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
+
+Both parts are integrated over c and u by Laplace's method.
 """
 
 from __future__ import annotations
@@ -29,9 +31,7 @@ ABSENT = 0.5  # prior of no remainder at an output
 SMALL = 0.005  # of an output's swing: width of the prior of the remainder's rms
 LEVEL = 2 * np.log(10.0)  # standard deviation of u at the lowest frequency: a tenth to ten times SMALL
 DRAWS = 400  # of the random walk, for the prior's normalisation
-WALK = np.log(
-    4.0
-)  # standard deviation of u's step over an octave: 1/f^2, what one storage makes of a white force
+WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a white force on one storage
 STEPS, CLOSE, LONGEST = 40, 1e-4, 2.0  # of Newton's method: their number, the step that ends it, the longest
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -61,8 +61,7 @@ class Grid:
 
 
 def grid(channels: Sequence[Channel], positions: Sequence[int], sigma: float, swing: float) -> Grid:
-    """The frequencies of one output with a stated noise of `sigma` and a rms of `swing` about its mean; `channels`: its
-    recordings."""
+    """The frequencies of one output. `sigma`: its stated noise; `swing`: its rms about the mean; `channels`: its recordings."""
     octave = np.concatenate([np.log2(c.frequency) for c in channels])
     cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)
     known, node = np.unique(cells, return_inverse=True)
@@ -82,9 +81,10 @@ def grid(channels: Sequence[Channel], positions: Sequence[int], sigma: float, sw
 
 @dataclass(frozen=True)
 class Averaged:
-    """A log marginal likelihood, and what follows. `inverse`: per channel E[1/V] in its bands; `sensor`: per output the
-    variance of its noise; `remainder`: per output the probability that there is one; `unsure`: per output the covariance of
-    1/V over its frequencies."""
+    """A log marginal likelihood and its by-products.
+
+    `inverse`: E[1/V] in the bands of each channel. By output: `sensor`, the variance of the noise; `remainder`, the
+    probability of one; `unsure`, the covariance of 1/V over frequencies."""
 
     log_likelihood: float
     inverse: list[np.ndarray]

@@ -44,7 +44,7 @@ def diagnose(
     after, before = left(known, best, reach), left(known, null, reach)
     value = worth(known, null, best, reserve)
     named = tuple(e.key for e in best.hypothesis.effects if posterior.effects[e.key] >= numbers.name)
-    # what took part in the choice cannot speak against it
+    # data that took part in the choice cannot speak against it
     ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects and value.reserved else 1.0
     facts = Facts(posterior.something, named, max(after.over_noise.values()), closed(before, after), ratio)
     return Diagnosis(

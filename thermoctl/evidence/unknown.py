@@ -9,7 +9,7 @@ from scipy.special import logsumexp
 
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.fit import Fitted
-from thermoctl.evidence.noise import averaged
+from thermoctl.evidence.noise import Grid, averaged
 from thermoctl.evidence.roles import Structure
 from thermoctl.evidence.where import Responses, responses, signals
 
@@ -29,18 +29,27 @@ class Left:
     follows: tuple[str, ...]
 
 
+def white_floor(case: Case, f: Fitted, g: Grid) -> float:
+    """Return the variance of an output's white noise: the median of its spectrum over all rows.
+
+    Noise and remainder are told apart by colour alone: a spectrum of both follows whatever noise is stated."""
+    count = np.concatenate([case.coordinates.channels[k].count for k in g.channels])
+    return float(np.median(np.repeat(1 / np.concatenate([f.average.inverse[k] for k in g.channels]), count)))
+
+
 def left(case: Case, f: Fitted, reach: Responses) -> Left:
     """Measure what a fitted hypothesis leaves, and locate it."""
     rms, noise, over = {}, {}, {}
     ideal = list(f.powers)
-    for g, learnt in zip(case.grids, f.average.sensor, strict=True):
+    for g in case.grids:
         name = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) / g.count.sum()
-        rms[name] = float(np.sqrt(max(power - learnt, 0.0)))
-        noise[name] = float(np.sqrt(learnt))
-        over[name] = float(np.sqrt(power / learnt))
+        own = max(white_floor(case, f, g), g.variance)
+        rms[name] = float(np.sqrt(max(power - own, 0.0)))
+        noise[name] = float(np.sqrt(own))
+        over[name] = float(np.sqrt(power / own))
         for k in g.channels:
-            ideal[k] = np.minimum(f.powers[k], learnt * case.coordinates.channels[k].count)
+            ideal[k] = np.minimum(f.powers[k], own * case.coordinates.channels[k].count)
     loss = averaged(case.grids, ideal).log_likelihood - f.average.log_likelihood
     worst = max(over, key=lambda o: over[o]) if over else ""
     follow = follows(case, f, worst) if over and over[worst] > 1 else ()
