@@ -38,8 +38,8 @@ def diagnose(
     posterior = weigh({w.fitted.hypothesis.keys: w.score for w in searched.tried}, numbers)
     best = searched.tried[0].fitted
     null = as_refitted(known, next(w.fitted for w in searched.tried if not w.fitted.hypothesis.effects))
-    if not best.hypothesis.effects:
-        best = null
+    if not best.hypothesis.effects or posterior.something < numbers.name:
+        best = null  # an effect that is not supported explains nothing of what is left
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)
     value = worth(known, null, best, reserve)
