@@ -1393,28 +1393,3 @@ def the_fault_table(module):
     )  # a frozen amplifier is stale
     assert table.mask("fault", "critical", readings=False) == (table.mask("fault", "critical") >> 34 << 34)
     assert (CHANNELS[5:17], TEMPERATURES[0], len(CHANNELS)) == (TEMPERATURES, "coil_c", 20)
-
-
-@scenario
-def names_in_a_recording(module):
-    """A recording's bits keep the names that they had when it was made: its own table, or its law's version."""
-    table = module.faults
-
-    def named(bits, **meta):
-        return table.names(bits, table.recorded_names(meta))
-
-    bits = 1 << 34 | 1 << 31 | 1
-    now = ("position_error", "amplifier_stale", "amplifier_stopped")
-    assert named(bits) == named(bits, law="") == named(bits, law='{"version": 2}') == now
-    assert named(bits, law='{"version": 1}') == (*now[:2], "amplifier_frozen")
-    assert named(1 << 34 | 2, faults='{"34": "other"}', law='{"version": 1}') == ("bit 1", "other")
-    assert tuple(f.name for f in table.FAULTS[: len(table.NAMES_2)]) == table.NAMES_2
-    assert len(table.NAMES_1) == len(table.NAMES_2) == 53
-    assert [k for k in range(53) if table.NAMES_1[k] != table.NAMES_2[k]] == [34]
-    for damaged in ('["a"]', '{"1": 2}'):
-        try:
-            table.recorded_names({"faults": damaged})
-        except ValueError as e:
-            assert "damaged" in str(e)
-        else:
-            raise AssertionError("a damaged table was taken")

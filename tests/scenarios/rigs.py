@@ -140,7 +140,7 @@ def configuration(name: str, port: int) -> str:
     """The rig file: config/wire.yaml with these devices, and what rig B does not have taken away."""
     text = (ROOT / "config/wire.yaml").read_text()
     for pattern, instead in (
-        (r"(?s)  # What the virtual rig simulates.*?  run_dir: \S+\n", ""),
+        (r"(?s)  # For the virtual rig only.*?  run_dir: \S+\n", ""),
         (r"(?s)  devices:\n.*?\n\n", f"  devices:{DEVICES[name].replace('PORT', str(port))}\n"),
         (r"\.\./run/wire\.sock", f"./{name}.sock"),
         (r"(?s)recording:\n.*?\n\n", "recording: {enable: false}\n\n"),
