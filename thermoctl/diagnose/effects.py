@@ -332,7 +332,7 @@ class Rig:
         p = self.physics
         if kind == "v":
             if near in self.velocities:
-                return [near]  # type: ignore[list-item]
+                return [near]
             found = [
                 *self.velocities,
                 *(i for i in p.inputs if self.kind(p.inputs[i]) in ("velocity", "rotation")),
@@ -340,7 +340,7 @@ class Rig:
             return (found or [c for c in self.spare if re.search(r"veloc|speed|^v$", c, re.I)])[:3]
         if kind == "x":
             if near in self.position_of:
-                return [self.position_of[near]]  # type: ignore[index]
+                return [self.position_of[near]]
             if self.position_of:
                 return list(self.position_of.values())
             found = [i for i in p.inputs if self.kind(p.inputs[i]) == "length" and i in self.moving_inputs]
@@ -784,7 +784,7 @@ class _Builder:
             return None
         for table in (self.base.nodes, self.base.inputs, self.base.parameters):
             if e.value in table:
-                return table[e.value].unit  # type: ignore[index]
+                return table[e.value].unit
         return None
 
     def _unit(self, text: str | None) -> str | None:
@@ -938,7 +938,7 @@ class _Builder:
         sample late."""
 
         def change(e: Expr) -> Expr | None:
-            i = self.base.inputs.get(e.value) if e.op == "name" else None  # type: ignore[arg-type]
+            i = self.base.inputs.get(e.value) if e.op == "name" else None
             if i is None or i.linear:
                 return None
             twin = f"{i.name}{STRAIGHT}"

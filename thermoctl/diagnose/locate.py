@@ -19,6 +19,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -199,7 +200,7 @@ def patterns(metric: Metric, rig: Rig) -> list[Suspect]:
                 for forces, h, on in zip(base, hat, side, strict=True):
                     column.forces.append({k: v * h * on for k, v in forces.items()})
                 columns.append(column)
-    rows: dict[tuple, list[np.ndarray]] = {}
+    rows: dict[tuple[Any, ...], list[np.ndarray]] = {}
     for part, block in directions(metric, columns):
         block = metric.project(block)
         for k, column in enumerate(part):

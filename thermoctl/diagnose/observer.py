@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
@@ -43,7 +44,7 @@ def follows(
             **{p.name: p.values.get(d.name, p.value) for p in plant.parameters.values()},
         }
 
-        def mean(e: ex.Expr, values=values) -> float:
+        def mean(e: ex.Expr, values: dict[str, Any] = values) -> float:
             return float(np.median(np.asarray(ex.evaluate(e, values), float)))
 
         for i, slope in enumerate(model.code.slopes):

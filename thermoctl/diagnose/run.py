@@ -323,7 +323,7 @@ def _signals(case: Case, seen: Round) -> dict[str, list[np.ndarray]]:
 
 def _weigh(current: Explanation, rivals: Sequence[Explanation]) -> None:
     """Posterior over the explanations that were refitted, tempered; the same effect at the same place counts once."""
-    best: dict[tuple, Explanation] = {}
+    best: dict[tuple[Any, ...], Explanation] = {}
     for e in [current, *rivals]:
         key = tuple(sorted(c.key for c in e.effects))
         if key not in best or e.score < best[key].score:

@@ -15,11 +15,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaincc
 
-from thermoctl.diagnose.effects import STRAIGHT, Candidate, Rig, shape_grid
+from thermoctl.diagnose.effects import STRAIGHT, Candidate, EffectParameter, Rig, shape_grid
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
@@ -249,7 +250,7 @@ def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], 
 class _Column:
     """A direction to be built: per recording its forces and its changes of outputs."""
 
-    item: tuple
+    item: tuple[Any, ...]
     forces: list[dict[int, np.ndarray]] = field(default_factory=list)
     outputs: list[dict[int, np.ndarray]] = field(default_factory=list)
 
@@ -298,7 +299,7 @@ def screen(
         columns += _columns(c, metric, at, edges)
     best: dict[int, Direction] = {}
     chance = None if draws is None else np.zeros(draws.shape[1])
-    pending: dict[tuple, list[tuple[_Column, np.ndarray, float, np.ndarray | None]]] = {}
+    pending: dict[tuple[Any, ...], list[tuple[_Column, np.ndarray, float, np.ndarray | None]]] = {}
     done = 0
     for part, rows in directions(metric, columns):
         full = np.linalg.norm(rows, axis=0)
@@ -374,7 +375,7 @@ def _columns(
     dims = effect.dims if amplitudes else ((1.0,),)
     out = []
     for g, shape in enumerate(shapes):
-        group: tuple = ("all",) if windowed else (g,)
+        group: tuple[Any, ...] = ("all",) if windowed else (g,)
         count = len(shapes) if windowed else len(dims) * len(phases)
         for dim in dims:
             for phase in phases:
@@ -520,7 +521,8 @@ def _score(
     return chance
 
 
-def _allowed(p, coefficient: float) -> bool:
+def _allowed(p: EffectParameter, coefficient: float) -> bool:
+    assert p.trial is not None  # an amplitude has one
     at = float(ex.evaluate(p.trial, {"s": coefficient, "tau": 1.0, "first_air": 0.0}))
     return (
         p.low - 1e-12 <= at <= p.high + 1e-12

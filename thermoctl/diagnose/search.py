@@ -91,7 +91,7 @@ def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, f
         if p.name == "C" and value > 0:
             low, high = value / 100, value * 100
         out[p.name] = (low, high)
-    return out
+    return {n: (float(low), float(high)) for n, (low, high) in out.items()}
 
 
 def weaker(direction: Direction, share: float = 0.1) -> Direction:

@@ -28,7 +28,7 @@ from thermoctl.evidence.coordinates import WIDTH, Channel
 
 STATED = 1.0  # standard deviation of log c^2: a stated noise is wrong by a factor of 1.6 in one case of three
 ABSENT = 0.5  # prior of no remainder at an output
-SMALL = 0.005  # of an output's swing: width of the prior of the remainder's rms
+SMALL = 0.05  # of an output's swing: width of the prior of the remainder's rms
 LEVEL = 2 * np.log(10.0)  # standard deviation of u at the lowest frequency: a tenth to ten times SMALL
 DRAWS = 400  # of the random walk, for the prior's normalisation
 WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a white force on one storage

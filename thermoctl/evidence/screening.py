@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +18,16 @@ from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
 
 ROWS, MOVING_ROWS = 6_000, 16_000  # of all outputs in all recordings; what moves needs the finer ones
+LIKELY = 0.5  # probability of a remainder, from which errors at all frequencies are looked at alike besides
 PROMISED = 30  # directions whose gain in log likelihood is predicted
 
 
 class Rows(Metric):
-    """Whitened rows of a refitted hypothesis: DCT rows over the standard deviation of noise and remainder in them."""
+    """Whitened rows of a refitted hypothesis: DCT rows over the standard deviation of their noise.
 
-    def __init__(self, case: Case, fitted: Fitted, most: int):
+    `remainder`: it counts as noise, too. Then errors at low frequencies weigh little, else those at high ones."""
+
+    def __init__(self, case: Case, fitted: Fitted, most: int, remainder: bool):
         self.fit, self.model = fitted.rough, fitted.rough.model
         self.drives = [self.model.excitation(t) for t in case.tables]
         self.problem = Problem(self.model, self.drives, case.noise)
@@ -37,7 +41,7 @@ class Rows(Metric):
             output = case.coordinates.channels[g.channels[0]].output
             ks = [k for k, c in enumerate(channels) if c.output == output]
             self.grids.append(grid([channels[k] for k in ks], ks, g.sigma, g.swing))
-        self.weights = _weights(case, fitted, self.coordinates)
+        self.weights = _weights(case, fitted, self.coordinates, remainder)
         self.runs, columns = [], []
         for r, d in enumerate(self.drives):
             run = self.model.run(d, self.fit.values[r], self.fit.dx0[r], sensitivities=True)
@@ -85,9 +89,13 @@ class Rows(Metric):
         return self.log_likelihood(self.residual - v * (v @ self.residual)) - self.now
 
 
-def _weights(case: Case, fitted: Fitted, coordinates: Coordinates) -> list[np.ndarray]:
+def _weights(case: Case, fitted: Fitted, coordinates: Coordinates, remainder: bool) -> list[np.ndarray]:
     """One over the standard deviation of each row (rows,) of each channel."""
-    inverse = as_refitted(case, fitted).average.inverse
+    average = as_refitted(case, fitted).average
+    inverse = average.inverse
+    if not remainder:
+        own = {k: v for g, v in zip(case.grids, average.sensor, strict=True) for k in g.channels}
+        inverse = [np.full_like(v, 1 / own[k]) for k, v in enumerate(inverse)]
     known = {(c.recording, c.output): k for k, c in enumerate(case.coordinates.channels)}
     out = []
     for c in coordinates.channels:
@@ -111,7 +119,8 @@ def screened(case: Case, fitted: Fitted) -> Screened:
     """Screen the catalogue, at the places of the plant as it came: what is missing is the rig's, not an effect's."""
     case.budget.screenings_done += 1
     moving = bool(Structure(case.plant, [], []).velocities) if case.plant.nodes else False
-    metric = Rows(case, fitted, MOVING_ROWS if moving else ROWS)
+    most = MOVING_ROWS if moving else ROWS
+    metric = Rows(case, fitted, most, True)
     rig = Structure(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()
@@ -122,7 +131,18 @@ def screened(case: Case, fitted: Fitted) -> Screened:
         if c.key not in fitted.hypothesis.keys and not c.place.parts() & added
     ]
     best = screen(metric, rig, found)[0][:PROMISED]
-    return Screened(metric, rig, best, [metric.promise(d) for d in best])
+    promised = [(d, metric.promise(d)) for d in best]
+    if max(as_refitted(case, fitted).average.remainder) > LIKELY:
+        other = Rows(case, fitted, most, False)
+        again = [(d, other.promise(d)) for d in screen(other, rig, found)[0][:PROMISED]]
+        known = {d.candidate.key: promise for d, promise in promised}
+        promised = [(d, p) for d, p in promised if p >= 0] + [
+            (dataclasses.replace(d, vector=None), p)  # its vector is of another metric
+            for d, p in again
+            if p > known.get(d.candidate.key, 0.0)
+        ]
+    promised.sort(key=lambda x: -x[1])
+    return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised])
 
 
 def places(case: Case) -> dict[str, set[str]]:

@@ -175,12 +175,13 @@ def shortlist(
     paying = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
         gain = promise + odds((Placed(d.candidate, {}),), where, limits)
-        if gain > 0 and not relabels(d.candidate):
+        if gain > 0 and d.gain > 0 and not relabels(d.candidate):
             paying.append((d, gain))
     paying.sort(key=lambda x: -x[1])
     out: list[tuple[tuple[Direction, ...], float]] = []
     for d, gain in paying:
-        if sum(o.candidate.effect is d.candidate.effect for (o,), _ in out) < PLACES_EACH:
+        alike = [o for (o,), _ in out if o.candidate.effect is d.candidate.effect]
+        if len(alike) < PLACES_EACH and d.candidate.key not in {o.candidate.key for o in alike}:
             out.append(((d,), gain))
     out = [(d, gain) for d, gain in out[: limits.shortlist] if HALF * gain > out[0][1]]
     return [*out, *((p, np.inf) for p in pairs([d for d, _ in paying], looked, limits))]
