@@ -1386,7 +1386,7 @@ def the_fault_table(module):
     assert (
         table.decode(float(2**52))[0].bit == 52 and table.BY_NAME["not_finite"].bit == table.BIT["not_finite"]
     )
-    assert table.NAMES == {f.bit: f.name for f in table.FAULTS} and table.NAMES[34] == "amplifier_stopped"
+    assert {f.bit: f.name for f in table.FAULTS} == table.NAMES and table.NAMES[34] == "amplifier_stopped"
     groups = [0, 1, 2, 3, 4, 5, *[1] * 11, 6, 6, 6]
     same = [*(5 * g + k for g in groups for k in range(5))]
     assert [31 if bit == 34 else bit for bit in same] == list(
