@@ -40,7 +40,9 @@ class Budget:
 
 @dataclass(frozen=True)
 class Case:
-    """Everything that hypotheses are compared on. `coordinates` and `grids` stay the same for all."""
+    """Data, catalogue and budget of a diagnosis.
+
+    All hypotheses are scored in the same `coordinates` and `grids`."""
 
     plant: Plant
     tables: tuple[Table, ...]

@@ -25,10 +25,10 @@ from thermoctl.plant.refit import Fit, Problem
 from thermoctl.plant.simulate import SimulationError, compile_plant
 
 SIGNIFICANT = 2.0  # standard deviations
-BELIEF = 0.3  # standard deviation of the plant's parameters round their beliefs, as a share of their ranges
+BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
 UNIFORM = 12.0  # precision of a uniform prior over 0..1
 PERIODS = 15.0  # times the range that a refit gives a period that it could have had (logarithms)
-DECADES = 4.0  # over which the order of magnitude of an effect's size is unknown
+DECADES = 4.0  # width of the log-uniform prior of an effect's size
 WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
 ROUNDS = 15  # of Gauss and Newton's steps
 LENGTHS = 1.0, 0.3, 0.1  # of a step that are tried
@@ -230,7 +230,7 @@ class Posterior:
 def _step(
     z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Newton's step inside the box: what meets a wall stays there."""
+    """Return Newton's step inside the bounds; a coordinate that reaches its bound stays there."""
     free = ~(((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0)))
     step = np.zeros_like(z)
     for _ in range(len(z)):
@@ -384,7 +384,7 @@ def as_refitted(case: Case, f: Fitted) -> Fitted:
 
 
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
-    """Log p(z): Gaussians, uniform shapes, and the effects' sizes, which are not measured more finely than `sd`."""
+    """Return log p(z): Gaussians, uniform shapes, and the effects' sizes with standard deviations `sd`."""
     values, _ = posterior.problem.unpack(z)
     out = posterior.prior(z) + 0.5 * float(
         np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi)))

@@ -13,13 +13,13 @@ from thermoctl.evidence.noise import Grid, averaged
 from thermoctl.evidence.roles import Structure
 from thermoctl.evidence.where import Responses, responses, signals
 
-CORRELATED, SHOWN = 0.4, 3  # correlation from which a signal is told, and how many are
+CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; largest number reported
 
 
 @dataclass(frozen=True)
 class Left:
-    """The residual beside the sensors' noise. `rms`, `noise`, `over_noise`: by output; `loss`: log likelihood that it costs;
-    `node`: where forces explain it best; `follows`: signals that it goes with."""
+    """The residual beside the sensors' noise. `rms`, `noise`, `over_noise`: by output; `loss`: log likelihood
+    that it costs; `node`: where forces explain it best; `follows`: signals that it goes with."""
 
     rms: dict[str, float]
     noise: dict[str, float]
@@ -78,7 +78,9 @@ def _node(case: Case, f: Fitted, reach: Responses) -> str | None:
 
 
 def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:
-    """The signals (and their changes) that correlate with an output's residual by CORRELATED or more, the strongest first."""
+    """Return signals (and changes of signals) whose correlation with an output's residual is CORRELATED or more.
+
+    The strongest is first; at most SHOWN."""
     model, j = f.fit.model, f.fit.model.outputs.index(output)
     found: dict[str, list[tuple[float, float, float]]] = {}
     for r, d in enumerate(case.drives(model)):
