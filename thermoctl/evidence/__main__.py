@@ -1,4 +1,4 @@
-"""`python -m thermoctl.evidence`: the evidence engine beside `thermoctl diagnose`, until it takes over; and --explain."""
+"""`python -m thermoctl.evidence`: diagnose with the evidence engine; it will replace `diagnose`."""
 
 from __future__ import annotations
 

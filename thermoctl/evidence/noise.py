@@ -1,14 +1,15 @@
 """Log marginal likelihood of residuals: sensor noise and remainder averaged over their spectra, not chosen.
 
-In band b of an output (coordinates.py; bands of its recordings at the same frequency are one), with n rows and power
-P = sum R^2, the variance of a row is
+In band b of an output, with n rows and power P = sum R^2, a row has this variance (coordinates.py).
+Bands of an output's recordings at the same frequency count as one.
 
     V_b = c^2 s^2 + q exp(u_b),   log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
 
-s is the noise that the plant file states, c its error, log-normal. q exp(u_b) is the remainder and every slow error of the
-sensor. u is a random walk over log frequency: smooth, and its size is learnt at each frequency by itself. So an error of
-the plant at one frequency says little about another. Errors that nobody will name are small: the remainder's share of the
-output's swing has a half-normal prior of width SMALL, and q is that share squared.
+s is the noise that the plant file states, c its error, log-normal. q exp(u_b) is the remainder and every slow
+error of the sensor. u is a random walk over log frequency: smooth, and its size is learnt at each frequency
+by itself. So an error of the plant at one frequency says little about another. Errors that nobody will name
+are small: q = (SMALL swing)^2, and the remainder's share of the output's swing has a half-normal prior of
+width SMALL.
 
     log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
 

@@ -26,7 +26,7 @@ PAIR = 2
 HALF = 2.0  # times its first-order promise that a refit may gain
 PLACES_EACH = 3  # of one effect in a shortlist
 ALIKE = 0.999  # cosine of two directions, above which they are one
-START = 10.0  # times that a start which nobody measured is less certain than the catalogue says
+START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def extensions(
 
 
 def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
-    """Return the entries with fewer parameters at the same places, for an entry with an insignificant part."""
+    """Return the entries at the same places with fewer parameters, to try without an insignificant part."""
     return [
         d
         for d in looked.directions
@@ -174,7 +174,7 @@ def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
 def shortlist(
     looked: Screened, where: Mapping[str, set[str]], limits: Limits
 ) -> list[tuple[tuple[Direction, ...], float]]:
-    """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain in score.
+    """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
     The best is first; at most PLACES_EACH of one effect."""
     paying = []
@@ -267,7 +267,7 @@ def _refitted(
 
 
 def free_starts(before: Plant, after: Plant) -> Plant:
-    """The plant with bodies that an effect brought starting anywhere near: what nobody measured need not rest at the start."""
+    """Widen the initial states of bodies that an effect added: nobody measured where they start."""
     nodes = {
         n.name: n
         if n.name in before.nodes or not n.initial_sigma
