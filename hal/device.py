@@ -39,7 +39,9 @@ class Device:
         self.up = False
 
     def connect(self) -> None:
-        """Open and configure; may block. Raises HardwareError: port and remedy, without the device's name."""
+        """Open and configure the device; may block.
+
+        Raises HardwareError with port and remedy; the caller adds the device's name."""
         raise NotImplementedError
 
     def switch_off(self) -> None:

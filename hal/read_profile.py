@@ -329,4 +329,4 @@ _BUSES: dict[str, tuple[Callable[[Section, Path], BusSpec], _ReadSource]] = {
     "can-cia402": (_cia402, _cia402_source),
     "modbus": (_modbus, _register),
 }
-"""For each bus: the reader of its section, and that of a channel's source."""
+"""Bus -> (reader of its section of a profile, reader of the keys that locate a channel's value)."""

@@ -1,7 +1,7 @@
 """Numbers in lines of text: which base and which decimal sign, and why a line or a number was not taken.
 
-Ambiguous text is never guessed: "+78" is 78 or 120, "1,5" is 1.5 or two numbers. The profile decides. Text
-that does not fit the profile is reported with the received line.
+Ambiguous text is never guessed: "+78" is 78 or, in base 16, 120; "1,5" is 1.5 or two numbers. The profile
+decides. Text that does not fit the profile is reported with the received line.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
 }
 """Suffix of the role's name -> {unit: (factor, offset)}."""
 _DBC_UNITS = {"°C": "degC", "C": "degC", "deg C": "degC", "Celsius": "degC", "µm": "um", "μm": "um"}
-"""Spellings of these units in DBC files, where they differ."""
+"""Spelling of a unit in DBC files -> our spelling, where they differ."""
 
 
 def role_units(role: str) -> dict[str, tuple[float, float]]:

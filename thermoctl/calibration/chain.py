@@ -225,7 +225,7 @@ def identify_better(tests: list[Recorded], order: int | None) -> StateSpace:
 
 
 def estimate_mkf(mkf: filter.Mkf, r: Recorded) -> np.ndarray:
-    """Run the MKF at its period over a 1 s recording; rises (N, 12), held between its steps."""
+    """Run the MKF over a 1 s recording; return temperature rises (N, 12), held between the MKF's steps."""
     return held(_mkf_steps(mkf, r), round(mkf.period_s), len(r.power_w))
 
 

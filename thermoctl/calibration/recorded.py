@@ -47,9 +47,9 @@ class Recorded:
 
 
 def of_columns(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> Recorded:
-    """Take SIGNALS at 1 s as one test, the position error from its first value.
+    """Take SIGNALS at 1 s as one test; the position error is relative to its start.
 
-    No truth is known."""
+    The true temperatures are unknown: NaN."""
     temperatures = np.column_stack([columns[f"{p}_c"] for p in POINTS])
     error = columns["output_reference_um"] - columns["position_raw_um"]
     error = error - np.nanmean(error[:SETTLED])

@@ -16,7 +16,7 @@ from thermoctl.identify.experiments import Schedule
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, suggest
 
-CUTOFF_HZ = 4.3e-4  # 1 / (2 pi 370 s): the coil's time constant in test 1 of the paper
+CUTOFF_HZ = 4.3e-4  # the coil's corner: 1 / (2 pi 370 s), its time constant in test 1 of the paper
 RAMPS_S = 8 * (0.1, 0.2, 0.1, 0.3)  # 11 s: phase margins repeat within 1 degree on the simulated rig
 TRAVEL_UM = 10.0  # longest ramp for tuning
 ROOM_C = 20.0  # coil temperature when it is not measured: that of protection.resistance_ohm
@@ -69,7 +69,7 @@ def within_limits(settings: Settings, schedules: Sequence[Schedule]) -> tuple[fl
 
 
 def check_predicted(inputs: experiments.Inputs, settings: Settings) -> None:
-    """Refuse an experiment whose predicted readings leave the rig's protection.
+    """Refuse an experiment whose predicted readings exceed the limits of `protection`.
 
     Raises InputError that names the reading.
     """

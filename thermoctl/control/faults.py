@@ -489,7 +489,7 @@ NAMES = {f.bit: f.name for f in FAULTS}
 """Bit -> name, as a recording stores it."""
 
 READING_BIT = bytes(bit for c in TABLE for bit in READING_BITS[c.group])
-"""Bits of the readings' faults, by channel and by KINDS; the compiled tick reads them here."""
+"""Fault bit of each channel and kind, for the compiled law: index = channel * len(KINDS) + kind."""
 
 
 def mask(*severities: str, readings: bool = True) -> int:

@@ -78,20 +78,20 @@ from thermoctl.signals import FAULT_WORD_BITS, OUTPUT, OUTPUTS
 MAX_AVERAGE = 64
 WARM_UP_TICKS = 100
 THERMAL_S = 0.1  # least time for a change of temperature: a bonded sensor's own time constant
-# Unit of `delay`: a recording has four bits a temperature, so 15 is 375 ms, above the 300 ms timeout of an
-# answer.
+# Unit of `delay`, s. A recording stores it in four bits: the largest, 15, is 375 ms, above the 300 ms timeout
+# of an answer.
 DELAY_S = 0.025
 MAX_GAP_S = 10.0  # after a longer time between two ticks the estimate restarts
 RESUME_LIMIT_C = 2.0  # keep the estimates of an earlier run if the coil's first reading is this close
-# Readings of the air averaged into the origin: 0.02 K of noise in a single one would stay as 0.03 um of
-# offset.
+# Number of air readings averaged into the expansion's origin. The noise of a single one, 0.02 K, would
+# remain as an offset of 0.03 um.
 AIR_READINGS = 30.0
 COPPER_1_K = 0.00393  # temperature coefficient of the coil's resistance, from 20 degC
 _GAP_S, _RESUME_C, _COPPER, _WARM_UP = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K, WARM_UP_TICKS
 _AIR_READINGS = AIR_READINGS
 _THERMAL_S, _DELAY_S, _NAN = THERMAL_S, DELAY_S, float("nan")
 COMPILED = not __file__.endswith(".py")
-"""False when this module runs interpreted: for coverage only, a hundred times too slow for a rig."""
+"""False when interpreted: a hundred times too slow for a rig, only for measuring test coverage."""
 
 # Constants that the compiler turns into C numbers (typed in law.pxd).
 _OK, _STALE, _ERROR, _ABSENT = OK, STALE, ERROR, ABSENT
@@ -118,7 +118,7 @@ _B_ELECTRICAL, _B_DISPLACED = faults.BIT["electrical_disagrees"], faults.BIT["po
 _B_MONITORED = faults.BIT["monitored_disagrees"]
 _TRIP_OTHERS = faults.mask(
     "fault", "critical", readings=False
-)  # a reading's fault trips where it is required
+)  # a reading's fault trips only where its channel is required
 _CRITICAL = faults.mask("critical")
 _WORD_BITS, _WORD = FAULT_WORD_BITS, (1 << FAULT_WORD_BITS) - 1
 _O_STATE, _O_FAULTS, _O_FAULTS_2 = OUTPUT["state"], OUTPUT["fault_bits"], OUTPUT["fault_bits_2"]

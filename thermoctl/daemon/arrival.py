@@ -21,7 +21,7 @@ SLOW_SHARE = (
 )
 LOOK_ROWS = 4000  # newest ticks in which `status` counts readings
 ATTEMPTS = 3  # to read the counters while the loop writes them, once a second
-FEWEST = 10  # expected readings in that time, below which no rate is reported
+FEWEST = 10  # no rate is reported where fewer readings are expected in the ticks counted
 
 
 def expected_hz(settings: Settings) -> dict[str, float]:

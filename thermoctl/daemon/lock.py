@@ -13,7 +13,7 @@ from pathlib import Path
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
-PROBE_S = 0.2  # `holder` takes the lock for less than this to test it
+PROBE_S = 0.2  # `hold` retries for this time: `holder` in another process takes the lock for less to test it
 
 
 def lock_path(settings: Settings) -> Path:

@@ -250,7 +250,7 @@ def run_loop(
             slept = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
             gap_ns = slept - slept_before if slept - slept_before > _SUSPEND_NS else 0
             slept_before = slept
-        if counted:  # the simulated rig's time stops while the machine stalls
+        if counted:  # time is counted in ticks: a stall of the machine also stops the simulated rig
             rig.tick(rig.start_s + (rig.law.tick + 1) * rig.law.period_s, rig.law.period_s, lateness_us)
         else:
             rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)

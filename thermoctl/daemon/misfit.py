@@ -21,7 +21,7 @@ BLOCK_S = 20.0  # duration of the innovations averaged to one z
 DRIFT = 1.0  # half of the shift to detect, which is two standard errors of a block
 LIMIT = 15.0
 CLIP = 4.0  # limit of |z|, so that no single block raises an alarm
-CORRELATED = 4.0  # samples that count as one: quantisation correlates neighbours
+CORRELATED = 4.0  # neighbouring samples that count as one independent one: quantisation correlates them
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reloa
 class Simulation:
     """One rig in simulated time: `command`, `tick`, and `row`, the newest record row (INDEX of signals.py).
 
-    settings: with hal.backend simulated or replay; model, parameters: default those of the settings. `law`
-    is the law, `backend` the open back end.
+    settings: hal.backend must be simulated or replay. model, parameters: those of the settings if None.
+    `law` is the law, `backend` the open back end.
     """
 
     def __init__(

@@ -31,9 +31,10 @@ _BOTH = 3 << 2 * CHANNELS.index("position_um") | 3 << 2 * CHANNELS.index("output
 
 
 class Tuning:
-    """Makes calibrations from record rows: `take` rows in order of time; `tuner` holds the state of learning.
+    """Learns the expansion model from a rig's record rows and saves calibrations.
 
-    folder: of calibrations, or None to learn without installing; say(text): writes to the log.
+    Give the rows to `take` in order of time; `tuner` holds the state of learning. folder: where calibrations
+    are saved, or None to learn without saving; say(text): writes to the log.
     """
 
     def __init__(

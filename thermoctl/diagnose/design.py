@@ -26,7 +26,7 @@ STARTS_APART = 0.05  # share by which a constant input differs between recording
 
 Limits = Mapping[str, tuple[float, float]]
 NONE: Limits = {}
-Plateaus = list[tuple[float, float]]  # (seconds, value) of each
+Plateaus = list[tuple[float, float]]  # (duration in s, value) of each plateau
 
 
 @dataclass(frozen=True)
@@ -225,9 +225,9 @@ def _plans(
 def _constant(
     plant: Plant, tables: Sequence[Table], moved: set[str]
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
-    """Inputs that nobody drives at their mean, readings that a start asks for, and the starts.
+    """Return the value of each input that is not driven (its mean), and the starting conditions.
 
-    Starts: where an input was constant in every recording but differed between them, both ends."""
+    An input that is constant in each recording but differs between recordings gives two starts: its extremes."""
     constant, low, high = {}, {}, {}
     for i in plant.inputs.values():
         if i.name in moved:

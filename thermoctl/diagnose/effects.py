@@ -78,7 +78,7 @@ class EffectParameter:
     shape: str | None
     per_recording: bool
     typical: float | None
-    origin: str | None  # 'first_air': low and high are counted from the ambient at the start
+    origin: str | None  # 'first_air': low and high are relative to the first ambient temperature
 
     @property
     def amplitude(self) -> bool:

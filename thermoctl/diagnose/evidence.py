@@ -47,8 +47,9 @@ _Filter = tuple[tuple[float, ...], tuple[float, ...], int]
 
 @dataclass(frozen=True)
 class Colour:
-    """The noise of one channel under an explanation: innovation's sigma, the filter ar(z)/ma(z) that turns it into white
-    noise, and its -2 log likelihood."""
+    """The noise model of one channel under a hypothesis.
+
+    The filter ar(z)/ma(z) whitens the residual; `sigma` is the innovation's; `score` is -2 log likelihood."""
 
     sigma: float
     ar: tuple[float, ...]
@@ -65,7 +66,7 @@ def _filters() -> tuple[_Filter, ...]:
 
 @cache
 def _mixed() -> tuple[_Filter, ...]:
-    """(ar, ma, parameters) of flicker noise beside a first-order part."""
+    """Return (ar, ma, number of parameters) for each grid point of flicker noise plus a first-order part."""
     return tuple((*flicker(v, 1.0, phi, large), 3) for phi in _BESIDE for large in _LARGE for v in _SMALL)
 
 
@@ -170,8 +171,9 @@ def white_sigma(parts: Sequence[np.ndarray]) -> float:
 
 
 def channels(residuals: Sequence[np.ndarray], sigmas: Sequence[float]) -> list[Colour]:
-    """The colour of every output channel over recordings, the prior's price in the score. residuals: per recording
-    (N, outputs); sigmas: white noise per output."""
+    """Return the noise model of every output, over all recordings; its score includes the prior.
+
+    residuals: per recording (N, outputs); sigmas: white noise per output."""
     out = []
     for j, sigma in enumerate(sigmas):
         found = colour([r[:, j] for r in residuals], 0.6 * sigma)

@@ -149,7 +149,7 @@ def noise_of(case: Case, e: Explanation) -> np.ndarray:
 
 
 def survivors(found: Diagnosis) -> list[Explanation]:
-    """List the hypotheses that are not ruled out, likeliest first, one of each set of effects."""
+    """List the hypotheses that are not ruled out, likeliest first; of those with equal effects only the likeliest."""
     out: dict[tuple[Any, ...], Explanation] = {}
     for e in sorted([found.final, *found.rivals], key=lambda e: -e.probability):
         if e.effects:

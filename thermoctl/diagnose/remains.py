@@ -25,7 +25,7 @@ UNLIKE_COLOUR, MOST = (
 
 
 def metric_of(case: Case, e: Explanation, colours: Sequence[Colour] | None) -> Metric:
-    """The rows of an explanation's residual, in the metric of colours, one a channel, or in white noise's."""
+    """Return the residual's rows of a fitted hypothesis, weighted by a noise model a channel, or as white noise."""
     drives = [e.fit.model.excitation(t) for t in case.tables]
     for r, d in enumerate(drives):
         e.fit.model.prepare(d, e.fit.values[r])

@@ -30,7 +30,7 @@ ROWS = 8_000  # rows of the screening, all recordings together
 FINE_ROWS = 64_000  # of what moves: it passes a pattern's period, or turns, within a block's time
 EPSILON = 1e-4  # amplitude at which a direction is taken
 CHUNK = 96
-ONSETS = 24  # of a grid over the recordings
+ONSETS = 24  # onset times of the grid over the recordings
 NEAR = 4.0  # a lag or delay this many times shorter or longer than the one looked at changes the outputs in proportion
 
 
@@ -114,8 +114,10 @@ class Metric:
         return np.concatenate(parts)
 
     def sketch(self, d: np.ndarray) -> np.ndarray:
-        """Directions (rows, k) in ROWS rows at most that keep their products but for a per cent: sums over blocks with random signs
-        (Charikar, Chen & Farach-Colton 2002, count sketch), to which what is fast is worth as much as what is slow."""
+        """Compress directions (rows, k) to at most ROWS rows; their inner products change by about one per cent.
+
+        Sums over blocks with random signs (count sketch; Charikar, Chen & Farach-Colton 2002). Unlike block means they
+        keep fast signals."""
         b = int(np.ceil(len(d) / ROWS))
         if b <= 1:
             return d

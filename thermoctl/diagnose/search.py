@@ -1,5 +1,6 @@
-"""The search for what was left out: screen the catalogue from an explanation, refit the best entries in full, keep what
-counts, look again."""
+"""Search for the missing effects, step by step.
+
+Each step screens the catalogue from a fitted hypothesis, refits the best entries, and keeps the significant ones."""
 
 from __future__ import annotations
 
@@ -162,8 +163,9 @@ class Round:
 def look(
     case: Case, base: Explanation, entries: Mapping[str, Any], draws: int = DRAWS, coloured: bool = False
 ) -> Round:
-    """Screen the catalogue from an explanation, at the places of the plant as it came: what was left out is the rig's, not that of a
-    part which another effect assumed. `coloured`: in the metric of the residual's own colour."""
+    """Screen the catalogue from a fitted hypothesis, at the places of the original plant.
+
+    A part that an earlier effect added is no place. `coloured`: weight by the residual's own noise model."""
     model = base.fit.model
     drives = [model.excitation(t) for t in case.tables]
     for d in drives:

@@ -1,4 +1,4 @@
-"""`python -m thermoctl.evidence`: the evidence engine beside `thermoctl diagnose`, until it takes over; and --explain."""
+"""`python -m thermoctl.evidence`: diagnose with the evidence engine; it will replace `diagnose`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thermoctl.yamlfile import InputError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one diagnosis, or retrace one; returns the exit status."""
+    """Run one diagnosis, or with --explain print the reasons of an earlier one; return the exit status."""
     p = argparse.ArgumentParser(prog="python -m thermoctl.evidence", description=__doc__)
     p.add_argument("--plant", metavar="FILE", help="plant file")
     p.add_argument("--out", metavar="DIR", help="for diagnosis.json and plant.yaml")

@@ -40,7 +40,9 @@ class Budget:
 
 @dataclass(frozen=True)
 class Case:
-    """Everything that hypotheses are compared on. `coordinates` and `grids` stay the same for all."""
+    """Data, catalogue and budget of a diagnosis.
+
+    All hypotheses are scored in the same `coordinates` and `grids`."""
 
     plant: Plant
     tables: tuple[Table, ...]
@@ -59,7 +61,9 @@ class Case:
 
 
 def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect], budget: Budget) -> Case:
-    """Refit the plant as it came, drop single outliers, measure how forces at its nodes reach its outputs. Raises InputError."""
+    """Refit the original plant, drop single outliers, fix the coordinates and grids of all hypotheses.
+
+    Raises InputError where too few values were measured."""
     model = compile_plant(plant)
     drives = [model.excitation(t) for t in tables]
     counts = [sum(int(np.isfinite(d.y[:, j]).sum()) for d in drives) for j in range(len(model.outputs))]

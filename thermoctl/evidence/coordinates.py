@@ -1,11 +1,12 @@
 """Residuals in frequency: the orthonormal DCT-II of each output's measured samples in each recording.
 
-There a stationary noise is nearly independent from row to row, with its spectral density as variance (Whittle's
-likelihood); a random walk is, too. Missing samples are left out: what remains counts as one sequence, exact for white noise.
+There a stationary noise is nearly independent from row to row, with its spectral density as variance
+(Whittle's likelihood); a random walk is, too. Missing samples are left out and the others joined: exact for
+white noise.
 
     R = DCT(e),   log p(e | V) = -1/2 sum_k (log 2 pi V_k + R_k^2 / V_k)
 
-Noise models differ only in V, which is smooth: only the power of R in bands of rows is needed to compare them.
+Noise models differ only in V, which is smooth. To compare them, the power of R in bands of rows is enough.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ class Channel:
 
     recording: int
     output: int
-    index: np.ndarray  # measured samples
+    index: np.ndarray  # indices of the measured samples
     block: int  # samples that are averaged before the transform
     band: np.ndarray  # (rows,) the band of each row
     count: np.ndarray  # (bands,) rows in each
-    frequency: np.ndarray  # (bands,) 1/s, of a band's middle
-    interval: float  # s, between measured samples
+    frequency: np.ndarray  # (bands,) Hz, middle of each band
+    interval: float  # s, mean between measured samples
 
     @property
     def rows(self) -> int:

@@ -1,4 +1,6 @@
-"""From posterior, remainder and worth to a verdict: a pure function and a table of rows, of which the first that holds decides."""
+"""Verdict from posterior, remainder and held-out error: a pure function.
+
+The first row of a table whose condition holds decides."""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ Key = tuple[str, str]  # (effect, where)
 
 @dataclass(frozen=True)
 class Posterior:
-    """Probabilities over the hypotheses tried (by their effects), and of each effect over all hypotheses that hold it."""
+    """Probability of each hypothesis tried (by its effects), and of each effect in any of them."""
 
     hypotheses: Mapping[frozenset[Key], float]
     effects: Mapping[Key, float]
@@ -28,9 +30,13 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Facts:
-    """All that a verdict depends on. `named`: effects whose own probability is high enough; `over_noise`: the largest residual
-    over its sensor's noise; `closed`: share of the refitted plant's misfit that the findings close; `worth`: held-out error over
-    that of a refit alone."""
+    """All numbers that a verdict depends on.
+
+    - `something`: probability that some effect is there
+    - `named`: effects whose own probability is high enough
+    - `over_noise`: the largest ratio of a residual to its sensor's noise
+    - `closed`: share of the refitted plant's misfit that the findings remove
+    - `worth`: held-out error, divided by that of a refit alone"""
 
     something: float
     named: tuple[Key, ...]
@@ -41,7 +47,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Decision:
-    """The verdict, the effects that are named, the set of alternatives, and the row that fired with its numbers."""
+    """The verdict, the named effects, the alternatives, and the row that decided, with its numbers."""
 
     verdict: str
     named: tuple[Key, ...]
@@ -100,7 +106,7 @@ def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
 
 
 def alternatives(posterior: Posterior, named: Sequence[Key], limits: Limits) -> tuple[tuple[Key, float], ...]:
-    """The effects beside the named ones in the likeliest hypotheses that together hold the set's probability."""
+    """Return the other effects of the likeliest hypotheses that together reach probability `limits.set`."""
     total, found = 0.0, set[Key]()
     for keys, p in sorted(posterior.hypotheses.items(), key=lambda item: (-item[1], sorted(item[0]))):
         if total >= limits.set:

@@ -1,10 +1,12 @@
 """A hypothesis refitted, and its log evidence by Laplace's method.
 
-    log p(D | h) ~ log p(D | z^) + log p(z^) + k/2 log 2 pi - 1/2 log |H|,    H = J' E[1/V] J + prior's precision
+    log p(D | h) ~ log p(D | z^) + log p(z^) + k/2 log 2 pi - 1/2 log |H|
 
-z: the plant's parameters in their ranges (0..1, logarithmic where the range spans a factor of three), its starts in their standard
-deviations, the effects' parameters in theirs. log p(D | z) is averaged over noise and remainder (noise.py); its maximum is found by
-Gauss and Newton's steps with the expected weights E[1/V], which are its exact gradient.
+    H = J' E[1/V] J + prior's precision
+
+z: parameters of plant and effects, 0..1 in their ranges, and initial states in their standard deviations.
+The scale is logarithmic where a range spans a factor of three. log p(D | z) is averaged over noise and
+remainder (noise.py). Gauss-Newton steps find its maximum; with the weights E[1/V] their gradient is exact.
 """
 
 from __future__ import annotations
@@ -25,15 +27,15 @@ from thermoctl.plant.refit import Fit, Problem
 from thermoctl.plant.simulate import SimulationError, compile_plant
 
 SIGNIFICANT = 2.0  # standard deviations
-BELIEF = 0.3  # standard deviation of the plant's parameters round their beliefs, as a share of their ranges
+BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
 UNIFORM = 12.0  # precision of a uniform prior over 0..1
 PERIODS = 15.0  # times the range that a refit gives a period that it could have had (logarithms)
-DECADES = 4.0  # over which the order of magnitude of an effect's size is unknown
+DECADES = 4.0  # width of the log-uniform prior of an effect's size
 WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
-ROUNDS = 15  # of Gauss and Newton's steps
-LENGTHS = 1.0, 0.3, 0.1  # of a step that are tried
+ROUNDS = 15  # largest number of Gauss-Newton steps
+LENGTHS = 1.0, 0.3, 0.1  # shares of a Newton step that are tried, in this order
 FAR = 8.0  # standard deviations that a start may be off
-HOPELESS = 50.0  # nats below the best hypothesis that a refit stays with all its steps still to come
+HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
 MOST = 0.9  # of a curvature that not knowing the spectrum may take
 ENOUGH = 0.05  # gain in the log posterior, below which no further step is taken
 LOG_2PI = float(np.log(2 * np.pi))
@@ -82,7 +84,7 @@ class Fitted:
 
     @property
     def absent(self) -> bool:
-        """Is a part of an effect not significant? Then the simpler hypothesis, without that part, stands for this one."""
+        """Return whether a part of an effect is not significant; a simpler hypothesis then replaces it."""
         return any(_insignificant(self, e) for e in self.hypothesis.effects)
 
     @property
@@ -92,7 +94,9 @@ class Fitted:
 
 
 def _insignificant(f: Fitted, e: Placed) -> bool:
-    """Is a size of the effect within SIGNIFICANT standard deviations of none, or a lag or delay that is all there is at its least?"""
+    """Return whether a size is within SIGNIFICANT sd of none.
+
+    Without a size (lag, delay): whether a parameter is at its lower bound."""
     sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
     if not set(e.own.values()) <= f.plant.parameters.keys():
         return True  # another effect took its place
@@ -176,8 +180,7 @@ class Posterior:
         return gradient - self.precision * (z - self.mean) - push, matrix + np.diag(self.precision) + bend
 
     def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
-        """By how much the second derivative falls short of E[1/V] J'J, since V itself is not known: the variance over V of the
-        gradient (Louis 1982)."""
+        """Return E[1/V] J'J minus the curvature: the gradient's variance over the unknown V (Louis 1982)."""
         out = np.zeros((len(z), len(z)))
         channels = self.case.coordinates.channels
         jacobians = [self.problem.jacobian(z, r) for r in range(len(self.drives))]
@@ -199,8 +202,9 @@ class Posterior:
     def climb(
         self, z: np.ndarray, goal: float
     ) -> tuple[np.ndarray, Averaged, list[np.ndarray], np.ndarray, list[np.ndarray]]:
-        """The maximum near z: z, likelihood, powers, H and errors there. A log posterior of `goal` that is out of reach is not
-        climbed for."""
+        """Return z, likelihood, powers, H and errors at the maximum near z.
+
+        Stop early if `goal` is out of reach."""
         low, high = self.bounds()
         errors = self.errors(z)
         rows = self.rows(errors)
@@ -230,7 +234,7 @@ class Posterior:
 def _step(
     z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Newton's step inside the box: what meets a wall stays there."""
+    """Return Newton's step inside the bounds; a coordinate that reaches its bound stays there."""
     free = ~(((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0)))
     step = np.zeros_like(z)
     for _ in range(len(z)):
@@ -279,8 +283,9 @@ def _priors(
 def fitted(
     case: Case, plant: Plant, effects: Sequence[Placed], start: Fit | None = None, best: Fitted | None = None
 ) -> Fitted:
-    """Refit a plant that holds these effects and take its log evidence; what stays far from the best hypothesis so far is not
-    followed to its end. Raises SimulationError."""
+    """Refit a plant that holds these effects and compute its log evidence. Raises SimulationError.
+
+    The refit ends early if it stays far from `best`, the best hypothesis so far."""
     case.budget.fits_done += 1
     posterior = Posterior(case, plant, effects)
     if start is None:
@@ -384,7 +389,7 @@ def as_refitted(case: Case, f: Fitted) -> Fitted:
 
 
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
-    """Log p(z): Gaussians, uniform shapes, and the effects' sizes, which are not measured more finely than `sd`."""
+    """Return log p(z): Gaussians, uniform shapes, and the effects' sizes with standard deviations `sd`."""
     values, _ = posterior.problem.unpack(z)
     out = posterior.prior(z) + 0.5 * float(
         np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi)))
@@ -399,7 +404,7 @@ def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) ->
 
 
 def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
-    """Log p(D | z) + log p(z) at any z, with the sizes' scales of a fitted hypothesis: what `log_evidence` integrates."""
+    """Return log p(D | z) + log p(z), the integrand of `log_evidence`; sizes' sd are those of `found`."""
     return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(
         posterior, z, found.sd
     )
@@ -412,7 +417,8 @@ def _gaussian(posterior: Posterior) -> np.ndarray:
 
 
 def _size(p: EffectParameter, value: float, sd: float) -> float:
-    """Log density of an effect's size: its order of magnitude is unknown over DECADES decades, and it is not measured more
-    finely than its standard deviation."""
+    """Return the log prior density of an effect's size: log-uniform over DECADES decades.
+
+    Below its standard deviation the density is nearly constant."""
     one_sided = p.low >= p.null or p.high <= p.null
     return -float(np.log(np.log(10.0) * DECADES * (1 if one_sided else 2) * np.hypot(value - p.null, sd)))

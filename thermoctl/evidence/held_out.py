@@ -1,4 +1,4 @@
-"""What a hypothesis is worth on data that took no part in any choice: measured once, after all choices."""
+"""Score of a hypothesis on data that took no part in any choice: measured once, after all choices."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ BLOCKS = 16  # of recordings that are too few: fitted to every other one, checke
 
 @dataclass(frozen=True)
 class Worth:
-    """Root-mean-square errors per output of the plant as it came, refitted, and with the findings. `reserved`: on recordings set
-    aside; otherwise cross-validated, on data that did take part in the choice."""
+    """Root-mean-square errors per output of the original plant, refitted, and with the findings.
+
+    `reserved`: on recordings set aside; otherwise cross-validated, on data that took part in the choice."""
 
     before: dict[str, float]
     refit_only: dict[str, float]
@@ -94,7 +95,7 @@ def _crossed(case: Case, f: Fitted) -> dict[str, float]:
     """Errors on each half of the blocks, the plant refitted to the other half."""
     measured = {o.column for o in case.plant.outputs.values()}
     errors = []
-    for parity in (0, 1):  # the first block is fitted to both times: what starts there shows nowhere else
+    for parity in (0, 1):  # the first block is always fitted: an effect of the start is seen only there
         train = [_masked(t, measured, parity, True) for t in case.tables]
         model = compile_plant(f.plant)
         drives = [model.excitation(t) for t in train]

@@ -1,14 +1,15 @@
 """Log marginal likelihood of residuals: sensor noise and remainder averaged over their spectra, not chosen.
 
-In band b of an output (coordinates.py; bands of its recordings at the same frequency are one), with n rows and power
-P = sum R^2, the variance of a row is
+In band b of an output, with n rows and power P = sum R^2, a row has this variance (coordinates.py).
+Bands of an output's recordings at the same frequency count as one.
 
     V_b = c^2 s^2 + q exp(u_b),   log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
 
-s is the noise that the plant file states, c its error, log-normal. q exp(u_b) is the remainder and every slow error of the
-sensor. u is a random walk over log frequency: smooth, and its size is learnt at each frequency by itself. So an error of
-the plant at one frequency says little about another. Errors that nobody will name are small: the remainder's share of the
-output's swing has a half-normal prior of width SMALL, and q is that share squared.
+s is the noise that the plant file states, c its error, log-normal. q exp(u_b) is the remainder and every slow
+error of the sensor. u is a random walk over log frequency: smooth, and its size is learnt at each frequency
+by itself. So an error of the plant at one frequency says little about another. Errors that nobody will name
+are small: q = (SMALL swing)^2, and the remainder's share of the output's swing has a half-normal prior of
+width SMALL.
 
     log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
 
@@ -26,11 +27,11 @@ from scipy.special import logsumexp
 
 from thermoctl.evidence.coordinates import WIDTH, Channel
 
-STATED = 1.0  # standard deviation of log c^2: a stated noise is wrong by a factor of 1.6 in one case of three
+STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times
 ABSENT = 0.5  # prior of no remainder at an output
 SMALL = 0.05  # of an output's swing: width of the prior of the remainder's rms
 LEVEL = 2 * np.log(10.0)  # standard deviation of u at the lowest frequency: a tenth to ten times SMALL
-DRAWS = 400  # of the random walk, for the prior's normalisation
+DRAWS = 400  # random walks drawn for the normalisation of the remainder's prior
 WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a white force on one storage
 STEPS, CLOSE, LONGEST = 40, 1e-4, 2.0  # of Newton's method: their number, the step that ends it, the longest
 LOG_2PI = float(np.log(2 * np.pi))
@@ -38,7 +39,9 @@ LOG_2PI = float(np.log(2 * np.pi))
 
 @dataclass(frozen=True)
 class Grid:
-    """The frequencies of one output. `node`: of each band of all its recordings its frequency; `count`: rows at each."""
+    """The frequencies of one output.
+
+    `node`: index of its frequency for each band of all recordings; `count`: rows at each frequency."""
 
     channels: tuple[int, ...]  # positions in Coordinates.channels
     node: np.ndarray
@@ -51,7 +54,7 @@ class Grid:
 
     @property
     def variance(self) -> float:
-        """s^2"""
+        """Variance of the stated noise, s^2."""
         return self.sigma**2
 
     @property
@@ -61,7 +64,9 @@ class Grid:
 
 
 def grid(channels: Sequence[Channel], positions: Sequence[int], sigma: float, swing: float) -> Grid:
-    """The frequencies of one output. `sigma`: its stated noise; `swing`: its rms about the mean; `channels`: its recordings."""
+    """Return the frequencies of one output.
+
+    `sigma`: its stated noise; `swing`: its rms about the mean; `channels`: its recordings."""
     octave = np.concatenate([np.log2(c.frequency) for c in channels])
     cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)
     known, node = np.unique(cells, return_inverse=True)
@@ -83,8 +88,10 @@ def grid(channels: Sequence[Channel], positions: Sequence[int], sigma: float, sw
 class Averaged:
     """A log marginal likelihood and its by-products.
 
-    `inverse`: E[1/V] in the bands of each channel. By output: `sensor`, the variance of the noise; `remainder`, the
-    probability of one; `unsure`, the covariance of 1/V over frequencies."""
+    - `inverse`: E[1/V] in the bands of each channel
+    - `sensor`: the noise's variance, by output
+    - `remainder`: the probability that there is a remainder, by output
+    - `unsure`: covariance (frequencies, frequencies) of 1/V, by output"""
 
     log_likelihood: float
     inverse: list[np.ndarray]
@@ -130,8 +137,9 @@ def _sensor_only(g: Grid, power: np.ndarray) -> tuple[float, float]:
 
 
 def _with_remainder(g: Grid, power: np.ndarray, own: float) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """Log p(R | remainder), the noise's variance, each frequency's variance V, and the covariance of 1/V: Fisher's scoring for
-    (log c^2, u)."""
+    """Return log p(R | remainder), the noise's variance, V at each frequency, and the covariance of 1/V.
+
+    Laplace's method over (log c^2, u); Fisher's scoring finds the maximum."""
     n, rows, size = g.count, float(g.count.sum()), len(g.count) + 1
     x = np.concatenate([[0.0], np.log(np.maximum(power / n - own, 0.05 * own) / g.small)])
 

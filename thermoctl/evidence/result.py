@@ -217,7 +217,7 @@ def words(found: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """JSON's own types, what is no number as null, figures to ten digits."""
+    """Convert to JSON's own types; NaN and infinity become null, numbers are rounded to ten digits."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -61,7 +61,7 @@ class Structure(Rig):
         return super().kind(q)
 
     def _ambients(self) -> dict[str, int]:
-        """Return the temperatures that losses of heat are counted from: name and number of losses."""
+        """Return the reference temperatures of heat losses: name -> number of losses."""
         stated = [i.name for i in self.physics.inputs.values() if i.role == "ambient"]
         known = (
             stated or self.heat_inputs,
@@ -80,7 +80,7 @@ class Structure(Rig):
         return {}
 
     def _coolest(self) -> str | None:
-        """Return the temperature that most losses of heat are counted from; of several the coolest."""
+        """Return the ambient: the reference temperature of most heat losses; of several the coolest."""
         count = self._ambients()
         return min(count, key=lambda i: (-count[i], self._mean(i)), default=None)
 

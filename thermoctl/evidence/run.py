@@ -31,7 +31,7 @@ def diagnose(
     numbers: Limits,
     held_out: Sequence[Table] = (),
 ) -> Diagnosis:
-    """What is missing from a plant, by recordings. Raises InputError."""
+    """Find the physics that a plant lacks, from recordings. Raises InputError."""
     chosen_on, reserve = split(tables, held_out)
     known = case(plant, chosen_on, entries, Budget(numbers.fits, numbers.fits))
     searched = search(known, numbers)
@@ -53,8 +53,10 @@ def diagnose(
 
 
 def closed(before: Left, after: Left) -> float:
-    """Share of the misfit beyond the sensors' noise that is gone: of its energy (each output in units of its noise) or of the log
-    likelihood that it costs, whichever is larger. A slow error of a sensor has much of the one, a fast one of the other."""
+    """Return the share of the misfit that the findings remove, as energy or as likelihood: the larger.
+
+    The misfit is the residual beyond the sensors' noise; its energy is in units of each output's noise.
+    A slow sensor error has much energy, a fast one costs much likelihood."""
     was = sum((before.rms[o] / before.noise[o]) ** 2 for o in before.rms)
     now = sum((after.rms[o] / before.noise[o]) ** 2 for o in after.rms)
     energy = 1 - now / was if was > 0 else 1.0
@@ -62,7 +64,7 @@ def closed(before: Left, after: Left) -> float:
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:
-    """Root of the mean over outputs of the ratio of mean squares; infinite where the plant could not be simulated."""
+    """Return the root of the outputs' mean ratio of mean squares; infinite if a simulation failed."""
     pairs = [(after.get(o, float("inf")), before[o]) for o in before if before[o] > 0]
     return (sum((a / b) ** 2 for a, b in pairs) / max(len(pairs), 1)) ** 0.5
 

@@ -1,4 +1,4 @@
-"""The score test of every catalogue entry at every place, from one fitted hypothesis, beside its noise and remainder."""
+"""Score test of every catalogue entry at every place, given a fitted hypothesis, its noise and remainder."""
 
 from __future__ import annotations
 
@@ -17,15 +17,18 @@ from thermoctl.evidence.roles import Structure
 from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
 
-ROWS, MOVING_ROWS = 6_000, 16_000  # of all outputs in all recordings; what moves needs the finer ones
-LIKELY = 0.5  # probability of a remainder, from which errors at all frequencies are looked at alike besides
+# Largest number of DCT rows, all outputs and recordings together; MOVING_ROWS for a plant with a moving axis.
+ROWS, MOVING_ROWS = 6_000, 16_000
+# Probability of a remainder above which the catalogue is screened once more, with the sensors' noise alone.
+LIKELY = 0.5
 PROMISED = 30  # directions whose gain in log likelihood is predicted
 
 
 class Rows(Metric):
-    """Whitened rows of a refitted hypothesis: DCT rows over the standard deviation of their noise.
+    """Whitened rows of a refitted hypothesis: DCT rows divided by the rms of their noise.
 
-    `remainder`: it counts as noise, too. Then errors at low frequencies weigh little, else those at high ones."""
+
+    `remainder`: does it count as noise, too? If so, errors at low frequencies have little weight."""
 
     def __init__(self, case: Case, fitted: Fitted, most: int, remainder: bool):
         self.fit, self.model = fitted.rough, fitted.rough.model
@@ -67,7 +70,7 @@ class Rows(Metric):
         self.now = self.log_likelihood(self.residual)
 
     def rows(self, r: int, e: np.ndarray) -> np.ndarray:
-        """(N, outputs, ...) of recording r as whitened rows of all its channels."""
+        """Transform samples (N, outputs, ...) of recording r to the whitened DCT rows of all its channels."""
         parts = []
         for c, w in zip(self.coordinates.channels, self.weights, strict=True):
             if c.recording == r:
@@ -107,7 +110,7 @@ def _weights(case: Case, fitted: Fitted, coordinates: Coordinates, remainder: bo
 
 @dataclass(frozen=True)
 class Screened:
-    """The entries' best directions, and what each promises: a gain in log likelihood."""
+    """The catalogue's best directions; `promises`: predicted gain in log likelihood of each."""
 
     metric: Rows
     rig: Structure
@@ -116,7 +119,7 @@ class Screened:
 
 
 def screened(case: Case, fitted: Fitted) -> Screened:
-    """Screen the catalogue, at the places of the plant as it came: what is missing is the rig's, not an effect's."""
+    """Screen the catalogue at the places of the original plant; a part that an effect added is no place."""
     case.budget.screenings_done += 1
     moving = bool(Structure(case.plant, [], []).velocities) if case.plant.nodes else False
     most = MOVING_ROWS if moving else ROWS
@@ -146,7 +149,7 @@ def screened(case: Case, fitted: Fitted) -> Screened:
 
 
 def places(case: Case) -> dict[str, set[str]]:
-    """Every effect that has a place in the plant, and its places: what an effect's prior odds are shared among."""
+    """Return the places of each effect that fits the plant. They share the effect's prior odds."""
     drives = case.drives(case.null.model)
     rig = Structure(case.plant, drives, [t.columns for t in case.tables])
     out: dict[str, set[str]] = {}

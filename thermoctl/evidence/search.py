@@ -26,7 +26,7 @@ PAIR = 2
 HALF = 2.0  # times its first-order promise that a refit may gain
 PLACES_EACH = 3  # of one effect in a shortlist
 ALIKE = 0.999  # cosine of two directions, above which they are one
-START = 10.0  # times that a start which nobody measured is less certain than the catalogue says
+START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,9 @@ class Searched:
 
 
 def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limits) -> float:
-    """Log prior odds of a hypothesis against no effect: entries share the odds alike, and their places theirs."""
+    """Return the log prior odds of a hypothesis against no effect.
+
+    The odds are shared equally among the entries, and each entry's among its places."""
     total = 0.0
     for e in effects:
         c = e.candidate
@@ -71,7 +73,7 @@ def _class(c: Candidate, limits: Limits) -> float:
 
 
 def search(case: Case, limits: Limits) -> Searched:
-    """Extend the beam's best hypotheses until no extension promises to pay its prior odds, or the budget is spent."""
+    """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent."""
     where = places(case)
     null = Weighed(fitted(case, case.plant, (), case.null), 0.0)
     tried: dict[frozenset[tuple[str, str]], Weighed] = {frozenset(): null}
@@ -84,7 +86,7 @@ def search(case: Case, limits: Limits) -> Searched:
             seen.add(parent.fitted.hypothesis.keys)
             found = extensions(case, parent, where, limits, tried)
             if parent is beam[0] and not found:
-                break  # what nothing can be added to needs no rival with more effects
+                break  # the best cannot be extended: no rival with more effects is needed
             for w in found:
                 tried[w.fitted.hypothesis.keys] = w
         beam = leaders(list(tried.values()), limits)
@@ -94,7 +96,9 @@ def search(case: Case, limits: Limits) -> Searched:
 
 
 def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
-    """The beam: by score and by free-run error in turn, since a remainder may absorb for a while what a later effect explains."""
+    """Return the beam: hypotheses in turn by score and by free-run error.
+
+    By error too: the remainder may absorb an effect that a later extension explains."""
     ranked = [sorted(tried, key=lambda w: -w.score), sorted(tried, key=lambda w: w.fitted.rough.cost)]
     out: dict[frozenset[tuple[str, str]], Weighed] = {}
     for pair in zip(*ranked, strict=True):
@@ -104,7 +108,7 @@ def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
 
 
 def relabels(c: Candidate) -> bool:
-    """Does the entry only say in another way what the plant, or a simpler entry at the same place, says already?"""
+    """Return whether the plant or a simpler entry at the same place already contains this physics."""
     if c.effect.where == "bending_pair":
         return any(_free_member(c, side) for side in ("TA", "TB"))
     displaced = PLACES["displacement"](c.rig)
@@ -130,7 +134,7 @@ def extensions(
     limits: Limits,
     tried: Mapping[frozenset[tuple[str, str]], Weighed],
 ) -> list[Weighed]:
-    """The parent with each direction of the shortlist, and with each pair that explains more than its parts, refitted."""
+    """Refit the parent with each direction, and with each pair of directions, of the shortlist."""
     out: list[Weighed] = []
     looked = screened(case, parent.fitted)
     leading = max(w.score for w in tried.values())
@@ -154,7 +158,7 @@ def extensions(
 
 
 def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
-    """The entries with fewer parameters at the same places: a part that is not significant is left to them."""
+    """Return the entries at the same places with fewer parameters, to try without an insignificant part."""
     return [
         d
         for d in looked.directions
@@ -170,8 +174,9 @@ def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
 def shortlist(
     looked: Screened, where: Mapping[str, set[str]], limits: Limits
 ) -> list[tuple[tuple[Direction, ...], float]]:
-    """The directions that promise to pay their prior odds, the best first and at most PLACES_EACH of an effect, then pairs; each
-    with the gain in score that it promises."""
+    """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
+
+    The best is first; at most PLACES_EACH of one effect."""
     paying = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
         gain = promise + odds((Placed(d.candidate, {}),), where, limits)
@@ -188,8 +193,9 @@ def shortlist(
 
 
 def pairs(directions: Sequence[Direction], looked: Screened, limits: Limits) -> list[tuple[Direction, ...]]:
-    """The pairs of constant physics that together explain far more than one by one, at their joint sizes: what the plant's own
-    parameters imitate alone, they may not imitate together."""
+    """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
+
+    The plant's own parameters may imitate each alone, but not both together."""
     best: dict[tuple[str, str], Direction] = {}
     for d in directions:
         if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values()):
@@ -218,7 +224,7 @@ def pairs(directions: Sequence[Direction], looked: Screened, limits: Limits) -> 
 
 
 def resized(d: Direction, factor: float) -> Direction | None:
-    """The direction at a multiple of its size; None where physics does not allow that."""
+    """Return the direction with its size multiplied by `factor`; None if the size leaves its bounds."""
     start = dict(d.start)
     for p in d.candidate.effect.parameters:
         if p.amplitude:
@@ -232,8 +238,9 @@ def resized(d: Direction, factor: float) -> Direction | None:
 def _followed(
     case: Case, parent: Weighed, looked: Screened, added: Sequence[Direction], leader: Fitted
 ) -> list[Fitted]:
-    """The refits from the starting points that the directions' shapes ask for; from nearer to nothing where the first steps went
-    astray and fit worse than without the effect."""
+    """Refit the parent with the directions from several starting points, which depend on their shapes.
+
+    If every refit fits worse than the parent, start again from a weaker effect."""
     first = tuple(sharpened(looked.metric, looked.rig, d) for d in added)
     stuck = tuple(sticking(d) or d for d in first)
     found = [_refitted(case, parent, first, looked, leader)]
@@ -261,7 +268,7 @@ def _refitted(
 
 
 def free_starts(before: Plant, after: Plant) -> Plant:
-    """The plant with bodies that an effect brought starting anywhere near: what nobody measured need not rest at the start."""
+    """Widen the initial states of bodies that an effect added: nobody measured where they start."""
     nodes = {
         n.name: n
         if n.name in before.nodes or not n.initial_sigma

@@ -11,7 +11,7 @@ MAPS = Path("/proc/self/maps")  # the libraries of this process (Linux)
 
 
 def _controls() -> list[tuple[Callable[..., int], Callable[..., int]]]:
-    """Return get and set of the number of threads, of each copy of OpenBLAS: numpy and scipy bring their own."""
+    """Return get and set of the thread count of each OpenBLAS: numpy and scipy each load a copy."""
     files = (
         {line.split()[-1] for line in MAPS.read_text().splitlines() if "openblas" in line}
         if MAPS.exists()

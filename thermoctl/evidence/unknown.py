@@ -1,4 +1,4 @@
-"""What no entry explains: how large the remainder is in the sensors' units, at which node it enters, and what it follows."""
+"""The remainder that no entry explains: its size in the sensors' units, its node, the signals it follows."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from thermoctl.evidence.noise import Grid, averaged
 from thermoctl.evidence.roles import Structure
 from thermoctl.evidence.where import Responses, responses, signals
 
-CORRELATED, SHOWN = 0.4, 3  # correlation from which a signal is told, and how many are
+CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; largest number reported
 
 
 @dataclass(frozen=True)
 class Left:
-    """The residual beside the sensors' noise. `rms`, `noise`, `over_noise`: by output; `loss`: log likelihood that it costs;
-    `node`: where forces explain it best; `follows`: signals that it goes with."""
+    """The residual beside the sensors' noise. `rms`, `noise`, `over_noise`: by output; `loss`: log likelihood
+    that it costs; `node`: where forces explain it best; `follows`: signals that it goes with."""
 
     rms: dict[str, float]
     noise: dict[str, float]
@@ -32,13 +32,13 @@ class Left:
 def white_floor(case: Case, f: Fitted, g: Grid) -> float:
     """Return the variance of an output's white noise: the median of its spectrum over all rows.
 
-    Noise and remainder are told apart by colour alone: a spectrum of both follows whatever noise is stated."""
+    The split into noise and remainder would instead follow the stated noise, right or wrong."""
     count = np.concatenate([case.coordinates.channels[k].count for k in g.channels])
     return float(np.median(np.repeat(1 / np.concatenate([f.average.inverse[k] for k in g.channels]), count)))
 
 
 def left(case: Case, f: Fitted, reach: Responses) -> Left:
-    """Measure what a fitted hypothesis leaves, and locate it."""
+    """Measure and locate the residual of a fitted hypothesis."""
     rms, noise, over = {}, {}, {}
     ideal = list(f.powers)
     for g in case.grids:
@@ -78,7 +78,9 @@ def _node(case: Case, f: Fitted, reach: Responses) -> str | None:
 
 
 def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:
-    """The signals (and their changes) that correlate with an output's residual by CORRELATED or more, the strongest first."""
+    """Return signals, or their changes, whose correlation with an output's residual is CORRELATED or more.
+
+    The strongest is first; at most SHOWN."""
     model, j = f.fit.model, f.fit.model.outputs.index(output)
     found: dict[str, list[tuple[float, float, float]]] = {}
     for r, d in enumerate(case.drives(model)):

@@ -1,8 +1,9 @@
-"""Where a remainder enters: at which node small random forces would explain it best.
+"""Where a remainder enters: the node at which small random forces would explain it best.
 
-A force of unit variance, white from sample to sample, at node i gives output j the variance F_ij(b) in band b: measured on the
-plant linearised along its own trajectory (`Model.respond`), by a few forces that share out the rows of the DCT among them.
-A slow force (first order, time constant tau) and its size eta, a share of the node's typical flow, scale it:
+A white force at node i, with the rms of its typical flow, gives output j the variance F_ij(b) in band b.
+F is measured on the plant, linearised along its own trajectory (`Model.respond`). A few forces are enough:
+each contains some bands of the DCT. A slow force is a first-order process with time constant tau. Its rms is
+the share eta of the typical flow:
 
     V_j(b) = c^2 s^2 + eta^2 F_ij(b) S_b(tau)
 """
@@ -26,7 +27,7 @@ FORCES = 2  # a node; each holds every second band, so that neighbours' response
 
 
 def first_order(frequency: np.ndarray, interval: float, tau: float) -> np.ndarray:
-    """Variance in the rows at these frequencies of a first-order process of unit variance, sampled at an interval."""
+    """Return the row variances, by frequency, of a sampled first-order process of unit variance."""
     rho = np.exp(-interval / tau)
     return (1 - rho**2) / (1 - 2 * rho * np.cos(2 * np.pi * frequency * interval) + rho**2)
 
@@ -57,8 +58,9 @@ class Responses:
 
 
 def typical_flow(plant: Plant, node: str, values: Sequence[Mapping[str, np.ndarray | float]]) -> float:
-    """Geometric mean of the root-mean-square flows at a node over all recordings: a large force that only stores and returns
-    energy says little of what may be missing beside it."""
+    """Return the geometric mean of the rms flows at a node, over all recordings.
+
+    Not the largest: a large force that only stores and returns energy says little about a missing one."""
     logs = []
     for f in plant.flows.values():
         if node in (f.source, f.target):
@@ -80,7 +82,7 @@ def signals(model: Model, d: Excitation, values: np.ndarray, x: np.ndarray) -> d
 
 
 def white_forces(n: int) -> np.ndarray:
-    """Return forces (n, FORCES) that together hold each row of the DCT once, with size 1 and a fixed random sign."""
+    """Return forces (n, FORCES) that contain each DCT row once, with size 1 and a fixed random sign."""
     band = np.repeat(np.arange(len(band_edges(n)) - 1), np.diff(band_edges(n)))
     rows = np.zeros((n, FORCES))
     rows[np.arange(n), band % FORCES] = np.random.default_rng(23).choice([-1.0, 1.0], n)
@@ -95,7 +97,9 @@ def responses(
     coordinates: Coordinates,
     skip: set[str],
 ) -> Responses:
-    """The responses at these parameters (recordings, parameters); `skip`: nodes that store nothing (a position)."""
+    """Return the responses to forces at the nodes, for parameter values (recordings, parameters).
+
+    `skip`: nodes that store nothing (a position)."""
     nodes = tuple(
         n
         for n in model.plant.nodes

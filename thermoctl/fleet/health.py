@@ -24,7 +24,7 @@ from thermoctl.recording.table import Table
 from thermoctl.signals import join_fault_words
 from thermoctl.yamlfile import InputError
 
-ROWS = 4000  # rows of a recording that is thinned for a fit
+ROWS = 4000  # a longer recording is thinned to about this many rows before a fit
 SECONDS_PER_HOUR = 3600.0
 
 

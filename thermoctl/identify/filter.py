@@ -75,9 +75,9 @@ class Mkf:
 
 
 def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: float) -> Mkf:
-    """Identify the paper's filter from its test, to run at `period_s`.
+    """Identify the paper's filter from a test; the filter returned runs with the period `period_s`.
 
-    u (N, 1) W and y (N, M) K are sampled as the model."""
+    u (N, 1) W and y (N, M) K have the sampling period of `model`."""
     e = y - model.simulate(u, model.x0)
     e = e[np.isfinite(e).all(1)]
     centred = e - e.mean(0)

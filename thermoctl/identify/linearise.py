@@ -176,7 +176,7 @@ def linearise(
     except (np.linalg.LinAlgError, ValueError) as e:
         raise InputError(f"{plant.file}: no steady Kalman gain exists: {e}") from None
     C, square = model.C, model.C.shape[0] == model.C.shape[1] and np.linalg.cond(model.C) < 1e8
-    T = C if square else np.eye(len(A))  # into the coordinates of the readings (33)
+    T = C if square else np.eye(len(A))  # state -> readings, the coordinates of (33), if C is invertible
     back = np.linalg.inv(T)
     P_read = C @ P @ C.T
     gain = (

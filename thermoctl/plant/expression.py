@@ -87,12 +87,12 @@ def make(op: str, *args: Expr, value: Any = None) -> Expr:
 
 
 def num(value: float) -> Expr:
-    """Return a number."""
+    """Return the expression of a constant."""
     return make("num", value=float(value))
 
 
 def name(value: str) -> Expr:
-    """Return a name."""
+    """Return the expression of a parameter, input, node or `t`."""
     return make("name", value=value)
 
 

@@ -39,7 +39,7 @@ MAX_ACCELERATION = 0.75  # use the geodesic acceleration only up to this share o
 MAX_SHIFT = 8.0  # largest shift of an uncertain initial state, in its standard deviations
 KEPT_STARTS = 2  # number of random starts that are refined
 PREVIEW = (
-    12  # iterations after which another start must be better than PREVIEW_SHARE of the best sum of squares
+    12  # iterations of a further start; it continues if its sum of squares is below PREVIEW_SHARE of the best
 )
 PREVIEW_SHARE = 0.98
 RELIMITS = 4  # number of times that the outlier limits are set anew
@@ -53,9 +53,9 @@ class Fit:
     """The result of a refit.
 
     - `values` (recordings, parameters) in the model's order; `dx0` (recordings, uncertain states)
-    - `unknowns`: (name, recording index or None); `z`: their coordinates
-    - `hessian`: Gauss-Newton matrix of the cost by `z`; its inverse is the covariance
-    - `prior_hessian`: the priors' share of it
+    - `unknowns`: (name, recording index or None) of each free parameter and initial state
+    - `z`: their scaled values: a parameter's is 0..1 in its range, an initial state's in standard deviations
+    - `hessian`: Gauss-Newton matrix, the inverse covariance of `z`; `prior_hessian`: the priors' share
     - `residuals`: (N, outputs) by recording, NaN where missing"""
 
     model: Model

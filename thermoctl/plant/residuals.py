@@ -108,9 +108,10 @@ def _rows(d: Excitation, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.n
 
 @dataclass(frozen=True)
 class Rows:
-    """Whitened residuals of one output in one recording, for one step.
+    """Whitened residuals of one output in one recording, and their sensitivities, for one refit step.
 
-    `w` (M,) residuals, `weight` (M,) Huber's weights, `jac` (M, k) = -dw / (slope d unknowns), `slope` (k,).
+    `w` (M,) residuals; `weight` (M,) Huber's weights; `unknowns` (k,) indices in the refit's z.
+    -dw/dz = `jac` (M, k) * `slope` (k,).
     """
 
     recording: int

@@ -137,7 +137,9 @@ class Model:
     def vector(
         self, parameters: Mapping[str, float] | np.ndarray | None, recording: str | None = None
     ) -> np.ndarray:
-        """Return all parameters in order: the plant's values, the recording's own first, then changes."""
+        """Return the values of all parameters in the model's order; an array is returned as it is.
+
+        Values in `parameters` replace those of `recording`, which replace the plant's."""
         if isinstance(parameters, np.ndarray):
             return np.ascontiguousarray(parameters, float)
         out = np.array(

@@ -1,4 +1,7 @@
-"""Run the diagnosis over many cases through Dask, each once, in separate processes that may die."""
+"""Diagnose many cases in parallel through Dask, and skip those already done.
+
+Workers are separate processes: a case that kills its worker does not stop the others.
+"""
 
 from __future__ import annotations
 

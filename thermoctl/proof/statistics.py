@@ -53,7 +53,7 @@ class Share:
         return max(0.0, (centre - half) / (1 + z * z / n)), min(1.0, (centre + half) / (1 + z * z / n))
 
     def plain(self) -> dict[str, Any]:
-        """Return it for JSON."""
+        """Return count, share and confidence interval as a dict for JSON."""
         low, high = self.interval()
         return {"k": self.k, "n": self.n, "share": self.value, "low": low, "high": high}
 

@@ -169,7 +169,7 @@ def _dated(field: dict[str, pa.Array], clock: np.ndarray) -> tuple[np.ndarray, s
         if named:
             del orders["month/day/year"]
     found = {order: _days(*parts) * DAY_NS + clock for order, parts in orders.items() if _valid(*parts)}
-    if len(found) > 1:  # both are dates: only one may run forward, or both tell the same seconds
+    if len(found) > 1:  # both orders are dates: keep one that runs forward
         forward = {k: ns for k, ns in found.items() if (np.diff(ns) > 0).all()}
         found = forward or found
     if not found:

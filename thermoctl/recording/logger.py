@@ -315,7 +315,7 @@ def _renamed(table: Table, columns: Mapping[str, str]) -> Table:
                 f"{suggest(name, table.columns)}; the columns are {known}"
             )
     taken = {name: wanted for wanted, name in columns.items()}
-    # A column that stands under a wanted name already, and is not itself renamed, gives way.
+    # Drop a column that already has a wanted name, unless it is renamed too.
     kept = {n: v for n, v in table.columns.items() if n in taken or n not in columns}
     units = {taken.get(n, n): table.units[n] for n in kept if n in table.units}
     return replace(table, columns={taken.get(n, n): v for n, v in kept.items()}, units=units)
