@@ -1,7 +1,8 @@
 """Old engine beside new on the shared real rigs and concealed cases: found, strays, verdict, held-out ratio, CPU seconds.
 
     python tests/prove_real.py --out DIR [--engine new|old] [TASK ...]      diagnose (results that are there are kept)
-    python tests/prove_real.py --out DIR --table                           print what is there
+    python tests/prove_real.py --out DIR --table                           print the results so far
+    ... --cases DIR      generated cases (python -m tests.concealed.generate --answers inside) instead
 
 Accepted effects: `answers.yaml` of each rig; where a rig has none, what its README says is missing.
 """
@@ -102,14 +103,14 @@ RIGS = (
 )
 
 
-def cases() -> list[Task]:
-    """The concealed cases beside the recordings, with their answers."""
+def cases(folder: Path) -> list[Task]:
+    """Concealed cases with their answers."""
     out = []
-    for folder in sorted((RECORDINGS.parent / "cases").glob("[0-9]*")):
-        answer = yaml.safe_load((folder / "answer.yaml").read_text())
+    for case in sorted(folder.glob("[0-9]*")):
+        answer = yaml.safe_load((case / "answer.yaml").read_text())
         names = [e for e, _ in answer["effects"] if e != "?"]
         accepted = tuple(frozenset({e, *answer["nearly_the_same"]}) for e in names)
-        out.append(Task(f"case_{folder.name}", folder, "plant.yaml", ("run_1", "run_2"), (), accepted))
+        out.append(Task(f"case_{case.name}", case, "plant.yaml", ("run_1", "run_2"), (), accepted))
     return out
 
 
@@ -170,9 +171,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument("--out", type=Path, required=True)
     p.add_argument("--engine", choices=("new", "old"), default="new")
     p.add_argument("--table", action="store_true")
+    p.add_argument("--cases", type=Path)
     p.add_argument("tasks", nargs="*")
     args = p.parse_args(argv)
-    for task in [*RIGS, *cases()]:
+    for task in cases(args.cases) if args.cases else [*RIGS, *cases(RECORDINGS.parent / "cases")]:
         if args.tasks and task.name not in args.tasks:
             continue
         if args.table:
