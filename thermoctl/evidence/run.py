@@ -53,14 +53,12 @@ def diagnose(
 
 
 def closed(before: Left, after: Left) -> float:
-    """Return the share of the misfit that the findings remove, as energy or as likelihood: the larger.
+    """Return the share of the misfit's energy that the findings remove.
 
-    The misfit is the residual beyond the sensors' noise; its energy is in units of each output's noise.
-    A slow sensor error has much energy, a fast one costs much likelihood."""
+    The misfit is the residual beyond the sensors' noise; its energy is in units of each output's noise."""
     was = sum((before.rms[o] / before.noise[o]) ** 2 for o in before.rms)
     now = sum((after.rms[o] / before.noise[o]) ** 2 for o in after.rms)
-    energy = 1 - now / was if was > 0 else 1.0
-    return max(energy, 1 - after.loss / before.loss if before.loss > 0 else 1.0)
+    return 1 - now / was if was > 0 else 1.0
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:

@@ -9,22 +9,22 @@ from scipy.special import logsumexp
 
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.fit import Fitted
-from thermoctl.evidence.noise import Grid, averaged
+from thermoctl.evidence.noise import Grid
 from thermoctl.evidence.roles import Structure
 from thermoctl.evidence.where import Responses, responses, signals
 
+WRONG = 2.0  # times its stated value that a sensor's white noise may have; more is a remainder
 CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; largest number reported
 
 
 @dataclass(frozen=True)
 class Left:
-    """The residual beside the sensors' noise. `rms`, `noise`, `over_noise`: by output; `loss`: log likelihood
-    that it costs; `node`: where forces explain it best; `follows`: signals that it goes with."""
+    """The residual beside the sensors' noise. `rms`, `noise`, `over_noise`: by output; `node`: the one whose
+    forces explain it best; `follows`: signals that it correlates with."""
 
     rms: dict[str, float]
     noise: dict[str, float]
     over_noise: dict[str, float]
-    loss: float
     node: str | None
     follows: tuple[str, ...]
 
@@ -40,20 +40,16 @@ def white_floor(case: Case, f: Fitted, g: Grid) -> float:
 def left(case: Case, f: Fitted, reach: Responses) -> Left:
     """Measure and locate the residual of a fitted hypothesis."""
     rms, noise, over = {}, {}, {}
-    ideal = list(f.powers)
     for g in case.grids:
         name = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) / g.count.sum()
-        own = max(white_floor(case, f, g), g.variance)
+        own = float(np.clip(white_floor(case, f, g), g.variance, WRONG**2 * g.variance))
         rms[name] = float(np.sqrt(max(power - own, 0.0)))
         noise[name] = float(np.sqrt(own))
         over[name] = float(np.sqrt(power / own))
-        for k in g.channels:
-            ideal[k] = np.minimum(f.powers[k], own * case.coordinates.channels[k].count)
-    loss = averaged(case.grids, ideal).log_likelihood - f.average.log_likelihood
     worst = max(over, key=lambda o: over[o]) if over else ""
     follow = follows(case, f, worst) if over and over[worst] > 1 else ()
-    return Left(rms, noise, over, loss, _node(case, f, reach), follow)
+    return Left(rms, noise, over, _node(case, f, reach), follow)
 
 
 def reached(case: Case) -> Responses:
