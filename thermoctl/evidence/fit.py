@@ -94,9 +94,9 @@ class Fitted:
 
 
 def _insignificant(f: Fitted, e: Placed) -> bool:
-    """Return whether a size is within SIGNIFICANT sd of none.
+    """Return whether an amplitude of the effect is within SIGNIFICANT standard deviations of no effect.
 
-    Without a size (lag, delay): whether a parameter is at its lower bound."""
+    For an effect without an amplitude (lag, delay): whether a parameter is at its lower bound."""
     sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
     if not set(e.own.values()) <= f.plant.parameters.keys():
         return True  # another effect took its place

@@ -132,7 +132,7 @@ class Code:
     # --------------------------------------------------------------------------------------------- writing C
 
     def _by_parameter(self, e: Expr, q: str) -> Expr:
-        """Return de/d(parameter), also through the seconds of delayed inputs."""
+        """Return de/dq of parameter q, including its effect on the delay times of inputs."""
         total = derivative(e, q)
         used = ex.names(e)
         for d, (_, seconds) in self.input_delays.items():
