@@ -50,7 +50,7 @@ class Placed:
 
     @property
     def key(self) -> tuple[str, str]:
-        """(effect, where)"""
+        """Return (name of the effect, name of its place): the key of the placed effect."""
         return self.candidate.key
 
 
@@ -151,7 +151,9 @@ class Posterior:
         )
 
     def prior(self, z: np.ndarray) -> float:
-        """-1/2 of the quadratic terms of the prior and of physics' own beliefs."""
+        """Return the log prior of the unknowns `z`, without the Gaussians' normalisation.
+
+        It is the sum of the Gaussian priors and of the priors that the catalogue's entries state."""
         values, _ = self.problem.unpack(z)
         return (
             -0.5 * float(self.precision @ (z - self.mean) ** 2)

@@ -40,9 +40,10 @@ LOG_2PI = float(np.log(2 * np.pi))
 
 @dataclass(frozen=True)
 class Grid:
-    """The frequencies of one output.
+    """The frequency grid of one output, common to its recordings, and the prior of its remainder there.
 
-    `node`: index of its frequency for each band of all recordings; `count`: rows at each frequency."""
+    `node`: for each band of all recordings, the index of the band's frequency in the grid. `count`: number of
+    DCT rows at each frequency."""
 
     channels: tuple[int, ...]  # positions in Coordinates.channels
     node: np.ndarray
