@@ -568,7 +568,9 @@ class Law:
             self.air_started = 1.0
 
     def _average_air_start(self):
-        """Average the first air readings into the expansion's origin; shift the estimates, too."""
+        """Average the first air readings to the reference air temperature of the expansion.
+
+        The estimated states are shifted by each change of that average."""
         self.air_started += 1.0
         s = (self.last[_AIR] - self.air_c) / self.air_started
         self.air_c += s
