@@ -165,7 +165,9 @@ class DevicesBackend:
         return text
 
     def counters(self) -> dict[str, int]:
-        """Return the counters of all devices (slow ones: as posted) as `<device>.<counter>`."""
+        """Return the counters of all devices as `<device>.<counter>`.
+
+        Those of a slow device are the values that its poller posted last."""
         counts = {f"{d.name}.{name}": n for d in self.fast for name, n in d.counters().items()}
         for d in self.slow:
             posted = d.counters() if self.board is None else self.board.counts(d)

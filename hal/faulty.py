@@ -171,7 +171,7 @@ class FaultInjector:
         self.inner.write(drive, enable)
 
     def check_pacing(self) -> None:
-        """Ask the inner back end."""
+        """Raise InputError when no device of the inner back end can start the ticks."""
         self.inner.check_pacing()
 
     def wait_frame(self, due_ns: int, until_ns: int) -> None:

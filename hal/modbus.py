@@ -200,7 +200,7 @@ class ModbusDevice(Device):
         self._blocks[at : at + 1] = [*good, *refused]
 
     def _request(self, block: Block) -> list[int] | int:
-        """Return the words of a block, or the code of the exception.
+        """Return the register values of a block, or the Modbus exception code that the unit answers with.
 
         Raises NoAnswer, or HardwareError when the link is gone."""
         client, code = self._client, 0

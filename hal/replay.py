@@ -41,7 +41,7 @@ class ReplayBackend:
                 )
         self.sample, self.finished = Sample(), False
         self._t = table.t - table.t[0]
-        self._channels: list[tuple[int, np.ndarray, float]] = []  # role, values (N,), stale after s
+        self._channels: list[tuple[int, np.ndarray, float]] = []  # role, values (N,), greatest valid age in s
         for column, values in table.columns.items():
             role, factor, shift = self._role(table, column, roles.get(column, column))
             if role in ROLES:

@@ -15,7 +15,7 @@ from thermoctl.yamlfile import InputError, suggest
 
 MEANS = ("voltage_v", "current_a")  # roles whose register holds the mean since its last refresh
 MAX_EXCEPTION = 11  # largest exception code of Modbus
-MAX_REQUEST = 1024  # bytes kept of a request
+MAX_REQUEST = 1024  # bytes: longest input read at once (TCP) or kept in the buffer (RTU)
 
 
 class ModbusOnWire(PtyDevice):

@@ -92,7 +92,7 @@ class Standing:
 
 
 def channels_of(name: str) -> tuple[str, ...]:
-    """Return the channels that share this reading's fault; () for another fault."""
+    """Return the channels that can raise fault `name`; () if it is not a fault of a reading."""
     group = BY_NAME[name].group
     return tuple(c.role for c in TABLE if group and c.group == group)
 

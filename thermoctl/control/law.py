@@ -91,7 +91,7 @@ _GAP_S, _RESUME_C, _COPPER, _WARM_UP = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K, WA
 _AIR_READINGS = AIR_READINGS
 _THERMAL_S, _DELAY_S, _NAN = THERMAL_S, DELAY_S, float("nan")
 COMPILED = not __file__.endswith(".py")
-"""False when interpreted: a hundred times too slow for a rig, only for measuring test coverage."""
+"""Whether the law is compiled. Interpreted, it is 100 times too slow for a rig: for test coverage only."""
 
 # Constants that the compiler turns into C numbers (typed in law.pxd).
 _OK, _STALE, _ERROR, _ABSENT = OK, STALE, ERROR, ABSENT
@@ -568,7 +568,9 @@ class Law:
             self.air_started = 1.0
 
     def _average_air_start(self):
-        """Average the first air readings into the expansion's origin; shift the estimates, too."""
+        """Average the first air readings to the reference air temperature of the expansion.
+
+        The estimated states are shifted by each change of that average."""
         self.air_started += 1.0
         s = (self.last[_AIR] - self.air_c) / self.air_started
         self.air_c += s

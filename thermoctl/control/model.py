@@ -25,7 +25,7 @@ def _array(unit: str, *shape: str | int) -> Any:
 
 
 def _number(unit: str = "", default: Any = MISSING, positive: bool = False) -> Any:
-    """Return the field of a number."""
+    """Return the dataclass field of a scalar, with its unit and whether it must be positive."""
     return field(default=default, metadata={"unit": unit, "positive": positive})
 
 

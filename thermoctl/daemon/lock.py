@@ -13,7 +13,8 @@ from pathlib import Path
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
-PROBE_S = 0.2  # `hold` retries for this time: `holder` in another process takes the lock for less to test it
+# `hold` retries for this time. To test the lock, `holder` in another process takes it for a shorter time.
+PROBE_S = 0.2
 
 
 def lock_path(settings: Settings) -> Path:

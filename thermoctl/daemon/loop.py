@@ -215,7 +215,7 @@ class Rig:
         )[kind]
 
     def keep_state(self) -> None:
-        """Put the law's state, its tick and generation into the box, to start a replay or the next run."""
+        """Store the law's tick, generation and state in `state_box`: a replay or the next run needs them."""
         if self.state_box is not None:
             self.state_box.put(np.concatenate(((self.law.tick, self.generation), self.law.snapshot())))
 

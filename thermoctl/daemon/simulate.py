@@ -26,10 +26,11 @@ COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reloa
 
 
 class Simulation:
-    """One rig in simulated time: `command`, `tick`, and `row`, the newest record row (INDEX of signals.py).
+    """One rig in simulated time: `command` sends a command, `tick` advances by one period.
 
-    settings: hal.backend must be simulated or replay. model, parameters: those of the settings if None.
-    `law` is the law, `backend` the open back end.
+    `row` is the newest record row (INDEX of signals.py), `law` the control law, `backend` the open back end.
+    The setting hal.backend must be simulated or replay. `model` and `parameters`: those of the settings if
+    None.
     """
 
     def __init__(

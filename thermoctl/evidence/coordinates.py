@@ -26,7 +26,7 @@ FEWEST = 8  # samples of an output in a recording, below which it says nothing
 
 @dataclass(frozen=True)
 class Channel:
-    """One output in one recording: which samples were measured, and the bands of its rows."""
+    """One output in one recording: its measured samples, and the frequency band of each DCT row."""
 
     recording: int
     output: int

@@ -57,7 +57,10 @@ class Decision:
 
 
 def weigh(scores: Mapping[frozenset[Key], float], limits: Limits) -> Posterior:
-    """Posterior of hypotheses from their log evidence and prior odds, at the calibrated temperature."""
+    """Return the posterior of hypotheses, and of each effect.
+
+    `scores`: log evidence plus log prior odds. They are divided by `limits.temperature` (diagnosis.yaml):
+    a value above 1 makes the probabilities less extreme."""
     values = np.array(list(scores.values())) / limits.temperature
     p = np.exp(values - logsumexp(values))
     hypotheses = dict(zip(scores, map(float, p), strict=True))

@@ -50,7 +50,7 @@ class Placed:
 
     @property
     def key(self) -> tuple[str, str]:
-        """(effect, where)"""
+        """Return (name of the effect, name of its place): the key of the placed effect."""
         return self.candidate.key
 
 
@@ -94,9 +94,9 @@ class Fitted:
 
 
 def _insignificant(f: Fitted, e: Placed) -> bool:
-    """Return whether a size is within SIGNIFICANT sd of none.
+    """Return whether an amplitude of the effect is within SIGNIFICANT standard deviations of no effect.
 
-    Without a size (lag, delay): whether a parameter is at its lower bound."""
+    For an effect without an amplitude (lag, delay): whether a parameter is at its lower bound."""
     sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
     if not set(e.own.values()) <= f.plant.parameters.keys():
         return True  # another effect took its place
@@ -151,7 +151,9 @@ class Posterior:
         )
 
     def prior(self, z: np.ndarray) -> float:
-        """-1/2 of the quadratic terms of the prior and of physics' own beliefs."""
+        """Return the log prior of the unknowns `z`, without the Gaussians' normalisation.
+
+        It is the sum of the Gaussian priors and of the priors that the catalogue's entries state."""
         values, _ = self.problem.unpack(z)
         return (
             -0.5 * float(self.precision @ (z - self.mean) ** 2)

@@ -30,7 +30,8 @@ from thermoctl.evidence.coordinates import WIDTH, Channel
 STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times
 ABSENT = 0.5  # prior of no remainder at an output
 SMALL = 0.05  # of an output's swing: width of the prior of the remainder's rms
-LEVEL = 2 * np.log(10.0)  # standard deviation of u at the lowest frequency: a tenth to ten times SMALL
+# Prior sd of u (see above) at the lowest frequency: one sd is a factor of ten in the remainder's rms.
+LEVEL = 2 * np.log(10.0)
 DRAWS = 400  # random walks drawn for the normalisation of the remainder's prior
 WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a white force on one storage
 STEPS, CLOSE, LONGEST = 40, 1e-4, 2.0  # of Newton's method: their number, the step that ends it, the longest
@@ -39,9 +40,10 @@ LOG_2PI = float(np.log(2 * np.pi))
 
 @dataclass(frozen=True)
 class Grid:
-    """The frequencies of one output.
+    """The frequency grid of one output, common to its recordings, and the prior of its remainder there.
 
-    `node`: index of its frequency for each band of all recordings; `count`: rows at each frequency."""
+    `node`: for each band of all recordings, the index of the band's frequency in the grid. `count`: number of
+    DCT rows at each frequency."""
 
     channels: tuple[int, ...]  # positions in Coordinates.channels
     node: np.ndarray
@@ -49,8 +51,8 @@ class Grid:
     rough: np.ndarray  # (nodes, nodes) inverse covariance of u
     log_rough: float  # its log determinant
     log_small: float  # log of the half-normal's mean over the random walk
-    sigma: float  # s
-    swing: float
+    sigma: float  # s above: standard deviation of the stated noise, in the output's unit
+    swing: float  # rms of the output about its mean
 
     @property
     def variance(self) -> float:

@@ -85,7 +85,7 @@ class Rows(Metric):
         return averaged(self.grids, self.coordinates.powers(plain)).log_likelihood
 
     def promise(self, d: Direction) -> float:
-        """Gain in log likelihood that the direction's first-order step promises."""
+        """Return the predicted gain in log likelihood of a first-order step along the direction."""
         if d.vector is None or d.gain <= 0:
             return 0.0
         v = d.vector.astype(float)

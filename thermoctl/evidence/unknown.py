@@ -19,8 +19,12 @@ CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; la
 
 @dataclass(frozen=True)
 class Left:
-    """The residual beside the sensors' noise. `rms`, `noise`, `over_noise`: by output; `node`: the one whose
-    forces explain it best; `follows`: signals that it correlates with."""
+    """The part of the residual that the sensors' noise does not explain.
+
+    - `rms`: rms of that part; `noise`: rms of the sensors' noise; by output, in the output's unit
+    - `over_noise`: rms of the whole residual divided by `noise`, by output
+    - `node`: the node whose random forces explain the residual best
+    - `follows`: signals that correlate with the residual of the output with the largest `over_noise`"""
 
     rms: dict[str, float]
     noise: dict[str, float]

@@ -21,7 +21,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation, Model
 
-SHARES = 10.0 ** np.arange(-3.5, 1.1, 0.5)  # eta
+SHARES = 10.0 ** np.arange(-3.5, 1.1, 0.5)  # values of eta: rms of a force over the typical flow
 CORNERS = 3  # tau, from a fortieth to a quarter of the longest recording
 FORCES = 2  # a node; each holds every second band, so that neighbours' responses do not mix
 

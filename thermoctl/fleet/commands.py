@@ -131,7 +131,7 @@ def diagnose_folders(args: argparse.Namespace) -> int:
 
 
 def _jobs(args: argparse.Namespace) -> list[Job]:
-    """List one job a rig: the newest `--last` of its recordings."""
+    """Return one job for each rig, with its newest recordings (`--last`: how many)."""
     rigs: dict[str, list[str]] = {}
     for path in (p for r in args.recordings for p in (find_recordings(r) if Path(r).is_dir() else [r])):
         rigs.setdefault(rig_of(path), []).append(path)

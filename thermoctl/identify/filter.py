@@ -84,7 +84,7 @@ def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: f
     sigma = centred[:, :1].T @ centred / len(e)
     r_w = float((e[:, 0] ** 2).mean() + r_v)
     alpha, beta = model.resample(period_s).output_form()
-    # The recursion runs at the filter's period, but the residual's variance grows over the identification's.
+    # The residual's variance grows over one period of `model`: scale it to the filter's shorter period.
     return Mkf(
         alpha,
         beta[:, :1],

@@ -68,7 +68,7 @@ class Tuner:
         return float(100 * np.minimum(self.counts / self.full, 1).mean())
 
     def proposal(self) -> tuple[CompensatorModel | None, str]:
-        """Return (model, reason); None with the reason while it is too early or no better."""
+        """Return (tuned model, reason); no model if samples are missing or it is not 5 % better."""
         if self.progress < 100:
             return (
                 None,

@@ -337,9 +337,9 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
     z_next = (target @ q) @ q.T
     state = np.hstack([pin_i @ z_i, np.zeros((n, L.shape[1] - np_))])
     left = np.vstack([pin_less @ z_next, yf[:l]]) - np.vstack([a, c]) @ state
-    # Solve (24), and (25), (26), which are linear in B (D = 0), together: min |left - N(B) Uf|. Solving for K
-    # first and then for B without weights is equal without noise. With noise it is far worse, because Uf of
-    # long pulses is nearly singular.
+    # Solve (24) to (26) in one least-squares problem: min |left - N(B) Uf|, linear in B (D = 0). The other
+    # way is to solve for K first, then for B without weights. Without noise the results are equal. With noise
+    # the other way is far worse, because Uf of long pulses is nearly singular.
     nu_factor = uf[:, :nu]
     target = left[:, :nu]  # left, projected on Uf
     lag, lcg = a @ pin_i, c @ pin_i  # (n, i l), (l, i l)

@@ -101,12 +101,8 @@ class Code:
         self.values = [
             ex.substitute(o.value, named(self.output_delays, "delayed_")) for o in self.plant.outputs.values()
         ]
-        for (
-            signal,
-            _,
-        ) in (
-            self.output_delays.values()
-        ):  # a file cannot contain it (language.py), but an effect added to a plant can
+        # A file cannot contain a nested delay (language.py), but an effect added to a plant can.
+        for signal, _ in self.output_delays.values():
             if ex.names(signal) & self.output_delays.keys():
                 raise InputError(
                     f"{self.plant.file}: a delay() within a delay() is not part of the language; add the seconds"
@@ -132,7 +128,7 @@ class Code:
     # --------------------------------------------------------------------------------------------- writing C
 
     def _by_parameter(self, e: Expr, q: str) -> Expr:
-        """Return de/d(parameter), also through the seconds of delayed inputs."""
+        """Return de/dq of parameter q, including its effect on the delay times of inputs."""
         total = derivative(e, q)
         used = ex.names(e)
         for d, (_, seconds) in self.input_delays.items():

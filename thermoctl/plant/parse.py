@@ -229,7 +229,7 @@ def _unit(s: Section) -> str | None:
 
 
 def _column(s: Section, name: str) -> tuple[str, Conversion | None]:
-    """Return the column's name, and how its numbers become the plant's."""
+    """Return the column's name, and the conversion of its values to the plant's unit (None: not given)."""
     node = s.get("column", False)
     if node is None:
         return name, None

@@ -163,7 +163,7 @@ class _Check:
         self.known: dict[int, Dimension | None] = {}
 
     def place(self, e: Expr, what: str, at: str, expected: Dimension | None, why: str) -> Dimension | None:
-        """Return the dimension of an expression that must be `expected`."""
+        """Return the dimension of an expression. Raises InputError if it is known and not `expected`."""
         given = self.expression(e, what, at)
         if given is not None and expected is not None and given != expected:
             raise InputError(

@@ -91,9 +91,11 @@ def by_chance(pairs: Sequence[tuple[float, bool]], draws: int = 400) -> float | 
 
 
 def found_by_size(sizes: Sequence[float], found: Sequence[bool]) -> dict[str, float] | None:
-    """Fit the curve of detection over size.
+    """Fit the detection probability as a logistic function of log size.
 
-    `half`: the size found half of the time, with its 95 % interval `low`, `high`; `nine_in_ten`; `slope`.
+    - `half`: size at probability 0.5; `low`, `high`: its 95 % interval
+    - `nine_in_ten`: size at probability 0.9
+    - `slope`: of the log odds over log size; `n`: number of sizes
 
     None for fewer than FEWEST_SIZES sizes, or where all or none were found."""
     if len(sizes) < FEWEST_SIZES or all(found) or not any(found):

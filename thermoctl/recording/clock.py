@@ -111,7 +111,7 @@ def from_texts(texts: pa.Array | pa.ChunkedArray) -> Seconds:
 
 
 def _iso(texts: pa.Array) -> Seconds | None:
-    """Arrow's own reading of ISO dates, five times as fast as the pattern; None where it cannot."""
+    """Parse ISO dates with Arrow, five times as fast as the regular expression; None if Arrow cannot."""
     for zone in (None, "UTC"):
         try:
             ns = texts.cast(pa.timestamp("ns", zone)).cast(pa.int64())

@@ -211,7 +211,7 @@ def _is_data(cells: list[str], decimal: str) -> bool:
 
 
 def _is_units(cells: list[str]) -> bool:
-    """Return whether a line below the header states units: short cells, one of a known symbol at least."""
+    """Return whether a line below the header states units: all cells short, at least one a known unit."""
     bare = [c.strip("[]()") for c in cells]
     return all(len(c) <= 12 for c in bare) and any(_UNIT.match(c) for c in bare if c)
 

@@ -223,7 +223,7 @@ class RecordingWriter:
 
     @property
     def path(self) -> Path | None:
-        """The full-rate file, None while the disk refuses."""
+        """Path of the full-rate file; None while the disk cannot be written."""
         return self._full_file.path if self._full_file else None
 
     @property

@@ -73,7 +73,8 @@ def quasi_static_run(
 ) -> Recorded:
     """Simulate the quasi-static plant on a full run's schedule and air, with its instruments.
 
-    The coil also moves by what the law compensated, (N,) um: 15 um of 250 are a tenth of the heat."""
+    The coil moves by the schedule minus `compensation_um` (N,), the law's correction. A correction of 15 um
+    in 250 um changes the heat by a tenth."""
     p = plant.load(plant_file)
     n = len(test.t)
     value = {k: v.value for k, v in p.parameters.items()}
