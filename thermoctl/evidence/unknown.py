@@ -9,11 +9,9 @@ from scipy.special import logsumexp
 
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.fit import Fitted
-from thermoctl.evidence.noise import Grid
 from thermoctl.evidence.roles import Structure
 from thermoctl.evidence.where import Responses, responses, signals
 
-WRONG = 2.0  # times its stated value that a sensor's white noise may have; more is a remainder
 CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; largest number reported
 
 
@@ -21,7 +19,7 @@ CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; la
 class Left:
     """The part of the residual that the sensors' noise does not explain.
 
-    - `rms`: rms of that part; `noise`: rms of the sensors' noise; by output, in the output's unit
+    - `rms`: rms of that part; `noise`: rms that the plant file states; by output, in the output's unit
     - `over_noise`: rms of the whole residual divided by `noise`, by output
     - `node`: the node whose random forces explain the residual best
     - `follows`: signals that correlate with the residual of the output with the largest `over_noise`"""
@@ -33,24 +31,15 @@ class Left:
     follows: tuple[str, ...]
 
 
-def white_floor(case: Case, f: Fitted, g: Grid) -> float:
-    """Return the variance of an output's white noise: the median of its spectrum over all rows.
-
-    The split into noise and remainder would instead follow the stated noise, right or wrong."""
-    count = np.concatenate([case.coordinates.channels[k].count for k in g.channels])
-    return float(np.median(np.repeat(1 / np.concatenate([f.average.inverse[k] for k in g.channels]), count)))
-
-
 def left(case: Case, f: Fitted, reach: Responses) -> Left:
     """Measure and locate the residual of a fitted hypothesis."""
     rms, noise, over = {}, {}, {}
     for g in case.grids:
         name = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) / g.count.sum()
-        own = float(np.clip(white_floor(case, f, g), g.variance, WRONG**2 * g.variance))
-        rms[name] = float(np.sqrt(max(power - own, 0.0)))
-        noise[name] = float(np.sqrt(own))
-        over[name] = float(np.sqrt(power / own))
+        rms[name] = float(np.sqrt(max(power - g.variance, 0.0)))
+        noise[name] = g.sigma
+        over[name] = float(np.sqrt(power / g.variance))
     worst = max(over, key=lambda o: over[o]) if over else ""
     follow = follows(case, f, worst) if over and over[worst] > 1 else ()
     return Left(rms, noise, over, _node(case, f, reach), follow)
