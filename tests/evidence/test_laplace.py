@@ -95,7 +95,7 @@ def test_laplace_agrees_with_importance_sampling(name):
         effects = (Placed(c, own),)
     truth = compile_plant(model).simulate(table).y[:, 0]
     table = _recording(plant, truth, 3, slow, inputs, t)
-    known = case(plant, [table], catalogue(), Budget(9, 9))
+    known = case(plant, [table], catalogue(), Budget(9))
     found = fitted(known, model, effects)
 
     posterior = Posterior(known, model, effects)

@@ -121,9 +121,7 @@ def _watch(rigs: Rigs, seconds: float) -> tuple[bool, str]:
 
 def main() -> int:
     """The command line."""
-    with contextlib.suppress(
-        PermissionError
-    ):  # the loop has its own; the other programs of a rig need a machine to themselves
+    with contextlib.suppress(PermissionError):  # other jobs of the machine are no part of the trial
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
@@ -143,7 +141,8 @@ def main() -> int:
             f"{os.cpu_count()} processors). Each Modbus answer takes {FASTEST_S * 1e3:.0f} to {SLOWEST_S * 1e3:.0f} ms; one in "
             f"{1 / LOSS:.0f} is lost. Limits are those of config/wire.yaml. Readings of these devices may be {STALE_S:g} s old, "
             "since two slow answers and a lost one take that long. The stage moves every 20 s. The coil is watched behind "
-            f"the wire every millisecond. Where the machine stood still (the emulators fell silent for {STOOD_S * 1e3:.0f} ms) the "
+            "the wire every millisecond. All programs run at real-time priority. "
+            f"Where the machine stood still (the emulators fell silent for {STOOD_S * 1e3:.0f} ms) the "
             f"rig is armed again and this is counted; {MOST_STALLS} times at most.\n\n{head}{lines}\n"
         )
     return 0 if good else 1

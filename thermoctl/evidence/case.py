@@ -25,12 +25,10 @@ OUTLIER = 6.0  # robust standard deviations from the median of five neighbours
 
 @dataclass
 class Budget:
-    """Refits and screenings done so far, and how many there may be: counted, never timed."""
+    """Largest number of refits, and the number done. Counted, never timed: the same on every machine."""
 
     fits: int
-    screenings: int
     fits_done: int = 0
-    screenings_done: int = 0
 
     @property
     def spent(self) -> bool:
@@ -50,7 +48,6 @@ class Case:
     noise: tuple[Noise, ...]
     null: Fit
     coordinates: Coordinates
-    outputs: tuple[tuple[int, ...], ...]  # per measured output its channels
     grids: tuple[Grid, ...]
     budget: Budget
     notes: list[str] = field(default_factory=list)
@@ -77,11 +74,6 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
     tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
     drives = [model.excitation(t) for t in tables]
     coordinates = Coordinates(drives)
-    outputs = [
-        tuple(k for k, c in enumerate(coordinates.channels) if c.output == j)
-        for j in range(len(model.outputs))
-    ]
-    measured = [(j, ks) for j, ks in enumerate(outputs) if ks]
     rig = Structure(plant, drives, [t.columns for t in tables])
     return Case(
         plant,
@@ -90,10 +82,9 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
         noise,
         null,
         coordinates,
-        tuple(ks for _, ks in measured),
         tuple(
-            grid([coordinates.channels[k] for k in ks], ks, noise[j].sigma, _swing(drives, j))
-            for j, ks in measured
+            grid(coordinates, ks, noise[j].sigma, _swing(drives, j))
+            for j, ks in coordinates.by_output().items()
         ),
         budget,
         [*([f"{dropped} single outliers were left out"] if dropped else []), *rig.guesses()],

@@ -84,9 +84,10 @@ class Coordinates:
         self.channels = [c for c in found if c is not None]
         self.recordings = len(drives)
 
-    def of(self, recording: int) -> list[Channel]:
-        """The channels of one recording."""
-        return [c for c in self.channels if c.recording == recording]
+    def by_output(self) -> dict[int, tuple[int, ...]]:
+        """Return the positions of each measured output's channels, by output."""
+        found = sorted({c.output for c in self.channels})
+        return {j: tuple(k for k, c in enumerate(self.channels) if c.output == j) for j in found}
 
     def transform(self, c: Channel, e: np.ndarray) -> np.ndarray:
         """(N, ...) values of a channel's output at all samples as its rows (rows, ...)."""

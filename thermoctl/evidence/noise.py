@@ -25,7 +25,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
-from thermoctl.evidence.coordinates import WIDTH, Channel
+from thermoctl.evidence.coordinates import WIDTH, Coordinates
 
 STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times
 ABSENT = 0.5  # prior of no remainder at an output
@@ -61,14 +61,15 @@ class Grid:
 
     @property
     def small(self) -> float:
-        """q"""
+        """Square of the prior width of the remainder's rms, q."""
         return (SMALL * self.swing) ** 2
 
 
-def grid(channels: Sequence[Channel], positions: Sequence[int], sigma: float, swing: float) -> Grid:
+def grid(coordinates: Coordinates, positions: Sequence[int], sigma: float, swing: float) -> Grid:
     """Return the frequencies of one output.
 
-    `sigma`: its stated noise; `swing`: its rms about the mean; `channels`: its recordings."""
+    `positions`: of its channels; `sigma`: its stated noise; `swing`: its rms about the mean."""
+    channels = [coordinates.channels[k] for k in positions]
     octave = np.concatenate([np.log2(c.frequency) for c in channels])
     cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)
     known, node = np.unique(cells, return_inverse=True)

@@ -33,7 +33,7 @@ def diagnose(
 ) -> Diagnosis:
     """Find the physics that a plant lacks, from recordings. Raises InputError."""
     chosen_on, reserve = split(tables, held_out)
-    known = case(plant, chosen_on, entries, Budget(numbers.fits, numbers.fits))
+    known = case(plant, chosen_on, entries, Budget(numbers.fits))
     searched = search(known, numbers)
     posterior = weigh({w.fitted.hypothesis.keys: w.score for w in searched.tried}, numbers)
     best = searched.tried[0].fitted

@@ -12,7 +12,7 @@ from thermoctl.diagnose.screen import Direction, Metric, screen
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.coordinates import Coordinates
 from thermoctl.evidence.fit import Fitted, as_refitted
-from thermoctl.evidence.noise import averaged, grid
+from thermoctl.evidence.noise import Averaged, averaged, grid
 from thermoctl.evidence.roles import Structure
 from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
@@ -27,10 +27,10 @@ PROMISED = 30  # directions whose gain in log likelihood is predicted
 class Rows(Metric):
     """Whitened rows of a refitted hypothesis: DCT rows divided by the rms of their noise.
 
+    `average`: spectra of the refit's residuals. `remainder`: does the remainder count as noise, too? If so,
+    errors at low frequencies have little weight."""
 
-    `remainder`: does it count as noise, too? If so, errors at low frequencies have little weight."""
-
-    def __init__(self, case: Case, fitted: Fitted, most: int, remainder: bool):
+    def __init__(self, case: Case, fitted: Fitted, average: Averaged, most: int, remainder: bool):
         self.fit, self.model = fitted.rough, fitted.rough.model
         self.drives = [self.model.excitation(t) for t in case.tables]
         self.problem = Problem(self.model, self.drives, case.noise)
@@ -38,13 +38,11 @@ class Rows(Metric):
             self.model.prepare(d, values)
         self.blocks = 1
         self.coordinates = Coordinates(self.drives, max(most // len(case.coordinates.channels), 32))
-        channels = self.coordinates.channels
-        self.grids = []
-        for g in case.grids:
-            output = case.coordinates.channels[g.channels[0]].output
-            ks = [k for k, c in enumerate(channels) if c.output == output]
-            self.grids.append(grid([channels[k] for k in ks], ks, g.sigma, g.swing))
-        self.weights = _weights(case, fitted, self.coordinates, remainder)
+        measured = self.coordinates.by_output().values()
+        self.grids = [
+            grid(self.coordinates, ks, g.sigma, g.swing) for ks, g in zip(measured, case.grids, strict=True)
+        ]
+        self.weights = _weights(case, average, self.coordinates, remainder)
         self.runs, columns = [], []
         for r, d in enumerate(self.drives):
             run = self.model.run(d, self.fit.values[r], self.fit.dx0[r], sensitivities=True)
@@ -92,9 +90,8 @@ class Rows(Metric):
         return self.log_likelihood(self.residual - v * (v @ self.residual)) - self.now
 
 
-def _weights(case: Case, fitted: Fitted, coordinates: Coordinates, remainder: bool) -> list[np.ndarray]:
+def _weights(case: Case, average: Averaged, coordinates: Coordinates, remainder: bool) -> list[np.ndarray]:
     """One over the standard deviation of each row (rows,) of each channel."""
-    average = as_refitted(case, fitted).average
     inverse = average.inverse
     if not remainder:
         own = {k: v for g, v in zip(case.grids, average.sensor, strict=True) for k in g.channels}
@@ -120,10 +117,10 @@ class Screened:
 
 def screened(case: Case, fitted: Fitted) -> Screened:
     """Screen the catalogue at the places of the original plant; a part that an effect added is no place."""
-    case.budget.screenings_done += 1
     moving = bool(Structure(case.plant, [], []).velocities) if case.plant.nodes else False
     most = MOVING_ROWS if moving else ROWS
-    metric = Rows(case, fitted, most, True)
+    average = as_refitted(case, fitted).average
+    metric = Rows(case, fitted, average, most, True)
     rig = Structure(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()
@@ -135,8 +132,8 @@ def screened(case: Case, fitted: Fitted) -> Screened:
     ]
     best = screen(metric, rig, found)[0][:PROMISED]
     promised = [(d, metric.promise(d)) for d in best]
-    if max(as_refitted(case, fitted).average.remainder) > LIKELY:
-        other = Rows(case, fitted, most, False)
+    if max(average.remainder) > LIKELY:
+        other = Rows(case, fitted, average, most, False)
         again = [(d, other.promise(d)) for d in screen(other, rig, found)[0][:PROMISED]]
         known = {d.candidate.key: promise for d, promise in promised}
         promised = [(d, p) for d, p in promised if p >= 0] + [
