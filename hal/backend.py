@@ -20,7 +20,7 @@ fault injector can wrap any of them. hal.make creates them.
   `time.monotonic()`). The simulated and replayed back ends take any clock, so they can run faster than real
   time.
 
-A sample has arrays over ROLES (thermoctl/channels.py; index by `ROLE[name]`), all of length len(ROLES):
+A sample has arrays over the rig's channels (thermoctl/channels.py), in their order:
 
     value    float64, in the role's unit; the last valid reading, NaN before the first one
     time_s   float64, when that reading was taken (clock of `now_s`); -inf before the first one
@@ -55,7 +55,7 @@ import numpy as np
 from thermoctl import channels
 
 ROLES, ROLE = channels.CHANNELS, channels.INDEX
-"""Roles of channels; the position of a role is its index in the arrays of a sample."""
+"""Roles of the paper's actuator only, and their indices: a rig's own are `settings.channels`."""
 OK, STALE, ERROR, ABSENT = channels.OK, channels.STALE, channels.ERROR, channels.ABSENT
 STATUS_NAMES = channels.STATUS_NAMES
 AMP_OFFLINE, AMP_DISABLED, AMP_ENABLED = channels.AMP_OFFLINE, channels.AMP_DISABLED, channels.AMP_ENABLED
@@ -71,11 +71,12 @@ class Sample:
 
     __slots__ = ("value", "time_s", "fresh", "status")
 
-    def __init__(self) -> None:
-        self.value = np.full(len(ROLES), np.nan)
-        self.time_s = np.full(len(ROLES), -np.inf)
-        self.fresh = np.zeros(len(ROLES), dtype=bool)
-        self.status = np.full(len(ROLES), ABSENT, dtype=np.uint8)
+    def __init__(self, count: int = len(ROLES)) -> None:
+        """Make the sample of a rig with `count` channels."""
+        self.value = np.full(count, np.nan)
+        self.time_s = np.full(count, -np.inf)
+        self.fresh = np.zeros(count, dtype=bool)
+        self.status = np.full(count, ABSENT, dtype=np.uint8)
 
 
 class Backend(Protocol):

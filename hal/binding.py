@@ -11,14 +11,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hal.backend import ROLES
-from hal.profile import Channel, Cia402, Modbus, Profile, Register
+from hal.profile import BinaryFrame, Channel, Cia402, Modbus, Profile, Register, TextLine
 from hal.read_profile import load_profile
 from hal.units import role_units
+from thermoctl.channels import DEFAULT, Channels
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 EXCLUSIVE = ("slcan:", "rtu:", "/")
-"""Prefixes of ports that only one program can open at a time."""
+"""Prefixes of ports that are a path, which only one program can open at a time."""
+FREE = ("socketcan", "virtual", "udp_multicast")
+"""CAN interfaces that any number of devices may open."""
+NETWORK = "socket://"
 _MANUAL_BASES = ((30001, "input"), (40001, "holding"))
 _MANUAL_REGISTERS = 9999
 """Manuals often number input registers 30001..39999 and holding registers 40001..49999, from address 0."""
@@ -46,6 +49,8 @@ class Binding:
     address: int  # node id or Modbus unit; default: the profile's
     bounds: tuple[Bound, ...]
     place: str
+    channels: Channels = DEFAULT
+    shared: bool = False  # other devices of this rig are on the same port
 
 
 def resolve_port(port: str, folder: Path) -> str:
@@ -57,8 +62,8 @@ def resolve_port(port: str, folder: Path) -> str:
     return f"{match[1]}{(folder / path.parent).resolve() / path.name}"
 
 
-def bind(node: Node, folder: Path) -> Binding:
-    """Read one item of `hal.devices`.
+def bind(node: Node, folder: Path, channels: Channels = DEFAULT) -> Binding:
+    """Read one item of `hal.devices`; `channels`: those of the rig.
 
     {profile, port, roles: {channel: role}, name?, address?, stale_after_s?, watchdog_s?, master_id?};
     `profile` is relative to `folder`. stale_after_s and watchdog_s replace the profile's values on a machine
@@ -70,10 +75,11 @@ def bind(node: Node, folder: Path) -> Binding:
         raise s.get("profile").error(f"profile: {path} cannot be read: no such file")
     profile = load_profile(path)
     if (stale := s.number("stale_after_s", 0.0, 1e-4, 3600.0)) > 0.0:
-        channels = {n: replace(c, stale_after_s=stale) for n, c in profile.channels.items()}
-        profile = replace(profile, channels=channels)
+        aged = {n: replace(c, stale_after_s=stale) for n, c in profile.channels.items()}
+        profile = replace(profile, channels=aged)
     bounds = tuple(
-        _bound(profile, name, role) for name, role in Section(s.get("roles"), "roles").node.value.items()
+        _bound(profile, name, role, channels)
+        for name, role in Section(s.get("roles"), "roles").node.value.items()
     )
     spec = profile.bus_spec
     if isinstance(spec, Cia402):
@@ -85,7 +91,7 @@ def bind(node: Node, folder: Path) -> Binding:
             if (found := s.get(key, False)) is not None:
                 raise found.error(f"{key}: a {profile.bus} device has none")
     port = resolve_port(s.text("port"), folder)
-    binding = Binding(s.text("name", profile.model), profile, port, address, bounds, node.place)
+    binding = Binding(s.text("name", profile.model), profile, port, address, bounds, node.place, channels)
     s.end()
     return binding
 
@@ -104,16 +110,17 @@ def _drive_of_this_rig(s: Section, spec: Cia402, node: int) -> Cia402:
     return replace(spec, watchdog_s=watchdog, master_id=master)
 
 
-def _bound(profile: Profile, name: str, role: Node) -> Bound:
+def _bound(profile: Profile, name: str, role: Node, channels: Channels) -> Bound:
     channel = profile.channels.get(name)
     if channel is None:
         raise role.error(
             f"roles: {profile.model} has no channel '{name}'{suggest(name, profile.channels)}; "
             f"it has {', '.join(profile.channels)}"
         )
-    if role.value not in ROLES:
+    if role.value not in channels.names:
         raise role.error(
-            f"roles: '{role.value}' is no role{suggest(role.value, ROLES)}; roles: {', '.join(ROLES)}"
+            f"roles: '{role.value}' is no role{suggest(role.value, channels.names)}; "
+            f"roles: {', '.join(channels.names)}"
         )
     units = role_units(role.value)
     if channel.unit not in units:
@@ -132,16 +139,13 @@ def _bound(profile: Profile, name: str, role: Node) -> Bound:
     )
 
 
-def check_rig(bindings: Iterable[Binding]) -> None:
-    """Raise InputError where two devices share a role, the command or an exclusive port."""
+def check_rig(bindings: Iterable[Binding]) -> list[Binding]:
+    """Return the bindings with `shared` set where several are on one port.
+
+    Raises InputError where two share a role or the command, or a port that they cannot share."""
+    bindings = list(bindings)
     claimed: dict[str, Binding] = {}
-    opened: dict[str, Binding] = {}
     for b in bindings:
-        if (first := opened.setdefault(_exclusive_port(b), b)) is not b and b.port.startswith(EXCLUSIVE):
-            raise InputError(
-                f"{b.place}: {b.name} and {first.name} ({first.place}) both open {b.port}, which one device can "
-                "open once; give each an adapter of its own, or read both as channels of one profile"
-            )
         for role in [x.role for x in b.bounds] + (["drive"] if b.profile.amplifier else []):
             if role in claimed:
                 raise InputError(
@@ -149,13 +153,56 @@ def check_rig(bindings: Iterable[Binding]) -> None:
                     f"({claimed[role].place}); keep one of them"
                 )
             claimed[role] = b
+    found = []
+    for k, b in enumerate(bindings):
+        others = [o for o in bindings if o is not b and port_key(o.port) == port_key(b.port)]
+        for o in others:
+            if o in bindings[:k]:
+                _check_shared(o, b)
+        found.append(replace(b, shared=bool(others) and b.port.split(":")[0] not in FREE))
+    return found
 
 
-def _exclusive_port(b: Binding) -> str:
-    """Return the port without interface and bitrate, links followed: one device may have it."""
-    if not b.port.startswith(EXCLUSIVE):
-        return b.port
-    return os.path.realpath(re.sub(r"^(slcan|rtu):|@\d+$", "", b.port))
+def _check_shared(first: Binding, second: Binding) -> None:
+    """Raise InputError where two devices cannot share their port."""
+    both = f"{second.place}: {second.name} and {first.name} ({first.place}) share {second.port}"
+    bus = second.profile.bus.split("-")[0]
+    if first.profile.bus.split("-")[0] != bus:
+        raise InputError(
+            f"{both}, but one is a {first.profile.bus} device and one a {second.profile.bus} device: "
+            "give each a port of its own"
+        )
+    if bus == "can":
+        _check_can_bus(first, second, both)
+        return
+    if first.profile.line != second.profile.line and not second.port.startswith("tcp:"):
+        raise InputError(f"{both}, but their profiles' 'line' differs: one line has one baud rate and format")
+    for b in (first, second):
+        if b.profile.amplifier is not None and isinstance(b.profile.bus_spec, BinaryFrame | TextLine):
+            raise InputError(f"{both}, but {b.name} is an amplifier: give it a line of its own")
+        if isinstance(b.profile.bus_spec, BinaryFrame | TextLine) and not b.profile.bus_spec.request:
+            raise InputError(
+                f"{both}, but {b.name} sends without being asked (its profile has no 'request'): "
+                "only devices that are asked can share a line"
+            )
+
+
+def _check_can_bus(first: Binding, second: Binding, both: str) -> None:
+    if first.port != second.port and not first.port.startswith(FREE):
+        raise InputError(f"{both}, but write it differently ({first.port}): one bus has one bitrate")
+    one, other = first.profile.bus_spec, second.profile.bus_spec
+    if isinstance(one, Cia402) and isinstance(other, Cia402):
+        if first.address == second.address:
+            raise InputError(f"{both}, and both have node id {first.address}: give each its own 'address'")
+        if one.master_id == other.master_id:
+            raise InputError(f"{both}, and both have master_id {one.master_id}: give each its own")
+
+
+def port_key(port: str) -> str:
+    """Return what a port opens: the path without interface and bitrate, links followed; or its address."""
+    if not port.startswith(EXCLUSIVE) or NETWORK in port:
+        return re.sub(r"@\d+(,\d+)?$", "", port).removeprefix("rtu:")
+    return os.path.realpath(re.sub(r"^(slcan|rtu):|@\d+(,\d+)?$", "", port))
 
 
 def rig_notes(bindings: Iterable[Binding]) -> list[str]:
@@ -164,9 +211,20 @@ def rig_notes(bindings: Iterable[Binding]) -> list[str]:
     bindings = list(bindings)
     if not any(b.profile.amplifier for b in bindings):
         notes.append(
-            "no device takes the command (a can-cia402 profile with 'drive'): this rig measures, it cannot be driven"
+            "no device takes the command (a profile with 'drive'): this rig measures, it cannot be driven"
         )
     for b in bindings:
+        amplifier = b.profile.amplifier
+        if amplifier is not None and amplifier.watchdog_s is None:
+            notes.append(
+                f"{b.place}: {b.name} cannot stop by itself (watchdog_s: none): when this computer dies or the cable "
+                "breaks, it keeps its last command; cut its enable input or supply by a hardware watchdog"
+            )
+        if amplifier is not None and amplifier.command is not None and amplifier.state is None:
+            notes.append(
+                f"{b.place}: {b.name} does not report its state: the daemon cannot see that it stopped or refused; "
+                "compare its current with the command (protection.current_per_drive)"
+            )
         for x in b.bounds:
             if isinstance(x.channel.source, Register) and (hint := register_hint(x.channel.source.address)):
                 notes.append(f"{x.channel.place}: register {x.channel.source.address}: {hint}")

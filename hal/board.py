@@ -7,6 +7,7 @@ reader that finds it odd or changed takes the rows at its next tick.
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 from pathlib import Path
@@ -27,10 +28,13 @@ _ROW = np.dtype(
         ("time_s", "f8"),
         ("status", "u8"),
         ("text", f"S{_TEXT_BYTES}"),
+        ("command_sequence", "u8"),
+        ("command", "f8"),
+        ("command_enable", "u8"),
+        ("command_s", "f8"),
         ("counts", "u8", len(COUNTED)),
     ]
 )
-_SIZE = _ROW.itemsize * len(ROLES)
 SHARED_MEMORY = Path("/dev/shm")
 
 
@@ -39,21 +43,22 @@ class Board:
 
     def __init__(self, buffer: mmap.mmap | bytearray, path: Path | None, owner: bool) -> None:
         self._path, self._owner, self._buffer = path, owner, buffer
-        self.rows: Any = np.ndarray(len(ROLES), _ROW, buffer)
+        self.rows: Any = np.ndarray(len(buffer) // _ROW.itemsize, _ROW, buffer)
         self._sequence = self.rows["sequence"]
         if owner:
-            self.rows["sequence"] = 0
+            self.rows["sequence"] = self.rows["command_sequence"] = 0
             self.rows["value"], self.rows["time_s"], self.rows["status"] = np.nan, -np.inf, ABSENT
 
     @classmethod
-    def create(cls, name: str) -> Board:
-        """Make a board in shared memory, for this user only; replace an old one of the same name."""
+    def create(cls, name: str, count: int = len(ROLES)) -> Board:
+        """Make a board of `count` channels in shared memory, for this user only; replace an old one."""
+        size = _ROW.itemsize * count
         path = SHARED_MEMORY / name
         path.unlink(missing_ok=True)
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
-            os.ftruncate(fd, _SIZE)
-            return cls(mmap.mmap(fd, _SIZE), path, True)
+            os.ftruncate(fd, size)
+            return cls(mmap.mmap(fd, size), path, True)
         finally:
             os.close(fd)
 
@@ -68,16 +73,16 @@ class Board:
                 f"board '{name}': {e.strerror}; the supervisor creates it before any poller"
             ) from None
         try:
-            return cls(mmap.mmap(fd, _SIZE), path, False)
+            return cls(mmap.mmap(fd, 0), path, False)
         except ValueError:
             raise HardwareError(f"board '{name}': of another version; restart the daemon") from None
         finally:
             os.close(fd)
 
     @classmethod
-    def private(cls) -> Board:
+    def private(cls, count: int = len(ROLES)) -> Board:
         """Make a board for threads of this process only."""
-        return cls(bytearray(_SIZE), None, True)
+        return cls(bytearray(_ROW.itemsize * count), None, True)
 
     @property
     def name(self) -> str:
@@ -113,6 +118,25 @@ class Board:
                 sample.value[role], sample.time_s[role] = row["value"], row["time_s"]
                 sample.fresh[role] = True
         return int(before)
+
+    def send(self, device: Device, drive: float, enable: bool, now_s: float) -> None:
+        """Write the command of a slow amplifier for its poller; only the loop may call it."""
+        row = self.rows[device.roles[0]]
+        writing = int(row["command_sequence"]) | 1
+        row["command_sequence"] = writing
+        row["command"], row["command_enable"], row["command_s"] = drive, enable, now_s
+        row["command_sequence"] = writing + 1
+
+    def command(self, device: Device) -> tuple[float, bool, float]:
+        """Return the last command of a slow amplifier, whether it is enabled, and when it was sent (s).
+
+        Disabled, from -inf, while the loop writes and before its first command."""
+        row = self.rows[device.roles[0]]
+        before = int(row["command_sequence"])
+        found = float(row["command"]), bool(row["command_enable"]), float(row["command_s"])
+        if before == 0 or before & 1 or int(row["command_sequence"]) != before:
+            return 0.0, False, -math.inf
+        return found
 
     def beat(self, roles: list[int]) -> int:
         """Return the number of posts of the device with these roles, to detect a hung poller."""

@@ -17,7 +17,7 @@ import time
 from typing import Any
 
 from hal.backend import HardwareError
-from hal.profile import ERROR_CODE, STATUS_WORD, Cia402, Object, object_name
+from hal.profile import ERROR_CODE, FIELD_TYPES, STATUS_WORD, Cia402, Object, object_name
 from hal.wire import CanPort
 from thermoctl.yamlfile import InputError
 
@@ -36,10 +36,27 @@ _FORMATS = {0x01: "B", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x
 """Data types of CiA 301 (BOOLEAN, INTEGER8 .. 32, UNSIGNED8 .. 32) and their letters in `struct`."""
 
 
+STANDARD_TYPES = {
+    0x1000: "uint32", 0x1016: "uint32", 0x1017: "uint16", 0x603F: "uint16", 0x6040: "uint16", 0x6041: "uint16",
+    0x6060: "int8", 0x6061: "int8", 0x6064: "int32", 0x606C: "int32", 0x6071: "int16", 0x6072: "uint16",
+    0x6073: "uint16", 0x6075: "uint32", 0x6076: "uint32", 0x6077: "int16", 0x6078: "int16", 0x6079: "uint32",
+    0x607A: "int32", 0x607F: "uint32", 0x6080: "uint32", 0x6081: "uint32", 0x6083: "uint32", 0x6084: "uint32",
+    0x6085: "uint32", 0x6087: "uint32", 0x60B1: "int32", 0x60B2: "int16", 0x60F4: "int32", 0x60FF: "int32",
+    0x60FD: "uint32", 0x6502: "uint32",
+}  # fmt: skip
+"""Types of objects that CiA 301 and CiA 402-2 define: for drives without an EDS file."""
+
+
 class Objects:
-    """The objects of an EDS file that a profile names. Raises InputError with the object."""
+    """The types of the objects that a profile names, from its EDS file or the standard.
+
+    Raises InputError with the object."""
 
     def __init__(self, spec: Cia402, place: str, node: int) -> None:
+        self._known = {Object(index): t for index, t in STANDARD_TYPES.items()} | dict(spec.objects)
+        if spec.eds is None:
+            self.place, self.eds = place, None
+            return
         import canopen  # takes a second; only rigs with a drive need it
 
         self.place, self.eds = place, spec.eds
@@ -54,6 +71,13 @@ class Objects:
     def format(self, item: Object, key: str) -> str:
         """Return the struct letter of an object; `key` is the profile's key that names it."""
         index, sub = item
+        if self.eds is None:
+            if item not in self._known:
+                raise InputError(
+                    f"{self.place}: {key}: the type of object {object_name(item)} is not known: give the drive's "
+                    f"'eds' file, or say objects: {{'{object_name(item)}': int32}}"
+                )
+            return FIELD_TYPES[self._known[item]]
         found = self._dictionary.get(index)
         if found is None:
             raise self._error(item, key, "is not in it")

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hal.backend import ERROR, ROLE, STALE, Sample
+from hal.backend import ERROR, STALE, Sample
 from hal.binding import Binding
 from hal.wire import Channels
 
@@ -31,7 +31,7 @@ class Device:
         self.name = binding.name
         self.slow = binding.profile.bus in SLOW_BUSES
         self.drives = binding.profile.amplifier is not None
-        self.roles = [ROLE[b.role] for b in binding.bounds]
+        self.roles = [binding.channels.index[b.role] for b in binding.bounds]
         columns = zip(*((b.scale, b.offset, b.low, b.high) for b in binding.bounds), strict=True)
         self._channels = Channels(np.array(self.roles, np.intc), *(np.array(c, float) for c in columns))
         self.problems: dict[int, str] = {}  # by role: the present problem; a good reading clears it

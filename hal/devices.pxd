@@ -4,10 +4,10 @@ from hal.device cimport Device
 from hal.wire cimport Ages
 
 cdef class DevicesBackend:
-    cdef public list fast, slow
+    cdef public list fast, slow, _slow_drives
     cdef public object board, sample, required, _pacing
     cdef public object _stop
-    cdef public dict _owner, _seen, _repairs
+    cdef public dict roles, _owner, _seen, _repairs
     cdef public list _threads
     cdef public Ages _ages
     cdef public double _now_s

@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from hal.backend import ABSENT, ROLE, ROLES, STALE, HardwareError, Sample
+from hal.backend import ABSENT, STALE, HardwareError, Sample
 from hal.board import Board
 from hal.device import Device
-from hal.poller import RECONNECT_S, poll_until
+from hal.poller import RECONNECT_S, poll_until, ports
 from hal.wire import Ages, wait_readable
+from thermoctl.channels import AT, DEFAULT, Channels
 from thermoctl.yamlfile import InputError
 
 
@@ -34,18 +35,19 @@ class DevicesBackend:
         slow: list[Device],
         board: Board | None = None,
         required: Iterable[str] | None = None,
+        channels: Channels = DEFAULT,
     ) -> None:
         self.fast, self.slow, self.board = fast, slow, board
-        self.required = {ROLE[r] for r in required} if required is not None else set(range(len(ROLES)))
-        self.sample = Sample()
+        self.roles, count = channels.index, len(channels.names)
+        self.required = {self.roles[r] for r in required} if required is not None else set(range(count))
+        self.sample = Sample(count)
         self._owner = {role: d for d in [*fast, *slow] for role in d.roles}
-        self._pacing = self._owner.get(
-            ROLE["position_um"]
-        )  # its frames start the ticks with loop.pace: device
+        self._pacing = self._owner.get(AT["position_um"])  # its frames start the ticks with loop.pace: device
+        self._slow_drives = [d for d in slow if d.drives]
         self._seen = dict.fromkeys(slow, 0)
-        limit_s = np.full(len(ROLES), np.inf)  # age at which a reading is stale
+        limit_s = np.full(count, np.inf)  # age at which a reading is stale
         for b in (b for d in self._owner.values() for b in d.binding.bounds):
-            limit_s[ROLE[b.role]] = b.channel.stale_after_s
+            limit_s[self.roles[b.role]] = b.channel.stale_after_s
         self._ages = Ages(self.sample, limit_s)
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -76,9 +78,9 @@ class DevicesBackend:
         for device, why in absent:
             self._connect_again(device, f"{why}; trying again")
         if self.board is None and self.slow:
-            self.board = Board.private()
-            for device in self.slow:
-                self._start(poll_until, (device, self.board, self._stop), f"poll {device.name}")
+            self.board = Board.private(len(self.roles))
+            for group in ports(self.slow):
+                self._start(poll_until, (group, self.board, self._stop), f"poll {group[0].name}")
 
     def _start(self, target: Callable[..., None], args: tuple[object, ...], name: str) -> None:
         thread = threading.Thread(target=target, args=args, daemon=True, name=name)
@@ -136,6 +138,9 @@ class DevicesBackend:
                     device.write(drive, enable, self._now_s)
                 except (OSError, HardwareError) as e:
                     self._lost(device, e)
+        if self.board is not None:
+            for device in self._slow_drives:
+                self.board.send(device, drive, enable, self._now_s)
 
     def close(self) -> None:
         """Disable and release everything; see hal.backend."""
@@ -156,7 +161,7 @@ class DevicesBackend:
 
     def problem(self, role: str) -> str:
         """Return in one line why `role` is not OK; '' when it is."""
-        i = ROLE[role]
+        i = self.roles[role]
         if i not in self._owner:
             return f"{role}: no device of hal.devices has this role"
         text = self._owner[i].explain(self.sample, i)

@@ -18,6 +18,8 @@ cdef class Cia402Device(Device):
     cdef public int[::1] _index, _is_state, _shift, _bits, _signed
     cdef public double _patience_s, _heartbeat_s, _heard_s, _beat_s, _reset_s, _low, _high, _scale
     cdef public tuple _ids
+    cdef public int _actual
+    cdef public double _slew, _target, _target_s, _actual_counts
     cdef public bint _wanted, _driving, _left
     cdef public double _left_to
     cdef public int _left_word
@@ -30,5 +32,7 @@ cdef class Cia402Device(Device):
     cpdef double _watch_state(self, double state) noexcept
     @cython.locals(raw=cython.longlong, span=cython.longlong)
     cdef double _number(self, unsigned long long data, int k) noexcept
+    @cython.locals(step=cython.double, wanted=cython.double)
+    cdef long long _position_target(self, double drive, bint steps, double now_s) except? -1
     @cython.locals(port=CanPort, word=cython.int, counts=cython.longlong, steps=cython.bint)
     cpdef write(self, double drive, bint enable, double now_s)

@@ -39,7 +39,7 @@ from hal.backend import (
     Sample,
 )
 from hal.binding import Binding
-from hal.can_bus import LibraryPort, SlcanPort, open_can
+from hal.can_bus import AnyPort, open_can
 from hal.cia402 import (
     NMT_ID,
     NMT_RESET_COMMUNICATION,
@@ -54,9 +54,11 @@ from hal.cia402 import (
 )
 from hal.device import Device
 from hal.profile import STATUS_WORD, Cia402, Object, typed
+from hal.read_drive import ACTUAL_POSITION, POSITION_MODES
 from hal.wire import nearest
 from thermoctl.yamlfile import InputError
 
+MAX_STEP_S = 0.01  # longest time for which a position target moves in one write
 FAULT_RESET_S = 1.0  # between attempts to reset a drive's fault while `enable` is False
 _PRE_OPERATIONAL = 0x7F  # NMT state in a heartbeat; 0: the node has just booted
 _SYNC_ID, _RESET_S = SYNC_ID, FAULT_RESET_S
@@ -115,7 +117,7 @@ class Cia402Device(Device):
         super().__init__(binding)
         spec = typed(binding.profile.bus_spec, Cia402)
         self._spec, self._node = spec, binding.address
-        self._port: SlcanPort | LibraryPort | None = None
+        self._port: AnyPort | None = None
         self._formats = check_objects(Objects(spec, binding.profile.file, self._node), spec)
         formats, command = [self._formats[o] for o in spec.transmit], self._formats[spec.command]
         sizes = [struct.calcsize(f) for f in formats]
@@ -137,6 +139,9 @@ class Cia402Device(Device):
         self._master = spec.master_id
         if amplifier is not None:
             (self._low, self._high), self._scale = amplifier.limits, amplifier.scale
+            self._slew = amplifier.slew_per_s / amplifier.scale
+        self._actual = spec.transmit.index(ACTUAL_POSITION) if spec.mode in POSITION_MODES else -1
+        self._target, self._target_s, self._actual_counts = math.nan, 0.0, 0.0
         self._ids = (
             0x080 + self._node,
             0x180 + self._node,
@@ -151,7 +156,7 @@ class Cia402Device(Device):
 
     def connect(self) -> None:
         """Open the port, set the drive up and start its node; the drive stays disabled."""
-        port = open_can(self.binding.port, self._ids)
+        port = open_can(self.binding.port, self._ids, self.binding.shared)
         try:
             sdo = Sdo(port, self._node, self._spec.sdo_timeout_s)
             self._fault_code = set_up(sdo, self._spec, self._formats, self.binding.port)
@@ -161,13 +166,14 @@ class Cia402Device(Device):
         self._port = port
         self._status_word = 0
         self._watch_state(_OFFLINE)  # lost while it drove: it must not be enabled again by itself
+        self._target = math.nan
         self._odd_size, self._odd = -1, 0
         self._heard_s = time.monotonic()
         self._beat_s = self._reset_s = -math.inf
 
     def switch_off(self) -> None:
         """Disable the drive over a link of its own. Raises HardwareError when the drive does not confirm."""
-        port = open_can(self.binding.port, self._ids)
+        port = open_can(self.binding.port, self._ids, self.binding.shared)
         try:
             switch_off(Sdo(port, self._node, self._spec.sdo_timeout_s), self._receive_size)
         finally:
@@ -204,7 +210,7 @@ class Cia402Device(Device):
         if now_s - self._heard_s > self._patience_s:
             raise HardwareError(f"no heartbeat of node {self._node} for {self._patience_s * 1e3:.0f} ms")
 
-    def _take_heartbeat(self, port: SlcanPort | LibraryPort, state: int, now_s: float) -> None:
+    def _take_heartbeat(self, port: AnyPort, state: int, now_s: float) -> None:
         """Take a heartbeat with the NMT state of the drive. Raises HardwareError when the drive restarted."""
         if state == 0:  # boot-up
             raise HardwareError("the drive restarted")  # its PDO mapping and watchdog are gone
@@ -216,6 +222,8 @@ class Cia402Device(Device):
         """Store the readings of a TPDO 1."""
         self._status_word = int(self._number(data, 0))
         self._frames += 1
+        if self._actual >= 0:
+            self._actual_counts = self._number(data, self._actual)
         state = self._watch_state(drive_state(self._status_word))
         for i in range(len(self._index)):
             if self._is_state[i]:
@@ -251,10 +259,12 @@ class Cia402Device(Device):
             self._driving = self._left = False
         steps = enable and not self._left
         word = next_control_word(self._status_word, steps)
-        if steps and drive_state(self._status_word) == _ENABLED:
+        if self._actual >= 0:
+            counts = self._position_target(drive, steps, now_s)
+        elif steps and drive_state(self._status_word) == _ENABLED:
             counts = nearest(min(max(drive, self._low), self._high) / self._scale)
-            counts = min(max(counts, -self._command_limit), self._command_limit)
-        elif not enable and self._status_word & 0x4F == 0x08 and now_s - self._reset_s >= _RESET_S:
+        counts = min(max(counts, -self._command_limit), self._command_limit)
+        if not enable and self._status_word & 0x4F == 0x08 and now_s - self._reset_s >= _RESET_S:
             word, self._reset_s = 0x80, now_s
         port.queue(0x200 + self._node, word | (counts & 0xFFFFFFFF) << 16, self._receive_size)
         port.queue(_SYNC_ID, 0, 0)
@@ -262,6 +272,19 @@ class Cia402Device(Device):
             self._beat_s = now_s
             port.queue(0x700 + self._master, 0x05, 1)
         port.flush()
+
+    def _position_target(self, drive: float, steps: bool, now_s: float) -> int:
+        """Return the target position in counts: the present one until enabled, then towards `drive`.
+
+        The target moves by at most `slew_per_s`, so that enabling or a step of the command is no jump."""
+        step = self._slew * min(max(now_s - self._target_s, 0.0), MAX_STEP_S)
+        self._target_s = now_s
+        if not steps or drive_state(self._status_word) != _ENABLED or self._target != self._target:
+            self._target = self._actual_counts
+        else:
+            wanted = min(max(drive, self._low), self._high) / self._scale
+            self._target += min(max(wanted - self._target, -step), step)
+        return nearest(self._target)
 
     def explain(self, sample: Sample, role: int) -> str:
         """Say also how a drive left 'operation enabled' by itself, until it is enabled anew."""

@@ -21,13 +21,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Backend, Sample
+from hal.backend import ABSENT, ERROR, OK, STALE, Backend, Sample
+from thermoctl.channels import AT, DEFAULT, Channels
 from thermoctl.yamlfile import Node, Section, suggest
 
 KINDS = (
@@ -62,8 +63,8 @@ class Fault:
     stale_after_s: float = 0.05
 
 
-def schedule(nodes: Iterable[Node]) -> list[Fault]:
-    """Read `hal.faults`. Raises InputError with file and line."""
+def schedule(nodes: Iterable[Node], channels: Channels = DEFAULT) -> list[Fault]:
+    """Read `hal.faults` of a rig with these channels. Raises InputError with file and line."""
     faults = []
     for node in nodes:
         s = Section(node, "fault")
@@ -72,7 +73,7 @@ def schedule(nodes: Iterable[Node]) -> list[Fault]:
         until = at + s.number("for_s", math.inf if s.get("for_s", False) is None else None, 0.0)
         fault = Fault(
             kind,
-            _roles(s, kind),
+            _roles(s, kind, channels.index),
             at,
             until,
             s.number("by", 0.0),
@@ -90,28 +91,31 @@ def schedule(nodes: Iterable[Node]) -> list[Fault]:
     return faults
 
 
-def _roles(s: Section, kind: str) -> tuple[int, ...]:
+def _roles(s: Section, kind: str, known: Mapping[str, int]) -> tuple[int, ...]:
     node = s.get("role", kind != "stuck")
     if node is None:
         return ()
     names = [n.value for n in node.value] if isinstance(node.value, list) else [node.value]
     if names == ["all"]:
-        return tuple(range(len(ROLES)))
+        return tuple(range(len(known)))
     for name in names:
-        if name not in ROLES:
+        if name not in known:
             raise node.error(
-                f"role: '{name}' is no role{suggest(str(name), ROLES)}; roles: all, {', '.join(ROLES)}"
+                f"role: '{name}' is no role{suggest(str(name), known)}; roles: all, {', '.join(known)}"
             )
-    return tuple(ROLE[n] for n in names)
+    return tuple(known[n] for n in names)
 
 
 class FaultInjector:
     """`hal.backend.Backend` that injects faults into another one; seeded, deterministic."""
 
-    def __init__(self, inner: Backend, faults: Iterable[Fault], seed: int = 0) -> None:
+    def __init__(
+        self, inner: Backend, faults: Iterable[Fault], seed: int = 0, channels: Channels = DEFAULT
+    ) -> None:
         self.inner: Any = inner
         self.faults = list(faults)
-        self.sample = Sample()
+        self.roles = channels.index
+        self.sample = Sample(len(channels.names))
         self._random = np.random.default_rng(seed)
         self._start_s = math.nan
         self._t = 0.0
@@ -166,7 +170,7 @@ class FaultInjector:
             if fault.at_s <= self._t < fault.until_s:
                 if fault.kind == "stuck":
                     drive, enable = fault.by, True
-                elif fault.kind == "disconnect" and ROLE["amplifier_state"] in fault.roles:
+                elif fault.kind == "disconnect" and AT["amplifier_state"] in fault.roles:
                     drive, enable = 0.0, False
         self.inner.write(drive, enable)
 
@@ -185,7 +189,7 @@ class FaultInjector:
     def problem(self, role: str) -> str:
         """Name the injected fault, else the inner back end's problem."""
         for fault in self.faults:
-            if ROLE[role] in fault.roles and fault.at_s <= self._t < fault.until_s:
+            if self.roles[role] in fault.roles and fault.at_s <= self._t < fault.until_s:
                 return f"{role}: injected fault: {fault.kind}"
         return self.inner.problem(role)
 

@@ -7,13 +7,14 @@ from pathlib import Path
 from hal.backend import Backend
 from hal.binding import Binding, bind, check_rig, rig_notes
 from hal.board import Board
-from hal.dbc import DbcDevice
+from hal.dbc import DbcDevice, DbcDrive
 from hal.device import Device
 from hal.devices import DevicesBackend
 from hal.drive import Cia402Device
 from hal.faulty import FaultInjector, schedule
-from hal.modbus import ModbusDevice
+from hal.modbus import ModbusDevice, ModbusDrive
 from hal.replay import replay_backend
+from hal.serial_drive import SerialDrive
 from hal.serial_port import SerialDevice
 from hal.simulated import simulated_backend
 from thermoctl.settings import Settings
@@ -34,11 +35,16 @@ def make_backend(settings: Settings, board: Board | None = None) -> Backend:
         backend = replay_backend(settings)
     elif kind == "devices":
         fast, slow = fast_devices(settings), slow_devices(settings)
-        backend = DevicesBackend(fast, slow, board, settings.protection.required)
+        backend = DevicesBackend(fast, slow, board, settings.protection.required, settings.channels)
     else:
         raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated, devices or replay")
     if settings.hal.faults:
-        backend = FaultInjector(backend, schedule(settings.hal.faults), seed=settings.hal.seed)
+        backend = FaultInjector(
+            backend,
+            schedule(settings.hal.faults, settings.channels),
+            seed=settings.hal.seed,
+            channels=settings.channels,
+        )
     return backend
 
 
@@ -67,13 +73,11 @@ def make_devices(settings: Settings) -> list[Device]:
     """Make the drivers of `hal.devices`, not connected. Raises InputError.
 
     Paths of profiles are relative to the configuration file."""
-    bindings = _bindings(settings)
-    check_rig(bindings)
-    return [driver(b) for b in bindings]
+    return [driver(b) for b in check_rig(_bindings(settings))]
 
 
 def _bindings(settings: Settings) -> list[Binding]:
-    return [bind(node, Path(settings.path).parent) for node in settings.hal.devices]
+    return [bind(node, Path(settings.path).parent, settings.channels) for node in settings.hal.devices]
 
 
 def device_notes(settings: Settings) -> list[str]:
@@ -89,7 +93,7 @@ def driving_devices(settings: Settings) -> list[Device]:
     devices, mistakes = [], []
     for node in settings.hal.devices:
         try:
-            binding = bind(node, Path(settings.path).parent)
+            binding = bind(node, Path(settings.path).parent, settings.channels)
             if binding.profile.amplifier is not None:
                 devices.append(driver(binding))
         except InputError as e:
@@ -113,6 +117,17 @@ _DRIVERS: dict[str, type[Device]] = {
 }
 
 
+_DRIVES: dict[str, type[Device]] = {
+    "serial-binary": SerialDrive,
+    "serial-lines": SerialDrive,
+    "can-dbc": DbcDrive,
+    "modbus": ModbusDrive,
+}
+"""Drivers of amplifiers that messages command."""
+
+
 def driver(binding: Binding) -> Device:
     """Make the driver of a bound device, not connected. Raises InputError."""
-    return _DRIVERS[binding.profile.bus](binding)
+    amplifier, bus = binding.profile.amplifier, binding.profile.bus
+    by_messages = amplifier is not None and amplifier.command is not None
+    return (_DRIVES if by_messages else _DRIVERS)[bus](binding)

@@ -1,36 +1,37 @@
-"""Modbus devices, TCP and RTU.
+"""Modbus devices, TCP and RTU: registers, coils and discrete inputs read in blocks.
 
-No other module uses pymodbus, which renames its interface in minor releases.
-
-Ports: "tcp:host:port" or "rtu:/dev/serial/by-id/...". Channels are registers; neighbours are read in one
-block. The profile gives the word order of a value of several words; bytes inside a word are big-endian, by
-the protocol. Sentinel numbers, such as an open thermocouple's, make the channel an ERROR while the others
-stay OK. After a lost or damaged answer, or while the device is busy, the last values are kept. A refused
-block is read register by register, so that one illegal address does not invalidate its neighbours.
+Neighbours are read in one block. The profile gives the word order of a value of several words. Bytes inside a
+word are big-endian, by the protocol, unless the profile says otherwise. Sentinel numbers, such as an open
+thermocouple's, and status bits make the channel an ERROR while the others stay OK. After a lost or damaged
+answer, or while the device is busy, the last values are kept. A refused block is read register by register.
+One illegal address therefore does not invalidate its neighbours. hal.modbus_link opens the ports.
 """
 
 from __future__ import annotations
 
-import logging
 import math
-import re
 import struct
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import serial
-from pymodbus import ModbusException
-from pymodbus.client import ModbusSerialClient, ModbusTcpClient
-from pymodbus.exceptions import ConnectionException
-
+from hal.amplifier import Commanded
 from hal.backend import HardwareError, Sample
 from hal.binding import Binding, register_hint
 from hal.device import Device
-from hal.profile import FIELD_TYPES, Modbus, Register, typed
-from hal.serial_port import open_port
-from hal.wire import crc16
+from hal.message import clipped
+from hal.modbus_link import Link, NoAnswer, join, leave
+from hal.profile import (
+    BIT_KINDS,
+    REGISTER_TYPES,
+    Assumed,
+    Condition,
+    Message,
+    Modbus,
+    Register,
+    RegisterMessage,
+    typed,
+)
 
 EXCEPTIONS = {
     1: ("illegal function", "try the other 'kind' (input, holding)"),
@@ -53,19 +54,14 @@ EXCEPTIONS = {
 BUSY, PASSING = (5, 6), (5, 6, 10, 11)  # requests repeated at once; never an ERROR of the channel itself
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
 REFUSED = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)  # one register may be the cause: the block is read one by one
-FUNCTIONS = {"holding": 3, "input": 4}  # Modbus function code of a kind of register
-MIN_FRAME, SHOWN = 4, 12  # bytes: the shortest RTU frame; the first bytes of a bad answer in a message
 BUSY_TRIES, BUSY_PAUSE_S = 3, 0.02
 LOST_POLLS = 3  # polls without any answer, after which the link is opened again
-
-
-class NoAnswer(Exception):
-    """No valid answer to a request: lost, cut short, wrong checksum, another unit."""
+MAX_BITS = 2000  # coils of one answer
 
 
 @dataclass(frozen=True)
 class Block:
-    """Registers read by one request; `members` are (number of the bound channel, register)."""
+    """Registers or bits read by one request; `members` are (number of the item, register)."""
 
     kind: str
     address: int
@@ -74,9 +70,9 @@ class Block:
 
 
 def plan_blocks(registers: Iterable[tuple[int, Register]], max_gap: int, max_block: int) -> list[Block]:
-    """Plan the fewest requests for (number of the channel, register).
+    """Plan the fewest requests for (number of the item, register).
 
-    Registers of one kind share a block of up to max_block registers over gaps <= max_gap."""
+    Registers of one kind share a block of up to max_block registers (MAX_BITS bits) over gaps <= max_gap."""
     blocks: list[Block] = []
     for i, r in sorted(registers, key=lambda item: (item[1].kind, item[1].address)):
         last = blocks[-1] if blocks else None
@@ -84,7 +80,7 @@ def plan_blocks(registers: Iterable[tuple[int, Register]], max_gap: int, max_blo
             last
             and last.kind == r.kind
             and r.address - last.address - last.count <= max_gap
-            and r.address + r.words - last.address <= max_block
+            and r.address + r.words - last.address <= (MAX_BITS if r.kind in BIT_KINDS else max_block)
         ):
             count = max(last.count, r.address + r.words - last.address)
             blocks[-1] = Block(r.kind, last.address, count, (*last.members, (i, r)))
@@ -94,10 +90,20 @@ def plan_blocks(registers: Iterable[tuple[int, Register]], max_gap: int, max_blo
 
 
 def decode(words: Sequence[int], register: Register) -> float:
-    """Return the raw number in `words` (uint16, in the order of the wire)."""
+    """Return the raw number in `words` (uint16 in the order of the wire; bits 0 or 1); NaN for no BCD."""
+    if register.type == "bit":
+        return float(words[0])
     ordered = words if register.word_order == "big" else words[::-1]
-    data = struct.pack(f">{len(ordered)}H", *ordered)
-    return float(struct.unpack(">" + FIELD_TYPES[register.type], data)[0])
+    letters = f"{'>' if register.byte_order == 'big' else '<'}{len(ordered)}H"
+    data = struct.pack(letters, *ordered)
+    low, count = register.bits
+    if count:
+        value = int.from_bytes(data, "big") >> low & (1 << count) - 1
+        return float(value - (1 << count) if register.signed and value >> (count - 1) else value)
+    if register.type.startswith("bcd"):
+        digits = data.hex()
+        return float(digits) if digits.isdecimal() else math.nan
+    return float(struct.unpack(">" + REGISTER_TYPES[register.type], data)[0])
 
 
 class ModbusDevice(Device):
@@ -106,53 +112,52 @@ class ModbusDevice(Device):
     def __init__(self, binding: Binding) -> None:
         super().__init__(binding)
         self.counts["lost"] = 0
-        self._client: Any = None
+        self._link: Link | None = None
         self._spec = typed(binding.profile.bus_spec, Modbus)
+        sources = [
+            (i, typed(b.channel.source, Register))
+            for i, b in enumerate(binding.bounds)
+            if not isinstance(b.channel.source, Assumed)
+        ]
+        self._items: list[tuple[int, Register, Condition | None]] = [(i, s, None) for i, s in sources] + [
+            (i, s.invalid[0], s.invalid[1]) for i, s in sources if s.invalid
+        ]
+        """Items to read: (bound channel, register, the test of a status register)."""
+        self._state: dict[int, str] = {}  # bound channel with a status: its fault, '' when good
+        self._got: list[tuple[int, float, float]] = []  # of this poll: item, raw number, time
         self._plan()
         self._lost_polls = 0
-        self._received = b""  # after the last request
-        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # our errors say the same
 
     def _plan(self) -> None:
-        registers = [typed(b.channel.source, Register) for b in self.binding.bounds]
-        self._blocks = plan_blocks(enumerate(registers), self._spec.max_gap, self._spec.max_block)
+        registers = [(k, register) for k, (_, register, _) in enumerate(self._items)]
+        self._blocks = plan_blocks(registers, self._spec.max_gap, self._spec.max_block)
 
     def connect(self) -> None:
         """Open the connection or the serial port. Raises HardwareError."""
-        port, line = self.binding.port, self.binding.profile.line
-        tcp = re.fullmatch(r"tcp:(\[[^]]+\]|[^:]+):(\d+)", port)
-        common: dict[str, Any] = {"timeout": self._spec.timeout_s, "retries": 0, "trace_packet": self._trace}
-        try:
-            if tcp:
-                self._client = ModbusTcpClient(tcp[1].strip("[]"), port=int(tcp[2]), **common)
-            elif port.startswith("rtu:"):
-                open_port(port[4:], line).close()  # its errors give the remedy, and it sets the latency timer
-                self._client = ModbusSerialClient(
-                    port[4:], baudrate=line.baud, parity=line.parity, stopbits=line.stop_bits, **common
-                )
-            else:
-                raise HardwareError(f"port '{port}': tcp:host:port or rtu:/dev/... was expected")
-            connected = self._client.connect()
-        except (OSError, ModbusException, serial.SerialException) as e:
-            raise HardwareError(f"{port}: cannot be opened ({e})") from None
-        if not connected:
-            self._client.close()
-            raise HardwareError(f"{port}: nobody answers: check power, network and address")
+        self._link = join(self.binding.port, self.binding.profile.line, self._spec.timeout_s)
         self._lost_polls = 0
+        self._state.clear()
         self._plan()
 
     def disconnect(self) -> None:
-        """Close the connection."""
-        client, self._client = self._client, None
-        if client is not None:
-            client.close()
+        """Close the connection, if no other device uses it."""
+        link, self._link = self._link, None
+        if link is not None:
+            leave(link)
 
     def poll(self, sample: Sample) -> None:
-        """Read every block.
+        """Read every block, then store what came.
 
         A lost answer ends this poll, because a late answer must not be taken for the next block's; the last
         values are kept. Raises HardwareError when the link is gone or LOST_POLLS polls in a row had no
         answer."""
+        self._got.clear()
+        try:
+            self._read_blocks(sample)
+        finally:
+            self._store(sample)
+
+    def _read_blocks(self, sample: Sample) -> None:
         for block in list(self._blocks):
             try:
                 self._read(sample, block)
@@ -160,13 +165,16 @@ class ModbusDevice(Device):
             except NoAnswer as e:
                 self.counts["lost"] += 1
                 self._lost_polls += 1
-                for i, _ in block.members:
+                for i in self._bounds(block):
                     self.miss(i, f"{self._named(block)}: {e}")
                 if self._lost_polls >= LOST_POLLS:
                     raise HardwareError(f"{self.binding.port}: {self._named(block)}: {e}") from None
                 at = self._blocks.index(block) + 1  # the next poll starts after this block
                 self._blocks = self._blocks[at:] + self._blocks[:at]
                 return
+
+    def _bounds(self, block: Block) -> list[int]:
+        return [self._items[k][0] for k, _ in block.members]
 
     def silence(self) -> str:
         """Report that the poller has posted no reading and no problem yet."""
@@ -175,7 +183,7 @@ class ModbusDevice(Device):
     def _read(self, sample: Sample, block: Block) -> None:
         answer = self._request(block)
         if isinstance(answer, list):
-            self._store(sample, block, answer)
+            self._take(block, answer)
         elif answer in REFUSED and (len(block.members) > 1 or block.count > block.members[0][1].words):
             self._read_singly(sample, block)
         else:
@@ -190,7 +198,7 @@ class ModbusDevice(Device):
             single = Block(block.kind, member[1].address, member[1].words, (member,))
             answer = self._request(single)
             if isinstance(answer, list):
-                self._store(sample, single, answer)
+                self._take(single, answer)
             else:
                 refused.append(single)
                 self._refused(sample, single, answer)
@@ -200,71 +208,69 @@ class ModbusDevice(Device):
         self._blocks[at : at + 1] = [*good, *refused]
 
     def _request(self, block: Block) -> list[int] | int:
-        """Return the register values of a block, or the Modbus exception code that the unit answers with.
+        """Return the values of a block, or the Modbus exception code that the unit answers with.
 
         Raises NoAnswer, or HardwareError when the link is gone."""
-        client, code = self._client, 0
-        read = client.read_input_registers if block.kind == "input" else client.read_holding_registers
+        if self._link is None:
+            raise HardwareError("not connected")
+        code = 0
         for _ in range(BUSY_TRIES):
-            self._received = b""
             try:
-                answer = read(block.address, count=block.count, device_id=self.binding.address)
-            except (ConnectionException, OSError, serial.SerialException) as e:
+                answer = self._link.read(
+                    block.kind, block.address, block.count, self.binding.address, self._spec.timeout_s
+                )
+            except HardwareError:
                 self.counts["lost"] += 1
-                raise HardwareError(f"{self.binding.port}: the connection is gone ({e})") from None
-            except Exception:  # foreign bytes may raise anything in the library
-                raise NoAnswer(self._bad_answer()) from None
-            if not answer.isError():
-                break
+                raise
+            if isinstance(answer, list):
+                self.counts["frames"] += 1
+                return answer
             self.counts["errors"] += 1
-            code = int(getattr(answer, "exception_code", 0))
+            code = answer
             if code not in BUSY:
-                return code
+                break
             time.sleep(BUSY_PAUSE_S)
-        else:
-            return code
-        words = getattr(answer, "registers", None)
-        if answer.function_code != FUNCTIONS[block.kind] or words is None:
-            raise NoAnswer(
-                f"function {answer.function_code} was answered, {block.kind} registers were asked for"
-            )
-        if len(words) != block.count:
-            raise NoAnswer(f"{len(words)} registers were answered, {block.count} were asked for")
-        self.counts["frames"] += 1
-        return list(words)
+        return code
 
-    def _trace(self, sending: bool, data: bytes) -> bytes:
-        if not sending:
-            self._received = data
-        return data
-
-    def _bad_answer(self) -> str:
-        data, unit, timeout_s = self._received, self.binding.address, self._spec.timeout_s
-        if not data:
-            return f"no answer within {timeout_s:g} s: check power, wiring, address {unit} and the line's settings"
-        more = " .." if len(data) > SHOWN else ""
-        text = f"no valid answer: {len(data)} bytes came ({data[:SHOWN].hex(' ')}{more})"
-        if not self.binding.port.startswith("rtu:"):
-            return f"{text}: cut short, or no Modbus TCP"
-        if len(data) < MIN_FRAME or crc16("modbus", data[:-2]) != int.from_bytes(data[-2:], "little"):
-            return f"{text} with a wrong CRC, or cut short: check the baud rate, parity, termination and other masters"
-        return f"{text} of unit {data[0]}, unit {unit} was asked: check 'address'"
-
-    def _store(self, sample: Sample, block: Block, words: list[int]) -> None:
+    def _take(self, block: Block, words: list[int]) -> None:
         now_s = time.monotonic()
-        for i, register in block.members:
+        for k, register in block.members:
             at = register.address - block.address
-            raw = decode(words[at : at + register.words], register)
-            if raw in register.sentinels or math.isnan(raw):
+            self._got.append((k, decode(words[at : at + register.words], register), now_s))
+
+    def _store(self, sample: Sample) -> None:
+        """Store the readings of this poll; those whose status register reports a fault are errors."""
+        for k, raw, _ in self._got:
+            i, register, test = self._items[k]
+            if test is not None:
+                bits = int(raw) & test.mask
+                self._state[i] = (
+                    ""
+                    if bits == test.value
+                    else f"{register.kind} {register.address} reads 0x{bits:X}, a good reading has "
+                    f"0x{test.value:X}: the device reports a fault of this channel (open wire?)"
+                )
+        for k, raw, time_s in self._got:
+            i, register, test = self._items[k]
+            if test is not None:
+                continue
+            state = self._state.get(i) if register.invalid else ""
+            if state:
+                self.fail(sample, i, state)
+            elif state is None:
+                self.miss(i, "its status register has not been read yet")
+            elif raw in register.sentinels or math.isnan(raw):
                 self.fail(sample, i, f"register {register.address} reads {raw:g}: open or missing sensor")
             else:
-                self.put(sample, i, raw, now_s)
+                self.put(sample, i, raw, time_s)
 
     def _refused(self, sample: Sample, block: Block, code: int) -> None:
         """Note the exception of an answer; it becomes the channel's ERROR when the last reading is stale."""
         name, remedy = EXCEPTIONS.get(code, ("unknown", "see the device's manual"))
         now_s = time.monotonic()
-        for i, register in block.members:
+        for k, register in block.members:
+            i = self._items[k][0]
+            self._state.pop(i, None)
             hint = register_hint(register.address) if code == ILLEGAL_ADDRESS else ""
             text = f"{self._named(block)}: exception {code} ({name}): {remedy}{'; ' if hint else ''}{hint}"
             stale_s = self.binding.bounds[i].channel.stale_after_s
@@ -275,6 +281,62 @@ class ModbusDevice(Device):
 
     @staticmethod
     def _named(block: Block) -> str:
+        what = f"{block.kind} {'input' if block.kind == 'discrete' else ''}".strip()
+        what = what if block.kind in BIT_KINDS else f"{block.kind} register"
         if len(block.members) == 1:
-            return f"{block.kind} register {block.address}"
-        return f"{block.kind} registers {block.address}..{block.address + block.count - 1}"
+            return f"{what} {block.address}"
+        return f"{what}s {block.address}..{block.address + block.count - 1}"
+
+
+class ModbusDrive(Commanded, ModbusDevice):
+    """An amplifier whose registers take the command (DAC, servo drive); its poller writes them."""
+
+    def __init__(self, binding: Binding) -> None:
+        ModbusDevice.__init__(self, binding)
+        self.prepare()
+
+    def poll(self, sample: Sample) -> None:
+        """Read every block; see ModbusDevice."""
+        super().poll(sample)
+        if self.is_assumed:
+            self.put(sample, self.state_bound, 0.0, time.monotonic())
+
+    def send_message(self, message: Message, command: float) -> None:
+        """Write a register. Raises HardwareError when the unit refuses it or does not answer."""
+        m = typed(message, RegisterMessage)
+        if self._link is None:
+            raise HardwareError("not connected")
+        value = clipped(command if m.value is None else m.value, m.register)
+        where = f"{self.binding.port}: writing {m.register.kind} {m.register.address}"
+        try:
+            code = self._link.write(
+                m.function,
+                m.register.address,
+                encode(value, m.register),
+                self.binding.address,
+                self._spec.timeout_s,
+            )
+        except NoAnswer as e:
+            raise HardwareError(f"{where}: {e}") from None
+        if code:
+            name, remedy = EXCEPTIONS.get(code, ("unknown", "see the device's manual"))
+            raise HardwareError(f"{where}: exception {code} ({name}): {remedy}")
+
+    def switch_off(self) -> None:
+        """Disable over a link of its own. Raises HardwareError when the amplifier does not confirm."""
+        self.connect()
+        sample = Sample(len(self.binding.channels.names))
+        try:
+            self.confirm_off(lambda: self.poll(sample))
+        finally:
+            ModbusDevice.disconnect(self)
+
+
+def encode(value: float, register: Register) -> list[int]:
+    """Return the words (or the bit) of a number, in the order of the wire."""
+    if register.type == "bit":
+        return [int(value != 0)]
+    letter = REGISTER_TYPES[register.type]
+    data = struct.pack(">" + letter, value if letter in "fd" else int(value))
+    words = list(struct.unpack(f">{register.words}H", data))
+    return words if register.word_order == "big" else words[::-1]

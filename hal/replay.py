@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.backend import OK, ROLE, ROLES, STALE, Sample
+from hal.backend import OK, STALE, Sample
 from hal.units import role_units
+from thermoctl.channels import DEFAULT, Channels
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.settings import Settings
@@ -26,46 +27,47 @@ STALE_PERIODS = 5  # a channel is stale after this many of its usual (median) pe
 
 def replay_backend(settings: Settings) -> ReplayBackend:
     """Make the back end `replay`. Raises InputError: no such file, or no column with a role."""
-    return ReplayBackend(read_table(Path(settings.path).parent / settings.hal.recording), settings.hal.roles)
+    table = read_table(Path(settings.path).parent / settings.hal.recording)
+    return ReplayBackend(table, settings.hal.roles, settings.channels)
 
 
 class ReplayBackend:
     """`hal.backend.Backend` over a Table."""
 
-    def __init__(self, table: Table, roles: Mapping[str, str]) -> None:
+    def __init__(self, table: Table, roles: Mapping[str, str], channels: Channels = DEFAULT) -> None:
         for column in roles:
             if column not in table.columns:
                 raise InputError(
                     f"{table.path}: no column '{column}' for hal.roles{suggest(column, table.columns)}; "
                     f"columns: {', '.join(table.columns)}"
                 )
-        self.sample, self.finished = Sample(), False
+        self.roles = channels.index
+        self.sample, self.finished = Sample(len(channels.names)), False
         self._t = table.t - table.t[0]
         self._channels: list[tuple[int, np.ndarray, float]] = []  # role, values (N,), greatest valid age in s
         for column, values in table.columns.items():
             role, factor, shift = self._role(table, column, roles.get(column, column))
-            if role in ROLES:
+            if role in self.roles:
                 times = self._t[np.isfinite(values)]
                 period = float(np.median(np.diff(times))) if len(times) > 1 else math.inf
-                self._channels.append((ROLE[role], values * factor + shift, STALE_PERIODS * period))
+                self._channels.append((self.roles[role], values * factor + shift, STALE_PERIODS * period))
         if not self._channels:
             raise InputError(
                 f"{table.path}: no column plays a role; say which in hal.roles "
-                f"(columns: {', '.join(table.columns)}; roles: {', '.join(ROLES)})"
+                f"(columns: {', '.join(table.columns)}; roles: {', '.join(self.roles)})"
             )
         taken = [r for r, _, _ in self._channels]
-        if twice := {ROLES[r] for r in taken if taken.count(r) > 1}:
+        if twice := {channels.names[r] for r in taken if taken.count(r) > 1}:
             raise InputError(f"{table.path}: hal.roles gives {', '.join(sorted(twice))} to two columns")
         self._next, self._start_s = 0, math.nan
 
-    @staticmethod
-    def _role(table: Table, column: str, text: str) -> tuple[str, float, float]:
+    def _role(self, table: Table, column: str, text: str) -> tuple[str, float, float]:
         match = re.fullmatch(r"(\w+)(?: \[([^]]+)\])?", text.strip())
         role = match[1] if match else text
-        if text != column and role not in ROLES:
+        if text != column and role not in self.roles:
             raise InputError(
-                f"{table.path}: hal.roles: '{role}' is no role{suggest(role, ROLES)}; "
-                f"roles: {', '.join(ROLES)}"
+                f"{table.path}: hal.roles: '{role}' is no role{suggest(role, self.roles)}; "
+                f"roles: {', '.join(self.roles)}"
             )
         if match is None or match[2] is None:
             return role, 1.0, 0.0
@@ -113,7 +115,7 @@ class ReplayBackend:
 
     def problem(self, role: str) -> str:
         """Say why a channel has no new reading."""
-        status = self.sample.status[ROLE[role]]
+        status = self.sample.status[self.roles[role]]
         if status == OK:
             return ""
         if status == STALE:

@@ -4,10 +4,12 @@ from hal.device cimport Device
 from hal.wire cimport Framer
 
 cdef class SerialDevice(Device):
-    cdef public object _port, _lines, _text, _fields
+    cdef public object _port, _line, _lines, _text, _fields
     cdef public str _why
+    cdef public bytes _request
     cdef public int _fd, _flags, _unread
-    cdef public unsigned long long _bad_flags
+    cdef public unsigned long long _flag_mask, _flag_good
+    cdef public double _request_hz, answer_s
     cdef public bint _waited
     cdef public Framer _framer
     cdef public double _due_s
@@ -15,5 +17,7 @@ cdef class SerialDevice(Device):
 
     @cython.locals(framer=Framer)
     cpdef bint wait_frame(self, long long until_ns) except -1
-    @cython.locals(framer=Framer, i=cython.int, flags=cython.ulonglong)
+    @cython.locals(framer=Framer)
     cpdef read(self, sample, double now_s)
+    @cython.locals(i=cython.int, flags=cython.ulonglong)
+    cdef _take_frame(self, sample, Framer framer, double now_s)

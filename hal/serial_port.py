@@ -1,121 +1,27 @@
 # cython: annotation_typing=False, cdivision=True
-"""Serial devices: framed bytes with a CRC, and lines of text.
+"""Serial devices: framed bytes with a checksum, and lines of text.
 
-pyserial opens and configures the line, exclusively, so that a second program is refused. The tick then reads
-and writes the bare descriptor without waiting. hal.wire.Framer finds the frames in the bytes.
+hal.serial_line opens the port, hal.wire.Framer finds the frames in the bytes. Several devices that answer
+requests may share a line (RS-485): hal.shared_line opens it once and asks one of them at a time.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
-import termios
+import re
 from array import array
-from pathlib import Path
+from typing import Any
 
-import serial
-
-from hal.backend import HardwareError, Sample
+from hal.backend import Sample
 from hal.binding import Binding
 from hal.device import Device
-from hal.profile import BinaryFrame, LineSettings, TextField, TextLine, typed
+from hal.message import with_address
+from hal.profile import Assumed, BinaryFrame, TextField, TextLine, typed
+from hal.serial_line import LineReader, open_port
+from hal.shared_line import SharedLine, join, leave
 from hal.text_number import cut_short, number, shown, why_no_match, why_no_number
-from hal.wire import Framer, read_available, wait_readable
-
-MAX_LINE = 1024  # a text line longer than this is garbage
-_CHARACTERS = 6  # place of the special characters in termios' list
-
-
-class LineReader:
-    """Bytes in, lines out; a line that is too long is dropped up to its end."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self._dropping = False
-        self.bad = 0
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that `data` completes, in order, without CR and LF."""
-        self._buffer += data
-        *lines, rest = bytes(self._buffer).replace(b"\r", b"\n").split(b"\n")
-        if lines and self._dropping:
-            lines, self._dropping = lines[1:], False
-        if len(rest) > MAX_LINE:
-            self.bad += not self._dropping
-            rest, self._dropping = b"", True
-        self._buffer[:] = rest
-        return [line for line in lines if 0 < len(line) <= MAX_LINE]
-
-    @property
-    def pending(self) -> int:
-        """Count the bytes of a line that has no end yet."""
-        return MAX_LINE if self._dropping else len(self._buffer)
-
-    def reset(self) -> None:
-        """Drop an incomplete line."""
-        self._buffer.clear()
-        self._dropping = False
-
-
-def open_port(path: str, line: LineSettings) -> serial.Serial:
-    """Open and configure a serial port exclusively, non-blocking. Raises HardwareError with the remedy."""
-    try:
-        port = serial.Serial(
-            path,
-            line.baud,
-            parity=line.parity,
-            stopbits=line.stop_bits,
-            timeout=0,
-            write_timeout=0,
-            exclusive=True,
-        )
-    except (OSError, ValueError, termios.error) as e:
-        code = getattr(e, "errno", None)
-        hint = {
-            errno.ENOENT: "no such device: is it plugged in? prefer a name of /dev/serial/by-id",
-            errno.EACCES: "permission denied: add the user to the group of the device (dialout)",
-            errno.EAGAIN: "in use by another program: stop it first",
-            errno.EBUSY: "in use by another program: stop it first",
-            errno.EINVAL: f"cannot do {line.baud} baud, parity {line.parity}: see the profile's 'line'",
-        }.get(code or 0, str(e))
-        raise HardwareError(f"{path}: {hint}") from None
-    if line.latency_timer_ms:
-        set_latency_timer(path, line.latency_timer_ms)
-    try:
-        settings = termios.tcgetattr(port.fileno())
-        settings[_CHARACTERS][termios.VMIN] = 1  # 'nothing yet' is EAGAIN, so that no bytes mean 'gone'
-        termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
-        termios.tcflush(port.fileno(), termios.TCIOFLUSH)
-        os.set_blocking(port.fileno(), False)
-    except (OSError, termios.error) as e:  # unplugged meanwhile; termios.error is no OSError
-        port.close()
-        raise HardwareError(f"{path}: gone while it was opened ({e})") from None
-    return port
-
-
-def set_latency_timer(path: str, ms: int, sys_root: str = "/sys") -> bool:
-    """Set an FTDI adapter's latency timer; by default it holds bytes back for up to 16 ms.
-
-    False when the port has no such timer or the system refuses."""
-    try:
-        _latency_timer(path, sys_root).write_text(str(ms))
-        return True
-    except OSError:
-        return False
-
-
-def latency_timer_ms(path: str, sys_root: str = "/sys") -> int | None:
-    """Return the FTDI latency timer in ms, None when the port has no such timer (for doctor)."""
-    try:
-        return int(_latency_timer(path, sys_root).read_text())
-    except (OSError, ValueError):
-        return None
-
-
-def _latency_timer(path: str, sys_root: str) -> Path:
-    adapter = os.path.basename(os.path.realpath(path))
-    return Path(sys_root, "bus/usb-serial/devices", adapter, "latency_timer")
+from hal.wire import Framer, checksum, read_available, wait_readable
 
 
 class SerialDevice(Device):
@@ -123,27 +29,44 @@ class SerialDevice(Device):
 
     def __init__(self, binding: Binding) -> None:
         super().__init__(binding)
-        self._port: serial.Serial | None = None
+        self._port: Any = None  # serial.Serial, or a socket
+        self._line: SharedLine | None = None
         self._fd = -1
         spec = binding.profile.bus_spec
         self._framer: Framer | None = None
-        self._lines = LineReader()
         self._due_s, self._waited = 0.0, False
         self._unread, self._why = 0, ""  # lines since the last reading, and why the last of them gave none
         if isinstance(spec, BinaryFrame):
             self._framer = Framer(spec)
-            names = [n for n, _ in spec.fields]
-            self._index = array("i", [names.index(typed(b.channel.source, str)) for b in binding.bounds])
-            self._flags = names.index(spec.invalid[0]) if spec.invalid else -1
-            self._bad_flags: int = spec.invalid[1] if spec.invalid else 0
+            self._lines = LineReader()
+            names = spec.names
+            sources = [b.channel.source for b in binding.bounds]
+            self._index = array(
+                "i", [-1 if isinstance(s, Assumed) else names.index(typed(s, str)) for s in sources]
+            )
+            self._flags = names.index(spec.invalid.field) if spec.invalid else -1
+            self._flag_mask = spec.invalid.mask if spec.invalid else 0
+            self._flag_good = spec.invalid.value if spec.invalid else 0
+            self._request, self._request_hz, self.answer_s = spec.request, spec.request_hz, spec.answer_s
         else:
-            self._text = typed(spec, TextLine)
-            self._fields = [typed(b.channel.source, TextField) for b in binding.bounds]
+            text = self._text = typed(spec, TextLine)
+            self._lines = LineReader(text.end)
+            self._fields = [
+                (i, typed(b.channel.source, TextField))
+                for i, b in enumerate(binding.bounds)
+                if not isinstance(b.channel.source, Assumed)
+            ]
+            self._request, self._request_hz, self.answer_s = text.request, text.request_hz, text.answer_s
+        self._request = with_address(self._request, binding.address)
 
     def connect(self) -> None:
         """Open the port; frames in its buffer are dropped."""
-        self._port = open_port(self.binding.port, self.binding.profile.line)
-        self._fd = self._port.fileno()
+        port, line = self.binding.port, self.binding.profile.line
+        if self.binding.shared:
+            self._line = join(port, line, self)
+        else:
+            self._port = open_port(port, line)
+            self._fd = self._port.fileno()
         self._lines.reset()
         self._waited, self._unread = False, 0
         if self._framer:
@@ -151,6 +74,9 @@ class SerialDevice(Device):
 
     def disconnect(self) -> None:
         """Close the port."""
+        if self._line is not None:
+            leave(self._line, self)
+            self._line = None
         port, self._port, self._fd = self._port, None, -1
         if port is not None:
             with contextlib.suppress(OSError):
@@ -169,18 +95,53 @@ class SerialDevice(Device):
         return True
 
     def read(self, sample: Sample, now_s: float) -> None:
-        """Put the newest frame or line into `sample`."""
+        """Ask when it is time to, and put the newest frame or line into `sample`."""
         framer = self._framer
+        if self._line is not None:
+            self._line.serve(now_s)
+            if framer is None:
+                self._take_lines(sample, self._line.received(self), now_s)
+            elif framer.feed(self._line.received(self)):
+                self._take_frame(sample, framer, now_s)
+            return
+        if self._request_hz and now_s >= self._due_s:
+            self._due_s = now_s + 1.0 / self._request_hz
+            self.ask(self._fd)
         if framer is None:
             self._take_lines(sample, read_available(self._fd), now_s)
         elif framer.read(self._fd) or self._waited:
             self._waited = False
-            flags = framer.whole(self._flags) & self._bad_flags if self._flags >= 0 else 0
-            if flags:
-                self.fail_all(sample, f"reports an error (status 0x{flags:X}): check the sensor")
-            else:
-                for i in range(len(self._index)):
-                    self.put(sample, i, framer.number(self._index[i]), now_s)
+            self._take_frame(sample, framer, now_s)
+
+    def request_due_s(self, now_s: float) -> float:
+        """Return when this device of a shared line is to be asked, in seconds of `now_s`."""
+        return self._due_s
+
+    def ask(self, fd: int) -> None:
+        """Send the request. A half answer to the one before is dropped."""
+        if self._framer is not None:
+            self._framer.drop()
+        with contextlib.suppress(BlockingIOError):  # the line is full: ask again at the next due time
+            os.write(fd, self._request)
+
+    def asked(self, now_s: float) -> None:
+        """Note that a shared line has asked this device."""
+        self._due_s = now_s + 1.0 / self._request_hz
+
+    def answers(self) -> int:
+        """Count the answers so far, good and bad ones."""
+        if self._framer is not None:
+            return self._framer.frames + self._framer.others
+        return self.counts["frames"] + self.counts["errors"]
+
+    def _take_frame(self, sample: Sample, framer: Framer, now_s: float) -> None:
+        flags = framer.whole(self._flags) & self._flag_mask if self._flags >= 0 else self._flag_good
+        if flags != self._flag_good:
+            self.fail_all(sample, f"reports an error (status 0x{flags:X}): check the sensor")
+            return
+        for i in range(len(self._index)):
+            if self._index[i] >= 0:
+                self.put(sample, i, framer.number(self._index[i]), now_s)
 
     def counters(self) -> dict[str, int]:
         """Return frames, errors (bad frames), lost (gaps of the sequence), reconnections."""
@@ -196,30 +157,30 @@ class SerialDevice(Device):
             if self._unread:
                 return f"{self._unread} lines gave no reading; {self._why}"
             if self._lines.pending:
-                return f"{self._lines.pending} bytes came and no line end (CR or LF): check baud {baud} and parity"
+                end = "'end' of the profile" if self._text.end else "CR or LF"
+                return (
+                    f"{self._lines.pending} bytes came and no line end ({end}): check baud {baud} and parity"
+                )
             return super().silence()
+        if framer.others and not framer.frames:
+            return f"{framer.others} frames came with another number in a field that says 'equals': check 'equals'"
         if not framer.quiet_bytes:
             return super().silence()
         came = f"{framer.quiet_bytes} bytes came"
         if framer.quiet_sums > framer.quiet_lengths:
             return (
                 f"{came}, {framer.quiet_sums} frames with a wrong CRC: "
-                f"check 'crc', 'crc_endian', 'fields', baud {baud}"
+                f"check 'crc', 'crc_endian', 'crc_over', 'fields', baud {baud}"
             )
         if framer.quiet_lengths:
             return (
-                f"{came}, {framer.quiet_lengths} frames with another length byte than {framer.spec.payload.size}: "
+                f"{came}, {framer.quiet_lengths} frames with another length byte than {framer.spec.payload_size}: "
                 f"check 'length', 'fields' and baud {baud}"
             )
         sync = framer.spec.sync.hex(" ")
         return f"{came} without a whole frame that begins with {sync}: check 'sync' and baud {baud}"
 
     def _take_lines(self, sample: Sample, data: bytes, now_s: float) -> None:
-        spec = self._text
-        if spec.request and now_s >= self._due_s:
-            self._due_s = now_s + 1.0 / spec.request_hz
-            with contextlib.suppress(BlockingIOError):  # the line is full: ask again at the next due time
-                os.write(self._fd, spec.request)
         for raw in self._lines.feed(data) if data else ():
             line = raw.decode("ascii", "replace")
             problem = self._take_line(sample, line, now_s)
@@ -235,23 +196,58 @@ class SerialDevice(Device):
 
         A line with one number that cannot be read gives no reading at all."""
         spec = self._text
+        if spec.checksum is not None and (problem := wrong_checksum(line, *spec.checksum)):
+            return problem
         match = spec.pattern.match(line)
         if match is None:
             return why_no_match(line, spec.pattern)
         values: list[tuple[int, float]] = []
-        for i, field in enumerate(self._fields):
-            text = match[field.group]
-            if text is None:  # a reading of another kind of line
+        for i, field in self._fields:
+            if match[field.group] is None:  # a reading of another kind of line
                 continue
-            value = number(text, field.base, spec.decimal)
-            if value is None:
-                return why_no_number(text, line, field.base, spec.decimal)
-            if cut_short(line, match, field.group):
-                return (
-                    f"received {shown(line)}: the number goes on behind {shown(text)}, where the pattern ends: "
-                    "end it with $"
-                )
+            value = _value(line, match, field, spec.decimal)
+            if isinstance(value, str):
+                return value
             values.append((i, value))
         for i, value in values:
             self.put(sample, i, value, now_s)
         return ""
+
+
+def _value(line: str, match: re.Match[str], field: TextField, decimal: str) -> float | str:
+    """Return the number that a field of a line gives, or the reason why it gives none."""
+    text = match[field.group]
+    value = number(text, field.base, decimal)
+    if value is None:
+        return why_no_number(text, line, field.base, decimal)
+    if cut_short(line, match, field.group):
+        return (
+            f"received {shown(line)}: the number goes on behind {shown(text)}, where the pattern ends: "
+            "end it with $"
+        )
+    if field.sign and (match[field.sign] or "").strip() == "-":
+        value = -value
+    if field.unit_field:
+        unit = (match[field.unit_field] or "").strip()
+        if unit not in field.unit_factors:
+            known = ", ".join(field.unit_factors)
+            return f"received {shown(line)}: unit '{unit}' is none of 'unit_factors' ({known})"
+        value *= field.unit_factors[unit]
+    return value
+
+
+def wrong_checksum(line: str, name: str, pattern: re.Pattern[str]) -> str:
+    """Return '' when the checksum of a line of text is right, else the reason."""
+    match = pattern.match(line)
+    if match is None:
+        return f"received {shown(line)}: no checksum where 'checksum' expects it ({pattern.pattern})"
+    wanted = checksum(name, match["data"].encode("ascii", "replace"))
+    try:
+        found = int(match["sum"], 16)
+    except ValueError:
+        found = -1
+    return (
+        ""
+        if found == wanted
+        else f"received {shown(line)}: checksum {match['sum']}, {wanted:02X} was expected"
+    )

@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample
+from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, STALE, Sample
+from thermoctl.channels import AT, DEFAULT, Channels
 from thermoctl.plant import load
 from thermoctl.plant.language import SensorNoise
 from thermoctl.plant.sensor import SlowError
@@ -30,7 +31,7 @@ from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 MAX_CATCH_UP = 1000  # periods in one read; when the clock jumps further (suspend), the plant skips that time
 SLOWEST_S = 3600.0  # longest time constant of a simulated 1/f error; slower parts count as offset
-_STATE = ROLE["amplifier_state"]
+_STATE, _FAULT = AT["amplifier_state"], AT["amplifier_fault"]
 EVERY_PERIOD = ("position_um", "output_reference_um", "voltage_v", "current_a")
 
 
@@ -80,6 +81,7 @@ class PlantRig:
         surroundings: Mapping[str, Surrounding],
         roles: Mapping[str, str],
         seed: int,
+        channels: Channels = DEFAULT,
     ) -> None:
         """Compile the plant and connect its inputs and outputs. Raises InputError when they do not fit.
 
@@ -109,7 +111,9 @@ class PlantRig:
         self.stepper = model.stepper(period_s, self.u)
         self._draw = _draws(np.random.default_rng(seed)).__next__
         self.y = self.stepper.step(self.u)
-        self.index = _roles_of_outputs(path, model.outputs, roles)  # after the outputs come the surroundings
+        self.index = _roles_of_outputs(
+            path, model.outputs, roles, channels.names
+        )  # after the outputs come the surroundings
         outputs = [plant.outputs[n] for n in model.outputs]
         self._noise = [o.noise.white if isinstance(o.noise, SensorNoise) else o.noise or 0.0 for o in outputs]
         self._noise += [s.noise for _, s in self._surroundings]
@@ -122,7 +126,7 @@ class PlantRig:
             s.resolution for _, s in self._surroundings
         ]
         for k, name in enumerate(surroundings):
-            role = next((r for r in (name, plant.inputs[name].column) if r in ROLES), "")
+            role = next((r for r in (name, plant.inputs[name].column) if r in channels.names), "")
             if role and role not in self.index:
                 self.index[role] = len(outputs) + k
 
@@ -159,15 +163,17 @@ class PlantRig:
         return round(value / step) * step if step else value
 
 
-def _roles_of_outputs(path: str | Path, outputs: Sequence[str], roles: Mapping[str, str]) -> dict[str, int]:
+def _roles_of_outputs(
+    path: str | Path, outputs: Sequence[str], roles: Mapping[str, str], known: Sequence[str]
+) -> dict[str, int]:
     """Return role -> number of the plant's output. Raises InputError."""
     index = {}
     for i, name in enumerate(outputs):
         role = roles.get(name, name)
-        if role in ROLES:
+        if role in known:
             index[role] = i
         elif name in roles:
-            raise InputError(f"{path}: hal.roles: '{role}' is no role{suggest(role, ROLES)}")
+            raise InputError(f"{path}: hal.roles: '{role}' is no role{suggest(role, known)}")
     for name in roles:
         if name not in outputs:
             raise InputError(f"{path}: hal.roles: the plant has no output '{name}'{suggest(name, outputs)}")
@@ -194,32 +200,38 @@ def make_rig(settings: Settings) -> PlantRig:
         surroundings(hal.inputs),
         hal.roles,
         hal.seed,
+        settings.channels,
     )
 
 
 def simulated_backend(settings: Settings) -> SimulatedBackend:
     """Make the back end `simulated`. Raises InputError."""
-    return SimulatedBackend(make_rig(settings), settings.loop.period_s, settings.hal.sensor_period_s)
+    return SimulatedBackend(
+        make_rig(settings), settings.loop.period_s, settings.hal.sensor_period_s, settings.channels
+    )
 
 
 class SimulatedBackend:
     """`hal.backend.Backend` over a PlantRig."""
 
-    def __init__(self, rig: PlantRig, period_s: float, sensor_period_s: float) -> None:
+    def __init__(
+        self, rig: PlantRig, period_s: float, sensor_period_s: float, channels: Channels = DEFAULT
+    ) -> None:
         self.rig, self.period_s = rig, period_s
-        self.sample = Sample()
+        self.roles = channels.index
+        self.sample = Sample(len(channels.names))
         self._every = max(1, round(sensor_period_s / period_s))
-        self._fast = [(ROLE[r], i) for r, i in rig.index.items() if r in EVERY_PERIOD]
-        self._slow = [(ROLE[r], i) for r, i in rig.index.items() if r not in EVERY_PERIOD]
-        self._fast_roles = np.array([role for role, _ in self._fast] + [_STATE, ROLE["amplifier_fault"]])
+        self._fast = [(self.roles[r], i) for r, i in rig.index.items() if r in EVERY_PERIOD]
+        self._slow = [(self.roles[r], i) for r, i in rig.index.items() if r not in EVERY_PERIOD]
+        self._fast_roles = np.array([role for role, _ in self._fast] + [_STATE, _FAULT])
         self._slow_roles = np.array([role for role, _ in self._slow], dtype=int)
-        self.sample.value[ROLE["amplifier_fault"]] = 0.0
+        self.sample.value[_FAULT] = 0.0
         self._steps, self._start_s, self._drive, self._enabled = 0, math.nan, 0.0, False
         self._shown = -1
 
     def open(self) -> None:
         """Mark all channels as stale until the first read."""
-        self.sample.status[list(ROLE[r] for r in self.rig.index)] = STALE
+        self.sample.status[list(self.roles[r] for r in self.rig.index)] = STALE
 
     def read(self, now_s: float) -> Sample:
         """Advance the plant to `now_s` with the last command held, then read the sensors that are due."""
@@ -263,7 +275,7 @@ class SimulatedBackend:
 
     def problem(self, role: str) -> str:
         """Say why a simulated channel is not OK."""
-        status = self.sample.status[ROLE[role]]
+        status = self.sample.status[self.roles[role]]
         if status == OK:
             return ""
         problem = "the plant's output is not finite" if status == ERROR else "not an output of the plant"

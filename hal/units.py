@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
-    "um": {"um": (1, 0), "nm": (1e-3, 0), "mm": (1e3, 0), "m": (1e6, 0)},
+    "um": {"um": (1, 0), "nm": (1e-3, 0), "mm": (1e3, 0), "m": (1e6, 0), "in": (25400, 0)},
+    "deg": {"deg": (1, 0), "arcsec": (1 / 3600, 0), "rad": (180 / math.pi, 0), "mrad": (0.18 / math.pi, 0)},
     "v": {"V": (1, 0), "mV": (1e-3, 0)},
     "a": {"A": (1, 0), "mA": (1e-3, 0)},
-    "c": {"degC": (1, 0), "K": (1, -273.15)},
+    "c": {"degC": (1, 0), "K": (1, -273.15), "degF": (5 / 9, -160 / 9)},
     "": {"1": (1, 0)},
 }
 """Suffix of the role's name -> {unit: (factor, offset)}."""

@@ -11,24 +11,44 @@ cdef enum:
     MAX_PENDING = 4096  # unsent bytes of a line that takes none; with more, it counts as lost
     EXTENDED_FLAG = 1 << 31      # of a can_id: 29 bits (as in the kernel's struct can_frame)
 
+cdef struct FieldPlace:
+    int kind, at, size, big          # kind: place in _KINDS; bytes of the payload
+    int low, bits, signed            # of a bit field; bits 0: all
+    int sign                         # field with the sign, -1 for none
+    uint64_t sign_mask, minus
+
+cdef class Checksum:
+    cdef readonly int width, size
+    cdef int _kind
+    cdef bint _reflected, _negated
+    cdef uint64_t _mask, _init, _xor_out
+    cdef uint64_t[256] _table
+
+    cdef uint64_t over(self, const uint8_t *data, int size) noexcept nogil
+
 cdef class Framer:
     cdef readonly object spec
-    cdef readonly long frames, bad, skipped, lost, quiet_bytes, quiet_sums, quiet_lengths
+    cdef readonly long frames, bad, skipped, lost, others, quiet_bytes, quiet_sums, quiet_lengths
     cdef readonly int size
-    cdef object _payload
+    cdef Checksum _checksum
     cdef uint8_t[MAX_READ + MAX_FRAME] _buffer
     cdef uint8_t[MAX_FRAME] _newest
-    cdef uint8_t[8] _sync
-    cdef int _length, _sync_size, _head, _payload_size, _has_length, _crc_kind, _crc_size, _crc_big, _big, _sequence, _known
-    cdef int[MAX_FIELDS] _offset
-    cdef char[MAX_FIELDS] _type
+    cdef uint8_t[8] _sync, _tail
+    cdef int _length, _sync_size, _tail_size, _head, _payload_size, _has_length, _crc_size, _crc_from, _crc_big
+    cdef int _sequence, _known, _constants
+    cdef int[MAX_FIELDS] _constant_field
+    cdef double[MAX_FIELDS] _constant
+    cdef FieldPlace[MAX_FIELDS] _field
     cdef uint64_t _modulus_mask
 
     cpdef int read(self, int fd) except -1
+    cdef bint _is_whole(self, const uint8_t *frame) noexcept
     cdef int _scan(self) noexcept
-    cdef uint64_t _bits(self, int field, int size) noexcept
+    cdef uint64_t _raw(self, const uint8_t *payload, int field) noexcept
     cpdef uint64_t whole(self, int field) noexcept
     cpdef double number(self, int field) noexcept
+    cdef double _number_in(self, const uint8_t *payload, int field) noexcept
+    cpdef void drop(self) noexcept
 
 cpdef bint wait_readable(int fd, int64_t until_ns) except -1
 

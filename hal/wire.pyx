@@ -5,7 +5,7 @@ Compiled, because interpreted code is slow in a tick: it runs once a period, wit
 
 A binary frame on the wire:
 
-    sync (1..8 bytes) | length (uint8, optional) | payload | CRC-16 over all that follows sync (optional)
+    sync (0..8 bytes) | length (uint8, optional) | payload | checksum (optional) | tail (0..8 bytes)
 
 Framing resynchronises after garbage: a frame whose length or CRC is wrong is dropped by its first byte only.
 The search continues at the next byte, so a true frame behind a false sync is never lost. Nothing here waits.
@@ -16,13 +16,13 @@ import os
 import struct
 
 from libc.errno cimport EAGAIN, EINTR, errno as c_errno
-from libc.math cimport llrint
-from libc.stdint cimport int8_t, int16_t, int32_t
+from libc.math cimport NAN, llrint
 from libc.string cimport memcmp, memcpy, memmove
 from posix.time cimport CLOCK_MONOTONIC, clock_gettime, timespec
 from posix.unistd cimport read as c_read, write as c_write
 
-from hal.profile import CRCS, FIELD_TYPES
+from hal.checksum import algorithm
+from hal.profile import FRAME_TYPES
 
 EXTENDED = 0x80000000
 """Bit 31 of an identifier: it has 29 bits. An 11-bit identifier of the same number is another one."""
@@ -38,41 +38,67 @@ cdef extern from "<poll.h>" nogil:
     int POLLIN
     int ppoll(pollfd *what, unsigned long count, const timespec *timeout, const void *mask)
 
-cdef uint16_t[256] _CCITT, _MODBUS
+cdef class Checksum:
+    """A checksum of hal.checksum by its name. Raises ValueError for an unknown one."""
+
+    def __init__(self, str name):
+        cdef int byte, k
+        cdef uint64_t crc, top
+        found = algorithm(name)
+        if found is None:
+            raise ValueError(f"checksum '{name}' is unknown")
+        self._kind = ("none", "sum", "xor", "crc").index(found.kind)
+        self.width, self.size = found.width, found.width // 8
+        self._mask = <uint64_t>((1 << found.width) - 1)
+        self._init, self._xor_out = found.init & self._mask, found.xor_out
+        self._reflected, self._negated = found.reflected, found.negated
+        poly = int(f"{found.poly:0{found.width}b}"[::-1], 2) if found.reflected and found.width else found.poly
+        if found.kind == "crc":
+            if found.reflected:
+                self._init = int(f"{found.init:0{found.width}b}"[::-1], 2)
+            top = (<uint64_t>1) << (self.width - 1)
+            for byte in range(256):
+                crc = byte if found.reflected else <uint64_t>byte << (self.width - 8)
+                for k in range(8):
+                    if found.reflected:
+                        crc = crc >> 1 ^ <uint64_t>poly if crc & 1 else crc >> 1
+                    else:
+                        crc = (crc << 1 ^ <uint64_t>poly if crc & top else crc << 1) & self._mask
+                self._table[byte] = crc
+
+    cdef uint64_t over(self, const uint8_t *data, int size) noexcept nogil:
+        cdef uint64_t crc = self._init
+        cdef int i
+        if self._kind == 1:
+            for i in range(size):
+                crc += data[i]
+            if self._negated:
+                crc = 0 - crc
+        elif self._kind == 2:
+            for i in range(size):
+                crc ^= data[i]
+        elif self._reflected:
+            for i in range(size):
+                crc = crc >> 8 ^ self._table[(crc ^ data[i]) & 0xFF]
+        elif self._kind == 3:
+            for i in range(size):
+                crc = crc << 8 ^ self._table[(crc >> (self.width - 8) ^ data[i]) & 0xFF]
+        return (crc ^ self._xor_out) & self._mask
+
+    def of(self, const uint8_t[::1] data) -> int:
+        """Return the checksum of `data`."""
+        return self.over(&data[0] if data.shape[0] else NULL, <int>data.shape[0])
 
 
-cdef void _fill_tables() noexcept:
-    cdef int byte, k
-    cdef uint16_t crc
-    for byte in range(256):
-        crc = <uint16_t>(byte << 8)
-        for k in range(8):
-            crc = <uint16_t>((crc << 1) ^ 0x1021) if crc & 0x8000 else <uint16_t>(crc << 1)
-        _CCITT[byte] = crc
-        crc = <uint16_t>byte
-        for k in range(8):
-            crc = (crc >> 1) ^ 0xA001 if crc & 1 else crc >> 1
-        _MODBUS[byte] = crc
+cdef dict _CHECKSUMS = {}
 
 
-_fill_tables()
-
-
-cdef uint16_t _crc16(int kind, const uint8_t *data, int size) noexcept nogil:
-    cdef uint16_t crc = 0 if kind == 1 else 0xFFFF
-    cdef int i
-    if kind == 2:
-        for i in range(size):
-            crc = (crc >> 8) ^ _MODBUS[(crc ^ data[i]) & 0xFF]
-    else:
-        for i in range(size):
-            crc = <uint16_t>(crc << 8) ^ _CCITT[(crc >> 8) ^ data[i]]
-    return crc
-
-
-def crc16(str kind, const uint8_t[::1] data) -> int:
-    """CRC-16 of `data`. Check values of b'123456789': ccitt-false 0x29B1, xmodem 0x31C3, modbus 0x4B37."""
-    return _crc16(CRCS.index(kind), &data[0] if data.shape[0] else NULL, <int>data.shape[0])
+def checksum(str name, data) -> int:
+    """Return the checksum of `data` by its name. Raises ValueError for an unknown name."""
+    found = _CHECKSUMS.get(name)
+    if found is None:
+        found = _CHECKSUMS[name] = Checksum(name)
+    return found.of(data)
 
 
 cpdef bint wait_readable(int fd, int64_t until_ns) except -1:
@@ -119,36 +145,57 @@ def read_available(int fd) -> bytes:
     return data[:got]
 
 
+cdef uint64_t NOT_A_NUMBER = ~(<uint64_t>0)
+
+
 cdef class Framer:
-    """Find frames in a stream of bytes. `newest` is the payload of the last good frame, () before the first.
+    """Find frames in a stream of bytes; `newest` holds the fields of the last good one, () before it.
 
-    Counters: `frames`; `bad` (wrong length or CRC); `skipped` (bytes outside frames); `lost` (gaps of the
-    sequence counter). The `quiet_` counters restart at every good frame: bytes received, wrong CRCs (`sums`)
-    and wrong length bytes since then.
+    Counters: `frames`; `bad` (wrong length, checksum or tail); `skipped` (bytes outside frames); `lost` (gaps
+    of the sequence counter). `others` counts good frames in which a constant field has another number. The
+    `quiet_` counters restart at every good frame: bytes received, wrong checksums (`sums`) and wrong length
+    bytes since then.
 
-    spec: hal.profile.BinaryFrame.
+    spec: hal.profile.BinaryFrame. Raises ValueError for a frame that is too long.
     """
 
     def __init__(self, spec):
-        self.spec, self._payload = spec, spec.payload
-        self._sync_size, self._has_length = len(spec.sync), spec.has_length
+        self.spec = spec
+        self._sync_size, self._has_length, self._tail_size = len(spec.sync), spec.has_length, len(spec.tail)
         memcpy(self._sync, <const char *><bytes>spec.sync, self._sync_size)
+        memcpy(self._tail, <const char *><bytes>spec.tail, self._tail_size)
         self._head = self._sync_size + self._has_length
-        self._payload_size = self._payload.size
-        self._crc_size = 0 if spec.crc == "none" else 2
-        self.size = self._head + self._payload_size + self._crc_size
-        if self.size > MAX_FRAME or len(spec.fields) > MAX_FIELDS:
-            raise ValueError(f"a frame of {self.size} bytes and {len(spec.fields)} fields; at most {MAX_FRAME} and {MAX_FIELDS}")
-        self._crc_kind, self._crc_big = CRCS.index(spec.crc), spec.crc_endian == ">"
-        self._big = spec.endian == ">"
-        names = [n for n, _ in spec.fields]
+        self._payload_size = spec.payload_size
+        self._checksum = Checksum(spec.crc)
+        self._crc_size = self._checksum.size
+        self._crc_from = {"frame": 0, "after-sync": self._sync_size, "payload": self._head}[spec.crc_over]
+        self.size = self._head + self._payload_size + self._crc_size + self._tail_size
+        names = spec.names
+        if self.size > MAX_FRAME or len(names) > MAX_FIELDS:
+            raise ValueError(f"a frame of {self.size} bytes and {len(names)} fields; at most {MAX_FRAME} and {MAX_FIELDS}")
+        self._crc_big = spec.crc_endian == ">"
         at = 0
-        for i, (_, kind) in enumerate(spec.fields):
-            self._type[i], self._offset[i] = ord(FIELD_TYPES[kind]), at
-            at += struct.calcsize(FIELD_TYPES[kind])
+        for i, (name, kind) in enumerate(spec.fields):
+            what, size = FRAME_TYPES[kind]
+            self._field[i] = FieldPlace(
+                _KINDS.index(what), at, size, (spec.endian == ">") != (name in spec.other_endian), 0, 0, 0, -1, 0, 0)
+            at += size
+        for i, b in enumerate(spec.bits, len(spec.fields)):
+            self._field[i] = self._field[names.index(b.of)]
+            self._field[i].low, self._field[i].bits, self._field[i].signed = b.low, b.count, b.signed
+        for name, test in spec.signs.items():
+            i = names.index(name)
+            self._field[i].sign, self._field[i].sign_mask = names.index(test.field), test.mask
+            self._field[i].minus = test.value
+        self._constants = 0
+        for name, value in spec.constants.items():
+            self._constant_field[self._constants], self._constant[self._constants] = names.index(name), value
+            self._constants += 1
         self._sequence = names.index(spec.sequence) if spec.sequence else -1
-        bits = 8 * struct.calcsize(FIELD_TYPES[spec.fields[self._sequence][1]]) if spec.sequence else 64
-        self._modulus_mask = <uint64_t>((1 << bits) - 1)
+        self._modulus_mask = ~(<uint64_t>0)
+        if self._sequence >= 0:
+            bits = self._field[self._sequence].bits or 8 * self._field[self._sequence].size
+            self._modulus_mask = <uint64_t>((1 << bits) - 1)
 
     @property
     def modulus(self) -> int:
@@ -157,7 +204,16 @@ cdef class Framer:
 
     @property
     def newest(self) -> tuple:
-        return self._payload.unpack(bytes(self._newest[:self._payload_size])) if self._known else ()
+        if not self._known:
+            return ()
+        found = []
+        for i, (_, kind) in enumerate(self.spec.fields):
+            what, size = FRAME_TYPES[kind]
+            bits = self.whole(i)
+            if what == "int" and bits >> (8 * size - 1):
+                bits -= 1 << 8 * size
+            found.append(self.number(i) if what == "float" or self._field[i].sign >= 0 else bits)
+        return tuple(found)
 
     @property
     def pending(self) -> int:
@@ -165,11 +221,14 @@ cdef class Framer:
         return self._length
 
     def encode(self, *values) -> bytes:
-        """Return a frame with these field values."""
-        body = (bytes([self._payload_size]) if self._has_length else b"") + self._payload.pack(*values)
-        if not self._crc_size:
-            return self.spec.sync + body
-        return self.spec.sync + body + crc16(self.spec.crc, body).to_bytes(2, "big" if self._crc_big else "little")
+        """Return a frame with these field values, one for each field (bit fields are part of theirs)."""
+        payload = b""
+        for value, (name, kind) in zip(values, self.spec.fields, strict=True):
+            other = name in self.spec.other_endian
+            payload += _packed(value, kind, (self.spec.endian == ">") != other)
+        body = self.spec.sync + (bytes([self._payload_size]) if self._has_length else b"") + payload
+        order = "big" if self._crc_big else "little"
+        return body + self._checksum.of(body[self._crc_from:]).to_bytes(self._crc_size, order) + self.spec.tail
 
     def feed(self, const uint8_t[::1] data) -> int:
         """Take bytes; return the number of good frames that they completed."""
@@ -193,10 +252,19 @@ cdef class Framer:
         self.quiet_bytes += got
         return self._scan()
 
+    cdef bint _is_whole(self, const uint8_t *frame) noexcept:
+        """Whether the checksum and the tail of a frame are right."""
+        cdef int i, at = self._head + self._payload_size
+        cdef uint64_t found = 0
+        if memcmp(frame + at + self._crc_size, self._tail, self._tail_size) != 0:
+            return False
+        for i in range(self._crc_size):
+            found = found << 8 | frame[at + (i if self._crc_big else self._crc_size - 1 - i)]
+        return self._crc_size == 0 or self._checksum.over(frame + self._crc_from, at - self._crc_from) == found
+
     cdef int _scan(self) noexcept:
         cdef uint8_t *buffer = self._buffer
-        cdef int at = 0, start, end, n = self._length, good = 0, found, whole_length
-        cdef uint16_t crc
+        cdef int at = 0, start, end, n = self._length, good = 0, found, whole_length, k
         cdef uint64_t before
         while at < n:
             start = at
@@ -215,10 +283,7 @@ cdef class Framer:
                 if n - at < self.size:
                     break
                 end = at + self.size
-                if self._crc_size:
-                    crc = (<uint16_t>(buffer[end - 2] << 8) | buffer[end - 1] if self._crc_big
-                           else <uint16_t>(buffer[end - 1] << 8) | buffer[end - 2])
-                    found = _crc16(self._crc_kind, buffer + at + self._sync_size, self.size - self._sync_size - 2) == crc
+                found = self._is_whole(buffer + at)
             if not found:
                 self.bad += 1
                 self.quiet_lengths += not whole_length
@@ -226,62 +291,107 @@ cdef class Framer:
                 self.skipped += 1
                 at += 1
                 continue
-            if self._sequence >= 0:
-                before = self.whole(self._sequence)
-                memcpy(self._newest, buffer + at + self._head, self._payload_size)
-                if self._known:
-                    self.lost += <long>((self.whole(self._sequence) - before - 1) & self._modulus_mask)
+            for k in range(self._constants):
+                if self._number_in(buffer + at + self._head, self._constant_field[k]) != self._constant[k]:
+                    break
             else:
+                before = self.whole(self._sequence) if self._sequence >= 0 else 0
                 memcpy(self._newest, buffer + at + self._head, self._payload_size)
-            self._known = 1
-            self.quiet_bytes = self.quiet_sums = self.quiet_lengths = 0
-            good += 1
+                if self._sequence >= 0 and self._known:
+                    self.lost += <long>((self.whole(self._sequence) - before - 1) & self._modulus_mask)
+                self._known = 1
+                self.quiet_bytes = self.quiet_sums = self.quiet_lengths = 0
+                good += 1
+                at = end
+                continue
+            self.others += 1
             at = end
         memmove(buffer, buffer + at, n - at)
         self._length = n - at
         self.frames += good
         return good
 
-    cdef uint64_t _bits(self, int field, int size) noexcept:
+    cdef uint64_t _raw(self, const uint8_t *payload, int field) noexcept:
+        """The whole number in a field; for digits and BCD the number that they spell, or NOT_A_NUMBER."""
+        cdef FieldPlace *f = &self._field[field]
+        cdef const uint8_t *p = payload + f.at
         cdef uint64_t value = 0
-        cdef const uint8_t *p = self._newest + self._offset[field]
-        cdef int i
-        for i in range(size):
-            value = value << 8 | p[i if self._big else size - 1 - i]
+        cdef int i, digit, byte, ten = 16 if f.kind == 4 else 10
+        for i in range(f.size):
+            byte = p[i if f.big or f.kind > 3 else f.size - 1 - i]
+            if f.kind == 3:                                  # BCD
+                if byte >> 4 > 9 or byte & 15 > 9:
+                    return NOT_A_NUMBER
+                value = value * 100 + (byte >> 4) * 10 + (byte & 15)
+            elif f.kind > 3:                                 # hexadecimal, decimal characters
+                digit = _nibble(<uint8_t>byte)
+                if byte == 32 and value == 0:
+                    digit = 0
+                if not 0 <= digit < ten:
+                    return NOT_A_NUMBER
+                value = value * ten + digit
+            else:
+                value = value << 8 | <uint64_t>byte
+        if f.bits:
+            value = value >> f.low
+            if f.bits < 64:
+                value &= ((<uint64_t>1) << f.bits) - 1
         return value
 
     cpdef uint64_t whole(self, int field) noexcept:
         """Return the bits of a field of the newest frame (sequence counters, status flags)."""
-        cdef char t = self._type[field]
-        return self._bits(field, 1 if t in (b'b', b'B') else 2 if t in (b'h', b'H') else 4 if t in (b'i', b'I', b'f') else 8)
+        return self._raw(self._newest, field)
 
     cpdef double number(self, int field) noexcept:
-        """Return a field of the newest frame as a number."""
-        cdef uint64_t bits = self.whole(field)
+        """Return a field of the newest frame as a number, NaN where its characters are no number."""
+        return self._number_in(self._newest, field)
+
+    cdef double _number_in(self, const uint8_t *payload, int field) noexcept:
+        cdef FieldPlace *f = &self._field[field]
+        cdef uint64_t bits = self._raw(payload, field)
         cdef uint32_t half = <uint32_t>bits
+        cdef int width = f.bits if f.bits else 8 * f.size
         cdef float single
-        cdef double double_
-        cdef char t = self._type[field]
-        if t == b'i':
-            return <int32_t>half
-        if t == b'h':
-            return <int16_t>half
-        if t == b'b':
-            return <int8_t>half
-        if t == b'q':
-            return <double><int64_t>bits
-        if t == b'f':
-            memcpy(&single, &half, 4)
-            return single
-        if t == b'd':
-            memcpy(&double_, &bits, 8)
-            return double_
-        return <double>bits
+        cdef double value
+        if f.kind > 2 and bits == NOT_A_NUMBER:
+            return NAN
+        if f.kind == 2 and f.bits == 0:
+            if f.size == 4:
+                memcpy(&single, &half, 4)
+                value = single
+            else:
+                memcpy(&value, &bits, 8)
+        elif f.signed if f.bits else f.kind == 1:
+            value = <double>(<int64_t>(bits << (64 - width)) >> (64 - width))
+        else:
+            value = <double>bits
+        if f.sign >= 0 and self._raw(payload, f.sign) & f.sign_mask == f.minus:
+            value = -value
+        return value
 
     def reset(self) -> None:
         """Drop an incomplete frame and the sequence (after a reconnection)."""
         self._length = self._known = 0
         self.quiet_bytes = self.quiet_sums = self.quiet_lengths = 0
+
+    cpdef void drop(self) noexcept:
+        """Drop an incomplete frame (before a new request)."""
+        self._length = 0
+
+
+cdef tuple _KINDS = ("uint", "int", "float", "bcd", "hex", "digits", "skip")
+
+
+def _packed(value, str kind, bint big) -> bytes:
+    """Return a number as the bytes of a frame's field."""
+    what, size = FRAME_TYPES[kind]
+    if what == "float":
+        return struct.pack((">" if big else "<") + ("f" if size == 4 else "d"), value)
+    if what in ("hex", "digits"):
+        return (f"{int(value):0{size}X}" if what == "hex" else f"{int(value):0{size}d}").encode()
+    if what == "bcd":
+        value = int(str(int(value)), 16)
+    return int(value).to_bytes(size, "big" if big else "little", signed=what == "int")
 
 
 cdef int _nibble(uint8_t c) noexcept nogil:
@@ -464,6 +574,10 @@ cdef class CanPort:
     cpdef uint64_t data(self, int k) noexcept:
         """Data of frame k."""
         return self._in[k].data
+
+    def long_frames(self) -> list:
+        """Return the CAN FD frames that have arrived, (id, data), and forget them."""
+        return []
 
     def send(self, *frames) -> None:
         """Send frames (id, data) without waiting. Raises OSError as `flush`."""

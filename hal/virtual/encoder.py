@@ -43,7 +43,7 @@ class EncoderStream(PtyDevice):
             self._sequence = (self._sequence + 1) % self._framer.modulus
             fields[self._spec.sequence] = self._sequence
         if self.invalid and self._spec.invalid:
-            fields[self._spec.invalid[0]] = self._spec.invalid[1]
+            fields[self._spec.invalid.field] = self._spec.invalid.mask & ~self._spec.invalid.value
         data = self._framer.encode(*(fields[n] for n in self._names))
         if self.corrupt:
             data = data[:-3] + bytes((data[-3] ^ 0x10,)) + data[-2:]

@@ -9,15 +9,15 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from hal.profile import FIELD_TYPES, Register
-from hal.wire import crc16
+from hal.profile import REGISTER_TYPES, Register
+from hal.wire import checksum
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
 
 
 def encode(value: float, register: Register) -> list[int]:
     """Return the words of a raw number; whole types are rounded and clipped to their range."""
-    letter = FIELD_TYPES[register.type]
+    letter = REGISTER_TYPES[register.type]
     if letter not in "fd":
         bits = 8 * struct.calcsize(letter)
         low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if letter.islower() else (0, (1 << bits) - 1)
@@ -90,7 +90,7 @@ class ModbusUnit:
         Garbage is skipped byte by byte."""
         out = bytearray()
         while len(buffer) >= 8:
-            if crc16("modbus", bytes(buffer[:6])) != int.from_bytes(buffer[6:8], "little"):
+            if checksum("modbus", bytes(buffer[:6])) != int.from_bytes(buffer[6:8], "little"):
                 del buffer[0]
                 continue
             unit, pdu = buffer[0], bytes(buffer[1:6])
@@ -98,7 +98,7 @@ class ModbusUnit:
             if self.silent or unit != self.unit_id:
                 continue
             body = bytes((unit,)) + self.answer(pdu)
-            crc = crc16("modbus", body) ^ (0x5A5A if self.corrupt else 0)
+            crc = checksum("modbus", body) ^ (0x5A5A if self.corrupt else 0)
             frame = body + crc.to_bytes(2, "little")
             out += frame[: len(frame) // 2] if self.half else frame
         return bytes(out)

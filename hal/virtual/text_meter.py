@@ -6,7 +6,7 @@ import re
 
 from hal.binding import Binding
 from hal.profile import TextField, TextLine, typed
-from hal.serial_port import LineReader
+from hal.serial_line import LineReader
 from hal.simulated import PlantRig
 from hal.virtual.device import PtyDevice
 

@@ -14,6 +14,7 @@ import pytest
 from hal.backend import ROLE, STATUS_NAMES, Sample
 from hal.virtual.rig import VirtualRig
 from thermoctl import yamlfile
+from thermoctl.channels import DEFAULT
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -60,6 +61,7 @@ def make_settings(directory: Path, **hal: object) -> SimpleNamespace:
     return SimpleNamespace(
         path=str(CONFIG / "devices/rig.yaml"),
         loop=SimpleNamespace(period_s=0.001),
+        channels=DEFAULT,
         protection=SimpleNamespace(required=tuple(ROLE)),
         hal=SimpleNamespace(**{**values, **hal}),
     )

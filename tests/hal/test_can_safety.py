@@ -516,6 +516,7 @@ def test_the_amplifier_is_switched_off_although_nothing_else_opens(bus, tmp_path
     from types import SimpleNamespace
 
     from hal.make import disable_amplifier
+    from thermoctl.channels import DEFAULT
 
     drive, m = bus.drive(5), bus.master(5)
     m.backend.open()
@@ -528,7 +529,7 @@ def test_the_amplifier_is_switched_off_although_nothing_else_opens(bus, tmp_path
 - {{name: drive, profile: drive-cia402.yaml, port: '{bus.port}', address: 5, watchdog_s: 5, roles: {{state: amplifier_state}}}}
 """).value
     hal = SimpleNamespace(backend="devices", devices=devices)
-    settings = SimpleNamespace(path=str(CONFIG / "devices/rig.yaml"), hal=hal)
+    settings = SimpleNamespace(path=str(CONFIG / "devices/rig.yaml"), hal=hal, channels=DEFAULT)
     disable_amplifier(settings)
     assert drive.status == 0x40 and drive.command == 0 and (0x6040, 0, 0) in drive.written
     hal.devices = devices[1:2]
@@ -580,7 +581,7 @@ def test_a_device_that_nobody_requires_may_be_absent_at_the_start(tmp_path, bus)
         needed.open()
 
 
-def test_one_port_for_two_devices_is_seen_by_check(tmp_path):
+def test_one_port_for_two_devices_is_shared(tmp_path):
     (tmp_path / "tty").write_text("")
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
     meter = "profile: meter-modbus.yaml, roles: {voltage: voltage_v}"
@@ -589,15 +590,11 @@ def test_one_port_for_two_devices_is_seen_by_check(tmp_path):
         (f"rtu:{tmp_path}/tty", f"rtu:{tmp_path}/tty", True),
         (f"rtu:{tmp_path}/tty", f"rtu:{tmp_path}/by-id", True),
         ("rtu:/dev/a", "rtu:/dev/b", False),
-        ("tcp:127.0.0.1:502", "tcp:127.0.0.1:502", False),
+        ("tcp:127.0.0.1:502", "tcp:127.0.0.1:502", True),
     ):
         two = [
             bind(yamlfile.loads(f"{{name: n{k}, port: '{p}', {rest}}}"), CONFIG / "devices")
             for k, (p, rest) in enumerate(((one, meter), (other, module)))
         ]
-        if shared:
-            with pytest.raises(InputError, match="n1 and n0 .* both open rtu:"):
-                check_rig(two)
-        else:
-            check_rig(two)
+        assert [b.shared for b in check_rig(two)] == [shared, shared]
     assert load_profile(CONFIG / "devices/meter-modbus.yaml")

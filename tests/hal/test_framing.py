@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.profile import BinaryFrame
-from hal.serial_port import MAX_LINE, LineReader, latency_timer_ms, set_latency_timer
-from hal.wire import Framer, crc16
+from hal.serial_line import MAX_LINE, LineReader, latency_timer_ms, set_latency_timer
+from hal.wire import Framer, checksum
 
 SPEC = BinaryFrame(
     b"\xaa\x55", (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8")), sequence="sequence"
@@ -17,13 +17,13 @@ SPEC = BinaryFrame(
 
 @pytest.mark.parametrize("name,check", [("ccitt-false", 0x29B1), ("xmodem", 0x31C3), ("modbus", 0x4B37)])
 def test_crc_check_values(name, check):
-    assert crc16(name, b"123456789") == check
+    assert checksum(name, b"123456789") == check
 
 
 def test_a_frame_is_these_bytes():
     frame = Framer(SPEC).encode(1, -2, 0)
     assert frame[:10] == bytes.fromhex("aa55 07 0100 feffffff 00".replace(" ", ""))
-    assert frame[10:] == crc16("ccitt-false", frame[2:10]).to_bytes(2, "little")
+    assert frame[10:] == checksum("ccitt-false", frame[2:10]).to_bytes(2, "little")
 
 
 def test_a_frame_may_arrive_byte_by_byte():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hal.modbus import decode, plan_blocks
 from hal.profile import Register
 from hal.virtual.modbus import ModbusUnit, encode
-from hal.wire import crc16
+from hal.wire import checksum
 
 
 def register(address, type="int16", kind="input", order="big"):
@@ -17,7 +17,7 @@ def register(address, type="int16", kind="input", order="big"):
 
 
 def rtu(body):
-    return body + crc16("modbus", body).to_bytes(2, "little")
+    return body + checksum("modbus", body).to_bytes(2, "little")
 
 
 def test_read_input_registers_bytes():

@@ -319,7 +319,7 @@ class Polled:
         self.backend = DevicesBackend([], [device], Board.private())
         self.backend.open()
         self.stop = threading.Event()
-        self.thread = threading.Thread(target=poll_until, args=(device, self.backend.board, self.stop))
+        self.thread = threading.Thread(target=poll_until, args=([device], self.backend.board, self.stop))
         self.seen = set()
         self.thread.start()
 

@@ -223,7 +223,7 @@ def test_poller_through_a_board_in_shared_memory(wire):
     attached = Board.attach(board.name)
     stop = threading.Event()
     pollers = [
-        threading.Thread(target=poll_until, args=(d, attached, stop))
+        threading.Thread(target=poll_until, args=([d], attached, stop))
         for d in make_devices(wire.settings)
         if d.slow
     ]
@@ -295,7 +295,7 @@ def test_a_port_that_goes_while_it_is_opened_is_a_hardware_error(monkeypatch):
     import termios
 
     from hal.profile import LineSettings
-    from hal.serial_port import open_port
+    from hal.serial_line import open_port
 
     master, slave = os.openpty()
 

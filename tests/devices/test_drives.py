@@ -1,0 +1,548 @@
+"""Amplifiers that are no CiA-402: commanded by DBC messages, registers, frames, lines; and position mode.
+
+Each drive here has a state machine and a watchdog of its own and its own framing. Shown for each: it follows
+the command only when enabled; a stop by itself is not undone; it is off when we stop, when its link breaks and
+after `switch_off`.
+"""
+
+import math
+import struct
+import threading
+import time
+
+import pytest
+
+from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, ROLE, STALE
+from hal.binding import bind, check_rig, rig_notes
+from hal.make import driver
+from hal.read_profile import load_profile
+from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, Unit, encode
+from tests.devices.harness import HEAD, Rig, wait
+from thermoctl import yamlfile
+from thermoctl.yamlfile import InputError
+
+AXIS_DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: A
+BO_ 1 Heartbeat: 8 A
+ SG_ Error : 0|32@1+ (1,0) [0|0] "" A
+ SG_ State : 32|8@1+ (1,0) [0|0] "" A
+BO_ 7 Set_State: 4 A
+ SG_ Requested : 0|32@1+ (1,0) [0|0] "" A
+BO_ 14 Set_Torque: 4 A
+ SG_ Torque : 0|32@1- (1,0) [0|0] "Nm" A
+BO_ 24 Clear: 1 A
+ SG_ Zero : 0|8@1+ (1,0) [0|0] "" A
+SIG_VALTYPE_ 14 Torque : 1;
+"""
+STATES = "state: {channel: axis, enabled: [8], disabled: [1]}"
+CHANNELS = """channels:
+  axis: {%s, unit: '1', rate_hz: 100, stale_after_s: 0.5}
+  error: {%s, unit: '1', rate_hz: 100, stale_after_s: 0.5}
+"""
+ROLES = "{axis: amplifier_state, error: amplifier_fault}"
+LIMITS = "unit: A, scale: 0.5, limits: [-2, 2]"
+
+
+class Drive:
+    """IDLE 1, CLOSED LOOP 8; back to IDLE when not commanded for 0.6 s. `trip` is a stop by itself."""
+
+    def __init__(self):
+        self.state, self.error, self.torque, self.fed_s, self.mute = 1, 0, 0.0, -math.inf, False
+        self.enabled_count = 0
+        self.lock = threading.Lock()
+
+    def feed(self, torque=None):
+        with self.lock:
+            self.fed_s = time.monotonic()
+            if torque is not None:
+                self.torque = torque
+
+    def request(self, state):
+        self.feed()
+        if state == 8 and not self.error:
+            self.enabled_count += self.state != 8
+            self.state = 8
+        elif state == 1:
+            self.state = 1
+
+    def trip(self, error=0):
+        self.state, self.error = 1, error
+
+    @property
+    def output(self):
+        if time.monotonic() - self.fed_s > 0.6:
+            self.state = 1
+        return self.torque if self.state == 8 else 0.0
+
+
+def dbc(folder):
+    """As ODrive's CANSimple: identifiers are node << 5 | command."""
+    drive = Drive()
+
+    def node(frame):
+        can_id, _, data = frame
+        if can_id >> 5 != 3:
+            return []
+        if can_id & 31 == 7:
+            drive.request(struct.unpack("<I", data)[0])
+        elif can_id & 31 == 14:
+            drive.feed(struct.unpack("<f", data)[0])
+        elif can_id & 31 == 24:
+            drive.error = 0
+        return []
+
+    wire = Port(SlcanAdapter(node).take, folder / "wire")
+    (folder / "axis.dbc").write_text(AXIS_DBC)
+    profile = (
+        f"{HEAD}bus: can-dbc\ndbc: axis.dbc\nnode_shift: 5\n"
+        f"drive: {{{LIMITS}, command_hz: 200, watchdog_s: 0.6, {STATES}, fault: error,\n"
+        "  command: {message: Set_Torque, values: {Torque: command}},\n"
+        "  enable: [{message: Set_State, values: {Requested: 8}}],\n"
+        "  disable: [{message: Set_State, values: {Requested: 1}}], reset: [{message: Clear}]}\n"
+        + CHANNELS
+        % ("message: Heartbeat, signal: State", "message: Heartbeat, signal: Error")
+    )
+
+    def report():
+        wire.send(encode((3 << 5 | 1, False, struct.pack("<IB3x", drive.error, drive.state))))
+
+    return drive, wire, profile, f"slcan:{folder}/wire@500000", report
+
+
+def modbus(folder):
+    """A servo drive: control word in holding 100, command in 101, status in input 10, error in 11."""
+    drive = Drive()
+    unit = Unit({3: {}, 4: {10: 1, 11: 0}})
+
+    def written(function, address, values):
+        Unit._write(unit, function, address, values)
+        for k, value in enumerate(values, address):
+            if k == 100:
+                if value == 0x80:
+                    drive.error = 0
+                else:
+                    drive.request({6: 1, 15: 8}[value])
+            elif k == 101:
+                drive.feed((value - 65536 if value > 32767 else value) / 1000)
+
+    unit._write = written
+    wire = Port(ModbusLine({3: unit}, True).take, folder / "wire")
+    profile = (
+        f"{HEAD}bus: modbus\nmodbus: {{timeout_s: 0.05}}\n"
+        "drive: {unit: A, scale: 0.0005, limits: [-2, 2], command_hz: 100, watchdog_s: 0.6, fault: error,\n"
+        f"  {STATES}, command: {{register: 101, value: command}}, enable: [{{register: 100, value: 15}}],\n"
+        "  disable: [{register: 100, value: 6, function: 16}], reset: [{register: 100, value: 0x80}]}\n"
+        + CHANNELS
+        % ("register: 10, type: uint16", "register: 11, type: uint16")
+    )
+
+    def report():
+        unit.mute = drive.mute
+        unit.tables[4].update({10: drive.state, 11: drive.error})
+
+    return drive, wire, profile, f"rtu:{folder}/wire", report
+
+
+def lines(folder):
+    """A laboratory amplifier: "TORQ +0.250", "OUT 1", "STAT?" -> "8,0"."""
+    drive, rest = Drive(), [b""]
+
+    def take(data):
+        *found, rest[0] = (rest[0] + data).split(b"\n")
+        out = b""
+        for line in found:
+            if line.startswith(b"TORQ "):
+                drive.feed(float(line[5:]))
+            elif line.startswith(b"OUT "):
+                drive.request(8 if line == b"OUT 1" else 1)
+            elif line == b"*CLS":
+                drive.error = 0
+            elif line == b"STAT?" and not drive.mute:
+                out += b"%d,%d\n" % (drive.state, drive.error)
+        return out
+
+    wire = Port(take, folder / "wire")
+    profile = (
+        f"{HEAD}bus: serial-lines\ntext: {{pattern: '(?P<s>[0-9]+),(?P<e>[0-9]+)$', request: 'STAT?\\n', "
+        "request_hz: 100}\n"
+        f"drive: {{{LIMITS}, command_hz: 100, watchdog_s: 0.6, fault: error, {STATES},\n"
+        "  command: 'TORQ {command:+.3f}\\n', enable: ['OUT 1\\n'], disable: ['OUT 0\\n'], reset: ['*CLS\\n']}\n"
+        + CHANNELS
+        % ("field: s", "field: e")
+    )
+    return drive, wire, profile, f"{folder}/wire", lambda: None
+
+
+def frames(folder):
+    """A drive with binary frames: address | command | value int32 big-endian | sum8."""
+    drive, rest = Drive(), [b""]
+
+    def take(data):
+        rest[0] += data
+        out = b""
+        while len(rest[0]) >= 7:
+            frame, rest[0] = rest[0][:7], rest[0][7:]
+            assert sum(frame[:6]) & 255 == frame[6], "the drive got a damaged frame"
+            address, command, value = struct.unpack(">BBi", frame[:6])
+            if address != 9:
+                continue
+            if command == 1:
+                drive.request(value)
+            elif command == 2:
+                drive.feed(value / 1000)
+            elif command == 3:
+                drive.error = 0
+            elif command == 6 and not drive.mute:
+                body = struct.pack(">BBHH", address, 100, drive.state, drive.error)
+                out += body + bytes([sum(body) & 255])
+        return out
+
+    def message(command, value):
+        fields = f"{{type: uint8, value: address}}, {{type: uint8, value: {command}}}, {{type: int32, value: {value}}}"
+        return f"{{endian: big, crc: sum8, fields: [{fields}]}}"
+
+    ask = bytes([9, 6, 0, 0, 0, 0, 15])
+    wire = Port(take, folder / "wire")
+    profile = (
+        f"{HEAD}bus: serial-binary\nframe: {{sync: [], length: false, endian: big, crc: sum8, request: {list(ask)}, "
+        "request_hz: 100, fields: [{name: a, type: uint8, equals: 9}, {type: skip1}, {name: s, type: uint16}, "
+        "{name: e, type: uint16}]}\n"
+        f"drive: {{unit: A, scale: 0.0005, limits: [-2, 2], command_hz: 100, watchdog_s: 0.6, fault: error, {STATES},\n"
+        f"  command: {message(2, 'command')}, enable: [{message(1, 8)}], disable: [{message(1, 1)}],\n"
+        f"  reset: [{message(3, 0)}]}}\n" + CHANNELS % ("field: s", "field: e")
+    )
+    return drive, wire, profile, f"{folder}/wire", lambda: None
+
+
+KINDS = {"dbc": (dbc, 3), "modbus": (modbus, 3), "lines": (lines, 1), "frames": (frames, 9)}
+
+
+@pytest.fixture(params=KINDS)
+def made(request, tmp_path):
+    make, address = KINDS[request.param]
+    drive, wire, profile, port, report = make(tmp_path)
+    (tmp_path / "drive.yaml").write_text(profile)
+    text = f"- {{name: drive, profile: drive.yaml, port: '{port}', address: {address}, roles: {ROLES}}}"
+    rig = Rig(tmp_path, text)
+    tick = rig.tick
+
+    def ticking():
+        if not drive.mute or request.param == "modbus":
+            report()
+        tick()
+
+    rig.tick = ticking
+    yield drive, wire, rig, text, tmp_path, report
+    rig.backend.close()
+    wire.close()
+
+
+def test_an_amplifier_by_messages(made):
+    drive, wire, rig, text, folder, report = made
+    with rig:
+        state = "amplifier_state"
+        rig.until(lambda: rig.value(state) == AMP_DISABLED and rig.status(state) == "OK", "disabled")
+        rig.drive = 1.0  # a command without enable moves nothing
+        rig.until(lambda: rig.devices[0].sequencer.state == AMP_DISABLED)
+        assert drive.output == 0.0 and drive.enabled_count == 0
+        rig.enable = True
+        rig.until(lambda: rig.value(state) == AMP_ENABLED and drive.output == pytest.approx(2.0), "enabled")
+        rig.drive = -9.0
+        rig.until(lambda: drive.output == pytest.approx(-4.0), "clipped")
+        drive.trip()  # a stop by itself
+        rig.until(lambda: rig.value(state) == AMP_DISABLED, "stopped by itself")
+        count, end = drive.enabled_count, time.monotonic() + 0.3
+        rig.until(lambda: time.monotonic() > end, "left alone")
+        assert drive.enabled_count == count and rig.value(state) == AMP_DISABLED
+        rig.enable, rig.drive = False, 0.0
+        rig.until(lambda: not rig.devices[0].sequencer.left)
+        rig.enable, rig.drive = True, 0.5
+        rig.until(lambda: drive.output == pytest.approx(1.0), "enabled again by a person")
+        drive.trip(77)
+        rig.until(lambda: rig.value(state) == AMP_FAULT and rig.value("amplifier_fault") == 77, "fault")
+        rig.enable = False
+        rig.until(lambda: drive.error == 0 and rig.value(state) == AMP_DISABLED, "reset while disabled")
+        rig.enable = True
+        rig.until(lambda: drive.output == pytest.approx(1.0), "enabled")
+        end = time.monotonic() + 5
+        while drive.output and time.monotonic() < end:  # we stop: its own watchdog
+            time.sleep(0.001)
+        assert drive.output == 0.0
+
+
+def test_an_amplifier_whose_state_is_not_reported_is_disabled(made):
+    drive, wire, rig, *_ = made
+    with rig:
+        rig.enable, rig.drive = True, 0.5
+        rig.until(lambda: drive.output == pytest.approx(1.0), "enabled")
+        drive.mute = True
+        rig.until(lambda: drive.output == 0.0 and drive.state == 1, "off")
+        rig.until(lambda: rig.sample.status[ROLE["amplifier_state"]] >= STALE, "shown")
+
+
+def test_an_amplifier_is_off_after_its_cable_was_pulled(made):
+    drive, wire, rig, *_ = made
+    with rig:
+        rig.enable, rig.drive = True, 0.5
+        rig.until(lambda: drive.output == pytest.approx(1.0), "enabled")
+        wire.unplug()
+        rig.until(lambda: rig.status("amplifier_state") == "ERROR" and drive.output == 0.0, "lost")
+        rig.enable = False
+        wire.plug()
+        rig.until(
+            lambda: rig.status("amplifier_state") == "OK" and rig.value("amplifier_state") == AMP_DISABLED
+        )
+        assert drive.output == 0.0
+
+
+def test_an_amplifier_is_switched_off_over_a_link_of_its_own(made):
+    drive, wire, rig, text, folder, report = made
+    drive.request(8)
+    drive.feed(1.0)
+    stop = threading.Event()
+
+    def reporting():
+        while not stop.wait(0.01):
+            report()
+
+    thread = threading.Thread(target=reporting)
+    thread.start()
+    other = driver(check_rig([bind(yamlfile.loads(text).value[0], folder)])[0])
+    other.switch_off()
+    assert drive.state == 1 and drive.torque == 0.0
+    stop.set()
+    thread.join()
+
+
+DAC = f"""{HEAD}bus: modbus
+modbus: {{timeout_s: 0.05}}
+drive: {{unit: V, scale: 0.005, limits: [-5, 5], command_hz: 50, watchdog_s: none, state: assumed,
+  command: {{register: 0, type: uint16, value: command}}, disable: []}}
+channels:
+  out: {{kind: holding, register: 0, type: uint16, scale: 0.005, unit: V, range: [0, 10], rate_hz: 20, stale_after_s: 1}}
+"""
+
+
+def test_a_dac_without_state_and_watchdog(tmp_path):
+    """It is taken to obey, its output is zero when disabled, and `check` names what it cannot do."""
+    unit = Unit({3: {0: 700}})
+    wire = Port(ModbusLine({1: unit}, True).take, tmp_path / "wire")
+    (tmp_path / "dac.yaml").write_text(DAC)
+    text = f"- {{name: dac, profile: dac.yaml, port: 'rtu:{tmp_path}/wire', roles: {{state: amplifier_state, out: voltage_v}}}}"
+    with Rig(tmp_path, text) as rig:
+        rig.until(lambda: unit.tables[3][0] == 0 and rig.value("amplifier_state") == AMP_DISABLED)
+        rig.enable, rig.drive = True, 2.5
+        rig.until(lambda: unit.tables[3][0] == 500 and rig.value("voltage_v") == 2.5)
+        rig.drive = -1.0  # it has no negative output: zero, not 65336 counts
+        rig.until(lambda: unit.tables[3][0] == 0)
+        rig.drive = 2.5
+        rig.until(lambda: unit.tables[3][0] == 500)
+        unit.exception = 4
+        rig.until(lambda: rig.status("amplifier_state") == "ERROR", "refused")
+        unit.exception = 0
+        rig.until(lambda: rig.status("amplifier_state") == "OK", "back")
+    assert unit.tables[3][0] == 0  # closed: off
+    notes = rig_notes([d.binding for d in rig.devices])
+    assert any("dac cannot stop by itself" in n for n in notes) and any(
+        "does not report its state" in n for n in notes
+    )
+    wire.close()
+
+
+@pytest.mark.parametrize(
+    "old,new,message",
+    [
+        ("watchdog_s: none, ", "", "'watchdog_s' is missing"),
+        ("watchdog_s: none", "watchdog_s: 0.01", "below two periods of command_hz"),
+        ("value: command", "value: 3", "does not carry the command"),
+        ("limits: [-5, 5]", "limits: [1, 5]", "must contain 0"),
+        ("state: assumed", "state: {channel: outt, enabled: [1], disabled: [0]}", "did you mean 'out'"),
+        ("disable: []", "disable: [{register: 1, value: 0, function: 5}]", "function: 5 cannot write"),
+        ("  out:", "  state:", "name of the assumed state"),
+    ],
+)
+def test_mistakes_in_a_drive_are_told(tmp_path, old, new, message):
+    assert old in DAC
+    (tmp_path / "p.yaml").write_text(DAC.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        load_profile(tmp_path / "p.yaml")
+
+
+class Positioner:
+    """A CiA-402 drive in cyclic position mode behind a Lawicel adapter: SDO, PDO by SYNC, heartbeat.
+
+    `targets` holds every target position that it was sent while enabled."""
+
+    def __init__(self, node):
+        self.node, self.od, self.control, self.state = node, {}, 0, 0x40
+        self.actual, self.targets = 123_456, []
+
+    def take(self, frame):
+        can_id, _, data = frame
+        if can_id == 0x600 + self.node:
+            return [(0x580 + self.node, False, self.sdo(data))]
+        if can_id == 0x200 + self.node:
+            word, target = struct.unpack("<Hi", data)
+            self.step(word)
+            if self.state == 0x27:
+                self.targets.append(target)
+                self.actual = target
+        if can_id == 0x80:
+            status = struct.pack("<Hi", self.state | 0x200, self.actual)
+            return [(0x180 + self.node, False, status), (0x700 + self.node, False, b"\x05")]
+        return []
+
+    def sdo(self, data):
+        command, index, sub = struct.unpack_from("<BHB", data)
+        if command == 0x40:
+            value = {0x1000: 0x20192}.get(index, 0)
+            return struct.pack("<BHBI", 0x43, index, sub, value)
+        self.od[index, sub] = struct.unpack_from("<I", data, 4)[0]
+        return struct.pack("<BHB4x", 0x60, index, sub)
+
+    def step(self, word):
+        low = word & 0x0F
+        if not word & 2:
+            self.state = 0x40
+        elif low == 6:
+            self.state = 0x21
+        elif low == 7 and self.state != 0x40:
+            self.state = 0x23
+        elif low == 15 and self.state in (0x23, 0x27):
+            self.state = 0x27
+
+
+POSITION_DRIVE = f"""{HEAD}bus: can-cia402
+cia402: {{node_id: 5, mode: 8, command: 0x607A, transmit: [0x6041, 0x6064], watchdog_s: 1}}
+drive: {{unit: um, scale: 0.01, limits: [500, 2000], slew_per_s: 1000}}
+channels:
+  state: {{object: 0x6041, unit: '1', rate_hz: 1000, stale_after_s: 0.5}}
+  position: {{object: 0x6064, unit: um, scale: 0.01, range: [-1e6, 1e6], rate_hz: 1000, stale_after_s: 0.5}}
+"""
+
+
+def test_a_position_drive_starts_where_it_stands(tmp_path):
+    """Without an EDS file. Enabling moves nothing; the target goes to the command by the slew rate, inside the limits."""
+    drive = Positioner(5)
+    wire = Port(SlcanAdapter(drive.take).take, tmp_path / "wire")
+    (tmp_path / "drive.yaml").write_text(POSITION_DRIVE)
+    text = (
+        f"- {{name: drive, profile: drive.yaml, port: 'slcan:{tmp_path}/wire', "
+        "roles: {state: amplifier_state, position: position_um}}"
+    )
+    with Rig(tmp_path, text) as rig:
+        assert drive.od[0x6060, 0] == 8 and drive.od[0x1600, 2] == 0x607A0020
+        rig.until(lambda: rig.value("position_um") == 1234.56)
+        rig.drive, rig.enable = 1300.0, True
+        rig.until(lambda: drive.actual == 130_000)
+        assert drive.targets[0] in range(123_456, 123_456 + 1100), drive.targets[:3]
+        steps = [b - a for a, b in zip(drive.targets, drive.targets[1:], strict=False)]
+        assert max(steps) <= 1000 and min(steps) >= 0  # at most 10 ms of 1000 um/s
+        rig.drive = 1e9
+        rig.until(lambda: drive.actual == 200_000)
+        rig.enable = False
+        rig.until(lambda: drive.state == 0x40)
+    wire.close()
+
+
+@pytest.mark.parametrize(
+    "old,new,message",
+    [
+        (", slew_per_s: 1000", "", "'slew_per_s' is missing"),
+        ("0x6041, 0x6064]", "0x6041]", "needs 0x6064"),
+        ("mode: 8", "mode: 1", "needs a handshake"),
+        ("command: 0x607A", "command: 0x2071", "the type of object 0x2071 is not known"),
+    ],
+)
+def test_mistakes_in_a_position_drive_are_told(tmp_path, old, new, message):
+    (tmp_path / "p.yaml").write_text(
+        POSITION_DRIVE.replace(old, new).replace("object: 0x6064", "object: 0x6041")
+    )
+    node = yamlfile.loads("{profile: p.yaml, port: 'slcan:x', roles: {state: amplifier_state}}")
+    with pytest.raises(InputError, match=message):
+        driver(bind(node, tmp_path))
+
+
+def test_a_drive_that_takes_can_fd_frames(tmp_path):
+    """The library's moteus profile: mode, torque and a query in one frame of 32 bytes; a watchdog of its own."""
+    import can
+
+    from hal.probe import Probe
+    from thermoctl.devices.library import find
+
+    name = f"moteus-{tmp_path.name}"
+    bus = can.Bus(name, interface="virtual", fd=True)
+    mode, torque, fed_s = 0, 0.0, 0.0
+
+    def device():
+        nonlocal mode, torque, fed_s
+        while (m := bus.recv(0)) is not None:
+            assert m.is_fd and m.is_extended_id and m.arbitration_id == 0x8001 and len(m.data) == 32
+            assert (
+                m.data[:2] == b"\x01\x00"
+                and m.data[3:6] == b"\x0c\x05\x20"
+                and m.data[26:] == b"\x14\x04\x00PPP"
+            )
+            _, _, torque, kp, kd = struct.unpack_from("<5f", m.data, 6)
+            assert kp == kd == 0.0
+            mode, fed_s = m.data[2] if mode != 11 or m.data[2] == 0 else 11, time.monotonic()
+            reply = b"\x24\x04\x00" + struct.pack("<hhhh", mode, 0, 0, round(torque * 100)) + b"P"
+            bus.send(can.Message(arbitration_id=0x100, is_extended_id=True, is_fd=True, data=reply))
+
+    profile = find("mjbots-moteus")
+    text = f"- {{name: m, profile: {profile}, port: 'virtual:{name}@1000000,5000000', roles: {{state: amplifier_state}}}}"
+    with Rig(tmp_path, text) as rig:
+        tick = rig.tick
+        rig.tick = lambda: (tick(), device())
+        rig.until(lambda: rig.value("amplifier_state") == AMP_DISABLED)
+        rig.drive, rig.enable = 2.0, True
+        rig.until(lambda: mode == 10 and torque == pytest.approx(0.2))
+        mode = 11  # its watchdog: it stays off until enable is withdrawn
+        rig.until(lambda: rig.devices[0].sequencer.left and mode == 0)
+        rig.enable = False
+        rig.until(lambda: rig.value("amplifier_state") == AMP_DISABLED)
+    probe = Probe(load_profile(profile), f"virtual:{name}@1000000,5000000", None)
+    probe.open()
+    bus.send(
+        can.Message(
+            arbitration_id=0x100,
+            is_extended_id=True,
+            is_fd=True,
+            data=b"\x24\x04\x00" + struct.pack("<4h", 0, 0, 0, -25) + b"P",
+        )
+    )
+    wait(probe.complete, probe.step)
+    assert {r.channel: r.value for r in probe.readings()} == {"state": 0, "torque": -0.25}
+    probe.close()
+    bus.shutdown()
+
+
+def test_a_drive_and_a_shunt_share_one_adapter(tmp_path):
+    """Opened once; the drive is set up, enabled and followed while the shunt sends; both come back after a pulled cable."""
+    from tests.devices.test_sharing import can_files
+
+    drive = Positioner(5)
+    adapter = SlcanAdapter(drive.take)
+    wire = Port(adapter.take, tmp_path / "wire")
+    can_files(tmp_path)
+    (tmp_path / "drive.yaml").write_text(POSITION_DRIVE)
+    port = f"slcan:{tmp_path}/wire"
+    text = (
+        f"- {{name: drive, profile: drive.yaml, port: '{port}', roles: {{state: amplifier_state, position: position_um}}}}\n"
+        f"- {{name: shunt, profile: shunt.yaml, port: '{port}', roles: {{v: voltage_v}}}}"
+    )
+    with Rig(tmp_path, text) as rig:
+        tick = rig.tick
+        rig.tick = lambda: (wire.send(encode((801, False, struct.pack("<h6x", 12500)))), tick())
+        rig.drive, rig.enable = 1300.0, True
+        rig.until(lambda: drive.actual == 130_000 and rig.value("voltage_v") == 12.5)
+        assert adapter.commands.count(b"O") == 1
+        wire.unplug()
+        rig.until(lambda: rig.status("amplifier_state") == "ERROR")
+        rig.enable, drive.state = False, 0x40
+        wire.plug()
+        rig.until(lambda: all(d.up for d in rig.devices) and rig.value("amplifier_state") == AMP_DISABLED)
+        rig.until(lambda: rig.status("amplifier_state") == rig.status("voltage_v") == "OK")
+    wire.close()

@@ -1,0 +1,138 @@
+"""Every profile of the library against its device's emulator: values, a fault, the cable pulled and plugged.
+
+`make devices` runs this and prints the table.
+"""
+
+import math
+import os
+import time
+from dataclasses import replace
+
+import pytest
+
+from hal.backend import HardwareError
+from hal.probe import Probe, read_for
+from hal.read_profile import load_profile
+from tests.devices.library import CASES, UNTRIED
+from thermoctl import cli
+from thermoctl.devices.library import find
+from thermoctl.devices.new import new
+from thermoctl.shipped import shipped
+from thermoctl.yamlfile import InputError
+
+NAMES = sorted(p.stem for p in shipped("config/devices/library").glob("*.yaml"))
+
+
+def test_every_profile_has_an_emulator_and_a_source():
+    assert len(NAMES) >= 25 and set(NAMES) == set(CASES) | set(UNTRIED)
+    for name in NAMES:
+        assert len(load_profile(find(name)).manual) > 20, name
+
+
+def read(device, profile, wanted, limit_s=20.0):
+    """Read until `wanted(readings)`; returns them. Reopens the port as the daemon does."""
+    end = time.monotonic() + limit_s
+    readings, probe = [], None
+    while time.monotonic() < end:
+        try:
+            if probe is None:
+                probe = Probe(profile, device.port, device.address)
+                probe.open()
+            device.send()
+            probe.step()
+            readings = probe.readings()
+            if wanted({r.channel: r for r in readings}):
+                probe.close()
+                return readings
+        except (HardwareError, OSError):
+            if probe is not None:
+                probe.close()
+            probe = None
+        time.sleep(0.002)
+    if probe is not None:
+        probe.close()
+    raise AssertionError(f"not within {limit_s} s: {readings}")
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_a_device_is_read_as_its_manual_says(tmp_path, name, capsys):
+    device, profile = CASES[name](tmp_path), load_profile(find(name))
+    profile = replace(profile, line=replace(profile.line, parity="N", data_bits=8))  # a pty has no other
+    started = time.monotonic()
+
+    def good(found):
+        return all(
+            not found[c].problem and math.isclose(found[c].value, v, rel_tol=2e-3, abs_tol=2e-3)
+            for c, v in device.expected.items()
+        )
+
+    try:
+        read(device, profile, good)
+        first_s = time.monotonic() - started
+        device.wire.unplug()
+        with pytest.raises((HardwareError, OSError)):
+            read_for(Probe(profile, device.port, device.address), 1.0)
+        device.wire.plug()
+        if device.port.startswith("tcp:"):
+            device.port = f"tcp:127.0.0.1:{device.wire.number}"
+        read(device, profile, good)
+        device.fault()
+        found = {r.channel: r for r in read(device, profile, lambda f: bool(f[device.bad].problem))}
+        assert "\n" not in found[device.bad].problem
+        if os.environ.get("THERMOCTL_TABLE"):
+            with capsys.disabled():
+                print(
+                    f"\n| {name} | {profile.bus} | {len(device.expected)} | {first_s:.2f} | {found[device.bad].problem} |"
+                )
+    finally:
+        device.wire.close()
+
+
+def test_the_commands_show_search_and_probe(tmp_path, capsys):
+    assert cli.main(["devices", "list"]) == 0 and len(capsys.readouterr().out.splitlines()) > 30
+    assert cli.main(["devices", "search", "rtd", "modbus"]) == 0
+    assert "ADAM-6015" in capsys.readouterr().out
+    assert cli.main(["devices", "search", "nonsense"]) == 1
+    assert "devices new" in capsys.readouterr().out
+    assert cli.main(["devices", "show", "odrive-cansimple"]) == 0
+    assert "stops by itself after 0.1 s" in capsys.readouterr().out
+    assert cli.main(["devices", "show", "odrive"]) == 2
+    device = CASES["icpdas-m-7015"](tmp_path)
+    try:
+        assert cli.main(["devices", "probe", device.port, "--profile", "icpdas-m-7015"]) == 0
+        out = capsys.readouterr().out.splitlines()
+        assert len(out) == 6 and all("2150" in x and "21.5 degC" in x and x.endswith("OK") for x in out)
+        assert cli.main(["devices", "probe", device.port, "--address", "1"]) == 0
+        out = capsys.readouterr().out
+        assert "holding 0..9: exception 1" in out and "input 0..9: exception 2" in out
+    finally:
+        device.wire.close()
+    assert cli.main(["devices", "probe", "/dev/none", "--profile", "icpdas-m-7015"]) == 3
+    assert "rtu:/dev/... " in capsys.readouterr().err
+
+
+ANSWERS = {
+    "vendor": "ours", "model": "oven: left", "manual": "manual 1.2, page 7", "bus": "modbus", "unit": "degC",
+    "register": "12", "scale": "0.1", "rate_hz": "5", "stale_after_s": "1", "range": "[-20, 300]", "kind": "holding",
+}  # fmt: skip
+
+
+def test_new_asks_and_writes_a_profile(tmp_path):
+    names = iter(["t1", ""])
+
+    def ask(question):
+        word = question.split()[0]
+        return next(names) if question.startswith("name of a channel") else ANSWERS.get(word, "")
+
+    target = tmp_path / "oven.yaml"
+    assert new(str(target), ask) == 0
+    profile = load_profile(target)
+    channel = profile.channels["t1"]
+    assert profile.model == "oven: left" and channel.scale == 0.1 and channel.source.address == 12
+    assert channel.source.kind == "holding" and channel.range == (-20, 300)
+    with pytest.raises(InputError, match="exists"):
+        new(str(target), ask)
+    names = iter(["t1", ""])
+    with pytest.raises(InputError, match="every reading would be stale; nothing was written"):
+        new(str(tmp_path / "bad.yaml"), lambda q: "0.01" if q.startswith("stale_after_s") else ask(q))
+    assert not (tmp_path / "bad.yaml").exists()

@@ -1,0 +1,1 @@
+"""The library of device profiles, and the commands about devices."""

@@ -1,0 +1,84 @@
+"""`thermoctl devices list | show | search`: the profiles that come with the program."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from hal.profile import Profile
+from hal.read_profile import load_profile
+from thermoctl.shipped import shipped
+from thermoctl.yamlfile import InputError, suggest
+
+EXIT_OK, EXIT_NONE = 0, 1
+FOLDERS = ("config/devices/library", "config/devices")
+
+
+def profiles() -> Iterator[tuple[str, Profile]]:
+    """Return every shipped profile with its name."""
+    for folder in FOLDERS:
+        for path in sorted(shipped(folder).glob("*.yaml")):
+            yield path.stem, load_profile(path)
+
+
+def find(name: str) -> Path:
+    """Return the file of a profile: a path, or the name of a shipped one. Raises InputError."""
+    path = Path(name)
+    if path.is_file():
+        return path
+    known = {p.stem: p for folder in FOLDERS for p in shipped(folder).glob("*.yaml")}
+    if name not in known:
+        raise InputError(
+            f"{name}: no file, and no profile of the library{suggest(name, known)}: see `thermoctl devices list`"
+        )
+    return known[name]
+
+
+def _row(name: str, profile: Profile) -> str:
+    kind = "amplifier" if profile.amplifier is not None else "sensor"
+    return f"{name:30} {profile.bus:14} {kind:9} {profile.vendor} {profile.model}"
+
+
+def list_all(_args: object = None) -> int:
+    """Print every profile of the library."""
+    for name, profile in profiles():
+        print(_row(name, profile))
+    return EXIT_OK
+
+
+def search(words: list[str]) -> int:
+    """Print the profiles in which every word stands; return 1 when there is none.
+
+    Searched are name, vendor, model, bus, manual and channels."""
+    found = 0
+    for name, p in profiles():
+        text = " ".join((name, p.vendor, p.model, p.bus, p.manual, *p.channels)).lower()
+        if all(w.lower() in text for w in words):
+            print(_row(name, p))
+            found += 1
+    if not found:
+        print(f"no profile with {' '.join(words)}: write one with `thermoctl devices new`")
+    return EXIT_OK if found else EXIT_NONE
+
+
+def show(name: str) -> int:
+    """Print a profile: its file, where its facts come from, its channels, and the text of the file."""
+    path = find(name)
+    profile = load_profile(path)
+    print(f"{profile.vendor} {profile.model}\nfile: {path}\nfrom: {profile.manual or 'not stated'}")
+    for c in profile.channels.values():
+        low, high = c.range
+        print(
+            f"  {c.name:20} {c.unit:6} {low:g} .. {high:g}, {c.rate_hz:g} Hz, stale after {c.stale_after_s:g} s"
+        )
+    amplifier = profile.amplifier
+    if amplifier is not None:
+        low, high = amplifier.limits
+        stop = (
+            "cannot stop by itself"
+            if amplifier.watchdog_s is None
+            else f"stops by itself after {amplifier.watchdog_s:g} s"
+        )
+        print(f"  command {low:g} .. {high:g} {amplifier.unit}; {stop}")
+    print(f"\n{path.read_text(encoding='utf-8')}", end="")
+    return EXIT_OK
