@@ -38,7 +38,7 @@ def test_plant_check_with_data(folder, capsys):
 def test_diagnose_stops_at_a_severe_finding(folder, capsys, monkeypatch):
     given = {}
 
-    def diagnosed(plant, tables, out, *_):
+    def diagnosed(plant, tables, *_):
         given["tables"] = tables
         return {"verdict": "consistent"}
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TextIO
 
 from thermoctl.checks import Finding, checks
+from thermoctl.checks.file import file_findings
 from thermoctl.plant import Plant, load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.logger import parsed_columns
@@ -18,9 +19,10 @@ from thermoctl.yamlfile import InputError
 def check(args: argparse.Namespace) -> int:
     """Load each plant file with all its checks; with --data compare one with recordings.
 
-    Returns 1 for a severe finding."""
+    Returns 1 for a severe finding; without --data also for a negative storage."""
     if args.data and len(args.plants) != 1:
         raise InputError("plant check --data: one plant file was expected")
+    severe = False
     for path in args.plants:
         p = load(path)
         free = sum(1 for q in p.parameters.values() if q.range)
@@ -34,7 +36,10 @@ def check(args: argparse.Namespace) -> int:
             if not found:
                 print("the recordings fit the plant's labels, units and clock")
             return int(any(f.severe for f in found))
-    return 0
+        alone = file_findings(p)
+        report(alone, sys.stdout)
+        severe |= any(f.severe for f in alone)
+    return int(severe)
 
 
 def checked(

@@ -7,12 +7,12 @@ they are, both after a short refit inside the parameters' ranges:
 
 n is the number of independent residuals of the corrected recordings: samples over their integrated
 autocorrelation time (Geyer 1992, initial positive sequence). The gain is the logarithm of a likelihood ratio.
-It has to exceed log(RARITY) plus the logarithm of the number of hypotheses.
+It has to exceed log(RARITY) plus the logarithm of the number of hypotheses. The correction also has to
+halve the misfit of its columns.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
@@ -33,11 +33,12 @@ from thermoctl.recording.table import Table
 RARITY = 1000.0  # prior odds against a wrong label
 CLOSE = 2.0  # residual over noise below which nothing is left to explain by labels
 FOLLOWS = 0.5  # a corrected column has to be followed to within this share of its spread
-ROWS = 10_000  # of all recordings together, of each from its start
-DRAWS = 6  # parameter draws of the screening
+HALVED = 0.5  # share of the misfit of its columns that a correction may leave at most
+ROWS = 4_000  # of all recordings together, of each from its start
+DRAWS = 4  # parameter draws of the screening
+ITERATIONS = 20  # of a refit
 REFITTED = 6  # best screened hypotheses that are refitted
 ROUNDS = 3  # corrections in a row
-SECONDS = 10.0  # of computing for a screening; fewer draws where runs are slow
 MAX_COLUMNS = 8  # up to so many columns every pair may have been swapped, beyond that pairs of one unit only
 FACTORS = (1e3, 1e-3, 1e6, 1e-6)
 CLOCKS = (("ms", 1e-3), ("us", 1e-6), ("min", 60.0), ("h", 3600.0))
@@ -86,13 +87,10 @@ def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
         return None
     hypotheses = [*_clocks(model, tables), *_hypotheses(model.plant, tables)]
     proof = log(RARITY * max(len(hypotheses), 1))
-    begin = time.thread_time()
     screened: list[tuple[float, Hypothesis]] = []
     plain = _screened(model, tables)
-    each = max(time.thread_time() - begin, 1e-6) / DRAWS
-    draws = int(np.clip(SECONDS / (each * max(len(hypotheses), 1)), 1, DRAWS))
     for h in hypotheses:
-        tried = _screened(model, [h.change(t) for t in tables], draws)
+        tried = _screened(model, [h.change(t) for t in tables])
         screened.append((float(np.sum(now.independent * np.log(plain / tried))), h))
     screened.sort(key=lambda pair: -pair[0])
     best: tuple[float, Hypothesis] | None = None
@@ -102,8 +100,10 @@ def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
             continue
         gain = float(np.sum(then.independent * np.log(now.share / then.share)))
         changed = [j for j, o in enumerate(model.plant.outputs.values()) if o.column in h.columns]
-        followed = np.sqrt(np.mean((then.share[changed] if changed else then.share) ** 2))
-        if gain > proof and followed < FOLLOWS and (best is None or gain > best[0]):
+        part = changed or list(range(len(then.share)))
+        followed = np.sqrt(np.mean(then.share[part] ** 2))
+        left = followed / np.sqrt(np.mean(now.share[part] ** 2))
+        if gain > proof and followed < FOLLOWS and left < HALVED and (best is None or gain > best[0]):
             best = gain, h
     return best[1] if best else None
 
@@ -126,7 +126,7 @@ def _misfit(model: Model, tables: Sequence[Table], refit: bool) -> _Misfit | Non
     spread = _spread(np.concatenate([e.y for e in excitations]), noise)
     try:
         if (model.active or model.uncertain) and refit:
-            residuals = fit(model, excitations, iterations=12, seconds=SECONDS / 4).residuals
+            residuals = fit(model, excitations, iterations=ITERATIONS, seconds=np.inf).residuals
         else:
             residuals = [e.y - model.run(e).y for e in excitations]
     except SimulationError:
@@ -137,14 +137,14 @@ def _misfit(model: Model, tables: Sequence[Table], refit: bool) -> _Misfit | Non
     return _Misfit(rms, rms / spread, noise, independent)
 
 
-def _screened(model: Model, tables: Sequence[Table], draws: int = DRAWS) -> np.ndarray:
+def _screened(model: Model, tables: Sequence[Table]) -> np.ndarray:
     """Return each output's misfit over its spread in free runs, of the best of a few parameter draws."""
     excitations = [model.excitation(t) for t in tables]
     measured = np.concatenate([e.y for e in excitations])
     noise = np.array([n.sigma for n in default_noise(model.plant, excitations)])
     spread = _spread(measured, noise)
     best = np.full(len(spread), SPREAD)
-    for values in _draws(model.plant, draws):
+    for values in _draws(model.plant):
         try:
             simulated = np.concatenate([model.run(e, values, rtol=1e-4).y for e in excitations])
         except SimulationError:
@@ -158,11 +158,11 @@ def _screened(model: Model, tables: Sequence[Table], draws: int = DRAWS) -> np.n
     return np.minimum(best, SPREAD)
 
 
-def _draws(plant: Plant, count: int) -> Iterator[dict[str, float]]:
+def _draws(plant: Plant) -> Iterator[dict[str, float]]:
     """Yield the plant's own parameters, then draws from their ranges."""
     rng = np.random.default_rng(0)
     yield {}
-    for _ in range(count - 1):
+    for _ in range(DRAWS - 1):
         drawn = {}
         for p in plant.parameters.values():
             if p.range:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from thermoctl.checks.finding import Finding
+from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.residuals import default_noise
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
@@ -21,19 +22,7 @@ SIGMAS = 6.0  # two-sided false alarm of 2e-9 a sample for normal errors
 
 def plant_findings(model: Model, excitations: Sequence[Excitation]) -> list[Finding]:
     """Check units, storages, stability and time constants."""
-    plant = model.plant
-    found = []
-    units = [i.unit for i in plant.readings()] + [p.unit for p in plant.parameters.values()]
-    if not any([*units, *(n.unit for n in plant.nodes.values())]):
-        found.append(
-            Finding(
-                "no units",
-                plant.file,
-                "no quantity has a unit, so no expression could be checked",
-                "Give inputs, parameters, nodes and outputs their units.",
-                severe=False,
-            )
-        )
+    found = unit_findings(model.plant)
     for excitation in excitations:
         found += _storages(model, excitation)
         if found and found[-1].kind == "storage":
@@ -43,6 +32,16 @@ def plant_findings(model: Model, excitations: Sequence[Excitation]) -> list[Find
             return found
         found += _time_constants(model, excitation)
     return _once(found)
+
+
+def unit_findings(plant: Plant) -> list[Finding]:
+    """Return a warning where nothing in the plant has a unit."""
+    items = [*plant.readings(), *plant.parameters.values(), *plant.nodes.values()]
+    if any(i.unit for i in items):
+        return []
+    what = "no quantity has a unit, so no expression could be checked"
+    todo = "Give inputs, parameters, nodes and outputs their units."
+    return [Finding("no units", plant.file, what, todo, severe=False)]
 
 
 def _once(found: list[Finding]) -> list[Finding]:
@@ -84,9 +83,8 @@ def _storages(model: Model, excitation: Excitation) -> list[Finding]:
     return found
 
 
-def jacobian(model: Model, values: dict[str, float], flip: str | None = None) -> np.ndarray:
+def jacobian(plant: Plant, values: dict[str, float], flip: str | None = None) -> np.ndarray:
     """Return d(dx/dt)/dx (nx, nx) per second; `flip` names a flow that is taken with the other sign."""
-    plant = model.plant
     index = {n: i for i, n in enumerate(plant.nodes)}
     out = np.zeros((len(index), len(index)))
     for flow in plant.flows.values():
@@ -113,10 +111,10 @@ def _stability(model: Model, excitation: Excitation) -> list[Finding]:
     """Find a mode that grows by more than e over the recording, and the flows whose sign would stop it."""
     plant, span = model.plant, float(excitation.t[-1] - excitation.t[0])
     values = start_values(model, excitation)
-    growth = _growth(jacobian(model, values))
+    growth = _growth(jacobian(plant, values))
     if growth * span <= GROWTH:
         return []
-    suspects = [f for f in plant.flows if _growth(jacobian(model, values, f)) * span <= GROWTH]
+    suspects = [f for f in plant.flows if _growth(jacobian(plant, values, f)) * span <= GROWTH]
     turn = f"Is the sign of the rate of {' or '.join(repr(s) for s in suspects)} right, or its 'from' and 'into'?"
     return [
         Finding(
@@ -131,7 +129,7 @@ def _stability(model: Model, excitation: Excitation) -> list[Finding]:
 
 def rates_of(model: Model, excitation: Excitation) -> np.ndarray:
     """Return the plant's eigenvalues at the start, absolute, 1/s; an integrator has none."""
-    rates = np.abs(_eigenvalues(jacobian(model, start_values(model, excitation))))
+    rates = np.abs(_eigenvalues(jacobian(model.plant, start_values(model, excitation))))
     return rates[rates > 1e-9 * rates.max(initial=0.0)]
 
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table as Grid
 
 from thermoctl.plant import Plant, load, save
+from thermoctl.plant import expression as ex
 from thermoctl.plant import show as drawing
 from thermoctl.plant.noise import coloured
 from thermoctl.plant.recordings import as_recorded, read_recordings
@@ -27,6 +28,32 @@ RENEWAL = 0.1  # largest error of a state, as a share of its range, allowed at t
 RECENT = 0.25  # share of a block from which its data count in full; older ones fade exponentially
 
 
+def ends_of_tables(plant: Plant) -> dict[str, float]:
+    """Return the last time, s, of every table over time, by the flow, output or node that reads it."""
+    found: dict[str, float] = {}
+    holders = {f.name: f.rate for f in plant.flows.values()} | {
+        o.name: o.value for o in plant.outputs.values()
+    }
+    holders |= {n.name: n.storage for n in plant.nodes.values()}
+    values = {p.name: p.value for p in plant.parameters.values()}
+    for name, expr in holders.items():
+        for e in ex.walk(expr):
+            if e.op == "table" and e.args[0].op == "name" and e.args[0].value == "t":
+                last = float(ex.evaluate(e.args[int(e.value or 0)], values))
+                found[name] = min(found.get(name, last), last)
+    return found
+
+
+def _warn_of_tables(plant: Plant, recording: str, last: float) -> None:
+    for name, end in ends_of_tables(plant).items():
+        if last > end:
+            print(
+                f"warning: {recording}: '{name}' holds a table over time that ends at {end:g} s; from there to {last:g} s "
+                "its last value is taken",
+                file=sys.stderr,
+            )
+
+
 def simulate(args: argparse.Namespace) -> int:
     """Simulate freely, or predict `--horizon` seconds ahead, on one recording or several.
 
@@ -37,6 +64,7 @@ def simulate(args: argparse.Namespace) -> int:
     model = compile_plant(_all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
     for path, table in zip(args.recordings, _read(plant, args.recordings, args), strict=True):
         excitation = model.excitation(table)
+        _warn_of_tables(plant, path, float(excitation.t[-1]))
         try:
             if args.horizon:
                 x, y = ahead(model, excitation, args.horizon)

@@ -1,0 +1,1 @@
+"""Help before a diagnosis: the effects that it could see, and checks of effect files."""

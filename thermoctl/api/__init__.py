@@ -1,0 +1,114 @@
+"""The Python interface: plants, simulation, refit and diagnosis on data frames, arrays or files.
+
+Every function takes a plant as a `Plant` or a path. Data are a path, a data frame (pandas, polars), a mapping
+of names to arrays, or a `Table`. Errors in the input are `thermoctl.yamlfile.InputError`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from thermoctl.api.data import Data, tables_of
+from thermoctl.api.fits import Refit
+from thermoctl.api.plants import Plant, plant_of
+from thermoctl.api.results import Diagnosis, Simulation
+from thermoctl.checks import Finding, checks
+from thermoctl.diagnose.effects import CATALOGUE, catalogue
+from thermoctl.evidence.limits import limits
+from thermoctl.evidence.run import diagnose as _diagnose
+from thermoctl.plant import from_plain, load
+from thermoctl.plant.refit import fit
+from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+
+def load_plant(source: str | Path | Mapping[str, Any]) -> Plant:
+    """Return the plant of a file, or of plain dicts with the file's keys. Raises InputError."""
+    return Plant(from_plain(source) if isinstance(source, Mapping) else load(source))
+
+
+def read(data: Data, time: str | None = None, columns: Mapping[str, str] | None = None) -> Table:
+    """Return a recording of any kind of data: `t` (N,) in seconds, `columns` (N,) each, `units`.
+
+    `time`: the column of times; `columns`: name that a plant reads: name in the data. Raises InputError."""
+    return tables_of(None, data, time, columns)[0]
+
+
+def simulate(
+    plant: Plant | str | Path, data: Data, parameters: Mapping[str, float] | None = None
+) -> Simulation:
+    """Simulate freely on the inputs in `data`; outputs in `data` are compared. Raises InputError.
+
+    `parameters`: values that replace the plant's."""
+    own = plant_of(plant)
+    model = compile_plant(own.description, ())
+    (table,) = tables_of(own.description, data)
+    excitation = model.excitation(table)
+    try:
+        return Simulation(own, excitation, model.run(excitation, parameters))
+    except SimulationError as e:
+        raise InputError(f"{own.description.file}: {e}") from None
+
+
+def refit(plant: Plant | str | Path, data: Data | Sequence[Data], tries: int = 0) -> Refit:
+    """Fit the parameters that have a range to recordings, inside their ranges. Raises InputError.
+
+    `tries`: further starting points, random in the ranges."""
+    own = plant_of(plant)
+    if not any(p.range for p in own.description.parameters.values()):
+        raise InputError(f"{own.description.file}: no parameter has a 'range', so there is nothing to refit")
+    model = compile_plant(own.description)
+    excitations = [model.excitation(t) for t in tables_of(own.description, data)]
+    try:
+        return Refit(own, fit(model, excitations, tries=tries), tuple(excitations))
+    except SimulationError as e:
+        raise InputError(f"{own.description.file}: {e}") from None
+
+
+def check(plant: Plant | str | Path, data: Data | Sequence[Data]) -> list[Finding]:
+    """Return wrong labels, units, clocks and signs, severe ones first; takes seconds. Raises InputError."""
+    own = plant_of(plant)
+    return checks(own.description, tables_of(own.description, data))
+
+
+def diagnose(
+    plant: Plant | str | Path,
+    data: Data | Sequence[Data],
+    held_out: Data | Sequence[Data] = (),
+    effects: Sequence[str | Path] = (),
+    anyway: bool = False,
+) -> Diagnosis:
+    """Find the physics that a plant lacks. Raises InputError, also for a severe finding of `check`.
+
+    `held_out`: recordings for validation only; `effects`: folders of further effect files; `anyway`: diagnose
+    in spite of a severe finding."""
+    own = plant_of(plant)
+    tables = tables_of(own.description, data)
+    severe = [] if anyway else [f for f in checks(own.description, tables) if f.severe]
+    if severe:
+        raise InputError(f"{severe[0]} (anyway=True diagnoses in spite of it)")
+    entries = catalogue((CATALOGUE, *map(Path, effects)))
+    reserve = tables_of(own.description, held_out)
+    return Diagnosis(own, _diagnose(own.description, tables, entries, limits(), reserve))
+
+
+__all__ = [
+    "Diagnosis",
+    "Finding",
+    "Plant",
+    "Refit",
+    "Simulation",
+    "check",
+    "diagnose",
+    "load_plant",
+    "read",
+    "refit",
+    "simulate",
+]
+
+# The package `thermoctl.diagnose`, imported above, has taken the function's name in `thermoctl`.
+setattr(sys.modules["thermoctl"], "diagnose", diagnose)  # noqa: B010

@@ -1,0 +1,107 @@
+"""The result of a refit, and its residuals as a statistician looks at them."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.api.plants import Plant
+from thermoctl.api.plots import Picture, profile_curve, residual_panels
+from thermoctl.plant.refit import Estimate, Fit, fit, report, updated
+from thermoctl.plant.simulate import Excitation, compile_plant
+from thermoctl.report.page import figure, table
+from thermoctl.yamlfile import InputError, suggest
+
+
+@dataclass(frozen=True)
+class Refit:
+    """Fitted parameters. `before` is the plant as it came; `residuals` are measured - simulated."""
+
+    before: Plant
+    fit: Fit
+    excitations: tuple[Excitation, ...]
+
+    @property
+    def plant(self) -> Plant:
+        """The plant with the fitted values."""
+        return Plant(updated(self.before.description, self.fit, self.excitations))
+
+    @property
+    def parameters(self) -> list[Estimate]:
+        """Value, standard error, state and trade-offs of each fitted parameter."""
+        return report(self.fit, self.excitations)
+
+    @property
+    def rms(self) -> dict[str, float]:
+        """Root-mean-square residual of each output over all recordings."""
+        return self.fit.rms()
+
+    def residuals(self, output: str) -> np.ndarray:
+        """Return one output's residuals of all recordings, one after the other, without missing samples."""
+        j = self._output(output)
+        e = np.concatenate([r[:, j] for r in self.fit.residuals])
+        return e[np.isfinite(e)]
+
+    def plot(self, output: str | None = None) -> Picture:
+        """Return residuals of an output (default: the first), ACF, cumulated periodogram and QQ.
+
+        White noise stays inside the 95 % bounds of the last three."""
+        name = output or self.fit.model.outputs[0]
+        return residual_panels(self.residuals(name), name, self.before.description.outputs[name].unit)
+
+    def profile(self, parameter: str, points: int = 13, reach: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+        """Return values (points,) of a parameter and the rise of -2 log likelihood (points,) there.
+
+        The other parameters are fitted anew at each. A rise of 3.84 bounds the 95 % interval. `reach`: half
+        the width in standard errors. Raises InputError for a parameter that was not fitted."""
+        found = next((e for e in self.parameters if e.name == parameter), None)
+        limits = self.before.description.parameters[parameter].range if found else None
+        if found is None or limits is None:
+            names = [e.name for e in self.parameters]
+            raise InputError(
+                f"'{parameter}' was not fitted{suggest(parameter, names)}; {', '.join(names)} were"
+            )
+        sd = found.sd if np.isfinite(found.sd) else limits[1] - limits[0]
+        low, high = max(found.value - reach * sd, limits[0]), min(found.value + reach * sd, limits[1])
+        others = tuple(q for q in self.fit.model.active if q != parameter)
+        values, rise = np.linspace(low, high, points), np.empty(points)
+        start = self.fit.parameters()
+        for k, value in enumerate(values):
+            description = self.plant.with_values({parameter: value}).description
+            known = dataclasses.replace(description.parameters[parameter], range=None)
+            fixed = dataclasses.replace(description, parameters={**description.parameters, parameter: known})
+            again = fit(
+                compile_plant(fixed, others),
+                self.excitations,
+                self.fit.noise,
+                {**start, parameter: float(value)},
+            )
+            rise[k] = again.cost
+        return values, rise - min(float(rise.min()), self.fit.cost)
+
+    def plot_profile(self, parameter: str) -> Picture:
+        """Return the profile likelihood of a parameter. Raises InputError for one that was not fitted."""
+        unit = (
+            self.before.description.parameters[parameter].unit
+            if parameter in self.before.parameters
+            else None
+        )
+        return profile_curve(*self.profile(parameter), parameter, unit)
+
+    def _output(self, output: str) -> int:
+        if output not in self.fit.model.outputs:
+            outputs = self.fit.model.outputs
+            raise InputError(
+                f"'{output}' is not an output{suggest(output, outputs)}; {', '.join(outputs)} are"
+            )
+        return self.fit.model.outputs.index(output)
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{e.name} = {e.value:.5g} ± {e.sd:.2g}" for e in self.parameters)
+        return f"<Refit: {shown}>"
+
+    def _repr_html_(self) -> str:
+        rows = [(e.name, f"{e.value:.6g}", f"{e.sd:.2g}", e.unit or "", e.state) for e in self.parameters]
+        return table(("parameter", "value", "standard error", "unit", "state"), rows) + figure(self.plot())

@@ -1,0 +1,144 @@
+"""Checks of a plant file by itself: units, storages, signs, and scales that no recording can give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from thermoctl.checks.finding import Finding
+from thermoctl.checks.model import jacobian, unit_findings
+from thermoctl.plant import Plant
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr
+from thermoctl.plant.language import Input, Node
+
+_TEMPERATURES = ("degC", "K", "degF")
+POINTS = 3  # random values at which an expression is tried
+HOMOGENEOUS = 1e-9  # relative error of Euler's theorem
+
+
+def file_findings(plant: Plant) -> list[Finding]:
+    """Return warnings of a plant file; no recording is needed."""
+    return [*unit_findings(plant), *_storages(plant), *_signs(plant), *_scales(plant)]
+
+
+def _values(plant: Plant, seed: int = 0) -> dict[str, float]:
+    """Return parameters as they are, and inputs and nodes at random values of a usual size."""
+    rng = np.random.default_rng(seed)
+    found = {p.name: p.value for p in plant.parameters.values()} | {"t": 1.0}
+    items: list[Input | Node] = [*plant.inputs.values(), *plant.nodes.values()]
+    for item in items:
+        warm = item.unit in _TEMPERATURES or item.role in ("ambient", "temperature")
+        found[item.name] = float(rng.uniform(20, 40) if warm else rng.uniform(0.1, 1))
+    return found
+
+
+def _value(e: Expr, values: Mapping[str, float]) -> float:
+    plain = ex.substitute(e, lambda part: part.args[0] if part.op == "delay" else None)
+    return float(ex.evaluate(plain, values))
+
+
+def _storages(plant: Plant) -> list[Finding]:
+    found = []
+    for node in plant.nodes.values():
+        if (
+            ex.names(node.storage) <= set(plant.parameters)
+            and not (q := _value(node.storage, _values(plant))) > 0
+        ):
+            found.append(
+                Finding(
+                    "storage",
+                    f"{plant.file}:{node.at}",
+                    f"the storage of node '{node.name}' is {q:g}; a positive one was expected",
+                    "A negative heat capacity or mass turns every flow around: correct the sign.",
+                )
+            )
+    return found
+
+
+def _signs(plant: Plant) -> list[Finding]:
+    """Find a flow of a node by itself that drives the node away: it should hold it back."""
+    found = []
+    values = [_values(plant, seed) for seed in range(POINTS)]
+    for flow in plant.flows.values():
+        ends = [(e, way) for e, way in ((flow.source, -1.0), (flow.target, 1.0)) if e is not None]
+        own = [(e, way) for e, way in ends if e in ex.names(flow.rate)]
+        if not own:
+            continue
+        slopes = [[way * _value(ex.derivative(flow.rate, e), v) for e, way in own] for v in values]
+        if (
+            np.all(np.array(slopes) > 0)
+            and _grows(plant, values[0])
+            and not _grows(plant, values[0], flow.name)
+        ):
+            found.append(
+                Finding(
+                    "sign",
+                    f"{plant.file}:{flow.at}",
+                    f"flow '{flow.name}' grows with '{own[0][0]}' and drives it further away, so the plant is unstable",
+                    "Is the sign of its rate right, or its 'from' and 'into'?",
+                    severe=False,
+                )
+            )
+    return found
+
+
+def _grows(plant: Plant, values: dict[str, float], flip: str | None = None) -> bool:
+    matrix = jacobian(plant, values, flip)
+    if not np.isfinite(matrix).all():
+        return False
+    rates = np.linalg.eigvals(matrix)
+    return bool(rates.real.max(initial=0.0) > 1e-6 * np.abs(rates).max(initial=0.0))
+
+
+def _scales(plant: Plant) -> list[Finding]:
+    """Find parameters that can all be multiplied by one factor without any change of a reading.
+
+    A part of the network has such a scale if its storages and rates are homogeneous of degree 1 in them.
+    Euler's theorem shows it: sum p df/dp = f."""
+    free = {p.name for p in plant.parameters.values() if p.range}
+    read = frozenset().union(
+        *(ex.names(o.value) for o in plant.outputs.values()),
+        *(ex.names(n.initial) for n in plant.nodes.values()),
+    )
+    found = []
+    for part in _parts(plant):
+        flows = [f for f in plant.flows.values() if {f.source, f.target} & part]
+        exprs = [f.rate for f in flows] + [plant.nodes[n].storage for n in part]
+        scaled = free & frozenset().union(*map(ex.names, exprs))
+        if scaled and not scaled & read and all(_homogeneous(plant, e, scaled) for e in exprs):
+            names = ", ".join(sorted(scaled))
+            found.append(
+                Finding(
+                    "scale",
+                    plant.file,
+                    f"the readings give only ratios of {names}: all of them times one factor change nothing",
+                    "Fix one of them: take its range away, once it is measured or computed.",
+                    severe=False,
+                )
+            )
+    return found
+
+
+def _parts(plant: Plant) -> list[set[str]]:
+    """Return the nodes by connected part of the network of flows."""
+    parts = [{n} for n in plant.nodes]
+    for f in plant.flows.values():
+        if f.source and f.target:
+            a = next(p for p in parts if f.source in p)
+            b = next(p for p in parts if f.target in p)
+            if a is not b:
+                a |= b
+                parts.remove(b)
+    return parts
+
+
+def _homogeneous(plant: Plant, e: Expr, parameters: set[str]) -> bool:
+    for seed in range(POINTS):
+        values = _values(plant, seed)
+        value = _value(e, values)
+        total = sum(values[q] * _value(ex.derivative(e, q), values) for q in parameters & ex.names(e))
+        if not abs(total - value) <= HOMOGENEOUS * max(abs(value), 1e-12):
+            return False
+    return True

@@ -1,0 +1,1 @@
+"""Plants for other programs: C, FMU, Python, Modelica, Simulink."""

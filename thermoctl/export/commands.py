@@ -1,0 +1,69 @@
+"""The command `plant export`."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+import numpy as np
+
+from thermoctl.export.c import c_source
+from thermoctl.export.fmu import write_fmu
+from thermoctl.export.matlab import matlab_source
+from thermoctl.export.modelica import modelica_source
+from thermoctl.export.python import python_source
+from thermoctl.export.values import values
+from thermoctl.plant import Plant, load
+from thermoctl.plant.equations import Equations
+from thermoctl.plant.recordings import read_recordings
+from thermoctl.recording.logger import parsed_columns
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+SUFFIX = {"fmu": ".fmu", "modelica": ".mo", "python": ".py", "c": ".c", "simulink-m": ".m"}
+
+
+def export(args: argparse.Namespace) -> int:
+    """Write a plant for another program. Raises InputError where that is impossible."""
+    plant = load(args.plant)
+    recording = None
+    if args.data:
+        (recording,) = read_recordings(plant, [args.data], args.time, parsed_columns(args.columns))
+    out = Path(args.out or Path(args.plant).with_suffix(SUFFIX[args.to]).name)
+    if out.suffix != SUFFIX[args.to]:
+        raise InputError(f"{out}: --to {args.to} writes a file that ends in {SUFFIX[args.to]}")
+    write(plant, args.to, out, recording)
+    print(out)
+    return 0
+
+
+def write(plant: Plant, to: str, out: Path, recording: Table | None = None) -> None:
+    """Write a plant as `to` (a key of SUFFIX); `recording` gives first readings and widths of jumps.
+
+    Raises InputError where the format lacks what the plant needs, or the file cannot be written."""
+    numbers = values(plant, Equations(plant), recording)
+    name = re.sub(r"\W", "_", out.stem)
+    name = name if name[:1].isalpha() else f"plant_{name}"
+    if to == "fmu":
+        start = {}
+        for i in plant.inputs.values() if recording else ():
+            assert recording is not None
+            column = recording.columns[i.column]
+            start[i.name] = float(column[np.isfinite(column)][0])
+        write_fmu(plant, numbers, out, start)
+        return
+    if to == "simulink-m" and name != out.stem:
+        raise InputError(
+            f"{out}: the file is called as its function: a name of letters, digits and '_' was expected"
+        )
+    text = {
+        "modelica": lambda: modelica_source(plant, numbers, name),
+        "python": lambda: python_source(plant, numbers),
+        "c": lambda: c_source(plant, numbers),
+        "simulink-m": lambda: matlab_source(plant, numbers, name),
+    }[to]()
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as e:
+        raise InputError(f"{out}: cannot be written: {e.strerror or e}") from None
