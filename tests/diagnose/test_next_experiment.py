@@ -1,5 +1,6 @@
 """The experiment that tells explanations apart: proposed inside the rig's limits, written, run, and decisive."""
 
+import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,13 +10,15 @@ import pytest
 import yaml
 
 from thermoctl.cli import main
-from thermoctl.diagnose import experiment_file, search
+from thermoctl.diagnose import experiment_file
 from thermoctl.diagnose.design import Excitation, courses, levers
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.experiment_file import peaks
-from thermoctl.diagnose.explain import Case
 from thermoctl.diagnose.propose import bits, distance, propose
 from thermoctl.diagnose.resolve import resolve
+from thermoctl.evidence.case import Budget, case
+from thermoctl.evidence.limits import limits
+from thermoctl.evidence.search import search
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
@@ -56,33 +59,40 @@ def undecided():
 
 
 def shared_by_two(belief, truth, inputs):
-    """A case, and a diagnosis of it that two refitted explanations share; both stand for what a whole diagnosis would hold."""
+    """A diagnosis that two refitted hypotheses share equally, without the rest of the search."""
     table = compile_plant(loads(truth), ()).measure(inputs, seed=1)
-    case = Case(loads(belief), [table])
-    base = case.explain(case.plant, [], [], iterations=40)
-    entries = {
-        k: e
-        for k, e in catalogue((CATALOGUE,)).items()
-        if k in ("radiation", "temperature_dependent_conductance")
-    }
-    seen = search.look(case, base, entries, draws=0)
-    found = search.compete(case, seen, search.finalists(seen.directions))
-    assert {e.last.effect.name for e in found} == set(entries)
-    for e in found:
-        e.probability = 0.5
-    return case, SimpleNamespace(verdict="ambiguous", final=found[0], rivals=found[1:])
+    two = ("radiation", "temperature_dependent_conductance")
+    entries = {k: e for k, e in catalogue((CATALOGUE,)).items() if k in two}
+    known = case(loads(belief), [table], entries, Budget(30))
+    numbers = dataclasses.replace(limits(), effects=1)
+    searched = search(known, numbers)
+    single = [w.fitted.hypothesis.keys for w in searched.tried if w.fitted.hypothesis.keys]
+    assert {e for keys in single for e, _ in keys} == set(two)
+    best = [next(k for k in single if e in {n for n, _ in k}) for e in two]
+    return undecided_between(known, searched, best)
+
+
+def undecided_between(known, searched, hypotheses, verdict="ambiguous"):
+    """A diagnosis as the next experiment reads it."""
+    share = 1 / max(len(hypotheses), 1)
+    return SimpleNamespace(
+        case=known,
+        searched=searched,
+        posterior=SimpleNamespace(hypotheses=dict.fromkeys(hypotheses, share)),
+        decision=SimpleNamespace(verdict=verdict),
+    )
 
 
 def test_proposal_stays_inside_the_limits_and_is_the_best_per_hour(undecided):
-    case, found = undecided
-    entry, chosen = propose(case, found, limits=LIMITS)
+    found = undecided
+    entry, chosen = propose(found, limits=LIMITS)
     heat = np.array(entry["inputs"]["heat"])
     assert heat[:, 1].min() >= 0 and heat[:, 1].max() <= 20 and entry["inputs"]["air"] == [[0.0, 22.0]]
-    ahead = compile_plant(loads(TRUTH), ()).simulate(chosen.table(case.plant, 5.0)).y
+    ahead = compile_plant(loads(TRUTH), ()).simulate(chosen.table(found.case.plant, 5.0)).y
     assert ahead.min() > 15 and ahead.max() < 110
     assert entry["separates"][0]["sigmas"] > 3 and entry["bits"] > 0.6
     assert entry["bits_per_hour"] == pytest.approx(entry["bits"] / (entry["duration_s"] / 3600))
-    near, _ = propose(case, found)  # no limits given: not beyond what was recorded, and there they look alike
+    near, _ = propose(found)  # no limits given: not beyond what was recorded, and there they look alike
     assert near["bits"] < 0.5 * entry["bits"] and near["also_helpful"]
 
 
@@ -107,12 +117,12 @@ def printing():
 
 def test_a_hot_end_is_not_heated_beyond_what_was_recorded(tmp_path):
     """Full heat at fan 0 would go on far beyond the hottest reading: neither as any hypothesis nor as the truth has it."""
-    case, found = shared_by_two(HOT_END, HOT_TRUTH, printing())
-    entry, chosen = propose(case, found)
+    found = shared_by_two(HOT_END, HOT_TRUTH, printing())
+    entry, chosen = propose(found)
     (p,) = entry["predicted"].values()
-    top = float(case.tables[0].columns["T_block"].max())
+    top = float(found.case.tables[0].columns["T_block"].max())
     assert top > 200 and p["high"] <= top and p["recorded"][1] == pytest.approx(top)
-    assert compile_plant(loads(HOT_TRUTH), ()).simulate(chosen.table(case.plant, 5.0)).y.max() <= top
+    assert compile_plant(loads(HOT_TRUTH), ()).simulate(chosen.table(found.case.plant, 5.0)).y.max() <= top
     full = Table(
         "full",
         "full",
@@ -120,7 +130,7 @@ def test_a_hot_end_is_not_heated_beyond_what_was_recorded(tmp_path):
         {"heat": np.full(600, 60.0), "fan": np.zeros(600), "air": np.full(600, 22.0)},
     )
     assert compile_plant(loads(HOT_TRUTH), ()).simulate(full).y.max() > top + 20, "the danger is there"
-    experiment_file.write(tmp_path, case, entry, chosen)
+    experiment_file.write(tmp_path, found.case, entry, chosen)
     text = (tmp_path / "next_experiment.yaml").read_text()
     assert f"{p['high']:.4g} degC predicted (recorded" in text and "predicted (recorded" in peaks(entry)[0]
     (read,) = load_inputs(tmp_path / "next_experiment.yaml").values()
@@ -155,17 +165,18 @@ def test_bits_are_none_for_equals_and_one_for_two_that_differ():
 
 
 def test_decided_diagnoses_ask_for_nothing(undecided):
-    case, found = undecided
-    assert propose(case, SimpleNamespace(verdict="explained", final=found.final, rivals=found.rivals)) is None
-    assert propose(case, SimpleNamespace(verdict="ambiguous", final=found.final, rivals=[])) is None
+    both = list(undecided.posterior.hypotheses)
+    again = (undecided.case, undecided.searched)
+    assert propose(undecided_between(*again, both, "explained")) is None
+    assert propose(undecided_between(*again, both[:1])) is None
     with pytest.raises(InputError, match="no such input or output"):
-        propose(case, found, limits={"T_blok": (0, 1)})
+        propose(undecided, limits={"T_blok": (0, 1)})
 
 
 def test_what_is_written_is_read_by_the_experiment_command(undecided, tmp_path):
-    case, found = undecided
-    entry, chosen = propose(case, found, limits=LIMITS)
-    assert set(experiment_file.write(tmp_path, case, entry, chosen)) == {
+    found = undecided
+    entry, chosen = propose(found, limits=LIMITS)
+    assert set(experiment_file.write(tmp_path, found.case, entry, chosen)) == {
         "next_experiment.yaml",
         "next_experiment.csv",
     }
@@ -217,9 +228,11 @@ def test_on_the_programs_own_rig_the_setpoint_is_driven(tmp_path):
             "T_block": 20 + t / 300,
         },
     )
-    case = Case(plant, [table])
+    known = case(plant, [table], {}, Budget(1))
     chosen = Excitation("hold", 60.0, {"heat": np.array([[0, 0.0], [10, 1.5], [60, 1.5]])}, {"air": 20.0})
-    experiment_file.write(tmp_path, case, {"why": "", "sample_s": 1.0, "predicted": {}, "limits": {}}, chosen)
+    experiment_file.write(
+        tmp_path, known, {"why": "", "sample_s": 1.0, "predicted": {}, "limits": {}}, chosen
+    )
     schedule = load_experiments(tmp_path / "next_experiment.yaml")["next_experiment"]
     assert schedule.setpoint_um == pytest.approx([0, 150, 150]) and schedule.commands() == [
         (0.0, "setpoint", pytest.approx(150.0))
@@ -283,15 +296,3 @@ def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment
     (size,) = finding["parameters"].values()
     assert size["value"] == pytest.approx(2.5e-9, rel=0.1)
     assert not (tmp_path / "out/next_experiment.yaml").exists()
-
-
-def test_a_missing_flow_is_not_said_to_follow_the_daemons_own_estimates():
-    from thermoctl.diagnose.run import _signals
-
-    columns = {
-        n: np.zeros(3) for n in ("coil_est_c", "coil_est_c_max", "coil_c", "coil_c_max", "slips", "power_w")
-    }
-    nothing = SimpleNamespace(drives=[], runs=[], model=SimpleNamespace(states=[]))
-    rig = SimpleNamespace(plant=SimpleNamespace(inputs={}), moving_inputs=[], spare=[*columns])
-    case = SimpleNamespace(tables=[SimpleNamespace(columns=columns)])
-    assert set(_signals(case, SimpleNamespace(rig=rig, metric=nothing))) == {"coil_c", "power_w"}

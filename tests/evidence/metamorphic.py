@@ -23,7 +23,7 @@ import yaml
 
 from tests.concealed.generate import NotVisible, make_case
 from tests.evidence.changes import CHANGES, KERNEL, SEED, Change, Rig, noise_stated, thinned
-from thermoctl.evidence.run import write
+from thermoctl.diagnose.run import diagnose_files
 
 CLOSE = 0.02  # probabilities that differ by less are the same (issue 23)
 EITHER_WAY = ("missing_link", "bending")  # their two places may be named in either order
@@ -73,7 +73,7 @@ def diagnosed(rig: Rig, folder: Path) -> dict[str, Any]:
         text = "\n".join(",".join("" if np.isnan(v) else repr(float(v)) for v in row) for row in rows)
         files.append(folder / f"{name}.csv")
         files[-1].write_text(",".join(c) + "\n" + text + "\n")
-    return write(folder / "plant.yaml", files, folder / "out")
+    return diagnose_files(folder / "plant.yaml", files, folder / "out")
 
 
 def findings(found: Mapping[str, Any], back: Mapping[str, str]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Every row of the table that turns a posterior into a verdict."""
+"""Every row of the table that turns a posterior into a verdict; effects that do not stand out of what stays."""
 
 from __future__ import annotations
 
@@ -6,38 +6,75 @@ import pytest
 
 from thermoctl.evidence.decide import Facts, decide, weigh
 from thermoctl.evidence.limits import limits
+from thermoctl.evidence.misfit import Energy, physics, standing
 
 A, B = ("radiation", "block"), ("natural_convection", "block")
-NOTHING, ONE, OTHER = frozenset(), frozenset({A}), frozenset({B})
+NOTHING, ONE, OTHER, BOTH = frozenset(), frozenset({A}), frozenset({B}), frozenset({A, B})
+
+
+def weighed(scores):
+    return weigh(scores, {keys: dict.fromkeys(keys, 1.0) for keys in scores}, limits())
 
 
 @pytest.mark.parametrize(
-    ("scores", "named", "over_noise", "closed", "worth", "verdict"),
+    ("scores", "named", "over_noise", "worth", "verdict"),
     [
-        ({NOTHING: 0.0, ONE: -9.0}, (), 1.0, 0.0, 1.0, "consistent"),
-        ({NOTHING: 0.0, ONE: -9.0}, (), 3.0, 0.0, 1.0, "unexplained"),
-        ({NOTHING: 0.0, ONE: 40.0}, (A,), 1.0, 0.9, 1.5, "unexplained"),
-        ({NOTHING: 0.0, ONE: 40.0, OTHER: 39.5}, (), 1.0, 0.9, 0.3, "ambiguous"),
-        ({NOTHING: 0.0, ONE: 40.0}, (A,), 1.0, 0.9, 0.3, "explained"),
-        ({NOTHING: 0.0, ONE: 40.0}, (A,), 3.0, 0.9, 0.3, "partly_explained"),
-        ({NOTHING: 0.0, ONE: 40.0}, (A,), 3.0, 0.2, 0.3, "unexplained"),
+        ({NOTHING: 0.0, ONE: -9.0}, (), 1.0, 1.0, "consistent"),
+        ({NOTHING: 0.0, ONE: -9.0}, (), 3.0, 1.0, "unexplained"),
+        ({NOTHING: 0.0, ONE: 40.0}, (A,), 1.0, 1.5, "unexplained"),
+        ({NOTHING: 0.0, ONE: 40.0, OTHER: 39.5}, (), 1.0, 0.3, "ambiguous"),
+        ({NOTHING: 0.0, ONE: 40.0}, (A,), 1.0, 0.3, "explained"),
+        ({NOTHING: 0.0, ONE: 40.0}, (A,), 3.0, 0.3, "partly_explained"),
     ],
 )
-def test_each_row_gives_its_verdict(scores, named, over_noise, closed, worth, verdict):
-    numbers = limits()
-    posterior = weigh(scores, numbers)
-    found = decide(posterior, Facts(posterior.something, named, over_noise, closed, worth), numbers)
+def test_each_row_gives_its_verdict(scores, named, over_noise, worth, verdict):
+    posterior = weighed(scores)
+    found = decide(posterior, Facts(posterior.something, named, over_noise, worth), limits())
     assert found.verdict == verdict
     assert (found.named == named) == (verdict in ("explained", "partly_explained") or not named)
 
 
 def test_alternatives_hold_the_set_and_no_more():
-    found = weigh({NOTHING: 0.0, ONE: 40.0, OTHER: 39.5, frozenset({("back_emf", "v")}): 10.0}, limits())
-    facts = Facts(found.something, (), 1.0, 0.9, 0.3)
+    found = weighed({NOTHING: 0.0, ONE: 40.0, OTHER: 39.5, frozenset({("back_emf", "v")}): 10.0})
+    facts = Facts(found.something, (), 1.0, 0.3)
     assert [k for k, _ in decide(found, facts, limits()).alternatives] == [A, B]
 
 
 def test_an_effect_gathers_the_probability_of_all_hypotheses_that_hold_it():
-    found = weigh({NOTHING: -50.0, ONE: 0.0, frozenset({A, B}): 0.0}, limits())
+    found = weighed({NOTHING: -50.0, ONE: 0.0, BOTH: 0.0})
     assert found.effects[A] == pytest.approx(1.0)
     assert found.effects[B] == pytest.approx(0.5)
+
+
+def test_a_likely_effect_that_may_be_a_misfit_is_no_certainty():
+    found = weigh({NOTHING: 0.0, ONE: 40.0}, {NOTHING: {}, ONE: {A: 0.7}}, limits())
+    assert found.effects[A] == pytest.approx(0.7)
+    assert found.something == pytest.approx(0.7)
+
+
+def test_a_second_effect_that_removes_less_than_stays_does_not_stand():
+    energy = {
+        NOTHING: Energy(100.0, 98.4),
+        ONE: Energy(10.0, 8.4),
+        OTHER: Energy(90.0, 88.4),
+        BOTH: Energy(9.5, 7.9),
+    }
+    found = standing(energy, {A: 1, B: 1}, limits())
+    assert set(found) == {NOTHING, ONE}
+    assert found[ONE][A] > 0.99
+
+
+def test_without_a_misfit_every_effect_stands():
+    energy = {NOTHING: Energy(1.02, 0.0), ONE: Energy(1.0, 0.0)}
+    assert standing(energy, {A: 7}, limits())[ONE][A] == 1.0
+
+
+def test_the_odds_of_physics_are_a_log_uniform_size_against_a_normal_one():
+    import numpy as np
+    from scipy.stats import loguniform, norm
+
+    r = 3.0  # sizes in standard deviations of the misfit, over four decades about it
+    expected = loguniform(1e-2, 1e2).pdf(r) / norm.pdf(r)
+    p = physics(r**2 * 0.1 * 5.0, 5.0, 0.1)
+    assert p / (1 - p) == pytest.approx(expected, rel=1e-9)
+    assert np.all(np.diff([physics(x, 1.0, 0.1) for x in np.linspace(0.2, 3.0, 30)]) > 0)

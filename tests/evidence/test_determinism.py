@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import blas
 
-from tests.evidence.test_engine import LAGGED, _write
+from tests.evidence.test_engine import LAGGED, _write, written
 from thermoctl.evidence import run, threads
 from thermoctl.yamlfile import InputError
 
@@ -25,11 +25,22 @@ def test_two_runs_at_once_on_one_and_on_two_threads_write_the_same_bytes(tmp_pat
             "OMP_NUM_THREADS": str(n),
             "PYTHONHASHSEED": str(n),
         }
-        command = [sys.executable, "-m", "thermoctl.evidence", "--plant", plant, "--out", str(out), *files]
+        command = [
+            sys.executable,
+            "-m",
+            "thermoctl.cli",
+            "diagnose",
+            "--quiet",
+            "--plant",
+            plant,
+            "--out",
+            str(out),
+            *files,
+        ]
         started.append(subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL))
     assert [p.wait(timeout=300) for p in started] == [0, 0]
-    assert len({(out / "diagnosis.json").read_bytes() for out in outs}) == 1
-    assert len({(out / "plant.yaml").read_bytes() for out in outs}) == 1
+    assert set(written(outs[0])) == {"diagnosis.json", "plant.yaml", "report.html"}
+    assert written(outs[0]) == written(outs[1])
 
 
 def test_a_diagnosis_runs_on_one_thread_and_gives_the_others_back(monkeypatch):

@@ -8,8 +8,8 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
 from thermoctl.diagnose.effects import Candidate, candidates, catalogue
+from thermoctl.diagnose.extend import extend
 from thermoctl.diagnose.screen import Direction
-from thermoctl.diagnose.search import extend
 from thermoctl.evidence.case import Budget, case
 from thermoctl.evidence.fit import Placed, Posterior, evidence_at, fitted
 from thermoctl.evidence.roles import Structure

@@ -482,14 +482,14 @@ def test_bench_counts_a_peer_by_the_same_scoring(tmp_path, capsys):
     generate.main(
         f"--out {cases} --answers inside --number 2 --families tanks,heater --kind none --smoke".split()
     )
-    argv = [cases, "--methods", "latent", "--out", str(tmp_path)]
+    argv = [cases, "--methods", "bic", "--out", str(tmp_path)]
     assert bench.main(argv) == 0
-    found = json.loads((tmp_path / "figures.json").read_text())["latent"]
+    found = json.loads((tmp_path / "figures.json").read_text())["bic"]
     assert found["cases"] == 2 and found["failed"] == 0
     assert found["detected"] == [0, 0] and found["false_alarms"][1] == 2
-    kept = sorted((tmp_path / "latent").glob("*.json"))
+    kept = sorted((tmp_path / "bic").glob("*.json"))
     told = json.loads(kept[0].read_text())
-    assert told["result"]["findings"] == [] and told["result"]["verdict"] in ("consistent", "unexplained")
+    assert (told["result"]["verdict"] == "explained") == bool(told["result"]["findings"])
     kept[0].write_text(json.dumps(told | {"cpu_s": 123.0}))
     assert bench.main(argv) == 0  # kept results are taken
-    assert json.loads((tmp_path / "figures.json").read_text())["latent"]["cpu_s_longest"] == 123.0
+    assert json.loads((tmp_path / "figures.json").read_text())["bic"]["cpu_s_longest"] == 123.0

@@ -19,47 +19,44 @@ from thermoctl.checks.commands import checked, report
 from thermoctl.diagnose import run
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.experiment_file import peaks
-from thermoctl.diagnose.outcome import sentence
 from thermoctl.diagnose.resolve import resolve
+from thermoctl.evidence.explain import explain
+from thermoctl.evidence.words import sentences, what_next
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.yamlfile import InputError, suggest
 
-# Share of a diagnosis that is done when a stage starts, roughly: for the time left.
-_STAGES = (
-    ("refitting the plant", 0.0),
-    ("screening the catalogue", 0.12),
-    ("looking again", 0.35),
-    ("refitting", 0.25),
-    ("screening again", 0.6),
-    ("one effect is not needed", 0.85),
-)
+QUIET_S = 5.0  # seconds between two lines on the same stage
 
 
 class StageReporter:
-    """Writes each stage with the time gone and, from the second stage on, a rough time left."""
+    """Writes each stage with the time gone; inside a stage at most one line in QUIET_S."""
 
     def __init__(self) -> None:
-        self.started, self.share = time.monotonic(), 0.0
+        self.started, self.stage, self.written = time.monotonic(), "", 0.0
 
     def __call__(self, text: str) -> None:
-        gone = time.monotonic() - self.started
-        self.share = max(self.share, next((share for start, share in _STAGES if text.startswith(start)), 0.0))
-        left = f", about {gone * (1 - self.share) / self.share:.0f} s left" if self.share else ""
-        print(f"{gone:6.1f} s{left}: {text}", file=sys.stderr, flush=True)
+        gone, stage = time.monotonic() - self.started, text.partition(":")[0]
+        if stage != self.stage or gone - self.written >= QUIET_S:
+            self.stage, self.written = stage, gone
+            print(f"{gone:6.1f} s: {text}", file=sys.stderr, flush=True)
 
 
 def diagnose(args: argparse.Namespace) -> int:
-    """`thermoctl diagnose`: runs the diagnosis and prints its summary.
+    """`thermoctl diagnose`: run the diagnosis and print its summary, or explain an earlier one.
 
     Raises InputError for unusable inputs."""
+    if args.explain:
+        print(explain(_read(Path(args.explain))))
+        return 0
     if not args.recordings:
         raise InputError("no recording was given; one or more were expected, or --live")
 
     plant = load(args.plant)
     given, found_before = checked(plant, args.recordings, args.time, args.columns)
-    report(found_before, sys.stderr)
-    if any(f.severe for f in found_before) and not args.anyway:
+    held_out, found_held = checked(plant, args.held_out or (), args.time, args.columns)
+    report([*found_before, *found_held], sys.stderr)
+    if any(f.severe for f in (*found_before, *found_held)) and not args.anyway:
         raise InputError(
             f"{args.plant}: not diagnosed: the checks above would make any name doubtful; correct the data or the "
             "plant, or diagnose with --anyway"
@@ -67,12 +64,12 @@ def diagnose(args: argparse.Namespace) -> int:
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
         added = read_recordings(plant, recordings[len(given) :])  # of --resolve: written by thermoctl
-        tables: list[Any] = [*given, *added]
         return run.diagnose(
-            args.plant,
-            tables,
+            plant,
+            [*given, *added],
             args.out,
             [Path(e) for e in args.effects or ()],
+            held_out,
             None if args.quiet else StageReporter(),
             args.drive or (),
             _limits(args.limit or ()),
@@ -94,6 +91,20 @@ def diagnose(args: argparse.Namespace) -> int:
     elif not args.quiet:
         summary(found, args.out)
     return 0
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    """Read the result of an earlier diagnosis. Raises InputError."""
+    path = folder / "diagnosis.json"
+    try:
+        found = json.loads(path.read_text())
+    except OSError:
+        raise InputError(f"{path}: no such file; the folder of a diagnosis (--out) was expected") from None
+    except ValueError as e:
+        raise InputError(f"{path}: no JSON ({e}); diagnose again") from None
+    if not isinstance(found, dict) or not {"decision", "hypotheses", "lost"} <= found.keys():
+        raise InputError(f"{path}: written by an older version, without its reasons; diagnose again")
+    return found
 
 
 def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -159,7 +170,7 @@ def effects(args: argparse.Namespace) -> int:
 def summary(found: dict[str, Any], out: str | Path) -> None:
     """Print a result for a person."""
     console = Console() if sys.stdout.isatty() else Console(width=160)
-    console.print(f"[bold]{found['verdict']}[/]. {sentence(found)}")
+    console.print(f"[bold]{found['verdict'].replace('_', ' ')}[/]. {' '.join(sentences(found))}")
     if found["findings"]:
         console.print(_findings(found["findings"]))
     if found["alternatives"]:
@@ -167,9 +178,7 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
         for a in found["alternatives"][:8]:
             table.add_row(a["effect"], a["where"], f"{a['probability']:.3f}")
         console.print(table)
-    if found["mismatch"]:
-        console.print(_mismatch(found["mismatch"]))
-    console.print(_errors(found["fit"], found.get("held_out_gain", {})))
+    console.print(_errors(found))
     lines = [f"note: {note}" for note in found["notes"]]
     if found["next_experiment"]:
         lines += _next_experiment(found["next_experiment"], Path(out))
@@ -177,7 +186,10 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
         f"round {k}: was {r['verdict']}; ran {r['experiment']} -> {r['recording']}"
         for k, r in enumerate(found.get("resolved", ()), 1)
     ]
-    lines.append(f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json")
+    lines.append(f"what next: {what_next(found)}")
+    lines.append(
+        f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json ({found['seconds']:.0f} s)"
+    )
     for line in lines:
         console.print(line, markup=False)
 
@@ -197,29 +209,19 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def _mismatch(mismatch: Sequence[Mapping[str, Any]]) -> Table:
-    table = _table("misfit of", "rms", "sensor allows", "missing flow", "follows")
-    for m in mismatch:
-        size, unit = m.get("missing_flow_rms"), m.get("missing_flow_unit")
-        flow = f"{size:.3g} {unit or ''} at {m['node']}" if size else "-"
-        rms = (f"{m['rms']:.4g}", f"{m['expected_rms']:.4g}")
-        table.add_row(m["channel"], *rms, flow, ", ".join(m.get("follows") or ()))
-    return table
-
-
-def _errors(fit: Mapping[str, Any], gain: Mapping[str, Any]) -> Table:
+def _errors(found: Mapping[str, Any]) -> Table:
     columns = {
         "before": "as it came",
         "refit_only": "refitted",
-        "after": "with the finding",
+        "after": "with the findings",
         "held_out_refit_only": "held out: refitted",
-        "held_out_after": "with the finding",
+        "held_out_after": "held out: with the findings",
     }
-    table = _table("rms of", *columns.values(), "ratio (95 %)")
-    for o in fit["refit_only"]:
-        g = gain.get(o)
-        ratio = f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else "-"
-        table.add_row(o, *(_number(fit.get(k, {}).get(o)) for k in columns), ratio)
+    if not found["findings"]:
+        columns = {k: title for k, title in columns.items() if not k.endswith("after")}
+    table = _table("rms of", "noise", *columns.values())
+    for o, x in found["outputs"].items():
+        table.add_row(o, _number(x["noise"]), *(_number(found["fit"][k].get(o)) for k in columns))
     return table
 
 

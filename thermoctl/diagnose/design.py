@@ -1,4 +1,4 @@
-"""The candidate experiments: what can be driven, and how, inside the rig's limits.
+"""The candidate experiments: the inputs that can be driven, and how, inside the rig's limits.
 
 The family: levels, steps both ways, warm-up and cool-down, trapezoids slow and fast, triangles small and
 large, and pseudo-random sequences of two bands. Every input is driven by itself and all together, in several
@@ -70,9 +70,9 @@ def levers(
 ) -> list[Lever]:
     """Find the inputs that moved in the recordings and can be commanded.
 
-    Inputs that moved alike are one lever.
+    Inputs that moved together are one lever.
 
-    Temperatures, sunshine and pressure belong to the surroundings. `only`: names that count, whatever their
+    Temperatures, sunshine and pressure belong to the surroundings. `only`: names that count, in any
     unit. `limits`: by input, instead of the recorded range. Raises InputError for an unknown name."""
     for n in only:
         if n not in plant.inputs:
@@ -227,7 +227,7 @@ def _constant(
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
     """Return the value of each input that is not driven (its mean), and the starting conditions.
 
-    An input that is constant in each recording but differs between recordings gives two starts: its extremes."""
+    An input that is constant in each recording but differs between recordings gives two starts."""
     constant, low, high = {}, {}, {}
     for i in plant.inputs.values():
         if i.name in moved:

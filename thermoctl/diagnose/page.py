@@ -2,50 +2,55 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.effects import Candidate
 from thermoctl.diagnose.experiment_file import peaks
-from thermoctl.diagnose.outcome import Diagnosis, sentence
-from thermoctl.plant.refit import report
+from thermoctl.evidence.fit import Fitted, Placed
+from thermoctl.evidence.result import Diagnosis
+from thermoctl.evidence.words import name, sentences, what_next
+from thermoctl.plant.refit import Estimate, Fit, report
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, page, table, unit
 
-if TYPE_CHECKING:
-    from thermoctl.diagnose.explain import Case, Explanation
-
 POINTS = 1500  # of a curve; more would only make the page heavy
 SHOWN = 6  # outputs that are drawn, worst first
+WIDE = 1.96  # standard deviations to either side of a 95 % interval
+MOVED, MOVED_SHARE = 4.0, 0.25  # change of a parameter by a finding that is worth a sentence: sd, share of it
 _COLOURS = {"measured": "#1b1f24", "refit": "#c7621b", "with": "#0b6bcb"}
+_NOTHING = "Nothing is marked: nothing is missing."
 
 
-def write_report(case: Case, found: Diagnosis, path: str | Path) -> None:
-    """Write report.html for a diagnosis whose `result` is set."""
-    r = found.result
+def write_report(found: Diagnosis, result: Mapping[str, Any], path: str | Path) -> None:
+    """Write report.html of a diagnosis; `result`: the content of its diagnosis.json."""
     sections = [
-        (
-            "",
-            f'<p class="lead"><b>{r["verdict"].capitalize()}.</b> {html.escape(sentence(r))}</p>'
-            + _items(r["notes"]),
-        ),
-        ("Where", _place(case, found)),
-        ("What is missing", _missing(found)),
-        ("The equation", _equations(found)),
-        ("What adding it is worth" if found.final.effects else "How well it fits", _worth(case, found)),
-        ("Before and after", _curves(case, found)),
-        ("What it could be confused with", _confused(found)),
-        ("Parameters before and after", _parameters(case, found)),
-        ("What could not have been seen", _unseen(found)),
-        ("Next experiment", _next(r["next_experiment"])),
-        ("How this was made", _made(case, found)),
+        ("", _lead(result)),
+        ("What next", _p(what_next(result)) + _experiment(result["next_experiment"])),
+        ("Where", _place(found, result)),
+        ("What was found", _findings(found, result)),
+        ("What it is worth" if found.shown else "How well the plant fits", _worth(found, result)),
+        ("Before and after", _curves(found)),
+        ("What remains", _remains(found, result)),
+        ("Why this verdict", _why(result)),
+        ("Tried and lost", _lost(result)),
+        ("Parameters before and after", _parameters(found)),
+        ("What could not have been seen", _unseen(result)),
+        ("How this was made", _made(found, result)),
     ]
+    case = found.case
     note = f"{case.plant.title} · {', '.join(t.name for t in case.tables)}"
     Path(path).write_text(page("Diagnosis", [(h, b) for h, b in sections if b], note), encoding="utf-8")
+
+
+def _lead(result: Mapping[str, Any]) -> str:
+    verdict = str(result["verdict"]).replace("_", " ").capitalize()
+    text = html.escape(" ".join(sentences(result)))
+    return f'<p class="lead"><b>{verdict}.</b> {text}</p>' + _items(result["notes"])
 
 
 def _p(text: str) -> str:
@@ -56,163 +61,72 @@ def _items(lines: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
 
 
-def _named(name: str, its_unit: str | None) -> str:
-    return f"{name} ({unit(its_unit)})" if unit(its_unit) else name
+def _named(quantity: str, its_unit: str | None) -> str:
+    return f"{quantity} ({unit(its_unit)})" if unit(its_unit) else quantity
 
 
-def _label(c: Candidate) -> str:
-    return f"{c.effect.title} at {c.place.where}"
+def _error_unit(its_unit: str | None) -> str:
+    """The unit of a difference of readings."""
+    return "K" if its_unit == "degC" else unit(its_unit)
 
 
-# ------------------------------------------------------------------------------------------------------- where, what
-
-
-def _place(case: Case, found: Diagnosis) -> str:
+def _place(found: Diagnosis, result: Mapping[str, Any]) -> str:
     marked: set[str] = set()
-    for c in found.final.effects:
-        marked |= {c.place.where, *c.place.nodes.values(), *(n for n in (c.place.flow, c.place.output) if n)}
-    if not found.final.effects and found.verdict != "consistent" and found.suspects:
-        marked.add(found.suspects[0].name)
-    words = "Red: where it sits." if marked else "Nothing is marked: nothing is missing."
-    body = figure(drawing(case.plant, marked, 11.0), f"The network of the plant file. {words}")
-    if found.suspects and found.verdict != "consistent":
-        body += table(
-            ("unknown input at", "kind", "explains (chi-square)", "degrees of freedom"),
-            [
-                (
-                    s.name,
-                    "heat, force or flow into the node" if s.kind == "node" else "error of the sensor",
-                    s.gain,
-                    s.dims,
-                )
-                for s in found.suspects[:6]
-            ],
-            "One smooth unknown input at a time, in place of what is missing, likeliest first",
-        )
-    return body
+    for e in found.shown:
+        place = e.candidate.place
+        marked |= {place.where, *place.nodes.values(), *(n for n in (place.flow, place.output) if n)}
+    words = "Red: where the findings sit." if marked else _NOTHING
+    remainder = result["remainder"]
+    if not marked and remainder and remainder["node"]:
+        marked, words = {remainder["node"]}, "Red: the node where the remainder enters."
+    return figure(drawing(found.case.plant, marked, 11.0), f"The network of the plant file. {words}")
 
 
-def _missing(found: Diagnosis) -> str:
-    m = found.missing
-    if m is None:
-        return ""
-    from matplotlib.figure import Figure
-
-    first = found.rounds[0]
-    followed = m.follows[0] if m.follows else None
-    fig = Figure(figsize=(9, 3.1), layout="constrained")
-    axes = fig.subplots(1, 2 if followed else 1, squeeze=False)[0]
-    for k, (t, q) in enumerate(zip(m.t, m.flow, strict=True)):
-        axes[0].plot(t, q, lw=1.3, label=first.metric.drives[k].name)
-        if followed:
-            drive, run = first.metric.drives[k], first.metric.runs[k]
-            model = first.metric.model
-            column = (
-                run.x[:, model.states.index(followed)]
-                if followed in model.states
-                else drive.u[:, model.inputs.index(followed)]
-                if followed in model.inputs
-                else first.rig.columns[k].get(followed)
-            )
-            if column is not None:
-                axes[1].plot(np.interp(t, drive.t, column), q, ".", ms=5, label=drive.name)
-    per = (
-        unit(next((x.get("missing_flow_unit") for x in found.result["mismatch"]), None))
-        or "storage x node's unit / s"
-    )
-    axes[0].set(xlabel="time (s)", ylabel=f"into {m.node} ({per})")
-    axes[0].axhline(0, color="0.7", lw=0.8)
-    if followed:
-        axes[1].set(xlabel=followed)
-        axes[1].axhline(0, color="0.7", lw=0.8)
-    fig.legend(
-        *axes[0].get_legend_handles_labels(),
-        loc="outside upper right",
-        ncols=len(m.flow),
-        fontsize=8,
-        frameon=False,
-    )
-    told = (
-        f" It follows {', '.join(m.follows)}." if m.follows else " It follows none of the recorded signals."
-    )
-    when = "; ".join(f"{a:.4g} to {b:.4g} s" for a, b in m.when[:6])
-    return figure(
-        fig,
-        f"The flow into {m.node} that the recordings ask for beyond the refitted plant, {m.rms:.3g} {per} rms."
-        + told
-        + (f" Largest: {when}." if when else "")
-        + " Made by: smooth unknown input, ridge by cross-validation, after what the plant's own parameters can absorb.",
-    )
-
-
-def _equations(found: Diagnosis) -> str:
+def _findings(found: Diagnosis, result: Mapping[str, Any]) -> str:
     body = ""
-    for f, c in zip(found.result["findings"], found.final.effects, strict=False):
-        body += f"<p><b>{html.escape(_label(c))}</b> (probability {f['probability']:.2f})</p><pre>{html.escape(f['equation'])}</pre>"
+    for f, e in zip(result["findings"], found.shown, strict=True):
+        effect = e.candidate.effect
+        body += f"<h3>{html.escape(name(f))} (probability {f['probability']:.2f})</h3>"
+        body += f"{_p(effect.title + '.')}<pre>{html.escape(f['equation'])}</pre>"
         rows = [
-            (
-                n,
-                p["value"],
-                unit(p["unit"]),
-                f"{p['value'] - 1.96 * (p['sd'] or 0):.4g} .. {p['value'] + 1.96 * (p['sd'] or 0):.4g}",
-            )
+            (n, p["value"], unit(p["unit"]), _interval(p["value"], p["sd"]))
             for n, p in f["parameters"].items()
         ]
         body += table(("parameter", "value", "unit", "95 % interval"), rows)
         if f["when"]:
-            body += _p("From " + " and from ".join(f"{a:.5g} s to {b:.5g} s" for a, b in f["when"]) + ".")
-        body += f'<p class="note">{html.escape(c.effect.source)}</p>'
+            body += _p("Active " + " and ".join(f"from {a:.5g} s to {b:.5g} s" for a, b in f["when"]) + ".")
+        body += _similar(e, result) + f'<p class="note">Source: {html.escape(effect.source)}</p>'
     return body
 
 
-def _worth(case: Case, found: Diagnosis) -> str:
-    fit, gain = found.result["fit"], found.result["held_out_gain"]
-    rows = []
-    for n, (o, out) in zip(case.noise, case.plant.outputs.items(), strict=True):
-        if o not in fit["refit_only"]:
-            continue
-        g = gain.get(o)
-        rows.append(
-            (
-                _named(o, out.unit),
-                n.sigma,
-                *(
-                    fit.get(k, {}).get(o)
-                    for k in (
-                        "before",
-                        "refit_only",
-                        "after",
-                        "held_out_before",
-                        "held_out_refit_only",
-                        "held_out_after",
-                    )
-                ),
-                f"{g['ratio']:.2f} ({g['interval'][0]:.2f} .. {g['interval'][1]:.2f})" if g else None,
-            )
-        )
-    how = (
-        "each recording in turn, fitted without it"
-        if found.held["data"] == "recordings"
-        else "every other one of 16 blocks of each recording, fitted without them, and then the others"
-    )
-    return table(
-        (
-            "rms error of",
-            "sensor allows",
-            "as it came",
-            "refitted",
-            "with finding",
-            "held out: as it came",
-            "refitted",
-            "with finding",
-            "ratio (95 %)",
-        ),
-        rows,
-        f"Held out: {how}. Ratio: with the finding over refitted, paired block bootstrap; below 1 is better.",
-    )
+def _interval(value: float, sd: float | None) -> str:
+    return f"{value - WIDE * sd:.4g} .. {value + WIDE * sd:.4g}" if sd else "–"
 
 
-# ----------------------------------------------------------------------------------------------------------- curves
+def _similar(e: Placed, result: Mapping[str, Any]) -> str:
+    effect = e.candidate.effect
+    if not effect.mimics:
+        return ""
+    near = {a["effect"] for a in result["alternatives"]} & set(effect.mimics)
+    text = f"It can be confused with {', '.join(effect.mimics)}".replace("_", " ")
+    text += "; here these stay possible: " + ", ".join(sorted(near)).replace("_", " ") if near else ""
+    return _p(text + (f". Excited by: {effect.excited_by}." if effect.excited_by else "."))
+
+
+def _worth(found: Diagnosis, result: Mapping[str, Any]) -> str:
+    fit, outputs = result["fit"], result["outputs"]
+    keys = ["before", "refit_only", "after", "held_out_before", "held_out_refit_only", "held_out_after"]
+    if not found.shown:
+        keys = [k for k in keys if not k.endswith("after")]
+    heads = {"before": "as it came", "refit_only": "refitted", "after": "with the findings"}
+    rows = [
+        (_named(o, _error_unit(x["unit"])), x["noise"], *(fit[k].get(o) for k in keys))
+        for o, x in outputs.items()
+    ]
+    titles = [
+        ("held out: " if k.startswith("held_out") else "") + heads[k.removeprefix("held_out_")] for k in keys
+    ]
+    return table(("rms error of", "sensor's noise", *titles), rows, f"Held out: {fit['held_out']}.")
 
 
 def _thin(t: np.ndarray, *curves: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -220,186 +134,200 @@ def _thin(t: np.ndarray, *curves: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(c[::step] for c in (t, *curves))
 
 
-def _residuals(case: Case, e: Explanation) -> list[np.ndarray]:
-    """Residuals by the case's outputs, in recordings' order."""
-    return [
-        np.stack([r[:, e.fit.model.outputs.index(o)] for o in case.model.outputs], axis=1)
-        for r in e.fit.residuals
-    ]
+def _errors(f: Fitted, output: str) -> list[np.ndarray]:
+    j = f.fit.model.outputs.index(output)
+    return [r[:, j] for r in f.fit.residuals]
 
 
-def _curves(case: Case, found: Diagnosis) -> str:
+def _curves(found: Diagnosis) -> str:
     from matplotlib.figure import Figure
 
-    refit, after = _residuals(case, found.base), _residuals(case, found.final)
-    excess = case.excess(found.base)
-    worst = sorted(excess, key=lambda o: -excess[o])[:SHOWN]
+    case = found.case
+    over = found.before.over_noise
+    worst = sorted(over, key=lambda o: -over[o])[:SHOWN]
+    drives = case.drives(case.null.model)
     body = ""
     for o in worst:
-        j = case.model.outputs.index(o)
+        j = case.null.model.outputs.index(o)
+        refit, after = _errors(found.null, o), _errors(found.final, o)
         fig = Figure(figsize=(9, 3.8), layout="constrained")
-        axes = fig.subplots(
-            2, len(case.drives), sharex="col", sharey="row", squeeze=False, height_ratios=(3, 2)
-        )
-        for k, d in enumerate(case.drives):
-            t, y, e0, e1 = _thin(d.t, d.y[:, j], refit[k][:, j], after[k][:, j])
+        axes = fig.subplots(2, len(drives), sharex="col", sharey="row", squeeze=False, height_ratios=(3, 2))
+        for k, d in enumerate(drives):
+            t, y, e0, e1 = _thin(d.t, d.y[:, j], refit[k], after[k])
             top, low = axes[0, k], axes[1, k]
             top.plot(t, y, ".", ms=2.5, color=_COLOURS["measured"], label="measured")
             top.plot(t, y - e0, color=_COLOURS["refit"], lw=1.2, label="refitted only")
             low.plot(t, e0, color=_COLOURS["refit"], lw=0.9)
-            if found.final.effects:
-                top.plot(t, y - e1, color=_COLOURS["with"], lw=1.2, label="with the finding")
+            if found.shown:
+                top.plot(t, y - e1, color=_COLOURS["with"], lw=1.2, label="with the findings")
                 low.plot(t, e1, color=_COLOURS["with"], lw=0.9)
             low.axhline(0, color="0.6", lw=0.8)
             top.set_title(d.name, fontsize=9)
             low.set_xlabel("time (s)")
-        axes[0, 0].set_ylabel(_named(o, case.plant.outputs[o].unit), fontsize=8)
-        axes[1, 0].set_ylabel(_named("error", case.plant.outputs[o].unit), fontsize=8)
-        fig.legend(
-            *axes[0, 0].get_legend_handles_labels(),
-            loc="outside upper right",
-            ncols=3,
-            fontsize=8,
-            frameon=False,
-        )
-        body += figure(
-            fig, f"{o}: free run of the simulator on the recorded inputs, and what it misses below."
-        )
-    if len(excess) > len(worst):
+        its = case.plant.outputs[o].unit
+        axes[0, 0].set_ylabel(_named(o, its), fontsize=8)
+        axes[1, 0].set_ylabel(f"error ({_error_unit(its)})" if its else "error", fontsize=8)
+        handles = axes[0, 0].get_legend_handles_labels()
+        fig.legend(*handles, loc="outside upper right", ncols=3, fontsize=8, frameon=False)
+        body += figure(fig, f"{o}: simulation on the recorded inputs alone, and its error below.")
+    if len(over) > len(worst):
         body += _p(
-            f"The {len(worst)} outputs with the largest misfit of {len(excess)} are drawn; the table has all."
+            f"The {len(worst)} outputs with the largest misfit of {len(over)} are drawn; the table has all."
         )
     return body
 
 
-# ------------------------------------------------------------------------------------------- rivals and parameters
-
-
-def _confused(found: Diagnosis) -> str:
-    shown = found.result["alternatives"]
-    body = ""
-    if shown:
-        body += table(
-            ("instead", "where", "probability"),
-            [(a["effect"], a["where"], f"{a['probability']:.3f}") for a in shown],
-            "Other explanations, refitted in full to the same recordings",
+def _remains(found: Diagnosis, result: Mapping[str, Any]) -> str:
+    r = result["remainder"]
+    if not r:
+        return ""
+    rows = [
+        (_named(o, _error_unit(x["unit"])), r["rms"].get(o), x["noise"], r["over_noise"].get(o))
+        for o, x in result["outputs"].items()
+    ]
+    body = table(("output", "remainder, rms", "sensor's noise", "whole residual over the noise"), rows)
+    facts = []
+    if found.shown and r["share_closed"] is not None:
+        facts.append(
+            f"The findings close {100 * max(r['share_closed'], 0.0):.1f} % of the energy of the misfit that a refit leaves."
         )
-    for c in found.final.effects:
-        near = [a["effect"] for a in shown if a["effect"] in c.effect.mimics]
-        body += _p(
-            f"{c.effect.title} is known to look like {', '.join(m.replace('_', ' ') for m in c.effect.mimics) or 'nothing else'}. "
-            + (
-                "Here these recordings do not tell it from "
-                + ", ".join(n.replace("_", " ") for n in near)
-                + ". "
-                if near
-                else ""
-            )
-            + f"What tells them apart: {c.effect.excited_by}."
+    if r["node"]:
+        facts.append(f"Small random forces at {r['node']} would explain the remainder best.")
+    follows = ", ".join(r["follows"])
+    facts.append(f"It follows {follows}." if follows else "It follows none of the recorded signals.")
+    for m in result["mismatch"]:
+        if m["when"] and not found.shown:
+            spans = "; ".join(f"{a:.4g} to {b:.4g} s" for a, b in m["when"][:6])
+            facts.append(f"The error of {m['channel']} is largest at {spans}.")
+    return body + _items(facts)
+
+
+def _why(result: Mapping[str, Any]) -> str:
+    decision = result["decision"]
+    rows = [(k, v) for k, v in decision.items() if k != "row"]
+    meanings = {
+        "something": "probability that some effect is missing",
+        "over_noise": "largest residual rms over its sensor's noise",
+        "worth": "held-out error with the findings over that of a refit alone (1: not measured)",
+    }
+    body = _p(f"Row of the decision table that applies: {decision['row']}.")
+    body += table(("number", "value"), [(meanings.get(k, f"probability of {k}"), v) for k, v in rows])
+    hypotheses = [
+        (
+            f"{h['log_evidence']:.1f}",
+            f"{h['log_prior_odds']:.1f}",
+            f"{h['posterior']:.3f}",
+            "–"
+            if not h["effects"]
+            else "no"
+            if h["physics"] is None
+            else ", ".join(f"{p:.3f}" for p in h["physics"]),
+            f"{h['remainder']:.3f}",
+            " + ".join(h["effects"]).replace("_", " ") or "no effect",
         )
-    return body
+        for h in result["hypotheses"]
+    ]
+    heads = ("log evidence", "log prior odds", "probability", "stands out", "remainder", "hypothesis")
+    return body + table(
+        heads,
+        hypotheses,
+        "Every hypothesis that was fitted. Log evidence and prior odds are relative to no effect. Stands out: each effect's "
+        "probability to be physics and no part of the misfit that nobody will name. Remainder: probability of a remainder.",
+    )
 
 
-def _parameters(case: Case, found: Diagnosis) -> str:
-    before = {e.name: e for e in report(found.base.fit)}
-    rows, said = [], []
-    for e in report(found.final.fit):
-        if e.name not in before:
+def _lost(result: Mapping[str, Any]) -> str:
+    rows = [
+        (
+            f"{e['effect'].replace('_', ' ')} at {e['where']}",
+            f"{e['probability']:.3f}",
+            f"{e['below_best']:.1f}",
+            e["reason"]
+            + (f"; best beside {' + '.join(e['beside'])}".replace("_", " ") if e["beside"] else ""),
+        )
+        for e in result["lost"]
+    ]
+    heads = ("effect", "probability", "below the result (nats)", "reason")
+    return table(heads, rows) if rows else ""
+
+
+def _estimates(fit: Fit) -> dict[str, Estimate]:
+    """Parameters by name; one that differs between recordings is shown for the first."""
+    out: dict[str, Estimate] = {}
+    for e in report(dataclasses.replace(fit, cost=0.0)):  # its Hessian is scaled to the noise already
+        out.setdefault(e.name, e)
+    return out
+
+
+def _parameters(found: Diagnosis) -> str:
+    before, after = _estimates(found.null.fit), _estimates(found.final.fit)
+    rows, changed = [], []
+    for n, e in after.items():
+        if n not in before:
             continue
-        refit = before[e.name]
-        first = case.plant.parameters[e.name].value
-        words = [e.state] if e.state != "ok" else []
-        if e.trades_with:
-            words.append("trades with " + ", ".join(e.trades_with[:3]))
+        refit, first = before[n], found.case.plant.parameters[n].value
+        words = [] if e.state == "ok" else [e.state]
+        words += ["trades with " + ", ".join(e.trades_with[:3])] if e.trades_with else []
         rows.append(
-            (
-                _named(e.name, e.unit),
-                first,
-                refit.value,
-                e.value,
-                f"± {1.96 * e.sd:.2g}",
-                "; ".join(words) or "ok",
-            )
+            (_named(n, e.unit), first, refit.value, e.value, f"± {WIDE * e.sd:.2g}", "; ".join(words) or "ok")
         )
-        moved = abs(refit.value - e.value) > max(4 * np.hypot(e.sd, refit.sd), 0.25 * abs(e.value))
-        if found.final.effects and moved and refit.value and e.value:
-            said.append(
-                f"{e.name}: without the missing physics the refit put it at {refit.value:.4g}, {refit.value / e.value:.2g} times "
-                f"the {e.value:.4g} {e.unit or ''} that it is with it; it had stood in for what was missing."
+        moved = abs(refit.value - e.value)
+        if found.shown and moved > max(MOVED * np.hypot(e.sd, refit.sd), MOVED_SHARE * abs(e.value)):
+            changed.append(
+                f"{n}: a refit alone put it at {refit.value:.4g}; with the findings it is {e.value:.4g} {e.unit or ''}. "
+                "It had stood in for the missing physics."
             )
         if refit.state == "at bound":
-            said.append(
-                f"{e.name}: the refit alone pressed it against the end of its range ({refit.value:.4g})."
+            changed.append(
+                f"{n}: the refit alone pressed it against the end of its range ({refit.value:.4g})."
             )
-    return (
-        table(("parameter", "as it came", "refitted", "with the finding", "95 %", "state"), rows)
-        + _items(said)
-        if rows
-        else ""
-    )
+    heads = ("parameter", "as it came", "refitted", "with the findings", "95 %", "state")
+    return table(heads, rows) + _items(changed) if rows else ""
 
 
-def _unseen(found: Diagnosis) -> str:
+def _unseen(result: Mapping[str, Any]) -> str:
     rows = [
-        (n["effect"], n["where"], n["smallest"], _named(n["parameter"], n["unit"]))
-        for n in found.result["not_seen"]
-        if n["smallest"] is not None
+        (e["effect"].replace("_", " "), e["where"], e["smallest"], _named(e["parameter"], e["unit"]))
+        for e in result["not_seen"]
     ]
-    if not rows:
-        return ""
-    more = f" The first 60 of {len(rows)}." if len(rows) > 60 else ""
-    return table(
-        ("effect", "where", "smallest that would have been seen", "as"),
-        rows[:60],
-        "Five standard errors of its size, after what the plant's own parameters can absorb." + more,
+    caption = "Five standard errors of its size, beside a refit of the plant's own parameters."
+    return (
+        table(("effect", "where", "smallest that would have been seen", "as"), rows, caption) if rows else ""
     )
 
 
-def _next(told: dict[str, Any] | None) -> str:
-    if not told:
+def _experiment(entry: Mapping[str, Any] | None) -> str:
+    if not entry:
         return ""
     from matplotlib.figure import Figure
 
     body = _p(
-        f"{told['profile']}, {told['duration_s']:.4g} s. {told['why']} {told.get('also_helpful') or ''}"
+        f"{entry['profile']}, {entry['duration_s']:.4g} s. {entry['why']} {entry.get('also_helpful') or ''}"
     )
-    body += _items(peaks(told))
-    moving = {
-        k: np.array(v) for k, v in told["inputs"].items() if len(v) > 1 and np.ptp([p[1] for p in v]) > 0
-    }
+    body += _items(peaks(entry))
+    corners = {n: np.array(v) for n, v in entry["inputs"].items()}
+    moving = {n: c for n, c in corners.items() if len(c) > 1 and np.ptp(c[:, 1]) > 0}
     if moving:
         fig = Figure(figsize=(9, 1.2 + 1.1 * len(moving)), layout="constrained")
-        for axis, (name, corners) in zip(
-            fig.subplots(len(moving), 1, sharex=True, squeeze=False)[:, 0], moving.items(), strict=True
-        ):
-            axis.plot(corners[:, 0], corners[:, 1], lw=1.2)
-            axis.set_ylabel(name, fontsize=8)
-        axis.set_xlabel("time (s)")
+        axes = fig.subplots(len(moving), 1, sharex=True, squeeze=False)[:, 0]
+        for axis, (n, c) in zip(axes, moving.items(), strict=True):
+            axis.plot(c[:, 0], c[:, 1], lw=1.2)
+            axis.set_ylabel(n, fontsize=8)
+        axes[-1].set_xlabel("time (s)")
         body += figure(fig, "The inputs of the proposed experiment, inside the range of the recorded ones.")
     return body
 
 
-def _chance(found: Diagnosis, chance: float) -> str:
-    """Draws of noise say nothing finer than one in their number."""
-    drawn = len(c) if found.rounds and (c := found.rounds[0].chance) is not None else 0
-    return (
-        f"less than 1/{drawn} (none of {drawn} draws came near)"
-        if drawn and chance < 1 / drawn
-        else f"{chance:.2g}"
-    )
-
-
-def _made(case: Case, found: Diagnosis) -> str:
-    chance = found.result["chance"]
+def _made(found: Diagnosis, result: Mapping[str, Any]) -> str:
+    case, budget = found.case, found.case.budget
+    samples, count = sum(len(t.t) for t in case.tables), len(case.tables)
+    recordings = f"{count} recording{'s' if count > 1 else ''}, {samples} samples: "
     lines = [
-        f"{len(case.tables)} recordings, {sum(len(t.t) for t in case.tables)} samples. "
-        + ", ".join(Path(t.path).name for t in case.tables)
-        + ".",
-        "Refit: bounded weighted least squares on the free-run error with exact sensitivities; noise with colour, "
-        "ARMA(1,1) a channel, fitted anew under every explanation.",
-        f"Chance that noise alone makes some entry of the catalogue look this good: {_chance(found, chance)}; "
-        f"{len(found.rounds[0].directions) if found.rounds else 0} directions (effect, place, shape) were screened.",
-        "Intervals: 1.96 standard errors of the joint refit. Probabilities: weights of the refitted explanations' scores.",
-        f"Settled in {len(found.rounds)} look{'' if len(found.rounds) == 1 else 's'} at the catalogue.",
+        recordings + ", ".join(Path(t.path).name for t in case.tables) + ".",
+        f"{budget.fits_done} of at most {budget.fits} refits; {len(result['hypotheses'])} hypotheses, in {result['seconds']:.0f} s."
+        + (" The budget ended the search." if result["truncated"] else ""),
+        "Each hypothesis: simulation on the recorded inputs, refitted with exact sensitivities; log evidence by Laplace's method, "
+        "averaged over the noise and over a remainder.",
+        "Intervals: 1.96 standard deviations of the joint fit. `thermoctl diagnose --explain DIR` prints the reasons in ten lines.",
     ]
     return _items(lines)

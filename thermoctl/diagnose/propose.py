@@ -18,20 +18,18 @@ inputs' excursions are made smaller (SHARES)."""
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose import observer
 from thermoctl.diagnose.design import NONE, Excitation, Lever, Limits, family, levers
 from thermoctl.diagnose.experiment_file import FILES
-from thermoctl.diagnose.explain import Case, Explanation
-from thermoctl.diagnose.outcome import Diagnosis
-from thermoctl.plant.language import Plant
+from thermoctl.evidence.case import Case
+from thermoctl.evidence.fit import Fitted
+from thermoctl.evidence.result import Diagnosis
 from thermoctl.plant.refit import Scale
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
@@ -41,7 +39,7 @@ MOST = 5  # hypotheses that are compared
 LIKELY = 0.02  # a hypothesis below this share of the likeliest one is not worth rig time
 POINTS, READINGS = 700, 4000  # of a simulated experiment, at most; thinned readings count as less noisy ones
 FEWEST_POINTS = 150  # of a simulated experiment, however many outputs it has
-SECONDS = 30.0  # of a thread's CPU, after which no further candidate is simulated
+TRIALS = 150  # candidates that are simulated, at most; of more, evenly chosen ones
 ENOUGH = 0.8  # of the best experiment's bits that a shorter one must reach
 SHARES = (
     1.0,
@@ -82,11 +80,10 @@ class _Predictor:
         return (y, slopes) if np.all(np.isfinite(y)) and np.all(np.isfinite(slopes)) else None
 
 
-def _predictor(e: Explanation, plant: Plant) -> _Predictor:
-    model = compile_plant(plant)
-    found = e.fit
-    inflate = max(found.cost / max(found.samples - len(found.z), 1), 1.0)
-    covariance = np.linalg.pinv(found.hessian, hermitian=True) * inflate
+def _predictor(f: Fitted, weight: float) -> _Predictor:
+    model = compile_plant(f.plant)
+    found = f.fit
+    covariance = np.linalg.pinv(found.hessian, hermitian=True)
     place = {q: k for k, (q, r) in enumerate(found.unknowns) if r is None}
     nq = len(model.unknowns)
     P, slopes = np.eye(nq), np.zeros(nq)
@@ -103,8 +100,8 @@ def _predictor(e: Explanation, plant: Plant) -> _Predictor:
     P[np.diag_indices(nq)] = np.minimum(np.diag(P), 1.0)  # no parameter is more uncertain than its range
     values, vectors = np.linalg.eigh((P + P.T) / 2)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    label = " and ".join(f"{c.effect.name} at {c.place.where}" for c in e.effects) or "nothing missing"
-    return _Predictor(label, e.probability, model, root, slopes)
+    label = " and ".join(f"{effect} at {where}" for effect, where in sorted(f.hypothesis.keys))
+    return _Predictor(label or "nothing missing", weight, model, root, slopes)
 
 
 def distance(a: Prediction, b: Prediction, columns: Sequence[tuple[int, int]], sigma: np.ndarray) -> float:
@@ -125,7 +122,7 @@ def bits(D: np.ndarray, weights: np.ndarray) -> float:
     return float(-weights @ np.log2(np.exp(-D / 8) @ weights))
 
 
-def noise_of(case: Case, e: Explanation) -> np.ndarray:
+def noise_of(case: Case, f: Fitted) -> np.ndarray:
     """Estimate the uncertainty of one reading, per output (ny,).
 
     Rms residual of the likeliest hypothesis, at least the sensor's noise.
@@ -133,9 +130,9 @@ def noise_of(case: Case, e: Explanation) -> np.ndarray:
     It is widened for the correlation of neighbours, whose mean tells less than that of independent
     readings."""
     out = []
-    for o, n in zip(case.model.outputs, case.noise, strict=True):
-        j = e.fit.model.outputs.index(o)
-        r = [q[np.isfinite(q[:, j]), j] for q in e.fit.residuals]
+    for o, n in zip(case.null.model.outputs, case.noise, strict=True):
+        j = f.fit.model.outputs.index(o)
+        r = [q[np.isfinite(q[:, j]), j] for q in f.fit.residuals]
         r = [q for q in r if len(q) > 8]
         square = np.concatenate([q**2 for q in r]).mean() if r else n.sigma**2
         lag = (
@@ -148,14 +145,12 @@ def noise_of(case: Case, e: Explanation) -> np.ndarray:
     return np.array(out)
 
 
-def survivors(found: Diagnosis) -> list[Explanation]:
-    """List the hypotheses that are not ruled out, likeliest first; of those with equal effects only the likeliest."""
-    out: dict[tuple[Any, ...], Explanation] = {}
-    for e in sorted([found.final, *found.rivals], key=lambda e: -e.probability):
-        if e.effects:
-            out.setdefault(tuple(sorted(c.key for c in e.effects)), e)
-    best = max((e.probability for e in out.values()), default=0.0)
-    return [e for e in out.values() if e.probability >= LIKELY * best and e.probability > 0][:MOST]
+def survivors(found: Diagnosis) -> list[tuple[Fitted, float]]:
+    """List the hypotheses with effects that are not ruled out, likeliest first, each with its probability."""
+    fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
+    likely = [(fits[keys], p) for keys, p in found.posterior.hypotheses.items() if keys]
+    likely.sort(key=lambda x: -x[1])
+    return [(f, p) for f, p in likely if p >= LIKELY * likely[0][1] and p > 0][:MOST]
 
 
 @dataclass(frozen=True)
@@ -177,34 +172,23 @@ class _Trial:
 class _Comparison:
     """The hypotheses of an undecided diagnosis, and what an experiment would tell between them."""
 
-    def __init__(self, case: Case, standing: Sequence[Explanation], limits: Limits):
+    def __init__(self, case: Case, standing: Sequence[tuple[Fitted, float]], limits: Limits):
         self.case, self.limits = case, limits
-        inputs = set(case.plant.inputs)
-        self.predictors = [
-            _predictor(e, e.plant if set(e.plant.inputs) == inputs else observer.without(e.plant))
-            for e in standing
-        ]
+        self.predictors = [_predictor(f, p) for f, p in standing]
         weights = np.array([b.weight for b in self.predictors])
         self.weights = weights / weights.sum()
         self.step = float(np.median(np.concatenate([np.diff(t.t) for t in case.tables])))
-        self.sigma = noise_of(case, standing[0])
-        self.outputs = list(case.model.outputs)
-        self.seen = [
-            j for j, _ in enumerate(self.outputs) if any(np.isfinite(d.y[:, j]).any() for d in case.drives)
-        ]
+        self.sigma = noise_of(case, standing[0][0])
+        self.outputs = list(case.null.model.outputs)
+        self.seen = [j for j, _ in enumerate(self.outputs) if len(_recorded(case, j))]
         self.points = min(POINTS, max(READINGS // len(self.outputs), FEWEST_POINTS))
-        self.deadline = time.thread_time() + SECONDS
 
     def grid(self, x: Excitation) -> float:
         """The step of a simulated experiment, s."""
         return max(self.step, x.duration_s / self.points)
 
     def trial(self, x: Excitation) -> _Trial | None:
-        """Simulate a candidate.
-
-        None where a hypothesis cannot, where a reading leaves its limits, or too late."""
-        if time.thread_time() > self.deadline:
-            return None
+        """Simulate a candidate; None where a hypothesis cannot, or where a reading leaves its limits."""
         table = x.table(self.case.plant, self.grid(x))
         predictions = [p for b in self.predictors if (p := b.predict(table)) is not None]
         if len(predictions) < len(self.predictors) or self._leaves_limits(predictions):
@@ -244,12 +228,16 @@ class _Comparison:
 
 
 def propose(
-    case: Case, found: Diagnosis, drivable: Sequence[str] = (), limits: Limits = NONE
+    found: Diagnosis,
+    drivable: Sequence[str] = (),
+    limits: Limits = NONE,
+    progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, Any], Excitation] | None:
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
 
-    None where one hypothesis stands alone or nothing can be driven. `limits`: {input or output: (low, high)}
-    of the rig. Raises InputError for a name that is neither."""
+    None where the verdict is not `ambiguous`, one hypothesis stands alone, or nothing can be driven.
+    `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
+    case = found.case
     for n in limits:
         if n not in case.plant.inputs and n not in case.plant.outputs:
             raise InputError(
@@ -257,16 +245,18 @@ def propose(
                 + ", ".join((*case.plant.inputs, *case.plant.outputs))
             )
     standing = survivors(found)
-    if found.verdict not in ("ambiguous", "unexplained") or len(standing) < 2:
+    if found.decision.verdict != "ambiguous" or len(standing) < 2:
         return None
     drive = levers(case.plant, case.tables, drivable, limits)
     if not drive:
         return None
-    case.progress("looking for the experiment that tells them apart")
+    if progress:
+        progress("looking for the experiment that tells them apart")
     comparison = _Comparison(case, standing, limits)
     for share in SHARES:
         smaller = [_smaller(lever, share) for lever in drive]
         candidates = family(case.plant, case.tables, smaller, comparison.step)
+        candidates = candidates[:: -(-len(candidates) // TRIALS)]
         with ThreadPoolExecutor(max_workers=2) as pool:
             trials = [t for t in pool.map(comparison.trial, candidates) if t is not None]
         if trials:
@@ -297,7 +287,7 @@ def _entry(comparison: _Comparison, best: _Trial, candidates: int) -> dict[str, 
         "bits_per_hour": best.bits / hours,
         "candidates": candidates,
         "separates": [
-            {"explanation": b.label, "from": first.label, "sigmas": float(q)}
+            {"hypothesis": b.label, "from": first.label, "sigmas": float(q)}
             for b, q in zip(others, sigmas, strict=True)
         ],
         "inputs": inputs,
@@ -318,7 +308,9 @@ def _smaller(lever: Lever, share: float) -> Lever:
 
 def _recorded(case: Case, j: int) -> np.ndarray:
     """All readings of output number j."""
-    return np.concatenate([d.y[np.isfinite(d.y[:, j]), j] for d in case.drives])
+    column = list(case.plant.outputs.values())[j].column
+    parts = [t.columns[column] for t in case.tables if column in t.columns]
+    return np.concatenate([p[np.isfinite(p)] for p in parts]) if parts else np.zeros(0)
 
 
 def _predicted(comparison: _Comparison, predictions: Sequence[Prediction]) -> dict[str, dict[str, Any]]:

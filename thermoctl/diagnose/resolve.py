@@ -25,7 +25,7 @@ def resolve(
     """Diagnose, and while nothing is decided run the proposed experiment, `rounds` times at most.
 
     `diagnosed(recordings)` writes a result into `out`; `record(experiment, recording)` runs an experiment
-    file on the rig; `say` is told of each round. The last result lists the experiments and verdicts in
+    file on the rig; `say` is called in each round. The last result lists the experiments and verdicts in
     `resolved`."""
     paths, history = list(recordings), []
     result = diagnosed(paths)

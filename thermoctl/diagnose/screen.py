@@ -1,9 +1,10 @@
-"""One pass over the catalogue: how much of the residual each effect at each place could explain, without a refit.
+"""Score test of every effect at every place: how much of the residual it could explain, without a refit.
 
-    r : whitened residual at the refit,  Q : orthonormal basis of what the plant's own parameters can absorb
-    d : first-order change of the outputs by an effect, whitened;   d' = d - Q Q^T d
-    gain = (d'^T r)^2 / (d'^T d')      (chi-square with one degree of freedom where nothing is missing; k for k amplitudes)
+    r: whitened residual of the refit,  Q: orthonormal basis of the directions that the plant's parameters absorb
+    d: first-order change of the outputs by an effect, whitened;  d' = d - Q Q^T d
+    gain = (d'^T r)^2 / (d'^T d')
 
+The gain is chi-square with one degree of freedom (k for k amplitudes) where nothing is missing.
 d comes from the effect laid over the plant: its change of the slopes dx/dt along the fitted trajectory drives the linearised
 plant (`Model.respond`), its change of the outputs adds directly. New nodes are integrated alone along that trajectory.
 Rows are sums over blocks of samples (white noise stays white), so that thousands of directions fit in memory; shorter blocks
@@ -13,7 +14,7 @@ where something moves.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,15 +24,13 @@ from scipy.special import gammaincc
 from thermoctl.diagnose.effects import STRAIGHT, Candidate, EffectParameter, Rig, shape_grid
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit, Problem
-from thermoctl.plant.simulate import Excitation, Simulation
+from thermoctl.plant.refit import Fit
+from thermoctl.plant.simulate import Excitation, Model, Simulation
 
-ROWS = 8_000  # rows of the screening, all recordings together
-FINE_ROWS = 64_000  # of what moves: it passes a pattern's period, or turns, within a block's time
 EPSILON = 1e-4  # amplitude at which a direction is taken
 CHUNK = 96
 ONSETS = 24  # onset times of the grid over the recordings
-NEAR = 4.0  # a lag or delay this many times shorter or longer than the one looked at changes the outputs in proportion
+NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
 
 
 @dataclass
@@ -43,7 +42,7 @@ class Direction:
     gain: float
     dims: int
     start: dict[str, float]
-    vector: np.ndarray | None = None  # unit direction in projected space, for likeness between candidates
+    vector: np.ndarray | None = None  # unit vector of the projected direction
     excited: float = 0.0  # share of the direction that the plant's own parameters leave
     elsewhere: float = 0.0  # log10 of how many shapes this one was picked from by the residual itself
 
@@ -67,65 +66,24 @@ def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
 
 
 class Metric:
-    """Whitened, blocked rows of a fit: the residual, the basis of the plant's own parameters and how to bring more in."""
+    """Whitened rows of a refitted hypothesis, as the screening needs them; a subclass fills them.
 
-    def __init__(self, fitted: Fit, drives: Sequence[Excitation], rows: int = ROWS):
-        self.fit, self.drives, self.model = fitted, list(drives), fitted.model
-        self.problem = Problem(self.model, drives, fitted.noise)
-        self.blocks = max(1, int(np.ceil(self.problem.samples / rows)))
-        self.runs: list[Simulation] = []
-        columns = []
-        for r, d in enumerate(self.drives):
-            run = self.model.run(d, fitted.values[r], fitted.dx0[r], sensitivities=True)
-            columns.append(run.dy)
-            self.runs.append(Simulation(run.t, run.x, run.y))
-        self.residual = np.concatenate(
-            [self.rows(r, d.y - run.y) for r, (d, run) in enumerate(zip(self.drives, self.runs, strict=True))]
-        )
-        basis = np.zeros((len(self.residual), len(self.problem.unknowns)))
-        at = 0
-        for r, dy in enumerate(columns):
-            assert dy is not None
-            used = np.flatnonzero(self.problem.columns[r] >= 0)
-            block = self.rows(r, dy[:, :, used])
-            basis[at : at + len(block), self.problem.columns[r, used]] = block
-            at += len(block)
-        free = [k for k, (q, _) in enumerate(self.problem.unknowns) if q not in fitted.at_bound]
-        basis = basis[:, free]
-        size = np.linalg.norm(basis, axis=0)
-        keep = size > 1e-9
-        scaled = basis[:, keep] / size[keep]
-        u, s, _ = np.linalg.svd(scaled, full_matrices=False)
-        self.basis = u[:, s > 1e-6 * s[0]] if len(s) else u
-        self.residual = self.residual - self.basis @ (self.basis.T @ self.residual)
+    - `residual` (rows,): the residual, without what the plant's own parameters absorb
+    - `basis` (rows, k): orthonormal; the directions that the plant's own parameters absorb"""
+
+    fit: Fit
+    model: Model
+    drives: list[Excitation]
+    runs: list[Simulation]
+    residual: np.ndarray
+    basis: np.ndarray
 
     def rows(self, r: int, e: np.ndarray) -> np.ndarray:
-        """(N, outputs, ...) of recording r as whitened rows, summed over blocks."""
-        parts = []
-        for j in range(len(self.problem.noise)):
-            w = self.problem.whiten(r, j, e[:, j])
-            if w.ndim == 1:  # the residual; slopes may be as large as their units make them (W/K^4)
-                w = np.clip(w, -1e6, 1e6)
-            b = self.blocks
-            if b > 1 and len(w):
-                full = len(w) // b * b
-                w = w[:full].reshape(full // b, b, *w.shape[1:]).sum(axis=1) / np.sqrt(b)
-            parts.append(w)
-        return np.concatenate(parts)
-
-    def sketch(self, d: np.ndarray) -> np.ndarray:
-        """Compress directions (rows, k) to at most ROWS rows; their inner products change by about one per cent.
-
-        Sums over blocks with random signs (count sketch; Charikar, Chen & Farach-Colton 2002). Unlike block means they
-        keep fast signals."""
-        b = int(np.ceil(len(d) / ROWS))
-        if b <= 1:
-            return d
-        signed = d * np.random.default_rng(7).choice([-1.0, 1.0], len(d))[:, None]
-        return np.add.reduceat(signed, np.arange(0, len(d), b), axis=0)
+        """Transform samples (N, outputs, ...) of recording r to whitened rows (rows, ...)."""
+        raise NotImplementedError
 
     def project(self, d: np.ndarray) -> np.ndarray:
-        """What the plant's own parameters leave of directions (rows, k)."""
+        """Return directions (rows, k) without the part that the plant's own parameters absorb."""
         return d - self.basis @ (self.basis.T @ d)
 
 
@@ -171,7 +129,7 @@ def _hold(column: np.ndarray) -> np.ndarray:
 def changes(
     base: Plant, extended: Plant, values: Mapping[str, float], at: Trajectory
 ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
-    """What the extension changes along the trajectory: slopes dx/dt by state index, outputs by output index."""
+    """Return the extension's changes along the trajectory: of slopes dx/dt by state, of outputs by output."""
     extra: dict[str, np.ndarray | float] = {k: v for k, v in values.items()}
     for n in extended.nodes.values():
         if n.name not in base.nodes:
@@ -213,7 +171,7 @@ def changes(
 
 
 def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], at: Trajectory) -> np.ndarray:
-    """A new node alone, along the trajectory: dn/dt = a(t) - b(t) n, exact for a and b that do not change between samples."""
+    """Integrate a new node alone along the trajectory: dn/dt = a(t) - b(t) n, a and b constant in a sample."""
     n = plant.nodes[node]
     net: ex.Expr = ex.ZERO
     for f in plant.flows.values():
@@ -257,6 +215,9 @@ class _Column:
     outputs: list[dict[int, np.ndarray]] = field(default_factory=list)
 
 
+_Entry = tuple[_Column, np.ndarray, float]  # its projected rows, and the norm of the whole ones
+
+
 def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Sequence[_Column], np.ndarray]]:
     """Whitened rows (rows, k) of columns, a chunk at a time."""
     buffers: dict[str, np.ndarray] = {}
@@ -285,47 +246,32 @@ def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Seq
 
 
 def screen(
-    metric: Metric,
-    rig: Rig,
-    found: Sequence[Candidate],
-    draws: np.ndarray | None = None,
-    progress: Callable[[float], None] | None = None,
-    edges: np.ndarray | None = None,
-) -> tuple[list[Direction], np.ndarray | None]:
-    """Every candidate's best direction, best first; `edges`: onsets to look at instead of the whole grid. With `draws` (rows, B)
-    of standard normal noise, as many rows as a `sketch` has, also, per draw, the smallest log10 p that any candidate would have
-    shown by chance (B,)."""
+    metric: Metric, rig: Rig, found: Sequence[Candidate], edges: np.ndarray | None = None
+) -> list[Direction]:
+    """Return every candidate's best direction, best first. `edges`: onsets to try instead of the grid."""
     at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     columns: list[_Column] = []
     for c in found:
         columns += _columns(c, metric, at, edges)
     best: dict[int, Direction] = {}
-    chance = None if draws is None else np.zeros(draws.shape[1])
-    pending: dict[tuple[Any, ...], list[tuple[_Column, np.ndarray, float, np.ndarray | None]]] = {}
-    done = 0
+    pending: dict[tuple[Any, ...], list[_Entry]] = {}
     for part, rows in directions(metric, columns):
         full = np.linalg.norm(rows, axis=0)
         rows = metric.project(rows)
-        by_chance = None if draws is None else metric.sketch(rows).T @ draws
         for k, column in enumerate(part):
             candidate, group, _, count = column.item
             entries = pending.setdefault((id(candidate), group), [])
-            entries.append(
-                (column, rows[:, k].copy(), float(full[k]), None if by_chance is None else by_chance[k])
-            )
-            if len(entries) < count:
-                continue
-            del pending[id(candidate), group]
-            chance = _score(candidate, entries, metric, best, chance)
-        done += len(part)
-        if progress:
-            progress(done / max(len(columns), 1))
-    return sorted(best.values(), key=lambda d: d.log_p), chance
+            entries.append((column, rows[:, k].copy(), float(full[k])))
+            if len(entries) == count:
+                del pending[id(candidate), group]
+                _score(candidate, entries, metric, best)
+    return sorted(best.values(), key=lambda d: d.log_p)
 
 
 def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
-    """The direction with its onset (or start and end) to the sample: a refit cannot move them, since what it sees at a jump
-    is the jump's own slope. Each look has a grid four times as fine round the best of the last."""
+    """Return the direction with its onset (or start and end) refined to the sample.
+
+    A refit cannot move them: a jump has no slope to follow. Each step's grid is four times as fine."""
     kinds = found.candidate.effect.shapes.values()
     if "onsets" not in kinds and "windows" not in kinds:
         return found
@@ -339,9 +285,7 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
                 if found.shape.get(k, np.inf) <= duration
             ]
         )
-        better, _ = screen(
-            metric, rig, [found.candidate], edges=np.unique(near[(near >= 0) & (near < duration)])
-        )
+        better = screen(metric, rig, [found.candidate], np.unique(near[(near >= 0) & (near < duration)]))
         if better and better[0].gain > found.gain:
             found = better[0]
         step /= 4
@@ -351,8 +295,9 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
 def _columns(
     c: Candidate, metric: Metric, at: Sequence[Trajectory], edges: np.ndarray | None = None
 ) -> list[_Column]:
-    """The columns that one candidate needs. item = (candidate, group, (shape, dim), columns in the group). `edges`: onsets to
-    look at instead of the whole grid."""
+    """Return the columns that one candidate needs. item = (candidate, group, (shape, dim), columns in the group).
+
+    `edges`: onsets to try instead of the grid."""
     effect = c.effect
     grids = {
         key: shape_grid(kind, c, metric.runs)
@@ -419,108 +364,90 @@ def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float
     return out
 
 
-def _score(
-    c: Candidate,
-    entries: list[tuple[_Column, np.ndarray, float, np.ndarray | None]],
-    metric: Metric,
-    best: dict[int, Direction],
-    chance: np.ndarray | None,
-) -> np.ndarray | None:
+def _score(c: Candidate, entries: Sequence[_Entry], metric: Metric, best: dict[int, Direction]) -> None:
+    """Score the columns of one candidate at one shape, and keep their best direction."""
     rows = np.stack([e[1] for e in entries], axis=1)
     full = np.array([e[2] for e in entries])
-    shape, dim = entries[0][0].item[2]
-    r = metric.residual
-    g, m = rows.T @ r, rows.T @ rows
-    amplitudes = [p for p in c.effect.parameters if p.amplitude]
-    windowed = "windows" in c.effect.shapes.values()
-    noise = None if chance is None else np.stack([e[3] for e in entries if e[3] is not None])
-    if windowed:
-        edges = [e[0].item[2][0]["start"] for e in entries]
-        ends = [*edges[1:], 10 * edges[-1]]
-        gains, at = -1.0, (0, 0, 0.0)
-        for a in range(len(edges)):
-            for b in range(a + 1, len(edges) + 1):
-                if b < len(edges):
-                    top, bottom = g[a] - g[b], m[a, a] + m[b, b] - 2 * m[a, b]
-                    z = None if noise is None else noise[a] - noise[b]
-                else:
-                    top, bottom = g[a], m[a, a]
-                    z = None if noise is None else noise[a]
-                if bottom <= 1e-12 * max(full) ** 2:
-                    continue
-                if top * top / bottom > gains:
-                    gains, at = top * top / bottom, (a, b, top / bottom)
-                if chance is not None and z is not None:
-                    chance = np.minimum(chance, _log_p(z * z / bottom, 1))
-        if gains < 0:
-            return chance
-        a, b, amplitude = at
-        if (
-            a == 0
-            and b < len(edges)
-            and m[b, b] > 1e-12 * max(full) ** 2
-            and g[b] ** 2 / m[b, b] > 0.8 * gains
-        ):
-            # Heat that ends and a lack of it that begins look alike where parameters absorb a constant: what begins is likelier.
-            a, b, amplitude = b, len(edges), g[b] / m[b, b]
-            gains = g[a] ** 2 / m[a, a]
-        shape = {"start": edges[a], "end": edges[b] if b < len(edges) else max(ends)}
-        vector = rows[:, a] - (rows[:, b] if b < len(edges) else 0)
-        start = parameter_values(c, shape, [amplitude])
-        _keep(best, c, shape, gains, 1, start, vector, np.linalg.norm(vector) / max(full[a], 1e-300))
-        return chance
+    g, m = rows.T @ metric.residual, rows.T @ rows
+    if "windows" in c.effect.shapes.values():
+        _score_windows(c, entries, rows, full, g, m, best)
+        return
     left = np.sqrt(np.maximum(np.diag(m), 0)) / np.maximum(full, 1e-300)
     useful = (left > 1e-4) & (full > 1e-9)
     if not useful.any():
-        return chance
+        return
     scale = np.where(useful, np.sqrt(np.maximum(np.diag(m), 1e-300)), 1.0)
-    if noise is not None and chance is not None:
-        sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
-        inverse = np.linalg.pinv(sub, rcond=1e-8, hermitian=True)
-        z = noise[useful] / scale[useful, None]
-        chance = np.minimum(chance, _log_p(np.einsum("kb,kl,lb->b", z, inverse, z), int(useful.sum())))
     sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
     coefficient = np.zeros(len(g))
     coefficient[useful] = (
         np.linalg.pinv(sub, rcond=1e-8, hermitian=True) @ (g[useful] / scale[useful]) / scale[useful]
     )
+    shape, _ = entries[0][0].item[2]
     gain = float(g @ coefficient)
-    if len(g) == 1:
-        p = amplitudes[0] if amplitudes else None
-        if p is not None:
-            allowed = _allowed(p, coefficient[0])
-        elif "tau" in shape and (entries[0][0].item[1] != (0,) or (c.jumps and not c.variant)):
-            # in proportion only from one lag of the grid to the next
-            allowed = 1 / NEAR < coefficient[0] < NEAR
-        else:
-            allowed = coefficient[0] > 0
-        if not allowed:
-            gain = 0.0
+    if len(g) == 1 and not _possible(c, entries[0][0], float(coefficient[0])):
+        gain = 0.0
+    shape, s = _sizes(c, entries, shape, coefficient)
+    excited = float(left[useful].max())
+    start = parameter_values(c, shape, s)
+    _keep(best, c, shape, gain, int(useful.sum()), start, rows @ coefficient, excited)
+
+
+def _possible(c: Candidate, column: _Column, coefficient: float) -> bool:
+    """Return whether the catalogue allows the size of a direction that has only one."""
+    amplitudes = [p for p in c.effect.parameters if p.amplitude]
+    shape, _ = column.item[2]
+    if amplitudes:
+        return _allowed(amplitudes[0], coefficient)
+    if "tau" in shape and (column.item[1] != (0,) or (c.jumps and not c.variant)):
+        # in proportion only from one lag of the grid to the next
+        return 1 / NEAR < coefficient < NEAR
+    return coefficient > 0
+
+
+def _sizes(
+    c: Candidate, entries: Sequence[_Entry], shape: dict[str, float], coefficient: np.ndarray
+) -> tuple[dict[str, float], list[float]]:
+    """Return the shape and the amplitudes at the best coefficients of the columns."""
     if "phases" in c.effect.shapes.values():
-        s = [float(np.hypot(*coefficient))]
-        shape = {
-            **{k: v for k, v in shape.items() if k != "phase"},
-            "phase": float(np.arctan2(coefficient[1], coefficient[0])),
-        }
-    elif amplitudes:
-        s = list(np.array([e[0].item[2][1] for e in entries]).T @ coefficient)
-    else:
-        s = [1.0]
-        factor = float(
-            np.clip(coefficient[0], 1e-3, 5.0)
-        )  # a short lag or delay changes the outputs in proportion
-        shape = {k: v * factor if k == "tau" else v for k, v in shape.items()}
-    _keep(
-        best,
-        c,
-        shape,
-        gain,
-        int(useful.sum()),
-        parameter_values(c, shape, s),
-        rows @ coefficient,
-        float(left[useful].max()),
-    )
-    return chance
+        phase = float(np.arctan2(coefficient[1], coefficient[0]))
+        return {**shape, "phase": phase}, [float(np.hypot(*coefficient))]
+    if any(p.amplitude for p in c.effect.parameters):
+        return shape, list(np.array([e[0].item[2][1] for e in entries]).T @ coefficient)
+    factor = float(np.clip(coefficient[0], 1e-3, 5.0))  # a short lag changes the outputs in proportion
+    return {k: v * factor if k == "tau" else v for k, v in shape.items()}, [1.0]
+
+
+def _score_windows(
+    c: Candidate,
+    entries: Sequence[_Entry],
+    rows: np.ndarray,
+    full: np.ndarray,
+    g: np.ndarray,
+    m: np.ndarray,
+    best: dict[int, Direction],
+) -> None:
+    """Keep the best pair of a start and an end; an end beyond the last column is that of the recording."""
+    edges = [e[0].item[2][0]["start"] for e in entries]
+    last, floor = len(edges), 1e-12 * float(full.max()) ** 2
+    gain, at = -1.0, (0, 0, 0.0)
+    for a in range(last):
+        for b in range(a + 1, last + 1):
+            top = g[a] - g[b] if b < last else g[a]
+            bottom = m[a, a] + m[b, b] - 2 * m[a, b] if b < last else m[a, a]
+            if bottom > floor and top * top / bottom > gain:
+                gain, at = top * top / bottom, (a, b, top / bottom)
+    if gain < 0:
+        return
+    a, b, amplitude = at
+    # Heat that ends and a lack of heat that starts differ by a constant, which parameters absorb.
+    # The lack is likelier.
+    if a == 0 and b < last and m[b, b] > floor and g[b] ** 2 / m[b, b] > 0.8 * gain:
+        a, b, amplitude = b, last, g[b] / m[b, b]
+        gain = g[a] ** 2 / m[a, a]
+    shape = {"start": edges[a], "end": edges[b] if b < last else 10 * edges[-1]}
+    vector = rows[:, a] - (rows[:, b] if b < last else 0)
+    excited = float(np.linalg.norm(vector)) / max(full[a], 1e-300)
+    _keep(best, c, shape, gain, 1, parameter_values(c, shape, [amplitude]), vector, excited)
 
 
 def _allowed(p: EffectParameter, coefficient: float) -> bool:

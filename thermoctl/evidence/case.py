@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +13,7 @@ from thermoctl.diagnose.effects import Effect
 from thermoctl.evidence.coordinates import Coordinates
 from thermoctl.evidence.noise import Grid, grid
 from thermoctl.evidence.roles import Structure
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.refit import Fit, Noise, default_noise, fit
 from thermoctl.plant.simulate import Excitation, Model, compile_plant
 from thermoctl.recording.table import Table
@@ -28,12 +28,18 @@ class Budget:
     """Largest number of refits, and the number done. Counted, never timed: the same on every machine."""
 
     fits: int
+    progress: Callable[[str], None] = lambda text: None
     fits_done: int = 0
 
     @property
     def spent(self) -> bool:
         """Is there nothing left for another refit?"""
         return self.fits_done >= self.fits
+
+    def spend(self) -> None:
+        """Count one refit, and report it."""
+        self.fits_done += 1
+        self.progress(f"searching: refit {self.fits_done} of at most {self.fits}")
 
 
 @dataclass(frozen=True)
@@ -74,6 +80,7 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
     tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
     drives = [model.excitation(t) for t in tables]
     coordinates = Coordinates(drives)
+    sensors = [o.noise if isinstance(o.noise, SensorNoise) else None for o in plant.outputs.values()]
     rig = Structure(plant, drives, [t.columns for t in tables])
     return Case(
         plant,
@@ -83,7 +90,7 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
         null,
         coordinates,
         tuple(
-            grid(coordinates, ks, noise[j].sigma, _swing(drives, j))
+            grid(coordinates, ks, noise[j].sigma, _swing(drives, j), sensors[j])
             for j, ks in coordinates.by_output().items()
         ),
         budget,

@@ -17,15 +17,11 @@ Key = tuple[str, str]  # (effect, where)
 
 @dataclass(frozen=True)
 class Posterior:
-    """Probability of each hypothesis tried (by its effects), and of each effect in any of them."""
+    """Probability of each hypothesis tried (by its effects), of each effect, and of any effect."""
 
     hypotheses: Mapping[frozenset[Key], float]
     effects: Mapping[Key, float]
-
-    @property
-    def something(self) -> float:
-        """Probability that some effect is there."""
-        return 1.0 - self.hypotheses.get(frozenset(), 0.0)
+    something: float
 
 
 @dataclass(frozen=True)
@@ -35,13 +31,11 @@ class Facts:
     - `something`: probability that some effect is there
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
-    - `closed`: share of the refitted plant's misfit that the findings remove
     - `worth`: held-out error, divided by that of a refit alone"""
 
     something: float
     named: tuple[Key, ...]
     over_noise: float
-    closed: float
     worth: float
 
 
@@ -56,19 +50,27 @@ class Decision:
     numbers: Mapping[str, float]
 
 
-def weigh(scores: Mapping[frozenset[Key], float], limits: Limits) -> Posterior:
-    """Return the posterior of hypotheses, and of each effect.
+def weigh(
+    scores: Mapping[frozenset[Key], float],
+    physics: Mapping[frozenset[Key], Mapping[Key, float]],
+    limits: Limits,
+) -> Posterior:
+    """Return the posterior of hypotheses, the likeliest first, and of each effect.
 
     `scores`: log evidence plus log prior odds. They are divided by `limits.temperature` (diagnosis.yaml):
-    a value above 1 makes the probabilities less extreme."""
-    values = np.array(list(scores.values())) / limits.temperature
+    a value above 1 makes the probabilities less extreme. `physics`: probability that each effect of a
+    hypothesis is physics and no unnamed misfit."""
+    order = sorted(scores, key=lambda keys: (-scores[keys], sorted(keys)))
+    values = np.array([scores[keys] for keys in order]) / limits.temperature
     p = np.exp(values - logsumexp(values))
-    hypotheses = dict(zip(scores, map(float, p), strict=True))
+    hypotheses = dict(zip(order, map(float, p), strict=True))
     effects: dict[Key, float] = {}
+    something = 0.0
     for keys, q in hypotheses.items():
+        something += q * max(physics[keys].values(), default=0.0)
         for key in keys:
-            effects[key] = effects.get(key, 0.0) + q
-    return Posterior(hypotheses, effects)
+            effects[key] = effects.get(key, 0.0) + q * physics[keys][key]
+    return Posterior(hypotheses, effects, something)
 
 
 ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
@@ -79,11 +81,6 @@ ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
     ),
     ("nothing is supported and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
     ("the findings predict held-out data worse than a refit alone", lambda f, q: f.worth > 1, "unexplained"),
-    (
-        "a remainder stays that is larger than what the findings close",
-        lambda f, q: f.over_noise > q.clean and f.closed < q.closed,
-        "unexplained",
-    ),
     ("something is supported, but no effect for sure", lambda f, q: not f.named, "ambiguous"),
     (
         "findings are supported and the residual is the sensors' noise",
@@ -100,7 +97,6 @@ def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
     numbers = {
         "something": facts.something,
         "over_noise": facts.over_noise,
-        "closed": facts.closed,
         "worth": facts.worth,
         **{f"{e} at {w}": posterior.effects[e, w] for e, w in facts.named},
     }

@@ -12,7 +12,7 @@ remainder (noise.py). Gauss-Newton steps find its maximum; with the weights E[1/
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,10 +20,11 @@ import numpy as np
 from thermoctl.diagnose.effects import Candidate, EffectParameter
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.coordinates import Coordinates
-from thermoctl.evidence.noise import Averaged, averaged
+from thermoctl.evidence.noise import Averaged, Grid, averaged
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
+from thermoctl.plant.residuals import Evaluation
 from thermoctl.plant.simulate import SimulationError, compile_plant
 
 SIGNIFICANT = 2.0  # standard deviations
@@ -34,6 +35,7 @@ DECADES = 4.0  # width of the log-uniform prior of an effect's size
 WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
 ROUNDS = 15  # largest number of Gauss-Newton steps
 LENGTHS = 1.0, 0.3, 0.1  # shares of a Newton step that are tried, in this order
+SHARE = 0.01  # of an effect's size, from which the first step towards it is taken
 FAR = 8.0  # standard deviations that a start may be off
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
 MOST = 0.9  # of a curvature that not knowing the spectrum may take
@@ -84,8 +86,13 @@ class Fitted:
 
     @property
     def absent(self) -> bool:
-        """Return whether a part of an effect is not significant; a simpler hypothesis then replaces it."""
-        return any(_insignificant(self, e) for e in self.hypothesis.effects)
+        """Return whether a whole effect is not significant."""
+        return any(_insignificant(self, e, all) for e in self.hypothesis.effects)
+
+    @property
+    def doubtful(self) -> bool:
+        """Return whether a part of an effect is not significant: a simpler hypothesis may replace it."""
+        return any(_insignificant(self, e, any) for e in self.hypothesis.effects)
 
     @property
     def log_evidence(self) -> float:
@@ -93,8 +100,8 @@ class Fitted:
         return self.log_likelihood + self.log_prior + self.volume
 
 
-def _insignificant(f: Fitted, e: Placed) -> bool:
-    """Return whether an amplitude of the effect is within SIGNIFICANT standard deviations of no effect.
+def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]) -> bool:
+    """Return whether any, or all, amplitudes of the effect are within SIGNIFICANT sd of no effect.
 
     For an effect without an amplitude (lag, delay): whether a parameter is at its lower bound."""
     sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
@@ -104,7 +111,7 @@ def _insignificant(f: Fitted, e: Placed) -> bool:
         return False
     if not sizes:
         return any(f.fit.at_bound.get(n) == "low" for n in e.own.values())
-    return any(
+    return which(
         abs(f.plant.parameters[e.own[p.name]].value - p.null) < SIGNIFICANT * f.sd[e.own[p.name]]
         for p in sizes
     )
@@ -283,18 +290,25 @@ def _priors(
 
 
 def fitted(
-    case: Case, plant: Plant, effects: Sequence[Placed], start: Fit | None = None, best: Fitted | None = None
+    case: Case,
+    plant: Plant,
+    effects: Sequence[Placed],
+    start: Fit | None = None,
+    best: Fitted | None = None,
+    parent: float = np.inf,
 ) -> Fitted:
     """Refit a plant that holds these effects and compute its log evidence. Raises SimulationError.
 
-    The refit ends early if it stays far from `best`, the best hypothesis so far."""
-    case.budget.fits_done += 1
+    The refit ends early if it stays far from `best`, the best hypothesis so far. `parent`: the cost before
+    the last effect was added."""
+    case.budget.spend()
     posterior = Posterior(case, plant, effects)
     if start is None:
         start = refit.fit(
             posterior.model,
             posterior.drives,
             case.noise,
+            start=_led(posterior, parent),
             iterations=WHITE,
             tolerance=ROUGH,
             goal=best.rough.cost if best else np.inf,
@@ -304,6 +318,64 @@ def fitted(
     goal = best.log_likelihood - HOPELESS if best else -np.inf
     z, average, powers, matrix, errors = posterior.climb(start.z, goal)
     return _weighed(case, posterior, z, average, powers, matrix, errors, start)
+
+
+def _led(posterior: Posterior, parent: float) -> np.ndarray:
+    """Return the unknowns from which a refit starts: the effects at full size, if these improve the fit.
+
+    The plant's own parameters may have imitated the effect. Then its full size gives a cost above `parent`,
+    that of the refit without it. In that case one Gauss-Newton step is taken from a small share of the
+    effect. Sizes and the plant's parameters change in this step, shapes do not. Of the three points the one
+    with the least cost is the start."""
+    problem = posterior.problem
+    full = problem.start({})
+    costs = [_cost(problem, full)]
+    plant = posterior.plant.parameters
+    names = {problem.unknowns[k][0]: p for k, (_, p) in posterior.amplitudes.items()}
+    if costs[0] < parent or not names:
+        return full
+    small = problem.start({q: p.null + SHARE * (plant[q].value - p.null) for q, p in names.items()})
+    own = {n for e in posterior.effects for n in e.own.values()}
+    free = np.array([k for k, (q, _) in enumerate(problem.unknowns) if q not in own or q in names])
+    try:
+        led = _along_values(posterior, small, problem.evaluate(small, True), free)
+    except SimulationError:
+        return full
+    starts = [full, small, led]
+    costs += [_cost(problem, small), _cost(problem, led)]
+    return starts[int(np.argmin(costs))]
+
+
+def _cost(problem: Problem, z: np.ndarray) -> float:
+    try:
+        return problem.evaluate(z, False).cost
+    except SimulationError:
+        return float("inf")
+
+
+def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np.ndarray) -> np.ndarray:
+    """Return z after one Gauss-Newton step of the unknowns `free`, straight in the values of the parameters.
+
+    A parameter that an effect replaces goes towards zero. Its logarithmic scale would bend that path."""
+    problem = posterior.problem
+    values, _ = problem.unpack(z)
+    low, high = (bound - z for bound in posterior.bounds())
+    at, slope = z.copy(), np.ones(len(z))
+    for k, (q, r) in enumerate(problem.unknowns[: problem.n_parameters]):
+        scale = problem.scales[q]
+        at[k] = float(values[r or 0, posterior.model.parameters.index(q)])
+        slope[k] = scale.slope(at[k])
+        low[k], high[k] = (scale.low - at[k]) / slope[k], (scale.high - at[k]) / slope[k]
+    zero = np.zeros(len(free))
+    step = _step(zero, now.gradient[free], now.matrix[np.ix_(free, free)], low[free], high[free])
+    out = z.copy()
+    for k, change in zip(free, step, strict=True):
+        if k < problem.n_parameters:
+            scale = problem.scales[problem.unknowns[k][0]]
+            out[k] = scale.z(float(np.clip(at[k] + slope[k] * change, scale.low, scale.high)))
+        else:
+            out[k] = z[k] + change
+    return out
 
 
 def _weighed(
@@ -377,6 +449,33 @@ def _relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
     share, p = np.linalg.eigh(0.5 * (inner + inner.T))
     left = root @ (p * (1 - np.clip(share, 0.0, MOST))) @ p.T @ root.T
     return left * np.outer(size, size)
+
+
+def levels(case: Case, f: Fitted, clean: float) -> list[float]:
+    """Return the standard deviation of each output's noise: the stated one, or more if that explains all.
+
+    A stated noise may be wrong by one standard deviation of its prior. So variance that is present at all
+    frequencies counts as noise up to there. The residual must then be within `clean` times this noise."""
+    out = []
+    for g in case.grids:
+        lowest, at = np.inf, 0
+        for k in g.channels:
+            inverse = f.average.inverse[k]
+            stated = g.variance * g.shape[g.node[at : at + len(inverse)]]
+            lowest = min(lowest, float(np.min(1 / (inverse * stated))))
+            at += len(inverse)
+        level = g.sigma * float(np.sqrt(np.clip(lowest, 1.0, np.exp(g.known))))
+        out.append(level if _rms(f, g) <= clean * level else g.sigma)
+    return out
+
+
+def over_noise(case: Case, f: Fitted, clean: float) -> list[float]:
+    """Return the rms of each output's residuals over its noise (`levels`)."""
+    return [_rms(f, g) / level for g, level in zip(case.grids, levels(case, f, clean), strict=True)]
+
+
+def _rms(f: Fitted, g: Grid) -> float:
+    return float(np.sqrt(sum(f.powers[k].sum() for k in g.channels) / g.count.sum()))
 
 
 def as_refitted(case: Case, f: Fitted) -> Fitted:

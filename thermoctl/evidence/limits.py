@@ -22,7 +22,7 @@ class Limits:
     set: float
     temperature: float
     clean: float
-    closed: float
+    alike: float
 
 
 def limits() -> Limits:

@@ -1,4 +1,4 @@
-"""The diagnosis as the contract's JSON, the extended plant, and the words of a report."""
+"""The diagnosis as one object, and as the JSON of its contract (thermoctl-diagnosis/1)."""
 
 from __future__ import annotations
 
@@ -9,61 +9,86 @@ from typing import Any
 import numpy as np
 
 from thermoctl.evidence.case import Case
-from thermoctl.evidence.decide import Decision, Posterior
+from thermoctl.evidence.decide import Decision, Key, Posterior
 from thermoctl.evidence.fit import Fitted, Placed
 from thermoctl.evidence.held_out import Worth
+from thermoctl.evidence.misfit import Energy
 from thermoctl.evidence.search import Searched
 from thermoctl.evidence.unknown import Left
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.refit import Fit
+from thermoctl.plant.simulate import SimulationError, compile_plant
 
-NEXT = {
-    "consistent": "Nothing. The smallest effects that these recordings would have shown depend on their excitation: wider steps show more.",
-    "explained": "Use the extended plant. Check it on a recording with another schedule before it is trusted outside these ranges.",
-    "ambiguous": "Record with an excitation on which the alternatives differ (`thermoctl diagnose --resolve` proposes one).",
-    "partly_explained": "Use the extended plant for what is named. Look for the rest where and when the remainder is largest.",
-    "unexplained": "Look for the cause where the remainder enters; add an entry to the catalogue once it is known.",
-}
+MOVES = 6.0  # of its noise: least spread of an output that moves
+FOLLOWS = (
+    0.3  # of an output's variance: most that a plant of the right rig leaves, even where it lacks physics
+)
+MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
+BLOCKS, LARGE = (
+    40,
+    1.5,
+)  # of a recording; a block's rms over that of the recording, from which its misfit is large
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that was found."""
+    """All that was found.
+
+    - `best`: the leading hypothesis; `null`: the plant without any effect, after an ordinary refit
+    - `left`, `before`: the residual of `best` and of `null`
+    - `energy`: of each hypothesis' residuals
+    - `physics`: for hypotheses whose every effect stands out of the misfit that they leave: each effect's
+      probability of being physics"""
 
     case: Case
     searched: Searched
     posterior: Posterior
     best: Fitted
-    null: Fitted  # as an ordinary refit leaves it
+    null: Fitted
     left: Left
     before: Left
     worth: Worth
     decision: Decision
+    energy: Mapping[frozenset[Key], Energy]
+    physics: Mapping[frozenset[Key], Mapping[Key, float]]
 
     @property
     def shown(self) -> tuple[Placed, ...]:
         """The effects that the result reports as findings."""
-        supported = self.decision.verdict in ("explained", "partly_explained")
+        effects = self.best.hypothesis.effects
         if self.decision.verdict == "ambiguous":
-            return self.best.hypothesis.effects
-        return (
-            tuple(e for e in self.best.hypothesis.effects if e.key in self.decision.named)
-            if supported
-            else ()
-        )
+            return effects
+        if self.decision.verdict in ("explained", "partly_explained"):
+            return tuple(e for e in effects if e.key in self.decision.named)
+        return ()
+
+    @property
+    def final(self) -> Fitted:
+        """The hypothesis that the result shows as the outcome."""
+        return self.best if self.shown else self.null
+
+    @property
+    def remainder(self) -> Left:
+        """The residual of the outcome."""
+        return self.left if self.shown else self.before
+
+    @property
+    def extended(self) -> Plant:
+        """The plant with the findings, refitted."""
+        return self.final.plant
 
 
 def contract(d: Diagnosis) -> dict[str, Any]:
-    """thermoctl-diagnosis/1."""
-    shown = d.shown
-    keys = {e.key for e in shown}
-    remainder = d.decision.verdict in ("partly_explained", "unexplained", "ambiguous")
+    """Return thermoctl-diagnosis/1; `next_experiment`, `not_seen` and `seconds` are still empty."""
+    keys = {e.key for e in d.shown}
+    stays = d.decision.verdict in ("partly_explained", "unexplained", "ambiguous")
+    outputs = d.case.plant.outputs
     return _plain(
         {
             "format": "thermoctl-diagnosis/1",
             "verdict": d.decision.verdict,
-            "findings": [_finding(d, e) for e in shown],
+            "findings": [_finding(d, e) for e in d.shown],
             "alternatives": [
                 {"effect": e, "where": w, "probability": round(p, 4)}
                 for (e, w), p in d.decision.alternatives
@@ -71,22 +96,22 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             ],
             "mismatch": _mismatch(d),
             "remainder": {
-                "share_closed": d.worth.share_closed if shown else 0.0,
-                "rms": d.left.rms,
-                "over_noise": d.left.over_noise,
-                "node": d.left.node,
-                "follows": d.left.follows,
+                "share_closed": d.worth.share_closed if d.shown else 0.0,
+                "rms": d.remainder.rms,
+                "over_noise": d.remainder.over_noise,
+                "node": d.remainder.node,
+                "follows": d.remainder.follows,
                 "law": None,
             }
-            if remainder
+            if stays
             else None,
             "fit": {
-                "before": _before(d),
+                "before": _as_it_came(d),
                 "refit_only": d.null.fit.rms(),
-                "after": (d.best if shown else d.null).fit.rms(),
+                "after": d.final.fit.rms(),
                 "held_out_before": d.worth.before,
                 "held_out_refit_only": d.worth.refit_only,
-                "held_out_after": d.worth.after,
+                "held_out_after": d.worth.after if d.shown else d.worth.refit_only,
                 "held_out": "recordings " + ", ".join(d.worth.names)
                 if d.worth.reserved
                 else "cross-validated: too few recordings to set one aside",
@@ -94,23 +119,66 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             "next_experiment": None,
             "decision": {"row": d.decision.row, **d.decision.numbers},
             "hypotheses": _hypotheses(d),
+            "lost": _lost(d),
+            "not_seen": [],
             "truncated": d.searched.truncated,
-            "notes": d.case.notes,
+            "notes": _notes(d),
+            "outputs": {o: {"unit": outputs[o].unit, "noise": s} for o, s in d.before.noise.items()},
+            "seconds": None,
         }
     )
 
 
-def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
-    plant = d.best.plant
-    values = {n: plant.parameters[n] for n in e.own.values()}
-    ends = {
-        p.shape: plant.parameters[e.own[p.name]].value
-        for p in e.candidate.effect.parameters
-        if p.name in e.own and p.shape
+def _notes(d: Diagnosis) -> list[str]:
+    """Return the assumptions and the cautions, as sentences."""
+    unnamed = [e.key for e in d.final.hypothesis.effects if e not in d.shown]
+    return [
+        *d.case.notes,
+        *doubts(d.case, d.final.fit, d.before.noise),
+        *(
+            f"{effect} at {where} is in the extended plant, but is not sure enough to be a finding "
+            f"(probability {d.posterior.effects.get((effect, where), 0.0):.2f})"
+            for effect, where in unnamed
+        ),
+        *(e.candidate.effect.caution for e in d.shown if e.candidate.effect.caution),
+    ]
+
+
+def doubts(case: Case, fit: Fit, noise: Mapping[str, float]) -> list[str]:
+    """Return doubts that the recordings suit the plant: nothing moves, or the errors are very large."""
+    model = fit.model
+    drives = case.drives(model)
+    recorded = np.concatenate([x.y for x in drives])
+    spread = {
+        o: float(np.nanquantile(recorded[:, j], 0.98) - np.nanquantile(recorded[:, j], 0.02))
+        for j, o in enumerate(model.outputs)
+        if np.isfinite(recorded[:, j]).any()
     }
+    moves = any(spread[o] > MOVES * s for o, s in noise.items())
+    if not moves and not any(np.ptp(x.u, axis=0).any() for x in drives):
+        return [
+            "no input changes and no output moves: almost nothing is excited, so almost nothing could be seen; "
+            "record a run with changing inputs"
+        ]
+    rms, out = fit.rms(), []
+    for j, o in enumerate(model.outputs):
+        if o in spread and spread[o] > MOVES * noise[o]:
+            swing = float(np.nanstd(recorded[:, j]))
+            if rms[o] ** 2 > FOLLOWS * swing**2:
+                out.append(
+                    f"the plant follows {o} only roughly (error {rms[o]:.3g}, standard deviation of the reading {swing:.3g}): "
+                    "check that the recording is of this rig, in the plant's units, on one clock"
+                )
+    return out
+
+
+def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
+    plant, effect = d.best.plant, e.candidate.effect
+    values = {n: plant.parameters[n] for n in e.own.values()}
+    ends = {p.shape: plant.parameters[e.own[p.name]].value for p in effect.parameters if p.name in e.own}
     last = max(float(t.t[-1] - t.t[0]) for t in d.case.tables)
     first = ends.get("onset", ends.get("start"))
-    equation = _equation(d.case.plant, plant, e)
+    equation = _equation(plant, e)
     figures = ", ".join(f"{n} = {p.value:.4g} {p.unit or ''}".strip() for n, p in values.items())
     return {
         "effect": e.key[0],
@@ -121,12 +189,12 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
         "parameters": {
             n: {"value": p.value, "sd": d.best.sd.get(n, 0.0), "unit": p.unit} for n, p in values.items()
         },
-        "summary": f"{e.candidate.effect.title} at {e.key[1]}: {equation} with {figures}.",
+        "summary": f"{effect.title} at {e.key[1]}: {equation} with {figures}.",
     }
 
 
-def _equation(before: Plant, after: Plant, e: Placed) -> str:
-    """The expression that the effect brings or changes."""
+def _equation(after: Plant, e: Placed) -> str:
+    """Return the expression that the effect brings or changes."""
     mine = set(e.own.values())
     for f in reversed(list(after.flows.values())):
         if ex.names(f.rate) & mine:
@@ -136,11 +204,12 @@ def _equation(before: Plant, after: Plant, e: Placed) -> str:
             return str(o.value)
     for n in after.nodes.values():
         if ex.names(n.storage) & mine:
-            return (
-                str(after.outputs[e.candidate.place.output].value)
-                if e.candidate.place.output
-                else str(n.storage)
+            net = " ".join(
+                f"{'+' if f.target == n.name else '-'} ({f.rate})"
+                for f in after.flows.values()
+                if n.name in (f.source, f.target)
             )
+            return f"{n.storage} * d({n.name})/dt = {net.removeprefix('+ ')}"
     return e.candidate.effect.title
 
 
@@ -149,16 +218,48 @@ def _mismatch(d: Diagnosis) -> list[dict[str, Any]]:
         return []
     rms = d.null.fit.rms()
     found = [
-        {"channel": o, "rms": rms[o], "expected_rms": d.before.noise[o], "node": d.before.node}
+        {
+            "channel": o,
+            "rms": rms[o],
+            "expected_rms": d.before.noise[o],
+            "node": d.before.node,
+            "when": _when(d, o),
+            "follows": d.before.follows,
+        }
         for o, ratio in d.before.over_noise.items()
-        if ratio > 1.1
+        if ratio > MISFIT
     ]
     return sorted(found, key=lambda m: -m["rms"] / max(m["expected_rms"], 1e-300))
 
 
-def _before(d: Diagnosis) -> dict[str, float]:
+def _when(d: Diagnosis, output: str) -> list[list[float]]:
+    """Return the intervals, s, in which an output's error is large, in the recording where it is largest."""
+    j = d.null.fit.model.outputs.index(output)
+    errors = [e[:, j] for e in d.null.fit.residuals]
+    sizes = [float(np.nanmean(e**2)) if np.isfinite(e).any() else 0.0 for e in errors]
+    r = int(np.argmax(sizes))
+    # the samples are about evenly spaced, so that a block of samples is a block of time
+    edges = np.linspace(0, len(errors[r]), min(BLOCKS, len(errors[r])) + 1).astype(int)
+    t = d.case.tables[r].t - d.case.tables[r].t[0]
+    out: list[list[float]] = []
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        part = errors[r][a:b]
+        if np.isfinite(part).any() and np.nanmean(part**2) > LARGE**2 * sizes[r]:
+            start, end = float(t[a]), float(t[min(b, len(t) - 1)])
+            if out and out[-1][1] == start:
+                out[-1][1] = end
+            else:
+                out.append([start, end])
+    return out
+
+
+def _as_it_came(d: Diagnosis) -> dict[str, float]:
+    """Return the rms error of the plant with the parameters of its file."""
     model = compile_plant(d.case.plant)
-    errors = np.concatenate([x.y - model.run(x).y for x in d.case.drives(model)])
+    try:
+        errors = np.concatenate([x.y - model.run(x).y for x in d.case.drives(model)])
+    except SimulationError:
+        return dict.fromkeys(model.outputs, float("nan"))
     return {
         o: float(np.sqrt(np.nanmean(errors[:, j] ** 2)))
         for j, o in enumerate(model.outputs)
@@ -167,53 +268,56 @@ def _before(d: Diagnosis) -> dict[str, float]:
 
 
 def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
-    """Every hypothesis that was fitted, the likeliest first."""
-    null = next(w.fitted.log_evidence for w in d.searched.tried if not w.fitted.hypothesis.effects)
-    return [
-        {
-            "effects": [f"{e} at {w}" for e, w in sorted(w.fitted.hypothesis.keys)],
-            "log_evidence": w.fitted.log_evidence - null,
-            "log_prior_odds": w.log_odds,
-            "posterior": d.posterior.hypotheses.get(w.fitted.hypothesis.keys, 0.0),
-            "remainder": max(w.fitted.average.remainder),
-            "rms": w.fitted.fit.rms(),
-            "cost": w.fitted.rough.cost,
-            "at_bound": w.fitted.fit.at_bound,
-        }
-        for w in d.searched.tried
-    ]
+    """Return every hypothesis that was fitted, the likeliest first.
 
-
-def words(found: Mapping[str, Any]) -> str:
-    """The result in a few sentences, by size."""
-    fit, lines = found["fit"], []
-    worst = (
-        max(fit["refit_only"], key=lambda o: fit["refit_only"][o] / max(fit["after"].get(o, 1e-300), 1e-300))
-        if fit["refit_only"]
-        else None
-    )
-    names = " and ".join(
-        f"{f['effect'].replace('_', ' ')} at {f['where']} (probability {f['probability']:.2f})"
-        for f in found["findings"]
-    )
-    if names:
-        start = "Found" if found["verdict"] != "ambiguous" else "Something is missing, most likely"
-        lines.append(f"{start}: {names}.")
-        lines.append(
-            f"The error of {worst} falls from {fit['before'][worst]:.3g} (refit alone: {fit['refit_only'][worst]:.3g}) to {fit['after'][worst]:.3g}."
+    `physics`: each effect's probability to be no unnamed misfit; null where one does not stand out of it.
+    `remainder`: the largest probability of a remainder at an output."""
+    tried = d.searched.tried
+    null = next(w.fitted.log_evidence for w in tried if not w.fitted.hypothesis.effects)
+    out = []
+    for w in tried:
+        keys = w.fitted.hypothesis.keys
+        physics = d.physics.get(keys)
+        out.append(
+            {
+                "effects": [f"{e} at {at}" for e, at in sorted(keys)],
+                "log_evidence": w.fitted.log_evidence - null,
+                "log_prior_odds": w.log_odds,
+                "posterior": d.posterior.hypotheses.get(keys, 0.0),
+                "physics": None if physics is None else [physics[k] for k in sorted(keys)],
+                "remainder": max(w.fitted.average.remainder),
+                "rms": w.fitted.fit.rms(),
+                "cost": w.fitted.rough.cost,
+                "at_bound": w.fitted.fit.at_bound,
+                "energy": d.energy[keys].all,
+                "misfit": d.energy[keys].misfit,
+                "dims": [len(e.own) for e in sorted(w.fitted.hypothesis.effects, key=lambda e: e.key)],
+            }
         )
-    elif found["verdict"] == "consistent":
-        lines.append("The recordings agree with the plant within its sensors' noise: nothing is missing.")
-    else:
-        lines.append("Something is missing that no entry of the catalogue explains.")
-    if found["remainder"]:
-        r = found["remainder"]
-        left = ", ".join(f"{v:.3g} of {o}" for o, v in r["rms"].items() if v > 0)
-        at = f"; it enters at {r['node']}" if r["node"] else ""
-        if left:
-            lines.append(f"Nothing known explains the remaining {left}{at}.")
-    lines.append("What next: " + NEXT[found["verdict"]])
-    return " ".join(lines)
+    return sorted(out, key=lambda h: -h["posterior"])  # the order of scores stays among the unlikely
+
+
+def _lost(d: Diagnosis) -> list[dict[str, Any]]:
+    """Return the fitted effects that are no finding, each in its best hypothesis, with the reason."""
+    out: dict[Key, dict[str, Any]] = {}
+    shown = {e.key for e in d.shown}
+    final = next(w.score for w in d.searched.tried if w.fitted.hypothesis.keys == d.final.hypothesis.keys)
+    for w in d.searched.tried:
+        keys = w.fitted.hypothesis.keys
+        for key in sorted(keys - shown):
+            if key not in out:
+                beside = sorted(f"{e} at {at}" for e, at in keys - {key})
+                out[key] = {
+                    "effect": key[0],
+                    "where": key[1],
+                    "beside": beside,
+                    "probability": d.posterior.effects.get(key, 0.0),
+                    "below_best": final - w.score,
+                    "reason": "less likely than the findings"
+                    if keys in d.physics
+                    else "does not stand out of the misfit that it leaves",
+                }
+    return sorted(out.values(), key=lambda e: (-e["probability"], e["below_best"]))
 
 
 def _plain(value: Any) -> Any:

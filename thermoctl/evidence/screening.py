@@ -11,7 +11,7 @@ from thermoctl.diagnose.effects import candidates
 from thermoctl.diagnose.screen import Direction, Metric, screen
 from thermoctl.evidence.case import Case
 from thermoctl.evidence.coordinates import Coordinates
-from thermoctl.evidence.fit import Fitted, as_refitted
+from thermoctl.evidence.fit import Fitted, as_refitted, over_noise
 from thermoctl.evidence.noise import Averaged, averaged, grid
 from thermoctl.evidence.roles import Structure
 from thermoctl.plant.refit import Problem
@@ -19,8 +19,6 @@ from thermoctl.plant.simulate import Simulation
 
 # Largest number of DCT rows, all outputs and recordings together; MOVING_ROWS for a plant with a moving axis.
 ROWS, MOVING_ROWS = 6_000, 16_000
-# Probability of a remainder above which the catalogue is screened once more, with the sensors' noise alone.
-LIKELY = 0.5
 PROMISED = 30  # directions whose gain in log likelihood is predicted
 
 
@@ -36,11 +34,11 @@ class Rows(Metric):
         self.problem = Problem(self.model, self.drives, case.noise)
         for d, values in zip(self.drives, self.fit.values, strict=True):
             self.model.prepare(d, values)
-        self.blocks = 1
         self.coordinates = Coordinates(self.drives, max(most // len(case.coordinates.channels), 32))
         measured = self.coordinates.by_output().values()
         self.grids = [
-            grid(self.coordinates, ks, g.sigma, g.swing) for ks, g in zip(measured, case.grids, strict=True)
+            grid(self.coordinates, ks, g.sigma, g.swing, g.sensor)
+            for ks, g in zip(measured, case.grids, strict=True)
         ]
         self.weights = _weights(case, average, self.coordinates, remainder)
         self.runs, columns = [], []
@@ -107,16 +105,24 @@ def _weights(case: Case, average: Averaged, coordinates: Coordinates, remainder:
 
 @dataclass(frozen=True)
 class Screened:
-    """The catalogue's best directions; `promises`: predicted gain in log likelihood of each."""
+    """The catalogue's best directions; `promises`: predicted gain in log likelihood of each.
+
+    `energy`: the rows in the sensors' noise alone; `by_energy`: all directions by their gain there. Where the
+    plant has a large error, a first-order step predicts log likelihood badly, and energy is the better
+    guide. Empty where the residual is about the noise."""
 
     metric: Rows
     rig: Structure
     directions: list[Direction]
     promises: list[float]
+    energy: Rows | None
+    by_energy: list[Direction]
 
 
-def screened(case: Case, fitted: Fitted) -> Screened:
-    """Screen the catalogue at the places of the original plant; a part that an effect added is no place."""
+def screened(case: Case, fitted: Fitted, clean: float) -> Screened:
+    """Screen the catalogue at the places of the original plant; a part that an effect added is no place.
+
+    Where the residual is more than `clean` times the noise, in the noise alone, too: there by energy."""
     moving = bool(Structure(case.plant, [], []).velocities) if case.plant.nodes else False
     most = MOVING_ROWS if moving else ROWS
     average = as_refitted(case, fitted).average
@@ -130,11 +136,13 @@ def screened(case: Case, fitted: Fitted) -> Screened:
         for c in candidates(rig, case.catalogue)
         if c.key not in fitted.hypothesis.keys and not c.place.parts() & added
     ]
-    best = screen(metric, rig, found)[0][:PROMISED]
+    best = screen(metric, rig, found)[:PROMISED]
     promised = [(d, metric.promise(d)) for d in best]
-    if max(average.remainder) > LIKELY:
+    other, by_energy = None, list[Direction]()
+    if max(over_noise(case, as_refitted(case, fitted), clean)) > clean:
         other = Rows(case, fitted, average, most, False)
-        again = [(d, other.promise(d)) for d in screen(other, rig, found)[0][:PROMISED]]
+        by_energy = screen(other, rig, found)
+        again = [(d, other.promise(d)) for d in by_energy[:PROMISED]]
         known = {d.candidate.key: promise for d, promise in promised}
         promised = [(d, p) for d, p in promised if p >= 0] + [
             (dataclasses.replace(d, vector=None), p)  # its vector is of another metric
@@ -142,7 +150,7 @@ def screened(case: Case, fitted: Fitted) -> Screened:
             if p > known.get(d.candidate.key, 0.0)
         ]
     promised.sort(key=lambda x: -x[1])
-    return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised])
+    return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised], other, by_energy)
 
 
 def places(case: Case) -> dict[str, set[str]]:

@@ -9,20 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoctl.diagnose.effects import PLACES, Candidate
-from thermoctl.diagnose.screen import Direction, sharpened
-from thermoctl.diagnose.search import extend, sticking, weaker
+from thermoctl.diagnose.extend import extend, sticking, weaker
+from thermoctl.diagnose.screen import Direction, Metric, sharpened
 from thermoctl.evidence.case import Case
-from thermoctl.evidence.fit import Fitted, Placed, fitted
+from thermoctl.evidence.fit import Fitted, Placed, fitted, over_noise
 from thermoctl.evidence.limits import Limits
 from thermoctl.evidence.roles import Structure
 from thermoctl.evidence.screening import Screened, places, screened
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.yamlfile import InputError
 
 EVENTS = ("onsets", "windows")  # shapes that happen at one moment
 PAIR = 2
+SURPLUS = 5.0  # nats over every other extension, from which one with an insignificant part is kept
+BEATEN = 10.0  # nats below the best: such a parent is not extended where the best leaves no more than noise
 HALF = 2.0  # times its first-order promise that a refit may gain
 PLACES_EACH = 3  # of one effect in a shortlist
 ALIKE = 0.999  # cosine of two directions, above which they are one
@@ -79,9 +81,9 @@ def search(case: Case, limits: Limits) -> Searched:
     tried: dict[frozenset[tuple[str, str]], Weighed] = {frozenset(): null}
     beam, seen = [null], set()
     for _ in range(limits.effects):
-        best = beam[0].score
+        best, close = beam[0].score, max(over_noise(case, beam[0].fitted, limits.clean)) <= limits.clean
         for parent in beam:
-            if parent.fitted.hypothesis.keys in seen:
+            if parent.fitted.hypothesis.keys in seen or (close and parent.score < best - BEATEN):
                 continue
             seen.add(parent.fitted.hypothesis.keys)
             found = extensions(case, parent, where, limits, tried)
@@ -136,7 +138,8 @@ def extensions(
 ) -> list[Weighed]:
     """Refit the parent with each direction, and with each pair of directions, of the shortlist."""
     out: list[Weighed] = []
-    looked = screened(case, parent.fitted)
+    doubtful: list[Weighed] = []
+    looked = screened(case, parent.fitted, limits.clean)
     leading = max(w.score for w in tried.values())
     queue = shortlist(looked, where, limits)
     for added, gain in queue:
@@ -150,11 +153,13 @@ def extensions(
         found = [f for f in fits if not f.absent]
         if found:
             best = max(found, key=lambda f: f.log_evidence)
-            out.append(Weighed(best, odds(best.hypothesis.effects, where, limits)))
-        if len(found) < len(fits):
+            w = Weighed(best, odds(best.hypothesis.effects, where, limits))
+            (doubtful if best.doubtful else out).append(w)
+        if any(f.absent or f.doubtful for f in fits):
             queued = {d.candidate.key for ds, _ in queue for d in ds}
             queue += [((d,), gain) for d in simpler(added, looked) if d.candidate.key not in queued]
-    return out
+    simplest = max((w.score for w in (parent, *out)), default=parent.score)
+    return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
 
 
 def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
@@ -176,7 +181,7 @@ def shortlist(
 ) -> list[tuple[tuple[Direction, ...], float]]:
     """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
-    The best is first; at most PLACES_EACH of one effect."""
+    The best is first; at most PLACES_EACH of one effect. Those with the largest gain in energy follow."""
     paying = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
         gain = promise + odds((Placed(d.candidate, {}),), where, limits)
@@ -189,10 +194,24 @@ def shortlist(
         if len(alike) < PLACES_EACH and d.candidate.key not in {o.candidate.key for o in alike}:
             out.append(((d,), gain))
     out = [(d, gain) for d, gain in out[: limits.shortlist] if HALF * gain > out[0][1]]
-    return [*out, *((p, np.inf) for p in pairs([d for d, _ in paying], looked, limits))]
+    known = {d.candidate.key for (d,), _ in out}
+    out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in known]
+    together = pairs([d for d, _ in paying], looked.metric, limits)
+    if looked.energy:
+        together += pairs(looked.by_energy, looked.energy, limits)
+    return [*out, *((p, np.inf) for p in together)]
 
 
-def pairs(directions: Sequence[Direction], looked: Screened, limits: Limits) -> list[tuple[Direction, ...]]:
+def largest(looked: Screened) -> list[Direction]:
+    """Return the direction of each candidate whose gain in energy is at least half of the best one's."""
+    first: dict[tuple[str, str], Direction] = {}
+    for d in looked.by_energy:
+        if HALF * d.gain > looked.by_energy[0].gain and not relabels(d.candidate):
+            first.setdefault(d.candidate.key, dataclasses.replace(d, vector=None))
+    return list(first.values())
+
+
+def pairs(directions: Sequence[Direction], metric: Metric, limits: Limits) -> list[tuple[Direction, ...]]:
     """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
 
     The plant's own parameters may imitate each alone, but not both together."""
@@ -204,7 +223,7 @@ def pairs(directions: Sequence[Direction], looked: Screened, limits: Limits) -> 
     if len(kept) < PAIR:
         return []
     v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
-    g = np.maximum(v @ looked.metric.residual, np.finfo(float).tiny)
+    g = np.maximum(v @ metric.residual, np.finfo(float).tiny)
     c = np.clip(v @ v.T, -ALIKE, ALIKE)
     first = (g[:, None] - c * g[None]) / (
         1 - c**2
@@ -260,9 +279,12 @@ def _refitted(
         for d in added:
             rig = Structure(plant, drives, [t.columns for t in case.tables])
             d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
+            inputs = plant.inputs.keys()
             plant, own = extend(plant, d, drives)
+            if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
+                drives = case.drives(compile_plant(plant))
             effects = (*effects, Placed(d.candidate, own))
-        return fitted(case, free_starts(case.plant, plant), effects, None, leader)
+        return fitted(case, free_starts(case.plant, plant), effects, None, leader, parent.fitted.rough.cost)
     except (SimulationError, InputError, np.linalg.LinAlgError):
         return None
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from thermoctl.evidence.case import Case
-from thermoctl.evidence.fit import Fitted
+from thermoctl.evidence.fit import Fitted, levels, over_noise
 from thermoctl.evidence.roles import Structure
 from thermoctl.evidence.where import Responses, responses, signals
 
@@ -19,7 +19,7 @@ CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; la
 class Left:
     """The part of the residual that the sensors' noise does not explain.
 
-    - `rms`: rms of that part; `noise`: rms that the plant file states; by output, in the output's unit
+    - `rms`: rms of that part; `noise`: rms of the noise (`levels`); by output, in the output's unit
     - `over_noise`: rms of the whole residual divided by `noise`, by output
     - `node`: the node whose random forces explain the residual best
     - `follows`: signals that correlate with the residual of the output with the largest `over_noise`"""
@@ -31,15 +31,12 @@ class Left:
     follows: tuple[str, ...]
 
 
-def left(case: Case, f: Fitted, reach: Responses) -> Left:
+def left(case: Case, f: Fitted, reach: Responses, clean: float) -> Left:
     """Measure and locate the residual of a fitted hypothesis."""
-    rms, noise, over = {}, {}, {}
-    for g in case.grids:
-        name = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
-        power = sum(float(f.powers[k].sum()) for k in g.channels) / g.count.sum()
-        rms[name] = float(np.sqrt(max(power - g.variance, 0.0)))
-        noise[name] = g.sigma
-        over[name] = float(np.sqrt(power / g.variance))
+    names = [case.null.model.outputs[case.coordinates.channels[g.channels[0]].output] for g in case.grids]
+    over = dict(zip(names, over_noise(case, f, clean), strict=True))
+    noise = dict(zip(names, levels(case, f, clean), strict=True))
+    rms = {o: noise[o] * float(np.sqrt(max(ratio**2 - 1, 0.0))) for o, ratio in over.items()}
     worst = max(over, key=lambda o: over[o]) if over else ""
     follow = follows(case, f, worst) if over and over[worst] > 1 else ()
     return Left(rms, noise, over, _node(case, f, reach), follow)

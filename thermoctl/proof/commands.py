@@ -9,18 +9,22 @@ from rich.console import Console
 
 from thermoctl.proof import tables
 from thermoctl.proof.prove import prove as prove_cases
-from thermoctl.proof.recordings import real
+from thermoctl.proof.recordings import real, recordings_folder, totals
 from thermoctl.proof.run import Reporter
+from thermoctl.yamlfile import InputError
 
 
 def prove(args: argparse.Namespace) -> int:
     """Run `thermoctl prove`: 0 when every goal that could be measured is reached, else 1."""
     console = Console()
     if args.real:
-        apart = args.apart.split(",") if args.apart else ()
-        entries = real(args.cases, args.out, apart, args.scheduler, args.workers, Reporter())
+        folder = recordings_folder(args.cases)
+        entries = real(folder, args.out, args.scheduler, args.workers, args.number, Reporter())
         console.print(tables.real_table(entries))
-        return 0
+        console.print(totals(entries))
+        return int(any(e.error for e in entries))
+    if not args.cases:
+        raise InputError("prove: a folder of cases was expected, or --real")
     content = prove_cases(
         args.cases, args.out, args.answers, args.scheduler, args.workers, args.number, Reporter()
     )

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from thermoctl.diagnose.effects import CATALOGUE
+from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError, load
 
 RECORDINGS = (".csv", ".parquet", ".arrow")
@@ -34,19 +35,22 @@ class Run(TypedDict):
 class Job:
     """One diagnosis to run.
 
-    Plant file, recordings, and folders of effects beside the catalogue's."""
+    Plant file, recordings, folders of effects beside the catalogue's, and recordings that take no part."""
 
     name: str
     plant: str
     recordings: tuple[str, ...]
     effects: tuple[str, ...] = ()
+    held_out: tuple[str, ...] = ()
 
     def fingerprint(self) -> str:
         """Hash the inputs and the program that diagnoses.
 
         A result with another fingerprint is out of date."""
         entries = [f for folder in map(Path, self.effects) for f in sorted(folder.glob("*.yaml"))]
-        return _digest((*map(Path, (self.plant, *self.recordings)), *entries, *program_files()))
+        return _digest(
+            (*map(Path, (self.plant, *self.recordings, *self.held_out)), *entries, *program_files())
+        )
 
 
 def program() -> str:
@@ -55,12 +59,11 @@ def program() -> str:
 
 
 def program_files() -> list[Path]:
-    """Find every file that can change a diagnosis: the code of three packages and the catalogue."""
+    """Find every file that can change a diagnosis: the code of four packages, the catalogue, the numbers."""
     package = Path(__file__).parents[1]
-    code = [
-        f for part in ("diagnose", "plant", "recording") for f in sorted((package / part).glob("*.[ph]*"))
-    ]
-    return [*sorted(CATALOGUE.glob("*.yaml")), *code]
+    parts = ("diagnose", "evidence", "plant", "recording")
+    code = [f for part in parts for f in sorted((package / part).glob("*.[ph]*"))]
+    return [*sorted(CATALOGUE.glob("*.yaml")), shipped("config") / "diagnosis.yaml", *code]
 
 
 def _digest(paths: Iterable[Path]) -> str:
@@ -70,11 +73,10 @@ def _digest(paths: Iterable[Path]) -> str:
     return digest.hexdigest()
 
 
-def find_jobs(folder: str | Path, number: int | None = None, apart: Sequence[str] = ()) -> list[Job]:
+def find_jobs(folder: str | Path, number: int | None = None) -> list[Job]:
     """Find the cases in a folder, in order of their names; `number`: only the first so many.
 
-    `apart`: folders whose recordings are of different rigs and are diagnosed one at a time. Raises InputError
-    without a case."""
+    Raises InputError without a case."""
     root = Path(folder)
     if not root.is_dir():
         raise InputError(
@@ -83,15 +85,11 @@ def find_jobs(folder: str | Path, number: int | None = None, apart: Sequence[str
     jobs = []
     for plant in sorted(root.glob("*/plant.yaml")):
         runs = tuple(str(p) for p in sorted(plant.parent.iterdir()) if p.suffix in RECORDINGS)
-        name = plant.parent.name
         if not runs:
             raise InputError(
                 f"{plant.parent}: plant.yaml without a recording; expected run_1.csv or the like beside it"
             )
-        if name in apart:
-            jobs += [Job(f"{name}-{Path(r).stem}", str(plant), (r,)) for r in runs]
-        else:
-            jobs.append(Job(name, str(plant), runs))
+        jobs.append(Job(plant.parent.name, str(plant), runs))
     if not jobs:
         raise InputError(f"{root}: no case in it; expected folders with plant.yaml and recordings")
     return jobs[:number]

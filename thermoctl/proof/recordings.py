@@ -1,74 +1,110 @@
-"""Diagnose real recordings without a known answer.
-
-The result shows verdict, places and held-out error beside the published figures.
-"""
+"""Diagnose real recordings: effects found, strays, and the error on data that took no part in any choice."""
 
 from __future__ import annotations
 
 import json
-import re
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from thermoctl.proof.jobs import Job, Run, find_jobs, outcome
+from thermoctl.proof.jobs import Job, Run, outcome
+from thermoctl.proof.rigs import RIGS, Rig
 from thermoctl.proof.run import OnCase, run_all
+from thermoctl.yamlfile import InputError
 
-_PUBLISHED = re.compile(r"publish|publication|benchmark's|upstream reports", re.IGNORECASE)
+VARIABLE = "THERMOCTL_RECORDINGS"  # of the environment: the folder of the recordings
+SUFFIX = ".csv"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One folder of real recordings.
+    """One diagnosed rig.
 
-    held_out: output -> rms on held-out data: plant as it was, refitted, extended.
-    """
+    - `hits`: the probability of each accepted effect, 0 where it was not found
+    - `strays`: findings that are neither accepted nor tolerated
+    - `ratio`: mean over the outputs of held-out error with the findings over that of a refit alone"""
 
     name: str
     verdict: str
     findings: list[tuple[str, str, float]]  # effect, place, probability
-    held_out: dict[str, tuple[float | None, float | None, float | None]]
-    gain: Mapping[str, Any] | None
-    published: list[str]  # the README's lines on published figures
-    seconds: float | None
+    hits: list[float]
+    strays: list[str]
+    ratio: float | None
+    share_closed: float | None
+    cpu_s: float | None
     error: str | None
 
 
+def recordings_folder(given: str | None) -> Path:
+    """Return the given folder, else that of the environment. Raises InputError."""
+    name = given or os.environ.get(VARIABLE)
+    if not name:
+        raise InputError(f"prove --real: a folder of recordings was expected, as argument or in {VARIABLE}")
+    if not Path(name).is_dir():
+        raise InputError(f"{name}: no such folder; the folder of real recordings was expected")
+    return Path(name)
+
+
 def real(
-    folder: str | Path,
+    folder: Path,
     out_dir: str | Path,
-    apart: Sequence[str] = (),
     scheduler: str | None = None,
     workers: int | None = None,
+    number: int | None = None,
     progress: OnCase | None = None,
 ) -> list[Entry]:
-    """Diagnose every folder of real recordings; write OUT/real.json."""
+    """Diagnose the known rigs in a folder and write OUT/real.json. Raises InputError where there is none."""
     out = Path(out_dir)
-    jobs = find_jobs(folder, apart=apart)
+    rigs = [r for r in RIGS if (folder / r.folder / r.plant).is_file()][:number]
+    if not rigs:
+        raise InputError(
+            f"{folder}: none of the known rigs is here ({', '.join(sorted({r.folder for r in RIGS}))})"
+        )
+    jobs = [_job(folder, r) for r in rigs]
     run_all(jobs, out / "cases", scheduler, workers, progress=progress)
-    entries = [_entry(job, *outcome(job, out / "cases")) for job in jobs]
+    entries = [_entry(r, *outcome(j, out / "cases")) for r, j in zip(rigs, jobs, strict=True)]
     (out / "real.json").write_text(json.dumps([asdict(e) for e in entries], indent=1) + "\n")
     return entries
 
 
-def _entry(job: Job, result: Mapping[str, Any] | None, run: Run) -> Entry:
+def _job(folder: Path, rig: Rig) -> Job:
+    def files(names: str) -> tuple[str, ...]:
+        return tuple(str(folder / rig.folder / f"{n}{SUFFIX}") for n in names.split())
+
+    return Job(rig.name, str(folder / rig.folder / rig.plant), files(rig.runs), held_out=files(rig.held_out))
+
+
+def _entry(rig: Rig, result: Mapping[str, Any] | None, run: Run) -> Entry:
     result = result or {"verdict": "failed", "findings": [], "fit": {}}
-    fit = result["fit"]
-    before, refitted = fit.get("held_out_before", {}), fit.get("held_out_refit_only", {})
+    named = {f["effect"]: float(f["probability"]) for f in result["findings"]}
+    known = frozenset().union(*rig.accepted, rig.tolerated)
     return Entry(
-        job.name,
+        rig.name,
         result["verdict"],
         [(f["effect"], f["where"], f["probability"]) for f in result["findings"]],
-        {o: (before.get(o), refitted.get(o), v) for o, v in (fit.get("held_out_after") or {}).items()},
-        result.get("held_out_gain"),
-        _published(Path(job.plant).parent / "README.md"),
-        run.get("seconds"),
+        [max((named[e] for e in options if e in named), default=0.0) for options in rig.accepted],
+        [e for e in named if e not in known],
+        _ratio(result["fit"]),
+        (result.get("remainder") or {}).get("share_closed"),
+        run.get("cpu_s"),
         run["error"],
     )
 
 
-def _published(readme: Path) -> list[str]:
-    if not readme.exists():
-        return []
-    return [line.strip("- ").strip() for line in readme.read_text().splitlines() if _PUBLISHED.search(line)]
+def _ratio(fit: Mapping[str, Any]) -> float | None:
+    before, after = fit.get("held_out_refit_only") or {}, fit.get("held_out_after") or {}
+    ratios = [after[o] / before[o] for o in after if before.get(o) and after[o] is not None]
+    return sum(ratios) / len(ratios) if ratios else None
+
+
+def totals(entries: Sequence[Entry]) -> str:
+    """Return the effects found, the strays and the diagnoses with every effect and none beside, in words."""
+    hits = [p for e in entries for p in e.hits]
+    strays = sum(len(e.strays) for e in entries)
+    clean = sum(all(e.hits) and not e.strays and not e.error for e in entries)
+    return (
+        f"{sum(p > 0 for p in hits)} of {len(hits)} accepted effects found; {strays} strays in {len(entries)} diagnoses; "
+        f"{clean} with every effect and no stray"
+    )

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from thermoctl import __version__
-from thermoctl.diagnose.run import diagnose
+from thermoctl.diagnose.run import diagnose_files
 from thermoctl.proof.jobs import Job, Run, done
 from thermoctl.yamlfile import InputError
 
@@ -29,7 +29,7 @@ def run_one(job: Job, out: str) -> Run:
     started, cpu = time.monotonic(), time.process_time()
     error = None
     try:
-        diagnose(job.plant, list(job.recordings), out, [Path(e) for e in job.effects])
+        diagnose_files(job.plant, job.recordings, out, [Path(e) for e in job.effects], job.held_out)
     except InputError as e:
         error = str(e)
     except Exception as e:  # a crash is a result of the proof

@@ -111,23 +111,25 @@ def _open_lines(found: Mapping[str, Any]) -> Iterator[Line]:
 
 
 def real_table(entries: Sequence[Entry]) -> Table:
-    """Show the diagnoses of real recordings, under each its README's lines on published figures."""
+    """Show the diagnoses of real recordings; an effect that was to be found and was not has probability 0."""
     t = Table(title="Real recordings, each from its naive plant")
     for title in (
-        "recording",
+        "rig",
         "verdict",
-        "effect at place (probability)",
-        "held-out rms: as it was → refit → extended",
-        "s",
+        "found",
+        "strays",
+        "held-out ratio",
+        "closed",
+        "CPU s",
+        "effect at place",
     ):
         t.add_column(title)
     for x in entries:
+        hits = f"{sum(p > 0 for p in x.hits)}/{len(x.hits)}"
+        if x.hits:
+            hits += " (" + " ".join(f"{p:.2f}" for p in x.hits) + ")"
         found = "\n".join(f"{a} at {b} ({p:.2f})" for a, b, p in x.findings) or (x.error or "")
-        rms = "\n".join(
-            f"{o}: " + " → ".join("–" if v is None else f"{v:.4g}" for v in three)
-            for o, three in x.held_out.items()
-        )
-        t.add_row(x.name, x.verdict, found, rms, f"{x.seconds or 0:.0f}")
-        for line in x.published:
-            t.add_row("", "", f"[dim]README: {line[:110]}[/dim]", "", "")
+        closed = "–" if x.share_closed is None else f"{100 * x.share_closed:.0f} %"
+        ratio = "–" if x.ratio is None else f"{x.ratio:.2f}"
+        t.add_row(x.name, x.verdict, hits, str(len(x.strays)), ratio, closed, f"{x.cpu_s or 0:.0f}", found)
     return t

@@ -1,0 +1,85 @@
+"""Which places and shapes the catalogue offers on a plant."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.plants import FREE_CARRIAGE
+from thermoctl.diagnose.effects import Rig, candidates, catalogue, shape_grid
+from thermoctl.diagnose.extend import ranges_of
+from thermoctl.diagnose.screen import Direction
+from thermoctl.plant import loads
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
+
+MOTOR = """format: thermoctl-plant/1
+title: A motor on a frame that grows
+inputs: {current: {unit: A}, speed: {unit: rad/s}, air: {unit: degC, between_samples: linear}}
+parameters:
+  C_winding: {value: 60, unit: J/K, range: [20, 200]}
+  C_housing: {value: 300, unit: J/K, range: [100, 900]}
+  G: {value: 1.2, unit: W/K, range: [0.3, 4]}
+  H: {value: 0.8, unit: W/K, range: [0.2, 3]}
+  fan: {value: 0.001, unit: W/K/(rad/s)}
+  R: {value: 1.2, unit: ohm, range: [0.6, 2.4]}
+  growth: {value: 2.0, unit: um/K, range: [0.5, 8]}
+nodes: {winding: {unit: degC, storage: C_winding, initial: air}, housing: {unit: degC, storage: C_housing, initial: air}}
+flows:
+  joule: {into: winding, rate: R * current**2 * (1 + 0.00393 * (winding - 20)), unit: W}
+  link: {from: winding, into: housing, rate: G * (winding - housing), unit: W}
+  draught: {into: housing, rate: (H + fan * abs(speed)) * (air - housing), unit: W}
+outputs:
+  winding_c: {value: winding, unit: degC, noise: 0.1}
+  housing_c: {value: housing, unit: degC, noise: 0.1}
+  error: {value: growth * (housing - 20), unit: um, noise: 0.05}
+"""
+
+
+@pytest.fixture(scope="module")
+def motor() -> tuple[Plant, Table]:
+    plant = loads(MOTOR)
+    t = np.arange(0.0, 3000.0, 10.0)
+    columns = {
+        "current": 3.0 * (np.sin(t / 200) > 0),
+        "speed": 50 + 50 * np.cos(t / 150),
+        "air": 21 + np.sin(t / 700),
+    }
+    return plant, compile_plant(plant).measure(Table("run", "run", t, columns))
+
+
+def entries(*names: str) -> dict:
+    return {n: catalogue()[n] for n in names}
+
+
+def offered(plant: Plant, table: Table, name: str) -> dict:
+    rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
+    return {c.place.where: c for c in candidates(rig, entries(name))}
+
+
+def test_heat_that_copper_makes_may_go_elsewhere_and_what_a_draught_carries_off_may_not(motor):
+    assert set(offered(*motor, "heat_split")) == {"winding-housing"}
+
+
+def test_a_reading_of_growth_may_follow_the_air_as_a_temperature_does(motor):
+    assert set(offered(*motor, "cold_junction_drift")) == {"winding_c", "housing_c", "error"}
+
+
+def test_a_period_that_has_not_come_once_is_not_offered():
+    plant = loads(FREE_CARRIAGE)
+    t = np.arange(4000) * 0.002
+    force = np.interp(t, np.arange(0, 9, 0.4), np.random.default_rng(1).uniform(-8, 8, 23))
+    table = compile_plant(plant).measure(Table("r", "r", t, {"force": force, "encoder": np.zeros(len(t))}))
+    model = compile_plant(plant)
+    drive = model.excitation(table)
+    runs = [model.run(drive)]
+    travel = np.ptp(runs[0].x[:, model.states.index("position")])
+    (found, *_) = candidates(Rig(plant, [drive], [table.columns]), entries("cogging"))
+    grid = shape_grid("periods", found, runs)
+    periods = [s["period"] for s in grid]
+    assert max(periods) == pytest.approx(travel) and min(periods) < travel / 50
+    start = {p.name: p.null for p in found.effect.parameters}
+    for shape in grid:
+        direction = Direction(found, shape, 1.0, 2, {**start, "P": shape["period"]})
+        assert ranges_of(direction, 8.0)["P"][1] <= 1.001 * travel

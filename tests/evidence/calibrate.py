@@ -1,0 +1,191 @@
+"""Set the numbers of config/diagnosis.yaml that weigh hypotheses, from generated cases with known answers.
+
+    python -m tests.evidence.calibrate CASES RESULTS [CASES RESULTS ...] [--write]
+
+CASES as of `python -m tests.concealed.generate --answers inside`; RESULTS: the folders that `thermoctl diagnose` wrote
+for them, by the same names. A diagnosis.json holds every hypothesis that was fitted, so it is decided again with
+other numbers, without a refit. The loss of a case is the mean log loss of its effects' probabilities: those that
+are there, and those that are not. Each number in turn takes the value of least loss; its flat range is where the
+loss of all cases grows by less than one. `--write` puts values and provenance into config/diagnosis.yaml.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from thermoctl.diagnose.effects import CATALOGUE, catalogue
+from thermoctl.evidence.decide import Key, weigh
+from thermoctl.evidence.limits import Limits, limits
+from thermoctl.evidence.misfit import Energy, standing
+from thermoctl.evidence.search import EVENTS
+from thermoctl.plant import load
+
+NUMBERS = {
+    "missing": (0.1, 0.2, 0.35, 0.5, 0.65, 0.8),
+    "rare": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
+    "temperature": (0.7, 1.0, 1.5, 2.0, 3.0, 5.0),
+    "alike": (0.02, 0.05, 0.1, 0.2, 0.3),
+}
+LEAST = 1e-3  # of a probability: the largest loss of one effect is 7
+FLAT = 1.0
+FILE = Path("config/diagnosis.yaml")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A case's hypotheses, and what the answer says is there.
+
+    `likelihood` and `share`: log evidence and log prior share of places; `rare`: number of rare classes; `truths`: the
+    accepted (effect, where) of each effect that is there."""
+
+    name: str
+    likelihood: Mapping[frozenset[Key], float]
+    share: Mapping[frozenset[Key], float]
+    rare: Mapping[frozenset[Key], int]
+    energy: Mapping[frozenset[Key], Energy]
+    dims: Mapping[Key, int]
+    truths: tuple[frozenset[Key], ...]
+
+
+def judged(case: Path, result: Path, used: Limits) -> Judged:
+    """Read one case and its result; `used`: the numbers that made the result."""
+    entries = catalogue((CATALOGUE,))
+    inputs = load(case / "plant.yaml").inputs
+    found = json.loads((result / "diagnosis.json").read_text())["hypotheses"]
+    keyed = {frozenset(_key(e) for e in h["effects"]): h for h in found}
+
+    def rare(key: Key) -> int:
+        effect = entries[key[0]]
+        event = any(kind in EVENTS for kind in effect.shapes.values())
+        event |= any(p.per_recording for p in effect.parameters)
+        return event + (key[1] in inputs and effect.where != "drive")
+
+    dims = {k: n for h in found for k, n in zip(map(_key, sorted(h["effects"])), h["dims"], strict=True)}
+    counts = {keys: sum(map(rare, keys)) for keys in keyed}
+    missing = np.log(used.missing / (1 - used.missing))
+    return Judged(
+        case.name,
+        {keys: h["log_evidence"] for keys, h in keyed.items()},
+        {
+            keys: h["log_prior_odds"] - counts[keys] * np.log(used.rare) - len(keys) * missing
+            for keys, h in keyed.items()
+        },
+        counts,
+        {keys: Energy(h["energy"], h["misfit"]) for keys, h in keyed.items()},
+        dims,
+        _truths(yaml.safe_load((case / "answer.yaml").read_text())),
+    )
+
+
+def _key(text: str) -> Key:
+    effect, _, where = text.partition(" at ")
+    return effect, where
+
+
+def _truths(answer: Mapping[str, Any]) -> tuple[frozenset[Key], ...]:
+    """The names and places that are accepted for each effect that is there."""
+    out = []
+    for effect, where in answer["effects"]:
+        if effect == "?":
+            continue
+        names = {effect, *answer["nearly_the_same"]}
+        places = {where, *(p if isinstance(p, str) else p[-1] for p in answer["nearly_the_same_places"])}
+        out.append(frozenset((n, p) for n in names for p in places))
+    return tuple(out)
+
+
+def loss(case: Judged, numbers: Limits) -> float:
+    """Return the mean log loss of one case: of each effect that is there, and of all that are not."""
+    physics = standing(case.energy, case.dims, numbers)
+    own = np.log(numbers.missing / (1 - numbers.missing))
+    scores = {
+        keys: case.likelihood[keys]
+        + case.share[keys]
+        + len(keys) * own
+        + case.rare[keys] * np.log(numbers.rare)
+        for keys in physics
+    }
+    effects = weigh(scores, physics, numbers).effects
+    right = [sum(effects.get(k, 0.0) for k in accepted) for accepted in case.truths]
+    known = frozenset().union(*case.truths)
+    wrong = [p for k, p in effects.items() if k not in known]
+    terms = [-np.log(np.clip(p, LEAST, 1.0)) for p in right]
+    terms.append(-float(np.sum(np.log(np.clip(1 - np.array(wrong), LEAST, 1.0)))))
+    return float(np.mean(terms))
+
+
+def calibrated(
+    cases: Sequence[Judged], numbers: Limits
+) -> tuple[Limits, dict[str, tuple[float, float, float]]]:
+    """Return the numbers of least loss, and for each the loss and its flat range."""
+    ranges = {}
+    for name, values in NUMBERS.items():
+        tried = {v: sum(loss(c, dataclasses.replace(numbers, **{name: v})) for c in cases) for v in values}
+        best = min(tried, key=lambda v: tried[v])
+        flat = [v for v in values if tried[v] < tried[best] + FLAT]
+        now = getattr(numbers, name)
+        value = now if flat[0] <= now <= flat[-1] else best  # a value in the flat range stays
+        numbers = dataclasses.replace(numbers, **{name: value})
+        ranges[name] = (tried[best], flat[0], flat[-1])
+        print(
+            f"{name:12} {value:<6g} loss by value: " + ", ".join(f"{v:g} {x:.2f}" for v, x in tried.items())
+        )
+    return numbers, ranges
+
+
+def write(
+    numbers: Limits, ranges: Mapping[str, tuple[float, float, float]], cases: Sequence[str], n: int
+) -> None:
+    """Put values and provenance into config/diagnosis.yaml."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+    )
+    lines, name = [], ""
+    for line in FILE.read_text().splitlines():
+        if line and not line.startswith((" ", "#")):
+            name = line.rstrip(":")
+        if name in ranges and line.startswith("  value:"):
+            line = f"  value: {getattr(numbers, name):g}"
+        if name in ranges and line.startswith("  set_by:"):
+            _, low, high = ranges[name]
+            line = (
+                f"  set_by: make calibrate-diagnosis, {n} cases ({', '.join(cases)}), commit {commit.stdout.strip()}; "
+                f"loss flat from {low:g} to {high:g}"
+            )
+        lines.append(line)
+    FILE.write_text("\n".join(lines) + "\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Calibrate on folders of cases and results."""
+    p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    p.add_argument("folders", nargs="+", type=Path, help="CASES RESULTS [CASES RESULTS ...]")
+    p.add_argument("--write", action="store_true")
+    args = p.parse_args(argv)
+    used = limits()
+    cases = [
+        judged(case, result, used)
+        for folder, results in zip(args.folders[::2], args.folders[1::2], strict=True)
+        for case in sorted(folder.iterdir())
+        if ((result := results / case.name) / "diagnosis.json").exists()
+    ]
+    print(f"{len(cases)} cases")
+    numbers, ranges = calibrated(cases, used)
+    if args.write:
+        write(numbers, ranges, [f.name for f in args.folders[::2]], len(cases))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,90 @@
+"""The words of a result state sizes with units; `diagnose --explain` and missing options give one clear line."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from thermoctl.cli import main
+from thermoctl.evidence.explain import explain
+from thermoctl.evidence.words import sentences, words
+
+LAG = {
+    "effect": "sensor_lag",
+    "where": "reading",
+    "when": None,
+    "probability": 0.98,
+    "parameters": {"TAU_sensor_lag_reading": {"value": 4.21, "sd": 0.1, "unit": "s"}},
+}
+RADIATION = {"effect": "radiation", "where": "block", "when": None, "probability": 1.0, "parameters": {}}
+FOUND = {
+    "verdict": "partly_explained",
+    "findings": [RADIATION, LAG],
+    "alternatives": [],
+    "remainder": {
+        "share_closed": 0.9,
+        "rms": {"reading": 0.03},
+        "over_noise": {"reading": 1.5},
+        "node": "block",
+        "follows": ["heat"],
+    },
+    "fit": {
+        "before": {"reading": 40.9},
+        "refit_only": {"reading": 3.2},
+        "after": {"reading": 0.252},
+        "held_out_refit_only": {"reading": 3.4},
+        "held_out_after": {"reading": 0.26},
+        "held_out": "recordings run_3",
+    },
+    "next_experiment": None,
+    "decision": {"row": "findings are supported and a remainder stays beside them", "over_noise": 1.5},
+    "hypotheses": [],
+    "lost": [],
+    "truncated": True,
+    "outputs": {"reading": {"unit": "degC", "noise": 0.02}},
+}
+
+
+def test_findings_are_told_by_size_with_units():
+    first, gain, rest = sentences(FOUND)
+    assert (
+        first
+        == "Found: radiation at block (probability 1.00) and sensor lag of 4.21 s at reading (probability 0.98)."
+    )
+    assert gain == (
+        "They take the error of reading from 3.2 K after a refit alone (40.9 K as the plant came) to 0.252 K; "
+        "on recordings set aside from 3.4 K to 0.26 K."
+    )
+    assert rest == (
+        "0.03 K of reading remains that nothing known explains; 90 % of the misfit's energy is closed; "
+        "it enters at block and follows heat."
+    )
+
+
+@pytest.mark.parametrize(
+    ("verdict", "start"),
+    [("consistent", "The recordings agree"), ("unexplained", "Something is missing that no effect")],
+)
+def test_without_findings_every_verdict_says_what_next(verdict, start):
+    found = FOUND | {"verdict": verdict, "findings": [], "remainder": None}
+    assert words(found).startswith(start) and "What next: " in words(found)
+    assert "budget of refits ended the search" in words(found)
+
+
+def test_the_reasons_of_a_folder_without_a_diagnosis_are_refused(tmp_path, capsys):
+    assert main(["diagnose", "--explain", str(tmp_path)]) == 2
+    assert "no such file" in capsys.readouterr().err
+    (tmp_path / "diagnosis.json").write_text(json.dumps({"verdict": "explained"}))
+    assert main(["diagnose", "--explain", str(tmp_path)]) == 2
+    assert "older version" in capsys.readouterr().err
+    (tmp_path / "diagnosis.json").write_text(json.dumps(FOUND))
+    assert main(["diagnose", "--explain", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.rstrip("\n") == explain(FOUND)
+
+
+def test_a_diagnosis_needs_its_plant_and_its_folder(tmp_path, capsys):
+    assert main(["diagnose", "run.csv", "--out", str(tmp_path)]) == 2
+    assert "--plant FILE is missing" in capsys.readouterr().err
+    assert main(["diagnose", "run.csv", "--plant", "plant.yaml"]) == 2
+    assert "--out DIR is missing" in capsys.readouterr().err

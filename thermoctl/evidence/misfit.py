@@ -1,0 +1,94 @@
+"""Is an effect physics, or the shape of a misfit that nobody will name?
+
+Every plant is also wrong in small ways, whose misfits have the shapes of effects. Their energy is what a
+hypothesis leaves. Along the direction of one effect such a misfit is normal: along each parameter of the
+effect lies the share `alike` of its energy. The size of a true effect is log-uniform.
+So with r, the effect's size in standard deviations of such a misfit,
+
+    r^2 = (energy that the effect removes) / (share (energy that stays)),   share = 1 - (1 - alike)^parameters
+    odds of physics = sqrt(2 pi) exp(r^2 / 2) / (r DECADES ln 10)
+
+Energies are mean squares of residuals over the sensors' noise, summed over outputs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from thermoctl.evidence.case import Case
+from thermoctl.evidence.decide import Key
+from thermoctl.evidence.fit import DECADES, as_refitted
+from thermoctl.evidence.limits import Limits
+from thermoctl.evidence.search import Searched
+
+MISFIT = 0.5  # probability of being physics, below which an effect is rather a misfit
+SURE = 200.0  # r^2 beyond which the probability is 1 in any case
+
+
+@dataclasses.dataclass(frozen=True)
+class Energy:
+    """Mean square of a hypothesis' residuals over the noise: `all`, and the part beyond the noise."""
+
+    all: float
+    misfit: float
+
+
+def standing(
+    energy: Mapping[frozenset[Key], Energy], dims: Mapping[Key, int], limits: Limits
+) -> dict[frozenset[Key], dict[Key, float]]:
+    """Return the hypotheses that stand out of their misfit, with each effect's probability of being physics.
+
+    Every effect has to stand out against the best tried hypothesis that holds part of the others. Where the
+    misfit is more than the noise, log evidence says little of rivals. There the hypothesis has to stand out
+    against every tried one with fewer parameters, too. `dims`: number of parameters of each effect."""
+
+    def sure(rival: Energy, mine: Energy, parameters: int) -> float:
+        return physics(rival.all - mine.all, mine.misfit, 1 - (1 - limits.alike) ** parameters)
+
+    size = {keys: sum(dims[k] for k in keys) for keys in energy}
+    out = {}
+    for home, mine in energy.items():
+        found = {}
+        for key in home:
+            part = (e for keys, e in energy.items() if keys < home and key not in keys)
+            found[key] = sure(min(part, key=lambda e: e.all), mine, dims[key])
+        far = mine.misfit > limits.clean**2
+        simpler = (k for k in energy if far and k and size[k] < size[home])
+        against = [sure(energy[k], mine, size[home] - size[k]) for k in simpler]
+        if all(p > MISFIT for p in [*found.values(), *against]):
+            out[home] = found
+    return out
+
+
+def physics(removed: float, left: float, share: float) -> float:
+    """Return the probability that an effect is physics, from the energies that it removes and leaves."""
+    if left <= 0:
+        return 1.0
+    square = min(max(removed, 0.0) / (share * left), SURE)
+    r = max(np.sqrt(square), 1.0)
+    odds = np.sqrt(2 * np.pi) * np.exp(0.5 * square) / (r * DECADES * np.log(10.0))
+    return float(odds / (1 + odds))
+
+
+def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozenset[Key], Energy]:
+    """Return the energies of all hypotheses. Up to `limits.clean` times its noise a residual is no misfit.
+
+    The noise is what the leading hypothesis learnt, and at least the stated one. Of the two refits of a
+    hypothesis the better one counts."""
+    sensor = searched.tried[0].fitted.average.sensor
+    out = {}
+    for w in searched.tried:
+        both = [_energy(case, f.powers, sensor, limits) for f in (w.fitted, as_refitted(case, w.fitted))]
+        out[w.fitted.hypothesis.keys] = min(both, key=lambda e: e.all)
+    return out
+
+
+def _energy(case: Case, powers: Sequence[np.ndarray], sensor: Sequence[float], limits: Limits) -> Energy:
+    squares = [
+        sum(float(powers[k].sum()) for k in g.channels) / (g.count.sum() * max(own, g.variance))
+        for g, own in zip(case.grids, sensor, strict=True)
+    ]
+    return Energy(sum(squares), sum(max(s - limits.clean**2, 0.0) for s in squares))

@@ -1,0 +1,133 @@
+"""A diagnosis in a few sentences, by size, from diagnosis.json alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+Result = Mapping[str, Any]  # the content of diagnosis.json
+
+NEXT = {
+    "consistent": "Nothing has to be done. Effects that these inputs do not excite would not show: record wider steps to exclude them.",
+    "explained": "Use the extended plant. Check it on a recording with another schedule before you trust it outside these ranges.",
+    "ambiguous": "Record with inputs on which the candidates differ.",
+    "partly_explained": "Use the extended plant for what is named. Look for the rest where and when the remainder is largest.",
+    "unexplained": "Look for the cause where and when the remainder is largest. Once it is known, add it to the catalogue "
+    "(--effects DIR) and diagnose again.",
+}
+
+
+def words(found: Result) -> str:
+    """Return the findings, their worth, the remainder and the next step."""
+    return " ".join([*sentences(found), f"What next: {what_next(found)}"])
+
+
+def sentences(found: Result) -> list[str]:
+    """Return the findings, their worth and the remainder."""
+    lines = [_found(found)]
+    output = _worst(found)
+    if output is None:
+        return lines
+    if found["findings"]:
+        lines.append(_gain(found, output))
+    remainder = _remainder(found, output)
+    return [*lines, remainder] if remainder else lines
+
+
+def what_next(found: Result) -> str:
+    """Return the next step for a person."""
+    proposed = found.get("next_experiment")
+    if proposed:
+        return (
+            f"Run the proposed experiment ({proposed['profile']}) and diagnose again with its recording; "
+            "`thermoctl diagnose --resolve` does both."
+        )
+    text = NEXT[found["verdict"]]
+    if found["truncated"]:
+        text += " The budget of refits ended the search: more effects may be hidden."
+    return text
+
+
+def name(finding: Mapping[str, Any]) -> str:
+    """Return an effect and its place; with its time, where it is a lag or delay."""
+    text = str(finding["effect"]).replace("_", " ")
+    parameters = list(finding.get("parameters", {}).values())
+    if len(parameters) == 1 and parameters[0]["unit"] == "s":
+        text += f" of {parameters[0]['value']:.3g} s"
+    if finding.get("when"):
+        text += f" from {finding['when'][0][0]:.4g} s"
+    return f"{text} at {finding['where']}"
+
+
+def listed(items: Sequence[str]) -> str:
+    """Return `a, b and c`."""
+    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
+
+
+def difference(unit: str | None) -> str:
+    """Return the unit of a difference of readings: kelvins for degrees Celsius."""
+    return {"degC": "K", "1": "", None: ""}.get(unit, unit or "")
+
+
+def amount(found: Result, output: str, value: float | None) -> str:
+    """Return an error of an output with its unit."""
+    if value is None or not math.isfinite(value):
+        return "an unknown amount"
+    return f"{value:.3g} {difference(found['outputs'].get(output, {}).get('unit'))}".strip()
+
+
+def _found(found: Result) -> str:
+    names = [f"{name(f)} (probability {f['probability']:.2f})" for f in found["findings"]]
+    if found["verdict"] == "consistent":
+        return "The recordings agree with the plant within its sensors' noise: nothing is missing."
+    if found["verdict"] == "ambiguous":
+        others = [f"{name(a)} ({a['probability']:.2f})" for a in found["alternatives"][:3]]
+        text = "Something is missing, but these recordings do not name it for sure"
+        text += f": most likely {listed(names)}" if names else ""
+        return text + (f"; also possible: {', '.join(others)}." if others else ".")
+    if names:
+        return f"Found: {listed(names)}."
+    return "Something is missing that no effect of the catalogue explains."
+
+
+def _worst(found: Result) -> str | None:
+    """Return the output whose error the findings reduce most in its noise; without findings the worst one."""
+    fit, noise = found["fit"], {o: x["noise"] for o, x in found["outputs"].items()}
+
+    def size(o: str) -> float:
+        refit, after = fit["refit_only"].get(o) or 0.0, fit["after"].get(o) or 0.0
+        gain = refit**2 - after**2 if found["findings"] else refit**2
+        return float(gain / noise[o] ** 2) if noise[o] else 0.0
+
+    return max(noise, key=size, default=None)
+
+
+def _gain(found: Result, output: str) -> str:
+    fit = found["fit"]
+
+    def of(key: str) -> str:
+        return amount(found, output, fit[key].get(output))
+
+    text = (
+        f"{'They take' if len(found['findings']) > 1 else 'It takes'} the error of {output} from {of('refit_only')} "
+        f"after a refit alone ({of('before')} as the plant came) to {of('after')}"
+    )
+    if str(fit["held_out"]).startswith("recordings"):
+        text += f"; on recordings set aside from {of('held_out_refit_only')} to {of('held_out_after')}"
+    return text + "."
+
+
+def _remainder(found: Result, output: str) -> str:
+    r = found["remainder"]
+    if not r:
+        return ""
+    output = max(r["over_noise"], key=lambda o: r["over_noise"][o] or 0.0, default=output)
+    left = r["rms"].get(output)
+    if not left:
+        return ""
+    text = f"{amount(found, output, left)} of {output} remains that nothing known explains"
+    if found["findings"] and r["share_closed"] is not None:
+        text += f"; {100 * max(r['share_closed'], 0.0):.0f} % of the misfit's energy is closed"
+    text += f"; it enters at {r['node']}" if r["node"] else ""
+    return text + (f" and follows {listed(list(r['follows']))}." if r["follows"] else ".")
