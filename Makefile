@@ -11,7 +11,7 @@ listed = $(BIN)/python -c "import tomllib; p = tomllib.load(open('pyproject.toml
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run help first-minute rig-hour bench-law test lint format install develop clean reproduce bench-identification test-identification prove
+.PHONY: run help first-minute rig-hour bench-law test lint format install develop clean reproduce bench-identification test-identification prove calibrate-diagnosis
 run: install                       # the closed loop on the simulated rig with a live view; Ctrl-C stops safely
 	$(BIN)/thermoctl demo --config config/simulated.yaml
 
@@ -39,6 +39,14 @@ NUMBER ?= 600
 prove: develop                     # the full proof on concealed cases: made, sealed, diagnosed, scored; hours; run again to continue
 	$(BIN)/python -m tests.concealed.generate --out $(PROOF)/cases --answers $(PROOF)/answers --number $(NUMBER) --seed $(SEED)
 	$(BIN)/thermoctl prove $(PROOF)/cases --answers $(PROOF)/answers --out $(PROOF)/result
+
+CALIBRATION ?= build/calibration
+calibrate-diagnosis: develop       # set the numbers of config/diagnosis.yaml from generated cases of the training seeds; hours; run again to continue
+	$(BIN)/python -m tests.concealed.generate --world open --answers inside --number 60 --seed 5001 --out $(CALIBRATION)/open_5001
+	$(BIN)/python -m tests.concealed.generate --world closed --answers inside --number 60 --seed 5002 --out $(CALIBRATION)/closed_5002
+	for world in open_5001 closed_5002; do for case in $(CALIBRATION)/$$world/*; do out=$(CALIBRATION)/results/$$world/$$(basename $$case); \
+		test -e $$out/diagnosis.json || $(BIN)/thermoctl diagnose --quiet --anyway --plant $$case/plant.yaml --out $$out $$case/run_*.csv; done; done
+	$(BIN)/python -m tests.evidence.calibrate $(CALIBRATION)/open_5001 $(CALIBRATION)/results/open_5001 $(CALIBRATION)/closed_5002 $(CALIBRATION)/results/closed_5002 --write
 
 lint: develop                      # ruff and mypy
 	$(BIN)/ruff check .
@@ -169,8 +177,8 @@ test-qemu: develop                 # SocketCAN in a qemu guest (root; Debian: qe
 	$(BIN)/python -m pytest -q -s -m slow tests/qemu
 
 .PHONY: diagnose-recordings
-diagnose-recordings: develop       # real recordings with naive plants: effect, place and gain on held-out data
-	$(BIN)/python -m pytest -m slow -s --no-header tests/diagnose/test_recordings.py
+diagnose-recordings: develop       # real recordings with naive plants: effects found, strays and gain on held-out data
+	$(BIN)/thermoctl prove --real --out build/recordings
 
 .PHONY: fuzz
 FUZZ_S ?= 20
@@ -188,3 +196,15 @@ scenarios: install                 # every fault scenario at the wire, twice, id
 
 armed-hour: install                # both rigs armed for an hour of real time on slow, lossy Modbus; docs/proof/armed-hour.md
 	$(BIN)/python -m tests.scenarios.armed_hour --page docs/proof/armed-hour.md
+
+.PHONY: devices
+devices: develop                   # every profile of the library against its emulator: table of bus, channels, first reading, fault
+	@echo "| profile | bus | channels | first reading, s | fault shown |"; echo "| --- | --- | --- | --- | --- |"
+	@THERMOCTL_TABLE=1 $(BIN)/python -m pytest -q tests/devices/test_library.py 2>&1 | grep '^|'
+
+.PHONY: bench-points rigs
+bench-points: develop              # processor time of a tick with 4 to 64 temperature points
+	$(BIN)/python -m tests.bench.points
+
+rigs: develop                      # rigs of 2, 4 and 8 points: calibrated from their own tests, compensation off and on; minutes
+	$(BIN)/python -m tests.rigs.run

@@ -1,13 +1,23 @@
 """Define every channel once; a channel is one reading from a device.
 
-All arrays over channels have the order of TABLE. Back ends, protection limits, fault bits, the law's indices,
-the recording's signals and `status` derive from it.
+A rig file declares its temperature points; `Channels` gives the channels of this declaration. All arrays over
+channels have its order: the channels of an axis, the air, then the points, the coil first. Back ends,
+protection limits, fault bits, the law's indices, the recording's signals and `status` derive from it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf
+from pathlib import Path
+from typing import Any
+
+from thermoctl.shipped import shipped
+from thermoctl.yamlfile import InputError, Node, Section, load
 
 OK, STALE, ERROR, ABSENT = range(4)
 STATUS_NAMES = ("OK", "STALE", "ERROR", "ABSENT")
@@ -32,13 +42,17 @@ GROUPS = {
 The law only watches the `monitored` channels when the coil's sensor alone corrects the estimate.
 """
 
+MAX_POINTS = 64
+_NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
+_LONGEST = 40  # characters of a point's name: it is part of column names and of tables on terminals
+
 
 @dataclass(frozen=True)
 class Channel:
     """One channel: `role` in the configuration, `unit` as pint reads it ('1' for a number), fault `group`.
 
     `low` and `high` bound a plausible reading. `signal` is its column in a recording (default: the role).
-    `point` is the place of a temperature on the actuator. A `thermal` sensor follows its body slowly, and its
+    `point` is the name of a temperature point. A `thermal` sensor follows its body slowly, and its
     delay is recorded. A `code` is a state or an error number: it is constant in normal operation, so it is
     never checked for `frozen`.
     """
@@ -58,13 +72,7 @@ class Channel:
         object.__setattr__(self, "signal", self.signal or self.role)
 
 
-def _point(name: str, group: str = "monitored") -> Channel:
-    """Return the temperature of one point of the actuator."""
-    meaning = f"{name.replace('_', ' ')}: measured"
-    return Channel(f"{name}_c", "degC", group, meaning, -40.0, 200.0, point=name, thermal=True)
-
-
-TABLE = (
+FIXED = (
     Channel("position_um", "um", "position", "position encoder", signal="position_raw_um"),
     Channel(
         "output_reference_um",
@@ -74,19 +82,6 @@ TABLE = (
     ),
     Channel("voltage_v", "V", "voltage", "coil voltage"),
     Channel("current_a", "A", "current", "coil current"),
-    Channel("air_c", "degC", "air", "chamber air", -40.0, 80.0, thermal=True),
-    _point("coil", "coil"),
-    _point("bobbin"),
-    _point("inner_magnet"),
-    _point("outer_magnet"),
-    _point("inner_stator"),
-    _point("outer_stator"),
-    _point("stator_connector"),
-    _point("bobbin_connector"),
-    _point("shaft_1"),
-    _point("shaft_2"),
-    _point("bracket_1"),
-    _point("bracket_2"),
     Channel("supply_v", "V", "amplifier", "the amplifier's supply", 0.0),
     Channel(
         "amplifier_state",
@@ -98,20 +93,170 @@ TABLE = (
         code=True,
     ),
     Channel("amplifier_fault", "1", "amplifier", "the amplifier's own error code; 0 none", 0.0, code=True),
+    Channel("air_c", "degC", "air", "chamber air", -40.0, 80.0, thermal=True),
 )
-"""The channels. Append a new one at the end: `fresh_bits` and `status_bits` of recordings hold one bit a
-channel.
+"""The channels that every axis has; the points follow. The air is the last of them: thermal channels must be
+neighbours."""
 
-Thermal channels must be neighbours, air first, then the points; `delay_bits` holds 13 of them.
-"""
+AT = {c.role: i for i, c in enumerate(FIXED)}
+"""Index of each fixed channel, the same in every rig."""
+COIL = len(FIXED)
+"""Index of the coil's temperature: the coil is the first point."""
+CODES = tuple(c.role for c in FIXED if c.code)
 
-CHANNELS = tuple(c.role for c in TABLE)
-INDEX = {role: i for i, role in enumerate(CHANNELS)}
-SIGNAL = {c.role: c.signal for c in TABLE}
-"""Each channel's column in a recording."""
-POINTS = tuple(c.point for c in TABLE if c.point)
-"""The twelve temperature points, in the paper's order."""
-TEMPERATURES = tuple(c.role for c in TABLE if c.point)
-"""Their channels."""
-THERMAL = tuple(c.role for c in TABLE if c.thermal)
-CODES = tuple(c.role for c in TABLE if c.code)
+
+@dataclass(frozen=True)
+class Point:
+    """A temperature point: `name` (its channel is NAME_c), `label` for views, role `coil` or ''."""
+
+    name: str
+    label: str = ""
+    role: str = ""
+
+    @property
+    def words(self) -> str:
+        """Return the label, or the name with blanks."""
+        return self.label or self.name.replace("_", " ")
+
+
+@dataclass(frozen=True)
+class Channels:
+    """The channels of one axis: those that every axis has, and one a point; the coil is the first point."""
+
+    points: tuple[Point, ...]
+
+    @cached_property
+    def table(self) -> tuple[Channel, ...]:
+        """Return the channels in the arrays' order."""
+        return (*FIXED, *(_channel(p) for p in self.points))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Return the channels' roles."""
+        return tuple(c.role for c in self.table)
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Return the index of each role."""
+        return {role: i for i, role in enumerate(self.names)}
+
+    @cached_property
+    def signal(self) -> dict[str, str]:
+        """Return each channel's column in a recording."""
+        return {c.role: c.signal for c in self.table}
+
+    @cached_property
+    def point_names(self) -> tuple[str, ...]:
+        """Return the points' names, the coil first."""
+        return tuple(p.name for p in self.points)
+
+    @cached_property
+    def temperatures(self) -> tuple[str, ...]:
+        """Return the points' channels."""
+        return tuple(c.role for c in self.table if c.point)
+
+    @property
+    def coil(self) -> str:
+        """Return the channel of the coil's temperature."""
+        return self.temperatures[0]
+
+    @cached_property
+    def labels(self) -> dict[str, str]:
+        """Return each point's words for views."""
+        return {p.name: p.words for p in self.points}
+
+    def in_group(self, group: str) -> tuple[str, ...]:
+        """Return the channels whose faults are those of `group`."""
+        return tuple(c.role for c in self.table if group and c.group == group)
+
+    def plain(self) -> dict[str, dict[str, str]]:
+        """Return the declaration as a rig file has it."""
+        return {p.name: {k: v for k, v in (("role", p.role), ("label", p.label)) if v} for p in self.points}
+
+    def text(self) -> str:
+        """Return the declaration as text that `of_text` reads."""
+        return json.dumps(self.plain())
+
+
+def _channel(point: Point) -> Channel:
+    """Return the temperature of one point."""
+    group = "coil" if point.role == "coil" else "monitored"
+    return Channel(
+        f"{point.name}_c",
+        "degC",
+        group,
+        f"{point.words}: measured",
+        -40.0,
+        200.0,
+        point=point.name,
+        thermal=True,
+    )
+
+
+def of_points(points: Iterable[Point]) -> Channels:
+    """Return the channels of these points; the coil's comes first."""
+    return Channels(tuple(sorted(points, key=lambda p: p.role != "coil")))
+
+
+def of_names(points: tuple[str, ...]) -> Channels:
+    """Return the channels of points of these names, the coil first; without a name the paper's."""
+    return of_points(Point(p, role="" if k else "coil") for k, p in enumerate(points)) if points else DEFAULT
+
+
+def of_text(text: str) -> Channels:
+    """Return the channels of a text that `Channels.text` wrote."""
+    found: dict[str, dict[str, Any]] = json.loads(text)
+    return of_points(Point(name, **keys) for name, keys in found.items())
+
+
+def read_points(node: Node, folder: Path) -> Channels:
+    """Read `points` of a rig file: a mapping name: {role, label}, or the path of a file that holds one.
+
+    `folder` is what the path is relative to. Raises InputError for a name that is not a plain word, no coil
+    or several, more than MAX_POINTS.
+    """
+    if isinstance(node.value, str):
+        node = load(folder / node.value)
+    points: list[Point] = []
+    for name, item in Section(node, "points").node.value.items():
+        if not _NAME.fullmatch(name) or len(name) > _LONGEST:
+            raise item.error(
+                f"points: '{name[:60]}': small letters, digits and single underscores were expected, a letter first, "
+                f"at most {_LONGEST} characters"
+            )
+        s = Section(replace(item, value={}) if item.value is None else item, name, name)
+        points.append(Point(name, s.text("label", ""), s.text("role", "", choices=("", "coil"))))
+        s.end()
+    coils = [p.name for p in points if p.role == "coil"]
+    if len(coils) != 1:
+        raise node.error(
+            f"points: one point with role: coil was expected (it takes the power, and its sensor corrects the "
+            f"estimates), found {', '.join(coils) or 'none'}"
+        )
+    if len(points) > MAX_POINTS:
+        raise node.error(f"points: {len(points)}; at most {MAX_POINTS} were expected")
+    return of_points(points)
+
+
+def points_of_file(path: str | Path) -> Channels:
+    """Return the channels of a rig file, or of a file of points only. Raises InputError."""
+    root = load(path)
+    rig = isinstance(root.value, dict) and "hal" in root.value
+    if rig and "points" not in root.value:
+        return DEFAULT
+    return read_points(root.value["points"] if rig else root, Path(path).absolute().parent)
+
+
+def _shipped() -> Channels:
+    path = shipped("config/points") / "actuator.yaml"
+    try:
+        return read_points(load(path), path.parent)
+    except InputError as e:
+        raise ImportError(f"thermoctl is not installed whole: {e}") from None
+
+
+DEFAULT = _shipped()
+"""The channels of a rig file without `points`: the paper's actuator."""
+
+CHANNELS, INDEX, TEMPERATURES = DEFAULT.names, DEFAULT.index, DEFAULT.temperatures
+"""Of the paper's actuator only: a rig's own are `settings.channels`."""

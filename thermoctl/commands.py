@@ -78,8 +78,9 @@ _ORDER = _arg("--order", type=int, default=0, help="number of real poles (defaul
 _ROOT = _arg("--root", default="/", metavar="DIR", help="install below this directory")
 
 GROUPS = {
+    "devices": "device profiles: list, show, search, write, try",
     "recordings": "list, inspect, import, export or recover recordings",
-    "plant": "start, check, show or linearise a plant file",
+    "plant": "start, check, show, export or linearise a plant file",
 }
 """Groups of commands, such as `plant`, with their help."""
 
@@ -177,6 +178,44 @@ _DAEMON = (
         _FILE,
         CONFIG,
         _arg("--seconds", type=float, default=2.0, help="time to read for (default 2)"),
+    ),
+    _command(
+        "devices list",
+        "list the device profiles that come with the program",
+        "thermoctl.devices.library:list_all",
+        "",
+    ),
+    _command(
+        "devices show",
+        "show a device profile: its channels, where its facts come from, its text",
+        "thermoctl.devices.library:show",
+        "name",
+        _arg("name", metavar="NAME"),
+    ),
+    _command(
+        "devices search",
+        "find device profiles by words: vendor, model, bus, channel; exit 1 when there is none",
+        "thermoctl.devices.library:search",
+        "words",
+        _arg("words", nargs="+", metavar="WORD"),
+    ),
+    _command(
+        "devices new",
+        "ask for the facts of a device's manual and write its profile",
+        "thermoctl.devices.new:new",
+        "file",
+        _arg("file", metavar="FILE"),
+    ),
+    _command(
+        "devices probe",
+        "read a device and show raw numbers, or the raw traffic of a port; drives nothing",
+        "thermoctl.devices.probe:probe",
+        "port profile address seconds baud",
+        _arg("port", metavar="PORT"),
+        _arg("--profile", default="", metavar="NAME", help="profile: a file, or a name of the library"),
+        _arg("--address", type=int, metavar="N", help="unit, node id or address (default: the profile's)"),
+        _arg("--seconds", type=float, default=3.0, help="longest time to read for (default 3)"),
+        _arg("--baud", type=int, default=9600, help="baud rate without a profile (default 9600)"),
     ),
     _command(
         "latency",
@@ -354,6 +393,27 @@ _PLANTS = (
         _arg("--out", metavar="FILE", help="draw to FILE.svg or FILE.png instead"),
     ),
     _command(
+        "plant export",
+        "write a plant for other programs: FMU, Modelica, Python, C, Simulink",
+        "thermoctl.export.commands:export",
+        "",
+        _arg("plant", metavar="PLANT"),
+        _arg(
+            "--to",
+            required=True,
+            choices=["fmu", "modelica", "python", "c", "simulink-m"],
+            help="the language",
+        ),
+        _arg("--out", metavar="FILE", help="the file (default: the plant's name with the language's ending)"),
+        _arg(
+            "--data",
+            metavar="REC",
+            help="a recording: first readings, this recording's parameters, and the widths of jumps",
+        ),
+        _TIME,
+        _COLUMNS,
+    ),
+    _command(
         "plant linearise",
         "make the compensator's model from a thermal plant",
         "thermoctl.identify.commands:linearise",
@@ -362,6 +422,9 @@ _PLANTS = (
         _arg("--out", metavar="MODEL", help="the model file"),
         _arg("--replace", action="store_true", help="overwrite MODEL"),
         _arg("--rig", default="simulated", metavar="NAME", help="name of the rig (default simulated)"),
+        _arg(
+            "--points", metavar="FILE", help="rig file or points file with the points (default: the paper's)"
+        ),
         _arg("--period", type=float, default=0.001, metavar="S", help="the loop's period (default 0.001)"),
         _arg(
             "--sensor-period",
@@ -488,6 +551,15 @@ _CALIBRATION = (
 
 _DIAGNOSIS = (
     _command(
+        "noise",
+        "learn each sensor's own noise from quiet recordings; write the plant file with it",
+        "thermoctl.evidence.sensor_noise:command",
+        "",
+        _PLANT,
+        _RECORDINGS,
+        _arg("--out", required=True, metavar="PLANT2", help="the plant file to write"),
+    ),
+    _command(
         "diagnose",
         "find where simulation and recordings differ, which physics is missing, and what adding it gains",
         "thermoctl.commands:diagnose",
@@ -498,7 +570,14 @@ _DIAGNOSIS = (
             metavar="REC",
             help="recordings (.csv, .xlsx, .parquet, .arrow), or folders of many rigs' recordings: one diagnosis a rig",
         ),
-        _arg("--plant", required=True, metavar="FILE", help="the plant file"),
+        _arg("--plant", metavar="FILE", help="the plant file"),
+        _arg(
+            "--held-out",
+            action="append",
+            metavar="REC",
+            help="recording that takes no part in any choice and measures what the findings are worth (repeatable; "
+            "default: the last of three or more)",
+        ),
         _TIME,
         _COLUMNS,
         _arg(
@@ -508,10 +587,10 @@ _DIAGNOSIS = (
         ),
         _arg(
             "--out",
-            required=True,
             metavar="DIR",
             help="folder of diagnosis.json, plant.yaml and report.html (with folders: DIR/RIG)",
         ),
+        _arg("--explain", metavar="DIR", help="print in ten lines the reasons of the diagnosis in DIR"),
         _arg(
             "--last",
             type=int,
@@ -565,11 +644,16 @@ _DIAGNOSIS = (
     ),
     _command(
         "effects",
-        "list the catalogue of effects, or show one (`effects show NAME`)",
-        "thermoctl.diagnose.commands:effects",
+        "list the catalogue of effects, show one (`effects show NAME`), or check files of your own (`effects check FILE`)",
+        "thermoctl.commands:effects",
         "",
-        _arg("action", nargs="?", metavar="show"),
-        _arg("name", nargs="?", metavar="NAME"),
+        _arg("action", nargs="?", metavar="show|check"),
+        _arg("files", nargs="*", metavar="NAME|FILE", help="an effect's name; files or folders of effects"),
+        _arg(
+            "--plant",
+            metavar="PLANT",
+            help="with check: a plant to put the effects into (default: the shipped ones)",
+        ),
         _EFFECTS,
     ),
     _command(
@@ -577,7 +661,12 @@ _DIAGNOSIS = (
         "diagnose a folder of cases, compare with the answers, score",
         "thermoctl.proof.commands:prove",
         "",
-        _arg("cases", metavar="CASES", help="folder of cases: plant.yaml and recordings each"),
+        _arg(
+            "cases",
+            nargs="?",
+            metavar="CASES",
+            help="folder of cases: plant.yaml and recordings each (with --real: of real recordings)",
+        ),
         _arg("--out", required=True, metavar="DIR", help="folder of the results"),
         _arg(
             "--answers", metavar="DIR", help="folder of NAME.yaml files (default: answer.yaml of each case)"
@@ -586,9 +675,10 @@ _DIAGNOSIS = (
         _arg("--workers", type=int, metavar="N", help="local processes (default: one a core)"),
         _arg("--scheduler", metavar="ADDRESS", help="a Dask scheduler (tcp://...) that sees the same files"),
         _arg(
-            "--real", action="store_true", help="real recordings without answers: name, place, held-out error"
+            "--real",
+            action="store_true",
+            help="real recordings: effects found, strays, held-out error (default folder: $THERMOCTL_RECORDINGS)",
         ),
-        _arg("--apart", metavar="NAMES", help="with --real: folders whose recordings are of different rigs"),
     ),
 )
 
@@ -764,11 +854,28 @@ def service(args: argparse.Namespace) -> int:
     return manual.command(args.parser, "uninstall", args.root)
 
 
+def effects(args: argparse.Namespace) -> int:
+    """List the catalogue of effects, show one, or check effect files."""
+    if args.action == "check":
+        from thermoctl.advice.commands import check_effects
+
+        return check_effects(args)
+    from thermoctl.diagnose import commands
+
+    args.name = args.files[0] if args.files else None
+    return commands.effects(args)
+
+
 def diagnose(args: argparse.Namespace) -> int:
     """Diagnose recordings, folders of rigs or a live rig; with --resolve the experiments run on the rig."""
     from thermoctl.diagnose import commands
     from thermoctl.yamlfile import InputError
 
+    if args.explain:
+        return commands.diagnose(args)
+    for value, option in ((args.plant, "--plant FILE"), (args.out, "--out DIR")):
+        if not value:
+            raise InputError(f"diagnose: {option} is missing; --plant, --out and recordings were expected")
     if args.live:
         from thermoctl.fleet.commands import live_recordings
 
@@ -776,9 +883,9 @@ def diagnose(args: argparse.Namespace) -> int:
         if not args.recordings:
             return 0
     if any(Path(r).is_dir() for r in args.recordings):
-        if args.time or args.columns:
+        if args.time or args.columns or args.held_out:
             raise InputError(
-                "diagnose: --time and --columns go with recordings, not with folders; make the folder's files with "
+                "diagnose: --time, --columns and --held-out go with recordings, not with folders; make the folder's files with "
                 "`thermoctl recordings import`"
             )
         from thermoctl.fleet.commands import diagnose_folders

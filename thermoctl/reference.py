@@ -2,8 +2,8 @@
 
 `python -m thermoctl.reference [--check]`.
 
-They are configuration, signals, faults, effects, cli and commands-that-act in docs/reference, and one page a
-fault in docs/faults.
+They are configuration, device-profiles, signals, faults, effects, cli, commands-that-act and python in
+docs/reference, and one page a fault in docs/faults.
 With --check nothing is written; exit status 1 if a page is stale, and its name on stderr.
 """
 
@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
+import inspect
 import math
 import sys
 from collections.abc import Iterable
@@ -18,6 +20,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+from hal.keys import REQUIRED, TABLES, Key
+from thermoctl import api
+from thermoctl.channels import DEFAULT
 from thermoctl.cli import parser
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
@@ -97,7 +102,9 @@ def signals() -> str:
     """Return the page of signals, the columns of a recording."""
     return (
         _HEAD
-        + "# Signals\n\nOne record row a tick, in this order, float64. A recording's 10 Hz tier holds the "
+        + "# Signals\n\nOne record row a tick, in this order, float64. The temperature points are those of the rig file's `points`; here the "
+        "paper's twelve. More points take more words of bits: `fresh_bits` holds 52 channels a word, `status_bits` 26, "
+        "`delay_bits` 13. A recording's 10 Hz tier holds the "
         "mean under the same name and `_min` and `_max` beside it; words of bits are or-ed.\n\n"
         + _table(
             ("signal", "unit", "plausible", "meaning"),
@@ -120,6 +127,40 @@ def faults() -> str:
     )
 
 
+def device_profiles() -> str:
+    """Return the page of device profiles: every key of every bus."""
+    text = (
+        _HEAD + "# Device profiles\n\nEvery key of a profile (`format: thermoctl-device/1`). "
+        "[How to write one](../how-to/devices.md); `thermoctl devices new` asks for them.\n"
+    )
+    for table, keys in TABLES.items():
+        rows = (
+            (
+                f"`{k.name}`",
+                k.kind,
+                k.unit,
+                ", ".join(c for c in k.choices if c) or _range(k.low, k.high),
+                _key_default(k),
+                f"`{k.example}`" if k.example else "",
+                k.meaning,
+            )
+            for k in keys
+        )
+        text += f"\n## {table}\n\n"
+        text += _table(("key", "kind", "unit", "range", "default", "example", "meaning"), rows)
+    return text
+
+
+def _key_default(key: Key) -> str:
+    if key.default is REQUIRED:
+        return "must be given"
+    if key.default is None or key.default == "" or isinstance(key.default, tuple):
+        return "none"
+    if isinstance(key.default, bool):
+        return str(key.default).lower()
+    return f"{key.default:g}" if isinstance(key.default, int | float) else str(key.default)
+
+
 def commands_that_act() -> str:
     """Return the page of commands that can move, arm, disarm or stop a rig."""
     return (
@@ -140,7 +181,7 @@ def commands_that_act() -> str:
 
 def fault(f: Fault) -> str:
     """Return the page of one fault."""
-    channels = causes.channels_of(f.name)
+    channels = causes.channels_of(f.name, DEFAULT)
     second, place = divmod(f.bit, FAULT_WORD_BITS)
     word = "fault_bits_2" if second else "fault_bits"
     cause_of = sorted(n for n, after in causes.FOLLOWS.items() if f.name in after)
@@ -215,11 +256,61 @@ def cli() -> str:
     return _HEAD + "# Commands\n\n" + "\n".join(pages)
 
 
+_PYTHON = """# Python
+
+```python
+import thermoctl as tc
+
+plant = tc.load_plant("docs/examples/heater/plant.yaml")
+result = tc.diagnose(plant, ["docs/examples/heater/run_1.csv", "docs/examples/heater/run_2.csv"])
+result.verdict  # 'explained'
+result.findings[0].equation
+result.plot()  # measured, as it came, refitted, with the findings
+result.plant.save("extended.yaml")
+result.plant.export("extended.fmu", "docs/examples/heater/run_1.csv")
+fitted = tc.refit(result.plant, "docs/examples/heater/run_1.csv")
+fitted.plot("temperature_2")  # residuals, autocorrelation, cumulated periodogram, normal quantiles
+fitted.plot_profile("G_12")  # profile likelihood
+```
+
+Results show themselves in a notebook ([notebooks](../notebooks)). Figures are matplotlib's. The package is typed.
+"""
+
+
+def python() -> str:
+    """Return the page of the Python interface, from its docstrings."""
+    text = f"{_HEAD}{_PYTHON}\n{inspect.getdoc(api)}\n"
+    for label in api.__all__:
+        item = getattr(api, label)
+        if inspect.isclass(item):
+            text += f"\n## {label}\n{inspect.getdoc(item)}\n\n"
+            rows = [(k, v) for k, v in vars(item).items() if not k.startswith("_") and _documented(v)]
+            text += _table(("member", "meaning"), ((f"`{k}{_signature(v)}`", _line(v)) for k, v in rows))
+        else:
+            text += f"\n## {label}\n```python\n{label}{_signature(item)}\n```\n{inspect.getdoc(item)}\n"
+    return text
+
+
+def _documented(item: object) -> bool:
+    return inspect.isfunction(item) or isinstance(item, property | functools.cached_property)
+
+
+def _signature(item: object) -> str:
+    """Return a function's arguments as written; nothing for a property."""
+    if not inspect.isfunction(item):
+        return ""
+    return str(inspect.signature(item)).replace("'", "").replace("(self, ", "(").replace("(self)", "()")
+
+
+def _line(item: object) -> str:
+    return " ".join((inspect.getdoc(item) or "").split())
+
+
 def pages() -> dict[Path, str]:
     """Return every generated page by its path below docs/."""
     made = {
         Path("reference", f"{make.__name__.replace('_', '-')}.md"): make()
-        for make in (configuration, signals, faults, effects, cli, commands_that_act)
+        for make in (configuration, device_profiles, signals, faults, effects, cli, commands_that_act, python)
     }
     return made | {Path("faults", f"{f.name}.md"): fault(f) for f in FAULTS}
 

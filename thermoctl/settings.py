@@ -21,14 +21,16 @@ from typing import Any
 
 import yaml
 
-from thermoctl import channels
-from thermoctl.channels import CHANNELS
+from thermoctl.channels import CODES, DEFAULT, Channels, read_points
 from thermoctl.control.limits import Limits
 from thermoctl.option import Option, option
+from thermoctl.signals import Row, of_channels
 from thermoctl.yamlfile import InputError, Node, Section, kind_of, load, number_of, suggest
 
 TEMPERATURES = "temperatures_c"
-"""In a mapping of limits: default for the twelve temperatures without an entry of their own."""
+"""In a mapping of limits: default for the temperatures of all points without an entry of their own."""
+COIL_CHANNEL = "coil_c"
+"""The default of protection.required; a coil of another name takes its place."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,12 @@ class RigSettings:
     """The rig's name."""
 
     name: str = option("name of the rig in recordings and on pages", "rig", restart=True)
+    drawing: str = option(
+        "SVG file of the dashboard's drawing, relative to this file; an element with data-p: POINT is coloured by that "
+        "point's temperature; empty: a box a point, or the paper's actuator where `points` is not given",
+        "",
+        restart=True,
+    )
 
 
 @dataclass(frozen=True)
@@ -82,11 +90,21 @@ class LoopSettings:
 class ControlSettings:
     """The position controller, equation (41)."""
 
+    mode: str = option(
+        "what the amplifier takes. torque: the controller's output as a current, voltage or force. velocity: the same as a "
+        "speed, um/s. position: a target position, um; the drive closes the loop and the compensation shifts its target",
+        "torque",
+        restart=True,
+        choices=("torque", "velocity", "position"),
+    )
     kp: float = option("proportional gain: drive per um of position error", unit="1/um", low=0.0, high=1e3)
     ti_s: float = option("integral time of the controller", unit="s", low=1e-5, high=1e6)
     td_s: float = option("derivative time of the controller; 0 switches the term off", 0.0, "s", 0.0, 1e3)
     output_limit: float = option(
-        "largest absolute drive, in the amplifier's unit", unit="1", low=0.0, high=1e6
+        "largest absolute drive, in the amplifier's unit; with mode: position the largest absolute target, um",
+        unit="1",
+        low=0.0,
+        high=1e6,
     )
     setpoint_rate_um_s: float = option(
         "largest speed of the reference on its way to a new setpoint (default: 1 mm/min)",
@@ -134,7 +152,7 @@ class ReadingLimits:
     required: tuple[str, ...] = option(
         "channels that must be valid: an invalid one disables the amplifier; an invalid reading of any other channel "
         "is a warning",
-        ("position_um", "voltage_v", "current_a", "coil_c"),
+        ("position_um", "voltage_v", "current_a", COIL_CHANNEL),
     )
     low: dict[str, float] = option(
         "smallest valid reading by channel, in the channel's unit; a smaller one is invalid", factory=dict
@@ -260,7 +278,7 @@ class SocketSettings:
 
 @dataclass(frozen=True)
 class Settings:
-    """A whole configuration; `path` is the file it came from."""
+    """A whole configuration; `path` is the file it came from, `channels` those of its points."""
 
     path: str
     rig: RigSettings
@@ -271,8 +289,16 @@ class Settings:
     recording: RecordingSettings
     hal: HalSettings
     socket: SocketSettings
+    channels: Channels = DEFAULT
+
+    @property
+    def row(self) -> Row:
+        """Return the signals of this rig's record rows."""
+        return of_channels(self.channels)
 
 
+POINTS = "points"
+"""Key of the declaration of the temperature points."""
 SECTIONS: dict[str, type] = {
     "rig": RigSettings,
     "loop": LoopSettings,
@@ -300,12 +326,14 @@ def changed(old: Settings, new: Settings) -> list[tuple[str, bool]]:
         before, after = (_plain(getattr(getattr(s, section), f.name)) for s in (old, new))
         if before != after:
             found.append((key, row.restart))
+    if old.channels != new.channels:
+        found.append((POINTS, True))
     return found
 
 
 def effective(settings: Settings) -> str:
     """Write every option with the value in force, as YAML that `load_settings` reads (absolute paths)."""
-    values: dict[str, dict[str, Any]] = {}
+    values: dict[str, dict[str, Any]] = {POINTS: settings.channels.plain()}
     for key, f, _ in options():
         section, name = key.split(".")
         value = _plain(getattr(getattr(settings, section), f.name))
@@ -324,11 +352,15 @@ def load_settings(path: str | Path) -> Settings:
     """Read and check a configuration. Raises InputError with file:line:column for the first error."""
     root = Section(load(path), "configuration")
     root.asked.update(SECTIONS)
+    points = root.given(POINTS)
     root.end()
-    sections = {name: _section(name, cls, root.given(name), root.node) for name, cls in SECTIONS.items()}
-    settings = Settings(path=str(path), **sections)
-    _check_together(settings, root.node)
     folder = Path(path).absolute().parent
+    channels = DEFAULT if points is None else _points(points, folder)
+    sections = {
+        name: _section(name, cls, root.given(name), root.node, channels) for name, cls in SECTIONS.items()
+    }
+    settings = Settings(path=str(path), **sections, channels=channels)
+    _check_together(settings, root.node)
     return dataclasses.replace(
         settings,
         socket=dataclasses.replace(settings.socket, path=_below(folder, settings.socket.path)),
@@ -341,6 +373,16 @@ def load_settings(path: str | Path) -> Settings:
     )
 
 
+def _points(node: Node, folder: Path) -> Channels:
+    """Read `points`. Raises InputError also where a name would give two signals of one name."""
+    channels = read_points(node, folder)
+    if twice := of_channels(channels).duplicates():
+        raise node.error(
+            f"points: two signals would have the name {twice[0]}; choose another name for the point"
+        )
+    return channels
+
+
 def _below(folder: Path, path: str) -> str:
     return str((folder / path).resolve()) if path else ""
 
@@ -348,15 +390,19 @@ def _below(folder: Path, path: str) -> str:
 class _Options(Section):
     """A mapping of the configuration; its errors name an option as section.key."""
 
+    def __init__(self, node: Node, what: str, channels: Channels) -> None:
+        super().__init__(node, what)
+        self.channels = channels
+
     def label(self, key: str) -> str:
         """Return section.key."""
         return f"{self.what}.{key}"
 
 
-def _section(name: str, cls: type, node: Node | None, root: Node) -> Any:
+def _section(name: str, cls: type, node: Node | None, root: Node, channels: Channels) -> Any:
     """Read one section into its dataclass; `root` is the place of the error where the section is missing."""
     place = root if node is None else node
-    section = _Options(node or dataclasses.replace(root, value={}), name)
+    section = _Options(node or dataclasses.replace(root, value={}), name, channels)
     fields = {f.name: f for f in dataclasses.fields(cls)}
     section.asked.update(fields)
     section.end()
@@ -365,15 +411,16 @@ def _section(name: str, cls: type, node: Node | None, root: Node) -> Any:
         no_default = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
         if no_default and key not in section.node.value:
             raise place.error(f"'{name}.{key}' is missing: {f.metadata['option'].meaning}")
-    return cls(
-        **{
-            key: _value(section, key, kinds[key], fields[key].metadata["option"])
-            for key in section.node.value
-        }
-    )
+    given = {
+        key: _value(section, key, kinds[key], fields[key].metadata["option"]) for key in section.node.value
+    }
+    if cls is ProtectionSettings and "required" not in given:
+        default = ProtectionSettings().required
+        given["required"] = tuple(channels.coil if c == COIL_CHANNEL else c for c in default)
+    return cls(**given)
 
 
-def _value(section: Section, key: str, kind: Any, row: Option) -> Any:
+def _value(section: _Options, key: str, kind: Any, row: Option) -> Any:
     """Read one option, checked and converted to its type."""
     node, label = section.get(key), section.label(key)
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
@@ -384,12 +431,12 @@ def _value(section: Section, key: str, kind: Any, row: Option) -> Any:
     if kind in (int, float):
         return _number(node, label, row, whole=kind is int)
     if origin is dict:
-        mapping = _Options(node, label)
+        mapping = _Options(node, label, section.channels)
         return _texts(mapping) if inner[1] is str else _limits(mapping, row)
     if origin is tuple and inner[0] is Node:
         return tuple(section.list(key))
     if origin is tuple:
-        return tuple(_channel(label, item.value, item) for item in section.list(key))
+        return tuple(_channel(label, item.value, item, section.channels) for item in section.list(key))
     if origin is types.UnionType:  # Node | None: the reader of that section checks it
         return node
     raise TypeError(f"{label}: no rule for {kind}")
@@ -430,21 +477,22 @@ def _texts(mapping: Section) -> dict[str, str]:
     return {name: mapping.text(name) for name in mapping.node.value}
 
 
-def _limits(mapping: Section, row: Option) -> dict[str, float]:
+def _limits(mapping: _Options, row: Option) -> dict[str, float]:
     """Read a limit by channel; a channel's own entry wins over TEMPERATURES."""
     limits = {}
     names: dict[str, Node] = mapping.node.value
     for name in sorted(names, key=lambda name: name != TEMPERATURES):
         number = _number(names[name], mapping.label(name), row)
-        for channel in channels.TEMPERATURES if name == TEMPERATURES else (name,):
-            limits[_channel(mapping.what, channel, names[name])] = number
+        for channel in mapping.channels.temperatures if name == TEMPERATURES else (name,):
+            limits[_channel(mapping.what, channel, names[name], mapping.channels)] = number
     return limits
 
 
-def _channel(label: str, name: Any, node: Node) -> str:
-    if name not in CHANNELS:
+def _channel(label: str, name: Any, node: Node, channels: Channels) -> str:
+    names = channels.names
+    if name not in names:
         raise node.error(
-            f"{label}: no channel '{name}'{suggest(str(name), CHANNELS)}; expected one of {', '.join(CHANNELS)}"
+            f"{label}: no channel '{name}'{suggest(str(name), names)}; expected one of {', '.join(names)}"
         )
     return str(name)
 
@@ -466,12 +514,16 @@ def _check_together(settings: Settings, root: Node) -> None:
             raise place("protection", "high").error(
                 f"protection.high.{name} must be above protection.low.{name}"
             )
-    for name in channels.CODES:
+    for name in CODES:
         if name in protection.frozen_s:
             raise place("protection", "frozen_s").error(
                 f"protection.frozen_s.{name}: this reading is constant in normal operation; limit supply_v instead, an "
                 "analogue reading of the same frame"
             )
+    if control.mode == "position" and "position_um" not in protection.required:
+        raise place("protection", "required").error(
+            "control.mode: position needs position_um in protection.required: the first target is the measured position"
+        )
     needed = {"simulated": "plant", "devices": "devices", "replay": "recording"}[hal.backend]
     if not getattr(hal, needed):
         raise place("hal", "backend").error(f"hal.{needed} is missing: back end '{hal.backend}' needs it")
@@ -482,4 +534,4 @@ def _check_together(settings: Settings, root: Node) -> None:
         )
 
 
-__all__ = ["CHANNELS", "InputError", "Option", "Settings", "changed", "load_settings", "options"]
+__all__ = ["InputError", "Option", "Settings", "changed", "load_settings", "options"]

@@ -6,18 +6,14 @@ CASES are folders of cases (plant.yaml, recordings; answers inside, or apart in 
 cases are generated (short records). Done (method, case) pairs in --out are not run again.
 
 thermoctl   `thermoctl diagnose`
-ctsm        forward selection by likelihood ratio as in CTSM practice (Bacher & Madsen, Energy and Buildings 43, 2011): the
-            plant held to the recording by a Kalman-Bucy filter, likelihood of its one-step predictions (white, Gaussian),
-            diffusion by likelihood; the candidate that gains most is kept while chi-square says p < 0.05
 sindy       PySINDy on the residual dynamics: smoothed derivatives of the measured states less the plant's slopes, sparse
             regression (STLSQ) on the candidates' forms, threshold by the error on the other recording
-latent      latent forces only: an unknown smooth input at each node and output; alarm at p < 0.05 (Bonferroni). It names a
-            place and no physics
 bic         greedy forward selection by BIC with white noise, on the free run
 
-All but sindy and latent get their candidates as a short list of the SHORT best by the product's own one-pass screening and its
-starting values: fitting every candidate in full, as they would without it, takes them hours. Every method's findings
-are refitted and judged on held-out data by the same code, so `gain` compares what was found and nothing else.
+bic gets its candidates as a short list of the SHORT best by the product's own one-pass screening and its
+starting values: fitting every candidate in full, as it would without it, takes hours. Every method's findings
+are refitted and scored on held-out data by the same code, so `gain` compares the findings and nothing else. Two earlier
+peers (CTSM practice, latent forces) needed the observer form and left with it; docs/proof holds their figures.
 """
 
 from __future__ import annotations
@@ -33,79 +29,72 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
-from thermoctl.diagnose import locate, observer, run, screen, search
-from thermoctl.diagnose.effects import Candidate, Rig, candidates, catalogue
-from thermoctl.diagnose.explain import Case, Explanation
-from thermoctl.diagnose.heldout import unseen_errors
+from thermoctl.diagnose import screen
+from thermoctl.diagnose.effects import Candidate, candidates, catalogue
+from thermoctl.diagnose.extend import extend
+from thermoctl.diagnose.run import diagnose_files
+from thermoctl.diagnose.screen import Direction, sharpened
+from thermoctl.evidence.case import Budget, Case, case
+from thermoctl.evidence.fit import Fitted, Placed, as_refitted, fitted
+from thermoctl.evidence.held_out import worth
+from thermoctl.evidence.limits import limits
+from thermoctl.evidence.roles import Structure
+from thermoctl.evidence.screening import screened
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
+from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.refit import report
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulate import Excitation, SimulationError
 from thermoctl.proof import jobs as proof_jobs
 from thermoctl.proof import score as scoring
-from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 
-SHORT, MOST, LEVEL = 8, 3, 0.05
+SHORT, MOST = 8, 3
 
 
 # ------------------------------------------------------------------------------------------------------- common parts
 
 
-def prepared(job: proof_jobs.Job) -> tuple[Case, Explanation, Mapping[str, Any]]:
-    """The case, its plant refitted, the catalogue."""
-    case = Case(load(job.plant), [read_table(r) for r in job.recordings])
-    begun = time.monotonic()
-    base = case.explain(case.plant, [], [], iterations=40)
-    case.patience = max(4.0, 6 * (time.monotonic() - begun))
-    return case, base, catalogue()
+def prepared(job: proof_jobs.Job) -> tuple[Case, Fitted]:
+    """The case, and its plant refitted in white noise."""
+    plant = load(job.plant)
+    known = case(plant, read_recordings(plant, job.recordings), catalogue(), Budget(10**6))
+    return known, as_refitted(known, fitted(known, plant, (), known.null))
 
 
-def rms(case: Case, errors: Sequence[np.ndarray]) -> dict[str, float]:
-    """Root mean square per output over all folds."""
-    stacked = np.concatenate(list(errors))
-    return {
-        o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2)))
-        for j, o in enumerate(case.plant.outputs)
-        if np.isfinite(stacked[:, j]).any()
-    }
-
-
-def told(case: Case, base: Explanation, final: Explanation, suspect: str | None = None) -> dict[str, Any]:
+def told(known: Case, base: Fitted, final: Fitted) -> dict[str, Any]:
     """A peer's result in the form of diagnosis.json. Peers give no probabilities: each finding counts as certain."""
-    drives = [final.fit.model.excitation(t) for t in case.tables]
-    estimates = {e.name: e for e in report(final.fit, drives)} if final.effects else {}
+    estimates = {e.name: e for e in report(final.fit)} if final.hypothesis.effects else {}
     findings = [
         {
-            "effect": c.effect.name,
-            "where": c.place.where,
+            "effect": e.key[0],
+            "where": e.key[1],
             "probability": 1.0,
             "when": None,
             "parameters": {
                 p: {"value": estimates[n].value, "sd": estimates[n].sd}
-                for p, n in own.items()
+                for p, n in e.own.items()
                 if n in estimates
             },
         }
-        for c, own in zip(final.effects, final.own, strict=True)
+        for e in final.hypothesis.effects
     ]
-    verdict = "explained" if findings else "unexplained" if suspect else "consistent"
-    before = rms(case, unseen_errors(case, base.plant))
-    after = rms(case, unseen_errors(case, final.plant)) if findings else before
+    value = worth(known, base, final, ())
     return {
-        "verdict": verdict,
+        "verdict": "explained" if findings else "consistent",
         "findings": findings,
         "alternatives": [],
-        "suspect": suspect,
-        "fit": {"held_out_refit_only": before, "held_out_after": after},
+        "fit": {
+            "held_out_refit_only": value.refit_only,
+            "held_out_after": value.after if findings else value.refit_only,
+        },
     }
 
 
-def white(e: Explanation) -> tuple[float, int]:
+def white(f: Fitted) -> tuple[float, int]:
     """-2 log likelihood of Gaussian white residuals with their own variance per output, and the number of samples."""
-    stacked = np.concatenate(e.fit.residuals)
+    stacked = np.concatenate(f.fit.residuals)
     total, n = 0.0, 0
     for column in stacked.T:
         known = column[np.isfinite(column)]
@@ -115,27 +104,16 @@ def white(e: Explanation) -> tuple[float, int]:
     return total, n
 
 
-def forward(
-    case: Case, start: Explanation, entries: Mapping[str, Any], price: Callable[[int, int], float]
-) -> Explanation:
-    """Add the candidate whose likelihood gains most beyond its price (parameters, samples) until none does."""
-    current = start
-    for _ in range(MOST):
-        seen = search.look(case, current, entries, draws=0)
-        best, margin = None, 0.0
-        now, samples = white(current)
-        for rival in search.compete(case, seen, search.finalists(seen.directions, SHORT)[:SHORT]):
-            added = sum(
-                len(case.tables) if rival.plant.parameters[n].per_recording else 1
-                for n in rival.own[-1].values()
-            )
-            gain = now - white(rival)[0] - price(added, samples)
-            if gain > margin:
-                best, margin = rival, gain
-        if best is None:
-            return current
-        current = best
-    return current
+def extended(
+    known: Case, current: Fitted, direction: Direction, drives: Sequence[Excitation]
+) -> Fitted | None:
+    """The current plant with one more effect, refitted in white noise; None where that cannot be simulated."""
+    try:
+        plant, own = extend(current.plant, direction, drives)
+        effects = (*current.hypothesis.effects, Placed(direction.candidate, own))
+        return as_refitted(known, fitted(known, plant, effects))
+    except (SimulationError, InputError, np.linalg.LinAlgError):
+        return None
 
 
 # ----------------------------------------------------------------------------------------------------------- the methods
@@ -144,66 +122,39 @@ def forward(
 def thermoctl(job: proof_jobs.Job) -> dict[str, Any]:
     """The product."""
     with tempfile.TemporaryDirectory() as out:
-        return run.diagnose(job.plant, list(job.recordings), out)
-
-
-def ctsm(job: proof_jobs.Job) -> dict[str, Any]:
-    """Likelihood ratios of one-step predictions."""
-    case, base, entries = prepared(job)
-    best, likelihood = base, white(base)[0]
-    for trust in (0.003, 0.03, 0.3):
-        held = observer.follows(base.plant, base.fit.model, case.drives, case.noise, trust)
-        if held is None:
-            break
-        # held readings: what is compared at a sample has seen the readings before it only
-        inputs = {
-            k: dataclasses.replace(i, linear=i.linear and not k.startswith(observer.SEEN))
-            for k, i in held.inputs.items()
-        }
-        try:
-            found = case.explain(dataclasses.replace(held, inputs=inputs), [], [])
-        except (SimulationError, InputError, np.linalg.LinAlgError):
-            continue
-        if white(found)[0] < likelihood:
-            best, likelihood = found, white(found)[0]
-    final = forward(case, best, entries, lambda added, n: float(chi2.isf(LEVEL, added)))
-    if best is not base:
-        final = (
-            case.explain(observer.without(final.plant), final.effects, final.own) if final.effects else base
-        )
-    return told(case, base, final)
+        return diagnose_files(job.plant, job.recordings, Path(out) / "result")
 
 
 def bic(job: proof_jobs.Job) -> dict[str, Any]:
-    """Greedy BIC on the free run, white noise."""
-    case, base, entries = prepared(job)
-    return told(case, base, forward(case, base, entries, lambda added, n: added * float(np.log(n))))
-
-
-def latent(job: proof_jobs.Job) -> dict[str, Any]:
-    """Unknown smooth inputs only."""
-    case, base, _ = prepared(job)
-    drives = [base.fit.model.excitation(t) for t in case.tables]
-    for r, d in enumerate(drives):
-        base.fit.model.prepare(d, base.fit.values[r])
-    model = base.fit.model  # where a slope is another state alone (dx/dt = v) no physics can be missing
-    kinematic = {
-        x
-        for x, slope in zip(model.states, model.code.slopes, strict=True)
-        if slope in [ex.name(v) for v in model.states]
-    }
-    found = [s for s in locate.suspects(screen.Metric(base.fit, drives)) if s.name not in kinematic]
-    alarm = bool(found) and found[0].log_p + np.log10(len(found)) < np.log10(LEVEL)
-    return told(case, base, base, found[0].name if alarm else None)
+    """Greedy BIC on the free run, white noise: the candidate that gains most beyond its price, until none does."""
+    known, base = prepared(job)
+    current = base
+    for _ in range(MOST):
+        looked = screened(known, current, limits().clean)
+        first: dict[tuple[str, str], Direction] = {}
+        for d in sorted(looked.directions, key=lambda d: d.log_p):
+            first.setdefault(d.candidate.key, sharpened(looked.metric, looked.rig, d))
+        best, margin = None, 0.0
+        now, samples = white(current)
+        for d in list(first.values())[:SHORT]:
+            rival = extended(known, current, d, looked.metric.drives)
+            if rival is None:
+                continue
+            price = float(np.log(samples)) * len(rival.hypothesis.effects[-1].own)
+            gain = now - white(rival)[0] - price
+            if gain > margin:
+                best, margin = rival, gain
+        if best is None:
+            break
+        current = best
+    return told(known, base, current)
 
 
 def sindy(job: proof_jobs.Job) -> dict[str, Any]:
     """Sparse regression of what the measured states' derivatives have beyond the plant's slopes."""
-    case, base, entries = prepared(job)
-    model = base.fit.model
-    drives = [model.excitation(t) for t in case.tables]
-    rig = Rig(base.plant, drives, [t.columns for t in case.tables])
-    metric = screen.Metric(base.fit, drives)
+    known_case, base = prepared(job)
+    looked = screened(known_case, base, limits().clean)
+    model, drives, rig, metric = base.fit.model, looked.metric.drives, looked.rig, looked.metric
     known: list[dict[str, np.ndarray]] = []  # per recording: the derivatives of the states that are measured
     at = []
     for r in range(len(drives)):
@@ -211,7 +162,7 @@ def sindy(job: proof_jobs.Job) -> dict[str, Any]:
         rates = _measured(base.plant, model, trajectory)
         known.append(rates)
         at.append(trajectory)
-    library = [c for c in candidates(rig, entries) if c.place.output is None]
+    library = [c for c in candidates(rig, known_case.catalogue) if c.place.output is None]
     columns = [column for c in library for column in screen._columns(c, metric, at)]
     chosen: dict[tuple[str, str], tuple[float, Candidate, dict[str, float]]] = {}
     for i, state in enumerate(model.states):
@@ -232,18 +183,14 @@ def sindy(job: proof_jobs.Job) -> dict[str, Any]:
     for _, c, kept in sorted(chosen.values(), key=lambda item: -item[0])[:MOST]:
         start = {k[1:]: v for k, v in kept.items() if k.startswith("=")}
         direction = screen.Direction(
-            dataclasses.replace(c, rig=Rig(current.plant, drives, rig.columns)),
+            dataclasses.replace(c, rig=Structure(current.plant, drives, rig.columns)),
             {k: v for k, v in kept.items() if k and not k.startswith("=")},
             0.0,
             1,
             start,
         )
-        try:
-            plant, own = search.extend(current.plant, direction, drives)
-            current = case.explain(plant, [*current.effects, c], [*current.own, own])
-        except (SimulationError, InputError, np.linalg.LinAlgError):
-            continue
-    return told(case, base, current)
+        current = extended(known_case, current, direction, drives) or current
+    return told(known_case, base, current)
 
 
 def _measured(plant: Any, model: Any, at: screen.Trajectory) -> dict[str, np.ndarray]:
@@ -334,9 +281,7 @@ def _sparse(
 
 METHODS: dict[str, Callable[[proof_jobs.Job], dict[str, Any]]] = {
     "thermoctl": thermoctl,
-    "ctsm": ctsm,
     "sindy": sindy,
-    "latent": latent,
     "bic": bic,
 }
 
@@ -344,18 +289,10 @@ METHODS: dict[str, Callable[[proof_jobs.Job], dict[str, Any]]] = {
 # ---------------------------------------------------------------------------------------------------------- the bench
 
 
-def placed(job: proof_jobs.Job, answer: Mapping[str, Any], row: scoring.Row, suspect: str | None) -> bool:
-    """Whether a true place was pointed at: by a finding of any name, or by the suspected node or output itself."""
-    plant = load(job.plant)
+def placed(answer: Mapping[str, Any], row: scoring.Row) -> bool:
+    """Whether a finding of any name is at a true place."""
     places = {str(w) for _, w in answer["effects"]}
-    if suspect is None:
-        return any(scoring.same_place(e, w, p) for e, w in row.findings for p in places)
-    near: set[str] = set()
-    for p in places:
-        near |= {p, *p.split("-")}
-        if p in plant.flows:
-            near |= {x for x in (plant.flows[p].source, plant.flows[p].target) if x}
-    return suspect in near
+    return any(scoring.same_place(e, w, p) for e, w in row.findings for p in places)
 
 
 def noise_of(job: proof_jobs.Job) -> dict[str, float]:
@@ -401,7 +338,7 @@ def figures(
         row = scoring.score(job.name, answers[job.name], x["result"], x["seconds"], x["error"])
         rows.append(row)
         if row.truth:
-            spots.append(placed(job, answers[job.name], row, (x["result"] or {}).get("suspect")))
+            spots.append(placed(answers[job.name], row))
     null = [r for r in rows if r.kind == "none"]
     there = [r for r in rows if r.kind not in ("none", "unknown")]
     unknown = [r for r in rows if r.kind == "unknown"]
@@ -524,7 +461,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             said = (
                 x["error"]
                 or ", ".join(f"{f['effect']} at {f['where']}" for f in x["result"]["findings"])
-                or x["result"].get("suspect")
                 or "nothing"
             )
             verdict = (x["result"] or {}).get("verdict", "failed")

@@ -273,7 +273,7 @@ def test_an_experiment_at_the_wire_is_ended_and_goes_on(tmp_path):
             again.append(subprocess.run(command, capture_output=True, text=True, timeout=120, check=False))
             goes_on += again[-1].stdout
         assert again[-1].returncode == 0, [(r.stdout, r.stderr) for r in again]
-        assert re.search(r"goes on at \d+ s|begins anew", goes_on)
+        assert re.search(r"goes on at \d+ s|starts again", goes_on)
         whole = read_table(out)
         assert (
             np.nanmax(whole.columns["position_um"]) == pytest.approx(20, abs=1)

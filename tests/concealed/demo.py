@@ -184,7 +184,7 @@ def tell(story: Story, seed: int, out: Path) -> dict[str, Any]:
     scene, effect, true, sigmas = conceal(story, seed, folder)
     begun = time.monotonic()
     say(f"{story.effect}: diagnosing (the truth is sealed in the judge)")
-    result = diagnosis.diagnose(folder / "plant.yaml", [folder / "run_1.csv"], folder / "diagnosis")
+    result = diagnosis.diagnose_files(folder / "plant.yaml", [folder / "run_1.csv"], folder / "diagnosis")
     seconds = time.monotonic() - begun
     plant = load(folder / "plant.yaml")
     model = compile_plant(plant)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import thermoctl
-from thermoctl.channels import CHANNELS, GROUPS, POINTS, TABLE, THERMAL
+from thermoctl.channels import AT, COIL, DEFAULT, FIXED, GROUPS, MAX_POINTS, Point, of_points
 from thermoctl.control import faults, recorded_faults, typed
 from thermoctl.control.model import CompensatorModel, zero_model
 from thermoctl.daemon.keep import _fingerprint
-from thermoctl.signals import INDEX, NAMES, fault_word, fault_words
+from thermoctl.signals import INDEX, NAMES, PAPER, fault_word, fault_words, of_channels
 
 PRODUCT = Path(thermoctl.__file__).parent
 
@@ -52,14 +52,20 @@ sys.meta_path.insert(0, Changed())
 
 def test_tables_are_consistent():
     """Recorded words hold every channel and fault exactly."""
-    assert len(set(CHANNELS)) == len(CHANNELS) <= 26
-    thermal = [c.thermal for c in TABLE]
-    first = thermal.index(True)
-    assert thermal[first : first + len(THERMAL)] == [True] * len(THERMAL) and len(THERMAL) <= 13
-    assert tuple(c.point for c in TABLE[first + 1 : first + 1 + len(POINTS)]) == POINTS
+    most = of_points([Point("motor", role="coil"), *(Point(f"p{k}") for k in range(1, MAX_POINTS))])
+    for channels in (DEFAULT, most):
+        row, table = of_channels(channels), channels.table
+        assert not row.duplicates() and channels.coil == channels.names[COIL]
+        assert [c.thermal for c in table] == [c >= AT["air_c"] for c in range(len(table))]
+        assert tuple(c.point for c in table[COIL:]) == channels.point_names
+        assert [row.names[k] for k in range(row.readings.start, row.readings.stop)] == list(
+            channels.signal.values()
+        )
+    assert [len(range(*s.indices(len(PAPER)))) for s in (PAPER.fresh, PAPER.status, PAPER.delay)] == [1, 1, 1]
+    assert [s.stop - s.start for s in (row.fresh, row.status, row.delay)] == [2, 3, 5]
     assert len(set(faults.BIT.values())) == len(faults.FAULTS) == len(faults.BIT)
     assert set(faults.BIT.values()) <= set(range(64))
-    assert set(faults.READING_BITS) == set(GROUPS) == {c.group for c in TABLE}
+    assert set(faults.READING_BITS) == set(GROUPS) == {c.group for c in DEFAULT.table}
     assert faults.BIT["amplifier_write"] < 53, "external_bits is one float64"
 
 
@@ -82,30 +88,30 @@ def test_a_channel_is_added_in_one_row():
         """
 import numpy as np
 from hal.backend import ROLES, Sample
-from thermoctl import settings, signals, reference
+from thermoctl import channels, signals, reference
 from thermoctl.control import causes, faults, law, model
 from thermoctl.daemon import readings
 from thermoctl.control.model import Parameters, zero_model
 p = Parameters(0.0, 1.0, 0.0, 1.0)
-p.high[-1], p.required[-1] = 0.9, 1.0
+new = channels.AT["humidity"]
+p.high[new], p.required[new] = 0.9, 1.0
 tick = law.Law(zero_model(), p, 0.001)
 value, status = np.zeros(len(ROLES)), np.zeros(len(ROLES), np.uint8)
-value[-1] = 0.95
+value[new] = 0.95
 tick.bind(value, np.ones(len(ROLES), np.uint8), status)
 tick.step(0.001)
 print(json.dumps({
-    "role": ROLES[-1], "sample": len(Sample().value), "settings": settings.CHANNELS[-1],
-    "limit": "high[humidity]" in model.NAMES, "signal": "humidity" in signals.NAMES,
-    "page": "humidity of the chamber" in reference.signals(), "status": readings.SIGNAL["humidity"],
-    "cause": "humidity" in causes.channels_of("monitored_range"), "trips": tick.trips == 1 << faults.BIT["monitored_range"],
+    "role": ROLES[new], "sample": len(Sample().value),
+    "limit": "high[humidity]" in model.packed_names(ROLES), "signal": "humidity" in signals.NAMES,
+    "page": "humidity of the chamber" in reference.signals(), "status": readings.sources(channels.DEFAULT)["humidity"][0],
+    "cause": "humidity" in causes.channels_of("monitored_range", channels.DEFAULT), "trips": tick.trips == 1 << faults.BIT["monitored_range"],
     "replayed": bool(tick.faults >> faults.BIT["monitored_range"] & 1),
 }))""",
     )
-    count = len(CHANNELS) + 1
+    count = len(FIXED) + len(DEFAULT.points) + 1
     assert found == {
         "role": "humidity",
         "sample": count,
-        "settings": "humidity",
         "limit": True,
         "signal": True,
         "page": True,
@@ -160,7 +166,7 @@ tick = law.Law(zero_model(), Parameters(0.0, 1.0, 0.0, 1.0), 0.001)
 for k in range(law.WARM_UP_TICKS + 3):
     tick.step(0.001, external=1 << faults.BIT["door_open"])
 row = np.zeros(len(signals.NAMES))
-row[-len(law.OUTPUTS):] = tick.outputs
+row[signals.AT["state"]:][:len(law.OUTPUTS)] = tick.outputs[:len(law.OUTPUTS)]
 print(json.dumps({
     "state": arming.STATES[tick.state], "shown": "door_open" in [f.name for f in faults.decode(signals.fault_word(row))],
     "second word": row[signals.INDEX["fault_bits_2"]], "page": "`fault_bits_2` (value 1)" in reference.fault(faults.BY_NAME["door_open"]),

@@ -57,3 +57,40 @@ def test_check_refuses_what_would_hide_a_stopped_drive(config, capsys, old, new,
     assert main(["check", str(config)]) == 2
     error = capsys.readouterr().err
     assert message in error and re.search(r"wire.yaml:\d+:\d+", error) and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("pairs", "said"),
+    [
+        ([("        thermocouple_1: coil_c\n", ""), ("coil_c, ", "")], "no coil_c: .* from its resistance"),
+        ([("        thermocouple_1: coil_c\n", ""), ("coil_c, ", ""), ("resistance_ohm: 5.0", "resistance_ohm: 0")],
+         "no coil_c: the model alone estimates"),
+        ([("        pt100: air_c\n", ""), ("air_c, ", "")], "no air_c: the air counts as constant"),
+        ([], "no output_reference_um .*calibrate. refuses"),
+    ],
+)  # fmt: skip
+def test_check_says_what_a_rig_without_a_sensor_does(config, capsys, pairs, said):
+    change(config, *pairs)
+    assert main(["check", str(config)]) == 0
+    assert re.search(f"note: {said}", capsys.readouterr().out)
+
+
+def test_check_refuses_a_model_without_any_temperature(config, capsys):
+    change(
+        config,
+        ("        thermocouple_1: coil_c\n", ""),
+        ("        pt100: air_c\n", ""),
+        ("air_c, coil_c, ", ""),
+        ("resistance_ohm: 5.0", "resistance_ohm: 0"),
+    )
+    assert main(["check", str(config)]) == 2
+    error = capsys.readouterr().err
+    assert "compensation.model needs air_c or coil_c" in error and error.count("\n") == 1
+
+
+def test_check_compares_the_drives_unit_with_the_mode(config, capsys):
+    """A target in um for a drive that takes amperes, or the other way round, must never reach it."""
+    change(config, ("control:                         #", "control:\n  mode: position                 #"))
+    assert main(["check", str(config)]) == 2
+    error = capsys.readouterr().err
+    assert "takes its command in A, and control.mode is position" in error and error.count("\n") == 1

@@ -18,9 +18,8 @@ def test_a_warm_start_refuses_the_estimates_of_another_model(tmp_path, field):
     """b_air, offset_um, sensors, R_w, R_v, expansion_period_s and air_filter_s were not looked at before."""
     model = TWO if field == "sensors" else ONE
     value = getattr(model, field)
-    other = {"kind": "mkf", "sensors": (0, 2)}.get(
-        field, value + 0.25 if field not in ("kind", "sensors") else None
-    )
+    told = {"kind": "mkf", "sensors": (0, 2), "points": tuple(f"p{k}" for k in range(len(ONE.points)))}
+    other = told[field] if field in told else value + 0.25
     path = tmp_path / "kept.state"
     state = np.arange(5.0)
     assert keep.save(path, model, state)

@@ -12,6 +12,7 @@ from thermoctl.daemon.clock import now_ns, sleep_until
 from thermoctl.daemon.ring import Box, Histogram, Mailbox, Record, Ring, unpack_readings
 from thermoctl.daemon.shared import Shared, percentiles
 from thermoctl.daemon.snapshot import latency
+from thermoctl.signals import OUTPUTS
 from thermoctl.yamlfile import InputError
 
 
@@ -144,19 +145,29 @@ def test_histogram_and_percentiles():
     assert np.isnan(percentiles(np.zeros(4, np.uint64))).all()
 
 
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 3), st.integers(0, 15)), min_size=20, max_size=20))
-def test_readings_pack_into_three_exact_numbers(channels):
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 3), st.integers(0, 15)), min_size=9, max_size=72))
+def test_readings_pack_into_exact_numbers(channels):
     fresh, status, delay = np.array(channels, dtype=np.uint8).T.copy()
-    delay[:4] = delay[17:] = 0  # of temperatures only
-    row, values, outputs = np.zeros(3 + 20 + 3 + 4), np.arange(20.0), np.arange(4.0)
+    n = len(channels)
+    delay[:7] = 0  # of temperatures only
+    words = sum(-(-count // size) for count, size in ((n, 52), (n, 26), (n - 7, 13)))
+    outputs = np.arange(100.0, 100.0 + len(OUTPUTS) + n - 8)
+    row, values = np.zeros(3 + n + words + len(outputs)), np.arange(float(n))
     record = Record(row, 3)
     record.bind(values, fresh, status, delay, outputs)
     row[:3] = 7, 8.5, 9
     record.fill()
-    np.testing.assert_array_equal(np.delete(row, [23, 24, 25]), [7, 8.5, 9, *values, *outputs])
-    again = np.zeros((3, 20), np.uint8)
-    unpack_readings(*row[23:26], *again)
+    first = 3 + len(OUTPUTS)
+    bits = slice(first + n, first + n + words)
+    parts = [row[:3], row[3:first], row[first : bits.start], row[bits.stop :]]
+    expected = [7, 8.5, 9, *outputs[: len(OUTPUTS)], *values, *outputs[len(OUTPUTS) :]]
+    np.testing.assert_array_equal(np.concatenate(parts), expected)
+    assert (row[bits] < 2.0**52).all()
+    again = np.zeros((3, n), np.uint8)
+    unpack_readings(row[bits], *again)
     np.testing.assert_array_equal(again, [fresh, status, delay])
+    with pytest.raises(ValueError, match="words of bits"):
+        unpack_readings(row[bits][1:], *again)
 
 
 @pytest.mark.parametrize("spin_ns", [0, 200_000])

@@ -9,14 +9,13 @@ import pytest
 import thermoctl
 from hal.backend import ERROR, OK, ROLE, ROLES, STALE
 from tests.daemon.conftest import make_model
-from thermoctl.channels import SIGNAL
+from thermoctl.channels import CHANNELS, DEFAULT
 from thermoctl.control import arming, faults
 from thermoctl.control.law import OUTPUTS
 from thermoctl.daemon.assemble import law_parameters
 from thermoctl.daemon.recorder import LAW_VERSION, law_metadata, read_law_metadata
 from thermoctl.daemon.replay import replay
 from thermoctl.daemon.simulate import Simulation, run_simulated
-from thermoctl.settings import CHANNELS
 from thermoctl.signals import INDEX, NAMES, SIGNALS
 from thermoctl.yamlfile import InputError
 
@@ -29,8 +28,8 @@ def test_one_list_of_names():
     """Signals, law, back ends and settings name the same things in the same order."""
     first, state = INDEX["position_raw_um"], INDEX["state"]
     assert CHANNELS == ROLES
-    assert NAMES[first : first + len(ROLES)] == tuple(SIGNAL.values())
-    assert NAMES[state:] == OUTPUTS
+    assert NAMES[first : first + len(ROLES)] == tuple(DEFAULT.signal.values())
+    assert NAMES[state:first] == OUTPUTS
 
 
 def test_the_tick_is_the_block_diagram():

@@ -23,6 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ def _cut(data: bytes) -> list[bytes]:
 def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """Encoder frames and text lines in any pieces; what the framer keeps stays small."""
     from hal.profile import BinaryFrame
-    from hal.serial_port import LineReader
+    from hal.serial_line import LineReader
     from hal.wire import Framer
 
     fields = (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8"))
@@ -196,12 +197,12 @@ def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
         "roles: {thermocouple_1: coil_c, thermocouple_2: bobbin_c}}"
     )
     device = ModbusDevice(bind(yamlfile.loads(text), ROOT / "config"))
+    device._spec = replace(device._spec, timeout_s=0.05)
 
     def one(data: bytes) -> None:
         answer[0], sample = data, Sample()
         try:
             device.connect()
-            device._client.comm_params.timeout_connect = 0.05
             device.poll(sample)
         except HardwareError:
             pass

@@ -12,7 +12,7 @@ from hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sample
 from tests.limits import OFF
 from thermoctl.control import arming, faults
 from thermoctl.control.law import WARM_UP_TICKS
-from thermoctl.control.model import NAMES, CompensatorModel, Parameters
+from thermoctl.control.model import CompensatorModel, Parameters, packed_length
 from thermoctl.daemon.loop import RELOAD, Rig
 from thermoctl.daemon.ring import Box, Mailbox
 from thermoctl.signals import INDEX
@@ -126,7 +126,7 @@ class NoPath(RuleBasedStateMachine):
         self.stage, self.given = Stage(), None
         self.mail, self.box = (
             Mailbox(np.zeros(2, np.uint64), np.zeros((4, 2))),
-            Box(np.zeros(1, np.uint64), np.zeros(len(NAMES) + 1)),
+            Box(np.zeros(1, np.uint64), np.zeros(packed_length(len(ROLES)) + 1)),
         )
         self.rig = Rig(self.stage, model(), parameters(), PERIOD_S, lambda row: None, self.mail, self.box)
         self.rig.wall_s = lambda: 0.0

@@ -254,7 +254,7 @@ def test_a_suspend_shows_in_the_loops_own_clock(quick):
         return len(rows) >= 80
 
     loops.run_loop(quick, shared, rig.rig, stopping)
-    dt = np.array(rows)[:, loops.INDEX["dt_s"]]
+    dt = np.array(rows)[:, loops.SIGNAL_AT["dt_s"]]
     late = np.flatnonzero(dt > 3000)
     assert len(late) == 1 and 40 <= late[0] <= 40 + loops.SUSPEND_EVERY
     rig.close()

@@ -43,7 +43,7 @@ class Running:
 
     def __init__(self, settings):
         self.settings = settings
-        self.shared = Shared.create(shared_name(settings))
+        self.shared = Shared.create(shared_name(settings), settings.channels)
         backend = make_backend(settings)
         backend.open()
         self.backend = Spoilt(backend)
@@ -57,6 +57,7 @@ class Running:
             self.shared.parameters,
             self.shared.state,
             remarks=self.shared.make_remarks(settings.loop.period_s),
+            channels=settings.channels,
         )
         self.rig.wall_s = lambda: self.base_s + self.now_s
         self.base_s, self.now_s, self.record = time.time(), 0.0, None

@@ -130,7 +130,7 @@ def test_a_test_on_a_daemon_is_ended_and_goes_on(settings, running, tmp_path, mo
         for block in rig.run(schedule, end_late, control):
             rows.append(block)
     assert 0.8 < ended.value.done_s < schedule.duration_s and status(running.shared)["state"] != "ARMED"
-    part = as_table(np.vstack(rows), tmp_path / "short.part.parquet")
+    part = as_table(np.vstack(rows), tmp_path / "short.part.parquet", settings.row)
     with monkeypatch.context() as m:
         m.setattr(daemon_rig, "GAP_S", 0.0)
         assert rig.meanwhile(part) is None, "nothing was recorded since, and now is later"

@@ -1,11 +1,9 @@
 """The one look of all reports: numbers as people write them, words to the left, nothing from elsewhere."""
 
 import re
-from types import SimpleNamespace
 
 import pytest
 
-from thermoctl.diagnose.page import _chance
 from thermoctl.report.page import cell, page, table, unit
 
 
@@ -60,9 +58,3 @@ def test_a_page_needs_nothing_from_elsewhere_and_escapes_what_it_is_given():
     text = page("<T>", [("<h>", "<p>body</p>")], "a & b")
     assert "<T>" not in text and "&lt;h&gt;" in text and "a &amp; b" in text and "<script" not in text
     assert not re.search(r"(src|href)=|url\(|@import", text)
-
-
-def test_a_chance_below_what_was_drawn_is_not_printed_as_nothing():
-    found = SimpleNamespace(rounds=[SimpleNamespace(chance=[0.0] * 100)])
-    assert _chance(found, 0.0) == _chance(found, 1e-30) == "less than 1/100 (none of 100 draws came near)"
-    assert _chance(found, 0.91) == "0.91" and _chance(SimpleNamespace(rounds=[]), 1.0) == "1"

@@ -340,6 +340,7 @@ def written(settings, rig, metadata, wall_s, value):
     rows[:, INDEX["compensation_um"]] = value
     rows[:, INDEX["coil_c"]] = 25.0
     rows[1000:2000, INDEX["status_bits"]] = 2 << 2 * CHANNELS.index("coil_c")
+    metadata = metadata and {"points": settings.channels.text(), **metadata}
     writer = RecordingWriter(settings.recording, metadata, rig, clock=lambda: 0.0, wall=lambda: wall_s)
     writer.write(rows)
     writer.close()

@@ -7,7 +7,7 @@ The measured error less the estimate is compared over test 4B. Estimators:
     paper    N4SID of order 12 with (26), MKF, recursion (5); one sampling period, as (38) and (39) have one n
     better   real poles by separable generalised least squares; Kalman filter with the coil alone and the
              air's rate as input; output error
-    twelve   the same filter and expansion model with all twelve thermometers
+    twelve   the same filter and expansion model with the thermometers of all points
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Calibration:
 
 
 def rises(r: Recorded) -> np.ndarray:
-    """Return the measured rises above the measured air (N, 12), K."""
+    """Return the measured rises above the measured air (N, points), K."""
     return r.temperatures - smooth_air(r.air_c)[:, None]
 
 
@@ -108,7 +108,7 @@ def calibrate(test_2: Recorded, test_3: Recorded, test_4a: Recorded, order: int 
     tests = [test_2, test_3, test_4a]
     model, kalman, variances, better_um = calibrate_better(tests, order)
     plant = filter.disturbed(filter.with_air(model))
-    twelve = filter.steady(plant, variances, r_v, tuple(range(12)))
+    twelve = filter.steady(plant, variances, r_v, tuple(range(len(plant.c))))
     twelve_um = fit_expansion(twelve, tests)
     return Calibration(
         paper_model, mkf, paper_um, siso_um, model, kalman, better_um, twelve, twelve_um, variances
@@ -119,7 +119,7 @@ def identify_paper(test_2: Recorded, check: Recorded) -> tuple[StateSpace, filte
     """Identify the paper's model of order 12 by (7) to (26) and its MKF, both from test 2.
 
     The paper leaves sampling period and block rows i open. Of PAPER_CHOICES this takes those whose stable
-    model's filter follows the twelve thermometers best over `check`, another test."""
+    model's filter follows the thermometers best over `check`, another test."""
     r_v = filter.sensor_variance(STEP_K, NOISE_K)
     y2, measured = filled(rises(test_2)), filled(rises(check))
     best: tuple[StateSpace, filter.Mkf] | None = None
@@ -225,12 +225,12 @@ def identify_better(tests: list[Recorded], order: int | None) -> StateSpace:
 
 
 def estimate_mkf(mkf: filter.Mkf, r: Recorded) -> np.ndarray:
-    """Run the MKF over a 1 s recording; return temperature rises (N, 12), held between the MKF's steps."""
+    """Run the MKF over a 1 s recording; return rises (N, points), held between the MKF's steps."""
     return held(_mkf_steps(mkf, r), round(mkf.period_s), len(r.power_w))
 
 
 def _mkf_steps(mkf: filter.Mkf, r: Recorded) -> np.ndarray:
-    """Run the MKF; rises (K, 12), one row for each of its periods."""
+    """Run the MKF; rises (K, points), one row for each of its periods."""
     q = round(mkf.period_s)
     return mkf.run(block_mean(r.power_w[:, None], q)[:, 0], block_mean(filled(rises(r)[:, :1]), q)[:, 0])[0]
 
@@ -241,7 +241,7 @@ def held(v: np.ndarray, q: int, n: int) -> np.ndarray:
 
 
 def run_kalman(k: filter.Kalman, r: Recorded) -> np.ndarray:
-    """Run the Kalman filter over a recording from rest; rises (N, 12)."""
+    """Run the Kalman filter over a recording from rest; rises (N, points)."""
     return k.run(r.power_w, air_rate(r.air_c), rises(r)[:, list(k.sensors)])
 
 
@@ -280,7 +280,7 @@ def estimates(c: Calibration, r: Recorded, starts_anew: bool = False) -> dict[st
 
 
 def compensator(
-    c: Calibration, kind: str, period_s: float = 0.001, sensor_s: float = 0.1
+    c: Calibration, kind: str, period_s: float = 0.001, sensor_s: float = 0.1, points: tuple[str, ...] = ()
 ) -> CompensatorModel:
     """Build the daemon's compensator model at its own period.
 
@@ -301,8 +301,8 @@ def compensator(
             "mkf",
             period_s,
             reduced.minus_identity(period_s),
-            np.column_stack([fast.b[:, 0], np.zeros(12)]),
-            np.eye(12),
+            np.column_stack([fast.b[:, 0], np.zeros(len(alpha))]),
+            np.eye(len(alpha)),
             c.mkf.zeta,
             c.mkf.r_w * period_s / c.mkf.period_s,
             c.mkf.r_v,
@@ -311,12 +311,17 @@ def compensator(
             um.b2,
             um.period_s,
             air_filter_s=AIR_FILTER_S,
+            points=points,
         )
-    return better_compensator(c.kalman, c.better_um, period_s, sensor_s)
+    return better_compensator(c.kalman, c.better_um, period_s, sensor_s, points)
 
 
 def better_compensator(
-    kalman: filter.Kalman, um: expansion.Expansion, period_s: float = 0.001, sensor_s: float = 0.1
+    kalman: filter.Kalman,
+    um: expansion.Expansion,
+    period_s: float = 0.001,
+    sensor_s: float = 0.1,
+    points: tuple[str, ...] = (),
 ) -> CompensatorModel:
     """Build the better estimator as the daemon runs it; see `compensator`."""
     model = kalman.model
@@ -343,6 +348,7 @@ def better_compensator(
         um.period_s,
         b_air=um.b_air,
         offset_um=um.offset_um,
+        points=points,
         air_filter_s=AIR_FILTER_S,
     )
 

@@ -17,7 +17,7 @@ from thermoctl.calibration.wizard import Wizard
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.recording.files import read_table
 from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX
+from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
 
 
@@ -75,16 +75,18 @@ def identify(
 
     Calibrate from recordings and install the compensator in the folder `models`."""
     settings = load_settings(config)
-    r2, r3, r4 = (recorded.read(p) for p in (test_2, test_3, test_4a))
+    r2, r3, r4 = (recorded.read(p, settings.channels.point_names) for p in (test_2, test_3, test_4a))
     figures: dict[str, Any] = {"method": method}
     if method == "paper":
         c = chain.calibrate(r2, r3, r4, order or None)
-        model = chain.compensator(c, method, settings.loop.period_s)
+        model = chain.compensator(c, method, settings.loop.period_s, points=settings.channels.point_names)
         left = r4.error_um - chain.estimates(c, r4)[method]
         figures |= {"time_constants_s": c.paper_model.time_constants_s, "zeta": c.mkf.zeta}
     else:
         thermal, kalman, variances, um, refined = chain.calibrate_refined([r2, r3, r4], order or None)
-        model = chain.better_compensator(kalman, um, settings.loop.period_s)
+        model = chain.better_compensator(
+            kalman, um, settings.loop.period_s, points=settings.channels.point_names
+        )
         left = r4.error_um - um.predict(
             chain.run_kalman(kalman, r4), chain.smooth_air(r4.air_c), um.info.get("start_um", 0.0)
         )
@@ -138,7 +140,7 @@ def tune(config: str, method: str, write: bool, yes: bool) -> int:
         return 1
     rows = drive.excite(rig, schedule, Keyboard(False))
     period, average = settings.loop.period_s, int(c.moving_average)
-    t, u, y = (rows[:, INDEX[n]] for n in ("t_s", "drive", "position_raw_um"))
+    t, u, y = (rows[:, AT[n]] for n in ("t_s", "drive", "position_raw_um"))
     plant = tuning.fit_response(t, u, y, period)
     present = tuning.Gains(c.kp, c.ti_s, c.td_s, "present")
     proposed = tuning.ziegler_nichols(plant) if method == "zn" else tuning.robust(plant, period, average)

@@ -29,7 +29,7 @@ from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import TIER, recording_files
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX
+from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
 
 POLL_S = 0.01  # between two polls of the rig and of the keyboard
@@ -89,7 +89,7 @@ class DaemonRig:
         ends, or the user ends the test. Raises HardwareError when the rig does not arm.
         """
         if earlier is not None:
-            yield rows_of(earlier)
+            yield rows_of(earlier, self.settings.row)
         elif rest:
             self._rest(keyboard)
         with _rig_answers(), Connection(self.settings.socket.path) as daemon:
@@ -130,12 +130,12 @@ class DaemonRig:
             now = time.monotonic()
             done, last = done + (0.0 if paused else now - last), now
             rows, position, _ = shared.ring.read(position)
-            kept = rows[rows[:, INDEX["tick"]] % stride == 0]
+            kept = rows[rows[:, AT["tick"]] % stride == 0]
             if len(kept):
                 yield kept
             ticked = now if len(rows) else ticked
             progress(Progress(min(done, schedule.duration_s), schedule.duration_s, now - started))
-            if len(rows) and rows[-1, INDEX["state"]] != arming.ARMED:
+            if len(rows) and rows[-1, AT["state"]] != arming.ARMED:
                 raise Aborted(f"the law left ARMED: {causes(rows[-1])}", done)
             if now - ticked > stall_s:
                 raise Aborted("the daemon's loop makes no more ticks; see its log", done)
@@ -145,7 +145,7 @@ class DaemonRig:
     def _disarm(self, daemon: Connection, shared: Shared) -> None:
         """Disarm if it is still armed; a fault stays latched for the user to read."""
         newest = shared.ring.newest()
-        if newest is None or newest[INDEX["state"]] != arming.ARMED:
+        if newest is None or newest[AT["state"]] != arming.ARMED:
             return
         with contextlib.suppress(InputError):
             daemon.ask({"command": "disarm"})
@@ -183,22 +183,22 @@ class DaemonRig:
 
     def meanwhile(self, earlier: Table) -> Table | None:
         """Append to `earlier` the daemon's own rows since then; None if they have a gap above GAP_S."""
-        parts = [rows_of(earlier)]
-        wall, folder = INDEX["wall_s"], Path(self.settings.recording.directory)
+        parts = [rows_of(earlier, self.settings.row)]
+        wall, folder = AT["wall_s"], Path(self.settings.recording.directory)
         for path in recording_files(folder, TIER) if folder.is_dir() else ():
             with contextlib.suppress(InputError):
-                rows = rows_of(read_table(path))
+                rows = rows_of(read_table(path), self.settings.row)
                 parts.append(
                     rows[
                         (rows[:, wall] > parts[-1][-1, wall])
-                        & (rows[:, INDEX["t_s"]] > parts[-1][-1, INDEX["t_s"]])
+                        & (rows[:, AT["t_s"]] > parts[-1][-1, AT["t_s"]])
                     ]
                 )
                 parts = [p for p in parts if len(p)]
         rows = np.vstack(parts)
         if np.diff(rows[:, wall]).max(initial=0.0) > GAP_S or time.time() - rows[-1, wall] > GAP_S:
             return None
-        return as_table(rows, earlier.path)
+        return as_table(rows, earlier.path, self.settings.row)
 
 
 @contextlib.contextmanager
@@ -211,7 +211,7 @@ def _rig_answers() -> Iterator[None]:
 
 
 def at_rest(seen: list[tuple[float, np.ndarray]]) -> bool:
-    """Check whether a rig of these temperatures, (s, degC (12,)) oldest first, is at rest.
+    """Check whether a rig of these temperatures, (s, degC (points,)) oldest first, is at rest.
 
     At rest: all temperatures are equal within REST_K, or none moved by more than REST_K in the last REST_S.
     Thermocouples differ by a degree.

@@ -24,7 +24,7 @@ from thermoctl.control import arming
 from thermoctl.daemon.control_socket import ask
 from thermoctl.identify.experiments import Aborted, Schedule
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX
+from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
 
 DrivenRig = SimulatedRig | DaemonRig
@@ -55,7 +55,7 @@ def agreed(rig: DrivenRig, schedules: Sequence[Schedule], yes: bool) -> bool:
     settings = rig.settings
     p = settings.protection
     low, high = within_limits(settings, schedules)
-    coil_c = float(rig.now()["temperatures_c"]["coil"] or math.nan)
+    coil_c = float(next(iter(rig.now()["temperatures_c"].values())) or math.nan)
     peaks = [forecast(settings, s, coil_c)[1] for s in schedules]
     known = [t for t in peaks if t is not None and math.isfinite(t)]
     if known and max(known) > p.coil_limit_c:
@@ -91,4 +91,4 @@ def excite(rig: DrivenRig, schedule: Schedule, keyboard: Keyboard) -> np.ndarray
             rows = np.vstack(list(rig.run(schedule, lambda p: None, keyboard, every_s=0.0, rest=False)))
     except Aborted as e:
         raise HardwareError(f"ended after {e.done_s:.1f} s, the amplifier is disabled: {e.reason}") from None
-    return rows[rows[:, INDEX["state"]] == arming.ARMED]
+    return rows[rows[:, AT["state"]] == arming.ARMED]

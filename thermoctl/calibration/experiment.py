@@ -104,7 +104,7 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
         ended = e.reason
     if blocks:
         rows = np.vstack(blocks)
-        write_table(path, as_table(rows, path))
+        write_table(path, as_table(rows, path, rig.settings.row))
         print(f"{path}: {len(rows)} rows")
     if not ended:
         progress_path.unlink(missing_ok=True)

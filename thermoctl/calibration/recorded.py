@@ -4,7 +4,7 @@ Rows as the loop records them, a table of them, and the signals of a calibration
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,17 +13,11 @@ import numpy as np
 from thermoctl.control import faults
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
-from thermoctl.signals import INDEX, NAMES, POINTS, fault_word
+from thermoctl.signals import AT, Row, fault_word
 from thermoctl.yamlfile import InputError, suggest
 
-SIGNALS = (
-    "power_w",
-    "air_c",
-    "output_reference_um",
-    "position_raw_um",
-    "setpoint_um",
-    *(f"{p}_c" for p in POINTS),
-)
+EVERY_RIG = ("power_w", "air_c", "output_reference_um", "position_raw_um", "setpoint_um")
+"""Signals of a calibration, besides the points' temperatures."""
 SETTLED = 5  # first samples, whose mean error is the origin of the thermal growth
 
 
@@ -31,10 +25,10 @@ SETTLED = 5  # first samples, whose mean error is the origin of the thermal grow
 class Recorded:
     """One test at 1 s: t (N,) s, power_w, air_c, setpoint_um.
 
-    Temperatures (N, 12) degC as read (NaN: no reading).
+    Temperatures (N, points) degC as read (NaN: no reading).
 
-    error_um is the difference of the two encoders. A simulated rig adds the truth: true_c (N, 12), true_um
-    (N,)."""
+    error_um is the difference of the two encoders. A simulated rig adds the truth: true_c
+    (N, points), true_um (N,)."""
 
     t: np.ndarray
     power_w: np.ndarray
@@ -46,11 +40,11 @@ class Recorded:
     setpoint_um: np.ndarray
 
 
-def of_columns(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> Recorded:
-    """Take SIGNALS at 1 s as one test; the position error is relative to its start.
+def of_columns(t: np.ndarray, columns: Mapping[str, np.ndarray], points: Sequence[str]) -> Recorded:
+    """Take the signals at 1 s as one test of a rig with these points.
 
-    The true temperatures are unknown: NaN."""
-    temperatures = np.column_stack([columns[f"{p}_c"] for p in POINTS])
+    The position error is relative to its start. The true temperatures are unknown: NaN."""
+    temperatures = np.column_stack([columns[f"{p}_c"] for p in points])
     error = columns["output_reference_um"] - columns["position_raw_um"]
     error = error - np.nanmean(error[:SETTLED])
     unknown = np.full(temperatures.shape, np.nan)
@@ -59,12 +53,13 @@ def of_columns(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> Recorded:
     )
 
 
-def read(path: str | Path) -> Recorded:
-    """Read a recording at 1 s; gaps in power and air are held.
+def read(path: str | Path, points: Sequence[str]) -> Recorded:
+    """Read a recording of a rig with these points at 1 s; gaps in power and air are held.
 
     Raises InputError when a signal is missing."""
     table = read_table(path)
-    for n in SIGNALS:
+    names = (*EVERY_RIG, *(f"{p}_c" for p in points))
+    for n in names:
         if n not in table.columns:
             raise InputError(
                 f"{path}: column '{n}' is missing{suggest(n, table.columns)}; a calibration needs it"
@@ -72,10 +67,10 @@ def read(path: str | Path) -> Recorded:
     since = table.t - table.t[0]
     t = np.arange(np.floor(since[-1]) + 1)
     k = np.clip(np.searchsorted(since, t + 1e-9, side="right") - 1, 0, None)
-    columns = {n: table.columns[n][k] for n in SIGNALS}
+    columns = {n: table.columns[n][k] for n in names}
     for n in ("power_w", "air_c"):
         columns[n] = filled(columns[n][:, None])[:, 0]
-    return of_columns(t, columns)
+    return of_columns(t, columns, points)
 
 
 def filled(y: np.ndarray) -> np.ndarray:
@@ -88,16 +83,16 @@ def filled(y: np.ndarray) -> np.ndarray:
     return out
 
 
-def rows_of(table: Table) -> np.ndarray:
+def rows_of(table: Table, layout: Row) -> np.ndarray:
     """Arrange a table as record rows (N, signals); NaN where a signal is missing."""
     missing = np.full(len(table), np.nan)
-    return np.column_stack([table.t if n == "t_s" else table.columns.get(n, missing) for n in NAMES])
+    return np.column_stack([table.t if n == "t_s" else table.columns.get(n, missing) for n in layout.names])
 
 
-def as_table(rows: np.ndarray, path: str | Path) -> Table:
+def as_table(rows: np.ndarray, path: str | Path, layout: Row) -> Table:
     """Arrange record rows as a table named after the file `path`."""
-    columns = {n: rows[:, i] for n, i in INDEX.items() if n != "t_s"}
-    return Table(Path(path).stem, str(path), rows[:, INDEX["t_s"]], columns)
+    columns = {n: rows[:, i] for n, i in layout.index.items() if n != "t_s"}
+    return Table(Path(path).stem, str(path), rows[:, AT["t_s"]], columns)
 
 
 def causes(row: np.ndarray) -> str:

@@ -76,7 +76,9 @@ def check_predicted(inputs: experiments.Inputs, settings: Settings) -> None:
     p = settings.protection
     for column, (low, high) in inputs.predicted.items():
         channel = "position_um" if column == "position_raw_um" else column
-        top = min(p.high.get(channel, np.inf), p.coil_limit_c if channel == "coil_c" else np.inf)
+        top = min(
+            p.high.get(channel, np.inf), p.coil_limit_c if channel == settings.channels.coil else np.inf
+        )
         bottom = p.low.get(channel, -np.inf)
         if low < bottom or high > top:
             raise InputError(

@@ -21,7 +21,7 @@ from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.table import Table
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX, POINTS
+from thermoctl.signals import AT
 
 EVERY_S = 0.1  # between the rows that are kept
 READY_S = 20.0  # longest simulated time until the law is READY
@@ -52,14 +52,20 @@ class SimulatedRig:
         Raises HardwareError after READY_S."""
         simulation = Simulation(self.settings)
         try:
-            ready = simulation.until(lambda row: row[INDEX["state"]] == arming.READY, READY_S)
+            ready = simulation.until(lambda row: row[AT["state"]] == arming.READY, READY_S)
             row = simulation.row
             if not ready:
                 raise HardwareError(f"{self.settings.path}: not READY within {READY_S:g} s: {causes(row)}")
             return {
-                "channels": channel_states(int(row[INDEX["status_bits"]])),
-                "temperatures_c": {p: float(row[INDEX[f"{p}_c"]]) for p in POINTS},
-                "compensated_um": float(row[INDEX["compensated_um"]]),
+                "channels": channel_states(row, self.settings.row),
+                "temperatures_c": dict(
+                    zip(
+                        self.settings.channels.point_names,
+                        row[self.settings.row.measured].tolist(),
+                        strict=True,
+                    )
+                ),
+                "compensated_um": float(row[AT["compensated_um"]]),
             }
         finally:
             simulation.close()

@@ -18,12 +18,13 @@ from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import Recorded, read
 from thermoctl.calibration.schedules import triangles
+from thermoctl.channels import Channels
 from thermoctl.identify import modelfile, tuning
 from thermoctl.identify.expansion import Expansion
 from thermoctl.identify.filter import Kalman
 from thermoctl.recording.files import read_table
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX, POINTS
+from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
 
 FITTED = ("test_2", "test_3", "test_4a")  # the tests that the model is fitted to
@@ -31,14 +32,8 @@ SHOWN_S = 3.0  # part of the ramps' recording in the report
 SHOWN = 2000  # approximate number of points of a curve in the report
 SETTLED = 5  # first samples, whose mean error is the origin of the thermal growth
 AT_TARGET_UM = 1e-6  # largest distance of reference and setpoint at rest
-NEEDED = (
-    "position_raw_um",
-    "output_reference_um",
-    "voltage_v",
-    "current_a",
-    "air_c",
-    *(f"{p}_c" for p in POINTS),
-)
+NEEDED = ("position_um", "output_reference_um", "voltage_v", "current_a", "air_c")
+"""Channels that a calibration needs besides the points'."""
 
 Series = list[float | None]
 MeanTwoS = tuple[float, float]  # mean and 2 s, um, after ISO 230-2
@@ -132,23 +127,23 @@ class Proof:
 Result = Doctor | Response | Pid | Test | Model | Proof
 
 
-def doctor(states: Mapping[str, str]) -> Doctor:
+def doctor(states: Mapping[str, str], channels: Channels) -> Doctor:
     """Check the channels. Raises InputError with the invalid ones."""
-    found = {n: states.get("position_um" if n == "position_raw_um" else n, "ABSENT") for n in NEEDED}
+    found = {n: states.get(n, "ABSENT") for n in (*NEEDED, *channels.temperatures)}
     if bad := [f"{n} is {s}" for n, s in found.items() if s != "OK"]:
         raise InputError(
-            "a calibration needs the second encoder and all twelve thermocouples; "
+            "a calibration needs the second encoder and the thermometers of all points; "
             + ", ".join(bad)
             + ": see `thermoctl doctor`"
         )
-    return Doctor(f"{len(NEEDED)} channels read well", dict(states))
+    return Doctor(f"{len(found)} channels read well", dict(states))
 
 
 def response(settings: Settings, rig: drive.DrivenRig) -> Response:
     """Drive short ramps and fit the position's response."""
     period_s = settings.loop.period_s
     rows = drive.excite(rig, triangles(settings, rig.now()["compensated_um"]), Keyboard(False))
-    t, u, y = (rows[:, INDEX[n]] for n in ("t_s", "drive", "position_raw_um"))
+    t, u, y = (rows[:, AT[n]] for n in ("t_s", "drive", "position_raw_um"))
     fitted = tuning.fit_response(t, u, y, period_s)
     k0, tau_d, tau_c = tuning.tangent(fitted)
     model = fitted.response(u - u[0], period_s)
@@ -190,9 +185,10 @@ def pid(settings: Settings, found: Response) -> Pid:
 
 def model(settings: Settings, recordings: Mapping[str, Path], order: int, path: Path) -> Model:
     """Fit the model to the recordings of FITTED and save it at `path`."""
-    tests = [read(recordings[n]) for n in FITTED]
+    points = settings.channels.point_names
+    tests = [read(recordings[n], points) for n in FITTED]
     thermal, kalman, _, expansion = chain.calibrate_better(tests, order or None)
-    compensator = chain.better_compensator(kalman, expansion, settings.loop.period_s)
+    compensator = chain.better_compensator(kalman, expansion, settings.loop.period_s, points=points)
     last = tests[-1]
     residual = last.error_um - _estimate(kalman, expansion, last)
     thin = max(1, len(residual) // SHOWN)
@@ -216,7 +212,7 @@ def model(settings: Settings, recordings: Mapping[str, Path], order: int, path: 
     )
 
 
-def proof(recordings: Mapping[str, Path], order: int, acting: bool) -> Proof:
+def proof(settings: Settings, recordings: Mapping[str, Path], order: int, acting: bool) -> Proof:
     """Compare the position error over test 4B without and with the model.
 
     `acting`: the model acted in that test."""
@@ -227,8 +223,10 @@ def proof(recordings: Mapping[str, Path], order: int, acting: bool) -> Proof:
         left = _from_start(c["output_reference_um"] - c["reference_um"])
         how = "the loop with the new model acting, judged by the second encoder, which it does not use"
     else:
-        _, kalman, _, expansion = chain.calibrate_better([read(recordings[n]) for n in FITTED], order or None)
-        r = read(recordings["test_4b"])
+        points = settings.channels.point_names
+        tests = [read(recordings[n], points) for n in FITTED]
+        _, kalman, _, expansion = chain.calibrate_better(tests, order or None)
+        r = read(recordings["test_4b"], points)
         left = growth - np.interp(t.t - t.t[0], r.t, _estimate(kalman, expansion, r))
         how = (
             "the second encoder less what the new model estimates from the recording; the model is not acting before it is "

@@ -39,7 +39,7 @@ from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX
+from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
 
 TESTS = ("test_1", "test_2", "test_3", "test_4a", "test_4b")
@@ -154,14 +154,14 @@ class Wizard:
         recordings = {name: self._recording(name) for name in TESTS}
         match step:
             case "doctor":
-                return steps.doctor(self.rig.now()["channels"])
+                return steps.doctor(self.rig.now()["channels"], self.settings.channels)
             case "step":
                 return steps.response(self.settings, self.rig)
             case "pid":
                 return steps.pid(self.settings, self.result("step", steps.Response))
             case "model":
                 return steps.model(self.settings, recordings, self.order, self._model_path)
-        return steps.proof(recordings, self.order, acting=not self.rig.real)
+        return steps.proof(self.settings, recordings, self.order, acting=not self.rig.real)
 
     def _test(self, number: int, name: str, keyboard: Keyboard) -> bool:
         """Run a test to its end; return False if it was interrupted: a new call continues from there."""
@@ -184,7 +184,7 @@ class Wizard:
         self._tested_s += ended.done_s if ended else schedule.duration_s - at_s
         print(file=sys.stderr)
         if blocks:
-            write_table(part, as_table(np.vstack(blocks), part))
+            write_table(part, as_table(np.vstack(blocks), part, self.settings.row))
         if ended is not None:
             self.at_s[name] = ended.done_s
             self._save()
@@ -195,7 +195,7 @@ class Wizard:
             return False
         part.replace(self._recording(name))
         self.at_s.pop(name, None)
-        power = np.vstack(blocks)[:, INDEX["power_w"]]
+        power = np.vstack(blocks)[:, AT["power_w"]]
         self.done[name] = steps.Test(
             f"{span(schedule.duration_s)} recorded",
             schedule.duration_s,

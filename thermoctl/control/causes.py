@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from thermoctl.channels import GROUPS, TABLE
+from thermoctl.channels import GROUPS, Channels
 from thermoctl.control.faults import BIT, BY_NAME, KINDS
 
 WITHIN_S, BEFORE_S, TOGETHER_S = 5.0, 1.0, 0.15
@@ -91,10 +91,9 @@ class Standing:
         return self.late_s > 0.0 and self.name in LATE_MAY_CAUSE
 
 
-def channels_of(name: str) -> tuple[str, ...]:
+def channels_of(name: str, channels: Channels) -> tuple[str, ...]:
     """Return the channels that can raise fault `name`; () if it is not a fault of a reading."""
-    group = BY_NAME[name].group
-    return tuple(c.role for c in TABLE if group and c.group == group)
+    return channels.in_group(BY_NAME[name].group)
 
 
 def _lost(name: str) -> bool:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from thermoctl.channels import GROUPS, TABLE
+from thermoctl.channels import FIXED, GROUPS
 
 
 @dataclass(frozen=True)
@@ -355,7 +355,7 @@ _ROWS = (
         "fault",
         "measured coil temperature and the model stay apart: drifted, swapped or frozen sensor",
         "The coil's sensor drifted, came loose, hangs or is swapped, or the model is of another rig.",
-        "compare all twelve points with the air while the rig is cold; warm the coil alone and see which point follows",
+        "compare all points with the air while the rig is cold; warm the coil alone and see which point follows",
         "fasten or replace the sensor; correct the order of the channels; calibrate again where the rig was changed",
     ),
     Fault(
@@ -475,7 +475,7 @@ _ROWS = (
         "warning",
         "the output reference or a temperature that is only watched stays away from its estimate",
         "A watched temperature sensor or the reference encoder drifted or is swapped, or the model is of another rig.",
-        "let the rig rest until it is cold: all twelve points must show the air's temperature",
+        "let the rig rest until it is cold: all points must show the air's temperature",
         "correct the order of the sensors; replace the one that is off; calibrate again",
     ),
 )
@@ -488,8 +488,12 @@ BY_NAME = {f.name: f for f in FAULTS}
 NAMES = {f.bit: f.name for f in FAULTS}
 """Bit -> name, as a recording stores it."""
 
-READING_BIT = bytes(bit for c in TABLE for bit in READING_BITS[c.group])
-"""Fault bit of each channel and kind, for the compiled law: index = channel * len(KINDS) + kind."""
+READING_BIT = bytes(
+    bit for group in (*(c.group for c in FIXED), "coil", "monitored") for bit in READING_BITS[group]
+)
+"""Fault bit of each channel and kind, for the compiled law: index = channel * len(KINDS) + kind.
+
+The channels that every rig has, then the coil, then any other point."""
 
 
 def mask(*severities: str, readings: bool = True) -> int:

@@ -15,6 +15,7 @@ and mutation tests. Both give the same bits (IEEE doubles, no contraction, one o
                 v(n) = v(n-1) + Kp [(eps - eps1) + (dt/Ti) eps + Td (d - d1)],  d = (eps - eps1)/dt      (41)
                 With dt constant this is (41) term by term; after a late tick the differences still add up.
                 v is clipped where it is stored: no wind-up. Gains may change without a jump.
+                a drive that closes the position loop itself gets v = reference - compensation, its target
     protect     range, rate, age and liveness of every reading; following error; coil temperature and its
                 rate; power; idle current; innovation; saturation; amplifier; arming; finite numbers
     agree       two measures of one quantity must agree in the mean. Only this finds a sensor that drifts, is
@@ -29,6 +30,10 @@ and mutation tests. Both give the same bits (IEEE doubles, no contraction, one o
                   the other way round, (y_i - y_j)(T_i - T_j) < -order_limit^2
                 - the coil's reading and the open-loop model, x - c, with c the sum of all corrections,
                   c(n+1) = c(n) + (dt/T) (A-I) c(n) + k zeta e; a drifting sensor moves x, but not x - c
+
+Without a thermometer at the coil its resistance is the thermometer: R = mean(V I) / mean(I^2) over
+RESISTANCE_S. It gives a reading every RESISTANCE_S while the current is large enough. Without any reading
+of the coil the estimate is the model alone, from rest at the air's temperature.
 
 After a gap of more than MAX_GAP_S (suspend) the estimate restarts on the coil's next reading. `resume` starts
 from the estimates of an earlier run, advanced over the pause without power. They are dropped when the coil's
@@ -57,20 +62,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.channels import (
-    ABSENT,
-    AMP_ENABLED,
-    AMP_FAULT,
-    CHANNELS,
-    CODES,
-    ERROR,
-    INDEX,
-    OK,
-    POINTS,
-    STALE,
-    TEMPERATURES,
-    THERMAL,
-)
+from thermoctl.channels import ABSENT, AMP_ENABLED, AMP_FAULT, AT, CODES, COIL, ERROR, OK, STALE
 from thermoctl.control import arming, faults
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters
 from thermoctl.signals import FAULT_WORD_BITS, OUTPUT, OUTPUTS
@@ -87,8 +79,11 @@ RESUME_LIMIT_C = 2.0  # keep the estimates of an earlier run if the coil's first
 # remain as an offset of 0.03 um.
 AIR_READINGS = 30.0
 COPPER_1_K = 0.00393  # temperature coefficient of the coil's resistance, from 20 degC
+RESISTANCE_S = 1.0  # mean of the coil's resistance, and time between two readings of it
+RESISTANCE_LATE_S = 10.0  # after this time without a reading by resistance nothing is known of the coil
 _GAP_S, _RESUME_C, _COPPER, _WARM_UP = MAX_GAP_S, RESUME_LIMIT_C, COPPER_1_K, WARM_UP_TICKS
 _AIR_READINGS = AIR_READINGS
+_RESISTANCE_S, _RESISTANCE_LATE_S = RESISTANCE_S, RESISTANCE_LATE_S
 _THERMAL_S, _DELAY_S, _NAN = THERMAL_S, DELAY_S, float("nan")
 COMPILED = not __file__.endswith(".py")
 """Whether the law is compiled. Interpreted, it is 100 times too slow for a rig: for test coverage only."""
@@ -97,11 +92,9 @@ COMPILED = not __file__.endswith(".py")
 _OK, _STALE, _ERROR, _ABSENT = OK, STALE, ERROR, ABSENT
 _NONE, _SETPOINT, _OFF, _ARMED, _FAULT = arming.NONE, arming.SETPOINT, arming.OFF, arming.ARMED, arming.FAULT
 _NEXT, _COMMANDS = arming.TABLE, len(arming.COMMANDS)
-_N, _M = len(CHANNELS), len(TEMPERATURES)
-_POSITION, _REFERENCE = INDEX["position_um"], INDEX["output_reference_um"]
-_VOLTAGE, _CURRENT = INDEX["voltage_v"], INDEX["current_a"]
-_AIR, _COIL, _AMPLIFIER_STATE = INDEX["air_c"], INDEX["coil_c"], INDEX["amplifier_state"]
-_THERMAL, _THERMAL_END = INDEX[THERMAL[0]], INDEX[THERMAL[0]] + len(THERMAL)
+_POSITION, _REFERENCE = AT["position_um"], AT["output_reference_um"]
+_VOLTAGE, _CURRENT, _AIR, _COIL = AT["voltage_v"], AT["current_a"], AT["air_c"], COIL
+_AMPLIFIER_STATE = AT["amplifier_state"]
 _AMPLIFIER_ENABLED, _AMPLIFIER_FAULT = int(AMP_ENABLED), int(AMP_FAULT)
 _K_ERROR, _K_STALE, _K_RANGE, _K_RATE, _K_FROZEN = range(len(faults.KINDS))
 _KINDS, _READING_BIT = len(faults.KINDS), faults.READING_BIT
@@ -126,7 +119,7 @@ _O_SETPOINT, _O_REFERENCE, _O_POSITION = OUTPUT["setpoint_um"], OUTPUT["referenc
 _O_COMPENSATED, _O_COMPENSATION = OUTPUT["compensated_um"], OUTPUT["compensation_um"]
 _O_EXPANSION, _O_CONTROL, _O_DRIVE = OUTPUT["expansion_um"], OUTPUT["control_v"], OUTPUT["drive"]
 _O_ENABLE, _O_POWER, _O_AIR_RATE = OUTPUT["enable"], OUTPUT["power_w"], OUTPUT["air_rate_k_s"]
-_O_ESTIMATES = OUTPUT[f"{POINTS[0]}_est_c"]
+_O_ESTIMATES = len(OUTPUTS)
 _O_INNOVATION, _O_GAIN = OUTPUT["innovation_c"], OUTPUT["kalman_gain"]
 _O_POSITION_AGE, _O_COIL_AGE = OUTPUT["position_age_s"], OUTPUT["coil_age_s"]
 
@@ -194,6 +187,10 @@ _SCALARS = (
     "reference_zeroed",
     "exchanged",
     "driving",
+    "ohm_w",
+    "ohm_a2",
+    "ohm_s",
+    "ohm_c",
 )
 _WHOLE = ("state", "tick", "latched", "average_at", "averaged")
 _VECTORS = (
@@ -260,13 +257,14 @@ class Law:
     """The state of the law and its four stages, called in order once per tick; `step` calls all four.
 
     model: CompensatorModel; parameters: Parameters; period_s: the loop's nominal period, s. `bind` sets the
-    arrays in which the readings arrive. After a tick, `outputs` (float64, order of OUTPUTS) and the
-    attributes of the same names hold the results. `drive` and `enable` go to the amplifier.
+    arrays in which the readings arrive. After a tick, `outputs` (OUTPUTS, then the points' estimates)
+    and the attributes of the same names hold the results. `drive` and `enable` go to the amplifier.
     """
 
     def __init__(self, model: CompensatorModel, parameters: Parameters, period_s: float):
         self.model = model
-        self.n, self.sensors_used = model.A_minus_I.shape[0], len(model.sensors)
+        self.n, self.m, self.sensors_used = model.A_minus_I.shape[0], model.C.shape[0], len(model.sensors)
+        self.channels = channels = _COIL + self.m
         self.mkf = model.kind == "mkf"
         self.A, self.B, self.C, self.K = model.A_minus_I, model.B, model.C, model.gain
         self.b1, self.b2, self.b_air, self.f1 = model.b1, model.b2, model.b_air, model.f1
@@ -287,13 +285,29 @@ class Law:
         self.correction_step_s = (
             0.5 * model.period_s / max(float(np.abs(model.A_minus_I).sum(axis=1).max()), 1e-12)
         )
-        self.dx, self.e = np.zeros(self.n), np.zeros(_M)
-        self.corrections, self.apart_c = np.zeros(self.n), np.zeros(_M)
-        self.x, self.T, self.T_before = np.zeros(self.n), np.zeros(_M), np.zeros(_M)
+        self.dx, self.e = np.zeros(self.n), np.zeros(self.m)
+        self.corrections, self.apart_c = np.zeros(self.n), np.zeros(self.m)
+        self.x, self.T, self.T_before = np.zeros(self.n), np.zeros(self.m), np.zeros(self.m)
         self.average = np.zeros(MAX_AVERAGE)
-        self.age, self.last, self.same_s = np.zeros(_N), np.zeros(_N), np.zeros(_N)
-        self.since_s, self.suspect = np.zeros(_N), np.zeros(_N)
-        self.seen, self.verdict = np.zeros(_N), np.zeros(_N)
+        self.age, self.last, self.same_s = np.zeros(channels), np.zeros(channels), np.zeros(channels)
+        self.since_s, self.suspect = np.zeros(channels), np.zeros(channels)
+        self.seen, self.verdict = np.zeros(channels), np.zeros(channels)
+        self._zero()
+        self.average_length = 1
+        self.out = np.zeros(len(OUTPUTS) + self.m)
+        self.outputs = np.asarray(self.out)
+        self.faults = 0
+        self.hold = 0
+        self.reports = self.enabled = self.powered = self.coil_fresh = self.by_resistance = False
+        self.configure(parameters)
+        self.bind(
+            np.full(channels, np.nan),
+            np.zeros(channels, dtype=np.uint8),
+            np.full(channels, _ABSENT, dtype=np.uint8),
+        )
+
+    def _zero(self):
+        """Set the scalars to those of a new law."""
         self.state, self.latched, self.tick, self.average_at, self.averaged = arming.OFF, 0, 0, 0, 0
         self.v = self.eps1 = self.d1 = 0.0
         self.setpoint_um = self.reference_um = self.position_um = self.compensated_um = 0.0
@@ -302,7 +316,7 @@ class Law:
         ) = 0.0
         self.corrected = self.coil_slow_c = self.coil_rate_k_s = self.coil_elapsed_s = 0.0
         self.innovation_c = self.innovation_mean_c = self.kalman_gain = 0.0
-        self.P = 1e3 * model.R_v
+        self.P = 1e3 * self.R_v
         self.primed = self.phase_s = self.expansion_before_um = self.expansion_after_um = 0.0
         self.expansion_um = self.compensation_um = 0.0
         self.air_started = self.resumed = self.model_error_c = 0.0
@@ -312,35 +326,35 @@ class Law:
         self.position_low_um = self.position_high_um = 0.0
         self.position_low_before_um = self.position_high_before_um = self.reference_error_um = 0.0
         self.reference_zero_um = self.reference_zeroed = self.exchanged = 0.0
+        self.ohm_w = self.ohm_a2 = self.ohm_s = self.ohm_c = 0.0
         self.following_s = self.idle_s = self.idle_readings = self.saturation_s = 0.0
         self.amplifier_s = self.driving = self.enable = self.drive = self.control_v = 0.0
-        self.average_length = 1
-        self.out = np.zeros(len(OUTPUTS))
-        self.outputs = np.asarray(self.out)
-        self.faults = 0
-        self.hold = 0
-        self.reports = self.enabled = self.powered = False
-        self.configure(parameters)
-        self.bind(np.full(_N, np.nan), np.zeros(_N, dtype=np.uint8), np.full(_N, _ABSENT, dtype=np.uint8))
 
     def bind(self, value, fresh, status, delay=None):
-        """Take the arrays over CHANNELS that hold the readings of each tick.
+        """Take the arrays over the channels that hold the readings of each tick.
 
         value: float64; fresh: uint8, 1 for a new reading; status: uint8, OK to ABSENT of channels.py.
         delay: uint8, the age of a new reading when it arrived, in units of DELAY_S; None: read in the tick.
         """
         self.value, self.fresh, self.status = value, fresh, status
-        self.delay = np.zeros(_N, dtype=np.uint8) if delay is None else delay
+        self.delay = np.zeros(self.channels, dtype=np.uint8) if delay is None else delay
 
     def configure(self, parameters: Parameters):
-        """Take new gains and limits, all at once, between two ticks; the state stays."""
+        """Take new gains and limits, all at once, between two ticks; the state stays.
+
+        Raises ValueError for limits of another number of channels.
+        """
+        if len(parameters.low) != self.channels:
+            raise ValueError(
+                f"law: limits of {len(parameters.low)} channels, the model's points make {self.channels}"
+            )
         typed: Any = Typed(parameters)  # its fields are declared in law.pxd only
         self.parameters, self.p = parameters, typed
         self.low, self.high = parameters.low.copy(), parameters.high.copy()
         self.rate, self.required = parameters.rate.copy(), parameters.required.copy()
         self.stale_s, self.frozen_s = parameters.stale_s.copy(), parameters.frozen_s.copy()
         for role in CODES:  # a state or an error number does not change while all is well
-            self.frozen_s[INDEX[role]] = np.inf
+            self.frozen_s[AT[role]] = np.inf
         length = int(min(max(parameters.moving_average, 1), MAX_AVERAGE))
         if self.tick > 0 and length != self.average_length:
             self.average = np.full(MAX_AVERAGE, self.position_um)  # the filter restarts at its own output
@@ -445,6 +459,9 @@ class Law:
         self.coil_elapsed_s += self.dt
         if dt > _GAP_S:
             self._forget()
+        self.coil_fresh = self.fresh[_COIL]
+        if self.status[_COIL] == _ABSENT:
+            self._measure_resistance()
         self._judge_readings(dt)
         self._power_and_air()
         n = self.n
@@ -458,7 +475,7 @@ class Law:
             self.x[i] += scale * self.dx[i]
         if not self.hold:
             self._correct()
-        for m in range(_M):
+        for m in range(self.m):
             s = 0.0
             for j in range(n):
                 s += self.C[m, j] * self.x[j]
@@ -470,19 +487,25 @@ class Law:
         one = 1
         self.trips = 0
         self.hold = 0
-        for c in range(_N):
+        for c in range(self.channels):
             self.age[c] += self.dt
             self.since_s[c] += self.dt
-            status = self.status[c]
-            if status == _ABSENT and self.required[c] == 0.0:
+            status, fresh, value = self.status[c], self.fresh[c], self.value[c]
+            if status == _ABSENT and c == _COIL and self.by_resistance:
+                if not self.coil_fresh:
+                    if self.seen[c] == 0.0 or self.age[c] > _RESISTANCE_LATE_S:
+                        self.verdict[c] = 1.0 + _K_ERROR
+                    continue
+                status, fresh, value = _OK, True, self.ohm_c
+            elif status == _ABSENT and self.required[c] == 0.0:
                 self.verdict[c] = 1.0 + _K_ERROR
                 continue
             if status in (_ERROR, _ABSENT):
                 self.verdict[c] = 1.0 + _K_ERROR
             elif status == _STALE:
                 self.verdict[c] = 1.0 + _K_STALE
-            elif self.fresh[c]:
-                self._judge_reading(c, self.value[c])
+            elif fresh:
+                self._judge_reading(c, value)
                 self.age[c] = 0.0
             elif self.age[c] > self.stale_s[c] or (self.seen[c] == 0.0 and self.verdict[c] == 0.0):
                 self.verdict[c] = 1.0 + _K_STALE
@@ -490,7 +513,7 @@ class Law:
                 kind = _K_ERROR
                 while self.verdict[c] > 1.0 + kind:
                     kind += 1
-                bit = one << _READING_BIT[c * _KINDS + kind]
+                bit = one << _READING_BIT[min(c, _COIL + 1) * _KINDS + kind]
                 self.faults |= bit
                 if self.required[c] > 0.0:
                     self.trips |= bit
@@ -505,7 +528,7 @@ class Law:
         """Check range, rate and liveness of a new reading; `last` and `since_s`: the newest valid one."""
         late = _DELAY_S * self.delay[c]
         elapsed = max(self.since_s[c] - late, self.period_s)
-        thermal = _THERMAL <= c < _THERMAL_END
+        thermal = c >= _AIR
         allowed = self.rate[c] * (max(elapsed, _THERMAL_S) if thermal else elapsed)
         jumped = self.seen[c] > 0.0 and abs(value - self.last[c]) > allowed
         if not (self.low[c] <= value <= self.high[c]) or not finite(value):
@@ -559,6 +582,28 @@ class Law:
             s = self.last[_COIL]
         return self.p.resistance_ohm * (1.0 + _COPPER * (s - 20.0))
 
+    def _measure_resistance(self):
+        """Set coil_fresh and ohm_c where a mean of the resistance is complete; no thermometer is bound."""
+        self.coil_fresh = False
+        self.by_resistance = (
+            self.p.resistance_ohm > 0.0
+            and self.required[_COIL] == 0.0
+            and self.status[_VOLTAGE] != _ABSENT
+            and self.status[_CURRENT] != _ABSENT
+        )
+        if not self.by_resistance:
+            return
+        part = min(1.0, self.dt / _RESISTANCE_S)
+        if self.verdict[_VOLTAGE] == 0.0 and self.verdict[_CURRENT] == 0.0:
+            self.ohm_w += part * (self.last[_VOLTAGE] * self.last[_CURRENT] - self.ohm_w)
+            self.ohm_a2 += part * (self.last[_CURRENT] * self.last[_CURRENT] - self.ohm_a2)
+        large = self.ohm_a2 > self.p.resistance_current_a * self.p.resistance_current_a
+        self.ohm_s = self.ohm_s + self.dt if large else 0.0
+        if self.ohm_s >= 2.0 * _RESISTANCE_S:  # the mean has settled; from now on once in RESISTANCE_S
+            self.ohm_s -= _RESISTANCE_S
+            self.ohm_c = 20.0 + (self.ohm_w / (self.p.resistance_ohm * self.ohm_a2) - 1.0) / _COPPER
+            self.coil_fresh = True
+
     def _start_air(self, value):
         """Start the air's low-pass at this reading; the very first one is the expansion's origin."""
         self.air_c = value
@@ -581,27 +626,32 @@ class Law:
 
     def _correct(self):
         """Correct the state with every new valid reading (35); the coil's first reading starts it."""
-        coil_new = self.fresh[_COIL] and self.verdict[_COIL] == 0.0 and self.suspect[_COIL] == 0.0
+        coil_new = self.coil_fresh and self.verdict[_COIL] == 0.0 and self.suspect[_COIL] == 0.0
         if self.resumed > 0.0 and coil_new:  # do the kept estimates still fit?
-            s = self.value[_COIL] - self.air_c
+            s = self.last[_COIL] - self.air_c
             for j in range(self.n):
                 s -= self.C[0, j] * self.x[j]
             self.resumed = 0.0
-            self.coil_slow_c = self.value[_COIL]
+            self.coil_slow_c = self.last[_COIL]
             if not (abs(s) <= _RESUME_C):
                 self._forget()
                 self.air_started = 0.0
                 if self.verdict[_AIR] == 0.0:
                     self._start_air(self.last[_AIR])
         if self.air_known == 0.0 and coil_new:  # no air sensor: rises above the first coil reading
-            self._start_air(self.value[_COIL])
+            self._start_air(self.last[_COIL])
         if self.corrected == 0.0 and not coil_new:
+            if self.status[_COIL] == _ABSENT and self.air_started >= _AIR_READINGS:
+                self.corrected = 1.0  # no thermometer at the coil: from rest
             return
         for k in range(self.sensors_used):
             c = _COIL + self.sensors[k]
             self.e[k] = 0.0
-            if self.fresh[c] and self.verdict[c] == 0.0 and self.suspect[c] == 0.0:
-                s = self.value[c] - self.air_c
+            new = coil_new
+            if c != _COIL:
+                new = self.fresh[c] and self.verdict[c] == 0.0 and self.suspect[c] == 0.0
+            if new:
+                s = self.last[c] - self.air_c
                 for j in range(self.n):
                     s -= self.C[self.sensors[k], j] * self.x[j]
                 self.e[k] = s
@@ -611,7 +661,7 @@ class Law:
             if self.corrected == 0.0:
                 for i in range(self.n):
                     self.x[i] += self.first_gain * self.K[i, 0] * self.e[0]
-                self.coil_slow_c = self.value[_COIL]
+                self.coil_slow_c = self.last[_COIL]
                 self.coil_rate_k_s = 0.0
                 self.corrected = 1.0
                 self.primed = 0.0
@@ -621,7 +671,7 @@ class Law:
             self.innovation_mean_c += (self.e[0] - self.innovation_mean_c) * min(
                 1.0, elapsed / self.p.innovation_time_s
             )
-            self.coil_rate_k_s = (self.value[_COIL] - self.coil_slow_c) / self.p.coil_rate_time_s
+            self.coil_rate_k_s = (self.last[_COIL] - self.coil_slow_c) / self.p.coil_rate_time_s
             self.coil_slow_c += self.coil_rate_k_s * min(elapsed, self.p.coil_rate_time_s)
         gain = 1.0
         if self.mkf:
@@ -665,7 +715,7 @@ class Law:
         one = 1
         if self.primed == 0.0:  # quasi-steady start at the first temperatures
             s = self.b_air * (self.air_c - self.air_start_c)
-            for m in range(_M):
+            for m in range(self.m):
                 s += (self.b1[m] + self.b2[m]) * self.T[m]
                 self.T_before[m] = self.T[m]
             self.expansion_before_um = self.expansion_after_um = s / (1.0 - self.f1)
@@ -677,7 +727,7 @@ class Law:
         if self.phase_s >= self.expansion_period_s:
             self.phase_s -= self.expansion_period_s
             s = self.f1 * self.expansion_after_um + self.b_air * (self.air_c - self.air_start_c)
-            for m in range(_M):
+            for m in range(self.m):
                 s += self.b1[m] * self.T_before[m] + self.b2[m] * self.T[m]
                 self.T_before[m] = self.T[m]
             self.expansion_before_um = self.expansion_after_um
@@ -733,10 +783,15 @@ class Law:
         if self.state != _ARMED or (self.reports and not self.enabled):
             self.reference_um = self.compensated_um
             self.v = self.eps1 = self.d1 = 0.0
+            if self.p.position_mode > 0.0:
+                self.v = self._target()
             return
         step = self.p.setpoint_rate_um_s * self.dt
         self.reference_um = clip(self.setpoint_um, self.reference_um - step, self.reference_um + step)
         eps = self.reference_um - self.compensated_um
+        if self.p.position_mode > 0.0:
+            self.v, self.eps1 = self._target(), eps
+            return
         change = eps - self.eps1
         d = change / self.dt if self.dt > 0.0 else 0.0
         self.v = clip(
@@ -745,6 +800,10 @@ class Law:
             self.p.output_limit,
         )
         self.eps1, self.d1 = eps, d
+
+    def _target(self):
+        """Return the target, um, of a drive that holds its own encoder's position: the reference, shifted."""
+        return clip(self.reference_um - self.compensation_um, -self.p.output_limit, self.p.output_limit)
 
     # ---- protect ------------------------------------------------------------------------------------------------
 
@@ -859,12 +918,12 @@ class Law:
         if self.corrected == 0.0:
             return
         part = min(1.0, self.dt / self.p.innovation_time_s)
-        for m in range(_M):
+        for m in range(self.m):
             if self.verdict[_COIL + m] == 0.0 and self.predicts[m]:
                 self.apart_c[m] += part * (self.last[_COIL + m] - self.air_c - self.T[m] - self.apart_c[m])
                 if m > 0 and abs(self.apart_c[m]) > self.p.monitored_limit_c:
                     self.faults |= one << _B_MONITORED
-        if self.fresh[_COIL]:
+        if self.coil_fresh:
             self._compare_order()
         if self.exchanged > 0.0:
             self.faults |= one << _B_MONITORED
@@ -922,7 +981,7 @@ class Law:
         """Set `exchanged`: two mean readings would fit their estimates better the other way round."""
         self.exchanged = 0.0
         limit = -self.p.order_limit_c * self.p.order_limit_c
-        for m in range(1, _M):
+        for m in range(1, self.m):
             for k in range(m):
                 if (
                     self.predicts[m]
@@ -967,7 +1026,7 @@ class Law:
         o[_O_ENABLE] = self.enable
         o[_O_POWER] = self.power_w if self.powered else _NAN
         o[_O_AIR_RATE] = self.air_rate_k_s
-        for m in range(_M):
+        for m in range(self.m):
             o[_O_ESTIMATES + m] = self.T[m] + self.air_c
         o[_O_INNOVATION] = self.innovation_c
         o[_O_GAIN] = self.kalman_gain

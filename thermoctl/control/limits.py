@@ -101,6 +101,13 @@ class Limits:
         0.0,
         1e6,
     )
+    resistance_current_a: float = option(
+        "smallest mean coil current at which the coil's resistance is its thermometer, where no device is bound to the coil's temperature",
+        0.1,
+        "A",
+        0.0,
+        1e3,
+    )
     resistance_tolerance: float = option(
         "relative tolerance of the comparison of voltage with resistance_ohm x current, as a share of the larger one",
         0.2,

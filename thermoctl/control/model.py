@@ -12,15 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.channels import CHANNELS, TEMPERATURES
+from thermoctl.channels import DEFAULT, FIXED, MAX_POINTS
 from thermoctl.control.limits import Limits
 
-MAX_ORDER = 24
-M = len(TEMPERATURES)
+MAX_ORDER = 2 * MAX_POINTS
 
 
 def _array(unit: str, *shape: str | int) -> Any:
-    """Return the field of a float64 array; its shape in numbers, `n` states and `s` sensors."""
+    """Return the field of a float64 array; its shape in numbers, `n` states, `m` points, `s` sensors."""
     return field(metadata={"unit": unit, "shape": shape})
 
 
@@ -37,16 +36,16 @@ class CompensatorModel:
 
         x(n+1) = x(n) + A_minus_I x(n) + B q(n),   q = [electrical power W, rate of the air temperature K/s]
 
-    C x are the twelve rises above the air, K. Expansion (39), um, every `expansion_period_s`:
+    C x are the points' rises above the air, K, the coil's first. Expansion (39), um, each expansion period:
 
         yL(n+1) = f1 yL(n) + b1 . T(n-1) + b2 . T(n) + b_air (air - air at start)
 
     kind: 'kalman' or 'mkf'. With 'kalman' the gain is K of a steady Kalman filter. With 'mkf' it is the map
     zeta (36) of the scalar Riccati recursion (34), (35), which uses the first row of A, R_w and R_v. gain:
     (n, s), one column per correcting sensor, K (or zeta) per K of innovation. sensors: (s,) indices among the
-    twelve temperatures; the first must be the coil (0). 'mkf' has only the coil. offset_um: added to the
+    points; the first must be the coil (0). 'mkf' has only the coil. offset_um: added to the
     expansion model's output. air_filter_s: time constant of the low-pass filter that gives the rate of the
-    air temperature.
+    air temperature. points: names of the points, m; () in a model that an older version made.
 
     Raises ValueError when shapes or numbers do not fit together. Files of models, recordings and the warm
     start's fingerprint derive from these fields.
@@ -56,18 +55,19 @@ class CompensatorModel:
     period_s: float = _number("s", positive=True)
     A_minus_I: np.ndarray = _array("1 per period", "n", "n")
     B: np.ndarray = _array("K per W, K per (K/s)", "n", 2)
-    C: np.ndarray = _array("K", M, "n")
+    C: np.ndarray = _array("K", "m", "n")
     gain: np.ndarray = _array("K/K", "n", "s")
     R_w: float = _number("K^2")
     R_v: float = _number("K^2", positive=True)
     f1: float = _number()
-    b1: np.ndarray = _array("um/K", M)
-    b2: np.ndarray = _array("um/K", M)
+    b1: np.ndarray = _array("um/K", "m")
+    b2: np.ndarray = _array("um/K", "m")
     expansion_period_s: float = _number("s", positive=True)
     sensors: tuple[int, ...] = (0,)
     b_air: float = _number("um/K", 0.0)
     offset_um: float = _number("um", 0.0)
     air_filter_s: float = _number("s", 60.0, positive=True)
+    points: tuple[str, ...] = ()
     meta: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -75,7 +75,8 @@ class CompensatorModel:
             object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64, order="C"))
         if self.gain.ndim == 1:
             object.__setattr__(self, "gain", self.gain.reshape(-1, 1))
-        sizes = {"n": self.A_minus_I.shape[0], "s": len(self.sensors)}
+        m = self.C.shape[0]
+        sizes = {"n": self.A_minus_I.shape[0], "s": len(self.sensors), "m": m}
         for f in _MODEL_FIELDS:
             if "shape" in f.metadata:
                 self._check_array(f.name, tuple(sizes.get(k, k) for k in f.metadata["shape"]))
@@ -85,9 +86,13 @@ class CompensatorModel:
             raise ValueError(f"compensator model: kind is '{self.kind}', expected 'mkf' or 'kalman'")
         if sizes["n"] > MAX_ORDER:
             raise ValueError(f"compensator model: order {sizes['n']}, expected at most {MAX_ORDER}")
-        if not self.sensors or self.sensors[0] != 0 or not all(0 <= j < M for j in self.sensors):
+        if not self.sensors or self.sensors[0] != 0 or not all(0 <= j < m for j in self.sensors):
             raise ValueError(
-                f"compensator model: sensors {self.sensors}, expected 0 (the coil) first, all below {M}"
+                f"compensator model: sensors {self.sensors}, expected 0 (the coil) first, all below {m}"
+            )
+        if not 1 <= m <= MAX_POINTS or len(self.points) not in (0, m):
+            raise ValueError(
+                f"compensator model: {m} points with {len(self.points)} names, expected 1 to {MAX_POINTS}, each named"
             )
         if self.kind == "mkf" and sizes["s"] != 1:
             raise ValueError("compensator model: the MKF corrects by the coil alone")
@@ -120,26 +125,28 @@ PLAIN = tuple(f.name for f in _MODEL_FIELDS if f.name not in (*ARRAYS, "meta"))
 UNITS = {f.name: f.metadata["unit"] for f in _MODEL_FIELDS if f.metadata.get("unit")}
 
 
-def zero_model(period_s: float = 0.001) -> CompensatorModel:
+def zero_model(period_s: float = 0.001, points: tuple[str, ...] = DEFAULT.point_names) -> CompensatorModel:
     """Return a model that estimates no rise and no expansion: the loop without compensation."""
+    m = len(points)
     return CompensatorModel(
         "mkf",
         period_s,
         np.full((1, 1), -period_s / 400.0),
         np.zeros((1, 2)),
-        np.zeros((M, 1)),
+        np.zeros((m, 1)),
         np.zeros(1),
         0.0,
         1.0,
         0.0,
-        np.zeros(M),
-        np.zeros(M),
+        np.zeros(m),
+        np.zeros(m),
         1.0,
+        points=points,
     )
 
 
 def _by_channel(value: float) -> Any:
-    return field(default_factory=lambda: np.full(len(CHANNELS), value), metadata={"by_channel": value})
+    return field(default_factory=lambda: np.full(len(DEFAULT.names), value), metadata={"by_channel": value})
 
 
 @dataclass(frozen=True)
@@ -158,6 +165,7 @@ class Gains:
     setpoint_high_um: float = np.inf
     moving_average: float = 1.0  # samples, 1..MAX_AVERAGE
     compensate: float = 1.0  # 1 on, 0 off
+    position_mode: float = 0.0  # 1: the drive takes a target position, um; 0: the controller's output
     bound_um: float = np.inf
     slew_um_s: float = np.inf
     low: np.ndarray = _by_channel(-np.inf)
@@ -183,15 +191,19 @@ class Parameters(Limits, Gains):
 
     @classmethod
     def unpack(cls, vector: np.ndarray) -> Parameters:
-        """Return the parameters of a packed vector. Raises ValueError for a vector of another length."""
-        if len(vector) != len(NAMES):
-            raise ValueError(f"parameters: {len(vector)} numbers, expected {len(NAMES)}")
+        """Return the parameters of a packed vector. Raises ValueError for an impossible length."""
+        channels, rest = divmod(len(vector) - (len(fields(cls)) - len(BY_CHANNEL)), len(BY_CHANNEL))
+        if rest or not 1 <= channels - len(FIXED) <= MAX_POINTS:
+            raise ValueError(
+                f"parameters: {len(vector)} numbers, expected {packed_length(len(FIXED) + 1)} and "
+                f"{len(BY_CHANNEL)} more a point"
+            )
         values: dict[str, Any] = {}
         start = 0
         for f in fields(cls):
             if f.name in BY_CHANNEL:
-                values[f.name] = np.array(vector[start : start + len(CHANNELS)], dtype=np.float64)
-                start += len(CHANNELS)
+                values[f.name] = np.array(vector[start : start + channels], dtype=np.float64)
+                start += channels
             else:
                 values[f.name] = float(vector[start])
                 start += 1
@@ -200,9 +212,17 @@ class Parameters(Limits, Gains):
 
 BY_CHANNEL = {f.name: f.metadata["by_channel"] for f in fields(Parameters) if "by_channel" in f.metadata}
 """Arrays over the channels, each with its default for a channel without an entry."""
-NAMES = tuple(
-    name
-    for f in fields(Parameters)
-    for name in ([f"{f.name}[{role}]" for role in CHANNELS] if f.name in BY_CHANNEL else [f.name])
-)
-"""The names of the numbers of `Parameters.pack`, in order."""
+
+
+def packed_length(channels: int) -> int:
+    """Return the number of numbers of `Parameters.pack` for so many channels."""
+    return len(fields(Parameters)) + (channels - 1) * len(BY_CHANNEL)
+
+
+def packed_names(roles: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of the numbers of `Parameters.pack`, in order, for these channels."""
+    return tuple(
+        name
+        for f in fields(Parameters)
+        for name in ([f"{f.name}[{role}]" for role in roles] if f.name in BY_CHANNEL else [f.name])
+    )

@@ -11,10 +11,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from thermoctl.channels import CHANNELS
 from thermoctl.daemon.shared import COUNTER_WORDS, Shared
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX
+from thermoctl.signals import AT
 
 SLOW_SHARE = (
     0.5  # of rate_hz: a lower rate is reported; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3
@@ -78,12 +77,12 @@ def slow_readings(shared: Shared, expected: Mapping[str, float]) -> list[str]:
     rows, _, _ = shared.ring.read(max(0, shared.ring.head - LOOK_ROWS))
     if len(rows) < 2:
         return []
-    seconds = rows[-1, INDEX["t_s"]] - rows[0, INDEX["t_s"]]
-    fresh, status = (rows[:, INDEX[name]].astype("i8") for name in ("fresh_bits", "status_bits"))
+    seconds = rows[-1, AT["t_s"]] - rows[0, AT["t_s"]]
+    arrived, states = shared.row.arrived(rows), shared.row.states(rows)
     lines = []
-    for c, role in enumerate(CHANNELS):
-        if role in expected and expected[role] * seconds >= FEWEST and not (status >> 2 * c & 3).any():
-            found_hz = (fresh >> c & 1).sum() / seconds
+    for c, role in enumerate(shared.channels.names):
+        if role in expected and expected[role] * seconds >= FEWEST and not states[:, c].any():
+            found_hz = arrived[:, c].sum() / seconds
             if said := slow(role, found_hz, expected, len(rows) / seconds):
                 lines.append(f"{role}: {said}")
     return lines

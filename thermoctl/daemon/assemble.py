@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hal.binding import bind
-from thermoctl.channels import CHANNELS
+from thermoctl.channels import Channels
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters, zero_model
 from thermoctl.settings import RigSettings, Settings
 from thermoctl.yamlfile import InputError, load
@@ -23,10 +23,11 @@ def law_parameters(settings: Settings) -> Parameters:
     given: dict[str, Any] = vars(settings.control) | vars(settings.compensation) | vars(settings.protection)
     given |= {
         "compensate": settings.compensation.enable,
+        "position_mode": settings.control.mode == "position",
         "required": dict.fromkeys(settings.protection.required, 1.0),
     }
     taken: dict[str, Any] = {
-        f.name: _by_channel(given[f.name], BY_CHANNEL[f.name], f"protection.{f.name}")
+        f.name: _by_channel(settings.channels, given[f.name], BY_CHANNEL[f.name], f"protection.{f.name}")
         if f.name in BY_CHANNEL
         else float(given[f.name])
         for f in fields(Parameters)
@@ -34,12 +35,12 @@ def law_parameters(settings: Settings) -> Parameters:
     return Parameters(**taken)
 
 
-def _by_channel(given: Any, default: float, where: str) -> np.ndarray:
-    array = np.full(len(CHANNELS), default)
+def _by_channel(channels: Channels, given: Any, default: float, where: str) -> np.ndarray:
+    array = np.full(len(channels.names), default)
     for name, number in given.items():
-        if name not in CHANNELS:
-            raise InputError(f"{where}: no channel '{name}'; expected one of {', '.join(CHANNELS)}")
-        array[CHANNELS.index(name)] = number
+        if name not in channels.index:
+            raise InputError(f"{where}: no channel '{name}'; expected one of {', '.join(channels.names)}")
+        array[channels.index[name]] = number
     return array
 
 
@@ -49,7 +50,7 @@ def power_warning(settings: Settings) -> str:
     if settings.hal.backend != "devices":
         return ""
     folder = Path(settings.path).parent
-    roles = {b.role for node in settings.hal.devices for b in bind(node, folder).bounds}
+    roles = {b.role for node in settings.hal.devices for b in bind(node, folder, settings.channels).bounds}
     lacks = [] if "current_a" in roles else ["current_a"]
     if "voltage_v" not in roles and protection.resistance_ohm == 0.0:
         lacks.append("voltage_v (or protection.resistance_ohm, for R I^2)")
@@ -67,16 +68,75 @@ def power_warning(settings: Settings) -> str:
     )
 
 
+def lacks(settings: Settings) -> list[str]:
+    """Return a line for each sensor that this rig has not, with the consequence.
+
+    Empty for back ends without devices. Raises InputError for a model on a rig without any temperature of
+    the air or the coil: there is nothing to start its estimates from.
+    """
+    if settings.hal.backend != "devices":
+        return []
+    folder, coil = Path(settings.path).parent, settings.channels.coil
+    roles = {b.role for node in settings.hal.devices for b in bind(node, folder, settings.channels).bounds}
+    electric = {"voltage_v", "current_a"} <= roles and settings.protection.resistance_ohm > 0.0
+    by_resistance = electric and coil not in roles and coil not in settings.protection.required
+    found = []
+    if "output_reference_um" not in roles:
+        found.append(
+            "no output_reference_um (second encoder): nothing proves the output's error, compensation.tune learns "
+            "nothing, `thermoctl calibrate` refuses; a model from `thermoctl plant linearise` compensates"
+        )
+    if "air_c" not in roles:
+        found.append(
+            f"no air_c: the air counts as constant, at the first reading of {coil}; the air's drift is not compensated"
+        )
+    if coil not in roles and by_resistance:
+        found.append(
+            f"no {coil}: the coil's temperature is taken from its resistance (voltage_v, current_a, "
+            f"protection.resistance_ohm) while the current is above protection.resistance_current_a "
+            f"({settings.protection.resistance_current_a:g} A); in between the model alone estimates it"
+        )
+    elif coil not in roles:
+        found.append(
+            f"no {coil}: the model alone estimates the temperatures, from rest at the air's; no reading corrects them. "
+            "voltage_v, current_a and protection.resistance_ohm would make the coil's resistance its thermometer"
+        )
+    if settings.compensation.model and coil not in roles and "air_c" not in roles and not by_resistance:
+        raise InputError(
+            f"{settings.path}: compensation.model needs air_c or {coil} (or voltage_v, current_a and "
+            "protection.resistance_ohm): without a temperature its estimates have no start"
+        )
+    return found
+
+
+def check_mode(settings: Settings) -> None:
+    """Check that the drive takes a target position, um, only with control.mode: position.
+
+    Raises InputError.
+    """
+    folder, wanted = Path(settings.path).parent, settings.control.mode == "position"
+    for node in settings.hal.devices if settings.hal.backend == "devices" else ():
+        profile = bind(node, folder, settings.channels).profile
+        if profile.amplifier is None or (profile.amplifier.unit == "um") == wanted:
+            continue
+        expected = "torque (or velocity)" if wanted else "position"
+        raise InputError(
+            f"{node.place}: the drive of {profile.model} takes its command in {profile.amplifier.unit}, and control.mode is "
+            f"{settings.control.mode}: set control.mode: {expected}, or take a profile whose drive has "
+            f"unit {'um' if wanted else 'of a current, voltage or speed'}"
+        )
+
+
 def compensator(settings: Settings) -> CompensatorModel:
     """Load the model that `compensation.model` names, else a model without rises and expansion.
 
-    Raises InputError for a model of another rig.
+    Raises InputError for a model of another rig, or of other points.
     """
     if not settings.compensation.model:
-        return zero_model(settings.loop.period_s)
+        return zero_model(settings.loop.period_s, settings.channels.point_names)
     from thermoctl.identify.modelfile import load_model
 
-    return load_model(settings.compensation.model, settings.rig.name)
+    return load_model(settings.compensation.model, settings.rig.name, settings.channels.point_names)
 
 
 def shared_name(settings: Settings) -> str:

@@ -28,7 +28,6 @@ from thermoctl.daemon.loop import RELOAD
 from thermoctl.daemon.shared import Shared
 from thermoctl.daemon.snapshot import latency, status
 from thermoctl.settings import Settings
-from thermoctl.signals import SIGNALS
 from thermoctl.yamlfile import InputError
 
 MAX_LINE = 65536  # bytes of one request
@@ -71,7 +70,7 @@ class Commands:
         if name == "latency":
             return {"ok": True, **latency(self.shared, self.settings.loop.period_s)}
         if name == "signals":
-            return {"ok": True, "signals": [[s.name, s.unit, s.meaning] for s in SIGNALS]}
+            return {"ok": True, "signals": [[s.name, s.unit, s.meaning] for s in self.shared.row.signals]}
         actions = {
             "arm": self._arm,
             "disarm": self._disarm,
@@ -132,7 +131,7 @@ class Commands:
             return {
                 "ok": False,
                 "state": self._state(),
-                "error": "not armed: no device of hal.devices takes the command (a can-cia402 profile with 'drive'): "
+                "error": "not armed: no device of hal.devices takes the command (a profile with 'drive'): "
                 "this rig measures, it cannot be driven",
             }
         deadline = time.monotonic() + ANSWER_S  # a loop that was just started warms up for 0.1 s

@@ -39,16 +39,18 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from thermoctl.channels import DEFAULT
 from thermoctl.daemon.access import MIN_TOKEN, Policy, Refused, parse_address
 from thermoctl.daemon.assemble import rig_identity
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.metrics import CONTENT_TYPE, metrics
 from thermoctl.daemon.readings import hide_invalid, invalid
-from thermoctl.daemon.sources import SOURCES
+from thermoctl.daemon.sources import sources
 from thermoctl.daemon.watch import Watch
 from thermoctl.recording.history import history
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX, POINTS, SIGNALS
+from thermoctl.shipped import shipped
+from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
 
 PAGE = Path(__file__).with_name("dashboard.html")
@@ -57,6 +59,26 @@ MAX_CONNECTIONS, MAX_STREAMS = 32, 12
 REQUEST_S, SEND_S = 5.0, 5.0  # time limits of receiving a request and of sending an answer
 COMMANDS = ("arm", "disarm", "setpoint")
 TOKEN_VARIABLE = "THERMOCTL_DASHBOARD_TOKEN"
+
+
+MAX_DRAWING = 1_000_000  # bytes
+
+
+def drawing(settings: Settings) -> str:
+    """Return the text of the rig's drawing, SVG; '' for none. Raises InputError where it cannot be read."""
+    if settings.rig.drawing:
+        path = Path(settings.path).parent / settings.rig.drawing
+    elif settings.channels == DEFAULT:
+        path = shipped("config/points") / "actuator.svg"
+    else:
+        return ""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as e:
+        raise InputError(f"{path}: rig.drawing cannot be read: {getattr(e, 'strerror', None) or e}") from None
+    if len(text) > MAX_DRAWING or "<svg" not in text:
+        raise InputError(f"{path}: rig.drawing: an SVG file of at most {MAX_DRAWING} bytes was expected")
+    return text
 
 
 class Server(ThreadingHTTPServer):
@@ -231,7 +253,9 @@ class Handler(BaseHTTPRequestHandler):
                 "ok": True,
                 "rig": settings.rig.name,
                 "commands": self.server.policy.commands,
-                "points": POINTS,
+                "points": settings.channels.labels,
+                "coil": settings.channels.coil,
+                "drawing": drawing(settings),
                 "period_s": settings.loop.period_s,
                 "rate_hz": self.server.watch.rate_hz,
                 "innovation_limit_c": settings.protection.innovation_limit_c,
@@ -240,8 +264,10 @@ class Handler(BaseHTTPRequestHandler):
                 "power_limit_w": settings.protection.power_limit_w,
                 "setpoint_low_um": settings.control.setpoint_low_um,
                 "setpoint_high_um": settings.control.setpoint_high_um,
-                "sources": SOURCES,
-                "signals": [{"name": s.name, "unit": s.unit, "meaning": s.meaning} for s in SIGNALS],
+                "sources": sources(settings.channels),
+                "signals": [
+                    {"name": s.name, "unit": s.unit, "meaning": s.meaning} for s in settings.row.signals
+                ],
             }
         )
 
@@ -255,6 +281,7 @@ class Handler(BaseHTTPRequestHandler):
             end,
             int(query.number("points", 800.0)),
             invalid,
+            self.server.settings.row.names,
         )
         self._json(
             {
@@ -277,7 +304,9 @@ class Handler(BaseHTTPRequestHandler):
             )
         if query.text("format", "json") == "csv":
             out = io.StringIO()
-            np.savetxt(out, capture.rows, "%.17g", ",", header=",".join(INDEX), comments="")
+            np.savetxt(
+                out, capture.rows, "%.17g", ",", header=",".join(self.server.settings.row.names), comments=""
+            )
             self._send(
                 out.getvalue().replace("nan", "").encode(),
                 "text/csv; charset=utf-8",
@@ -285,14 +314,14 @@ class Handler(BaseHTTPRequestHandler):
             )
             return
         signal = query.text("signal", "compensated_um")
-        if signal not in INDEX:
+        if signal not in self.server.settings.row.index:
             raise InputError(f"capture: no signal '{signal[:60]}'")
         self._json(
             {
                 "ok": True,
                 **capture.summary(),
-                "t": _numbers(capture.rows[:, INDEX["t_s"]] - capture.t_s, 6),
-                "values": _numbers(hide_invalid(capture.rows, signal)),
+                "t": _numbers(capture.rows[:, AT["t_s"]] - capture.t_s, 6),
+                "values": _numbers(hide_invalid(capture.rows, signal, self.server.settings.row)),
             }
         )
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from thermoctl.daemon.sources import SOURCES
+from thermoctl.daemon.sources import FIXED_SOURCES
 
 LATE_REMEDY = "docs/how-to/real-time.md: stop other programs on the loop's processor; `thermoctl latency` shows the lateness"
 _NORMAL = ("frames", "rows")  # counters of devices that count what is well
@@ -74,7 +74,8 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
         name: number(status[name], 3)
         if status[name] is not None
         else next(
-            (shown(found[r], 3) for r in SOURCES[name] if found[r]["state"] not in ("OK", "ABSENT")), "-"
+            (shown(found[r], 3) for r in FIXED_SOURCES[name] if found[r]["state"] not in ("OK", "ABSENT")),
+            "-",
         )
         for name in ("position_um", "output_reference_um", "power_w")
     }
@@ -89,11 +90,11 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
         r = found[f"{point}_c"]
         bad = "" if r["state"] == "OK" else f"  {r['state'].lower()}"
         lines.append(
-            f"{point.replace('_', ' '):20}{number(r['value'], 2):>9}{number(estimate, 2):>11}{span(r['age_s']):>9}{bad}"
+            f"{status['labels'][point]:20}{number(r['value'], 2):>9}{number(estimate, 2):>11}{span(r['age_s']):>9}{bad}"
         )
     if status["estimates_state"] != "OK":
         lines.append(
-            f"estimates and compensation (?): not corrected by the coil's sensor for {span(found['coil_c']['age_s'])}"
+            f"estimates and compensation (?): not corrected by the coil's sensor for {span(found[status['coil']]['age_s'])}"
         )
     return lines + message_lines(status)
 

@@ -14,16 +14,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from hal.backend import OK, ROLES, STATUS_NAMES, Backend, HardwareError, Sample
+from hal.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
 from hal.make import device_notes, fast_devices, make_backend
-from hal.serial_port import latency_timer_ms
-from thermoctl.channels import SIGNAL
+from hal.serial_line import latency_timer_ms
 from thermoctl.daemon.arrival import expected_hz, slow
-from thermoctl.daemon.assemble import compensator, law_parameters, power_warning
+from thermoctl.daemon.assemble import check_mode, compensator, lacks, law_parameters, power_warning
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.loop import become_real_time
 from thermoctl.settings import Settings
-from thermoctl.signals import SIGNALS
 from thermoctl.yamlfile import InputError
 
 
@@ -32,6 +30,8 @@ def check(settings: Settings) -> int:
     law_parameters(settings)
     model = compensator(settings)
     make_backend(settings)
+    check_mode(settings)
+    without = lacks(settings)
     if warning := power_warning(settings):
         print(f"warning: {warning}")
     print(
@@ -39,7 +39,7 @@ def check(settings: Settings) -> int:
         f"{settings.compensation.model or 'none'} ({model.kind}, order {len(model.A_minus_I)})"
     )
     if settings.hal.backend == "devices":
-        for note in device_notes(settings):
+        for note in [*device_notes(settings), *without]:
             print(f"note: {note}")
     return 0
 
@@ -65,13 +65,15 @@ def doctor(settings: Settings, seconds: float = 2.0) -> int:
     backend = make_backend(settings)
     try:
         backend.open()
-        found = _read_for(backend, seconds, settings.loop.period_s)
+        found = _read_for(backend, seconds, settings.loop.period_s, settings.channels.names)
         bad = _print_channels(settings, backend, found, seconds)
     except HardwareError as e:
         print(f"thermoctl: {e}", file=sys.stderr)
         return 3
     finally:
         backend.close()
+    for note in device_notes(settings) if settings.hal.backend == "devices" else ():
+        print(f"note: {note}")
     print("\nreal time:")
     refused: list[str] = []
     become_real_time(settings, refused.append)
@@ -85,13 +87,13 @@ def doctor(settings: Settings, seconds: float = 2.0) -> int:
     return 1 if bad else 0
 
 
-def _read_for(backend: Backend, seconds: float, period_s: float) -> _Readings:
+def _read_for(backend: Backend, seconds: float, period_s: float, roles: tuple[str, ...]) -> _Readings:
     """Read every period for `seconds`, with the amplifier disabled."""
-    counts, reads = dict.fromkeys(ROLES, 0), 0
+    counts, reads = dict.fromkeys(roles, 0), 0
     begin = now = time.monotonic()
     while not reads or now < begin + seconds:
         sample = backend.read(now)
-        for role, fresh in zip(ROLES, sample.fresh, strict=True):
+        for role, fresh in zip(roles, sample.fresh, strict=True):
             counts[role] += int(fresh)
         reads += 1
         backend.write(0.0, False)  # a drive sends readings after each SYNC; it stays disabled
@@ -102,10 +104,10 @@ def _read_for(backend: Backend, seconds: float, period_s: float) -> _Readings:
 
 def _print_channels(settings: Settings, backend: Backend, found: _Readings, seconds: float) -> int:
     """Print one line a channel; return how many are bad."""
-    units = {s.name: s.unit for s in SIGNALS}
     expected, sample, bad = expected_hz(settings), found.sample, 0
     print(f"{'channel':24}{'value':>14} {'unit':8}{'status':8}{'rate':>10}")
-    for k, role in enumerate(ROLES):
+    for k, channel in enumerate(settings.channels.table):
+        role = channel.role
         state = STATUS_NAMES[sample.status[k]]
         if state == "ABSENT" and role not in settings.protection.required:
             continue
@@ -113,7 +115,7 @@ def _print_channels(settings: Settings, backend: Backend, found: _Readings, seco
         rate_hz = found.counts[role] / seconds
         problem = backend.problem(role) or slow(role, rate_hz, expected, found.reads / seconds)
         print(
-            f"{role:24}{sample.value[k]:14.4f} {units.get(SIGNAL[role], ''):8}{state:8}{rate_hz:7.1f} Hz"
+            f"{role:24}{sample.value[k]:14.4f} {channel.unit:8}{state:8}{rate_hz:7.1f} Hz"
             + (f"   {problem}" if problem else "")
         )
     if counters := backend.counters():

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import structlog
 
-from thermoctl.channels import CHANNELS
 from thermoctl.control import arming, faults
 from thermoctl.daemon import readings
 from thermoctl.daemon.display import LATE_REMEDY
 from thermoctl.daemon.shared import Shared
-from thermoctl.signals import INDEX, fault_words
+from thermoctl.signals import AT, fault_words
 
 TELL_AGAIN_S = 10.0  # an intermittent fault is logged at most once in this time
 Log = Callable[..., None]
@@ -40,7 +39,7 @@ class Watcher:
         self.shared, self.log = shared, log
         self.position, self.before = 0, (arming.OFF, 0)
         self.told: dict[str, float] = {}
-        self.changes = [0] * len(CHANNELS)
+        self.changes = [0] * len(shared.channels.names)
         self.code: Any = None
 
     def look(self) -> None:
@@ -49,7 +48,7 @@ class Watcher:
         if not len(rows):
             return
         self._devices(rows[-1])
-        states = rows[:, INDEX["state"]].astype(np.uint64)
+        states = rows[:, AT["state"]].astype(np.uint64)
         pairs = np.column_stack((states, np.where(states == arming.OFF, np.uint64(0), fault_words(rows))))
         known = np.vstack((np.array([self.before], np.uint64), pairs))
         changed = np.flatnonzero((known[1:] != known[:-1]).any(axis=1))
@@ -60,7 +59,7 @@ class Watcher:
             if state != before_state:
                 self.log(
                     "state",
-                    tick=int(rows[k, INDEX["tick"]]),
+                    tick=int(rows[k, AT["tick"]]),
                     was=arming.STATES[int(before_state)],
                     now=arming.STATES[int(state)],
                 )
@@ -94,9 +93,9 @@ class Watcher:
 
         A channel is logged again only after TELL_AGAIN_S.
         """
-        if row[INDEX["state"]] == arming.OFF:
+        if row[AT["state"]] == arming.OFF:
             return
-        for c, role in enumerate(CHANNELS):
+        for c, role in enumerate(self.shared.channels.names):
             said = self.shared.remarks.get(c)
             if said is None or said[0] == self.changes[c]:
                 continue

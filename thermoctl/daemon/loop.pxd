@@ -6,11 +6,12 @@ from thermoctl.control.law cimport Law
 from thermoctl.daemon.clock cimport now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring cimport Histogram, Mailbox, Record, Remarks, Ring
 
-cdef int _STATE_EVERY, _COUNTERS_AT, _SUSPEND_EVERY, _SUSPEND_NS, _THERMAL, _THERMAL_END, _LATEST, _N, _OFF, _STATE, _CODE, _ABSENT
+cdef int _STATE_EVERY, _COUNTERS_AT, _SUSPEND_EVERY, _SUSPEND_NS, _THERMAL, _LATEST, _OFF, _STATE, _CODE, _ABSENT
 cdef double _DELAY_S
 
 cdef class Rig:
-    cdef public object backend, publish_row, parameter_box, state_box, reading, row, wall_s, suspended_ns
+    cdef public object backend, publish_row, parameter_box, state_box, reading, row, wall_s, suspended_ns, channels
+    cdef int _n
     cdef public Record record
     cdef public Remarks remarks
     cdef public list said

@@ -23,7 +23,7 @@ import numpy as np
 
 from hal.backend import ABSENT
 from hal.devices import DevicesBackend
-from thermoctl.channels import CHANNELS, THERMAL
+from thermoctl.channels import AT, DEFAULT, Channels
 from thermoctl.control import arming, faults
 from thermoctl.control.law import DELAY_S, Law
 from thermoctl.control.model import CompensatorModel, Parameters
@@ -32,23 +32,24 @@ from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring import Mailbox, Record, Remarks, Ring
 from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX, SIGNALS
+from thermoctl.signals import AT as SIGNAL_AT
+from thermoctl.signals import of_channels
 
 RELOAD = float(len(arming.COMMANDS))
 """The mailbox command that applies the parameter block; the others are arming's."""
 SUSPEND_NS = 1_000_000  # a smaller difference is no suspend: the two clocks are read one after the other
 SUSPEND_EVERY = 16  # ticks between two checks for a suspend
 STATE_EVERY = 1000  # ticks between two snapshots of the law's state, and between two of the devices' counters
-_HEAD = INDEX["position_raw_um"]  # numbers of a row before the channels, in the order of `publish`
+_HEAD = SIGNAL_AT["state"]  # numbers of a row before the law's outputs, in the order of `publish`
 _STATE_EVERY, _SUSPEND_EVERY, _SUSPEND_NS = (
     STATE_EVERY,
     SUSPEND_EVERY,
     SUSPEND_NS,
 )  # numbers of C, by loop.pxd
 _COUNTERS_AT = STATE_EVERY // 2  # not in the tick of the law's state
-_THERMAL, _THERMAL_END = CHANNELS.index(THERMAL[0]), CHANNELS.index(THERMAL[0]) + len(THERMAL)
 _DELAY_S, _LATEST = DELAY_S, 15
-_N, _OFF, _STATE, _CODE = len(CHANNELS), arming.OFF, INDEX["state"], INDEX["amplifier_fault"]
+_OFF, _STATE, _CODE = arming.OFF, SIGNAL_AT["state"], SIGNAL_AT["amplifier_fault"]
+_THERMAL = AT["air_c"]  # the air is the first thermal channel, all later ones are thermal
 _ABSENT = ABSENT
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
 
@@ -73,17 +74,19 @@ class Rig:
         state_box: Any = None,
         start_s: float = 0.0,
         remarks: Remarks | None = None,
+        channels: Channels = DEFAULT,
     ):
         self.backend, self.publish_row, self.mailbox = backend, publish, mailbox
         self.parameter_box, self.state_box, self.start_s = parameter_box, state_box, start_s
         self.law = Law(model, parameters, period_s)
         self.reading: Any = None
-        self.row = self._head = np.zeros(len(SIGNALS))
+        self.channels, self._n = channels, len(channels.names)
+        self.row = self._head = np.zeros(len(of_channels(channels)))
         self.record = Record(self.row, _HEAD)
-        self._delay = np.zeros(len(CHANNELS), np.uint8)
+        self._delay = np.zeros(self._n, np.uint8)
         self.remarks: Any = remarks
-        self.said = [(0.0, "")] * _N
-        self._status = np.zeros(_N, np.uint8)
+        self.said = [(0.0, "")] * self._n
+        self._status = np.zeros(self._n, np.uint8)
         self.slips = self.generation = self.external = self.write_failed = 0
         self.command, self.value, self.busy_us = arming.NONE, 0.0, 0.0
         self.wall_s: Callable[[], float] | None = None
@@ -121,7 +124,7 @@ class Rig:
             self.law.bind(reading.value, fresh, reading.status, self._delay)
             self.record.bind(reading.value, fresh, reading.status, self._delay, self.law.outputs)
             self._status = reading.status
-        for c in range(_THERMAL, _THERMAL_END):
+        for c in range(_THERMAL, self._n):
             if self._fresh[c]:  # temperatures come from slow buses: record the age of each
                 age = (now_s - self._time_s[c]) / _DELAY_S
                 self._delay[c] = 0 if age < 0.0 else _LATEST if age >= _LATEST else int(age)
@@ -186,17 +189,17 @@ class Rig:
         trips = 0 if off else law.trips | law.latched
         new = self.remarks.fill(law.age, law.verdict, bits, trips, t_s, law.tick, dt_s, head[_CODE])
         if new:
-            for c in range(_N):
+            for c in range(self._n):
                 self._say(c, t_s)
         elif not off:
-            self._say(law.tick % _N, t_s)
+            self._say(law.tick % self._n, t_s)
 
     def _say(self, c: int, t_s: float) -> None:
         """Publish channel c's message when the channel is invalid and the message is new."""
         verdict = self.law.verdict[c]
         if self._status[c] == _ABSENT or (verdict == 0.0 and self.said[c][0] == 0.0):
             return
-        words = self.backend.problem(CHANNELS[c]) if verdict > 0.0 and self._status[c] else ""
+        words = self.backend.problem(self.channels.names[c]) if verdict > 0.0 and self._status[c] else ""
         if (verdict, words) == self.said[c]:
             return
         self.said[c] = (verdict, words)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from thermoctl.control import arming, faults
-from thermoctl.daemon.readings import readings, valid
+from thermoctl.daemon.readings import readings, valid_signals
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared
-from thermoctl.signals import BIT_WORDS, INDEX, POINTS, SIGNALS, fault_word
+from thermoctl.signals import AT, Row, fault_word
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BUCKETS_US = (10, 20, 50, 100, 200, 500, 1000, 2000, 4096)
@@ -26,17 +26,7 @@ HISTOGRAMS = {
     "reference": "lateness of the idle loop beside it",
 }
 _COUNTERS = {"tick": "thermoctl_ticks_total", "slips": "thermoctl_slips_total"}
-_ELSEWHERE = {
-    "t_s",
-    "wall_s",
-    "lateness_us",
-    "busy_us",
-    "state",
-    *BIT_WORDS,
-    "command",
-    "command_value",
-    *(f"{p}{end}" for p in POINTS for end in ("_c", "_est_c")),
-}
+_ELSEWHERE = {"t_s", "wall_s", "lateness_us", "busy_us", "state", "command", "command_value"}
 
 
 Family = tuple[str, str, str, list[tuple[str, float]]]
@@ -52,8 +42,13 @@ def metrics(shared: Shared | None) -> str:
     if shared is None or row is None:
         return "\n".join(_lines(families)) + "\n"
     found = readings(shared, row)
-    row = np.array([v if valid(n, found) else math.nan for n, v in zip(INDEX, row, strict=True)])
-    families += [*_state_families(row, found), *_signal_families(row), *_recorder_families(shared)]
+    valid, layout = valid_signals(shared.channels, found), shared.row
+    row = np.array([v if valid.get(n, True) else math.nan for n, v in zip(layout.names, row, strict=True)])
+    families += [
+        *_state_families(row, found, layout),
+        *_signal_families(row, layout),
+        *_recorder_families(shared),
+    ]
     lines = list(_lines(families))
     for name, meaning in HISTOGRAMS.items():
         lines += _histogram(f"thermoctl_{name}_seconds", meaning, shared.areas[name])
@@ -67,9 +62,9 @@ def _lines(families: Iterable[Family]) -> Iterator[str]:
         yield from (f"{name}{labels} {_number(value)}" for labels, value in samples)
 
 
-def _state_families(row: np.ndarray, found: Mapping[str, Mapping[str, Any]]) -> Iterator[Family]:
+def _state_families(row: np.ndarray, found: Mapping[str, Mapping[str, Any]], layout: Row) -> Iterator[Family]:
     """Yield state, faults, readings and temperatures."""
-    state, bits = int(row[INDEX["state"]]), fault_word(row)
+    state, bits = int(row[AT["state"]]), fault_word(row)
     yield (
         "thermoctl_state",
         "gauge",
@@ -100,27 +95,28 @@ def _state_families(row: np.ndarray, found: Mapping[str, Mapping[str, Any]]) -> 
         "gauge",
         "temperature of a point",
         [
-            (f'{{point="{p}",kind="{kind}"}}', row[INDEX[f"{p}{end}"]])
-            for p in POINTS
+            (f'{{point="{p}",kind="{kind}"}}', row[layout.index[f"{p}{end}"]])
+            for p in layout.channels.point_names
             for kind, end in (("measured", "_c"), ("estimated", "_est_c"))
         ],
     )
 
 
-def _signal_families(row: np.ndarray) -> Iterator[Family]:
+def _signal_families(row: np.ndarray, layout: Row) -> Iterator[Family]:
     """Yield the start time, and every signal that no other family holds."""
-    start_s = row[INDEX["wall_s"]] - row[INDEX["t_s"]]
+    start_s = row[AT["wall_s"]] - row[AT["t_s"]]
     yield (
         "thermoctl_start_time_seconds",
         "gauge",
         "when the daemon started, seconds since 1970",
         [("", start_s)],
     )
-    for s in SIGNALS:
+    temperatures = {f"{p}{end}" for p in layout.channels.point_names for end in ("_c", "_est_c")}
+    for s in layout.signals:
         if s.name in _COUNTERS:
-            yield _COUNTERS[s.name], "counter", s.meaning, [("", row[INDEX[s.name]])]
-        elif s.name not in _ELSEWHERE:
-            yield f"thermoctl_{s.name}", "gauge", s.meaning, [("", row[INDEX[s.name]])]
+            yield _COUNTERS[s.name], "counter", s.meaning, [("", row[layout.index[s.name]])]
+        elif s.name not in _ELSEWHERE | layout.bit_words | temperatures:
+            yield f"thermoctl_{s.name}", "gauge", s.meaning, [("", row[layout.index[s.name]])]
 
 
 def _recorder_families(shared: Shared) -> Iterator[Family]:

@@ -29,7 +29,6 @@ _READINGS = {
     "position, mean": "position_um",
     "compensated": "position_um",
     "output (proof)": "output_reference_um",
-    "innovation": "coil_c",
     "air": "air_c",
 }
 """Rows of the numbers, and the channel that must be valid for each."""
@@ -61,7 +60,7 @@ def errors(status: dict[str, Any]) -> tuple[float | None, float | None]:
 def remember(trails: dict[str, deque[float]], status: dict[str, Any]) -> None:
     """Add this status' values to the trails (NaN where there is none)."""
     with_, without = errors(status)
-    coil = (status.get("temperatures_c") or {}).get("coil")
+    coil = (status.get("temperatures_c") or {}).get(status.get("coil", "").removesuffix("_c"))
     values = {**status, "with": with_, "without": without, "coil_c": coil}
     for _, key, _, _ in TRAILS:
         value = values.get(key)
@@ -144,7 +143,7 @@ def _numbers(status: dict[str, Any]) -> Table:
 
 def _value(status: dict[str, Any], label: str, value: float | None) -> Text:
     """Return the number, or the state of the reading that makes it invalid."""
-    role = _READINGS.get(label)
+    role = status["coil"] if label == "innovation" else _READINGS.get(label)
     reading = status["readings"][role] if role and value is None else None
     if reading is None or reading["state"] in ("OK", "ABSENT"):
         return Text(number(value, 3))
@@ -163,7 +162,7 @@ def _temperatures(status: dict[str, Any]) -> Table:
         difference = None if measured is None or estimate is None else measured - estimate
         dead = reading["state"] not in ("OK", "ABSENT")
         table.add_row(
-            Text(name.replace("_", " "), style="yellow" if dead else ""),
+            Text(status["labels"][name], style="yellow" if dead else ""),
             Text("-" if dead else number(measured, 2), style="yellow" if dead else ""),
             Text(number(estimate, 2), style="" if estimated else "dim"),
             Text(reading["state"].lower(), style="yellow") if dead else number(difference, 2),

@@ -16,7 +16,7 @@ from typing import Any
 from hal.backend import HardwareError
 from hal.board import Board
 from hal.make import make_backend, slow_devices
-from hal.poller import run_poller
+from hal.poller import ports, run_poller
 from thermoctl.daemon import keep
 from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
@@ -77,6 +77,7 @@ def _loop_process(settings: Settings, shared: Shared, board: Any) -> int:
             shared.state,
             time.monotonic(),
             shared.make_remarks(settings.loop.period_s),
+            settings.channels,
         )
         _resume(settings, shared, rig)
 
@@ -145,6 +146,7 @@ def _tuner_process(settings: Settings, shared: Shared, board: Any) -> int:
         settings.rig.name,
         Path(settings.compensation.model),
         lambda text: console_log("tuned", what=text),
+        channels=settings.channels,
     )
     tuner.run(shared, tuning, stop)
     return EXIT_OK
@@ -159,8 +161,10 @@ def _reference_process(settings: Settings, shared: Shared, board: Any) -> int:
 
 
 def _poller_process(settings: Settings, shared: Shared, board: Any, device: str) -> int:
+    """Poll the devices of a port, of which `device` is one."""
     loops.die_with_parent()
-    run_poller(next(d for d in slow_devices(settings) if d.name == device), board.name)
+    groups = ports(slow_devices(settings))
+    run_poller(next(g for g in groups if device in (d.name for d in g)), board.name)
     return EXIT_OK
 
 
@@ -244,7 +248,7 @@ def restart(children: list[Child], now: float, log: Log) -> None:
 def make_children(settings: Settings, shared: Shared) -> tuple[Board | None, Child, list[Child]]:
     """Make the board of slow readings (None without slow devices), the loop and the helpers."""
     slow = slow_devices(settings) if settings.hal.backend == "devices" else []
-    board = Board.create(shared_name(settings) + "-board") if slow else None
+    board = Board.create(shared_name(settings) + "-board", len(settings.channels.names)) if slow else None
 
     def child(name: str, main: Callable[..., int], beat: int | None = None) -> Child:
         beats = None if beat is None else partial(shared.beats, beat)
@@ -252,15 +256,15 @@ def make_children(settings: Settings, shared: Shared) -> tuple[Board | None, Chi
 
     others = [
         Child(
-            f"poller {d.name}",
+            f"poller {group[0].name}",
             _poller_process,
             settings,
             shared,
             board,
-            d.name,
-            beats=partial(board.beat, d.roles),
+            group[0].name,
+            beats=partial(board.beat, group[0].roles),
         )
-        for d in slow
+        for group in ports(slow)
         if board is not None
     ]
     if settings.recording.enable:

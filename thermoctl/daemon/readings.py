@@ -13,20 +13,20 @@ from typing import Any
 import numpy as np
 
 from hal.drive_errors import describe
-from thermoctl.channels import CHANNELS, SIGNAL, STATUS_NAMES
+from thermoctl.channels import ERROR, STALE, STATUS_NAMES, Channels
 from thermoctl.control import causes, faults
 from thermoctl.daemon.ring import CODE, CODE_S, TRIPS
 from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.sources import SOURCES
-from thermoctl.signals import INDEX, fault_word
+from thermoctl.daemon.sources import sources
+from thermoctl.signals import AT, Row, fault_word, of_recording, recorded_states
 
 
-def verdict(status_bits: int, kind: float, channel: int) -> str:
-    """Return a channel's state: OK, ABSENT, or the error found by the device or the law.
+def verdict(status: int, kind: float) -> str:
+    """Return a channel's state: OK, ABSENT, or the error found by the device (status) or the law (kind).
 
     Errors are ERROR, STALE, RANGE, RATE and FROZEN.
     """
-    state = STATUS_NAMES[status_bits >> (2 * channel) & 3]
+    state = STATUS_NAMES[status]
     if state == "OK" and kind > 0.0:
         return faults.KINDS[int(kind) - 1].upper()
     return state
@@ -38,11 +38,12 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
     The message is the device's newest one, with its time (seconds since 1970); it stays when the channel
     is valid again.
     """
-    bits, found = int(row[INDEX["status_bits"]]), {}
-    begin_s = row[INDEX["wall_s"]] - row[INDEX["t_s"]]
-    for c, role in enumerate(CHANNELS):
-        state = verdict(bits, shared.areas["verdicts"][c], c)
-        last = _or_none(row[INDEX[SIGNAL[role]]])
+    statuses, found = shared.row.states(row)[0], {}
+    values = row[shared.row.readings]
+    begin_s = row[AT["wall_s"]] - row[AT["t_s"]]
+    for c, role in enumerate(shared.channels.names):
+        state = verdict(int(statuses[c]), shared.areas["verdicts"][c])
+        last = _or_none(values[c])
         said = shared.remarks.get(c) or (0, math.nan, "")
         found[role] = {
             "value": last if state == "OK" else None,
@@ -55,24 +56,33 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
     return found
 
 
-def valid(name: str, found: Mapping[str, Mapping[str, Any]]) -> bool:
-    """Return whether a signal is valid: every channel it comes from is."""
-    allowed = ("OK",) if name in SIGNAL.values() else ("OK", "ABSENT")
-    return all(found[role]["state"] in allowed for role in SOURCES.get(name, ()))
+def valid_signals(channels: Channels, found: Mapping[str, Mapping[str, Any]]) -> dict[str, bool]:
+    """Return for each signal that comes from channels whether it is valid: every such channel is."""
+    measured = set(channels.signal.values())
+    return {
+        name: all(
+            found[role]["state"] in (("OK",) if name in measured else ("OK", "ABSENT")) for role in roles
+        )
+        for name, roles in sources(channels).items()
+    }
 
 
-def hide_invalid(rows: np.ndarray, name: str) -> np.ndarray:
-    """Return a signal's column of rows (n, signals), NaN where one of its channels was invalid."""
-    values = rows[:, INDEX[name]]
-    return np.where(invalid(rows[:, INDEX["status_bits"]], name), np.nan, values)
+def hide_invalid(rows: np.ndarray, name: str, layout: Row) -> np.ndarray:
+    """Return a signal's column of rows (n, signals), NaN where one of its channels was stale or in error."""
+    channels = [layout.channels.index[role] for role in sources(layout.channels).get(name, ())]
+    states = layout.states(rows)[:, channels]
+    return np.where(((states == STALE) | (states == ERROR)).any(axis=1), np.nan, rows[:, layout.index[name]])
 
 
-def invalid(status_bits: np.ndarray, name: str) -> np.ndarray:
-    """Return for each status word whether a channel of this signal is stale or in error."""
-    bits, bad = np.nan_to_num(status_bits).astype(np.int64), np.zeros(len(status_bits), bool)
-    for role in SOURCES.get(name, ()):
-        state = bits >> (2 * CHANNELS.index(role)) & 3
-        bad |= (state == 1) | (state == 2)
+def invalid(columns: Mapping[str, np.ndarray], meta: Mapping[str, str], name: str) -> np.ndarray:
+    """Return for each row of a recording whether a channel of this signal is stale or in error.
+
+    columns: the recording's words of status bits; meta: its metadata.
+    """
+    states = recorded_states(columns, meta)
+    bad = np.zeros(len(next(iter(columns.values()))), bool)
+    for role in sources(of_recording(meta).channels).get(name, ()):
+        bad |= (states[role] == STALE) | (states[role] == ERROR)
     return bad
 
 
@@ -84,8 +94,8 @@ def drive_code(shared: Shared, row: np.ndarray) -> dict[str, Any] | None:
     code, at_s = (float(shared.areas["remark_numbers"][k]) for k in (CODE, CODE_S))
     if not code:
         return None
-    now = row[INDEX["amplifier_fault"]] == code
-    wall_s = row[INDEX["wall_s"]] - row[INDEX["t_s"]] + at_s
+    now = row[AT["amplifier_fault"]] == code
+    wall_s = row[AT["wall_s"]] - row[AT["t_s"]] + at_s
     return {"code": int(code), "text": describe(code), "wall_s": float(wall_s), "stands": bool(now)}
 
 
@@ -96,10 +106,10 @@ def standing_faults(
 
     `also`: bits of further faults to list, which are gone again in this row. Empty while the daemon starts.
     """
-    if row[INDEX["state"]] == 0.0:
+    if row[AT["state"]] == 0.0:
         return []
     trips, onsets = int(shared.areas["remark_numbers"][TRIPS]), shared.areas["onsets"]
-    begin_s = row[INDEX["wall_s"]] - row[INDEX["t_s"]]
+    begin_s = row[AT["wall_s"]] - row[AT["t_s"]]
     standing = [
         causes.Standing(f.name, float(onsets[f.bit, 0]), int(onsets[f.bit, 1]), float(onsets[f.bit, 2]))
         for f in faults.decode(fault_word(row) | also)
@@ -116,14 +126,18 @@ def standing_faults(
             "tick": f.tick,
             "follows": cause,
             "late_s": f.late_s if f.late_first and not cause else 0.0,
-            "messages": _messages(f, found, begin_s, code),
+            "messages": _messages(f, found, begin_s, code, shared.channels),
         }
         for f, cause in causes.in_order(standing, trips)
     ]
 
 
 def _messages(
-    fault: causes.Standing, found: Mapping[str, Any], begin_s: float, code: Mapping[str, Any] | None
+    fault: causes.Standing,
+    found: Mapping[str, Any],
+    begin_s: float,
+    code: Mapping[str, Any] | None,
+    channels: Channels,
 ) -> list[str]:
     """Return the devices' messages for this fault.
 
@@ -131,7 +145,7 @@ def _messages(
     """
     roles: dict[str, list[str]] = {}  # by message: a lost device gives each channel the same one
     texts: dict[str, str] = {}
-    for role in causes.channels_of(fault.name):
+    for role in causes.channels_of(fault.name, channels):
         r = found[role]
         since = r["message_wall_s"] is not None and r["message_wall_s"] >= begin_s + fault.t_s - 0.5
         if r["message"] and (since or r["state"] not in ("OK", "ABSENT")):

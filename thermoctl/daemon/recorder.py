@@ -24,11 +24,11 @@ from thermoctl.control.model import ARRAYS, PLAIN, CompensatorModel, Parameters
 from thermoctl.daemon.misfit import Misfit
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, RUN_S, Shared
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX
+from thermoctl.signals import AT
 
 INTERVAL_S = 0.1
-LAW_VERSION = 3  # of the law's inputs, state and arithmetic: a replay is bit for bit only within one
-_TICK, _GENERATION = INDEX["tick"], INDEX["generation"]
+LAW_VERSION = 4  # of the law's inputs, state and arithmetic: a replay is bit for bit only within one
+_TICK, _GENERATION = AT["tick"], AT["generation"]
 
 
 def encode(array: np.ndarray) -> str:
@@ -83,7 +83,9 @@ def read_law_metadata(text: str) -> dict[str, Any]:
     m = found["model"]
     if unknown := set(m) - {*PLAIN, *ARRAYS}:
         raise ValueError(f"the model has {', '.join(sorted(unknown))}, which this program does not know")
-    values: dict[str, Any] = {name: m[name] for name in PLAIN if name in m} | {"sensors": tuple(m["sensors"])}
+    values: dict[str, Any] = {name: m[name] for name in PLAIN if name in m} | {
+        k: tuple(m[k]) for k in ("sensors", "points") if k in m
+    }
     values |= {name: decode(m[name]["values"]).reshape(m[name]["shape"]) for name in ARRAYS if name in m}
     model = CompensatorModel(**values)
     return {
@@ -144,7 +146,7 @@ class Recorder:
             return
         try:
             alarm = self.misfit.add(
-                rows[:, INDEX["t_s"]], rows[:, INDEX["innovation_c"]], rows[:, INDEX["kalman_gain"]]
+                rows[:, AT["t_s"]], rows[:, AT["innovation_c"]], rows[:, AT["kalman_gain"]]
             )
         except Exception as e:  # a failing model check must never stop the recording
             self.misfit = None
@@ -201,14 +203,23 @@ def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) 
     """
     from thermoctl.daemon.assemble import compensator, law_parameters, rig_identity
     from thermoctl.recording.writer import RecordingWriter
-    from thermoctl.settings import effective
+    from thermoctl.settings import POINTS, effective
 
     config, rig = effective(settings), rig_identity(settings)
     run = datetime.fromtimestamp(float(shared.counters[RUN_S]), UTC).strftime("%Y%m%dT%H%M%SZ")
 
     def open_writer(law: str) -> RecordingWriter:
-        metadata = {"rig": rig, "run": run, "config": config, "law": law, "faults": json.dumps(faults.NAMES)}
-        return RecordingWriter(settings.recording, metadata, rig, lambda text: log("recorder", what=text))
+        metadata = {
+            "rig": rig,
+            "run": run,
+            "config": config,
+            "law": law,
+            "faults": json.dumps(faults.NAMES),
+            POINTS: settings.channels.text(),
+        }
+        return RecordingWriter(
+            settings.recording, metadata, rig, lambda text: log("recorder", what=text), settings.row.signals
+        )
 
     return Recorder(
         shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer, log

@@ -7,16 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.channels import of_names
 from thermoctl.control.law import Law
 from thermoctl.daemon.recorder import read_law_metadata
 from thermoctl.daemon.ring import unpack_readings
 from thermoctl.recording.reader import info, read_rows
-from thermoctl.signals import INDEX, OUTPUTS
+from thermoctl.signals import AT, OUTPUTS, of_channels
 from thermoctl.yamlfile import InputError
 
-_CHANNELS, _OUTPUTS = INDEX["position_raw_um"], INDEX["state"]
-_BITS = [INDEX[n] for n in ("fresh_bits", "status_bits", "delay_bits")]
-_DT, _COMMAND, _VALUE, _EXTERNAL = (INDEX[n] for n in ("dt_s", "command", "command_value", "external_bits"))
+_DT, _COMMAND, _VALUE, _EXTERNAL = (AT[n] for n in ("dt_s", "command", "command_value", "external_bits"))
 
 
 @dataclass
@@ -24,7 +23,7 @@ class Replay:
     """Result of a replay.
 
     `ticks` compared, `skipped` before the stored state; `differences` {signal: (ticks that differ, first
-    of them, largest difference)}; `outputs` (ticks, len(OUTPUTS)) of this replay.
+    of them, largest difference)}; `outputs` (ticks, outputs) of this replay.
     """
 
     ticks: int
@@ -34,7 +33,7 @@ class Replay:
 
 
 def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Replay:
-    """Run `rows` (ticks, len(SIGNALS)) through a law made from the recording's own metadata.
+    """Run `rows` (ticks, signals) through a law made from the recording's own metadata.
 
     A recording of this law's version has its fault bits: a bit is never given to another fault
     (control/faults.py).
@@ -47,50 +46,55 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
         tick = int(found["tick"])
         if found["state"] is not None:
             law.restore(found["state"])
+        layout = of_channels(of_names(found["model"].points))
+        if rows.shape[1] != len(layout):
+            raise ValueError(f"rows of {rows.shape[1]} signals, expected {len(layout)}")
     except (ValueError, KeyError, TypeError, OverflowError) as e:
         raise InputError(
             f"{name}: holds no usable law to replay ({e}): replay it with the version that recorded it"
         ) from None
-    ticks = rows[:, INDEX["tick"]]
+    ticks = rows[:, AT["tick"]]
     skipped = int(np.searchsorted(ticks, tick, side="right"))
     rows = np.ascontiguousarray(rows[skipped:])
-    if len(rows) and rows[0, INDEX["tick"]] != tick + 1:
+    if len(rows) and rows[0, AT["tick"]] != tick + 1:
         raise InputError(
             f"{name}: the stored state is of tick {tick}, the next row is tick "
-            f"{rows[0, INDEX['tick']]:.0f}; ticks are missing, so a replay cannot start"
+            f"{rows[0, AT['tick']]:.0f}; ticks are missing, so a replay cannot start"
         )
-    missing = np.flatnonzero(np.diff(rows[:, INDEX["tick"]]) != 1)
+    missing = np.flatnonzero(np.diff(rows[:, AT["tick"]]) != 1)
     if len(missing):
         raise InputError(
-            f"{name}: ticks are missing after tick {rows[missing[0], INDEX['tick']]:.0f} (the recorder "
+            f"{name}: ticks are missing after tick {rows[missing[0], AT['tick']]:.0f} (the recorder "
             "fell behind); a replay would not start from the same state"
         )
-    whole = rows[:, [_COMMAND, _EXTERNAL, *_BITS]]
+    bits = range(layout.fresh.start, layout.delay.stop)
+    whole = rows[:, [_COMMAND, _EXTERNAL, *bits]]
     wrong = np.flatnonzero(
-        ~((whole == np.floor(whole)) & (np.abs(whole) <= [100, *[2.0**53] * 4])).all(axis=1)
+        ~((whole == np.floor(whole)) & (np.abs(whole) <= [100, *[2.0**53] * (1 + len(bits))])).all(axis=1)
     )
     if len(wrong):
         raise InputError(
-            f"{name}: tick {rows[wrong[0], INDEX['tick']]:.0f} has a command, or bits, that are no whole number: "
+            f"{name}: tick {rows[wrong[0], AT['tick']]:.0f} has a command, or bits, that are no whole number: "
             "damaged"
         )
-    n = _BITS[0] - _CHANNELS
+    n = layout.readings.stop - layout.readings.start
     value, (fresh, status, delay) = np.zeros(n), np.zeros((3, n), dtype=np.uint8)
     law.bind(value, fresh, status, delay)
-    given = np.empty((len(rows), len(OUTPUTS)))
+    outputs = [*(AT[name] for name in OUTPUTS), *range(layout.estimates.start, layout.estimates.stop)]
+    given = np.empty((len(rows), len(outputs)))
     for k, row in enumerate(rows):
-        value[:] = row[_CHANNELS : _BITS[0]]
-        unpack_readings(row[_BITS[0]], row[_BITS[1]], row[_BITS[2]], fresh, status, delay)
+        value[:] = row[layout.readings]
+        unpack_readings(row[bits.start : bits.stop], fresh, status, delay)
         law.step(row[_DT], int(row[_COMMAND]), row[_VALUE], int(row[_EXTERNAL]))
         given[k] = law.outputs
-    recorded = np.ascontiguousarray(rows[:, _OUTPUTS:])
+    recorded = np.ascontiguousarray(rows[:, outputs])
     differences = {}
     same = given.view(np.uint64) == recorded.view(np.uint64)
-    for j, output in enumerate(OUTPUTS):
+    for j, output in enumerate(layout.names[k] for k in outputs):
         wrong = np.flatnonzero(~same[:, j])
         if len(wrong):
             largest = float(np.nanmax(np.abs(given[wrong, j] - recorded[wrong, j]), initial=0.0))
-            differences[output] = (len(wrong), int(rows[wrong[0], INDEX["tick"]]), largest)
+            differences[output] = (len(wrong), int(rows[wrong[0], AT["tick"]]), largest)
     return Replay(len(rows), skipped, differences, given)
 
 

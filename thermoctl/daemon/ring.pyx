@@ -14,10 +14,12 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from thermoctl.channels import INDEX, THERMAL
+from thermoctl.channels import AT
+from thermoctl.signals import DELAYS_PER_WORD, FRESH_PER_WORD, OUTPUTS, STATUS_PER_WORD
 
-# The channels whose delay is recorded, air_c and the twelve temperatures: 13 x 4 bits are exact in a float64.
-cdef int FIRST_DELAYED = INDEX[THERMAL[0]], DELAYED = len(THERMAL)
+# The air and the points have their delay recorded. All words hold at most 52 bits, exact in a float64.
+cdef int FIRST_DELAYED = AT["air_c"], OUTPUTS_OF_EVERY_RIG = len(OUTPUTS)
+cdef int FRESH_WORD = FRESH_PER_WORD, STATUS_WORD = STATUS_PER_WORD, DELAY_WORD = DELAYS_PER_WORD
 
 cdef extern from *:
     """
@@ -168,13 +170,21 @@ cdef class Histogram:
             self.largest[0] = microseconds
 
 
+cdef inline int words(int count, int per_word) noexcept:
+    return (count + per_word - 1) // per_word
+
+
+cdef inline int bit_words_of(int channels) noexcept:
+    return words(channels, FRESH_WORD) + words(channels, STATUS_WORD) + words(channels - FIRST_DELAYED, DELAY_WORD)
+
+
 cdef class Record:
     """The record row of a tick. The loop writes the first `head` scalars itself; `fill` copies the rest.
 
-    Layout (signals.SIGNALS), with bits as whole float64 numbers:
+    Layout (signals.Row), with bits as whole float64 numbers:
 
-        head scalars | values of the channels | fresh bits (one a channel) | status bits (two a channel) |
-        delay bits (four a temperature) | outputs of the law
+        head scalars | outputs of the law | values of the channels | fresh bits (one a channel) | status bits
+        (two a channel) | delay bits (four a temperature) | the points' estimates
     """
     def __init__(self, double[::1] row, int head):
         self.row, self.head = row, head
@@ -185,22 +195,37 @@ cdef class Record:
 
         Raises ValueError when they do not make up a row.
         """
-        if self.head + value.shape[0] + 3 + outputs.shape[0] != self.row.shape[0] or value.shape[0] > 26:
-            raise ValueError(f"{self.head} + {value.shape[0]} + 3 + {outputs.shape[0]} numbers are not a row of {self.row.shape[0]}")
+        cdef int n = <int>value.shape[0]
+        cdef int bits = bit_words_of(n)
+        if self.head + n + bits + outputs.shape[0] != self.row.shape[0] or outputs.shape[0] < OUTPUTS_OF_EVERY_RIG:
+            raise ValueError(f"{self.head} + {n} + {bits} + {outputs.shape[0]} numbers are not a row of {self.row.shape[0]}")
         self.value, self.fresh, self.status, self.delay, self.outputs = value, fresh, status, delay, outputs
 
     cpdef void fill(self) noexcept:
         """Copy the bound arrays into the row."""
-        cdef int k, n = <int>self.value.shape[0]
-        cdef uint64_t f = 0, s = 0, d = 0
-        memcpy(&self.row[self.head], &self.value[0], n * sizeof(double))
-        for k in range(n):
-            f |= <uint64_t>(self.fresh[k] != 0) << k
-            s |= <uint64_t>(self.status[k] & 3) << (2 * k)
-        for k in range(FIRST_DELAYED, min(n, FIRST_DELAYED + DELAYED)):
-            d |= <uint64_t>(self.delay[k] & 15) << (4 * (k - FIRST_DELAYED))
-        self.row[self.head + n], self.row[self.head + n + 1], self.row[self.head + n + 2] = <double>f, <double>s, <double>d
-        memcpy(&self.row[self.head + n + 3], &self.outputs[0], self.outputs.shape[0] * sizeof(double))
+        cdef int k, n = <int>self.value.shape[0], at = self.head
+        memcpy(&self.row[at], &self.outputs[0], OUTPUTS_OF_EVERY_RIG * sizeof(double))
+        at += OUTPUTS_OF_EVERY_RIG
+        memcpy(&self.row[at], &self.value[0], n * sizeof(double))
+        at = pack(self.row, at + n, self.fresh, 0, 1, FRESH_WORD)
+        at = pack(self.row, at, self.status, 0, 2, STATUS_WORD)
+        at = pack(self.row, at, self.delay, FIRST_DELAYED, 4, DELAY_WORD)
+        memcpy(&self.row[at], &self.outputs[OUTPUTS_OF_EVERY_RIG], (self.outputs.shape[0] - OUTPUTS_OF_EVERY_RIG) * sizeof(double))
+
+
+cdef int pack(double[::1] row, int at, unsigned char[::1] numbers, int first, int bits, int per_word) noexcept:
+    """Write the numbers from `first` on into words at `at`, `bits` bits each; return the place after them."""
+    cdef int k = first, n = <int>numbers.shape[0], last
+    cdef uint64_t word, mask = (1 << bits) - 1
+    while k < n:
+        last, word = min(k + per_word, n), 0
+        while last > k:
+            last -= 1
+            word = word << bits | (numbers[last] & mask)
+        row[at] = <double>word
+        at += 1
+        k += per_word
+    return at
 
 
 TRIPS, CODE, CODE_S = range(3)
@@ -210,7 +235,7 @@ LATE_FOR_S = 1.0    # time after the gap for which it is reported
 
 
 cdef class Remarks:
-    """Data that the loop publishes besides the row. Channels are channels.CHANNELS.
+    """Data that the loop publishes besides the row. Channels are those of the rig.
 
         ages, verdicts   float64 (channels,): of every tick, as in the law
         numbers          float64 (3,): TRIPS, CODE, CODE_S
@@ -279,13 +304,22 @@ cdef class Remarks:
         return int(before), t_s, text.rstrip(b"\0").decode("utf-8", "replace")
 
 
-def unpack_readings(double fresh_bits, double status_bits, double delay_bits, unsigned char[::1] fresh,
-                    unsigned char[::1] status, unsigned char[::1] delay):
-    """Unpack the bits that `Record.fill` packed, into the given arrays."""
-    cdef uint64_t f = <uint64_t>fresh_bits, s = <uint64_t>status_bits, d = <uint64_t>delay_bits
-    cdef int c
-    for c in range(fresh.shape[0]):
-        fresh[c] = f >> c & 1
-        status[c] = s >> (2 * c) & 3
-        if FIRST_DELAYED <= c < FIRST_DELAYED + DELAYED:
-            delay[c] = d >> (4 * (c - FIRST_DELAYED)) & 15
+def unpack_readings(double[::1] bit_words, unsigned char[::1] fresh, unsigned char[::1] status, unsigned char[::1] delay):
+    """Unpack the words of bits that `Record.fill` packed, into the given arrays over the channels.
+
+    Raises ValueError for another number of words.
+    """
+    cdef int at, n = <int>fresh.shape[0]
+    if bit_words.shape[0] != bit_words_of(n) or status.shape[0] != n or delay.shape[0] != n:
+        raise ValueError(f"{bit_words.shape[0]} words of bits for {n} channels, expected {bit_words_of(n)}")
+    at = unpack(bit_words, 0, fresh, 0, 1, FRESH_WORD)
+    at = unpack(bit_words, at, status, 0, 2, STATUS_WORD)
+    unpack(bit_words, at, delay, FIRST_DELAYED, 4, DELAY_WORD)
+
+
+cdef int unpack(double[::1] row, int at, unsigned char[::1] numbers, int first, int bits, int per_word) noexcept:
+    cdef int k, n = <int>numbers.shape[0]
+    cdef uint64_t mask = (1 << bits) - 1
+    for k in range(first, n):
+        numbers[k] = <uint64_t>row[at + (k - first) // per_word] >> bits * ((k - first) % per_word) & mask
+    return at + words(n - first, per_word)

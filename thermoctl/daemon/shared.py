@@ -5,7 +5,8 @@ removes it; a segment left behind by a killed daemon is replaced. It is a mapped
 multiprocessing's own class is not used: it starts one more process, which removes the segment of a killed
 daemon at any later time.
 
-    ring        the record of every tick (rows in the order of signals.SIGNALS)
+    declaration the rig's points: the sizes of all areas follow from it (signals.Row)
+    ring        the record of every tick
     mailbox     commands to the loop;  parameters: the block that a RELOAD command applies
     remarks     age and verdict of every reading, onset of every active fault, messages of the devices
     state       the law's state at intervals, with tick and generation: where a recording's replay starts
@@ -25,47 +26,57 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.channels import CHANNELS
+from thermoctl.channels import DEFAULT, Channels, of_text
 from thermoctl.control import faults
-from thermoctl.control.model import NAMES
+from thermoctl.control.model import packed_names
 from thermoctl.daemon.ring import Box, Histogram, Mailbox, Remarks, Ring
-from thermoctl.signals import SIGNALS
+from thermoctl.signals import Row, of_channels
 from thermoctl.yamlfile import InputError
 
-VERSION = 1
+VERSION = 2
 MAGIC = 0x7468726D6F63746C  # 'thrmoctl'
 ROWS = 8192  # ticks a reader may lag behind
 BINS = 4096  # us
-STATE_NUMBERS = 1024
+STATE_NUMBERS = 4096
 TEXT_WORDS = 40  # of 8 bytes each, for a device's message
 COUNTER_WORDS = 512  # of 8 bytes each, for the counters of all devices as text
 SHARED_MEMORY = Path("/dev/shm")
 
-_AREAS = (
-    ("header", "u8", (4,)),
-    ("ring_head", "u8", (1,)),
-    ("rows", "f8", (ROWS, len(SIGNALS))),
-    ("mail_counters", "u8", (2,)),
-    ("mail", "f8", (64, 2)),
-    ("parameters_sequence", "u8", (1,)),
-    ("parameters", "f8", (len(NAMES) + 1,)),
-    ("state_sequence", "u8", (1,)),
-    ("state", "f8", (STATE_NUMBERS,)),
-    ("lateness", "u8", (BINS + 1,)),
-    ("busy", "u8", (BINS + 1,)),
-    ("reference", "u8", (BINS + 1,)),
-    ("largest", "f8", (3,)),
-    ("counters", "f8", (16,)),
-    ("ages", "f8", (len(CHANNELS),)),
-    ("verdicts", "f8", (len(CHANNELS),)),
-    ("remark_numbers", "f8", (3,)),
-    ("onsets", "f8", (64, 3)),
-    ("text_sequences", "u8", (len(CHANNELS),)),
-    ("text_times", "f8", (len(CHANNELS),)),
-    ("texts", "u8", (len(CHANNELS), TEXT_WORDS)),
-    ("device_counters_sequence", "u8", (1,)),
-    ("device_counters", "f8", (COUNTER_WORDS,)),
-)
+DECLARATION_BYTES = 16384
+_HEADER = 4  # numbers: MAGIC, VERSION, layout, bytes of the segment
+
+
+def _areas(row: Row) -> tuple[tuple[str, str, tuple[int, ...]], ...]:
+    """Return the areas' names, types and shapes for a rig with this row."""
+    channels = len(row.channels.names)
+    return (
+        ("header", "u8", (_HEADER,)),
+        ("declaration", "u8", (DECLARATION_BYTES // 8,)),
+        ("ring_head", "u8", (1,)),
+        ("rows", "f8", (ROWS, len(row))),
+        ("mail_counters", "u8", (2,)),
+        ("mail", "f8", (64, 2)),
+        ("parameters_sequence", "u8", (1,)),
+        ("parameters", "f8", (len(packed_names(row.channels.names)) + 1,)),
+        ("state_sequence", "u8", (1,)),
+        ("state", "f8", (STATE_NUMBERS,)),
+        ("lateness", "u8", (BINS + 1,)),
+        ("busy", "u8", (BINS + 1,)),
+        ("reference", "u8", (BINS + 1,)),
+        ("largest", "f8", (3,)),
+        ("counters", "f8", (16,)),
+        ("ages", "f8", (channels,)),
+        ("verdicts", "f8", (channels,)),
+        ("remark_numbers", "f8", (3,)),
+        ("onsets", "f8", (64, 3)),
+        ("text_sequences", "u8", (channels,)),
+        ("text_times", "f8", (channels,)),
+        ("texts", "u8", (channels, TEXT_WORDS)),
+        ("device_counters_sequence", "u8", (1,)),
+        ("device_counters", "f8", (COUNTER_WORDS,)),
+    )
+
+
 START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED, RUN_S = range(8)
 """Indices in `counters`. TUNING: 1 + percent, 0 without tuning. RUN_S: start of this run, seconds since 1970.
 
@@ -73,17 +84,26 @@ RESUMED: 1 when the law started with the estimates of an earlier run.
 """
 BEATS = 8
 """First index in `counters` of the helpers' round counts; the supervisor detects one that hangs."""
-_LAYOUT = zlib.crc32(json.dumps([_AREAS, [s.name for s in SIGNALS], NAMES, faults.NAMES]).encode())
+
+
+def _layout(row: Row) -> int:
+    """Return a number that differs for another layout of the segment."""
+    names = [row.names, packed_names(row.channels.names), faults.NAMES]
+    return zlib.crc32(json.dumps([_areas(row), names]).encode())
 
 
 class Shared:
-    """The segment with its areas; the supervisor calls `create`, others `attach`."""
+    """The segment with its areas; the supervisor calls `create`, others `attach`.
 
-    def __init__(self, memory: mmap.mmap, path: Path):
+    `row`: the signals of its rows; `channels`: the rig's channels.
+    """
+
+    def __init__(self, memory: mmap.mmap, path: Path, channels: Channels):
         self._memory, self._path = memory, path
+        self.channels, self.row = channels, of_channels(channels)
         at = 0
         self.areas: dict[str, np.ndarray] = {}
-        for name, kind, shape in _AREAS:
+        for name, kind, shape in _areas(self.row):
             array: np.ndarray = np.ndarray(shape, kind, memory, at)
             self.areas[name] = array
             at += array.nbytes
@@ -114,9 +134,14 @@ class Shared:
         )
 
     @classmethod
-    def create(cls, name: str) -> Shared:
+    def create(cls, name: str, channels: Channels = DEFAULT) -> Shared:
         """Create the segment; one that a killed daemon left behind is removed first."""
-        size = sum(int(np.prod(shape)) * 8 for _, _, shape in _AREAS)
+        row, text = of_channels(channels), channels.text().encode()
+        if len(text) > DECLARATION_BYTES:
+            raise InputError(
+                f"points: names and labels of {len(text)} bytes; at most {DECLARATION_BYTES} fit"
+            )
+        size = sum(int(np.prod(shape)) * 8 for _, _, shape in _areas(row))
         path = SHARED_MEMORY / name
         try:
             path.unlink(missing_ok=True)
@@ -127,10 +152,11 @@ class Shared:
             ) from None
         try:
             os.ftruncate(file, size)
-            shared = cls(mmap.mmap(file, size), path)
+            shared = cls(mmap.mmap(file, size), path, channels)
         finally:
             os.close(file)
-        shared.areas["header"][:] = MAGIC, VERSION, _LAYOUT, size
+        shared.areas["declaration"].view("u1")[: len(text)] = np.frombuffer(text, "u1")
+        shared.areas["header"][:] = MAGIC, VERSION, _layout(row), size
         shared.counters[RUN_S] = time.time()
         return shared
 
@@ -151,14 +177,17 @@ class Shared:
             ) from None
         try:
             memory = mmap.mmap(file, 0)
-            header = tuple(int(h) for h in np.ndarray((4,), "u8", memory))
-        except (ValueError, TypeError):  # empty, or shorter than a header
-            header = ()
+            header = tuple(int(h) for h in np.ndarray((_HEADER,), "u8", memory))
+            if header[:2] != (MAGIC, VERSION) or len(memory) < header[3]:
+                raise ValueError("another version")
+            channels = of_text(memory[8 * _HEADER : 8 * _HEADER + DECLARATION_BYTES].rstrip(b"\0").decode())
+            if header[2] != _layout(of_channels(channels)):
+                raise ValueError("another version")
+        except (ValueError, TypeError):  # also where it is empty, or shorter than a header
+            raise InputError(f"shared memory '{name}': of another version; restart the daemon") from None
         finally:
             os.close(file)
-        if header[:3] != (MAGIC, VERSION, _LAYOUT) or len(memory) < header[3]:
-            raise InputError(f"shared memory '{name}': of another version; restart the daemon")
-        return cls(memory, path)
+        return cls(memory, path, channels)
 
     def beats(self, place: int) -> float:
         """Return the rounds that the helper at this place has done."""

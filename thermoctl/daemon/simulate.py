@@ -15,12 +15,12 @@ import numpy as np
 
 from hal.make import make_backend
 from thermoctl.control import arming, faults
-from thermoctl.control.model import NAMES, CompensatorModel, Parameters
+from thermoctl.control.model import CompensatorModel, Parameters, packed_length
 from thermoctl.daemon.assemble import compensator, law_parameters
 from thermoctl.daemon.loop import RELOAD, Rig
 from thermoctl.daemon.ring import Box, Mailbox
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX, SIGNALS, fault_word
+from thermoctl.signals import AT, fault_word
 
 COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reload": RELOAD}
 
@@ -28,7 +28,8 @@ COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reloa
 class Simulation:
     """One rig in simulated time: `command` sends a command, `tick` advances by one period.
 
-    `row` is the newest record row (INDEX of signals.py), `law` the control law, `backend` the open back end.
+    `row` is the newest record row (`settings.row` has its signals), `law` the control law,
+    `backend` the open back end.
     The setting hal.backend must be simulated or replay. `model` and `parameters`: those of the settings if
     None.
     """
@@ -46,7 +47,7 @@ class Simulation:
         self.backend.open()
         self.mailbox, self.box = (
             Mailbox(np.zeros(2, np.uint64), np.zeros((64, 2))),
-            Box(np.zeros(1, np.uint64), np.zeros(len(NAMES) + 1)),
+            Box(np.zeros(1, np.uint64), np.zeros(packed_length(len(settings.channels.names)) + 1)),
         )
         self.quiet = publish is None
         self.rig = Rig(
@@ -57,6 +58,7 @@ class Simulation:
             publish or (lambda row: None),
             self.mailbox,
             self.box,
+            channels=settings.channels,
         )
         self.rig.wall_s = lambda: self.now_s
         self.law, self.row = self.rig.law, self.rig.row
@@ -97,7 +99,7 @@ class Simulation:
 
     def arm(self, limit_s: float = 20.0) -> None:
         """Wait for READY and arm. Raises RuntimeError when READY does not come."""
-        state = INDEX["state"]
+        state = AT["state"]
         if not self.until(lambda row: row[state] == arming.READY, limit_s):
             raise RuntimeError(
                 f"not READY within {limit_s} s: state {arming.STATES[int(self.row[state])]}, faults "
@@ -124,7 +126,7 @@ def run_simulated(
     every: int = 1,
     model: CompensatorModel | None = None,
 ) -> np.ndarray:
-    """Run `duration_s` of rig time; returns every `every`-th row, (N, len(SIGNALS)).
+    """Run `duration_s` of rig time; returns every `every`-th row, (N, signals).
 
     schedule: (time_s, command, value) in order of time; command arm, disarm or setpoint (um). seed replaces
     hal.seed.
@@ -135,7 +137,7 @@ def run_simulated(
     period_s = simulation.period_s
     waiting = deque((round(item[0] / period_s), *item[1:]) for item in schedule)
     ticks = round(duration_s / period_s)
-    rows = np.empty((ticks // every, len(SIGNALS)))
+    rows = np.empty((ticks // every, len(settings.row)))
     try:
         for k in range(ticks):
             while waiting and waiting[0][0] <= k:
@@ -163,9 +165,9 @@ def trapezoids(settings: Settings, hours: float, compensate: bool, out: str | No
     simulation.arm()
     half, steps = round(CYCLE_S / 2 / simulation.period_s), round(hours * 3600.0 / simulation.period_s)
     keep = max(1, round(0.1 / simulation.period_s))
-    rows = np.empty((steps // keep, len(SIGNALS)))
+    rows = np.empty((steps // keep, len(settings.row)))
     standing = round(SETTLE_S / simulation.period_s)
-    setpoint, reference, output = (INDEX[n] for n in ("setpoint_um", "reference_um", "output_reference_um"))
+    setpoint, reference, output = (AT[n] for n in ("setpoint_um", "reference_um", "output_reference_um"))
     stood, settled = 0, np.zeros(len(rows), dtype=bool)
     for k in range(steps):
         if k % half == 0:
@@ -174,14 +176,14 @@ def trapezoids(settings: Settings, hours: float, compensate: bool, out: str | No
         stood = stood + 1 if row[setpoint] == row[reference] else 0
         if k % keep == keep - 1:
             rows[k // keep], settled[k // keep] = row, stood > standing
-    state = arming.STATES[int(simulation.row[INDEX["state"]])]
+    state = arming.STATES[int(simulation.row[AT["state"]])]
     simulation.close()
     error = (rows[:, output] - rows[:, setpoint])[settled]
-    coil = rows[:, INDEX["coil_est_c"]]
+    coil = rows[:, settings.row.estimates.start]
     print(
         f"{hours:g} h of rig time, compensation {'on' if compensate else 'off'}: state {state}, coil "
         f"{coil[0]:.1f} to {coil.max():.1f} C, compensation up to "
-        f"{np.abs(rows[:, INDEX['compensation_um']]).max():.2f} um"
+        f"{np.abs(rows[:, AT['compensation_um']]).max():.2f} um"
     )
     print(
         f"output minus setpoint, {settled.sum()} settled samples: mean {error.mean():+.3f} um, 2 sigma "
@@ -191,6 +193,10 @@ def trapezoids(settings: Settings, hours: float, compensate: bool, out: str | No
         from thermoctl.recording.files import write_table
         from thermoctl.recording.table import Table
 
-        columns = {s.name: np.ascontiguousarray(rows[:, i]) for i, s in enumerate(SIGNALS) if s.name != "t_s"}
-        write_table(out, Table(name="simulated", path=out, t=rows[:, INDEX["t_s"]].copy(), columns=columns))
+        columns = {
+            s.name: np.ascontiguousarray(rows[:, i])
+            for i, s in enumerate(settings.row.signals)
+            if s.name != "t_s"
+        }
+        write_table(out, Table(name="simulated", path=out, t=rows[:, AT["t_s"]].copy(), columns=columns))
     return 0 if np.abs(error).max() <= 0.5 and state == "ARMED" else 1

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from thermoctl.channels import CHANNELS, STATUS_NAMES
+import numpy as np
+
+from thermoctl.channels import STATUS_NAMES
 from thermoctl.control import arming
 from thermoctl.daemon import readings
 from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
-from thermoctl.signals import INDEX, POINTS
+from thermoctl.signals import AT, Row
 
 NUMBERS = (
     "setpoint_um",
@@ -55,24 +57,27 @@ def status(shared: Shared) -> dict[str, Any]:
             "compensation_um": None,
         }
     found = readings.readings(shared, row)
+    valid, coil = readings.valid_signals(shared.channels, found), shared.channels.coil
     number = {
-        name: float(row[i]) if math.isfinite(row[i]) and readings.valid(name, found) else None
-        for name, i in INDEX.items()
+        name: float(row[i]) if math.isfinite(row[i]) and valid.get(name, True) else None
+        for name, i in shared.row.index.items()
     }
     busy = percentiles(shared.areas["busy"])
     return {
-        "state": arming.STATES[int(row[INDEX["state"]])],
-        "ticks": int(row[INDEX["tick"]]),
-        "slips": int(row[INDEX["slips"]]),
-        "generation": int(row[INDEX["generation"]]),
+        "state": arming.STATES[int(row[AT["state"]])],
+        "ticks": int(row[AT["tick"]]),
+        "slips": int(row[AT["slips"]]),
+        "generation": int(row[AT["generation"]]),
         "uptime_s": number["t_s"],
         **{name: number[name] for name in NUMBERS},
         "channels": {role: r["state"] for role, r in found.items()},
         "readings": found,
-        "estimates_state": "OK" if found["coil_c"]["state"] == "OK" else "NOT CORRECTED",
+        "estimates_state": "OK" if found[coil]["state"] == "OK" else "NOT CORRECTED",
+        "coil": coil,
+        "labels": shared.channels.labels,
         "drive_code": readings.drive_code(shared, row),
-        "temperatures_c": {p: number[f"{p}_c"] for p in POINTS},
-        "estimates_c": {p: number[f"{p}_est_c"] for p in POINTS},
+        "temperatures_c": {p: number[f"{p}_c"] for p in shared.channels.point_names},
+        "estimates_c": {p: number[f"{p}_est_c"] for p in shared.channels.point_names},
         "lateness_us": number["lateness_us"],
         "busy_us": number["busy_us"],
         "busy_p50_us": _or_none(busy[0]),
@@ -86,9 +91,12 @@ def status(shared: Shared) -> dict[str, Any]:
     }
 
 
-def channel_states(status_bits: int) -> dict[str, str]:
-    """Return each channel's state, OK, STALE, ERROR or ABSENT, from the signal status_bits."""
-    return {name: STATUS_NAMES[status_bits >> (2 * c) & 3] for c, name in enumerate(CHANNELS)}
+def channel_states(row: np.ndarray, layout: Row) -> dict[str, str]:
+    """Return each channel's state in a record row: OK, STALE, ERROR or ABSENT."""
+    return {
+        name: STATUS_NAMES[state]
+        for name, state in zip(layout.channels.names, layout.states(row)[0], strict=True)
+    }
 
 
 def latency(shared: Shared, period_s: float) -> dict[str, Any]:
@@ -96,8 +104,8 @@ def latency(shared: Shared, period_s: float) -> dict[str, Any]:
     row = shared.ring.newest()
     answer: dict[str, Any] = {
         "period_us": period_s * 1e6,
-        "ticks": 0 if row is None else int(row[INDEX["tick"]]),
-        "slips": 0 if row is None else int(row[INDEX["slips"]]),
+        "ticks": 0 if row is None else int(row[AT["tick"]]),
+        "slips": 0 if row is None else int(row[AT["slips"]]),
     }
     for k, name in enumerate(("lateness", "busy", "reference")):
         counts = shared.areas[name].copy()  # the loop continues to count

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from thermoctl.channels import SIGNAL
+from thermoctl.channels import FIXED, Channels
 
-SOURCES: dict[str, tuple[str, ...]] = {
-    **{signal: (role,) for role, signal in SIGNAL.items()},
+FIXED_SOURCES: dict[str, tuple[str, ...]] = {
+    **{c.signal: (c.role,) for c in FIXED},
     "position_um": ("position_um",),
     "compensated_um": ("position_um",),
     "power_w": ("voltage_v", "current_a"),
-    "innovation_c": ("coil_c",),
-    "kalman_gain": ("coil_c",),
     "air_rate_k_s": ("air_c",),
 }
-"""Channels that must be valid for a signal to be valid.
+"""Channels that must be valid for a signal of every rig to be valid.
 
 A computed signal may have ABSENT channels: the law does without them.
 """
+
+
+def sources(channels: Channels) -> dict[str, tuple[str, ...]]:
+    """Return the same for all signals of a rig with these channels."""
+    return {
+        **FIXED_SOURCES,
+        **{role: (role,) for role in channels.temperatures},
+        "innovation_c": (channels.coil,),
+        "kalman_gain": (channels.coil,),
+    }

@@ -26,7 +26,7 @@ from hal.make import disable_amplifier
 from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep
 from thermoctl.daemon import loop as loops
-from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
+from thermoctl.daemon.assemble import check_mode, compensator, law_parameters, shared_name
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.journal import Log, Watcher, console_log
 from thermoctl.daemon.lock import hold
@@ -93,11 +93,12 @@ def run(settings: Settings, log: Log = console_log) -> int:
     lock = hold(settings)
     compensator(settings)
     law_parameters(settings)
+    check_mode(settings)
     if settings.compensation.tune:  # loaded only on demand, because it loads scipy
         from thermoctl.daemon import tuner
 
         tuner.check(settings)
-    shared = Shared.create(shared_name(settings))
+    shared = Shared.create(shared_name(settings), settings.channels)
     board = None
     try:
         board, loop, others = make_children(settings, shared)

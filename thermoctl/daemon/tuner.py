@@ -13,21 +13,21 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.channels import CHANNELS
+from thermoctl.channels import AT as CHANNEL_AT
+from thermoctl.channels import DEFAULT, Channels
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.shared import TUNING, Shared
 from thermoctl.identify import modelfile
 from thermoctl.identify.online import Tuner
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX, POINTS
+from thermoctl.signals import AT, of_channels
 from thermoctl.yamlfile import InputError
 
 INTERVAL_S = 0.5
 PROPOSE_S = 600.0  # rig time between two checks of the proposal
-_ESTIMATES = [INDEX[f"{p}_est_c"] for p in POINTS]
-_T, _AIR, _STATUS = INDEX["t_s"], INDEX["air_c"], INDEX["status_bits"]
-_POSITION, _REFERENCE = INDEX["position_raw_um"], INDEX["output_reference_um"]
-_BOTH = 3 << 2 * CHANNELS.index("position_um") | 3 << 2 * CHANNELS.index("output_reference_um")
+_T, _AIR = AT["t_s"], AT["air_c"]
+_POSITION, _REFERENCE = AT["position_raw_um"], AT["output_reference_um"]
+_BOTH = [CHANNEL_AT["position_um"], CHANNEL_AT["output_reference_um"]]
 
 
 class Tuning:
@@ -44,8 +44,10 @@ class Tuning:
         folder: Path | None,
         say: Callable[[str], None],
         tuner: Tuner | None = None,
+        channels: Channels = DEFAULT,
     ):
         self.rig, self.folder, self.say = rig, folder, say
+        self.row = of_channels(channels)
         self.tuner = tuner or Tuner(model)
         self.period_s = model.expansion_period_s
         self.zero_um = self.air_c = float("nan")
@@ -64,12 +66,12 @@ class Tuning:
         self._rows = [rows[ends[-1] if len(ends) else 0 :]]
 
     def _sample(self, rows: np.ndarray) -> None:
-        good = (rows[:, _STATUS].astype(np.int64) & _BOTH) == 0
+        good = ~self.row.states(rows)[:, _BOTH].any(axis=1)
         error = (
             float(np.mean((rows[:, _REFERENCE] - rows[:, _POSITION])[good])) if good.any() else float("nan")
         )
         air = float(np.nanmean(rows[:, _AIR]))
-        estimates = rows[:, _ESTIMATES].mean(0)
+        estimates = rows[:, self.row.estimates].mean(0)
         if not (np.isfinite(air) and np.isfinite(estimates).all()):
             return
         if np.isnan(self.air_c):

@@ -255,7 +255,7 @@ class _Demo:
         error = "-" if with_ is None else f"{with_:+.3f} um (without compensation {without:+.3f} um)"
         line = (
             f"{status['state']} tick {status['ticks']} setpoint {status['setpoint_um']:.1f} um, error {error}"
-            f", coil {status['temperatures_c']['coil']:.2f} C, {status['slips']} slips"
+            f", coil {next(iter(status['temperatures_c'].values())):.2f} C, {status['slips']} slips"
         )
         if status["state"] == "FAULT":
             names = ", ".join(f["name"] for f in status["faults"])

@@ -27,7 +27,7 @@ from thermoctl.daemon.readings import hide_invalid
 from thermoctl.daemon.shared import Shared
 from thermoctl.daemon.snapshot import latency, status
 from thermoctl.settings import Settings
-from thermoctl.signals import INDEX, fault_words
+from thermoctl.signals import AT, fault_words
 from thermoctl.yamlfile import InputError
 
 BEFORE_S, AFTER_S = 2.0, 2.0  # span of a capture before and after the fault
@@ -56,13 +56,13 @@ RANGED = (
 """Signals whose minimum and maximum since the previous frame are in each frame."""
 LATENESS_EDGES_US = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
-_T, _WALL = INDEX["t_s"], INDEX["wall_s"]
+_T, _WALL = AT["t_s"], AT["wall_s"]
 _TRIPS = np.uint64(faults.mask("fault", "critical"))
 
 
 @dataclass
 class Capture:
-    """The rows of every tick from BEFORE_S before a fault to AFTER_S after it: rows (n, len(SIGNALS))."""
+    """The rows of every tick from BEFORE_S before a fault to AFTER_S after it: rows (n, signals)."""
 
     number: int
     t_s: float
@@ -203,13 +203,13 @@ class Watch:
             with np.errstate(all="ignore"):
                 frame["range"] = {
                     n: [_finite(np.fmin.reduce(column)), _finite(np.fmax.reduce(column))]
-                    for n, column in ((n, hide_invalid(rows, n)) for n in RANGED)
+                    for n, column in ((n, hide_invalid(rows, n, self.settings.row)) for n in RANGED)
                 }
         return frame
 
     def _sigma(self, row: np.ndarray) -> float | None:
         """Return the innovation's expected standard deviation, K: S = R_v / (1 - C K), from (35)."""
-        share = self._gain * row[INDEX["kalman_gain"]]
+        share = self._gain * row[AT["kalman_gain"]]
         return _finite(math.sqrt(self._noise_c2 / (1.0 - share))) if 0.0 <= share < 1.0 else None
 
     def _remember(self, rows: np.ndarray) -> None:
@@ -217,11 +217,11 @@ class Watch:
         rows = rows[rows[:, _WALL] > rows[-1, _WALL] - PAST_S]
         step = np.floor(rows[:, _WALL] / PAST_STEP_S)
         rows = rows[np.append(np.diff(step) != 0, True)]
-        columns = {n: hide_invalid(rows, n) for n in PAST}
+        columns = {n: hide_invalid(rows, n, self.settings.row) for n in PAST}
         for k, row in enumerate(rows):
             point = {
                 "ok": True,
-                "state": arming.STATES[int(row[INDEX["state"]])],
+                "state": arming.STATES[int(row[AT["state"]])],
                 **{n: _finite(column[k]) for n, column in columns.items()},
             }
             if self.past and row[_WALL] < self.past[-1]["wall_s"]:
@@ -246,7 +246,7 @@ class Watch:
                 after = rows[rows[:, _T] <= capture.t_s + AFTER_S]
                 capture.rows = np.concatenate((capture.rows, after))
                 capture.whole = len(after) < len(rows)
-        bits = np.where(rows[:, INDEX["state"]] == arming.OFF, np.uint64(0), fault_words(rows) & _TRIPS)
+        bits = np.where(rows[:, AT["state"]] == arming.OFF, np.uint64(0), fault_words(rows) & _TRIPS)
         before = np.concatenate((bits[:1] if self._bits is None else [np.uint64(self._bits)], bits[:-1]))
         for k in np.flatnonzero(bits & ~before):
             names = [f.name for f in faults.decode(int(bits[k] & ~before[k]))]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thermoctl.channels import DEFAULT, points_of_file
 from thermoctl.identify import linearise as thermal_model
 from thermoctl.identify.modelfile import save_model
 from thermoctl.plant import load
@@ -17,8 +18,9 @@ from thermoctl.recording.table import Table
 def linearise(args: argparse.Namespace) -> int:
     """Return the compensator's model file from a thermal plant."""
     plant = load(args.plant)
+    channels = points_of_file(args.points) if args.points else DEFAULT
     model = thermal_model.linearise(
-        plant, args.period, args.sensor_period, args.kind, density=args.heat_density
+        plant, args.period, args.sensor_period, args.kind, density=args.heat_density, channels=channels
     )
     poles = model.meta["time_constants_s"]
     print(
@@ -27,7 +29,10 @@ def linearise(args: argparse.Namespace) -> int:
     )
     if args.gains:
         sequence = thermal_model.gains(
-            thermal_model.thermal(plant), args.sensor_period, args.samples, density=args.heat_density
+            thermal_model.thermal(plant, channels=channels),
+            args.sensor_period,
+            args.samples,
+            density=args.heat_density,
         )[:, :, 0]
         t = np.arange(args.samples) * args.sensor_period
         columns = {n: sequence[:, i] for i, n in enumerate(plant.nodes)}

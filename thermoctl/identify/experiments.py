@@ -21,7 +21,7 @@ from typing import Protocol
 import numpy as np
 
 from thermoctl.control import arming, faults
-from thermoctl.signals import INDEX, fault_word
+from thermoctl.signals import AT, fault_word
 from thermoctl.yamlfile import InputError, Node, load, suggest
 
 FORMAT = "thermoctl-experiments/1"
@@ -341,7 +341,7 @@ def run(
     waiting = ([(start_s, *before[-1][1:])] if before else []) + waiting
     ticks = round((schedule.duration_s - start_s) / period)
     block, began, nxt, k = [], time.monotonic(), 0, 0
-    state = INDEX["state"]
+    state = AT["state"]
     if simulation.row[state] != arming.ARMED:
         simulation.arm()
     while k < ticks:

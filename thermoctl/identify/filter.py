@@ -19,8 +19,8 @@ so C b_air = -1. The process noise w has four parts:
 - outside heat into one body (C+ C+')
 - a slowly decaying outside heat as a disturbance state
 
-Their variances come from the calibration, where all twelve points are measured. The chosen ones give the best
-estimate of the twelve points from the coil alone.
+Their variances come from the calibration, where all points are measured. The chosen ones give the best
+estimate of all points from the coil alone.
 """
 
 from __future__ import annotations

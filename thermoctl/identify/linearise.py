@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from thermoctl.channels import TEMPERATURES
+from thermoctl.channels import DEFAULT, Channels
 from thermoctl.control.model import CompensatorModel
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Output, Plant
@@ -37,7 +37,7 @@ HEAT_DENSITY = 0.05  # W^2 s: 0.03 W of unknown heat in each body over a minute
 class Thermal:
     """A plant's heat in continuous time.
 
-    A (n, n) 1/s, b (n,) K/J, C (12, n), a (n,) um/K, air_um_k, capacity (n,) J/K, variance (12,) of the
+    A (n, n) 1/s, b (n,) K/J, C (m, n), a (n,) um/K, air_um_k, capacity (n,) J/K, variance (m,) of the
     readings, K^2."""
 
     A: np.ndarray
@@ -49,7 +49,9 @@ class Thermal:
     variance: np.ndarray
 
 
-def _signals(plant: Plant) -> tuple[dict[str, str], dict[str, Output], tuple[str, ...]]:
+def _signals(
+    plant: Plant, temperatures: tuple[str, ...]
+) -> tuple[dict[str, str], dict[str, Output], tuple[str, ...]]:
     """Return inputs and outputs by column, and the columns that give the power. Raises InputError."""
     inputs = {i.column: i.name for i in plant.inputs.values()}
     outputs = {o.column: o for o in plant.outputs.values()}
@@ -60,21 +62,21 @@ def _signals(plant: Plant) -> tuple[dict[str, str], dict[str, Output], tuple[str
                 f"{plant.file}: no input reads the column '{column}'; a compensator is made from a thermal plant "
                 "driven by air_c and voltage_v, current_a (or power_w), such as config/plants/actuator_thermal.yaml"
             )
-    for column in (*TEMPERATURES, ERROR):
+    for column in (*temperatures, ERROR):
         if column not in outputs:
             raise InputError(
-                f"{plant.file}: no output for the column '{column}'; a compensator needs all twelve "
-                f"temperatures and {ERROR}"
+                f"{plant.file}: no output for the column '{column}'; a compensator needs {ERROR} and "
+                f"the temperatures of all points of the rig: {', '.join(temperatures)}"
             )
     return inputs, outputs, powered
 
 
-def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
-    """Return the plant's matrices at the temperature `at_c`.
+def thermal(plant: Plant, at_c: float = 25.0, channels: Channels = DEFAULT) -> Thermal:
+    """Return the plant's matrices at the temperature `at_c`, for a rig with these channels.
 
     Columns of its inputs and outputs must be the program's signals (air_c, voltage_v and current_a or
-    power_w, coil_c ... bracket_2_c, position_error_um). Raises InputError."""
-    inputs, outputs, powered = _signals(plant)
+    power_w, the points' POINT_c, position_error_um). Raises InputError."""
+    inputs, outputs, powered = _signals(plant, channels.temperatures)
     nodes = list(plant.nodes)  # those that are states; the others keep their start
     point: dict[str, float] = (
         {p.name: p.value for p in plant.parameters.values()}
@@ -109,12 +111,14 @@ def thermal(plant: Plant, at_c: float = 25.0) -> Thermal:
             f"by {np.max(np.abs(rest)):.3g} K/s); such a plant has no model of rises above the air"
         )
     one_watt = values(slopes, point | {inputs[c]: 1.0 for c in powered})
-    C = np.array([values([ex.derivative(outputs[c].value, n) for n in nodes], point) for c in TEMPERATURES])
+    C = np.array(
+        [values([ex.derivative(outputs[c].value, n) for n in nodes], point) for c in channels.temperatures]
+    )
     growth = outputs[ERROR].value
     a = values([ex.derivative(growth, n) for n in nodes], point)
     air = float(a.sum()) + float(ex.evaluate(ex.derivative(growth, inputs[AIR]), point))
     variance = np.array(
-        [outputs[c].noise_sd ** 2 + (outputs[c].resolution or 0.0) ** 2 / 12 for c in TEMPERATURES]
+        [outputs[c].noise_sd ** 2 + (outputs[c].resolution or 0.0) ** 2 / 12 for c in channels.temperatures]
     )
     capacity = values(capacities, point)
     return Thermal(A, one_watt - rest, C, a, air, capacity, np.where(variance > 0, variance, 1e-4))
@@ -162,12 +166,13 @@ def linearise(
     sensors: tuple[int, ...] = (0,),
     density: float = HEAT_DENSITY,
     expansion_period_s: float = 1.0,
+    channels: Channels = DEFAULT,
 ) -> CompensatorModel:
-    """Return the compensator's model of a thermal plant.
+    """Return the compensator's model of a thermal plant, for a rig with these channels.
 
     `kind` 'kalman' (steady gain) or 'mkf' (scalar recursion with a map zeta = covariance of the steady
     filter's errors with the coil's). Raises InputError."""
-    model = thermal(plant)
+    model = thermal(plant, channels=channels)
     step, B, _ = discrete(model, period_s, density)
     slow, _, noise = discrete(model, sensor_period_s, density)
     A, C1, R = np.eye(len(slow)) + slow, model.C[list(sensors)], np.diag(model.variance[list(sensors)])
@@ -200,6 +205,7 @@ def linearise(
         expansion_period_s,
         sensors,
         model.air_um_k,
+        points=channels.point_names,
         meta={
             "made_from": "plant linearise",
             "plant": plant.title,

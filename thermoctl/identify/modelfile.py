@@ -11,7 +11,7 @@ import os
 import re
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -110,7 +110,9 @@ def load_calibration(path: str | Path, rig: str | None = None) -> Calibration:
             f"the calibration is of rig '{content['rig']}', this one is '{rig}'; calibrate this rig"
         )
     node: Node = root.value["model"]
-    numbers: dict[str, Any] = {k: tuple(v) if k == "sensors" else v for k, v in content["model"].items()}
+    numbers: dict[str, Any] = {
+        k: tuple(v) if k in ("sensors", "points") else v for k, v in content["model"].items()
+    }
     try:
         model = CompensatorModel(**numbers)
     except (TypeError, ValueError) as e:
@@ -118,9 +120,19 @@ def load_calibration(path: str | Path, rig: str | None = None) -> Calibration:
     return Calibration(model, content["rig"], content["created"], content["fingerprints"], content["figures"])
 
 
-def load_model(path: str | Path, rig: str | None = None) -> CompensatorModel:
-    """Return the compensator's model of a calibration, for the daemon. Raises as `load_calibration`."""
-    return load_calibration(path, rig).model
+def load_model(
+    path: str | Path, rig: str | None = None, points: tuple[str, ...] | None = None
+) -> CompensatorModel:
+    """Return the compensator's model of a calibration, for the daemon.
+
+    Raises as `load_calibration`, and InputError for a model of other points than these (None: any)."""
+    model = load_calibration(path, rig).model
+    if points is not None and (model.points not in ((), points) or len(model.C) != len(points)):
+        raise InputError(
+            f"{path}: the model is of {', '.join(model.points) or f'{len(model.C)} points'}, the rig has the points "
+            f"{', '.join(points)}: calibrate this rig, or list its points in the model's order"
+        )
+    return model if points is None else replace(model, points=points)
 
 
 def install(

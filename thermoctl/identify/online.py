@@ -48,8 +48,8 @@ class Tuner:
     def update(self, rises_k: np.ndarray, error_um: float, air_k: float = 0.0) -> None:
         """One sample at the expansion model's period.
 
-        Arguments: estimated rises (12,), the measured position error (NaN: no reference), and the rise of the
-        air since the start. Bodies expand with their absolute temperature, hence the air."""
+        Arguments: estimated rises (points,), the measured position error (NaN: no reference), and the
+        rise of the air since the start. Bodies expand with their absolute temperature, hence the air."""
         coil = float(rises_k[0])
         if self.last_coil is not None:
             self.slow += 0.02 * ((coil - self.last_coil) - self.slow)
@@ -113,6 +113,6 @@ class Tuner:
 
 
 def calibrated_gains(model: CompensatorModel) -> np.ndarray:
-    """Return the static gains (12,) um/K of the calibration that a model came from, before any tuning."""
+    """Return the static gains (points,) um/K of the calibration that a model came from, before any tuning."""
     known = model.meta.get("calibrated_gains_um_k")
     return np.array(known, dtype=float) if known is not None else (model.b1 + model.b2) / (1 - model.f1)

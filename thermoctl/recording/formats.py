@@ -17,10 +17,8 @@ from types import ModuleType
 import numpy as np
 
 from thermoctl.recording.table import Table
-from thermoctl.signals import SIGNALS
+from thermoctl.signals import units
 from thermoctl.yamlfile import InputError
-
-_UNITS = {s.name: s.unit for s in SIGNALS} | {"t": "s"}
 
 
 def _library(name: str, path: Path) -> ModuleType:
@@ -140,11 +138,11 @@ def read_excel(path: Path) -> bytes:
 
 def write_mdf(path: str, table: Table) -> None:
     """Write MDF 4.10, one channel group, zipped; units of our signals."""
-    asammdf = _library("asammdf", Path(path))
+    asammdf, unit = _library("asammdf", Path(path)), units(table.columns)
     with asammdf.MDF(version="4.10") as mdf:
         mdf.append(
             [
-                asammdf.Signal(samples=v, timestamps=table.t, name=n, unit=_UNITS.get(n, ""))
+                asammdf.Signal(samples=v, timestamps=table.t, name=n, unit=unit.get(n, ""))
                 for n, v in table.columns.items()
             ],
             comment=f"thermoctl recording {table.name}",
@@ -159,6 +157,7 @@ def write_mcap(path: str, table: Table) -> None:
     """
     writer_module = _library("mcap.writer", Path(path))
     clock = table.columns.get("wall_s", table.t - min(table.t[0], 0.0))
+    unit = {"t": "s"} | units(table.columns)
     names, values = ["t", *table.columns], np.column_stack([table.t, *table.columns.values()])
     with open(path, "wb") as f:
         writer = writer_module.Writer(f)
@@ -169,7 +168,7 @@ def write_mcap(path: str, table: Table) -> None:
             json.dumps(
                 {
                     "type": "object",
-                    "properties": {n: {"type": "number", "description": _UNITS.get(n, "")} for n in names},
+                    "properties": {n: {"type": "number", "description": unit.get(n, "")} for n in names},
                 }
             ).encode(),
         )

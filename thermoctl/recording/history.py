@@ -9,7 +9,7 @@ a day is drawn again in milliseconds.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -19,13 +19,14 @@ import numpy as np
 
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.writer import FULL, NAME, TIER, recording_files
-from thermoctl.signals import BIT_WORDS, INDEX, NAMES
+from thermoctl.signals import NAMES
 from thermoctl.yamlfile import InputError, suggest
 
+Invalid = Callable[[Mapping[str, np.ndarray], Mapping[str, str], str], np.ndarray] | None
 FULL_SPAN_S = 60.0  # at and below this the full rate is shown
 COARSE_SPAN_S = 7200.0  # above this, one second is fine enough
 MAX_POINTS = 4000
-_CLOCK, _STATUS = "wall_s", "status_bits"
+_CLOCK, _STATUS = "wall_s", "status_bits"  # further words are status_bits_2 ...
 
 
 @dataclass(frozen=True)
@@ -49,16 +50,17 @@ def history(
     begin_s: float,
     end_s: float,
     points: int = 800,
-    invalid: Callable[[np.ndarray, str], np.ndarray] | None = None,
+    invalid: Invalid = None,
+    names: Collection[str] = NAMES,
 ) -> History:
     """Return the rig's signal from begin_s to end_s (seconds since 1970) in at most `points` buckets.
 
-    invalid(status_bits, signal) marks the samples to omit (daemon.readings.invalid); None keeps all. Empty
-    when nothing is recorded. Raises InputError for an unknown signal, an empty span, or points outside
-    2..MAX_POINTS.
+    names: the rig's signals. invalid(columns of status bits, metadata, signal) marks the samples to omit
+    (readings.invalid); None keeps all. Empty when nothing is recorded.
+    Raises InputError for an unknown signal, an empty span, or points outside 2..MAX_POINTS.
     """
-    if signal not in INDEX:
-        raise InputError(f"history: no signal '{signal[:60]}'{suggest(signal, NAMES)}")
+    if signal not in names:
+        raise InputError(f"history: no signal '{signal[:60]}'{suggest(signal, names)}")
     if not (np.isfinite([begin_s, end_s]).all() and 0.0 <= begin_s < end_s <= 1e11):
         raise InputError("history: a span of seconds since 1970 with its begin before its end was expected")
     if not 2 <= points <= MAX_POINTS:
@@ -142,9 +144,6 @@ def _rig_of(path: Path, inode: int) -> str:
     return (open_stream(path).schema.metadata or {}).get(b"rig", b"").decode(errors="replace")
 
 
-Invalid = Callable[[np.ndarray, str], np.ndarray] | None
-
-
 def _samples(path: Path, signal: str, kind: str, step_s: float, invalid: Invalid) -> tuple[np.ndarray, ...]:
     """Return (wall, low, mean, high) of one file, reduced to `step_s` (0: as recorded); [] if broken."""
     try:
@@ -171,9 +170,11 @@ def _reduced(
 
 
 def _read(path: Path, signal: str, kind: str, invalid: Invalid) -> tuple[np.ndarray, ...]:
-    ranged = kind == TIER and signal not in BIT_WORDS and signal != "t_s"
+    schema = open_stream(path).schema
+    ranged = kind == TIER and f"{signal}_min" in schema.names
     names = [f"{signal}_min", signal, f"{signal}_max"] if ranged else [signal] * 3
-    wanted = {_CLOCK, _STATUS, *names}
+    status = {n for n in schema.names if n.startswith(_STATUS)}
+    wanted = {_CLOCK, *status, *names}
     batches = [
         {n: batch.column(n).to_numpy(zero_copy_only=False) for n in wanted}
         for batch in open_stream(path, wanted)
@@ -181,5 +182,12 @@ def _read(path: Path, signal: str, kind: str, invalid: Invalid) -> tuple[np.ndar
     if not batches:
         return (np.empty(0),) * 4
     columns = {n: np.concatenate([b[n] for b in batches]) for n in wanted}
-    bad = np.zeros(len(columns[_CLOCK]), bool) if invalid is None else invalid(columns[_STATUS], signal)
+    meta = {
+        k.decode(errors="replace"): v.decode(errors="replace") for k, v in (schema.metadata or {}).items()
+    }
+    bad = (
+        np.zeros(len(columns[_CLOCK]), bool)
+        if invalid is None
+        else invalid({n: columns[n] for n in status}, meta, signal)
+    )
     return columns[_CLOCK], *(np.where(bad, np.nan, columns[n]) for n in names)

@@ -18,7 +18,7 @@ import pyarrow.parquet
 from thermoctl.recording import formats
 from thermoctl.recording.files import read_table, to_arrow, whole_file
 from thermoctl.recording.stream import END, open_stream
-from thermoctl.signals import NAMES, SIGNALS
+from thermoctl.signals import of_recording
 from thermoctl.yamlfile import InputError, suggest
 
 
@@ -77,22 +77,23 @@ def info(path: str | Path) -> Info:
 
 
 def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
-    """Return (ticks (n, signals) in the order of signals.SIGNALS, text `law` of the metadata) for a replay.
+    """Return (ticks (n, signals) in the order of its rig's signals, text `law` of the metadata) for a replay.
 
     Raises InputError when a signal is missing (a tier, or a recording of another version).
     """
     table = read_table(path)
     if "10 Hz" in table.meta.get("tier", ""):
         raise InputError(f"{path}: no full-rate recording but its 10 Hz tier; a replay needs every tick")
-    before = {s.name: s.before for s in SIGNALS if s.before is not None}
+    row = of_recording(table.meta)
+    before = {s.name: s.before for s in row.signals if s.before is not None}
     columns = {n: np.full(len(table), number) for n, number in before.items()} | dict(table.columns)
-    missing = [n for n in NAMES if n not in columns]
+    missing = [n for n in row.names if n not in columns]
     if missing:
         raise InputError(
             f"{path}: no full-rate recording of this version: {', '.join(missing[:3])} "
             f"{'is' if len(missing) == 1 else 'are'} missing; replay it with the version that recorded it"
         )
-    return np.column_stack([columns[n] for n in NAMES]), table.meta.get("law", "")
+    return np.column_stack([columns[n] for n in row.names]), table.meta.get("law", "")
 
 
 def recover(path: str | Path, out: str | Path) -> Info:

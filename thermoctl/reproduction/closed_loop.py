@@ -34,7 +34,7 @@ from thermoctl.signals import INDEX, NAMES, POINTS
 
 def of_rows(rows: np.ndarray) -> Recorded:
     """Take record rows (N, signals) at 1 s as one test."""
-    return of_columns(np.arange(len(rows), dtype=float), {n: rows[:, i] for n, i in INDEX.items()})
+    return of_columns(np.arange(len(rows), dtype=float), {n: rows[:, i] for n, i in INDEX.items()}, POINTS)
 
 
 def run_test(

@@ -4,7 +4,7 @@
 #include <string.h>
 
 enum { OK, STALE, ERROR, ABSENT };
-enum { POSITION = 0, REFERENCE = 1, VOLTAGE = 2, CURRENT = 3, AIR = 4, COIL = 5, AMPLIFIER_STATE = 18 };
+enum { POSITION = 0, REFERENCE = 1, VOLTAGE = 2, CURRENT = 3, AMPLIFIER_STATE = 5, AIR = 7, COIL = 8 };
 enum { THERMAL = AIR, THERMAL_END = COIL + M };
 enum { K_ERROR, K_STALE, K_RANGE, K_RATE, K_FROZEN };
 enum { B_STOPPED = 34, B_FOLLOWING = 35, B_HOT, B_HOT_MODEL, B_HEATING, B_DISAGREES, B_POWER, B_STUCK, B_BOUND, B_SLEWING, B_SATURATED,
@@ -475,8 +475,8 @@ static void protect(law_t *l, int command, uint64_t external) {
     o[0] = l->state, o[1] = bits & (BIT(53) - 1), o[2] = bits >> 53, o[3] = l->setpoint_um, o[4] = l->reference_um;
     o[5] = l->position_um, o[6] = l->compensated_um, o[7] = l->compensation_um, o[8] = l->expansion_um;
     o[9] = l->control_v, o[10] = l->drive, o[11] = l->enable, o[12] = l->powered ? l->power_w : NAN, o[13] = l->air_rate_k_s;
-    for (int m = 0; m < M; m++) o[14 + m] = l->T[m] + l->air_c;
-    o[26] = l->innovation_c, o[27] = l->kalman_gain, o[28] = l->age[POSITION], o[29] = l->age[COIL];
+    o[14] = l->innovation_c, o[15] = l->kalman_gain, o[16] = l->age[POSITION], o[17] = l->age[COIL];
+    for (int m = 0; m < M; m++) o[18 + m] = l->T[m] + l->air_c;
 }
 
 void law_step(law_t *l, double dt, int command, double command_value, uint64_t external) {

@@ -343,6 +343,7 @@ def processes(pid: int) -> dict[str, int]:
 
 def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
     """Model and parameters in the order that law_load of law.c takes them."""
+    from thermoctl.channels import COIL
     from thermoctl.control import faults
     from thermoctl.control.law import MAX_AVERAGE
 
@@ -356,7 +357,7 @@ def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
         len(model.sensors),
         model.kind == "mkf",
         model.sensors,
-        list(faults.READING_BIT),
+        [bit for c in range(len(p.low)) for bit in faults.READING_BIT[min(c, COIL + 1) * 5 :][:5]],
         model.C.any(axis=1),
         model.b1.any() or model.b2.any() or model.b_air != 0.0,
         model.A_minus_I,
@@ -437,22 +438,22 @@ def readings(ticks: int, seed: int = 7) -> dict[str, np.ndarray]:
     values = np.full((ticks, n), 22.0)
     values[:, 0] = np.round(20 * np.sin(t) / 0.005) * 0.005
     values[:, 2], values[:, 3] = 6.0, 0.5
-    values[:, 5:17] += np.outer(2 * (1 - np.exp(-t / 20)), np.linspace(1, 0.1, 12)) + rng.normal(
+    values[:, 8:] += np.outer(2 * (1 - np.exp(-t / 20)), np.linspace(1, 0.1, 12)) + rng.normal(
         0, 0.02, (ticks, 12)
     )
-    values[:, 2:5] += rng.normal(0, 1e-3, (ticks, 3))
-    values[:, 17], values[:, 18], values[:, 19] = 24.0, AMP_ENABLED, 0.0
+    values[:, [2, 3, 7]] += rng.normal(0, 1e-3, (ticks, 3))
+    values[:, 4], values[:, 5], values[:, 6] = 24.0, AMP_ENABLED, 0.0
     disabled = ((np.arange(ticks) - 140) % 1000 < 70) | (np.arange(ticks) < 210)  # around each DISARM and ARM
-    values[disabled, 18] = AMP_DISABLED
+    values[disabled, 5] = AMP_DISABLED
     fresh = np.zeros((ticks, n), np.uint8)
-    fresh[:, [0, 17, 18, 19]] = rng.random((ticks, 1)) > 0.02
+    fresh[:, [0, 4, 5, 6]] = rng.random((ticks, 1)) > 0.02
     fresh[::50, 2:4] = 1
-    fresh[::100, 4:17] = 1
+    fresh[::100, 7:] = 1
     fresh[0] = 1
     status = np.zeros((ticks, n), np.uint8)
     status[:, 1] = 3
     for _ in range(max(1, ticks // 5000)):
-        at, channel = int(rng.integers(500, ticks)), int(rng.choice([0, 2, 5, 9]))
+        at, channel = int(rng.integers(500, ticks)), int(rng.choice([0, 2, 8, 12]))
         status[at : at + 30, channel] = rng.integers(1, 3)
     commands = np.zeros(ticks, np.intc)
     commands[200::1000], commands[150::1000] = 1, 2
@@ -534,7 +535,7 @@ def bench_law(bench: Bench, ticks: int = 20000, repeats: int = 15) -> dict[str, 
     library = ctypes.CDLL(str(bench.work / "law.so"))
     names = ("values", "fresh", "status", "dt", "commands", "command_values")
     arrays = [np.ascontiguousarray(data[k]) for k in names]
-    c_out, out = np.zeros((ticks, len(OUTPUTS))), np.zeros((ticks, len(OUTPUTS)))
+    c_out, out = np.zeros((2, ticks, len(OUTPUTS) + len(model.C)))
 
     def in_c() -> float:
         assert library.batch_load(str(bench.work / "law.bin").encode()) == 0

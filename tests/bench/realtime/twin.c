@@ -68,9 +68,9 @@ static void take_can(const char *m, int size, double now_s) {
         status_word = d[0] | d[1] << 8;
         double state = (status_word & 0x4F) == 0x0F || (status_word & 0x4F) == 0x08 ? 3
                        : (status_word & 0x6F) == 0x27 ? 2 : (status_word & 0x4F) == 0 ? 0 : 1;
-        put(18, state, -INFINITY, INFINITY, now_s);
-        put(19, 0, -INFINITY, INFINITY, now_s);
-        put(17, (d[4] | d[5] << 8 | d[6] << 16 | (uint32_t)d[7] << 24) * 0.001, 0, 60, now_s);
+        put(5, state, -INFINITY, INFINITY, now_s);
+        put(6, 0, -INFINITY, INFINITY, now_s);
+        put(4, (d[4] | d[5] << 8 | d[6] << 16 | (uint32_t)d[7] << 24) * 0.001, 0, 60, now_s);
     } else if (id == 0x700 + NODE) heard_s = now_s;
 }
 
@@ -118,7 +118,7 @@ int main(int argc, char **argv) {
         return 3;
     }
     for (int c = 0; c < N; c++) time_s[c] = -INFINITY, limit_s[c] = INFINITY, law.status[c] = 3;
-    for (int c = 17; c < N; c++) limit_s[c] = 0.1, law.status[c] = 1;
+    for (int c = 4; c < 7; c++) limit_s[c] = 0.1, law.status[c] = 1;
     limit_s[0] = 0.1, law.status[0] = 1;
     int encoder = open_raw(argv[6]), can = open_raw(argv[7]);
     const char *setup = "\r\rC\rS8\rO\rt00020105\r";
