@@ -122,12 +122,15 @@ class Link:
         return 0
 
     def _ask(self, method: str, address: int, what: dict[str, Any], unit: int, timeout_s: float) -> Any:
+        if self.broken:  # pymodbus would open the port again, beside the link that replaces this one
+            raise HardwareError(f"{self.port}: the connection is gone")
         self._received = b""
         self.client.comm_params.timeout_connect = timeout_s
         try:
             return getattr(self.client, method)(address, **what, device_id=unit)
         except (ConnectionException, OSError, serial.SerialException) as e:
             self.broken = True
+            self.client.close()
             raise HardwareError(f"{self.port}: the connection is gone ({e})") from None
         except Exception:  # foreign bytes may raise anything in the library
             raise NoAnswer(self._bad_answer(unit, timeout_s)) from None

@@ -7,9 +7,11 @@ import time
 import can
 import pytest
 
-from hal.backend import Sample
+from hal import modbus_link
+from hal.backend import HardwareError, Sample
 from hal.binding import bind, check_rig
 from hal.can_bus import open_can
+from hal.profile import LineSettings
 from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, Unit, encode, words
 from tests.devices.harness import HEAD, Line, Rig
 from thermoctl import yamlfile
@@ -83,6 +85,26 @@ def test_two_units_of_one_line_with_status_bits(tmp_path, kind):
         meter.set(4, 0, words(7.25, "f"))
         rig.until(lambda: rig.value("voltage_v") == 7.25 and rig.status("coil_c") == "OK")
     assert line.bad == 0
+    wire.close()
+
+
+def test_a_lost_link_never_opens_the_port_beside_the_new_one(tmp_path):
+    tc, _ = units()
+    wire = Port(ModbusLine({3: tc}, True).take, tmp_path / "line")
+    port, line = f"rtu:{tmp_path}/line", LineSettings(baud=19200)
+    first, second = (modbus_link.join(port, line, 0.1) for _ in range(2))
+    assert first is second and first.read("holding", 9, 1, 3, 0.5) == [(-37 & 0xFFF) << 4]
+    wire.unplug()
+    with pytest.raises(HardwareError, match="gone"):
+        first.read("holding", 9, 1, 3, 0.5)
+    wire.plug()
+    with pytest.raises(HardwareError, match="gone"):
+        second.read("holding", 9, 1, 3, 0.5)
+    modbus_link.leave(first)
+    third = modbus_link.join(port, line, 0.1)
+    assert third.read("holding", 9, 1, 3, 0.5) == [(-37 & 0xFFF) << 4]
+    for link in (second, third):
+        modbus_link.leave(link)
     wire.close()
 
 
