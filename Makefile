@@ -46,7 +46,7 @@ calibrate-diagnosis: develop       # set the numbers of config/diagnosis.yaml fr
 	$(BIN)/python -m tests.concealed.generate --world closed --answers inside --number 60 --seed 5002 --out $(CALIBRATION)/closed_5002
 	for world in open_5001 closed_5002; do for case in $(CALIBRATION)/$$world/*; do out=$(CALIBRATION)/results/$$world/$$(basename $$case); \
 		test -e $$out/diagnosis.json || $(BIN)/thermoctl diagnose --quiet --anyway --plant $$case/plant.yaml --out $$out $$case/run_*.csv; done; done
-	$(BIN)/python -m tests.evidence.calibrate $(CALIBRATION)/open_5001 $(CALIBRATION)/results/open_5001 $(CALIBRATION)/closed_5002 $(CALIBRATION)/results/closed_5002 --write
+	$(BIN)/python -m tests.diagnose.calibrate $(CALIBRATION)/open_5001 $(CALIBRATION)/results/open_5001 $(CALIBRATION)/closed_5002 $(CALIBRATION)/results/closed_5002 --write
 
 lint: develop                      # ruff and mypy
 	$(BIN)/ruff check .

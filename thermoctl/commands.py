@@ -553,7 +553,7 @@ _DIAGNOSIS = (
     _command(
         "noise",
         "learn each sensor's own noise from quiet recordings; write the plant file with it",
-        "thermoctl.evidence.sensor_noise:command",
+        "thermoctl.diagnose.sensor_noise:command",
         "",
         _PLANT,
         _RECORDINGS,

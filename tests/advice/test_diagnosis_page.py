@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from thermoctl.diagnose.diagnosis import diagnose
 from thermoctl.diagnose.effects import catalogue
-from thermoctl.evidence.limits import limits
-from thermoctl.evidence.result import contract
-from thermoctl.evidence.run import diagnose
-from thermoctl.evidence.words import NEXT
+from thermoctl.diagnose.limits import limits
+from thermoctl.diagnose.result import contract
+from thermoctl.diagnose.words import NEXT
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 

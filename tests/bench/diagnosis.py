@@ -31,16 +31,16 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose import screen
+from thermoctl.diagnose.case import Budget, Case, case
 from thermoctl.diagnose.effects import Candidate, candidates, catalogue
 from thermoctl.diagnose.extend import extend
+from thermoctl.diagnose.fit import Fitted, Placed, as_refitted, fitted
+from thermoctl.diagnose.held_out import worth
+from thermoctl.diagnose.limits import limits
+from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.run import diagnose_files
 from thermoctl.diagnose.screen import Direction, sharpened
-from thermoctl.evidence.case import Budget, Case, case
-from thermoctl.evidence.fit import Fitted, Placed, as_refitted, fitted
-from thermoctl.evidence.held_out import worth
-from thermoctl.evidence.limits import limits
-from thermoctl.evidence.roles import Structure
-from thermoctl.evidence.screening import screened
+from thermoctl.diagnose.screening import screened
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings

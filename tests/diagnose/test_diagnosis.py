@@ -10,9 +10,9 @@ from scipy.signal import cont2discrete, dlsim, lsim
 
 from tests.plants import SPRING_STAGE, TWO_BLOCKS
 from thermoctl.cli import main
+from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.effects import Rig, candidates, catalogue
-from thermoctl.evidence.case import Budget, case
-from thermoctl.evidence.result import doubts
+from thermoctl.diagnose.result import doubts
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table

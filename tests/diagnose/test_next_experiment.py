@@ -11,14 +11,14 @@ import yaml
 
 from thermoctl.cli import main
 from thermoctl.diagnose import experiment_file
+from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.design import Excitation, courses, levers
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.experiment_file import peaks
+from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.propose import bits, distance, propose
 from thermoctl.diagnose.resolve import resolve
-from thermoctl.evidence.case import Budget, case
-from thermoctl.evidence.limits import limits
-from thermoctl.evidence.search import search
+from thermoctl.diagnose.search import search
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant

@@ -16,9 +16,9 @@ from thermoctl.api.fits import Refit
 from thermoctl.api.plants import Plant, plant_of
 from thermoctl.api.results import Diagnosis, Simulation
 from thermoctl.checks import Finding, checks
+from thermoctl.diagnose.diagnosis import diagnose as _diagnose
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
-from thermoctl.evidence.limits import limits
-from thermoctl.evidence.run import diagnose as _diagnose
+from thermoctl.diagnose.limits import limits
 from thermoctl.plant import from_plain, load
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import SimulationError, compile_plant

@@ -14,9 +14,9 @@ import numpy as np
 
 from thermoctl.api.plants import Plant
 from thermoctl.api.plots import Picture, over_time
-from thermoctl.evidence.result import Diagnosis as Found
-from thermoctl.evidence.result import contract
-from thermoctl.evidence.words import words
+from thermoctl.diagnose.result import Diagnosis as Found
+from thermoctl.diagnose.result import contract
+from thermoctl.diagnose.words import words
 from thermoctl.plant import save
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.plant.simulate import Simulation as Run

@@ -19,9 +19,9 @@ from thermoctl.checks.commands import checked, report
 from thermoctl.diagnose import run
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.experiment_file import peaks
+from thermoctl.diagnose.explain import explain
 from thermoctl.diagnose.resolve import resolve
-from thermoctl.evidence.explain import explain
-from thermoctl.evidence.words import sentences, what_next
+from thermoctl.diagnose.words import sentences, what_next
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.yamlfile import InputError, suggest

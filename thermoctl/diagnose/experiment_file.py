@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.design import TOGETHER, Excitation
-from thermoctl.evidence.case import Case
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose.experiment_file import peaks
-from thermoctl.evidence.fit import Fitted, Placed
-from thermoctl.evidence.result import Diagnosis
-from thermoctl.evidence.words import name, sentences, what_next
+from thermoctl.diagnose.fit import Fitted, Placed
+from thermoctl.diagnose.result import Diagnosis
+from thermoctl.diagnose.words import name, sentences, what_next
 from thermoctl.plant.refit import Estimate, Fit, report
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, page, table, unit

@@ -25,11 +25,11 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.design import NONE, Excitation, Lever, Limits, family, levers
 from thermoctl.diagnose.experiment_file import FILES
-from thermoctl.evidence.case import Case
-from thermoctl.evidence.fit import Fitted
-from thermoctl.evidence.result import Diagnosis
+from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.result import Diagnosis
 from thermoctl.plant.refit import Scale
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table

@@ -11,16 +11,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from thermoctl.diagnose import diagnosis as engine
 from thermoctl.diagnose import experiment_file
 from thermoctl.diagnose.design import NONE, Limits
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
+from thermoctl.diagnose.limits import limits as numbers
 from thermoctl.diagnose.page import write_report
 from thermoctl.diagnose.propose import propose
+from thermoctl.diagnose.result import contract
+from thermoctl.diagnose.threads import one_thread
 from thermoctl.diagnose.unseen import not_seen
-from thermoctl.evidence import run as engine
-from thermoctl.evidence.limits import limits as numbers
-from thermoctl.evidence.result import contract
-from thermoctl.evidence.threads import one_thread
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import read_recordings

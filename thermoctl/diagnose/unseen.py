@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose.effects import candidates
+from thermoctl.diagnose.result import Diagnosis
+from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import screen
-from thermoctl.evidence.result import Diagnosis
-from thermoctl.evidence.roles import Structure
-from thermoctl.evidence.screening import ROWS, Rows
+from thermoctl.diagnose.screening import ROWS, Rows
 
 SEEN = 5.0  # standard errors of an effect's size, from which it would have been seen
 

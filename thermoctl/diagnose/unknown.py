@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from thermoctl.evidence.case import Case
-from thermoctl.evidence.fit import Fitted, levels, over_noise
-from thermoctl.evidence.roles import Structure
-from thermoctl.evidence.where import Responses, responses, signals
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.fit import Fitted, levels, over_noise
+from thermoctl.diagnose.roles import Structure
+from thermoctl.diagnose.where import Responses, responses, signals
 
 CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; largest number reported
 

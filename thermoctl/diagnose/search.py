@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.effects import PLACES, Candidate
 from thermoctl.diagnose.extend import extend, sticking, weaker
+from thermoctl.diagnose.fit import Fitted, Placed, fitted, over_noise
+from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Metric, sharpened
-from thermoctl.evidence.case import Case
-from thermoctl.evidence.fit import Fitted, Placed, fitted, over_noise
-from thermoctl.evidence.limits import Limits
-from thermoctl.evidence.roles import Structure
-from thermoctl.evidence.screening import Screened, places, screened
+from thermoctl.diagnose.screening import Screened, places, screened
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError, compile_plant

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.coordinates import Coordinates
 from thermoctl.diagnose.effects import Candidate, EffectParameter
-from thermoctl.evidence.case import Case
-from thermoctl.evidence.coordinates import Coordinates
-from thermoctl.evidence.noise import Averaged, Grid, averaged
+from thermoctl.diagnose.noise import Averaged, Grid, averaged
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem

@@ -7,12 +7,12 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
+from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.effects import Candidate, candidates, catalogue
 from thermoctl.diagnose.extend import extend
+from thermoctl.diagnose.fit import Placed, Posterior, evidence_at, fitted
+from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction
-from thermoctl.evidence.case import Budget, case
-from thermoctl.evidence.fit import Placed, Posterior, evidence_at, fitted
-from thermoctl.evidence.roles import Structure
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

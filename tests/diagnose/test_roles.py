@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.evidence.changes import Rig, kelvin, milliwatt, names, order
+from tests.diagnose.changes import Rig, kelvin, milliwatt, names, order
 from thermoctl.diagnose.effects import Candidate, candidates, catalogue
+from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Trajectory, changes
-from thermoctl.evidence.roles import Structure
 from thermoctl.plant import from_plain, loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import compile_plant

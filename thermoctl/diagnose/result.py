@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.evidence.case import Case
-from thermoctl.evidence.decide import Decision, Key, Posterior
-from thermoctl.evidence.fit import Fitted, Placed
-from thermoctl.evidence.held_out import Worth
-from thermoctl.evidence.misfit import Energy
-from thermoctl.evidence.search import Searched
-from thermoctl.evidence.unknown import Left
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.decide import Decision, Key, Posterior
+from thermoctl.diagnose.fit import Fitted, Placed
+from thermoctl.diagnose.held_out import Worth
+from thermoctl.diagnose.misfit import Energy
+from thermoctl.diagnose.search import Searched
+from thermoctl.diagnose.unknown import Left
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit

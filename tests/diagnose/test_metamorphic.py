@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.evidence.changes import (
+from tests.diagnose.changes import (
     cells_lost,
     clock,
     columns_added,
@@ -15,7 +15,7 @@ from tests.evidence.changes import (
     rows_lost,
     together,
 )
-from tests.evidence.metamorphic import diagnosed, difference, drawn
+from tests.diagnose.metamorphic import diagnosed, difference, drawn
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.evidence.case import Case
-from thermoctl.evidence.fit import Fitted
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.fit import Fitted
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.decide import Facts, decide, weigh
 from thermoctl.diagnose.effects import Effect
-from thermoctl.evidence.case import Budget, case
-from thermoctl.evidence.decide import Facts, decide, weigh
-from thermoctl.evidence.fit import as_refitted
-from thermoctl.evidence.held_out import split, worth
-from thermoctl.evidence.limits import Limits
-from thermoctl.evidence.misfit import energies, standing
-from thermoctl.evidence.result import Diagnosis
-from thermoctl.evidence.search import search
-from thermoctl.evidence.threads import one_thread
-from thermoctl.evidence.unknown import left, reached
+from thermoctl.diagnose.fit import as_refitted
+from thermoctl.diagnose.held_out import split, worth
+from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.misfit import energies, standing
+from thermoctl.diagnose.result import Diagnosis
+from thermoctl.diagnose.search import search
+from thermoctl.diagnose.threads import one_thread
+from thermoctl.diagnose.unknown import left, reached
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.coordinates import Coordinates
 from thermoctl.diagnose.effects import candidates
+from thermoctl.diagnose.fit import Fitted, as_refitted, over_noise
+from thermoctl.diagnose.noise import Averaged, averaged, grid
+from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Metric, screen
-from thermoctl.evidence.case import Case
-from thermoctl.evidence.coordinates import Coordinates
-from thermoctl.evidence.fit import Fitted, as_refitted, over_noise
-from thermoctl.evidence.noise import Averaged, averaged, grid
-from thermoctl.evidence.roles import Structure
 from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
 

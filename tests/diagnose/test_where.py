@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.fft import dct
 
-from tests.evidence.changes import order
-from tests.evidence.test_roles import blocks
-from thermoctl.evidence.coordinates import Coordinates
-from thermoctl.evidence.where import responses, white_forces
+from tests.diagnose.changes import order
+from tests.diagnose.test_roles import blocks
+from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.where import responses, white_forces
 from thermoctl.plant import from_plain
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

@@ -1,6 +1,6 @@
 """Changes of a case that must not change its diagnosis: spelling, order, units, clock, losses, thinning, stated noise.
 
-    python -m tests.evidence.metamorphic [--cases N] [--changes names,order] [--work DIR]
+    python -m tests.diagnose.metamorphic [--cases N] [--changes names,order] [--work DIR]
 
 prints a Markdown table, case by change: `same`, or what differs. The same are verdict, effects and places, with each
 probability within CLOSE. The cases are the generator's (tests/concealed), thinned to a few hundred rows.
@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 
 from tests.concealed.generate import NotVisible, make_case
-from tests.evidence.changes import CHANGES, KERNEL, SEED, Change, Rig, noise_stated, thinned
+from tests.diagnose.changes import CHANGES, KERNEL, SEED, Change, Rig, noise_stated, thinned
 from thermoctl.diagnose.run import diagnose_files
 
 CLOSE = 0.02  # probabilities that differ by less are the same (issue 23)
@@ -118,7 +118,7 @@ def compared(rig: Rig, changes: Sequence[str], work: Path) -> dict[str, str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table; 1 where something differs."""
-    p = argparse.ArgumentParser(prog="python -m tests.evidence.metamorphic", description=__doc__)
+    p = argparse.ArgumentParser(prog="python -m tests.diagnose.metamorphic", description=__doc__)
     p.add_argument("--cases", type=int, default=len(CASES), metavar="N", help="the first N cases only")
     p.add_argument("--changes", default=",".join(CHANGES), help="only these changes")
     p.add_argument("--work", type=Path, help="keep the files of all diagnoses here")

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import median_filter
 
+from thermoctl.diagnose.coordinates import Coordinates
 from thermoctl.diagnose.effects import Effect
-from thermoctl.evidence.coordinates import Coordinates
-from thermoctl.evidence.noise import Grid, grid
-from thermoctl.evidence.roles import Structure
+from thermoctl.diagnose.noise import Grid, grid
+from thermoctl.diagnose.roles import Structure
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.refit import Fit, Noise, default_noise, fit
 from thermoctl.plant.simulate import Excitation, Model, compile_plant

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.linalg import blas
 
-from tests.evidence.test_engine import LAGGED, _write, written
-from thermoctl.evidence import run, threads
+from tests.diagnose.test_engine import LAGGED, _write, written
+from thermoctl.diagnose import run, threads
 from thermoctl.yamlfile import InputError
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from thermoctl.evidence.limits import Limits
+from thermoctl.diagnose.limits import Limits
 
 Key = tuple[str, str]  # (effect, where)
 

@@ -18,11 +18,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from thermoctl.evidence.case import Case
-from thermoctl.evidence.decide import Key
-from thermoctl.evidence.fit import DECADES, as_refitted
-from thermoctl.evidence.limits import Limits
-from thermoctl.evidence.search import Searched
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.decide import Key
+from thermoctl.diagnose.fit import DECADES, as_refitted
+from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.search import Searched
 
 MISFIT = 0.5  # probability of being physics, below which an effect is rather a misfit
 SURE = 200.0  # r^2 beyond which the probability is 1 in any case

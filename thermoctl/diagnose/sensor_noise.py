@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.table import Table as Printed
 from scipy.optimize import minimize
 
-from thermoctl.evidence.coordinates import Channel, Coordinates
-from thermoctl.evidence.noise import spectrum
+from thermoctl.diagnose.coordinates import Channel, Coordinates
+from thermoctl.diagnose.noise import spectrum
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.recordings import read_recordings

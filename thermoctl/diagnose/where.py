@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import idct
 
-from thermoctl.evidence.coordinates import Coordinates, band_edges
+from thermoctl.diagnose.coordinates import Coordinates, band_edges
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation, Model

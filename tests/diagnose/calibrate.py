@@ -1,6 +1,6 @@
 """Set the numbers of config/diagnosis.yaml that weigh hypotheses, from generated cases with known answers.
 
-    python -m tests.evidence.calibrate CASES RESULTS [CASES RESULTS ...] [--write]
+    python -m tests.diagnose.calibrate CASES RESULTS [CASES RESULTS ...] [--write]
 
 CASES as of `python -m tests.concealed.generate --answers inside`; RESULTS: the folders that `thermoctl diagnose` wrote
 for them, by the same names. A diagnosis.json holds every hypothesis that was fitted, so it is decided again with
@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 import yaml
 
+from thermoctl.diagnose.decide import Key, weigh
 from thermoctl.diagnose.effects import CATALOGUE, catalogue
-from thermoctl.evidence.decide import Key, weigh
-from thermoctl.evidence.limits import Limits, limits
-from thermoctl.evidence.misfit import Energy, standing
-from thermoctl.evidence.search import EVENTS
+from thermoctl.diagnose.limits import Limits, limits
+from thermoctl.diagnose.misfit import Energy, standing
+from thermoctl.diagnose.search import EVENTS
 from thermoctl.plant import load
 
 NUMBERS = {

@@ -7,8 +7,8 @@ import json
 import pytest
 
 from thermoctl.cli import main
-from thermoctl.evidence.explain import explain
-from thermoctl.evidence.words import sentences, words
+from thermoctl.diagnose.explain import explain
+from thermoctl.diagnose.words import sentences, words
 
 LAG = {
     "effect": "sensor_lag",

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
-from thermoctl.evidence.coordinates import WIDTH, Coordinates
+from thermoctl.diagnose.coordinates import WIDTH, Coordinates
 from thermoctl.plant.language import SensorNoise
 
 STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times

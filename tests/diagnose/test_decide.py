@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from thermoctl.evidence.decide import Facts, decide, weigh
-from thermoctl.evidence.limits import limits
-from thermoctl.evidence.misfit import Energy, physics, standing
+from thermoctl.diagnose.decide import Facts, decide, weigh
+from thermoctl.diagnose.limits import limits
+from thermoctl.diagnose.misfit import Energy, physics, standing
 
 A, B = ("radiation", "block"), ("natural_convection", "block")
 NOTHING, ONE, OTHER, BOTH = frozenset(), frozenset({A}), frozenset({B}), frozenset({A, B})
