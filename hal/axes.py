@@ -10,8 +10,8 @@ from thermoctl.channels import AxesChannels
 class AxisBackend:
     """`hal.backend.Backend` of one axis.
 
-    The first axis reads all devices; the others, which tick after it, see what it read. Opening and closing any
-    axis opens and closes all devices.
+    The first axis reads all devices; the others, which tick after it, see what it read. Opening or closing
+    one axis opens or closes all devices.
     """
 
     def __init__(self, devices: DevicesBackend, channels: AxesChannels, axis: str):

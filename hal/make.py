@@ -47,9 +47,12 @@ def make_backends(settings: Settings, board: Board | None = None) -> list[Backen
 
 
 def _devices_backend(settings: Settings, board: Board | None) -> DevicesBackend:
-    needed = [f"{s.axis}.{r}" if s.axis else r for s in settings.parts for r in s.protection.required]
-    shared = settings.channels.shared if isinstance(settings.channels, AxesChannels) else ()
-    needed += [r for r in shared if any(r in s.protection.required for s in settings.parts)]
+    needed = list(settings.protection.required)
+    if isinstance(settings.channels, AxesChannels):
+        required = [(s.axis, r) for s in settings.parts for r in s.protection.required]
+        needed = [f"{axis}.{r}" for axis, r in required] + [
+            r for _, r in required if r in settings.channels.shared
+        ]
     return DevicesBackend(fast_devices(settings), slow_devices(settings), board, needed, settings.channels)
 
 

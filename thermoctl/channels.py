@@ -182,8 +182,8 @@ class Channels:
 class AxesChannels(Channels):
     """The channels of all axes in one sample: those of the first axis, then those of the next.
 
-    A role is AXIS.CHANNEL. A channel of `shared` also has a role without an axis: it is read once, into the first
-    axis' place, and copied to its places in the other axes.
+    A role is AXIS.CHANNEL. A channel of `shared` also has a role without an axis. Its reading is stored in
+    the first axis' place, and copied to its places in the other axes.
     """
 
     axes: tuple[tuple[str, Channels], ...] = ()
@@ -247,8 +247,8 @@ def of_text(text: str) -> Channels:
 def read_points(node: Node, folder: Path, shared: Iterable[Point] = ()) -> Channels:
     """Read `points` of a rig file: a mapping name: {role, label}, or the path of a file that holds one.
 
-    `folder` is what the path is relative to; shared: further points, those of all axes. Raises InputError for a
-    name that is not a plain word or stands in both, no coil or several, more than MAX_POINTS.
+    `folder` is what the path is relative to; shared: further points, those of all axes. Raises InputError
+    for a name that is not a plain word or stands in both, no coil or several, more than MAX_POINTS.
     """
     points = [*_listed(node, folder), *shared]
     if twice := {p.name for p in points if [q.name for q in points].count(p.name) > 1}:

@@ -289,9 +289,9 @@ class SocketSettings:
 class Settings:
     """A whole configuration; `path` is the file it came from, `channels` those of its points.
 
-    A rig file with `axes` gives two kinds. Those of one axis (`axis` is its name, `rig_socket` the rig's socket) are
-    what a rig without axes has. Those of the whole rig have `axes`, and the channels of all axes; their sections
-    `control`, `compensation` and `protection` are the first axis'.
+    A rig file with `axes` gives two kinds. Those of one axis are what a rig without axes has; `axis` is its
+    name, `rig_socket` the rig's socket. Those of the whole rig have `axes`, and the channels of all axes.
+    Their sections `control`, `compensation` and `protection` are the first axis'.
     """
 
     path: str
@@ -449,7 +449,7 @@ _AXIS = re.compile(r"[a-z][a-z0-9]*")
 
 
 def _named(part: Settings, axis: str, count: int) -> Settings:
-    """Return the settings of an axis with its own name, socket and folder, and its share of the disk space."""
+    """Return an axis' settings with its own name, socket and folder, and its share of the disk space."""
     path, recording = Path(part.socket.path), part.recording
     return dataclasses.replace(
         part,
@@ -467,7 +467,7 @@ def _named(part: Settings, axis: str, count: int) -> Settings:
 
 
 def _axis_node(root: Node, axis: str, own: Node) -> Node:
-    """Return the configuration of one axis: the rig's sections, the axis' keys over them, its devices only."""
+    """Return one axis' configuration: the rig's sections, the axis' keys over them, its devices only."""
     sections = {k: v for k, v in root.value.items() if k not in (AXES, POINTS)}
     for name in OF_AN_AXIS:
         if name in own.value:

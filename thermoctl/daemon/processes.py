@@ -148,8 +148,9 @@ def _command_process(settings: Settings, shared: Shared, board: Any) -> int:
     loops.die_with_parent()
     path = Path(settings.socket.path)
     listener = listen(path, settings.socket.group)
+    log = partial(console_log, axis=settings.axis) if settings.axis else console_log
     try:
-        serve(listener, Commands(shared, settings, reload_settings, console_log), stop)
+        serve(listener, Commands(shared, settings, reload_settings, log), stop)
     finally:
         listener.close()
         with contextlib.suppress(FileNotFoundError):
