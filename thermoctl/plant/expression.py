@@ -396,6 +396,11 @@ def names(expr: Expr) -> frozenset[str]:
     return frozenset(n.value for n in walk(expr) if n.op == "name")
 
 
+def calls_fmu(expr: Expr) -> bool:
+    """Return whether an FMU computes a part of the expression."""
+    return any(n.op == "fmu" for n in walk(expr))
+
+
 def substitute(expr: Expr, change: Callable[[Expr], Expr | None]) -> Expr:
     """Return a copy where `change(node)` replaces each node for which it is not None (bottom up)."""
     done: dict[int, Expr] = {}

@@ -22,6 +22,7 @@ from thermoctl.plant.units import dimension
 from thermoctl.yamlfile import Node, suggest
 
 SECTIONS = ("title", "inputs", "states", "outputs", "parameters")
+EXPRESSIONS = ("storage", "initial", "value")
 PROBES = 5  # random points at which an output that is a state's reading must equal the state
 
 
@@ -50,9 +51,13 @@ class _Plant:
                 ("parameters", fmu.parameters),
             )
         }
-        free = [n for n, v in fmu.parameters.items() if n in self.given["parameters"] or _is_free(v)]
-        self.parameters = {n: fmu.parameters[n] for n in free}
-        self.names = _names([*fmu.inputs, *fmu.states, *self.parameters, *fmu.outputs], set(RESERVED))
+        self.names = _names([*fmu.inputs, *fmu.states, *fmu.parameters, *fmu.outputs], set(RESERVED))
+        read = self._words()
+        self.parameters = {
+            n: v
+            for n, v in fmu.parameters.items()
+            if n in self.given["parameters"] or _is_free(v) or self.names[n] in read
+        }
         self.constants = {n: e.value.pop("constant") for n, e in self.given["inputs"].items() if "constant" in e.value}
 
     def _section(self, kind: str, variables: Iterable[str]) -> dict[str, Node]:
@@ -68,6 +73,12 @@ class _Plant:
                     f"there are {', '.join(variables) or 'none'}"[:600]
                 )
         return {k: Node(dict(v.value or {}), v.file, v.line, v.column) for k, v in node.value.items()}
+
+    def _words(self) -> set[str]:
+        """Return the names in the map's expressions."""
+        entries = [*self.given["states"].values(), *self.given["outputs"].values()]
+        texts = [str(q.value) for e in entries for k, q in e.value.items() if k in EXPRESSIONS]
+        return {word for text in texts for word in re.findall(r"[A-Za-z_]\w*", text)}
 
     def document(self) -> Node:
         fmu, names = self.fmu, self.names
