@@ -67,7 +67,9 @@ def as_fmu(plant: Plant, table: Table, folder: Path) -> Plant:
         "nodes": ("initial", "initial_sigma", "storage", "role"),
         "outputs": ("column", "noise", "role"),
     }
-    mapped = {s: {n: {k: q[k] for k in keys if k in q} for n, q in p.get(s, {}).items()} for s, keys in kept.items()}
+    mapped = {
+        s: {n: {k: q[k] for k in keys if k in q} for n, q in p.get(s, {}).items()} for s, keys in kept.items()
+    }
     mapped["states"] = mapped.pop("nodes")
     mapped["outputs"] = {  # as the exporter calls a reading that is named like a state
         f"{o}_reading" if o in plant.nodes else o: {"column": plant.outputs[o].column, **q}

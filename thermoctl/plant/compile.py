@@ -114,7 +114,6 @@ class Code(Equations):
             ]
         return "\n".join([*parts, lu, lu_lanes, '#include "integrator.h"\n'])
 
-
     def _declared(self) -> list[str]:
         """Return the C that declares the functions of FMUs; their contents are part of the source's key."""
         if not self.fmus:

@@ -144,7 +144,9 @@ class Equations:
                 elif e.op == "name":
                     done[id(e)] = place[e.value]
                 else:
-                    text = self._statement(e, a, lines)
+                    text = (
+                        self._foreign(e, a) if e.op in ("fmu", "fmu_slope") else self._statement(e, a, lines)
+                    )
                     done[id(e)] = f"c{len(lines)}"
                     lines.append(f"const double c{len(lines)} = {text};\n")
         return "".join(lines) + "".join(f"out[{i}] = {done[id(e)]};\n" for i, e in enumerate(exprs))
@@ -181,8 +183,6 @@ class Equations:
         if op in ("table", "table_slope"):
             lines.append(f"const double c{len(lines)}[] = {{{', '.join(a[1:])}}};\n")
             return f"{op}_({a[0]}, {e.value}, c{len(lines) - 1})"
-        if op in ("fmu", "fmu_slope"):
-            return self._foreign(e, a)
         function = {"abs": "fabs", "min": "min_", "max": "max_", "dpow": "dpow_"}.get(op, op)
         return f"{function}({', '.join(a)})"
 

@@ -4,7 +4,7 @@
 
 is the derivative that the FMU computes with its variables T and heater.P at these values; the name of an
 output gives that output. Time is passed on. Other variables keep the FMU's start values.
-Slopes are directional derivatives where the FMU gives them, else central differences (fmu.c).
+Slopes are directional derivatives where the FMU gives them, else central differences (fmu.h).
 An FMU is a program: opening one runs it.
 """
 
@@ -29,8 +29,8 @@ from thermoctl.yamlfile import InputError, suggest
 if TYPE_CHECKING:
     from fmpy.model_description import ModelDescription, ModelVariable
 
-_TIME, _STATE, _CONTINUOUS, _DISCRETE, _FIXED = range(5)  # as in fmu.c
-_FUNCTIONS = {  # in the order of fmu.c
+_TIME, _STATE, _CONTINUOUS, _DISCRETE, _FIXED = range(5)  # as in fmu.h
+_FUNCTIONS = {  # in the order of fmu.h
     2: "SetTime SetContinuousStates GetDerivatives SetReal GetReal EnterEventMode NewDiscreteStates "
     "EnterContinuousTimeMode Reset SetupExperiment EnterInitializationMode ExitInitializationMode "
     "GetDirectionalDerivative",
@@ -143,7 +143,9 @@ class Fmu:
             ctypes.c_void_p.in_dll(library, f"{name}_").value = address
         (ctypes.c_void_p * (index + 1)).in_dll(library, "fmus_")[index] = self._handle
 
-    def evaluate(self, result: str, names: Sequence[str], values: Sequence[Any], by: str | None = None) -> Any:
+    def evaluate(
+        self, result: str, names: Sequence[str], values: Sequence[Any], by: str | None = None
+    ) -> Any:
         """Return a result, or its slope `by` an argument, at values that broadcast together; [0]: time."""
         shaped = np.broadcast_arrays(*(np.asarray(v, float) for v in values))
         rows = np.full((shaped[0].size, 1 + len(self.arguments)), np.nan)
@@ -250,7 +252,7 @@ def _instance(path: Path, d: ModelDescription) -> Any:
 
 @cache
 def _shim() -> ctypes.CDLL:
-    shim = library(Path(__file__).with_name("fmu.c").read_text())
+    shim = library(Path(__file__).with_name("fmu.h").read_text())
     p, i = ctypes.c_void_p, ctypes.c_int
     shim.fmu_make.argtypes, shim.fmu_make.restype = [p] * 8, p
     shim.fmu_rows.argtypes, shim.fmu_rows.restype = [p, i, i, i, p, p], None

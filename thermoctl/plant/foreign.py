@@ -51,14 +51,18 @@ class _Plant:
                 ("parameters", fmu.parameters),
             )
         }
-        self.names = _names([*fmu.inputs, *fmu.states, *fmu.parameters, *fmu.outputs], set(RESERVED))
+        taken = set(RESERVED)
+        self.names = _names([*fmu.inputs, *fmu.states, *fmu.parameters], taken)
+        self.readings = _names(fmu.outputs, taken)
         read = self._words()
         self.parameters = {
             n: v
             for n, v in fmu.parameters.items()
-            if n in self.given["parameters"] or _is_free(v) or self.names[n] in read
+            if n in self.given["parameters"] or _range(v) or self.names[n] in read
         }
-        self.constants = {n: e.value.pop("constant") for n, e in self.given["inputs"].items() if "constant" in e.value}
+        self.constants = {
+            n: e.value.pop("constant") for n, e in self.given["inputs"].items() if "constant" in e.value
+        }
 
     def _section(self, kind: str, variables: Iterable[str]) -> dict[str, Node]:
         node = self.mapped.value.get(kind)
@@ -82,12 +86,16 @@ class _Plant:
 
     def document(self) -> Node:
         fmu, names = self.fmu, self.names
-        inputs = {names[n]: self._entry("inputs", n, self._input(v)) for n, v in fmu.inputs.items() if n not in self.constants}
+        inputs = {
+            names[n]: self._entry("inputs", n, self._input(v))
+            for n, v in fmu.inputs.items()
+            if n not in self.constants
+        }
         same = self._readings()
         outputs = {}
         for n, v in fmu.outputs.items():
             value = names[same[n]] if n in same else self._call(n)
-            outputs[names[n]] = self._entry("outputs", n, {"value": value, "column": n, **_unit(v)})
+            outputs[self.readings[n]] = self._entry("outputs", n, {"value": value, "column": n, **_unit(v)})
         flows, nodes = {}, {}
         for n, v in fmu.states.items():
             entry = self._entry("states", n, {"storage": 1, "initial": v.start, **_unit(v)})
@@ -95,10 +103,11 @@ class _Plant:
             nodes[names[n]] = entry
             rate = self._call(fmu.derivatives[n])
             flows[f"change_of_{names[n]}"] = {
-                "into": names[n], "rate": rate if storage == 1 else f"({storage}) * {rate}",
+                "into": names[n],
+                "rate": rate if storage == 1 else f"({storage}) * {rate}",
             }
         parameters = {
-            names[n]: self._entry("parameters", n, {"value": v.start, **_unit(v), **({"range": list(v.range)} if _is_free(v) else {})})
+            names[n]: self._entry("parameters", n, {"value": v.start, **_unit(v), **_range(v)})
             for n, v in self.parameters.items()
         }
         title = self.mapped.value.get("title")
@@ -142,7 +151,9 @@ class _Plant:
         """Return outputs that are a state's reading, and the state: equal at random points."""
         fmu, random = self.fmu, np.random.default_rng(0)
         free = {**fmu.states, **fmu.inputs}
-        points = {n: v.start + (abs(v.start) or 1.0) * random.uniform(-0.1, 0.1, PROBES) for n, v in free.items()}
+        points = {
+            n: v.start + (abs(v.start) or 1.0) * random.uniform(-0.1, 0.1, PROBES) for n, v in free.items()
+        }
         found = {}
         for output in fmu.outputs:
             y = fmu.evaluate(output, tuple(points), [0.0, *points.values()])
@@ -152,8 +163,10 @@ class _Plant:
         return found
 
 
-def _is_free(v: Variable) -> bool:
-    return v.range is not None and v.range[0] <= v.start <= v.range[1] and v.range[0] < v.range[1]
+def _range(v: Variable) -> dict[str, list[float]]:
+    """Return the range of a refit, where the description gives both ends."""
+    low, high = v.range or (np.inf, -np.inf)
+    return {"range": [low, high]} if low < high and low <= v.start <= high else {}
 
 
 def _names(variables: Iterable[str], taken: set[str]) -> dict[str, str]:
