@@ -109,7 +109,7 @@ def _description(
 def _dependencies(plant: Plant, e: Equations, first_state: int) -> list[str]:
     """Return the attribute that names the inputs and states which each derivative and each output reads.
 
-    None is written for a plant with delays: what is delayed is a state of the FMU's own."""
+    A plant with delays gets none: a delayed value is a state of the FMU's own."""
     if e.input_delays or e.output_delays:
         return [""] * (len(e.states) + len(e.outputs))
     index = {i: 1 + k for k, i in enumerate(plant.inputs)}

@@ -71,7 +71,7 @@ def cache_directory() -> Path:
 def library(source: str, folders: Sequence[Path] = (), key: str = "") -> ctypes.CDLL:
     """Return C source as a loaded library, compiled once a machine. Raises InputError.
 
-    `folders`: those of its headers; `key`: what else its content depends on, such as the headers."""
+    `folders`: those of its headers; `key`: the headers' text, or other text that the content depends on."""
     key = hashlib.sha256((source + key + _compiler()[1]).encode()).hexdigest()[:32]
     folder = cache_directory()
     path = folder / f"{key}.so"

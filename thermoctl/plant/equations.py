@@ -187,7 +187,7 @@ class Equations:
         return f"{function}({', '.join(a)})"
 
     def _foreign(self, e: Expr, a: list[str]) -> str:
-        """Return the call of an FMU; an argument that the expression leaves out is NaN and keeps its value."""
+        """Return the call of an FMU; a missing argument is NaN and keeps its value."""
         path, result, names, *by = e.value
         fmu = opened(path)
         given = dict(zip([0, *map(fmu.argument, names)], a, strict=True))
