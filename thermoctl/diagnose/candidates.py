@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose.catalogue import Effect, EffectParameter
-from thermoctl.diagnose.places import PLACES, Place, driven, heats
+from thermoctl.diagnose.places import PLACES, Place, askable, driven, heats
 from thermoctl.diagnose.rig import STRAIGHT, TEMPERATURE, Rig, kind_of, zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
@@ -118,6 +118,8 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     driving = {place.input for place in driven(rig)}
     for effect in effects.values():
         for place in PLACES[effect.where](rig):
+            if not askable(rig, place):
+                continue
             near = place.nodes.get("v")
             choices: list[dict[str, Expr]] = [{}]
             for need in effect.needs:

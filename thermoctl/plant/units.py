@@ -186,7 +186,7 @@ class _Check:
 
     def _of(self, e: Expr, a: list[Dimension | None]) -> Dimension | None:
         op = e.op
-        if op == "num":
+        if op in ("num", "fmu"):
             return None
         if op == "name":
             return self.units.get(e.value)
