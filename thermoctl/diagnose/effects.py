@@ -31,6 +31,7 @@ _KEYS = (
     "title",
     "where",
     "needs",
+    "reads",
     "change",
     "variants",
     "shapes",
@@ -103,6 +104,7 @@ class Effect:
     source: str
     caution: str | None = None  # what a finding of it cannot tell, in words
     prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
+    reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
 
 
 def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
@@ -202,6 +204,7 @@ def _read(root: yamlfile.Node) -> Effect:
         top["source"].value,
         top["caution"].value if "caution" in top else None,
         prior,
+        tuple(top["reads"].plain()) if "reads" in top else (),
     )
 
 
@@ -409,6 +412,20 @@ def _velocity_nodes(rig: Rig) -> Iterator[Place]:
     yield from _nodes(rig, rig.velocities, "v")
 
 
+def _storing(rig: Rig) -> list[str]:
+    """The nodes that a flow can fill; a position stores nothing."""
+    ends = {e for f in rig.physics.flows.values() for e in (f.source, f.target)}
+    return [n for n in rig.physics.nodes if n in ends and n not in rig.position_of.values()]
+
+
+def _exchanging(rig: Rig) -> Iterator[Place]:
+    nodes = set(_storing(rig))
+    for f in rig.physics.flows.values():
+        if f.source in nodes and f.target in nodes:
+            ends = {"m": f.source, "n": f.target}
+            yield Place(f"{f.source}-{f.target}", {k: name(str(v)) for k, v in ends.items()}, ends)
+
+
 def _conductances(rig: Rig) -> Iterator[Place]:
     for f in rig.physics.flows.values():
         read = ex.names(f.rate)
@@ -562,6 +579,8 @@ def _resistive(rig: Rig) -> Iterator[Place]:
 
 
 PLACES = {
+    "node": lambda rig: _nodes(rig, _storing(rig), "n"),
+    "node_pair": _exchanging,
     "temperature_node": _temperature_nodes,
     "velocity_node": _velocity_nodes,
     "conductance": _conductances,
@@ -670,6 +689,8 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     out = []
     driving = {place.input for place in _drives(rig)}
     for effect in effects.values():
+        if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
+            continue
         for place in PLACES[effect.where](rig):
             near = place.nodes.get("v")
             choices: list[dict[str, Expr]] = [{}]
