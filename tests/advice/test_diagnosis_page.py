@@ -5,15 +5,25 @@ from pathlib import Path
 
 import pytest
 
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.effects import catalogue
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.result import contract
 from thermoctl.diagnose.words import NEXT
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 
-LAW = "expression variables parameters probability gain rms share_closed family effect".split()
+LAW = [
+    "expression",
+    "variables",
+    "parameters",
+    "probability",
+    "gain",
+    "rms",
+    "share_closed",
+    "family",
+    "effect",
+]
 LOST = ("effect", "where", "beside", "probability", "below_best", "reason")
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/reference/diagnosis.md").read_text()

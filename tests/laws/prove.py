@@ -20,8 +20,8 @@ import numpy as np
 
 from tests.laws.rigs import LAWS, RATIOS, Made, Truth, drawn, make
 from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.effects import catalogue
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law import Law, find_law, law_rate
 from thermoctl.diagnose.limits import limits

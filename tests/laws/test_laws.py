@@ -8,12 +8,14 @@ import yaml
 from tests.laws.prove import EQUAL, difference
 from tests.laws.rigs import LAWS, make
 from thermoctl.cli import main
+from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.effects import Rig, candidates, catalogue
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law import find_law
 from thermoctl.diagnose.law_result import law_entry, law_section
 from thermoctl.diagnose.limits import limits
+from thermoctl.diagnose.rig import Rig
 from thermoctl.plant import load, save
 
 ENTROPIC = next(law for law in LAWS if law.name == "entropic heat")

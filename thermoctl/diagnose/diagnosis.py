@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.decide import Facts, decide, weigh
-from thermoctl.diagnose.effects import Effect
 from thermoctl.diagnose.fit import as_refitted
 from thermoctl.diagnose.held_out import split, worth
 from thermoctl.diagnose.law import find_law

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose import effects
+from thermoctl.diagnose import places as catalogue_places
+from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.effects import Candidate
 from thermoctl.diagnose.fit import Fitted, Placed, fitted
 from thermoctl.diagnose.held_out import Worth, worth
 from thermoctl.diagnose.law_forms import (
@@ -375,7 +375,7 @@ def law_candidate(case: Case, rig: Structure, p: Proposal) -> Candidate:
     """Return a law as an effect at its place."""
     effect = law_effect(p.terms, p.place, _unit(case, p.place))
     ends = {"target": p.place.target, **({"source": p.place.source} if p.place.source else {})}
-    return Candidate(effect, effects.Place(p.place.where, {}, ends), rig)
+    return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig)
 
 
 def refitted_law(case: Case, parent: Fitted, p: Proposal, at: Tracked) -> Fitted | None:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from thermoctl import yamlfile
-from thermoctl.diagnose.effects import TEMPERATURE, Effect, EffectParameter, zero_of
+from thermoctl.diagnose.catalogue import Effect, EffectParameter
+from thermoctl.diagnose.rig import TEMPERATURE, zero_of
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num

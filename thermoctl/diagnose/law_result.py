@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
-from thermoctl.diagnose.effects import zero_of
 from thermoctl.diagnose.fit import Fitted
 from thermoctl.diagnose.law import Law, Proposal, equation
+from thermoctl.diagnose.rig import zero_of
 from thermoctl.diagnose.words import law_sentence
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
