@@ -62,8 +62,11 @@ def gplearn(x: np.ndarray, y: np.ndarray) -> Predict:
     from gplearn.genetic import SymbolicRegressor
 
     model = SymbolicRegressor(
-        population_size=1000, generations=15, function_set=("add", "sub", "mul", "div", "sqrt", "log", "abs", "neg"),
-        parsimony_coefficient=0.01, random_state=1,
+        population_size=1000,
+        generations=15,
+        function_set=("add", "sub", "mul", "div", "sqrt", "log", "abs", "neg"),
+        parsimony_coefficient=0.01,
+        random_state=1,
     )
     model.fit(x, y)
     return model.predict
@@ -96,7 +99,9 @@ def smoothed(made: Made) -> tuple[Fitted, list, np.ndarray, np.ndarray]:
 
 def _values(found: list, run: dict) -> np.ndarray:
     n = len(run["t"])
-    return np.stack([(np.broadcast_to(ex.evaluate(s.value, run), n) - s.centre) / s.size for s in found], axis=1)
+    return np.stack(
+        [(np.broadcast_to(ex.evaluate(s.value, run), n) - s.centre) / s.size for s in found], axis=1
+    )
 
 
 def judged(made: Made, first: Fitted, found: list, x: np.ndarray, predict: Predict) -> dict:
@@ -110,19 +115,38 @@ def judged(made: Made, first: Fitted, found: list, x: np.ndarray, predict: Predi
             used |= set(ex.names(s.value))
     model = compile_plant(made.truth)
     d = model.excitation(made.tables[-1])
-    run = {**dict(zip(model.inputs, d.u.T, strict=False)), **dict(zip(model.states, model.run(d).x.T, strict=True)), "t": d.t, "pi": np.pi}
+    run = {
+        **dict(zip(model.inputs, d.u.T, strict=False)),
+        **dict(zip(model.states, model.run(d).x.T, strict=True)),
+        "t": d.t,
+        "pi": np.pi,
+    }
 
     def net(plant, only=None):
         known = {**run, **{k: v.value for k, v in plant.parameters.items()}}
         total = np.zeros(len(d.t))
         for f in plant.flows.values():
             if made.law.target in (f.source, f.target) and only in (None, f.name):
-                total = total + (1 if f.target == made.law.target else -1) * np.asarray(ex.evaluate(f.rate, known), float)
+                total = total + (1 if f.target == made.law.target else -1) * np.asarray(
+                    ex.evaluate(f.rate, known), float
+                )
         return total / np.asarray(ex.evaluate(plant.nodes[made.law.target].storage, known), float)
 
-    storage = float(np.mean(np.asarray(ex.evaluate(first.plant.nodes[made.law.target].storage, {k: v.value for k, v in first.plant.parameters.items()}))))
+    storage = float(
+        np.mean(
+            np.asarray(
+                ex.evaluate(
+                    first.plant.nodes[made.law.target].storage,
+                    {k: v.value for k, v in first.plant.parameters.items()},
+                )
+            )
+        )
+    )
     delta = net(first.plant) + predict(_values(found, run)) / storage - net(made.truth)
-    return {"variable": used - AMBIENT == set(made.law.variables) - AMBIENT, "difference": float(np.sqrt(np.mean(delta**2) / np.mean(net(made.truth, "hidden") ** 2)))}
+    return {
+        "variable": used - AMBIENT == set(made.law.variables) - AMBIENT,
+        "difference": float(np.sqrt(np.mean(delta**2) / np.mean(net(made.truth, "hidden") ** 2))),
+    }
 
 
 def main() -> None:
@@ -135,7 +159,13 @@ def main() -> None:
     for name, law, family, size, world, seed in [c for c in cases() if c[1]][: args.number]:
         made = make(law, family, size, world, seed)
         ours = judge(made, False)
-        rows["thermoctl"].append({"variable": bool(ours.get("variable")), "difference": ours["difference"], "seconds": ours["seconds"]})
+        rows["thermoctl"].append(
+            {
+                "variable": bool(ours.get("variable")),
+                "difference": ours["difference"],
+                "seconds": ours["seconds"],
+            }
+        )
         first, found, x, y = smoothed(made)
         for m, method in PEERS.items():
             started = time.process_time()
@@ -144,8 +174,18 @@ def main() -> None:
             except Exception as e:
                 r = {"variable": False, "difference": float("inf"), "error": str(e)[:100]}
             rows[m].append({**r, "seconds": time.process_time() - started})
-        print(name, {m: (r[-1]["variable"], round(r[-1]["difference"], 2), r[-1].get("error")) for m, r in rows.items()}, flush=True)
-    lines = ["| method | variable right | law equivalent | difference, median | processor time, median |", "|---|---|---|---|---|"]
+        print(
+            name,
+            {
+                m: (r[-1]["variable"], round(r[-1]["difference"], 2), r[-1].get("error"))
+                for m, r in rows.items()
+            },
+            flush=True,
+        )
+    lines = [
+        "| method | variable right | law equivalent | difference, median | processor time, median |",
+        "|---|---|---|---|---|",
+    ]
     for m, r in rows.items():
         n = len(r)
         lines.append(

@@ -40,7 +40,9 @@ def main(folder: Path) -> None:
         if law:
             entry = law_entry(law)
             assert entry is not None
-            print(f"found: {law_sentence(entry)}\nrms: {first.fit.rms()} -> {entry['rms']}; held-out energy closed: {law.closed:.2f}")
+            print(
+                f"found: {law_sentence(entry)}\nrms: {first.fit.rms()} -> {entry['rms']}; held-out energy closed: {law.closed:.2f}"
+            )
             print("\n".join(entry["family"]))
         else:
             print("found: no law")
