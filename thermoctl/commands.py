@@ -653,11 +653,17 @@ _DIAGNOSIS = (
     ),
     _command(
         "effects",
-        "list the catalogue of effects, show one (`effects show NAME`), or check files of your own (`effects check FILE`)",
+        "list the catalogue of effects, show one (`effects show NAME`), check files of your own (`effects check FILE`), "
+        "or save the law of a diagnosis as one (`effects save DIR NAME`)",
         "thermoctl.commands:effects",
         "",
-        _arg("action", nargs="?", metavar="show|check"),
-        _arg("files", nargs="*", metavar="NAME|FILE", help="an effect's name; files or folders of effects"),
+        _arg("action", nargs="?", metavar="show|check|save"),
+        _arg(
+            "files",
+            nargs="*",
+            metavar="NAME|FILE|DIR",
+            help="an effect's name; files or folders of effects; a diagnosis and a name",
+        ),
         _arg(
             "--plant",
             metavar="PLANT",
