@@ -54,7 +54,7 @@ def _run(job: Job, error: str | None, seconds: float | None) -> Run:
 
 
 def _dask() -> tuple[Any, Any]:
-    """Return dask and distributed; importing them takes a second. Raises InputError where they are missing."""
+    """Return dask and distributed; their import takes a second. Raises InputError where one is missing."""
     try:
         import dask
         import distributed
