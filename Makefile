@@ -115,6 +115,10 @@ size: install                      # the wheel in a fresh environment: megabytes
 stranger: develop                  # another simulator's log with ; and decimal commas, up to the right name: commands, edits, times
 	$(BIN)/python -m pytest -q -s -k strangers_rig tests/plant/test_plant_new.py
 
+.PHONY: wrong-plants
+wrong-plants: develop              # twenty wrong plants: found by the checks, named rightly, or not named with confidence; minutes
+	$(BIN)/python -m tests.checks.wrong_plants
+
 .PHONY: fmu-back
 fmu-back: develop                  # ten plants with a hidden effect, diagnosed with the plant file and with its FMU: a table; minutes
 	$(BIN)/python -m tests.plant.fmu_back
