@@ -61,7 +61,7 @@ install: $(VENV)/.installed        # dependencies of the program, and its compil
 $(VENV)/.installed: $(SOURCES)
 	@echo "[1/3] a virtual environment in $(VENV)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(call listed,p['build-system']['requires'] + p['project']['dependencies']) > $(VENV)/needs
+	@$(call listed,p['build-system']['requires'] + p['project']['dependencies'] + p['project']['optional-dependencies']['fleet']) > $(VENV)/needs
 	@all=$$(wc -l < $(VENV)/needs); n=0; while read -r need; do n=$$((n + 1)); \
 		echo "[2/3] $$need ($$n of $$all)"; $(PIP) "$$need" || exit 1; done < $(VENV)/needs
 	@echo "[3/3] compiling the control loop and the drivers (a minute or two)"
@@ -106,6 +106,10 @@ prove-refit: develop               # share of 95 % intervals that contain the tr
 
 refit-recordings: develop          # fits of real recordings, beside the published fits of the same structure
 	$(BIN)/python -m pytest -m slow -s tests/plant/test_refit_recordings.py
+
+.PHONY: size
+size: install                      # the wheel in a fresh environment: megabytes by package, import times, demo, diagnose, service install
+	$(BIN)/python tests/bench/install.py
 
 .PHONY: stranger
 stranger: develop                  # another simulator's log with ; and decimal commas, up to the right name: commands, edits, times

@@ -795,6 +795,13 @@ _PEOPLE = (
         _JSON,
     ),
     _command(
+        "init",
+        "copy configurations, device profiles, plants and examples into a folder, to start from",
+        "thermoctl.shipped:init",
+        "folder",
+        _arg("folder", nargs="?", default=".", metavar="DIR", help="the folder (default: this one)"),
+    ),
+    _command(
         "completion",
         "print the shell's completion script; source it",
         "thermoctl.manual:completion",
