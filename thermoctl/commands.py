@@ -55,7 +55,12 @@ _YES = _arg(
     "--yes", action="store_true", help="start without asking; without a terminal, required to move a rig"
 )
 _JSON = _arg("--json", action="store_true", help="print one JSON object, for programs")
-_PLANT = _arg("--plant", required=True, metavar="PLANT", help="the plant file")
+_PLANT = _arg("--plant", required=True, metavar="PLANT", help="the plant file, or an FMU")
+_MAP = _arg(
+    "--map",
+    metavar="FILE",
+    help="with an FMU as the plant: columns, roles, units, noise and ranges of its variables",
+)
 _RECORDINGS = _arg(
     "recordings",
     nargs="+",
@@ -313,6 +318,7 @@ _PLANTS = (
         "thermoctl.plant.commands:simulate",
         "",
         _PLANT,
+        _MAP,
         _RECORDINGS,
         _TIME,
         _COLUMNS,
@@ -331,6 +337,7 @@ _PLANTS = (
         "thermoctl.plant.commands:refit",
         "",
         _PLANT,
+        _MAP,
         _RECORDINGS,
         _TIME,
         _COLUMNS,
@@ -356,6 +363,7 @@ _PLANTS = (
         "thermoctl.checks.commands:check",
         "",
         _arg("plants", nargs="+", metavar="PLANT"),
+        _MAP,
         _arg(
             "--data",
             nargs="+",
@@ -572,7 +580,8 @@ _DIAGNOSIS = (
             metavar="REC",
             help="recordings (.csv, .xlsx, .parquet, .arrow), or folders of many rigs' recordings: one diagnosis a rig",
         ),
-        _arg("--plant", metavar="FILE", help="the plant file"),
+        _arg("--plant", metavar="FILE", help="the plant file, or an FMU"),
+        _MAP,
         _arg(
             "--held-out",
             action="append",
@@ -646,11 +655,17 @@ _DIAGNOSIS = (
     ),
     _command(
         "effects",
-        "list the catalogue of effects, show one (`effects show NAME`), or check files of your own (`effects check FILE`)",
+        "list the catalogue of effects, show one (`effects show NAME`), check files of your own (`effects check FILE`), "
+        "or save the law of a diagnosis as one (`effects save DIR NAME`)",
         "thermoctl.commands:effects",
         "",
-        _arg("action", nargs="?", metavar="show|check"),
-        _arg("files", nargs="*", metavar="NAME|FILE", help="an effect's name; files or folders of effects"),
+        _arg("action", nargs="?", metavar="show|check|save"),
+        _arg(
+            "files",
+            nargs="*",
+            metavar="NAME|FILE|DIR",
+            help="an effect's name; files or folders of effects; a diagnosis and a name",
+        ),
         _arg(
             "--plant",
             metavar="PLANT",
@@ -780,6 +795,27 @@ _PEOPLE = (
         ),
         _arg("--scheduler", metavar="ADDRESS", help="a Dask cluster"),
         _JSON,
+    ),
+    _command(
+        "report",
+        "write one archive for a question to others: versions, configuration, log, the end of the newest recording",
+        "thermoctl.support:report",
+        "settings out seconds",
+        CONFIG,
+        _arg(
+            "--out",
+            default="thermoctl-report.zip",
+            metavar="FILE",
+            help="the archive (default thermoctl-report.zip)",
+        ),
+        _arg("--seconds", type=float, default=60.0, metavar="S", help="of the newest recording (default 60)"),
+    ),
+    _command(
+        "init",
+        "copy configurations, device profiles, plants and examples into a folder, to start from",
+        "thermoctl.shipped:init",
+        "folder",
+        _arg("folder", nargs="?", default=".", metavar="DIR", help="the folder (default: this one)"),
     ),
     _command(
         "completion",

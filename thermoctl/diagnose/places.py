@@ -43,6 +43,20 @@ def _velocity_nodes(rig: Rig) -> Iterator[Place]:
     yield from _nodes(rig, rig.velocities, "v")
 
 
+def _storing(rig: Rig) -> list[str]:
+    """The nodes that a flow can fill; a position stores nothing."""
+    ends = {e for f in rig.physics.flows.values() for e in (f.source, f.target)}
+    return [n for n in rig.physics.nodes if n in ends and n not in rig.position_of.values()]
+
+
+def _exchanging(rig: Rig) -> Iterator[Place]:
+    nodes = set(_storing(rig))
+    for f in rig.physics.flows.values():
+        if f.source in nodes and f.target in nodes:
+            ends = {"m": str(f.source), "n": str(f.target)}
+            yield Place(f"{f.source}-{f.target}", {k: name(v) for k, v in ends.items()}, ends)
+
+
 def _conductances(rig: Rig) -> Iterator[Place]:
     for f in rig.physics.flows.values():
         read = ex.names(f.rate)
@@ -77,6 +91,7 @@ def heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
         for f in plant.flows.values()
         if f.target == node
         and f.source is None
+        and not ex.calls_fmu(f.rate)
         and ex.names(f.rate) & rig.moving_inputs
         and not ex.names(f.rate) & set(rig.heat_inputs)
         and (node not in ex.names(f.rate) or _rests(plant, f))
@@ -114,11 +129,18 @@ def _motors(rig: Rig) -> Iterator[Place]:
 
 
 def driven(rig: Rig) -> Iterator[Place]:
-    """Yield each input that drives a motor or a pump, by its flow."""
+    """Yield each input that drives a motor or a pump, by its flow, or by its own name where the flow is an FMU's."""
     for f in rig.physics.flows.values():
         if rig.is_motor(f) or rig.is_pump(f):
             for u in rig.drives_of(f):
-                yield Place(f.name, {"u": name(u)}, flow=f.name, input=u)
+                yield Place(u if ex.calls_fmu(f.rate) else f.name, {"u": name(u)}, flow=f.name, input=u)
+
+
+def askable(rig: Rig, place: Place) -> bool:
+    """Return whether the plant shows what an effect at the place would change.
+
+    The rate of an FMU is a body's whole balance, not one flow: only an input in it can be changed."""
+    return place.input is not None or not place.flow or not ex.calls_fmu(rig.physics.flows[place.flow].rate)
 
 
 def _sensors(rig: Rig, dimension: str | None = None) -> Iterator[Place]:
@@ -197,6 +219,8 @@ def _resistive(rig: Rig) -> Iterator[Place]:
 
 
 PLACES = {
+    "node": lambda rig: _nodes(rig, _storing(rig), "n"),
+    "node_pair": _exchanging,
     "temperature_node": _temperature_nodes,
     "velocity_node": _velocity_nodes,
     "conductance": _conductances,
