@@ -10,9 +10,9 @@
 A rig with axes has one loop and its pollers; recorder, commands and tuner are an axis each.
 
 The loop ends: the supervisor disables every amplifier over its own link, and the daemon ends. systemd
-starts it again, into SAFE, with the estimates that were kept. The loop stands still: it is killed, then as if it had
-ended. Any other process ends or hangs: it is started again while the loop runs on. The supervisor ends: the
-kernel signals every child (PDEATHSIG), and the loop disables the amplifier.
+starts it again, into SAFE, with the estimates that were kept. The loop stands still: it is killed, then
+as if it had ended. Any other process ends or hangs: it is started again while the loop runs on. The
+supervisor ends: the kernel signals every child (PDEATHSIG), and the loop disables the amplifiers.
 """
 
 from __future__ import annotations
