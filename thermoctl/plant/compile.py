@@ -34,6 +34,7 @@ from thermoctl.plant.language import Plant
 from thermoctl.yamlfile import InputError
 
 _HEADERS = tuple(Path(__file__).with_name(h) for h in ("esdirk.h", "integrator.h"))
+LARGE = 400_000  # characters of a source that is compiled with -O1
 _LOCK = threading.Lock()
 _LOADED: dict[str, Code] = {}
 _LANES = """/* Columns of sensitivities, eight at a time. */
@@ -42,12 +43,14 @@ typedef double lanes __attribute__((vector_size(64), aligned(8)));
 
 
 class Code(Equations):
-    """A compiled plant: its equations with sensitivities to `active`, and the library that computes them."""
+    """A compiled plant: its equations with sensitivities to `active`, and the library that computes them.
 
-    def __init__(self, plant: Plant, active: tuple[str, ...]):
+    `stepper`: with the functions that advance by one period."""
+
+    def __init__(self, plant: Plant, active: tuple[str, ...], stepper: bool = False):
         super().__init__(plant)
         self.active = active
-        self.source = self._source()
+        self.source = "#define STEPPER\n" * stepper + self._source()
         headers = "".join(path.read_text() for path in _HEADERS)
         self.key = hashlib.sha256((self.source + headers + _compiler()[1]).encode()).hexdigest()[:32]
         self.library = _library(self.key, self.source)
@@ -143,7 +146,7 @@ def _compiler() -> tuple[list[str], str]:
                 flags = ""
             command = [
                 *candidate.split(),
-                "-O3",
+                "-O2",
                 "-march=native",
                 "-fno-math-errno",
                 "-fno-trapping-math",
@@ -160,7 +163,7 @@ def _compiler() -> tuple[list[str], str]:
 def compiler() -> list[str]:
     """Return the command of the C compiler, without options. Raises InputError where there is none."""
     command = _compiler()[0]
-    return command[: command.index("-O3")]
+    return command[: command.index("-O2")]
 
 
 def cache_directory() -> Path:
@@ -193,10 +196,11 @@ def _library(key: str, source: str) -> ctypes.CDLL:
 
 def _build(work: Path, source: str) -> None:
     (work / "plant.c").write_text(source)
-    # -O1 compiles a large file's straight-line code as well as -O3, in a fraction of the time. A small plant
-    # runs a tenth slower with -O1, and compiles in less than half of the time. A diagnosis compiles many
-    # plants.
-    command = [("-O1" if a == "-O3" and not 10_000 < len(source) < 400_000 else a) for a in _compiler()[0]]
+    # -O2 compiles in 0.7 of the time of -O3, and its code is a tenth slower. With -O1 the lanes of the
+    # sensitivities are not kept in registers: 3 to 10 times slower. It is for files that -O2 takes minutes for.
+    command = _compiler()[0]
+    if len(source) >= LARGE:
+        command = ["-O1" if a == "-O2" else a for a in command]
     done = subprocess.run(
         [*command, f"-I{_HEADERS[0].parent}", "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],
         capture_output=True,
@@ -226,17 +230,20 @@ def _typed(library: ctypes.CDLL) -> ctypes.CDLL:
     library.observe.restype = None
     library.slopes.argtypes = [_I, _P, _P, _P, _P, _P, _P]
     library.slopes.restype = None
-    library.advance_period.argtypes = [_D, _D, _P, _P, _P, _D, _P, _P, _P, _P, _P]
+    if hasattr(library, "advance_period"):
+        library.advance_period.argtypes = [_D, _D, _P, _P, _P, _D, _P, _P, _P, _P, _P]
     return library
 
 
-def machine_code(plant: Plant, active: tuple[str, ...]) -> Code:
-    """Return the plant's machine code with sensitivities to `active`; plants of one structure share it."""
-    identity = hashlib.sha256(repr((active, _structure(plant))).encode()).hexdigest()
+def machine_code(plant: Plant, active: tuple[str, ...], stepper: bool = False) -> Code:
+    """Return the plant's machine code with sensitivities to `active`; plants of one structure share it.
+
+    `stepper`: with the functions that advance by one period, which take a fifth of the compiler's time."""
+    identity = hashlib.sha256(repr((active, stepper, _structure(plant))).encode()).hexdigest()
     with _LOCK:
         found = _LOADED.get(identity)
     if found is None:
-        found = Code(plant, active)
+        found = Code(plant, active, stepper)
         with _LOCK:
             _LOADED[identity] = found
             if len(_LOADED) > 256:
