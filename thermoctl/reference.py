@@ -26,7 +26,7 @@ from thermoctl.channels import DEFAULT
 from thermoctl.cli import parser
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
-from thermoctl.diagnose.effects import catalogue
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.settings import SECTIONS, options
 from thermoctl.signals import FAULT_WORD_BITS, SIGNALS
 from thermoctl.which_rig import ACTS

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.effects import catalogue
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.result import contract
 from thermoctl.diagnose.words import NEXT

@@ -7,7 +7,9 @@ import pytest
 
 from thermoctl import cli
 from thermoctl.advice.effect_files import FORMS, PARTS, SHAPES, SYMBOLS, check_file
-from thermoctl.diagnose import effects
+from thermoctl.diagnose.catalogue import CHANGES, KEYS, catalogue
+from thermoctl.diagnose.catalogue import SHAPES as catalogue_shapes
+from thermoctl.diagnose.places import PLACES
 from thermoctl.plant import load
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import Section
@@ -31,15 +33,13 @@ def rows(title):
 def test_the_page_lists_what_the_reader_knows():
     keys = re.findall(r"^\| (\w+) \| (`.*?`) \|", chapter("Keys"), re.MULTILINE)
     assert {k for section, cell in keys for k in re.findall(r"`(\w+)`", cell) if section == "file"} == set(
-        effects._KEYS
+        KEYS
     )
     assert {r[0][0]: tuple(r[2]) for r in rows("Places") if r[0] != ["where"]} == dict(SYMBOLS)
-    assert set(SYMBOLS) == set(effects.PLACES)
-    assert (
-        {r[0][0] for r in rows("Changes")} == {*effects._CHANGES} == {*FORMS, *PARTS, "exponent", "straight"}
-    )
+    assert set(SYMBOLS) == set(PLACES)
+    assert {r[0][0] for r in rows("Changes")} == {*CHANGES} == {*FORMS, *PARTS, "exponent", "straight"}
     told = {kind: r[1] for r in rows("Shapes") for kind in r[0]}
-    assert set(told) == set(SHAPES) == set(effects._SHAPES)
+    assert set(told) == set(SHAPES) == set(catalogue_shapes)
     assert all(set(SHAPES[kind]) <= set(names) for kind, names in told.items())
 
 
@@ -57,7 +57,7 @@ def test_every_key_that_the_check_asks_for_is_in_the_table(monkeypatch):
     }
     assert (
         asked
-        - {"from", "into", "rate", *effects.catalogue()["second_ambient"].shapes}
+        - {"from", "into", "rate", *catalogue()["second_ambient"].shapes}
         - {"G", *(f"B{k}" for k in range(5))}
         == table
     )

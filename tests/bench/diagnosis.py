@@ -31,8 +31,9 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose import screen
+from thermoctl.diagnose.candidates import Candidate, candidates
 from thermoctl.diagnose.case import Budget, Case, case
-from thermoctl.diagnose.effects import Candidate, candidates, catalogue
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.extend import extend
 from thermoctl.diagnose.fit import Fitted, Placed, as_refitted, fitted
 from thermoctl.diagnose.held_out import worth

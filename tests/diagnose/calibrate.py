@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.decide import Key, weigh
-from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.limits import Limits, limits
 from thermoctl.diagnose.misfit import Energy, standing
 from thermoctl.diagnose.search import EVENTS

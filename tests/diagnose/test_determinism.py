@@ -11,7 +11,7 @@ import pytest
 from scipy.linalg import blas
 
 from tests.diagnose.test_engine import LAGGED, _write, written
-from thermoctl.diagnose import run, threads
+from thermoctl.diagnose import diagnosis, threads
 from thermoctl.yamlfile import InputError
 
 
@@ -55,10 +55,10 @@ def test_a_diagnosis_runs_on_one_thread_and_gives_the_others_back(monkeypatch):
         seen.extend(get() for get, _ in controls)
         raise InputError("seen enough")
 
-    monkeypatch.setattr(run, "split", stop)
+    monkeypatch.setattr(diagnosis, "split", stop)
     try:
         with pytest.raises(InputError, match="seen enough"):
-            run.diagnose(None, [], {}, None)
+            diagnosis.diagnose(None, [], {}, None)
         assert set(seen) == {1}
         assert {get() for get, _ in controls} == {2}
     finally:

@@ -10,9 +10,11 @@ from scipy.signal import cont2discrete, dlsim, lsim
 
 from tests.plants import SPRING_STAGE, TWO_BLOCKS
 from thermoctl.cli import main
+from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.effects import Rig, candidates, catalogue
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.result import doubts
+from thermoctl.diagnose.rig import Rig
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table
@@ -422,7 +424,7 @@ def test_every_entry_of_the_catalogue_reads_and_a_users_own_replaces_it(tmp_path
         "effect: mine\ntitle: T\nwhere: temperature_node\nsource: me\n"
         "change: [{flow: {from: T, rate: 'K * (T - air)**3'}}]\nparameters: {K: {low: 0}}\n"
     )
-    from thermoctl.diagnose.effects import CATALOGUE
+    from thermoctl.diagnose.catalogue import CATALOGUE
 
     assert "mine" in catalogue((CATALOGUE, tmp_path))
 

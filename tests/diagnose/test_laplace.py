@@ -7,8 +7,9 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
+from thermoctl.diagnose.candidates import Candidate, candidates
 from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.effects import Candidate, candidates, catalogue
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.extend import extend
 from thermoctl.diagnose.fit import Placed, Posterior, evidence_at, fitted
 from thermoctl.diagnose.roles import Structure

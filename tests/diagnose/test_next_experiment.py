@@ -12,8 +12,8 @@ import yaml
 from thermoctl.cli import main
 from thermoctl.diagnose import experiment_file
 from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.design import Excitation, courses, levers
-from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.experiment_file import peaks
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.propose import bits, distance, propose

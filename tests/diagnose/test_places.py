@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from tests.plants import FREE_CARRIAGE
-from thermoctl.diagnose.effects import Rig, candidates, catalogue, shape_grid
+from thermoctl.diagnose.candidates import candidates
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.extend import ranges_of
+from thermoctl.diagnose.rig import Rig
 from thermoctl.diagnose.screen import Direction
+from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import compile_plant

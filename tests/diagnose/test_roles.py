@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from tests.diagnose.changes import Rig, kelvin, milliwatt, names, order
-from thermoctl.diagnose.effects import Candidate, candidates, catalogue
+from thermoctl.diagnose.candidates import Candidate, candidates
+from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Trajectory, changes
 from thermoctl.plant import from_plain, loads

@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl import yamlfile
-from thermoctl.diagnose.effects import CATALOGUE, Candidate, Rig, _read, candidates
+from thermoctl.diagnose.candidates import Candidate, candidates
+from thermoctl.diagnose.catalogue import CATALOGUE, _read
+from thermoctl.diagnose.rig import Rig
 from thermoctl.plant import Plant, expression, load
 from thermoctl.plant.simulate import Excitation
 from thermoctl.plant.units import check_units, dimension

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import median_filter
 
+from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.coordinates import Coordinates
-from thermoctl.diagnose.effects import Effect
 from thermoctl.diagnose.noise import Grid, grid
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant.language import Plant, SensorNoise

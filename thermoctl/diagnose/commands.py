@@ -17,7 +17,7 @@ from rich.table import Table
 
 from thermoctl.checks.commands import checked, report
 from thermoctl.diagnose import run
-from thermoctl.diagnose.effects import CATALOGUE, catalogue
+from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.experiment_file import peaks
 from thermoctl.diagnose.explain import explain
 from thermoctl.diagnose.resolve import resolve

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.decide import Facts, decide, weigh
-from thermoctl.diagnose.effects import Effect
 from thermoctl.diagnose.fit import as_refitted
 from thermoctl.diagnose.held_out import split, worth
 from thermoctl.diagnose.limits import Limits

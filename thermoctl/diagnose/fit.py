@@ -17,9 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.coordinates import Coordinates
-from thermoctl.diagnose.effects import Candidate, EffectParameter
 from thermoctl.diagnose.noise import Averaged, Grid, averaged
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from thermoctl.diagnose.effects import TEMPERATURE, Rig
+from thermoctl.diagnose.rig import TEMPERATURE, Rig
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Input, Node, Output, Plant
 from thermoctl.plant.simulate import Excitation

@@ -13,8 +13,8 @@ from typing import Any
 
 from thermoctl.diagnose import diagnosis as engine
 from thermoctl.diagnose import experiment_file
+from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.design import NONE, Limits
-from thermoctl.diagnose.effects import CATALOGUE, catalogue
 from thermoctl.diagnose.limits import limits as numbers
 from thermoctl.diagnose.page import write_report
 from thermoctl.diagnose.propose import propose

@@ -21,7 +21,10 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincc
 
-from thermoctl.diagnose.effects import STRAIGHT, Candidate, EffectParameter, Rig, shape_grid
+from thermoctl.diagnose.candidates import Candidate
+from thermoctl.diagnose.catalogue import EffectParameter
+from thermoctl.diagnose.rig import STRAIGHT, Rig
+from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit

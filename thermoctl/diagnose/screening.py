@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.coordinates import Coordinates
-from thermoctl.diagnose.effects import candidates
 from thermoctl.diagnose.fit import Fitted, as_refitted, over_noise
 from thermoctl.diagnose.noise import Averaged, averaged, grid
 from thermoctl.diagnose.roles import Structure

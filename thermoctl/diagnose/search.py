@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.effects import PLACES, Candidate
 from thermoctl.diagnose.extend import extend, sticking, weaker
 from thermoctl.diagnose.fit import Fitted, Placed, fitted, over_noise
 from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.places import PLACES
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Metric, sharpened
 from thermoctl.diagnose.screening import Screened, places, screened

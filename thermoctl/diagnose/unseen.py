@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.effects import candidates
+from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import screen

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-from thermoctl.diagnose.effects import CATALOGUE
+from thermoctl.diagnose.catalogue import CATALOGUE
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError, load
 

@@ -1,0 +1,218 @@
+"""The places of a plant at which an entry of the catalogue can sit, by the kind that the entry names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from thermoctl.diagnose.rig import Rig
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr, name
+from thermoctl.plant.language import Flow, Plant
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an effect sits, by the name that a result gives, and what its symbols stand for there."""
+
+    where: str
+    symbols: Mapping[str, Expr] = field(default_factory=dict)
+    nodes: Mapping[str, str] = field(default_factory=dict)  # T, v, a, b ... as ends of flows
+    flow: str | None = None
+    output: str | None = None
+    input: str | None = None
+
+    def parts(self) -> set[str]:
+        """The nodes and the flow that it names (not those that a reading is made of)."""
+        named = {str(e.value) for s, e in self.symbols.items() if s != "y" and e.op == "name"}
+        return {*self.nodes.values(), *named} | ({self.flow} if self.flow else set())
+
+
+def _nodes(rig: Rig, which: Sequence[str], symbol: str) -> Iterator[Place]:
+    for n in which:
+        yield Place(n, {symbol: name(n)}, {symbol: n})
+
+
+def _temperature_nodes(rig: Rig) -> Iterator[Place]:
+    if rig.air:
+        yield from _nodes(rig, rig.temperatures, "T")
+
+
+def _velocity_nodes(rig: Rig) -> Iterator[Place]:
+    yield from _nodes(rig, rig.velocities, "v")
+
+
+def _conductances(rig: Rig) -> Iterator[Place]:
+    for f in rig.physics.flows.values():
+        read = ex.names(f.rate)
+        ends = [e for e in (f.source, f.target) if e in rig.temperatures]
+        if ends and read & set(rig.temperatures):
+            hot = next(e for e in ends if e in read) if any(e in read for e in ends) else ends[0]
+            yield Place(f.name, {"T": name(hot)}, flow=f.name)
+
+
+def _pairs(rig: Rig) -> Iterator[Place]:
+    linked = {frozenset((f.source, f.target)) for f in rig.physics.flows.values()}
+    for k, a in enumerate(rig.temperatures):
+        for b in rig.temperatures[k + 1 :]:
+            if frozenset((a, b)) not in linked:
+                yield Place(f"{a}-{b}", {"TA": name(a), "TB": name(b)}, {"TA": a, "TB": b})
+
+
+def _heated_pairs(rig: Rig) -> Iterator[Place]:
+    for a in rig.temperatures:
+        if not heats(rig.physics, a, rig):
+            continue
+        for b in rig.temperatures:
+            if a != b:
+                yield Place(f"{a}-{b}", {"TA": name(a), "TB": name(b)}, {"a": a, "b": b})
+
+
+def heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
+    """Flows of heat from outside into a node that follow inputs, not temperatures of the network: where these change it (copper's
+    resistance), there is none of it while the inputs rest."""
+    return [
+        f
+        for f in plant.flows.values()
+        if f.target == node
+        and f.source is None
+        and ex.names(f.rate) & rig.moving_inputs
+        and not ex.names(f.rate) & set(rig.heat_inputs)
+        and (node not in ex.names(f.rate) or _rests(plant, f))
+    ]
+
+
+def _rests(plant: Plant, f: Flow) -> bool:
+    """Is a flow nothing while all inputs are zero, whatever the temperatures?"""
+    if any(e.op == "delay" for e in ex.walk(f.rate)):
+        return False
+    at = {
+        **{p.name: p.value for p in plant.parameters.values()},
+        **dict.fromkeys(plant.inputs, 0.0),
+        "t": 0.0,
+    }
+    return all(float(ex.evaluate(f.rate, {**at, **dict.fromkeys(plant.nodes, T)})) == 0 for T in (10.0, 60.0))
+
+
+def _joule_flows(rig: Rig) -> Iterator[Place]:
+    for f in rig.physics.flows.values():
+        squares = [
+            e
+            for e in ex.walk(f.rate)
+            if (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 2)
+            or (e.op == "*" and e.args[0] is e.args[1])
+        ]
+        if f.target in rig.temperatures and f.source is None and squares and f.target not in ex.names(f.rate):
+            yield Place(f.name, {"T": name(f.target)}, flow=f.name)
+
+
+def _motors(rig: Rig) -> Iterator[Place]:
+    for f in rig.physics.flows.values():
+        if rig.is_motor(f):
+            yield Place(f.name, {}, {"v": f.target or f.source or ""}, flow=f.name)
+
+
+def driven(rig: Rig) -> Iterator[Place]:
+    """Yield each input that drives a motor or a pump, by its flow."""
+    for f in rig.physics.flows.values():
+        if rig.is_motor(f) or rig.is_pump(f):
+            for u in rig.drives_of(f):
+                yield Place(f.name, {"u": name(u)}, flow=f.name, input=u)
+
+
+def _sensors(rig: Rig, dimension: str | None = None) -> Iterator[Place]:
+    for o in rig.physics.outputs.values():
+        if dimension is None or rig.kind(o) == dimension:
+            yield Place(o.name, {"y": o.value}, output=o.name)
+    used = [*(f.rate for f in rig.plant.flows.values()), *(o.value for o in rig.plant.outputs.values())]
+    read = set().union(*map(ex.names, used))
+    for i in rig.physics.inputs.values():
+        if i.name in rig.moving_inputs & read and (dimension is None or rig.kind(i) == dimension):
+            yield Place(i.name, {"y": name(i.name)}, input=i.name)
+
+
+def _displacements(rig: Rig) -> Iterator[Place]:
+    warm = set(rig.temperatures) | set(rig.heat_inputs)
+    for o in rig.physics.outputs.values():
+        if rig.kind(o) == "length" and ex.names(o.value) & warm:
+            yield Place(o.name, {"y": o.value}, output=o.name)
+
+
+def _members(rig: Rig) -> Iterator[Place]:
+    for at in _displacements(rig):
+        for T in rig.signals("T"):
+            yield Place(T, {**at.symbols, "T": name(T)}, output=at.output)
+
+
+def _bending_pairs(rig: Rig) -> Iterator[Place]:
+    for at in _displacements(rig):
+        T = rig.signals("T")
+        for k, a in enumerate(T):
+            for b in T[k + 1 :]:
+                yield Place(f"{a}-{b}", {**at.symbols, "TA": name(a), "TB": name(b)}, output=at.output)
+
+
+def _voltages(rig: Rig) -> Iterator[Place]:
+    for o in rig.physics.outputs.values():
+        if rig.kind(o) == "voltage" and not any(_sources(rig, n) for n in ex.names(o.value)):
+            yield Place(o.name, {"y": o.value}, output=o.name)
+    for n in rig.physics.nodes.values():
+        if rig.kind(n) == "current":
+            yield Place(n.name, {}, {"a": n.name})
+
+
+def _sources(rig: Rig, node: str) -> bool:
+    return any(
+        f.source == node and any(e.op in ("sqrt", "**") and node in ex.names(e) for e in ex.walk(f.rate))
+        for f in rig.physics.flows.values()
+    )
+
+
+def _levels(rig: Rig) -> Iterator[Place]:
+    for n in rig.physics.nodes:
+        if _sources(rig, n):
+            after = next((f.target for f in rig.physics.flows.values() if f.source == n and f.target), None)
+            yield Place(n, {"a": name(n)}, {"a": n, **({"b": after} if after else {})})
+
+
+def _orifices(rig: Rig) -> Iterator[Place]:
+    for f in rig.physics.flows.values():
+        if f.source and any(
+            e.op == "sqrt" or (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 0.5)
+            for e in ex.walk(f.rate)
+            if f.source in ex.names(e)
+        ):
+            yield Place(f.name, {}, flow=f.name)
+
+
+def _resistive(rig: Rig) -> Iterator[Place]:
+    ohms = {q for q, p in rig.physics.parameters.items() if p.unit and re.search(r"ohm", p.unit, re.I)}
+    for o in rig.physics.outputs.values():
+        if ex.names(o.value) & ohms:
+            yield Place(o.name, {}, output=o.name)
+    for f in rig.physics.flows.values():
+        if ex.names(f.rate) & ohms and f.target not in rig.temperatures:
+            yield Place(f.name, {}, flow=f.name)
+
+
+PLACES = {
+    "temperature_node": _temperature_nodes,
+    "velocity_node": _velocity_nodes,
+    "conductance": _conductances,
+    "temperature_pair": _pairs,
+    "heated_pair": _heated_pairs,
+    "joule_flow": _joule_flows,
+    "motor": _motors,
+    "drive": driven,
+    "sensor": _sensors,
+    "reading_in_air": lambda rig: (*_sensors(rig, "temperature"), *_displacements(rig)),
+    "position_sensor": lambda rig: _sensors(rig, "length"),
+    "displacement": _displacements,
+    "member": _members,
+    "bending_pair": _bending_pairs,
+    "voltage_sensor": _voltages,
+    "level_node": _levels,
+    "orifice": _orifices,
+    "resistive": _resistive,
+}

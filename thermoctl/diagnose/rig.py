@@ -1,0 +1,182 @@
+"""A plant and its recordings as the catalogue sees them: kinds of signals, what moves, what is air."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from functools import cache
+
+import numpy as np
+
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
+from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.units import dimension
+
+STRAIGHT = "_straight"  # what an input that holds is called where it goes on straight lines
+KELVIN = {"K", "kelvin"}
+ZERO_DEGC = 273.15  # K
+TEMPERATURE = {"degC", "celsius", "degree_Celsius", "delta_degC", "°C", *KELVIN}
+
+
+_KINDS = {
+    "temperature": "K",
+    "length": "m",
+    "velocity": "m/s",
+    "current": "A",
+    "time": "s",
+    "rotation": "1/s",
+    "voltage": "V",
+    "power": "W",
+}
+
+
+@cache
+def kind_of(unit: str | None) -> str:
+    """Return the kind of quantity that a unit measures, a key of _KINDS; "" for any other."""
+    if unit is None:
+        return ""
+    if unit in TEMPERATURE:
+        return "temperature"
+    try:
+        found = dimension(unit)
+    except ValueError:
+        return ""
+    return next((kind for kind, like in _KINDS.items() if dimension(like) == found), "")
+
+
+def zero_of(unit: str | None) -> float:
+    """The reading of 0 degC in a unit of temperature."""
+    return ZERO_DEGC if unit in KELVIN else 0.0
+
+
+_ROLE_KINDS = {"ambient": "temperature", "position": "length"}  # the other roles are kinds of their own
+
+
+# Nodes that an effect brought to model a reading (lag, memory of the start): no body, so no physics can sit there.
+_READINGS = re.compile(
+    r"(lagged|memory|grown)_(sensor_lag|cold_junction_drift|missing_member|expansion_lag)_"
+)
+
+
+class Rig:
+    """A plant and its recordings as the catalogue sees them: which node is a temperature, what moves, what is air."""
+
+    def __init__(
+        self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
+    ):
+        self.plant, self.drives, self.columns = plant, list(drives), list(columns)
+        p = dataclasses.replace(
+            plant, inputs={k: v for k, v in plant.inputs.items() if not k.endswith(STRAIGHT)}
+        )
+        self.physics = p
+        self.temperatures = [
+            n.name for n in p.nodes.values() if self.kind(n) == "temperature" and not _READINGS.match(n.name)
+        ]
+        self.velocities = [
+            n.name
+            for n in p.nodes.values()
+            if self.kind(n) in ("velocity", "rotation")
+            and any(f.target == n.name or f.source == n.name for f in p.flows.values())
+        ]
+        self.position_of: dict[str, str] = {}
+        for f in p.flows.values():
+            for v in self.velocities:
+                if f.target and f.target != v and ex.names(f.rate) == {v}:
+                    self.position_of.setdefault(v, f.target)
+        common = set.intersection(*(set(c) for c in columns)) if columns else set()
+        taken = {i.column for i in p.inputs.values()} | {o.column for o in p.outputs.values()}
+        self.spare = sorted(
+            c
+            for c in common - taken
+            if re.fullmatch(r"[A-Za-z_]\w*", c)
+            and c not in p.nodes
+            and c not in p.parameters
+            and c not in p.outputs
+            and c not in p.inputs
+            and c not in p.flows
+            and all(np.ptp(t[c][np.isfinite(t[c])]) > 0 for t in columns if np.isfinite(t[c]).any())
+            and all(np.isfinite(t[c]).any() for t in columns)
+        )
+        moving = {
+            i
+            for j, i in enumerate(plant.inputs)
+            if i in p.inputs and any(np.ptp(d.u[:, j]) > 0 for d in drives)
+        }
+        self.moving_inputs = moving
+        self.heat_inputs = [i for i in p.inputs if self.kind(p.inputs[i]) == "temperature"]
+        named = [
+            i
+            for i in self.heat_inputs
+            if re.search(r"air|amb|room|outdoor|chamber|base|environment", i, re.I)
+            and not re.search(r"start|initial", i, re.I)
+        ]
+        self.air = next(iter(named), None) or self._coolest()
+
+    def kind(self, q: Input | Node | Output) -> str:
+        """Return the kind of a quantity, from its role or else its unit; empty where neither has one."""
+        return _ROLE_KINDS.get(q.role, q.role) if q.role else kind_of(q.unit)
+
+    def _coolest(self) -> str | None:
+        """The temperature input that losses of heat are counted from."""
+        for f in self.physics.flows.values():
+            if f.target is None or f.source is None:
+                for i in self.heat_inputs:
+                    if i in ex.names(f.rate):
+                        return i
+        return self.heat_inputs[0] if self.heat_inputs else None
+
+    def first_air(self, d: Excitation) -> float:
+        """The ambient at a recording's start, degC; 0 without one."""
+        air = self.air or ""
+        known = self.plant.parameters.get(air) or self.plant.inputs.get(air)
+        start = d.first.get(air, known.value if isinstance(known, Parameter) else 0.0)
+        return float(start - zero_of(known.unit) if known else start)
+
+    def signals(self, kind: str, near: str | None = None) -> list[str]:
+        """Names that can stand for v, x, i or T: nodes, inputs, recorded columns (which become inputs)."""
+        p = self.physics
+        if kind == "v":
+            if near in self.velocities:
+                return [near]
+            found = [
+                *self.velocities,
+                *(i for i in p.inputs if self.kind(p.inputs[i]) in ("velocity", "rotation")),
+            ]
+            return (found or [c for c in self.spare if re.search(r"veloc|speed|^v$", c, re.I)])[:3]
+        if kind == "x":
+            if near in self.position_of:
+                return [self.position_of[near]]
+            if self.position_of:
+                return list(self.position_of.values())
+            found = [i for i in p.inputs if self.kind(p.inputs[i]) == "length" and i in self.moving_inputs]
+            found += [n.name for n in p.nodes.values() if self.kind(n) == "length"]
+            return (found or [c for c in self.spare if re.search(r"posit|stroke|travel|^x$", c, re.I)])[:3]
+        if kind == "i":
+            found = [n.name for n in p.nodes.values() if self.kind(n) == "current"]
+            found += [i for i in p.inputs if self.kind(p.inputs[i]) == "current"]
+            return (found or [c for c in self.spare if re.search(r"current|^i$", c, re.I)])[:2]
+        found = [*self.temperatures, *(i for i in self.heat_inputs if i in self.moving_inputs)]
+        return found + [c for c in self.spare if re.search(r"temp|_c$|^t_", c, re.I)]
+
+    def is_motor(self, f: Flow) -> bool:
+        """A flow of force that an input drives."""
+        return bool(
+            (f.target in self.velocities or f.source in self.velocities)
+            and ex.names(f.rate) & self.moving_inputs
+        )
+
+    def is_pump(self, f: Flow) -> bool:
+        """A flow from outside, of something else than heat or force, that an input drives."""
+        return f.source is None and f.target not in (None, *self.temperatures, *self.velocities)
+
+    def drives_of(self, f: Flow) -> list[str]:
+        """The inputs that drive a flow (temperatures, positions and references aside)."""
+        return [
+            i
+            for i in self.physics.inputs
+            if i in ex.names(f.rate)
+            and i in self.moving_inputs
+            and self.kind(self.physics.inputs[i]) not in ("temperature", "length", "velocity", "rotation")
+        ]

@@ -1,0 +1,123 @@
+"""The values of an entry's shapes (onsets, periods, thresholds ...) that a screening looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from thermoctl.diagnose.candidates import Candidate
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr, name
+from thermoctl.plant.simulate import Simulation
+
+SLOW_TURNS, FINE_TURNS = (
+    60.0,
+    4000,
+)  # periods over the span: each looked at up to the first, the strongest up to the second
+
+
+def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count: int = 16) -> np.ndarray:
+    """The strongest numbers of turns beyond SLOW_TURNS in output errors (N,) per recording, over the signal x of all of them:
+    peaks of their spectrum over x. What moves slowly in time is taken off first."""
+    fast = []
+    for e in errors:
+        e = np.nan_to_num(e)
+        total = np.concatenate([[0.0], np.cumsum(e)])
+        half = max(len(e) // 200, 4)
+        low, high = np.maximum(np.arange(len(e)) - half, 0), np.minimum(np.arange(len(e)) + half + 1, len(e))
+        fast.append(e - (total[high] - total[low]) / (high - low))
+    e = np.concatenate(fast)
+    e = np.clip(e, *(np.array([-8, 8]) * (1.4826 * float(np.median(np.abs(e))) or np.inf)))
+    good = np.isfinite(x)
+    if not good.any():
+        return np.zeros(0)
+    bins = 8 * FINE_TURNS
+    index = np.clip(((x[good] - np.min(x[good])) / span * bins).astype(int), 0, bins - 1)
+    power = np.abs(np.fft.rfft(np.bincount(index, e[good], bins), 4 * bins))[
+        : 4 * FINE_TURNS
+    ]  # by a quarter of a turn
+    power[: int(4 * SLOW_TURNS)] = 0.0
+    peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+    return peaks[np.argsort(-power[peaks])[:count]] / 4
+
+
+def shape_grid(
+    kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24
+) -> list[dict[str, float]]:
+    """The values of a shape to look at in screening. Beside them `picked_from`: of how many the residual itself picked this one, and
+    `longest`: beyond which a period would not have come once."""
+    rig = candidate.rig
+    duration = max(float(d.t[-1]) for d in rig.drives)
+    dt = min(float(np.median(np.diff(d.t))) for d in rig.drives if len(d.t) > 1)
+
+    def signal(e: Expr) -> np.ndarray:
+        parts = []
+        for d, run, columns in zip(rig.drives, runs, rig.columns, strict=True):
+            values = {
+                **{c: columns[c] for c in rig.spare},
+                **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
+                **dict(zip(rig.plant.nodes, run.x.T, strict=True)),
+                "t": d.t,
+                **{q: p.value for q, p in rig.plant.parameters.items()},
+            }
+            parts.append(np.broadcast_to(np.asarray(ex.evaluate(e, values), float), d.t.shape))
+        return np.concatenate(parts)
+
+    if kind == "onsets":
+        return [{"onset": float(v)} for v in np.linspace(0, duration, onsets + 2)[1:-1]]
+    if kind == "windows":
+        edges = np.linspace(0, duration, onsets + 1)
+        return [
+            {"start": float(a), "end": float(b)} for k, a in enumerate(edges[:-1]) for b in edges[k + 1 :]
+        ]
+    if kind == "times":
+        return [{"tau": float(v)} for v in np.geomspace(3 * dt, 0.6 * duration, 12)]
+    if kind == "lags":
+        return [{"tau": float(v)} for v in np.geomspace(0.5 * dt, 0.1 * duration, 10)]
+    if kind == "delays":
+        return [{"tau": float(v)} for v in np.geomspace(0.3 * dt, 0.03 * duration, 9)]
+    symbols = {**candidate.place.symbols, **candidate.symbols}
+    if kind in ("periods", "phases", "distances"):
+        x = signal(symbols["x"]) if "x" in symbols else np.array([0.0, 1.0])
+        if kind == "distances" and "x" not in symbols:
+            v = candidate.place.nodes.get("v")
+            position = rig.position_of.get(v or "")
+            x = signal(name(position)) if position else x
+        span = float(np.ptp(x[np.isfinite(x)])) or 1.0
+        if kind == "periods":
+            # neighbouring periods differ by a quarter of a turn over the span
+            slow = [{"period": float(span / n), "longest": span} for n in np.arange(1.0, SLOW_TURNS, 0.25)]
+            errors = [d.y - run.y for d, run in zip(rig.drives, runs, strict=True)]
+            if candidate.place.output:
+                j = list(rig.plant.outputs).index(candidate.place.output)
+                fine = _fine_turns(x, [e[:, j] for e in errors], span)
+                return slow + [
+                    {"period": float(span / n), "longest": span, "picked_from": 4.0 * FINE_TURNS}
+                    for n in fine
+                ]
+            return slow
+        if kind == "phases":
+            return [{"phase": 0.0}, {"phase": float(np.pi / 2)}]
+        return [{"distance": float(v)} for v in np.geomspace(1e-3 * span, 0.5 * span, 8)]
+    if kind in ("speeds", "creep_speeds"):
+        v = np.abs(signal(symbols["v"]))
+        top = float(np.nanmax(v)) or 1.0
+        if kind == "creep_speeds":  # the speed below which dry friction gives way smoothly
+            return [{"creep": 1e-3 * top}]
+        return [{"speed": float(q)} for q in np.geomspace(0.01 * top, 0.6 * top, 8)]
+    target = symbols.get("y") or symbols.get("u") or symbols.get("a")
+    z = signal(target) if target is not None else np.array([0.0, 1.0])
+    z = z[np.isfinite(z)]
+    if kind == "drive_levels":
+        return [
+            {"level": float(v)}
+            for v in np.unique(np.quantile(np.abs(z), [0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98]))
+        ]
+    if kind == "small_levels":
+        top = float(np.max(np.abs(z))) or 1.0
+        return [{"level": float(v)} for v in np.geomspace(0.001 * top, 0.6 * top, 14)]
+    quantiles = [0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.94, 0.97, 0.99]
+    if kind == "end_levels" and candidate.variant == 1:
+        quantiles = [1 - q for q in quantiles]
+    return [{"level": float(v)} for v in np.unique(np.quantile(z, quantiles))]
