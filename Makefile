@@ -107,6 +107,14 @@ prove-refit: develop               # share of 95 % intervals that contain the tr
 refit-recordings: develop          # fits of real recordings, beside the published fits of the same structure
 	$(BIN)/python -m pytest -m slow -s tests/plant/test_refit_recordings.py
 
+.PHONY: stranger
+stranger: develop                  # another simulator's log with ; and decimal commas, up to the right name: commands, edits, times
+	$(BIN)/python -m pytest -q -s -k strangers_rig tests/plant/test_plant_new.py
+
+.PHONY: fmu-back
+fmu-back: develop                  # ten plants with a hidden effect, diagnosed with the plant file and with its FMU: a table; minutes
+	$(BIN)/python -m tests.plant.fmu_back
+
 .PHONY: test-resolve
 test-resolve: develop              # two equally good effects, separated by the proposed experiment
 	$(BIN)/python -m pytest -m slow tests/diagnose/test_next_experiment.py

@@ -53,7 +53,12 @@ _YES = _arg(
     "--yes", action="store_true", help="start without asking; without a terminal, required to move a rig"
 )
 _JSON = _arg("--json", action="store_true", help="print one JSON object, for programs")
-_PLANT = _arg("--plant", required=True, metavar="PLANT", help="the plant file")
+_PLANT = _arg("--plant", required=True, metavar="PLANT", help="the plant file, or an FMU")
+_MAP = _arg(
+    "--map",
+    metavar="FILE",
+    help="with an FMU as the plant: columns, roles, units, noise and ranges of its variables",
+)
 _RECORDINGS = _arg(
     "recordings",
     nargs="+",
@@ -311,6 +316,7 @@ _PLANTS = (
         "thermoctl.plant.commands:simulate",
         "",
         _PLANT,
+        _MAP,
         _RECORDINGS,
         _TIME,
         _COLUMNS,
@@ -329,6 +335,7 @@ _PLANTS = (
         "thermoctl.plant.commands:refit",
         "",
         _PLANT,
+        _MAP,
         _RECORDINGS,
         _TIME,
         _COLUMNS,
@@ -354,6 +361,7 @@ _PLANTS = (
         "thermoctl.checks.commands:check",
         "",
         _arg("plants", nargs="+", metavar="PLANT"),
+        _MAP,
         _arg(
             "--data",
             nargs="+",
@@ -570,7 +578,8 @@ _DIAGNOSIS = (
             metavar="REC",
             help="recordings (.csv, .xlsx, .parquet, .arrow), or folders of many rigs' recordings: one diagnosis a rig",
         ),
-        _arg("--plant", metavar="FILE", help="the plant file"),
+        _arg("--plant", metavar="FILE", help="the plant file, or an FMU"),
+        _MAP,
         _arg(
             "--held-out",
             action="append",

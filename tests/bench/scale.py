@@ -137,7 +137,7 @@ def rows(number: int, before: Path | None) -> None:
         recorded(
             folder,
             TWO,
-            "{from: block_1, rate: \"0.012 * max(block_1 - air, 0)**1.25\", unit: W}",
+            '{from: block_1, rate: "0.012 * max(block_1 - air, 0)**1.25", unit: W}',
             number,
             1.0,
             5.0,

@@ -26,9 +26,11 @@ from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 
-def load_plant(source: str | Path | Mapping[str, Any]) -> Plant:
-    """Return the plant of a file, or of plain dicts with the file's keys. Raises InputError."""
-    return Plant(from_plain(source) if isinstance(source, Mapping) else load(source))
+def load_plant(source: str | Path | Mapping[str, Any], map: str | Path | None = None) -> Plant:
+    """Return the plant of a file, of an FMU, or of plain dicts with the file's keys. Raises InputError.
+
+    `map`: with an FMU, the file of its variables' columns, roles, units, noise and ranges."""
+    return Plant(from_plain(source) if isinstance(source, Mapping) else load(source, map))
 
 
 def read(data: Data, time: str | None = None, columns: Mapping[str, str] | None = None) -> Table:

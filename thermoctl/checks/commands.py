@@ -24,7 +24,7 @@ def check(args: argparse.Namespace) -> int:
         raise InputError("plant check --data: one plant file was expected")
     severe = False
     for path in args.plants:
-        p = load(path)
+        p = load(path, args.map)
         free = sum(1 for q in p.parameters.values() if q.range)
         print(
             f"{path}: good; {len(p.inputs)} inputs, {len(p.parameters)} parameters ({free} free), {len(p.nodes)} nodes, "

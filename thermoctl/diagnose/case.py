@@ -68,7 +68,8 @@ class Case:
 def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect], budget: Budget) -> Case:
     """Refit the original plant, drop single outliers, fix the coordinates and grids of all hypotheses.
 
-    Rows of long recordings are put together (rows.py). Raises InputError where too few values were measured."""
+    Rows of long recordings are put together (rows.py).
+    Raises InputError where too few values were measured."""
     fewer = reduced(plant, tables)
     tables = fewer.tables
     model = compile_plant(plant)

@@ -28,6 +28,7 @@ KEYS = (
     "parameters",
     "dims",
     "prior",
+    "usual",
     "caution",
     "excited_by",
     "mimics",
@@ -103,6 +104,7 @@ class Effect:
     source: str
     caution: str | None = None  # what a finding of it cannot tell, in words
     prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
+    usual: Expr | None = None  # its size in standard deviations of an instrument in order, from SI units
 
 
 def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
@@ -166,10 +168,12 @@ def _read(root: yamlfile.Node) -> Effect:
                 p.get("origin"),
             )
         )
-    try:
-        prior = ex.parse(str(top["prior"].value)) if "prior" in top else None
-    except ex.ExpressionError as e:
-        raise top["prior"].error(str(e)) from None
+    form = {}
+    for key in ("prior", "usual"):
+        try:
+            form[key] = ex.parse(str(top[key].value)) if key in top else None
+        except ex.ExpressionError as e:
+            raise top[key].error(str(e)) from None
     dims = (
         tuple(map(tuple, top["dims"].plain()))
         if "dims" in top
@@ -201,5 +205,6 @@ def _read(root: yamlfile.Node) -> Effect:
         tuple(top["mimics"].plain()) if "mimics" in top else (),
         top["source"].value,
         top["caution"].value if "caution" in top else None,
-        prior,
+        form["prior"],
+        form["usual"],
     )

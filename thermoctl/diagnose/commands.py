@@ -52,7 +52,7 @@ def diagnose(args: argparse.Namespace) -> int:
     if not args.recordings:
         raise InputError("no recording was given; one or more were expected, or --live")
 
-    plant = load(args.plant)
+    plant = load(args.plant, args.map)
     given, found_before = checked(plant, args.recordings, args.time, args.columns)
     held_out, found_held = checked(plant, args.held_out or (), args.time, args.columns)
     report([*found_before, *found_held], sys.stderr)

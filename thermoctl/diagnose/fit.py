@@ -170,7 +170,9 @@ class Posterior:
         )
 
     def slopes(self, z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return of each channel the unknowns (k,) and the rows' slopes by them (rows, k); the last z's are kept."""
+        """Return each channel's unknowns (k,), and the slopes of its rows by them (rows, k).
+
+        The result is kept for the next call with the same z."""
         if self.kept is None or not np.array_equal(self.kept[0], z):
             found, r = [], -1
             for c in self.case.coordinates.channels:

@@ -77,6 +77,7 @@ def heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
         for f in plant.flows.values()
         if f.target == node
         and f.source is None
+        and not ex.calls_fmu(f.rate)
         and ex.names(f.rate) & rig.moving_inputs
         and not ex.names(f.rate) & set(rig.heat_inputs)
         and (node not in ex.names(f.rate) or _rests(plant, f))
@@ -114,11 +115,18 @@ def _motors(rig: Rig) -> Iterator[Place]:
 
 
 def driven(rig: Rig) -> Iterator[Place]:
-    """Yield each input that drives a motor or a pump, by its flow."""
+    """Yield each input that drives a motor or a pump, by its flow, or by its own name where the flow is an FMU's."""
     for f in rig.physics.flows.values():
         if rig.is_motor(f) or rig.is_pump(f):
             for u in rig.drives_of(f):
-                yield Place(f.name, {"u": name(u)}, flow=f.name, input=u)
+                yield Place(u if ex.calls_fmu(f.rate) else f.name, {"u": name(u)}, flow=f.name, input=u)
+
+
+def askable(rig: Rig, place: Place) -> bool:
+    """Return whether the plant shows what an effect at the place would change.
+
+    The rate of an FMU is a body's whole balance, not one flow: only an input in it can be changed."""
+    return place.input is not None or not place.flow or not ex.calls_fmu(rig.physics.flows[place.flow].rate)
 
 
 def _sensors(rig: Rig, dimension: str | None = None) -> Iterator[Place]:

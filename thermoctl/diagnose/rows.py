@@ -71,7 +71,7 @@ class Reduced:
 
     @property
     def note(self) -> str:
-        """What was done, for the result."""
+        """Return how many rows were needed, as a text for the result."""
         return (
             f"{self.after} of {self.before} rows were needed: means of {self.block} rows hold the same information; "
             "noise and errors below are those of the means"

@@ -42,7 +42,12 @@ def write(plant: Plant, to: str, out: Path, recording: Table | None = None) -> N
     """Write a plant as `to` (a key of SUFFIX); `recording` gives first readings and widths of jumps.
 
     Raises InputError where the format lacks what the plant needs, or the file cannot be written."""
-    numbers = values(plant, Equations(plant), recording)
+    equations = Equations(plant)
+    if equations.fmus:
+        raise InputError(
+            f"{plant.file}: a plant that calls an FMU cannot be exported; write the effect into the FMU's own model"
+        )
+    numbers = values(plant, equations, recording)
     name = re.sub(r"\W", "_", out.stem)
     name = name if name[:1].isalpha() else f"plant_{name}"
     if to == "fmu":

@@ -18,7 +18,8 @@ from xml.sax.saxutils import quoteattr
 from thermoctl import __version__
 from thermoctl.export.c import core, time_jumps
 from thermoctl.export.values import Values, first_outputs
-from thermoctl.plant.compile import compiler
+from thermoctl.plant import expression as ex
+from thermoctl.plant.build import compiler
 from thermoctl.plant.equations import Equations
 from thermoctl.plant.language import Plant
 from thermoctl.plant.units import conversion, dimension
@@ -82,8 +83,13 @@ def _description(
         "Derivatives": derivatives,
         "InitialUnknowns": [*range(at, at + states), *derivatives, *outputs],
     }
+    reads = dict(zip((*derivatives, *outputs), _dependencies(plant, e, at), strict=True))
     structure = "".join(
-        f"    <{k}>\n" + "".join(f'      <Unknown index="{i}"/>\n' for i in v) + f"    </{k}>\n"
+        f"    <{k}>\n"
+        + "".join(
+            f'      <Unknown index="{i}"{reads.get(i, "") if k != "InitialUnknowns" else ""}/>\n' for i in v
+        )
+        + f"    </{k}>\n"
         for k, v in unknown.items()
         if v
     )
@@ -98,6 +104,18 @@ def _description(
         + "\n".join(variables)
         + f"\n  </ModelVariables>\n  <ModelStructure>\n{structure}  </ModelStructure>\n</fmiModelDescription>\n"
     )
+
+
+def _dependencies(plant: Plant, e: Equations, first_state: int) -> list[str]:
+    """Return the attribute that names the inputs and states which each derivative and each output reads.
+
+    A plant with delays gets none: a delayed value is a state of the FMU's own."""
+    if e.input_delays or e.output_delays:
+        return [""] * (len(e.states) + len(e.outputs))
+    index = {i: 1 + k for k, i in enumerate(plant.inputs)}
+    index |= {n: first_state + k for k, n in enumerate(e.states)}
+    read = [sorted(index[n] for n in ex.names(q) & index.keys()) for q in (*e.slopes, *e.values)]
+    return [f' dependencies="{" ".join(map(str, r))}"' for r in read]
 
 
 def _variables(plant: Plant, e: Equations, numbers: Values, begin: list[float]) -> Iterator[str]:

@@ -59,7 +59,7 @@ def simulate(args: argparse.Namespace) -> int:
 
     Prints figures; writes a file and a plot on request.
     """
-    plant = load(args.plant)
+    plant = load(args.plant, args.map)
     runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
     model = compile_plant(_all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
     for path, table in zip(args.recordings, _read(plant, args.recordings, args), strict=True):
@@ -219,7 +219,7 @@ def _plot(
 
 def refit(args: argparse.Namespace) -> int:
     """Refit a plant's parameters; write the plant; report estimates and the fit before and after."""
-    plant = load(args.plant)
+    plant = load(args.plant, args.map)
     model = compile_plant(plant)
     if not any(p.range for p in plant.parameters.values()):
         raise InputError(f"{plant.file}: no parameter has a 'range', so there is nothing to refit")

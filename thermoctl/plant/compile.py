@@ -14,27 +14,20 @@ that is held between samples is not smoothed.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import hashlib
-import os
-import shutil
-import subprocess
-import tempfile
 import threading
-import time
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 
 from thermoctl.plant import expression as ex
+from thermoctl.plant.build import library
 from thermoctl.plant.equations import ARGUMENTS, PRELUDE, Equations, ints, sparse_lu
 from thermoctl.plant.expression import ZERO, Expr, add, derivative, mul, name
+from thermoctl.plant.fmu import opened
 from thermoctl.plant.language import Plant
-from thermoctl.yamlfile import InputError
 
 _HEADERS = tuple(Path(__file__).with_name(h) for h in ("esdirk.h", "integrator.h"))
-LARGE = 400_000  # characters of a source that is compiled with -O1
 _LOCK = threading.Lock()
 _LOADED: dict[str, Code] = {}
 _LANES = """/* Columns of sensitivities, eight at a time. */
@@ -52,8 +45,9 @@ class Code(Equations):
         self.active = active
         self.source = "#define STEPPER\n" * stepper + self._source()
         headers = "".join(path.read_text() for path in _HEADERS)
-        self.key = hashlib.sha256((self.source + headers + _compiler()[1]).encode()).hexdigest()[:32]
-        self.library = _library(self.key, self.source)
+        self.library = _typed(library(self.source, [_HEADERS[0].parent], headers))
+        for number, path in enumerate(self.fmus):
+            opened(path).link(self.library, number)
 
     # --------------------------------------------------------------------------------------------- writing C
 
@@ -98,6 +92,7 @@ class Code(Equations):
             f"#define NO0 {len(lists[0][1])}\n#define NO1 {len(lists[1][1])}\n"
             f"#define NO {max(len(lists[0][1]), len(lists[1][1]))}\n#define LINEAR {int(self.linear)}\n",
             PRELUDE,
+            *self._declared(),
             _LANES,
             ints("J_ROW", [i for i, _, _ in jac]),
             ints("J_COL", [k for _, k, _ in jac]),
@@ -121,104 +116,18 @@ class Code(Equations):
             ]
         return "\n".join([*parts, lu, lu_lanes, '#include "integrator.h"\n'])
 
-
-# -------------------------------------------------------------------------------------- building and loading
-
-
-@cache
-def _compiler() -> tuple[list[str], str]:
-    """Return the C compiler's command and a text that identifies its result (version, processor)."""
-    for candidate in (os.environ.get("CC"), "cc", "gcc", "clang"):
-        if candidate and (path := shutil.which(candidate.split()[0])):
-            version = subprocess.run([path, "--version"], capture_output=True, text=True).stdout.splitlines()[
-                :1
-            ]
-            try:
-                flags = next(
-                    (
-                        line
-                        for line in Path("/proc/cpuinfo").read_text().splitlines()
-                        if line.startswith("flags")
-                    ),
-                    "",
-                )
-            except OSError:
-                flags = ""
-            command = [
-                *candidate.split(),
-                "-O2",
-                "-march=native",
-                "-fno-math-errno",
-                "-fno-trapping-math",
-                "-fPIC",
-                "-shared",
-                "-w",
-            ]
-            return command, f"{version}{flags}{command}"
-    raise InputError(
-        "no C compiler (cc, gcc or clang) was found; install one (Debian: apt-get install gcc) or set CC"
-    )
+    def _declared(self) -> list[str]:
+        """Return the C that declares the functions of FMUs; their contents are part of the source's key."""
+        if not self.fmus:
+            return []
+        contents = "".join(f"/* {opened(path).digest} */\n" for path in self.fmus)
+        return [
+            f"{contents}double (*fmu_value_)(void *, int, const double *), "
+            f"(*fmu_slope_)(void *, int, int, const double *);\nvoid *fmus_[{len(self.fmus)}];\n"
+        ]
 
 
-def compiler() -> list[str]:
-    """Return the command of the C compiler, without options. Raises InputError where there is none."""
-    command = _compiler()[0]
-    return command[: command.index("-O2")]
-
-
-def cache_directory() -> Path:
-    """Return the folder of compiled plants: $THERMOCTL_CACHE, else thermoctl/plants in the user's cache."""
-    own = os.environ.get("THERMOCTL_CACHE")
-    return (
-        Path(own)
-        if own
-        else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thermoctl" / "plants"
-    )
-
-
-def _library(key: str, source: str) -> ctypes.CDLL:
-    folder = cache_directory()
-    path = folder / f"{key}.so"
-    if not path.exists():
-        try:
-            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            with tempfile.TemporaryDirectory(dir=folder) as work:
-                _build(Path(work), source)
-                os.replace(Path(work) / "plant.so", path)
-        except OSError:  # a read-only home: build for this process only
-            with tempfile.TemporaryDirectory() as work:
-                _build(Path(work), source)
-                return _typed(ctypes.CDLL(str(Path(work) / "plant.so")))
-        if key[0] == "0":  # only one build in sixteen: listing a full folder takes half a second
-            _trim(folder)
-    return _typed(ctypes.CDLL(str(path)))
-
-
-def _build(work: Path, source: str) -> None:
-    (work / "plant.c").write_text(source)
-    # -O2 compiles in 0.7 of the time of -O3, and its code is a tenth slower. With -O1 the lanes of the
-    # sensitivities are not kept in registers: 3 to 10 times slower. It is for files that -O2 takes minutes for.
-    command = _compiler()[0]
-    if len(source) >= LARGE:
-        command = ["-O1" if a == "-O2" else a for a in command]
-    done = subprocess.run(
-        [*command, f"-I{_HEADERS[0].parent}", "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise InputError(f"the C compiler failed on the plant: {done.stderr.strip()[:500]}")
-
-
-def _trim(folder: Path, keep: int = 2000, age_s: float = 86_400.0) -> None:
-    """Delete the oldest beyond `keep`, but none made within a day: a process may be about to load it."""
-    made = []
-    for path in folder.glob("*.so"):
-        with contextlib.suppress(OSError):  # another process trims, too
-            made.append((path.stat().st_mtime, path))
-    for mtime, path in sorted(made)[:-keep]:
-        if time.time() - mtime > age_s:
-            path.unlink(missing_ok=True)
+# ------------------------------------------------------------------------------------------------------ loading
 
 
 _P, _I, _D = ctypes.c_void_p, ctypes.c_int, ctypes.c_double
@@ -262,4 +171,4 @@ def _structure(plant: Plant) -> Mapping[str, object]:
     }
 
 
-__all__ = ["Code", "cache_directory", "compiler", "machine_code"]
+__all__ = ["Code", "machine_code"]

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import ZERO, Expr, add, derivative, div, name, neg
+from thermoctl.plant.fmu import opened, used
 from thermoctl.plant.language import Plant
 from thermoctl.yamlfile import InputError
 
@@ -49,6 +50,7 @@ class Equations:
                 net[f.target] = add(net[f.target], rate)
         self.slopes = [div(net[n.name], n.storage) for n in plant.nodes.values()]
         self._widths()
+        self.fmus = used(e for root in self._roots() for e in ex.walk(root))
 
     def _take_out_delays(self) -> None:
         """Replace delays by names: of derived inputs in rates, of delayed values in outputs."""
@@ -88,9 +90,8 @@ class Equations:
     def _widths(self) -> None:
         """Return the jumps that are smoothed: by argument, 'state' or 'time'."""
         self.jumps: list[tuple[Expr, str]] = []
-        roots = [*self.slopes, *self.values, *(d[0] for d in self.output_delays.values())]
         seen: set[int] = set()
-        for root in roots:
+        for root in self._roots():
             for e in ex.walk(root):
                 if e.op not in _JUMPS:
                     continue
@@ -101,6 +102,9 @@ class Equations:
                     seen.add(id(z))
                     self.jumps.append((z, kind))
         self.jump_index = {id(z): i for i, (z, _) in enumerate(self.jumps)}
+
+    def _roots(self) -> list[Expr]:
+        return [*self.slopes, *self.values, *(d[0] for d in self.output_delays.values())]
 
     def jacobian(self) -> list[tuple[int, int, Expr]]:
         """Return (row, column, slope) of each entry of df/dx that is not zero; set `linear`."""
@@ -140,7 +144,9 @@ class Equations:
                 elif e.op == "name":
                     done[id(e)] = place[e.value]
                 else:
-                    text = self._statement(e, a, lines)
+                    text = (
+                        self._foreign(e, a) if e.op in ("fmu", "fmu_slope") else self._statement(e, a, lines)
+                    )
                     done[id(e)] = f"c{len(lines)}"
                     lines.append(f"const double c{len(lines)} = {text};\n")
         return "".join(lines) + "".join(f"out[{i}] = {done[id(e)]};\n" for i, e in enumerate(exprs))
@@ -179,6 +185,16 @@ class Equations:
             return f"{op}_({a[0]}, {e.value}, c{len(lines) - 1})"
         function = {"abs": "fabs", "min": "min_", "max": "max_", "dpow": "dpow_"}.get(op, op)
         return f"{function}({', '.join(a)})"
+
+    def _foreign(self, e: Expr, a: list[str]) -> str:
+        """Return the call of an FMU; a missing argument is NaN and keeps its value."""
+        path, result, names, *by = e.value
+        fmu = opened(path)
+        given = dict(zip([0, *map(fmu.argument, names)], a, strict=True))
+        values = ", ".join(given.get(j, "NAN") for j in range(1 + len(fmu.arguments)))
+        places = ", ".join(str(k) for k in (fmu.result(result), *map(fmu.argument, by)))
+        function = "fmu_slope_" if by else "fmu_value_"
+        return f"{function}(fmus_[{self.fmus.index(path)}], {places}, (const double[]){{{values}}})"
 
 
 PRELUDE = """#include <math.h>

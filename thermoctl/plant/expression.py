@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.plant.fmu import opened
+
 FUNCTIONS = {
     "abs": 1,
     "sign": 1,
@@ -31,18 +33,19 @@ FUNCTIONS = {
     "max": 2,
     "step": 1,
 }
-SPECIAL = ("table", "delay", "first")
+SPECIAL = ("table", "delay", "first", "fmu")
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 MAX_LENGTH, MAX_DEPTH, MAX_TOKENS = 20_000, 80, 5_000
 MAX_LEVELS = 250  # deepest tree: levels of brackets, and of terms and factors in a row
 ALLOWED = (
     "+ - * / **, comparisons, numbers, pi, t, the names of the file, and "
     + " ".join(FUNCTIONS)
-    + " table delay first"
+    + " table delay first fmu"
 )
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
+    r'|(?P<text>"[^"]*")'
     r"|(?P<op>\*\*|<=|>=|==|!=|[-+*/()<>,\[\]]))"
 )
 
@@ -58,6 +61,8 @@ class Expr:
     - 'num' and 'name', with `value`; '+', '*', '/', '**', 'neg'; a comparison; a function's name;
     - 'table': args are x, the x points and the y points; value is the number of points;
     - 'delay': args are an expression and seconds; 'first': value is a name;
+    - 'fmu': args are time and the values given; value is the file, its result, and the names of the values
+    - only in derivatives: 'fmu_slope', an 'fmu' whose value ends in the name that it is differentiated by
     - only in derivatives: 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope', 'bump' (slope of a smoothed
       step);
     - only in derivatives: 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed).
@@ -302,6 +307,8 @@ class _Reader:
             self.at += 1
             self.need(")")
             return make("first", value=text)
+        if function == "fmu":
+            return self.fmu()
         args = [self.comparison()]
         if function == "table":
             self.need(",")
@@ -336,6 +343,25 @@ class _Reader:
             raise ExpressionError(f"{function}() takes one argument, not {len(args)}")
         return make(function, args[0])
 
+    def fmu(self) -> Expr:
+        path = self.text("the file of an FMU")
+        self.need(",")
+        result = self.text("a derivative or an output of the FMU")
+        given: dict[str, Expr] = {}
+        while self.take(","):
+            variable = self.text("a variable of the FMU")
+            self.need(",")
+            given[variable] = self.comparison()
+        self.need(")")
+        return make("fmu", name("t"), *given.values(), value=(path, result, tuple(given)))
+
+    def text(self, what: str) -> str:
+        kind, text = self.tokens[self.at] if self.at < len(self.tokens) else ("", "")
+        if kind != "text":
+            raise ExpressionError(f'fmu(): {what} was expected in "quotes"')
+        self.at += 1
+        return text[1:-1]
+
     def list(self) -> list[Expr]:
         self.need("[")
         items = [self.comparison()]
@@ -368,6 +394,11 @@ def walk(expr: Expr) -> tuple[Expr, ...]:
 def names(expr: Expr) -> frozenset[str]:
     """Return the names an expression reads (those inside first() are not among them)."""
     return frozenset(n.value for n in walk(expr) if n.op == "name")
+
+
+def calls_fmu(expr: Expr) -> bool:
+    """Return whether an FMU computes a part of the expression."""
+    return any(n.op == "fmu" for n in walk(expr))
 
 
 def substitute(expr: Expr, change: Callable[[Expr], Expr | None]) -> Expr:
@@ -408,6 +439,10 @@ def _text(e: Expr, outer: int) -> str:
             f"table({_text(e.args[0], 0)}, [{', '.join(_text(a, 0) for a in e.args[1 : k + 1])}], "
             f"[{', '.join(_text(a, 0) for a in e.args[k + 1 :])}])"
         )
+    if e.op == "fmu":
+        path, result, given = e.value
+        pairs = [f'"{n}", {_text(a, 0)}' for n, a in zip(given, e.args[1:], strict=True)]
+        return f'fmu("{path}", "{result}"' + "".join(f", {pair}" for pair in pairs) + ")"
     p = _PRECEDENCE.get(e.op)
     if p is None:
         return f"{e.op}({', '.join(_text(a, 0) for a in e.args)})"
@@ -493,6 +528,12 @@ def _derive(e: Expr, by: str, done: Mapping[int, Expr]) -> Expr:
             return mul(make("bump", add(a[1], neg(a[0]))), add(d[1], neg(d[0])))
         case "==" | "!=" | "le" | "side" | "bump" | "dpow":
             return ZERO
+        case "fmu":  # time is not among the unknowns
+            total = ZERO
+            for n, change in zip(e.value[2], d[1:], strict=True):
+                if change is not ZERO:
+                    total = add(total, mul(make("fmu_slope", *a, value=(*e.value, n)), change))
+            return total
         case "table":
             k = e.value
             total = mul(make("table_slope", *a, value=k), d[0])
@@ -585,6 +626,9 @@ def _value(
     if op == "dpow":
         base = np.maximum(a[0], 1e-8)
         return np.where(np.asarray(a[0]) > 0, np.power(base, a[1] - 1.0), 0.0)
+    if op in ("fmu", "fmu_slope"):
+        path, result, given, *by = e.value
+        return opened(path).evaluate(result, given, a, *by)
     if op in ("table", "table_slope"):
         k = e.value
         x = np.asarray(a[0], float)

@@ -9,13 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl import yamlfile
+from thermoctl.plant.foreign import plant_node
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parse import parse
 from thermoctl.plant.units import check_units
+from thermoctl.yamlfile import InputError
 
 
-def load(path: str | Path) -> Plant:
-    """Read and check a plant file. Raises InputError."""
+def load(path: str | Path, mapped: str | Path | None = None) -> Plant:
+    """Read and check a plant file, or an FMU with the file that maps its variables. Raises InputError."""
+    if Path(path).suffix == ".fmu":
+        return _checked(plant_node(path, yamlfile.load(mapped) if mapped else None))
+    if mapped:
+        raise InputError(f"{path}: a map ({mapped}) goes with an FMU; a file that ends in .fmu was expected")
     return _checked(yamlfile.load(path))
 
 

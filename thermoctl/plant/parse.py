@@ -30,7 +30,7 @@ from thermoctl.yamlfile import Section, kind_of, number_of, suggest
 MAX_ITEMS = 2_000  # inputs, nodes, ... of one file
 SECTIONS = ("inputs", "parameters", "nodes", "flows", "outputs")
 _NAME = re.compile(r"[A-Za-z_]\w{0,79}$", re.ASCII)
-_RESERVED = {"pi", "t", *ex.FUNCTIONS, *ex.SPECIAL}
+RESERVED = {"pi", "t", *ex.FUNCTIONS, *ex.SPECIAL}
 
 Items = dict[str, dict[str, Section]]
 """Entries of each section of the file, by section and name."""
@@ -99,7 +99,7 @@ def _items(top: Section) -> Items:
 def _check_name(name: str, item: YamlNode, section: str) -> None:
     if not _NAME.match(name):
         raise item.error(f"'{name}' is not a name: letters, digits and _ were expected, a letter first")
-    if name in _RESERVED:
+    if name in RESERVED:
         raise item.error(f"'{name}' is a word of the language and cannot name one of the {section}")
 
 

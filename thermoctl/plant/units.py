@@ -186,7 +186,7 @@ class _Check:
 
     def _of(self, e: Expr, a: list[Dimension | None]) -> Dimension | None:
         op = e.op
-        if op == "num":
+        if op in ("num", "fmu"):
             return None
         if op == "name":
             return self.units.get(e.value)
@@ -324,6 +324,13 @@ def conversion(given: str, wanted: str) -> tuple[float, float]:
     registry = _registry()
     ends = [float(registry.Quantity(x, _spelled(given)).to(_spelled(wanted)).magnitude) for x in (0.0, 1.0)]
     return ends[1] - ends[0], ends[0]
+
+
+def in_si(unit: str | None) -> float:
+    """Return the factor from a unit to SI units; a temperature counts as a difference. Raises ValueError."""
+    if unit is None or dimension(unit) == dimension("K"):
+        return 1.0
+    return float(_registry().Quantity(1.0, _spelled(unit)).to_base_units().magnitude)
 
 
 def _spelled(unit: str) -> str:
