@@ -26,11 +26,14 @@ OUTLIER = 6.0  # robust standard deviations from the median of five neighbours
 
 @dataclass
 class Budget:
-    """Largest number of refits, and the number done. Counted, never timed: the same on every machine."""
+    """Largest number of refits, and the number done. Counted, never timed: the same on every machine.
+
+    `planned`: number of refits after this step of the search; each step may plan more."""
 
     fits: int
     progress: Callable[[str], None] = lambda text: None
     fits_done: int = 0
+    planned: int = 1
 
     @property
     def spent(self) -> bool:
@@ -40,7 +43,8 @@ class Budget:
     def spend(self) -> None:
         """Count one refit, and report it."""
         self.fits_done += 1
-        self.progress(f"searching: refit {self.fits_done} of at most {self.fits}")
+        planned = min(max(self.planned, self.fits_done), self.fits)
+        self.progress(f"searching: refit {self.fits_done} of {planned} planned so far (at most {self.fits})")
 
 
 @dataclass(frozen=True)
