@@ -61,7 +61,7 @@ install: $(VENV)/.installed        # dependencies of the program, and its compil
 $(VENV)/.installed: $(SOURCES)
 	@echo "[1/3] a virtual environment in $(VENV)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(call listed,p['build-system']['requires'] + p['project']['dependencies']) > $(VENV)/needs
+	@$(call listed,p['build-system']['requires'] + p['project']['dependencies'] + p['project']['optional-dependencies']['fleet']) > $(VENV)/needs
 	@all=$$(wc -l < $(VENV)/needs); n=0; while read -r need; do n=$$((n + 1)); \
 		echo "[2/3] $$need ($$n of $$all)"; $(PIP) "$$need" || exit 1; done < $(VENV)/needs
 	@echo "[3/3] compiling the control loop and the drivers (a minute or two)"
@@ -112,9 +112,17 @@ prove-refit: develop               # share of 95 % intervals that contain the tr
 refit-recordings: develop          # fits of real recordings, beside the published fits of the same structure
 	$(BIN)/python -m pytest -m slow -s tests/plant/test_refit_recordings.py
 
+.PHONY: size
+size: install                      # the wheel in a fresh environment: megabytes by package, import times, demo, diagnose, service install
+	$(BIN)/python tests/bench/install.py
+
 .PHONY: stranger
 stranger: develop                  # another simulator's log with ; and decimal commas, up to the right name: commands, edits, times
 	$(BIN)/python -m pytest -q -s -k strangers_rig tests/plant/test_plant_new.py
+
+.PHONY: wrong-plants
+wrong-plants: develop              # twenty wrong plants: found by the checks, named rightly, or not named with confidence; minutes
+	$(BIN)/python -m tests.checks.wrong_plants
 
 .PHONY: fmu-back
 fmu-back: develop                  # ten plants with a hidden effect, diagnosed with the plant file and with its FMU: a table; minutes
@@ -148,6 +156,20 @@ test-wizard: develop               # thermoctl calibrate from doctor to proof, w
 bench-diagnosis: develop           # the diagnosis beside other methods on the same cases; CASES= other folders of cases with answers
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/diagnosis.py $(CASES)
+
+.PHONY: bench-laws
+bench-laws: develop                # laws beside PySINDy, gplearn and a Gaussian process on the same smoothed inputs
+	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
+	$(BIN)/python -m tests.bench.laws
+
+.PHONY: prove-laws
+prove-laws: develop                # concealed laws that the catalogue lacks: 90 cases and 40 without a law; half an hour; run again to continue
+	$(BIN)/python -m tests.laws.prove --out $(or $(PROOF),build/proof/laws)
+	$(BIN)/python -m tests.laws.prove --out $(or $(PROOF),build/proof/laws) --table
+
+.PHONY: laws-recordings
+laws-recordings: develop           # laws of real rigs beside the published form; RECORDINGS= the folder of rigs
+	$(BIN)/python -m tests.laws.real $(RECORDINGS)
 
 .PHONY: demo-concealed
 demo-concealed: develop            # seven hidden effects on independently simulated rigs: diagnosed, modelled, compensated

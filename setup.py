@@ -1,5 +1,6 @@
 """Builds the compiled parts: every .pyx, and every .py with its C types in a .pxd. The rest is in pyproject.toml."""
 
+from itertools import groupby
 from pathlib import Path
 
 import numpy
@@ -11,19 +12,29 @@ sources = sorted(
     {p.with_suffix(".pyx") if p.with_suffix(".pyx").exists() else p.with_suffix(".py") for p in typed}
 )
 
+# Beside the package, under share/thermoctl: thermoctl/shipped.py finds them.
+files = sorted(
+    p for root in ("config", "docs/examples", "systemd") for p in Path(root).rglob("*.*") if p.is_file()
+)
+shipped = [
+    (f"share/thermoctl/{folder}", list(map(str, of))) for folder, of in groupby(files, lambda p: p.parent)
+]
+
+# -g0: no debug symbols, nine tenths of the compiled parts' size.
 # -ffp-contract=off: the law gives the same bits on every machine that a recording is replayed on.
 setup(
+    data_files=shipped,
     ext_modules=cythonize(
         [
             Extension(
                 ".".join(p.with_suffix("").parts),
                 [str(p)],
                 include_dirs=[numpy.get_include()],
-                extra_compile_args=["-O2", "-ffp-contract=off"],
+                extra_compile_args=["-O2", "-g0", "-ffp-contract=off"],
                 define_macros=[("NPY_NO_DEPRECATED_API", "NPY_1_7_API_VERSION")],
             )
             for p in sources
         ],
         compiler_directives={"language_level": "3"},
-    )
+    ),
 )

@@ -3,6 +3,7 @@
 import pytest
 
 from thermoctl import cli, which_rig
+from thermoctl.shipped import COPIED, shipped
 from thermoctl.yamlfile import InputError
 
 COMMANDS = {  # every command that means a rig, as it would be typed without --config
@@ -47,8 +48,14 @@ def parsed(command, *more):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_one_order_for_every_command(command, folder, monkeypatch, capsys):
-    with pytest.raises(InputError, match="no configuration: neither config/simulated.yaml"):
-        which_rig.choose(parsed(command))
+    if command == "demo":  # it has a rig of its own
+        demo = parsed(command)
+        which_rig.choose(demo)
+        assert demo.config == str(shipped("config") / "simulated.yaml")
+        capsys.readouterr()
+    else:
+        with pytest.raises(InputError, match="no configuration: neither config/simulated.yaml"):
+            which_rig.choose(parsed(command))
     for name in ("etc", "config"):
         (folder / name).mkdir()
     found = []
@@ -89,3 +96,14 @@ def test_commands_that_need_no_rig_ask_for_none(folder):
         ["service", "uninstall"],
     ):
         which_rig.choose(cli.parser().parse_args(line))
+
+
+def test_init_copies_what_a_start_needs_and_keeps_what_is_there(folder, capsys):
+    assert cli.main(["init"]) == 0
+    assert {str(p) for p in folder.iterdir()} == {str(folder / name) for name in COPIED.values()}
+    assert cli.main(["check", "config/simulated.yaml"]) == 0
+    assert cli.main(["plant", "check", "examples/heater/plant.yaml"]) == 0
+    (folder / "config/simulated.yaml").write_text("mine")
+    assert cli.main(["init"]) == 2
+    assert "exists already and is kept" in capsys.readouterr().err
+    assert (folder / "config/simulated.yaml").read_text() == "mine"

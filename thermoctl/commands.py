@@ -653,11 +653,17 @@ _DIAGNOSIS = (
     ),
     _command(
         "effects",
-        "list the catalogue of effects, show one (`effects show NAME`), or check files of your own (`effects check FILE`)",
+        "list the catalogue of effects, show one (`effects show NAME`), check files of your own (`effects check FILE`), "
+        "or save the law of a diagnosis as one (`effects save DIR NAME`)",
         "thermoctl.commands:effects",
         "",
-        _arg("action", nargs="?", metavar="show|check"),
-        _arg("files", nargs="*", metavar="NAME|FILE", help="an effect's name; files or folders of effects"),
+        _arg("action", nargs="?", metavar="show|check|save"),
+        _arg(
+            "files",
+            nargs="*",
+            metavar="NAME|FILE|DIR",
+            help="an effect's name; files or folders of effects; a diagnosis and a name",
+        ),
         _arg(
             "--plant",
             metavar="PLANT",
@@ -787,6 +793,27 @@ _PEOPLE = (
         ),
         _arg("--scheduler", metavar="ADDRESS", help="a Dask cluster"),
         _JSON,
+    ),
+    _command(
+        "report",
+        "write one archive for a question to others: versions, configuration, log, the end of the newest recording",
+        "thermoctl.support:report",
+        "settings out seconds",
+        CONFIG,
+        _arg(
+            "--out",
+            default="thermoctl-report.zip",
+            metavar="FILE",
+            help="the archive (default thermoctl-report.zip)",
+        ),
+        _arg("--seconds", type=float, default=60.0, metavar="S", help="of the newest recording (default 60)"),
+    ),
+    _command(
+        "init",
+        "copy configurations, device profiles, plants and examples into a folder, to start from",
+        "thermoctl.shipped:init",
+        "folder",
+        _arg("folder", nargs="?", default=".", metavar="DIR", help="the folder (default: this one)"),
     ),
     _command(
         "completion",

@@ -1,7 +1,7 @@
 """Find the configuration of a command; every command uses this rule.
 
 `--config FILE`; else `$THERMOCTL_CONFIG`; else `config/simulated.yaml` in the current folder; else
-`/etc/thermoctl/rig.yaml`.
+`/etc/thermoctl/rig.yaml`; else, for `demo`, the simulated rig that comes with the program.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 
 FALLBACKS = ("config/simulated.yaml", "/etc/thermoctl/rig.yaml")
@@ -156,7 +157,7 @@ def find_config(given: str | None) -> tuple[str, str]:
             return path, "no --config, no THERMOCTL_CONFIG"
     raise InputError(
         f"no configuration: neither {FALLBACKS[0]} in this folder nor {FALLBACKS[1]} exists; "
-        "give --config FILE or set THERMOCTL_CONFIG"
+        "give --config FILE or set THERMOCTL_CONFIG; `thermoctl init` copies configurations to start from"
     )
 
 
@@ -165,7 +166,12 @@ def choose(args: argparse.Namespace) -> None:
     if "config" not in args or not _means_a_rig(args):
         return
     given = args.config or getattr(args, "file", None)
-    args.config, how = find_config(given)
+    try:
+        args.config, how = find_config(given)
+    except InputError:
+        if args.command != "demo":
+            raise
+        args.config, how = str(shipped("config") / "simulated.yaml"), "the simulated rig of the program"
     if not given and _acts(args):
         print(f"thermoctl: configuration {args.config} ({how})", file=sys.stderr)
 

@@ -13,6 +13,17 @@ from thermoctl.diagnose.words import NEXT
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 
+LAW = [
+    "expression",
+    "variables",
+    "parameters",
+    "probability",
+    "gain",
+    "rms",
+    "share_closed",
+    "family",
+    "effect",
+]
 LOST = ("effect", "where", "beside", "probability", "below_best", "reason")
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/reference/diagnosis.md").read_text()
@@ -50,7 +61,8 @@ def test_every_key_of_a_result_is_on_the_page(result):
     assert not absent, "this result has no remainder, nothing that lost, and all other keys"
     assert {k for k in listed if k.startswith("lost[].")} == {f"lost[].{k}" for k in LOST}
     assert {k for k in listed if k.startswith("remainder.")} == {
-        f"remainder.{k}" for k in ("share_closed", "rms", "over_noise", "node", "follows", "law")
+        f"remainder.{k}"
+        for k in ("share_closed", "rms", "over_noise", "node", "follows", "law", *(f"law.{k}" for k in LAW))
     }
 
 

@@ -220,11 +220,14 @@ def test_the_ambient_that_most_losses_are_counted_from_is_taken_and_said():
         assert any(n.startswith("'air' is taken as the ambient") and "wall" in n for n in structure.guesses())
 
 
-def test_a_column_that_nothing_reads_is_no_speed_and_no_position_whatever_its_name():
+def test_what_an_unread_column_sounds_like_is_a_guess_that_is_said():
     plant = loads(OSCILLATOR)
-    columns = {n: np.arange(5.0) for n in ("drive", "motor_speed", "position", "current", "x", "v")}
+    columns = {n: np.arange(5.0) for n in ("drive", "motor_speed", "position", "current", "x", "v", "c7")}
     drive = compile_plant(plant).excitation(Table("run", "run", np.arange(5.0), columns))
     structure = Structure(plant, [drive], [columns])
-    assert structure.signals("v") == ["slope"]
+    assert structure.signals("v") == ["slope"], "the plant's own motion comes first"
     assert structure.signals("x") == ["out"]
-    assert structure.signals("i") == []
+    assert structure.signals("i") == ["current"]
+    notes = structure.guesses()
+    assert any("'current': it may be a current; " in n for n in notes)
+    assert any("'c7': it may be a temperature; " in n for n in notes)

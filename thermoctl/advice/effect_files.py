@@ -24,6 +24,8 @@ from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 SYMBOLS: Mapping[str, tuple[str, ...]] = {
+    "node": ("n",),
+    "node_pair": ("m", "n"),
     "temperature_node": ("T",),
     "velocity_node": ("v",),
     "conductance": ("T",),
@@ -124,7 +126,8 @@ def _structure(root: Node) -> tuple[str, str]:
     parameters = top.sections("parameters")
     amplitudes = [n for q, p in parameters.items() for n in _parameter(q, p, given, parameters)]
     _dims(top, amplitudes)
-    known = {*SYMBOLS[where], *needs, *EVERYWHERE, *parameters}
+    reads = [str(node.value) for node in top.list("reads", required=False)]
+    known = {*SYMBOLS[where], *needs, *reads, *EVERYWHERE, *parameters}
     prior = top.given("prior")
     if prior:
         _expression(prior, {*parameters, "duration", "first_air"}, "prior")
@@ -159,8 +162,8 @@ def _shapes(top: Section) -> set[str]:
 def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, Section]) -> list[str]:
     """Check a parameter; return the amplitudes (s, s2 ...) of its trial value."""
     low, high = p.number("low", -np.inf), p.number("high", np.inf)
-    if not low < high:
-        raise p.node.error(f"parameter '{name}': low {low:g} must be below high {high:g}")
+    if not low <= high:  # equal: a known value
+        raise p.node.error(f"parameter '{name}': low {low:g} must not be above high {high:g}")
     for key in ("null", "typical"):
         p.optional_number(key)
     p.flag("per_recording", False)

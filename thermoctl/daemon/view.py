@@ -32,6 +32,7 @@ from thermoctl.daemon.monitor import errors, ramp_of, remember, screen
 from thermoctl.daemon.service import START_S, STOP_S, Background
 from thermoctl.daemon.watch import Watch
 from thermoctl.settings import Settings, effective, load_settings
+from thermoctl.shipped import state_folder
 from thermoctl.yamlfile import InputError
 
 MOTION, CYCLE_S = ((0.0, 240.0), (70.0, 200.0)), 90.0
@@ -67,7 +68,7 @@ def demo(settings: Settings, seconds: float | None = None) -> int:
 
 def demo_folder(settings: Settings) -> Path:
     """Return the folder of everything that the demo of this configuration writes."""
-    return Path(settings.socket.path).parent / "demo"
+    return (state_folder(settings.path) or Path(settings.socket.path).parent) / "demo"
 
 
 def _own(settings: Settings) -> Any:

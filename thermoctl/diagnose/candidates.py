@@ -117,6 +117,8 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     out = []
     driving = {place.input for place in driven(rig)}
     for effect in effects.values():
+        if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
+            continue
         for place in PLACES[effect.where](rig):
             if not askable(rig, place):
                 continue

@@ -22,6 +22,7 @@ KEYS = (
     "title",
     "where",
     "needs",
+    "reads",
     "change",
     "variants",
     "shapes",
@@ -105,6 +106,7 @@ class Effect:
     caution: str | None = None  # what a finding of it cannot tell, in words
     prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
     usual: Expr | None = None  # its size in standard deviations of an instrument in order, from SI units
+    reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
 
 
 def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
@@ -207,4 +209,5 @@ def _read(root: yamlfile.Node) -> Effect:
         top["caution"].value if "caution" in top else None,
         form["prior"],
         form["usual"],
+        tuple(top["reads"].plain()) if "reads" in top else (),
     )

@@ -22,6 +22,7 @@ from thermoctl.diagnose import run
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.experiment_file import peaks
 from thermoctl.diagnose.explain import explain
+from thermoctl.diagnose.law_result import save_effect
 from thermoctl.diagnose.resolve import resolve
 from thermoctl.diagnose.words import sentences, what_next
 from thermoctl.plant import load
@@ -149,9 +150,18 @@ def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 def effects(args: argparse.Namespace) -> int:
-    """`thermoctl effects [show NAME]`: the catalogue, or one entry in full.
+    """`thermoctl effects [show NAME | save DIR NAME]`: list the catalogue, show an entry, save a law as one.
 
-    Raises InputError for an unknown name."""
+    Raises InputError for an unknown name, and for a diagnosis without a law."""
+    if args.action == "save":
+        if len(args.files) != 2:
+            raise InputError(
+                "effects save: the folder of a diagnosis and a name were expected: effects save DIR NAME"
+            )
+        folder, label = args.files
+        path = save_effect(_read(Path(folder)), label, Path((args.effects or ["effects"])[0]))
+        print(f"written: {path}; `thermoctl diagnose --effects {path.parent}` finds it by name")
+        return 0
     found = catalogue((CATALOGUE, *map(Path, args.effects or ())))
     console = Console(soft_wrap=True)
     if args.action == "show":
@@ -183,7 +193,9 @@ def effects(args: argparse.Namespace) -> int:
             )
         return 0
     if args.action:
-        raise InputError(f"effects: 'show NAME' or nothing was expected, not '{args.action}'")
+        raise InputError(
+            f"effects: 'show NAME', 'check FILE', 'save DIR NAME' or nothing was expected, not '{args.action}'"
+        )
     table = Table("effect", "place", "what it is", box=None, header_style="bold")
     for e in found.values():
         table.add_row(e.name, e.where, e.title)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.decide import Facts, decide, weigh
 from thermoctl.diagnose.fit import as_refitted
 from thermoctl.diagnose.held_out import split, worth
+from thermoctl.diagnose.law import find_law
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.misfit import energies, standing
 from thermoctl.diagnose.result import Diagnosis
@@ -17,6 +19,8 @@ from thermoctl.diagnose.threads import one_thread
 from thermoctl.diagnose.unknown import left, reached
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
+
+WITHOUT_REMAINDER = ("consistent", "explained")  # verdicts that leave nothing for a law
 
 
 @one_thread()
@@ -52,7 +56,7 @@ def diagnose(
     # data that took part in the choice cannot speak against it
     ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects and value.reserved else 1.0
     facts = Facts(posterior.something, named, max(after.over_noise.values()), ratio)
-    return Diagnosis(
+    found = Diagnosis(
         known,
         searched,
         posterior,
@@ -65,6 +69,12 @@ def diagnose(
         energy,
         physics,
     )
+    if (
+        found.decision.verdict not in WITHOUT_REMAINDER
+        and max(found.remainder.over_noise.values()) > numbers.clean
+    ):
+        found = replace(found, law=find_law(known, found.final, numbers, reserve, say))
+    return found
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:

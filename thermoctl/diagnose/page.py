@@ -12,6 +12,7 @@ import numpy as np
 
 from thermoctl.diagnose.experiment_file import peaks
 from thermoctl.diagnose.fit import Fitted, Placed
+from thermoctl.diagnose.law_result import law_section
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.words import name, sentences, what_next
 from thermoctl.plant.refit import Estimate, Fit, report
@@ -36,6 +37,7 @@ def write_report(found: Diagnosis, result: Mapping[str, Any], path: str | Path) 
         ("What it is worth" if found.shown else "How well the plant fits", _worth(found, result)),
         ("Before and after", _curves(found)),
         ("What remains", _remains(found, result)),
+        ("A law for the remainder", law_section(found.law)),
         ("Why this verdict", _why(result)),
         ("Tried and lost", _lost(result)),
         ("Parameters before and after", _parameters(found)),

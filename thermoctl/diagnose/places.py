@@ -43,6 +43,20 @@ def _velocity_nodes(rig: Rig) -> Iterator[Place]:
     yield from _nodes(rig, rig.velocities, "v")
 
 
+def _storing(rig: Rig) -> list[str]:
+    """The nodes that a flow can fill; a position stores nothing."""
+    ends = {e for f in rig.physics.flows.values() for e in (f.source, f.target)}
+    return [n for n in rig.physics.nodes if n in ends and n not in rig.position_of.values()]
+
+
+def _exchanging(rig: Rig) -> Iterator[Place]:
+    nodes = set(_storing(rig))
+    for f in rig.physics.flows.values():
+        if f.source in nodes and f.target in nodes:
+            ends = {"m": str(f.source), "n": str(f.target)}
+            yield Place(f"{f.source}-{f.target}", {k: name(v) for k, v in ends.items()}, ends)
+
+
 def _conductances(rig: Rig) -> Iterator[Place]:
     for f in rig.physics.flows.values():
         read = ex.names(f.rate)
@@ -205,6 +219,8 @@ def _resistive(rig: Rig) -> Iterator[Place]:
 
 
 PLACES = {
+    "node": lambda rig: _nodes(rig, _storing(rig), "n"),
+    "node_pair": _exchanging,
     "temperature_node": _temperature_nodes,
     "velocity_node": _velocity_nodes,
     "conductance": _conductances,

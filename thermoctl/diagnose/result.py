@@ -12,6 +12,8 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.decide import Decision, Key, Posterior
 from thermoctl.diagnose.fit import Fitted, Placed
 from thermoctl.diagnose.held_out import Worth
+from thermoctl.diagnose.law import Law
+from thermoctl.diagnose.law_result import law_entry
 from thermoctl.diagnose.misfit import Energy
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import Left
@@ -39,7 +41,8 @@ class Diagnosis:
     - `left`, `before`: the residual of `best` and of `null`
     - `energy`: of each hypothesis' residuals
     - `physics`: for hypotheses whose every effect stands out of the misfit that they leave: each effect's
-      probability of being physics"""
+      probability of being physics
+    - `law`: a law for the remainder of the outcome"""
 
     case: Case
     searched: Searched
@@ -52,6 +55,7 @@ class Diagnosis:
     decision: Decision
     energy: Mapping[frozenset[Key], Energy]
     physics: Mapping[frozenset[Key], Mapping[Key, float]]
+    law: Law | None = None
 
     @property
     def shown(self) -> tuple[Placed, ...]:
@@ -75,8 +79,8 @@ class Diagnosis:
 
     @property
     def extended(self) -> Plant:
-        """The plant with the findings, refitted."""
-        return self.final.plant
+        """The plant with the findings and the law of the remainder, refitted."""
+        return self.law.fitted.plant if self.law else self.final.plant
 
 
 def contract(d: Diagnosis) -> dict[str, Any]:
@@ -101,7 +105,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
                 "over_noise": d.remainder.over_noise,
                 "node": d.remainder.node,
                 "follows": d.remainder.follows,
-                "law": None,
+                "law": law_entry(d.law),
             }
             if stays
             else None,

@@ -60,6 +60,11 @@ _READINGS = re.compile(
 )
 
 
+# Nothing states what a column is that the plant does not read: its name is a guess, and a note in the result.
+SOUNDS = {"v": r"veloc|speed|^v$", "x": r"posit|stroke|travel|^x$", "i": r"current|^i$", "T": r"temp|_c$|^t_"}
+MEANINGS = {"v": "velocity", "x": "position", "i": "current", "T": "temperature"}
+
+
 class Rig:
     """A plant and its recordings as the catalogue sees them: which node is a temperature, what moves, what is air."""
 
@@ -144,7 +149,7 @@ class Rig:
                 *self.velocities,
                 *(i for i in p.inputs if self.kind(p.inputs[i]) in ("velocity", "rotation")),
             ]
-            return (found or [c for c in self.spare if re.search(r"veloc|speed|^v$", c, re.I)])[:3]
+            return (found or self.guessed("v"))[:3]
         if kind == "x":
             if near in self.position_of:
                 return [self.position_of[near]]
@@ -152,13 +157,17 @@ class Rig:
                 return list(self.position_of.values())
             found = [i for i in p.inputs if self.kind(p.inputs[i]) == "length" and i in self.moving_inputs]
             found += [n.name for n in p.nodes.values() if self.kind(n) == "length"]
-            return (found or [c for c in self.spare if re.search(r"posit|stroke|travel|^x$", c, re.I)])[:3]
+            return (found or self.guessed("x"))[:3]
         if kind == "i":
             found = [n.name for n in p.nodes.values() if self.kind(n) == "current"]
             found += [i for i in p.inputs if self.kind(p.inputs[i]) == "current"]
-            return (found or [c for c in self.spare if re.search(r"current|^i$", c, re.I)])[:2]
+            return (found or self.guessed("i"))[:2]
         found = [*self.temperatures, *(i for i in self.heat_inputs if i in self.moving_inputs)]
-        return found + [c for c in self.spare if re.search(r"temp|_c$|^t_", c, re.I)]
+        return found + self.guessed("T")
+
+    def guessed(self, kind: str) -> list[str]:
+        """Return the columns that the plant does not read and that sound like v, x, i or T."""
+        return [c for c in self.spare if re.search(SOUNDS[kind], c, re.I)]
 
     def is_motor(self, f: Flow) -> bool:
         """A flow of force that an input drives."""

@@ -1,5 +1,6 @@
 """Kinds of quantities from `role`, units and structure of the plant, never from its names.
 
+Only a column that the plant does not read has neither: what its name sounds like is a guess.
 Of a pair of nodes, one the rate of the other, one is a velocity and one its position, in any unit. The
 ambient is the temperature that losses of heat are counted from. Each assumption is a note in the result."""
 
@@ -9,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from thermoctl.diagnose.rig import TEMPERATURE, Rig
+from thermoctl.diagnose.rig import MEANINGS, SOUNDS, TEMPERATURE, Rig
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Input, Node, Output, Plant
 from thermoctl.plant.simulate import Excitation
@@ -102,18 +103,17 @@ class Structure(Rig):
         for v, x in self.pairs.items():
             if super().kind(self.physics.nodes[v]) not in ("velocity", "rotation"):
                 out.append(f"'{x}' is taken as a position and '{v}' as its velocity, since '{v}' is its rate")
-        if self.spare:
+        for c in self.spare:
+            kinds = [MEANINGS[kind] for kind in SOUNDS if c in self.guessed(kind)]
             out.append(
-                f"columns that the plant does not read may be temperatures: {', '.join(self.spare)}; "
-                "an input with a `role` states what one is"
+                f"the plant does not read the column '{c}': it may be a {' or a '.join(kinds or ['temperature'])}; "
+                "an input with a `role` states what it is"
             )
         return out
 
     def signals(self, kind: str, near: str | None = None) -> list[str]:
-        """Return names that can stand for v, x, i or T; for T also columns that the plant does not read."""
-        spare, self.spare = self.spare, []
-        try:
-            found = super().signals(kind, near)
-        finally:
-            self.spare = spare
-        return found + (spare if kind == "T" else [])
+        """Return names that can stand for v, x, i or T; for T also unread columns that sound like nothing."""
+        found = super().signals(kind, near)
+        if kind == "T":
+            found += [c for c in self.spare if not any(c in self.guessed(k) for k in SOUNDS)]
+        return found

@@ -32,7 +32,8 @@ def sentences(found: Result) -> list[str]:
     if found["findings"]:
         lines.append(_gain(found, output))
     remainder = _remainder(found, output)
-    return [*lines, remainder] if remainder else lines
+    law = law_sentence((found["remainder"] or {}).get("law"))
+    return [*lines, *(text for text in (remainder, law) if text)]
 
 
 def what_next(found: Result) -> str:
@@ -89,6 +90,17 @@ def _found(found: Result) -> str:
     if names:
         return f"Found: {listed(names)}."
     return "Something is missing that no effect of the catalogue explains."
+
+
+def law_sentence(entry: Result | None) -> str:
+    """Return the law of the remainder."""
+    if not entry:
+        return ""
+    values = ", ".join(
+        f"{n} = {p['value']:.4g} {p['unit'] or ''}".strip() for n, p in entry["parameters"].items()
+    )
+    at = f"from {entry['from']} into {entry['into']}" if entry["from"] else f"into {entry['into']}"
+    return f"A law for it: a flow {at} of {entry['expression']} with {values} (probability {entry['probability']:.2f})."
 
 
 def _worst(found: Result) -> str | None:

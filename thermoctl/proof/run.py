@@ -53,11 +53,22 @@ def _run(job: Job, error: str | None, seconds: float | None) -> Run:
     }
 
 
+def _dask() -> tuple[Any, Any]:
+    """Return dask and distributed; their import takes a second. Raises InputError where one is missing."""
+    try:
+        import dask
+        import distributed
+    except ImportError:
+        raise InputError(
+            "many rigs or cases are diagnosed by Dask, which is not installed: pip install 'thermoctl[fleet]'"
+        ) from None
+    return dask, distributed
+
+
 @contextmanager
 def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     """Open a Dask client of the scheduler at the address, else of local single-threaded processes."""
-    import dask
-    from distributed import Client, LocalCluster
+    dask, distributed = _dask()
 
     with dask.config.set(
         {
@@ -67,11 +78,11 @@ def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         }
     ):
         if scheduler:
-            with Client(scheduler) as client:
+            with distributed.Client(scheduler) as client:
                 yield client
             return
         with (
-            LocalCluster(
+            distributed.LocalCluster(
                 n_workers=workers or os.cpu_count(),
                 threads_per_worker=1,
                 processes=True,
@@ -79,7 +90,7 @@ def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
                 memory_limit=0,
                 silence_logs=50,
             ) as local,
-            Client(local) as client,
+            distributed.Client(local) as client,
         ):
             yield client
 
@@ -98,13 +109,12 @@ def run_all(
     waiting = [j for j in jobs if not done(j, out / j.name)]
     if not waiting:
         return 0
-    from distributed import as_completed
-
+    _, distributed = _dask()
     with cluster(scheduler, workers) as client:
         futures = {
             client.submit(task, j, str(out / j.name), pure=False, key=f"case-{j.name}"): j for j in waiting
         }
-        for count, future in enumerate(as_completed(list(futures)), 1):
+        for count, future in enumerate(distributed.as_completed(list(futures)), 1):
             job = futures[future]
             if future.status == "error":  # its workers died RETRIES times
                 run = _run(job, f"{type(future.exception()).__name__}: {future.exception()}", None)

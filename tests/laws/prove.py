@@ -1,0 +1,271 @@
+"""Concealed laws that no entry of the catalogue holds: place, variable, law, worth, false claims.
+
+    python -m tests.laws.prove --out DIR [--full] [--shard K/N] [--limit N]      # one line of JSON for each case
+    python -m tests.laws.prove --out DIR --table                                 # docs/proof/laws.md
+
+Without --full the law is looked for in what a refit of the plant leaves. With --full the whole diagnosis runs, and the
+catalogue may take the law's place. Lines of an earlier run are kept: run again to continue."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.laws.rigs import LAWS, RATIOS, Made, Truth, drawn, make
+from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.catalogue import catalogue
+from thermoctl.diagnose.diagnosis import diagnose
+from thermoctl.diagnose.fit import fitted
+from thermoctl.diagnose.law import Law, find_law, law_rate
+from thermoctl.diagnose.limits import limits
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import default_noise, fit, updated
+from thermoctl.plant.simulate import compile_plant
+
+DRAWN, NONE = 16, 40  # laws from the grammar; cases without a law
+EQUAL = 0.15  # rms difference of the net flow over the law's own rms, up to which a law is equivalent
+PART = 0.2  # of a law's rms, from which a term counts for its variables
+AMBIENT = {"air", "jacket"}
+SEED = 4200
+
+
+def cases() -> list[tuple[str, Truth | None, str, str, str, int]]:
+    """(name, law, family, size, world, seed): every law once for each world, the sizes in turn; then none."""
+    out: list[tuple[str, Truth | None, str, str, str, int]] = []
+    for w, world in enumerate(("closed", "open")):
+        for k, law in enumerate((*LAWS, *drawn(DRAWN, SEED))):
+            size = list(RATIOS)[(k + w) % len(RATIOS)]
+            out.append(
+                (
+                    f"{law.family}: {law.name} | {size} | {world}",
+                    law,
+                    law.family,
+                    size,
+                    world,
+                    SEED + 7 * k + w,
+                )
+            )
+    for k in range(NONE):
+        family = ("heater", "stage", "tanks", "reactor")[k % 4]
+        size = list(RATIOS)[k // 4 % len(RATIOS)]
+        world = "open" if k % 8 < 6 else "closed"
+        out.append((f"{family}: none {k} | {size} | {world}", None, family, size, world, SEED + 1000 + k))
+    rng = np.random.default_rng(SEED)
+    return [out[i] for i in rng.permutation(len(out))]
+
+
+def judge(made: Made, full: bool) -> dict[str, Any]:
+    """Look for the law of one case, and compare with its truth."""
+    started = time.process_time()
+    numbers, law = limits(), None
+    if full:
+        d = diagnose(made.plant, made.tables[:3], catalogue(), numbers)
+        law, plant, null = d.law, d.extended, d.null.plant
+        named = [f"{e.key[0]} at {e.key[1]}" for e in d.shown]
+        verdict = d.decision.verdict
+    else:
+        known = case(made.plant, made.tables[:2], {}, Budget(numbers.fits))
+        first = fitted(known, known.plant, (), known.null)
+        law, named, verdict = find_law(known, first, numbers, made.tables[2:3]), [], ""
+        plant, null = (law.fitted.plant if law else first.plant), first.plant
+    out: dict[str, Any] = {
+        "seconds": round(time.process_time() - started, 1),
+        "verdict": verdict,
+        "named": named,
+        "claimed": law is not None,
+        "ratio": made.ratio,
+        "law": str(law_rate(law.fitted)) if law else None,
+        "forms": [t.form.name for t in law.proposal.terms] if law else None,
+    }
+    if made.law is None:
+        return out
+    oracle = _refit(made, _with_range(made.truth))
+    e = [_misfit(p, made) for p in (null, plant, oracle)]
+    closed = [1 - x / max(e[0], 1e-9) for x in e[1:]]
+    out |= {"closed": closed[0], "oracle": closed[1], "difference": difference(plant, made)}
+    if law:
+        out["place"] = {*law.proposal.place.nodes} == {made.law.target, made.law.source} - {None}
+        out["variables"] = sorted(_variables(law, made))
+        out["variable"] = set(out["variables"]) == made.law.variables - AMBIENT
+    return out
+
+
+def _with_range(truth: Plant) -> Plant:
+    """The truth's plant, whose law's size a refit may move."""
+    hidden = truth.flows["hidden"]
+    from thermoctl.plant.language import Parameter
+
+    size = Parameter("size_of_law", 1.0, None, (0.2, 5.0))
+    rate = ex.mul(ex.name("size_of_law"), hidden.rate)
+    return replace(
+        truth,
+        parameters={**truth.parameters, "size_of_law": size},
+        flows={**truth.flows, "hidden": replace(hidden, rate=rate)},
+    )
+
+
+def _refit(made: Made, plant: Plant) -> Plant:
+    model = compile_plant(plant)
+    drives = [model.excitation(t) for t in made.tables[:3]]
+    found = fit(model, drives, default_noise(plant, drives), iterations=30, tolerance=1e-3, seconds=np.inf)
+    return updated(plant, found, drives)
+
+
+def _misfit(plant: Plant, made: Made) -> float:
+    """Energy of the error beyond the noise on the last recording, summed over the outputs, over the noise's."""
+    model = compile_plant(plant)
+    d = model.excitation(made.tables[-1])
+    try:
+        run = model.run(d, None, None, sensitivities=True)
+    except Exception:
+        return float("inf")
+    sd = np.array([o.noise_sd for o in made.plant.outputs.values()])
+    error, start = (d.y - run.y) / sd, run.dy[:, :, len(model.active) :] / sd[None, :, None]
+    if start.shape[2]:  # less what the unknown start explains
+        a = start.reshape(-1, start.shape[2])
+        error = (error.ravel() - a @ np.linalg.lstsq(a, error.ravel(), rcond=None)[0]).reshape(error.shape)
+    return float(np.sum(np.maximum(np.mean(error**2, axis=0) - 1, 0)))
+
+
+def difference(plant: Plant, made: Made) -> float:
+    """Rms difference of the rates dx/dt at the law's place, along the truth's last run, over that of the law."""
+    model = compile_plant(made.truth)
+    d = model.excitation(made.tables[-1])
+    x = model.run(d).x
+    trajectory = {
+        **dict(zip(model.inputs, d.u.T, strict=False)),
+        **dict(zip(model.states, x.T, strict=True)),
+        "t": d.t,
+        "pi": np.pi,
+    }
+    if plant.nodes.keys() - trajectory.keys():
+        return float("nan")  # a law with a memory of its own
+
+    def net(p: Plant, only: str | None = None) -> np.ndarray:
+        known = {**trajectory, **{k: v.value for k, v in p.parameters.items()}}
+        total = np.zeros(len(d.t))
+        for f in p.flows.values():
+            if made.law.target in (f.source, f.target) and only in (None, f.name):
+                total = total + (1 if f.target == made.law.target else -1) * np.asarray(
+                    ex.evaluate(f.rate, known), float
+                )
+        return total / np.asarray(ex.evaluate(p.nodes[made.law.target].storage, known), float)
+
+    with np.errstate(all="ignore"):
+        delta = net(plant) - net(made.truth)
+    return float(np.sqrt(np.mean(delta**2) / np.mean(net(made.truth, "hidden") ** 2)))
+
+
+def _variables(law: Law, made: Made) -> set[str]:
+    """The signals of the terms that matter, without the ambient."""
+    model = compile_plant(made.plant)
+    d = model.excitation(made.tables[0])
+    x = model.run(d).x
+    run = {
+        **dict(zip(model.inputs, d.u.T, strict=False)),
+        **dict(zip(model.states, x.T, strict=True)),
+        "t": d.t,
+        "pi": np.pi,
+    }
+    sizes, out, at = [], set(), 0
+    for k, t in enumerate(law.proposal.terms):
+        flow = t.values(run, d.t) @ np.array(law.proposal.sizes[at : at + len(t.form.sizes)])
+        at += len(t.form.sizes)
+        sizes.append((k, float(np.sqrt(np.mean(flow**2)))))
+    for k, size in sizes:
+        if size >= PART * max(s for _, s in sizes):
+            out |= {n for s in law.proposal.terms[k].signals for n in ex.names(s.value)}
+    return out - AMBIENT
+
+
+def table(lines: Sequence[dict[str, Any]]) -> str:
+    """The figures, in Markdown."""
+    with_law = [r for r in lines if r["truth"]]
+    shown = [r for r in with_law if r.get("ratio", 0) and r["oracle"] > 0.5]
+    claimed = [r for r in shown if r["claimed"]]
+    none = [r for r in lines if not r["truth"]]
+
+    def share(rows: Sequence[Any], good: Sequence[Any]) -> str:
+        return f"{100 * len(good) / max(len(rows), 1):.0f} % ({len(good)} of {len(rows)})"
+
+    def row(name: str, goal: str, value: str) -> str:
+        return f"| {name} | {goal} | {value} |"
+
+    ratio = [r["closed"] / r["oracle"] for r in shown]
+    out = [
+        "| | goal | measured |",
+        "|---|---|---|",
+        row("a law claimed", "", share(shown, claimed)),
+        row("place right, of the claimed", "90 %", share(claimed, [r for r in claimed if r["place"]])),
+        row("variable right, of the claimed", "85 %", share(claimed, [r for r in claimed if r["variable"]])),
+        row(
+            "held-out misfit closed over the oracle's, median of all",
+            "80 %",
+            f"{100 * float(np.median(ratio)) if ratio else 0:.0f} %",
+        ),
+        row("equivalent law, of all", "60 %", share(shown, [r for r in shown if r["difference"] < EQUAL])),
+        row("a law claimed where none is", "2 %", share(none, [r for r in none if r["claimed"]])),
+        row(
+            "processor time, median",
+            "60 s",
+            f"{np.median([r['seconds'] for r in lines]):.0f} s" if lines else "-",
+        ),
+    ]
+    for key in ("small", "middle", "large", "closed", "open", "heater", "stage", "tanks", "reactor"):
+        part = [r for r in shown if key in r["case"].split(" | ")[1:] or r["case"].startswith(key)]
+        good = [r for r in part if r["claimed"] and r["place"]]
+        right = [r for r in part if r["claimed"] and r["variable"]]
+        same = [r for r in part if r["difference"] < EQUAL]
+        out.append(
+            row(
+                f"{key}: place, variable, equivalent, of {len(part)}",
+                "",
+                f"{len(good)}, {len(right)}, {len(same)}",
+            )
+        )
+    return "\n".join(out) + "\n"
+
+
+def main() -> None:
+    """Run the cases of a shard, or print the table."""
+    p = argparse.ArgumentParser()
+    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--full", action="store_true")
+    p.add_argument("--shard", default="0/1")
+    p.add_argument("--limit", type=int, default=10**6)
+    p.add_argument("--table", action="store_true")
+    args = p.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    kind = "full" if args.full else "law"
+    lines = [
+        json.loads(x) for f in sorted(args.out.glob(f"{kind}_*.jsonl")) for x in f.read_text().splitlines()
+    ]
+    if args.table:
+        print(table(lines))
+        return
+    k, n = map(int, args.shard.split("/"))
+    done = {r["case"] for r in lines}
+    with (args.out / f"{kind}_{k}.jsonl").open("a") as file:
+        for name, law, family, size, world, seed in cases()[k::n][: args.limit]:
+            if name in done:
+                continue
+            try:
+                result = judge(make(law, family, size, world, seed), args.full)
+            except Exception as e:  # a case that cannot be made or diagnosed is a line of the result, too
+                result = {"error": f"{type(e).__name__}: {e}"[:300]}
+            line = {"case": name, "truth": law.rate if law else None, **result}
+            file.write(json.dumps(line) + "\n")
+            file.flush()
+            print(json.dumps({k: v for k, v in line.items() if k != "truth"}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,237 @@
+"""A law in the result: its entry in diagnosis.json, its section of the report, its effect file."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.law import Law, Proposal, equation
+from thermoctl.diagnose.rig import zero_of
+from thermoctl.diagnose.words import law_sentence
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr, name, num
+from thermoctl.plant.language import Plant
+from thermoctl.report.page import figure, table, unit
+from thermoctl.yamlfile import InputError
+
+WIDE = 1.96  # standard deviations to either side of a 95 % interval
+EVERY = "node"  # place of a law at a node that is neither a temperature nor a velocity
+
+
+def law_entry(law: Law | None) -> dict[str, Any] | None:
+    """Return `remainder.law` of diagnosis.json."""
+    if law is None:
+        return None
+    f, p, place = law.fitted, law.proposal, law.proposal.place
+    return {
+        "expression": equation(law.rate, f),
+        "into": place.target,
+        "from": place.source,
+        "variables": sorted({s.label for t in p.terms for s in t.signals}),
+        "parameters": _parameters(law),
+        "probability": round(law.probability, 4),
+        "gain": law.gain,
+        "rms": f.fit.rms(),
+        "share_closed": law.closed,
+        "held_out": law.worth.reserved,
+        "family": family(law),
+        "effect": effect_file(law),
+    }
+
+
+def _parameters(law: Law) -> dict[str, Any]:
+    c, plant = law.placed.candidate, law.fitted.plant
+    used = {q.name: c.own(q.name) for q in c.effect.parameters if c.own(q.name) in plant.parameters}
+    return {
+        short: {
+            "value": plant.parameters[q].value,
+            "sd": law.fitted.sd.get(q),
+            "unit": plant.parameters[q].unit,
+        }
+        for short, q in used.items()
+    }
+
+
+def family(law: Law) -> list[str]:
+    """Return what the recordings leave open: the exponents within 95 %, and laws that fit about as well."""
+    out = []
+    c, plant = law.placed.candidate, law.fitted.plant
+    for k, t in enumerate(law.proposal.terms, 1):
+        for q in t.form.shapes:
+            long = c.own(f"{q}{k}")
+            value, sd = plant.parameters[long].value, law.fitted.sd.get(long, 0.0)
+            of = ", ".join(s.label for s in t.signals)
+            out.append(
+                f"{q}{k} of the {t.form.name.replace('_', ' ')} in {of}: {value - WIDE * sd:.3g} to {value + WIDE * sd:.3g}"
+            )
+    return out + [
+        f"{described(p, f)} fits about as well (probability {share:.2f})" for p, f, share in law.rivals
+    ]
+
+
+def described(p: Proposal, f: Fitted) -> str:
+    """Return a law as an expression with its place."""
+    own = set(f.hypothesis.effects[-1].own.values())
+    rate = next(x.rate for x in reversed(list(f.plant.flows.values())) if ex.names(x.rate) & own)
+    return f"{equation(rate, f)} at {p.place.where}"
+
+
+def law_section(law: Law | None) -> str:
+    """Return the report's section: the law, its parameters, its family, and the curve with its band."""
+    if law is None:
+        return ""
+    entry = law_entry(law) or {}
+    body = f"<p>{html.escape(law_sentence(entry))}</p><pre>{html.escape(entry['expression'])}</pre>"
+    rows = [
+        (n, p["value"], unit(p["unit"]), f"± {WIDE * p['sd']:.2g}" if p["sd"] else "known")
+        for n, p in entry["parameters"].items()
+    ]
+    body += table(("parameter", "value", "unit", "95 %"), rows)
+    if entry["family"]:
+        body += "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in entry["family"]) + "</ul>"
+    where = "recordings set aside" if entry["held_out"] else "cross-validated data"
+    body += f"<p>On {where} it closes {100 * entry['share_closed']:.0f} % of the energy of the misfit.</p>"
+    return (
+        body
+        + _drawing(law)
+        + "<p>thermoctl effects save DIR NAME writes it as an effect of your own catalogue.</p>"
+    )
+
+
+def _drawing(law: Law) -> str:
+    from matplotlib.figure import Figure
+
+    c = law.curve
+    if c is None:
+        return ""
+    fig = Figure(figsize=(6, 3.4), layout="constrained")
+    axis = fig.subplots()
+    axis.fill_between(
+        c.at, c.flow - WIDE * c.sd, c.flow + WIDE * c.sd, color="0.85", label="any function, 95 %"
+    )
+    axis.plot(c.at, c.flow, ".", color="#1b1f24", label="any function")
+    axis.plot(c.at, c.law, color="#0b6bcb", label="law")
+    axis.set_xlabel(f"{c.signal.label} ({unit(c.signal.unit)})" if c.signal.unit else c.signal.label)
+    axis.set_ylabel(f"flow ({unit(law.unit)})" if law.unit else "flow")
+    axis.legend(frameon=False, fontsize=8)
+    return figure(
+        fig,
+        "The flow as a free function of the signal, and the law. Parts that the plant's own parameters absorb are the law's.",
+    )
+
+
+# ------------------------------------------------------------------------------------------------ effect file
+
+
+def effect_file(law: Law) -> dict[str, Any]:
+    """Return the content of an effect file: sizes are fitted again, shapes start at the values found here."""
+    c, plant = law.placed.candidate, law.fitted.plant
+    where, swap = _symbols(law, plant)
+    parameters: dict[str, Any] = {}
+    sizes = 0
+    for q in c.effect.parameters:
+        own = c.own(q.name)
+        p = plant.parameters.get(own)
+        if p is None:
+            continue
+        entry: dict[str, Any] = {"unit": p.unit} if p.unit else {}
+        if q.amplitude:
+            sizes += 1
+            entry["trial"] = "s" if sizes == 1 else f"s{sizes}"
+        else:
+            low, high = p.range or (p.value, p.value)
+            entry |= {"trial": repr(p.value), "null": p.value, "low": low, "high": high}
+        parameters[q.name] = entry
+    changes = []
+    for item in c.effect.changes[0]:
+        ((kind, what),) = item.items()
+        told = {
+            k: (v if k not in ("rate", "initial") else str(ex.substitute(ex.parse(v), swap)))
+            for k, v in what.items()
+        }
+        for end, label in (("into", "target"), ("from", "source")):
+            if told.get(end) == label:
+                told[end] = _ends(where)[label]
+        changes.append({kind: told})
+    variables = ", ".join(sorted({s.label for t in law.proposal.terms for s in t.signals}))
+    read = _names(changes)
+    needs = ["x"] if where == "velocity_node" and "x" in read else []
+    reads = sorted(read & (plant.inputs.keys() | plant.nodes.keys()))
+    return {
+        "effect": "law",
+        "title": f"Law over {variables}, proposed from recordings",
+        "where": where,
+        **({"needs": needs} if needs else {}),
+        **({"reads": reads} if reads else {}),
+        "change": changes,
+        "parameters": parameters,
+        "excited_by": f"the visited range of {variables}",
+        "source": f"thermoctl diagnose of {Path(plant.file).name}",
+    }
+
+
+def _names(changes: Sequence[Mapping[str, Any]]) -> set[str]:
+    rates = [what["rate"] for c in changes for kind, what in c.items() if kind == "flow"]
+    return set().union(*(ex.names(ex.parse(r)) for r in rates))
+
+
+def _ends(where: str) -> dict[str, str]:
+    symbol = {"temperature_node": "T", "velocity_node": "v"}.get(where, "n")
+    return {"target": symbol, "source": "m"} if where == "node_pair" else {"target": symbol}
+
+
+def _symbols(law: Law, plant: Plant) -> tuple[str, Any]:
+    """Return the kind of place, and the change of the plant's names to the symbols of an effect file."""
+    place, rig = law.proposal.place, law.placed.candidate.rig
+    target, symbols = place.target, dict[str, Expr]()
+    where = EVERY
+    if place.source:
+        where, symbols = "node_pair", {target: name("n"), place.source: name("m")}
+    elif target in rig.temperatures and rig.air:
+        where = "temperature_node"
+        symbols = {
+            n: _celsius(name(s), u)
+            for n, s, u in (
+                (target, "T", plant.nodes[target].unit),
+                (rig.air, "air", _unit_of(plant, rig.air)),
+            )
+        }
+    elif target in rig.velocities:
+        where, symbols = "velocity_node", {target: name("v")}
+        if target in rig.position_of:
+            symbols[rig.position_of[target]] = name("x")
+    else:
+        symbols = {target: name("n")}
+    return where, lambda e: symbols.get(str(e.value)) if e.op == "name" else None
+
+
+def _celsius(e: Expr, its_unit: str | None) -> Expr:
+    zero = zero_of(its_unit)
+    return ex.add(e, num(zero)) if zero else e
+
+
+def _unit_of(plant: Plant, signal: str) -> str | None:
+    known = plant.inputs.get(signal) or plant.parameters.get(signal)
+    return known.unit if known else None
+
+
+def save_effect(found: Mapping[str, Any], label: str, folder: Path) -> Path:
+    """Write the law of a diagnosis as an effect file of this name, and return its path. Raises InputError."""
+    law = (found.get("remainder") or {}).get("law")
+    if not law:
+        raise InputError(
+            "this diagnosis has no law to save; one with `remainder.law` in diagnosis.json was expected"
+        )
+    if not label.isidentifier():
+        raise InputError(f"'{label}': a name of letters, digits and _ was expected, such as windage")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{label}.yaml"
+    if path.exists():
+        raise InputError(f"{path}: exists already; another name or folder (--effects) was expected")
+    path.write_text(yaml.safe_dump({**law["effect"], "effect": label}, sort_keys=False, allow_unicode=True))
+    return path

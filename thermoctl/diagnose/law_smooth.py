@@ -1,0 +1,164 @@
+"""Track the recordings with unknown flows at all nodes, and linearise the plant about this trajectory.
+
+    y - y(u^) + D u^ = sum_k c_k D phi_k(x^) + S dtheta + noise
+
+u^: flows at all nodes, straight lines between knots, that bring the plant's outputs to the recorded ones.
+D: exact first-order response of the outputs to flows, S: to parameters and initial states. A law at one node
+replaces all of u^. Regression on this equation equals one on the smoothed flow with its covariance.
+
+The prior of u^ is white, of one size in units of each node's typical flow. The size has the largest marginal
+likelihood."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.law_forms import Place
+from thermoctl.diagnose.screening import ROWS, Rows
+from thermoctl.diagnose.where import SHARES, signals, typical_flow
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import name
+from thermoctl.plant.language import Flow, Input, Plant
+from thermoctl.plant.simulate import SimulationError, compile_plant
+
+LATENT = "unknown_flow_into_"
+KNOTS = 240  # of a recording, shared among the nodes
+FEWEST_KNOTS = 24
+ABSORBED = 1e-3  # share of a flow's response, below which the plant's own parameters absorb it
+STEPS = 3  # Gauss-Newton steps of the tracking
+
+
+@dataclass
+class Tracked:
+    """The plant linearised about the tracked trajectory.
+
+    - `metric`: whitened rows there, the plant's own parameters projected out
+    - `target` (rows,): the misfit that a law has to explain
+    - `runs`: every signal of each recording, along the trajectory"""
+
+    metric: Rows
+    target: np.ndarray
+    runs: list[dict[str, np.ndarray | float]]
+    duration: float
+
+    def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
+        """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording.
+
+        A flow that the plant's own parameters absorb gives zeros."""
+        whole = _responses(self.metric, self.runs, place, flows)
+        rest = self.metric.project(whole)
+        absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
+        return np.where(absorbed, 0.0, rest)
+
+
+def _responses(
+    metric: Rows, runs: Sequence[dict[str, np.ndarray | float]], place: Place, flows: Sequence[np.ndarray]
+) -> np.ndarray:
+    blocks, model = [], metric.model
+    for r, (d, q) in enumerate(zip(metric.drives, flows, strict=True)):
+        k = q.shape[1]
+        forces, values = [], []
+        for node, sign in zip(reversed(place.nodes), (1.0, -1.0), strict=False):
+            storage = np.asarray(ex.evaluate(model.plant.nodes[node].storage, runs[r]), float)
+            forces += [(model.states.index(node), j) for j in range(k)]
+            values.append(sign * np.nan_to_num(q) / np.broadcast_to(storage, d.t.shape)[:, None])
+        q = np.concatenate(values, axis=1)
+        dy = model.respond(d, metric.fit.values[r], metric.fit.dx0[r], forces, q, k)
+        blocks.append(metric.rows(r, dy))
+    return np.concatenate(blocks)
+
+
+def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
+    """Return the plant with a recorded flow into each node."""
+    inputs = {f"{LATENT}{n}": Input(f"{LATENT}{n}", None, f"{LATENT}{n}", True) for n in nodes}
+    flows = {k: Flow(k, name(k), None, k.removeprefix(LATENT)) for k in inputs}
+    return dataclasses.replace(plant, inputs={**plant.inputs, **inputs}, flows={**plant.flows, **flows})
+
+
+def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
+    """Track the recordings from a fitted hypothesis. Raises SimulationError."""
+    f = as_refitted(case, f)
+    plant = with_latent(f.rough_plant, nodes)
+    model = compile_plant(plant)
+    # with a law a parameter may leave the bound that the refit without it pressed it to
+    rough = dataclasses.replace(f.rough, model=model, at_bound={})
+    base = dataclasses.replace(f, rough=rough, rough_plant=plant)
+    knots = max(FEWEST_KNOTS, KNOTS // max(len(nodes), 1))
+    hats = [_hats(t.t - t.t[0], knots) for t in case.tables]
+    weights = [np.zeros((knots, len(nodes))) for _ in hats]
+    sizes: list[float] = []
+    best: tuple[float, Rows, list[dict[str, np.ndarray | float]], np.ndarray, np.ndarray] | None = None
+    for _ in range(STEPS + 1):
+        tables = tuple(
+            dataclasses.replace(
+                t, columns={**t.columns, **{f"{LATENT}{n}": h @ w[:, i] for i, n in enumerate(nodes)}}
+            )
+            for t, h, w in zip(case.tables, hats, weights, strict=True)
+        )
+        try:
+            metric = Rows(dataclasses.replace(case, tables=tables), base, f.average, ROWS, False)
+        except SimulationError:
+            break
+        runs = [
+            signals(model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
+        ]
+        sizes = sizes or [typical_flow(f.rough_plant, n, runs) or 1.0 for n in nodes]
+        residual = np.concatenate(
+            [metric.rows(r, np.nan_to_num(d.y - metric.runs[r].y)) for r, d in enumerate(metric.drives)]
+        )
+        wide = _wide(metric, runs, nodes, sizes, hats)
+        scaled = np.concatenate([(w / np.array(sizes)).T.ravel() for w in weights])
+        size = float(residual @ residual)
+        if best is None or size < best[0]:
+            best = size, metric, runs, residual, wide @ scaled
+        else:
+            break
+        new = _smoothed(wide, residual + wide @ scaled)
+        parts = np.split(new, len(hats))
+        weights = [p.reshape(len(nodes), knots).T * np.array(sizes) for p in parts]
+    if best is None:
+        raise SimulationError("the plant cannot be tracked")
+    _, metric, runs, residual, explained = best
+    duration = max(float(d.t[-1]) for d in metric.drives)
+    return Tracked(metric, metric.project(residual + explained), runs, duration)
+
+
+def _hats(t: np.ndarray, knots: int) -> np.ndarray:
+    """(N, knots) straight lines between evenly spaced knots."""
+    at = np.linspace(t[0], t[-1], knots)
+    return np.stack([np.interp(t, at, row) for row in np.eye(knots)], axis=1)
+
+
+def _wide(
+    metric: Rows,
+    runs: Sequence[dict[str, np.ndarray | float]],
+    nodes: Sequence[str],
+    sizes: Sequence[float],
+    hats: Sequence[np.ndarray],
+) -> np.ndarray:
+    """(rows, recordings * nodes * knots) responses to each knot, in units of the typical flows."""
+    parts = []
+    for r, h in enumerate(hats):
+        for n, s in zip(nodes, sizes, strict=True):
+            flows = [h * s if k == r else np.zeros((len(other), h.shape[1])) for k, other in enumerate(hats)]
+            parts.append(_responses(metric, runs, Place(n), flows))
+    return np.concatenate(parts, axis=1)
+
+
+def _smoothed(wide: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the mean of the knots' flows, their prior size chosen by marginal likelihood."""
+    u, s, v = np.linalg.svd(wide, full_matrices=False)
+    along, rest = u.T @ target, float(target @ target)
+    best = (-np.inf, np.zeros(wide.shape[1]))
+    for share in SHARES:
+        variance = 1 + (share * s) ** 2
+        score = -0.5 * (float(np.log(variance).sum()) + rest - float(along**2 @ (1 - 1 / variance)))
+        if score > best[0]:
+            best = score, v.T @ (share**2 * s / variance * along)
+    return best[1]
