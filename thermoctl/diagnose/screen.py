@@ -83,7 +83,7 @@ class Metric:
     residual: np.ndarray
     basis: np.ndarray
 
-    def rows(self, r: int, e: np.ndarray) -> np.ndarray:
+    def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
         raise NotImplementedError
 
@@ -246,7 +246,7 @@ def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Seq
             for c, column in enumerate(part):
                 for j, delta in column.outputs[r].items():
                     dy[:, j, c] += np.nan_to_num(delta)
-            blocks.append(metric.rows(r, dy))
+            blocks.append(metric.unweighted(r, dy))
         yield part, np.concatenate(blocks)
 
 

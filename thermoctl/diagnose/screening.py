@@ -83,9 +83,16 @@ class Rows(Metric):
         self.residual = self.project(plain.residual * self.weight)
         self.now = self.log_likelihood(self.residual)
 
-    def rows(self, r: int, e: np.ndarray) -> np.ndarray:
+    def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
         return self.plain.rows(r, e)
+
+    def rows(self, r: int, e: np.ndarray) -> np.ndarray:
+        """Transform samples (N, outputs, ...) of recording r to whitened rows (rows, ...)."""
+        channels = zip(self.plain.coordinates.channels, self.weights, strict=True)
+        weight = np.concatenate([w for c, w in channels if c.recording == r])
+        x = self.unweighted(r, e)
+        return x * weight.reshape(-1, *([1] * (x.ndim - 1)))
 
     def log_likelihood(self, rows: np.ndarray) -> float:
         """Of whitened rows (all recordings, one after the other), noise and remainder averaged."""
