@@ -152,6 +152,20 @@ bench-diagnosis: develop           # the diagnosis beside other methods on the s
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/diagnosis.py $(CASES)
 
+.PHONY: bench-laws
+bench-laws: develop                # laws beside PySINDy, gplearn and a Gaussian process on the same smoothed inputs
+	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
+	$(BIN)/python -m tests.bench.laws
+
+.PHONY: prove-laws
+prove-laws: develop                # concealed laws that the catalogue lacks: 90 cases and 40 without a law; half an hour; run again to continue
+	$(BIN)/python -m tests.laws.prove --out $(or $(PROOF),build/proof/laws)
+	$(BIN)/python -m tests.laws.prove --out $(or $(PROOF),build/proof/laws) --table
+
+.PHONY: laws-recordings
+laws-recordings: develop           # laws of real rigs beside the published form; RECORDINGS= the folder of rigs
+	$(BIN)/python -m tests.laws.real $(RECORDINGS)
+
 .PHONY: demo-concealed
 demo-concealed: develop            # seven hidden effects on independently simulated rigs: diagnosed, modelled, compensated
 	$(BIN)/python -m tests.concealed.demo

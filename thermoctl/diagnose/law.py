@@ -48,6 +48,7 @@ PIECES = 8  # of a free function of a signal
 COMBINATIONS = 12  # places and signals whose forms are tried
 POOL = 60  # terms that a sum of terms is built from
 REFITS = 12
+SIMPLER = 6  # further refits, of sums of terms without their least significant one
 TERMS = 3
 CHUNK = 256  # terms whose responses are computed at a time
 SEEN = 0.01  # of the strongest direction of a free function: weaker ones are not drawn
@@ -62,7 +63,17 @@ class Proposal:
     terms: tuple[Term, ...]
     sizes: tuple[float, ...]
     promise: float
-    cost: float  # log of how many laws it was chosen from
+    look: float  # log of the number of places, signals and forms that a term was chosen from
+
+    @property
+    def cost(self) -> float:
+        """Log of the number of laws that it was chosen from; a second signal is chosen once more."""
+        return self.look * sum(max(len(t.signals), 1) for t in self.terms) + float(np.log(2)) * self.shapes
+
+    @property
+    def shapes(self) -> int:
+        """Number of parameters beside the sizes."""
+        return sum(len(t.form.shapes) for t in self.terms)
 
     @property
     def score(self) -> float:
@@ -112,6 +123,26 @@ class Law:
         return law_rate(self.fitted)
 
 
+def simpler_law(p: Proposal, f: Fitted) -> Proposal:
+    """Return a refitted law without its least significant term, at the values of the refit."""
+    c, values = f.hypothesis.effects[-1].candidate, f.plant.parameters
+
+    def value(q: str) -> float:
+        return values[c.own(q)].value
+
+    sizes = [[value(f"{q}{k}") for q in t.form.sizes] for k, t in enumerate(p.terms, 1)]
+    significant = [
+        max(abs(value(f"{q}{k}")) / max(f.sd.get(c.own(f"{q}{k}"), 0.0), 1e-300) for q in t.form.sizes)
+        for k, t in enumerate(p.terms, 1)
+    ]
+    kept = [k for k in range(len(p.terms)) if k != int(np.argmin(significant))]
+    terms = tuple(
+        dataclasses.replace(p.terms[k], shapes={q: value(f"{q}{k + 1}") for q in p.terms[k].form.shapes})
+        for k in kept
+    )
+    return dataclasses.replace(p, terms=terms, sizes=tuple(v for k in kept for v in sizes[k]))
+
+
 def law_rate(f: Fitted) -> ex.Expr:
     """Return the flow of the law that a hypothesis holds as its last effect."""
     own = set(f.hypothesis.effects[-1].own.values())
@@ -137,11 +168,17 @@ def find_law(
     except (SimulationError, np.linalg.LinAlgError):
         return None
     tried: list[tuple[Proposal, Fitted]] = []
-    for p in proposals:
-        say(f"looking for a law of the remainder: refit {len(tried) + 1}")
+    queue, more = list(proposals), SIMPLER
+    for k, p in enumerate(queue):
+        say(f"looking for a law of the remainder: refit {k + 1}")
         f = refitted_law(case, parent, p, at)
-        if f is not None and not f.absent and not at_bound(f):
+        if f is None:
+            continue
+        if not f.absent and not at_bound(f):
             tried.append((p, f))
+        if len(p.terms) > 1 and more and (f.doubtful or at_bound(f)):
+            queue.append(simpler_law(p, f))
+            more -= 1
     if not tried:
         return None
     gains = np.array([f.log_evidence - p.cost - parent.log_evidence for p, f in tried])
@@ -289,16 +326,9 @@ def _varied(
 
 def _proposal(at: Tracked, place: Place, law: tuple[Term, ...], x: np.ndarray, base: float) -> Proposal:
     promise, c = _promise(at, x)
-    shapes = sum(len(t.form.shapes) for t in law)
-    pairs = sum(len(t.signals) - 1 for t in law)  # a second signal is chosen once more
-    cost = (len(law) + pairs) * base + float(np.log(2)) * shapes
-    return Proposal(
-        place,
-        law,
-        tuple(map(float, c)),
-        promise - 0.5 * (len(c) + shapes) * float(np.log(len(at.target))),
-        cost,
-    )
+    p = Proposal(place, law, tuple(map(float, c)), promise, base)
+    dims = len(c) + p.shapes
+    return dataclasses.replace(p, promise=promise - 0.5 * dims * float(np.log(len(at.target))))
 
 
 def _sums(

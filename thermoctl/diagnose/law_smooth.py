@@ -30,6 +30,7 @@ from thermoctl.plant.simulate import SimulationError, compile_plant
 LATENT = "unknown_flow_into_"
 KNOTS = 240  # of a recording, shared among the nodes
 FEWEST_KNOTS = 24
+ABSORBED = 1e-3  # share of a flow's response, below which the plant's own parameters absorb it
 STEPS = 3  # Gauss-Newton steps of the tracking
 
 
@@ -47,8 +48,13 @@ class Tracked:
     duration: float
 
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
-        """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording."""
-        return self.metric.project(_responses(self.metric, self.runs, place, flows))
+        """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording.
+
+        A flow that the plant's own parameters absorb gives zeros."""
+        whole = _responses(self.metric, self.runs, place, flows)
+        rest = self.metric.project(whole)
+        absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
+        return np.where(absorbed, 0.0, rest)
 
 
 def _responses(
@@ -80,7 +86,9 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
     f = as_refitted(case, f)
     plant = with_latent(f.rough_plant, nodes)
     model = compile_plant(plant)
-    base = dataclasses.replace(f, rough=dataclasses.replace(f.rough, model=model), rough_plant=plant)
+    # with a law a parameter may leave the bound that the refit without it pressed it to
+    rough = dataclasses.replace(f.rough, model=model, at_bound={})
+    base = dataclasses.replace(f, rough=rough, rough_plant=plant)
     knots = max(FEWEST_KNOTS, KNOTS // max(len(nodes), 1))
     hats = [_hats(t.t - t.t[0], knots) for t in case.tables]
     weights = [np.zeros((knots, len(nodes))) for _ in hats]
