@@ -100,6 +100,11 @@ bench: develop                     # speed of plants beside scipy and CasADi
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/plant.py
 
+.PHONY: bench-scale
+bench-scale: develop               # cost of a diagnosis by rows and by bodies; BEFORE=a checkout of an older version, beside it; minutes
+	$(BIN)/python -m tests.bench.scale rows $(if $(BEFORE),--before $(BEFORE))
+	$(BIN)/python -m tests.bench.scale bodies
+
 .PHONY: prove-refit refit-recordings
 prove-refit: develop               # share of 95 % intervals that contain the true parameter: 100 truths for each rig and noise
 	nice -n 15 $(BIN)/python tests/plant/prove_refit.py
