@@ -100,6 +100,11 @@ bench: develop                     # speed of plants beside scipy and CasADi
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/plant.py
 
+.PHONY: bench-scale
+bench-scale: develop               # cost of a diagnosis by rows and by bodies; BEFORE=a checkout of an older version, beside it; minutes
+	$(BIN)/python -m tests.bench.scale rows $(if $(BEFORE),--before $(BEFORE))
+	$(BIN)/python -m tests.bench.scale bodies
+
 .PHONY: prove-refit refit-recordings
 prove-refit: develop               # share of 95 % intervals that contain the true parameter: 100 truths for each rig and noise
 	nice -n 15 $(BIN)/python tests/plant/prove_refit.py
@@ -114,6 +119,10 @@ size: install                      # the wheel in a fresh environment: megabytes
 .PHONY: stranger
 stranger: develop                  # another simulator's log with ; and decimal commas, up to the right name: commands, edits, times
 	$(BIN)/python -m pytest -q -s -k strangers_rig tests/plant/test_plant_new.py
+
+.PHONY: wrong-plants
+wrong-plants: develop              # twenty wrong plants: found by the checks, named rightly, or not named with confidence; minutes
+	$(BIN)/python -m tests.checks.wrong_plants
 
 .PHONY: fmu-back
 fmu-back: develop                  # ten plants with a hidden effect, diagnosed with the plant file and with its FMU: a table; minutes

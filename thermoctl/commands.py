@@ -795,6 +795,20 @@ _PEOPLE = (
         _JSON,
     ),
     _command(
+        "report",
+        "write one archive for a question to others: versions, configuration, log, the end of the newest recording",
+        "thermoctl.support:report",
+        "settings out seconds",
+        CONFIG,
+        _arg(
+            "--out",
+            default="thermoctl-report.zip",
+            metavar="FILE",
+            help="the archive (default thermoctl-report.zip)",
+        ),
+        _arg("--seconds", type=float, default=60.0, metavar="S", help="of the newest recording (default 60)"),
+    ),
+    _command(
         "init",
         "copy configurations, device profiles, plants and examples into a folder, to start from",
         "thermoctl.shipped:init",

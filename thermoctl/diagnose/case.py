@@ -13,8 +13,9 @@ from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.coordinates import Coordinates
 from thermoctl.diagnose.noise import Grid, grid
 from thermoctl.diagnose.roles import Structure
-from thermoctl.plant.language import Plant, SensorNoise
-from thermoctl.plant.refit import Fit, Noise, default_noise, fit
+from thermoctl.diagnose.rows import reduced
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Fit, Noise, fit
 from thermoctl.plant.simulate import Excitation, Model, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
@@ -25,11 +26,14 @@ OUTLIER = 6.0  # robust standard deviations from the median of five neighbours
 
 @dataclass
 class Budget:
-    """Largest number of refits, and the number done. Counted, never timed: the same on every machine."""
+    """Largest number of refits, and the number done. Counted, never timed: the same on every machine.
+
+    `planned`: number of refits after this step of the search; each step may plan more."""
 
     fits: int
     progress: Callable[[str], None] = lambda text: None
     fits_done: int = 0
+    planned: int = 1
 
     @property
     def spent(self) -> bool:
@@ -39,7 +43,8 @@ class Budget:
     def spend(self) -> None:
         """Count one refit, and report it."""
         self.fits_done += 1
-        self.progress(f"searching: refit {self.fits_done} of at most {self.fits}")
+        planned = min(max(self.planned, self.fits_done), self.fits)
+        self.progress(f"searching: refit {self.fits_done} of {planned} planned so far (at most {self.fits})")
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,7 @@ class Case:
     grids: tuple[Grid, ...]
     budget: Budget
     notes: list[str] = field(default_factory=list)
+    block: int = 1  # rows of the recordings whose mean is one row here
 
     def drives(self, model: Model) -> list[Excitation]:
         """The recordings as a model reads them."""
@@ -66,7 +72,10 @@ class Case:
 def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect], budget: Budget) -> Case:
     """Refit the original plant, drop single outliers, fix the coordinates and grids of all hypotheses.
 
+    Rows of long recordings are put together (rows.py).
     Raises InputError where too few values were measured."""
+    fewer = reduced(plant, tables)
+    tables = fewer.tables
     model = compile_plant(plant)
     drives = [model.excitation(t) for t in tables]
     counts = [sum(int(np.isfinite(d.y[:, j]).sum()) for d in drives) for j in range(len(model.outputs))]
@@ -75,12 +84,12 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
             f"{', '.join(t.path for t in tables)}: too little data: at most {max(counts, default=0)} measured values of one "
             f"output ({', '.join(o.column for o in plant.outputs.values())}); {LEAST} or more are needed"
         )
-    noise = default_noise(plant, drives)
+    noise = fewer.noise(plant, drives)
     null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
     tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
     drives = [model.excitation(t) for t in tables]
     coordinates = Coordinates(drives)
-    sensors = [o.noise if isinstance(o.noise, SensorNoise) else None for o in plant.outputs.values()]
+    sensors = [fewer.sensor(o.noise) for o in plant.outputs.values()]
     rig = Structure(plant, drives, [t.columns for t in tables])
     return Case(
         plant,
@@ -94,7 +103,12 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
             for j, ks in coordinates.by_output().items()
         ),
         budget,
-        [*([f"{dropped} single outliers were left out"] if dropped else []), *rig.guesses()],
+        [
+            *([fewer.note] if fewer.block > 1 else []),
+            *([f"{dropped} single outliers were left out"] if dropped else []),
+            *rig.guesses(),
+        ],
+        fewer.block,
     )
 
 

@@ -5,8 +5,10 @@ Progress while they work, a summary for a person, JSON for a program."""
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,16 +33,33 @@ QUIET_S = 5.0  # seconds between two lines on the same stage
 
 
 class StageReporter:
-    """Writes each stage with the time gone; inside a stage at most one line in QUIET_S."""
+    """Writes each stage with the time gone; inside a stage at most one line in QUIET_S.
+
+    As a context, it writes a line every QUIET_S while nothing is reported: a sign of life."""
 
     def __init__(self) -> None:
-        self.started, self.stage, self.written = time.monotonic(), "", 0.0
+        self.started, self.stage, self.last, self.written = time.monotonic(), "", "", 0.0
+        self.ended = threading.Event()
+        self.beat = threading.Thread(target=self._live, daemon=True)
 
     def __call__(self, text: str) -> None:
         gone, stage = time.monotonic() - self.started, text.partition(":")[0]
+        self.last = text
         if stage != self.stage or gone - self.written >= QUIET_S:
             self.stage, self.written = stage, gone
             print(f"{gone:6.1f} s: {text}", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> StageReporter:
+        self.beat.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.ended.set()
+
+    def _live(self) -> None:
+        while not self.ended.wait(1.0):
+            if self.last and time.monotonic() - self.started - self.written >= QUIET_S:
+                self(self.last)
 
 
 def diagnose(args: argparse.Namespace) -> int:
@@ -65,28 +84,33 @@ def diagnose(args: argparse.Namespace) -> int:
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
         added = read_recordings(plant, recordings[len(given) :])  # of --resolve: written by thermoctl
-        return run.diagnose(
-            plant,
-            [*given, *added],
-            args.out,
-            [Path(e) for e in args.effects or ()],
-            held_out,
-            None if args.quiet else StageReporter(),
-            args.drive or (),
-            _limits(args.limit or ()),
-        )
+        with contextlib.nullcontext() if args.quiet else StageReporter() as progress:
+            return run.diagnose(
+                plant,
+                [*given, *added],
+                args.out,
+                [Path(e) for e in args.effects or ()],
+                held_out,
+                progress,
+                args.drive or (),
+                _limits(args.limit or ()),
+            )
 
-    if args.resolve:
-        found = resolve(
-            diagnosed,
-            args.recordings,
-            Path(args.out),
-            args.record,
-            args.rounds,
-            lambda text: print(text, file=sys.stderr, flush=True),
-        )
-    else:
-        found = diagnosed(args.recordings)
+    try:
+        if args.resolve:
+            found = resolve(
+                diagnosed,
+                args.recordings,
+                Path(args.out),
+                args.record,
+                args.rounds,
+                lambda text: print(text, file=sys.stderr, flush=True),
+            )
+        else:
+            found = diagnosed(args.recordings)
+    except KeyboardInterrupt:
+        print(f"thermoctl: stopped; {args.out} holds nothing of this diagnosis", file=sys.stderr)
+        raise
     if args.json:
         print(json.dumps(found, indent=1, allow_nan=False))
     elif not args.quiet:

@@ -132,6 +132,7 @@ class Posterior:
         self.mean, self.precision = mean, precision
         beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
         self.problem.priors = tuple(beliefs)
+        self.kept: tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]] | None = None
 
     def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
         """(N, outputs, ...) of each recording as rows of each channel."""
@@ -168,23 +169,33 @@ class Posterior:
             - 0.5 * self.problem.prior_terms(values, False)[0]
         )
 
+    def slopes(self, z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return each channel's unknowns (k,), and the slopes of its rows by them (rows, k).
+
+        The result is kept for the next call with the same z."""
+        if self.kept is None or not np.array_equal(self.kept[0], z):
+            found, r = [], -1
+            for c in self.case.coordinates.channels:
+                if c.recording != r:
+                    r = c.recording
+                    unknown, jac = self.problem.jacobian(z, r)
+                found.append((unknown, self.case.coordinates.transform(c, jac[:, c.output])))
+            self.kept = z.copy(), found
+        return self.kept[1]
+
     def slope(
         self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
         """Gradient of the log posterior, and minus its second derivative."""
         n = len(z)
         gradient, matrix = np.zeros(n), np.zeros((n, n))
-        channels = self.case.coordinates.channels
-        for r in range(len(self.drives)):
-            unknown, jac = self.problem.jacobian(z, r)
-            for k, c in enumerate(channels):
-                if c.recording != r:
-                    continue
-                j = self.case.coordinates.transform(c, jac[:, c.output])
-                w = np.sqrt(inverse[k][c.band])
-                j *= w[:, None]
-                gradient[unknown] += j.T @ (w * rows[k])
-                matrix[np.ix_(unknown, unknown)] += j.T @ j
+        for c, (unknown, jac), weight, row in zip(
+            self.case.coordinates.channels, self.slopes(z), inverse, rows, strict=True
+        ):
+            w = np.sqrt(weight[c.band])
+            j = jac * w[:, None]
+            gradient[unknown] += j.T @ (w * row)
+            matrix[np.ix_(unknown, unknown)] += j.T @ j
         values, _ = self.problem.unpack(z)
         _, push, bend = self.problem.prior_terms(values, True)
         return gradient - self.precision * (z - self.mean) - push, matrix + np.diag(self.precision) + bend
@@ -192,20 +203,18 @@ class Posterior:
     def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
         """Return E[1/V] J'J minus the curvature: the gradient's variance over the unknown V (Louis 1982)."""
         out = np.zeros((len(z), len(z)))
-        channels = self.case.coordinates.channels
-        jacobians = [self.problem.jacobian(z, r) for r in range(len(self.drives))]
+        jacobians = self.slopes(z)
         for g, unsure in zip(self.case.grids, average.unsure, strict=True):
             pull = np.zeros((len(unsure), len(z)))
             at = 0
             for k in g.channels:
-                c = channels[k]
-                unknown, jac = jacobians[c.recording]
-                j = self.case.coordinates.transform(c, jac[:, c.output]) * rows[k][:, None]
-                node = g.node[at : at + len(c.count)][c.band]
+                c = self.case.coordinates.channels[k]
+                unknown, jac = jacobians[k]
+                node = g.node[at : at + len(c.count)]
                 at += len(c.count)
-                part = np.zeros((len(unsure), j.shape[1]))
-                np.add.at(part, node, j)
-                pull[:, unknown] += part
+                starts = np.cumsum(c.count) - c.count
+                by_band = np.add.reduceat(jac * rows[k][:, None], starts, axis=0)
+                np.add.at(pull, np.ix_(node, unknown), by_band)  # two bands may share a node
             out += pull.T @ unsure @ pull
         return out
 

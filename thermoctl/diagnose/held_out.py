@@ -10,6 +10,7 @@ import numpy as np
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.rows import means
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
@@ -52,6 +53,8 @@ def split(tables: Sequence[Table], held_out: Sequence[Table]) -> tuple[list[Tabl
 def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> Worth:
     """Errors on the reserve; without one, on every other block, the plants refitted to the rest."""
     if reserve:
+        if case.block > 1:
+            reserve = [means(case.null.model, t, case.block) for t in reserve]
         return Worth(
             _rms([_errors(case, case.plant, t) for t in reserve], null.fit.model),
             _rms([_errors(case, null.plant, t) for t in reserve], null.fit.model),

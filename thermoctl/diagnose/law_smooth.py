@@ -21,7 +21,7 @@ from scipy.linalg import block_diag
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, as_refitted
 from thermoctl.diagnose.law_forms import Place
-from thermoctl.diagnose.screening import ROWS, Rows
+from thermoctl.diagnose.screening import ROWS, Plain, Rows
 from thermoctl.diagnose.where import SHARES, signals, typical_flow
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name
@@ -111,7 +111,8 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
             for t, h, w in zip(case.tables, hats, weights, strict=True)
         )
         try:
-            metric = Rows(dataclasses.replace(case, tables=tables), base, f.average, ROWS, False)
+            plain = Plain(dataclasses.replace(case, tables=tables), base, ROWS)
+            metric = Rows(plain, f.average, False)
         except SimulationError:
             break
         runs = [

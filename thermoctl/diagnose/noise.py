@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.special import logsumexp
 
 from thermoctl.diagnose.coordinates import WIDTH, Coordinates
@@ -189,37 +189,44 @@ def _with_remainder(g: Grid, power: np.ndarray, own: float) -> tuple[float, floa
     n, rows, size = g.count, float(g.count.sum()), len(g.count) + 1
     x = np.concatenate([[0.0], np.log(np.maximum(power / n - own * g.shape, 0.05 * own) / g.small)])
 
-    def density(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    def spectra(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         noise, free = g.variance * g.shape * np.exp(x[0]), np.exp(x[1:])
         mean = float(n @ free) / rows
         v = noise + g.small * (free + FLOOR * mean)
-        log_p = -0.5 * float(np.sum(n * np.log(v) + power / v)) - 0.5 * mean - 0.5 * (x[0] / g.known) ** 2
-        slope = np.zeros((size - 1, size))  # d log V / d (log c^2, u)
-        slope[:, 0] = noise
-        slope[:, 1:] = g.small * (np.diag(free) + FLOOR * n * free / rows)
-        return log_p - 0.5 * float(x[1:] @ g.rough @ x[1:]), slope / v[:, None], v, n * free / rows
+        log_p = -0.5 * float(n @ np.log(v) + (power / v).sum()) - 0.5 * mean - 0.5 * (x[0] / g.known) ** 2
+        return log_p - 0.5 * float(x[1:] @ (g.rough @ x[1:])), noise, free, v
 
-    now, slope, v, parts = density(x)
+    def slopes(noise: np.ndarray, free: np.ndarray, v: np.ndarray) -> np.ndarray:
+        out = np.empty((size - 1, size))  # d log V / d (log c^2, u)
+        out[:, 0] = noise
+        out[:, 1:] = g.small * FLOOR / rows * n * free
+        out[inside, 1 + inside] += g.small * free
+        return out / v[:, None]
+
+    now, noise, free, v = spectra(x)
+    inside = np.arange(size - 1)
     for _ in range(STEPS):
+        parts, slope = n * free / rows, slopes(noise, free, v)
         gradient = slope.T @ (0.5 * (power / v - n))
         gradient -= np.concatenate([[x[0] / g.known**2], g.rough @ x[1:] + 0.5 * parts])
         h = slope.T @ (0.5 * n[:, None] * slope)
         h[0, 0] += g.known**-2
         h[1:, 1:] += g.rough
-        h[range(1, size), range(1, size)] += 0.5 * parts
-        step = np.clip(cho_solve(cho_factor(h), gradient), -LONGEST, LONGEST)
+        h[1 + inside, 1 + inside] += 0.5 * parts
+        factor = dpotrf(h, lower=1)[0]
+        step = np.clip(dpotrs(factor, gradient, lower=1)[0], -LONGEST, LONGEST)
         for _ in range(8):
-            then = density(x + step)
+            then = spectra(x + step)
             if then[0] >= now:
                 break
             step *= 0.5
         else:
             break
         gain = then[0] - now
-        x, (now, slope, v, parts) = x + step, then
+        x, (now, noise, free, v) = x + step, then
         if gain < CLOSE:
             break
     score = now - 0.5 * rows * LOG_2PI - np.log(g.known) + 0.5 * g.log_rough - g.log_small
-    score -= float(np.sum(np.log(np.diag(cho_factor(h)[0]))))
-    moves = slope.T / v  # -d(1/V) / d(log c^2, u)
-    return (float(score), float(g.variance * np.exp(x[0])), v, moves.T @ cho_solve(cho_factor(h), moves))
+    score -= float(np.sum(np.log(np.diag(factor))))
+    moves = slopes(noise, free, v).T / v  # -d(1/V) / d(log c^2, u)
+    return (float(score), float(g.variance * np.exp(x[0])), v, moves.T @ dpotrs(factor, moves, lower=1)[0])

@@ -50,7 +50,7 @@ def diagnose(
     Raises InputError for unusable inputs."""
     if not tables:
         raise InputError("no recording was given; one or more were expected")
-    started = time.monotonic()
+    started, folder = time.monotonic(), _writable(Path(out))
     named = _distinct([*tables, *held_out])
     chosen_on, reserve = named[: len(tables)], named[len(tables) :]
     try:
@@ -64,8 +64,6 @@ def diagnose(
     result["next_experiment"] = proposed[0] if proposed else None
     result["not_seen"] = not_seen(found) if found.decision.verdict == "consistent" else []
     result["seconds"] = round(time.monotonic() - started, 1)
-    folder = Path(out)
-    folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as part_name:
         part = Path(part_name)
         added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in found.shown)
@@ -92,6 +90,21 @@ def diagnose_files(
     """Diagnose recordings that are named by their files. Raises InputError."""
     plant = load(plant_file)
     return diagnose(plant, read_recordings(plant, recordings), out, effects, read_recordings(plant, held_out))
+
+
+def _writable(folder: Path) -> Path:
+    """Return the folder of a result, if files can be written there. Raises InputError: before the work, not after."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: a file; a folder for the result was expected (--out)")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder if folder.exists() else folder.parent):
+            pass
+    except OSError as e:
+        raise InputError(
+            f"{folder}: the result cannot be written there: {e.strerror}; give another --out"
+        ) from None
+    return folder
 
 
 def _distinct(tables: Sequence[Table]) -> list[Table]:

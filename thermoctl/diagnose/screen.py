@@ -71,6 +71,7 @@ def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
 class Metric:
     """Whitened rows of a refitted hypothesis, as the screening needs them; a subclass fills them.
 
+    - `weight` (rows,): factor of each row that whitens it
     - `residual` (rows,): the residual, without what the plant's own parameters absorb
     - `basis` (rows, k): orthonormal; the directions that the plant's own parameters absorb"""
 
@@ -78,11 +79,12 @@ class Metric:
     model: Model
     drives: list[Excitation]
     runs: list[Simulation]
+    weight: np.ndarray
     residual: np.ndarray
     basis: np.ndarray
 
-    def rows(self, r: int, e: np.ndarray) -> np.ndarray:
-        """Transform samples (N, outputs, ...) of recording r to whitened rows (rows, ...)."""
+    def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
+        """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
         raise NotImplementedError
 
     def project(self, d: np.ndarray) -> np.ndarray:
@@ -222,7 +224,7 @@ _Entry = tuple[_Column, np.ndarray, float]  # its projected rows, and the norm o
 
 
 def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Sequence[_Column], np.ndarray]]:
-    """Whitened rows (rows, k) of columns, a chunk at a time."""
+    """Rows (rows, k) of columns, not whitened, a chunk at a time."""
     buffers: dict[str, np.ndarray] = {}
     for at in range(0, len(columns), CHUNK):
         part = columns[at : at + CHUNK]
@@ -244,31 +246,37 @@ def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Seq
             for c, column in enumerate(part):
                 for j, delta in column.outputs[r].items():
                     dy[:, j, c] += np.nan_to_num(delta)
-            blocks.append(metric.rows(r, dy))
+            blocks.append(metric.unweighted(r, dy))
         yield part, np.concatenate(blocks)
 
 
 def screen(
-    metric: Metric, rig: Rig, found: Sequence[Candidate], edges: np.ndarray | None = None
-) -> list[Direction]:
-    """Return every candidate's best direction, best first. `edges`: onsets to try instead of the grid."""
-    at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
+    metrics: Sequence[Metric], rig: Rig, found: Sequence[Candidate], edges: np.ndarray | None = None
+) -> list[list[Direction]]:
+    """Return every candidate's best direction, best first, in each of the metrics.
+
+    The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid."""
+    first = metrics[0]
+    at = [Trajectory(first, rig, r) for r in range(len(first.drives))]
     columns: list[_Column] = []
     for c in found:
-        columns += _columns(c, metric, at, edges)
-    best: dict[int, Direction] = {}
+        columns += _columns(c, first, at, edges)
+    best: list[dict[int, Direction]] = [{} for _ in metrics]
     pending: dict[tuple[Any, ...], list[_Entry]] = {}
-    for part, rows in directions(metric, columns):
-        full = np.linalg.norm(rows, axis=0)
-        rows = metric.project(rows)
-        for k, column in enumerate(part):
-            candidate, group, _, count = column.item
-            entries = pending.setdefault((id(candidate), group), [])
-            entries.append((column, rows[:, k].copy(), float(full[k])))
-            if len(entries) == count:
-                del pending[id(candidate), group]
-                _score(candidate, entries, metric, best)
-    return sorted(best.values(), key=lambda d: d.log_p)
+    for part, plain in directions(first, columns):
+        for metric, leaders in zip(metrics, best, strict=True):
+            rows = plain * metric.weight[:, None]
+            full = np.linalg.norm(rows, axis=0)
+            rows = metric.project(rows)
+            for k, column in enumerate(part):
+                candidate, group, _, count = column.item
+                key = (id(metric), id(candidate), group)
+                entries = pending.setdefault(key, [])
+                entries.append((column, rows[:, k].copy(), float(full[k])))
+                if len(entries) == count:
+                    del pending[key]
+                    _score(candidate, entries, metric, leaders)
+    return [sorted(leaders.values(), key=lambda d: d.log_p) for leaders in best]
 
 
 def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
@@ -288,7 +296,7 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
                 if found.shape.get(k, np.inf) <= duration
             ]
         )
-        better = screen(metric, rig, [found.candidate], np.unique(near[(near >= 0) & (near < duration)]))
+        (better,) = screen([metric], rig, [found.candidate], np.unique(near[(near >= 0) & (near < duration)]))
         if better and better[0].gain > found.gain:
             found = better[0]
         step /= 4

@@ -22,15 +22,12 @@ ROWS, MOVING_ROWS = 6_000, 16_000
 PROMISED = 30  # directions whose gain in log likelihood is predicted
 
 
-class Rows(Metric):
-    """Whitened rows of a refitted hypothesis: DCT rows divided by the rms of their noise.
+class Plain:
+    """DCT rows of a refitted hypothesis, not whitened: of its residual and of its sensitivities."""
 
-    `average`: spectra of the refit's residuals. `remainder`: does the remainder count as noise, too? If so,
-    errors at low frequencies have little weight."""
-
-    def __init__(self, case: Case, fitted: Fitted, average: Averaged, most: int, remainder: bool):
-        self.fit, self.model = fitted.rough, fitted.rough.model
-        self.drives = [self.model.excitation(t) for t in case.tables]
+    def __init__(self, case: Case, fitted: Fitted, most: int):
+        self.case, self.fit, self.model = case, fitted.rough, fitted.rough.model
+        self.drives = case.drives(self.model)
         self.problem = Problem(self.model, self.drives, case.noise)
         for d, values in zip(self.drives, self.fit.values, strict=True):
             self.model.prepare(d, values)
@@ -40,45 +37,68 @@ class Rows(Metric):
             grid(self.coordinates, ks, g.sigma, g.swing, g.sensor)
             for ks, g in zip(measured, case.grids, strict=True)
         ]
-        self.weights = _weights(case, average, self.coordinates, remainder)
-        self.runs, columns = [], []
+        self.runs, residual = [], []
+        self.sensitivities = np.zeros(
+            (sum(c.rows for c in self.coordinates.channels), len(self.problem.unknowns))
+        )
+        at = 0
         for r, d in enumerate(self.drives):
             run = self.model.run(d, self.fit.values[r], self.fit.dx0[r], sensitivities=True)
+            assert run.dy is not None
             self.runs.append(Simulation(run.t, run.x, run.y))
-            columns.append(run.dy)
-        residual = [
-            self.rows(r, d.y - run.y) for r, (d, run) in enumerate(zip(self.drives, self.runs, strict=True))
-        ]
-        basis = np.zeros((sum(map(len, residual)), len(self.problem.unknowns)))
-        at = 0
-        for r, dy in enumerate(columns):
-            assert dy is not None  # the runs were asked for their sensitivities
+            residual.append(self.rows(r, d.y - run.y))
             used = np.flatnonzero(self.problem.columns[r] >= 0)
-            block = self.rows(r, dy[:, :, used])
-            basis[at : at + len(block), self.problem.columns[r, used]] = block
+            block = self.rows(r, run.dy[:, :, used])
+            self.sensitivities[at : at + len(block), self.problem.columns[r, used]] = block
             at += len(block)
-        free = [k for k, (q, _) in enumerate(self.problem.unknowns) if q not in self.fit.at_bound]
-        size = np.linalg.norm(basis[:, free], axis=0)
-        scaled = basis[:, free][:, size > 0] / size[size > 0]
-        u, s, _ = np.linalg.svd(scaled, full_matrices=False)
-        self.basis = u[:, s > 1e-6 * s[0]] if len(s) else u
-        self.residual = self.project(np.concatenate(residual))
-        self.now = self.log_likelihood(self.residual)
+        self.residual = np.concatenate(residual)
 
     def rows(self, r: int, e: np.ndarray) -> np.ndarray:
-        """Transform samples (N, outputs, ...) of recording r to the whitened DCT rows of all its channels."""
-        parts = []
-        for c, w in zip(self.coordinates.channels, self.weights, strict=True):
-            if c.recording == r:
-                x = self.coordinates.transform(c, e[:, c.output])
-                parts.append(x * w.reshape(-1, *([1] * (x.ndim - 1))))
-        return np.concatenate(parts)
+        """Transform samples (N, outputs, ...) of recording r to the DCT rows of all its channels."""
+        return np.concatenate(
+            [
+                self.coordinates.transform(c, e[:, c.output])
+                for c in self.coordinates.channels
+                if c.recording == r
+            ]
+        )
+
+
+class Rows(Metric):
+    """Whitened rows of a refitted hypothesis: DCT rows divided by the rms of their noise.
+
+    `average`: spectra of the refit's residuals. `remainder`: does the remainder count as noise, too? If so,
+    errors at low frequencies have little weight."""
+
+    def __init__(self, plain: Plain, average: Averaged, remainder: bool):
+        self.plain, self.fit, self.model = plain, plain.fit, plain.model
+        self.drives, self.runs = plain.drives, plain.runs
+        self.weights = _weights(plain.case, average, plain.coordinates, remainder)
+        self.weight = np.concatenate(self.weights)
+        free = [k for k, (q, _) in enumerate(plain.problem.unknowns) if q not in self.fit.at_bound]
+        basis = plain.sensitivities[:, free] * self.weight[:, None]
+        size = np.linalg.norm(basis, axis=0)
+        u, s, _ = np.linalg.svd(basis[:, size > 0] / size[size > 0], full_matrices=False)
+        self.basis = u[:, s > 1e-6 * s[0]] if len(s) else u
+        self.residual = self.project(plain.residual * self.weight)
+        self.now = self.log_likelihood(self.residual)
+
+    def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
+        """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
+        return self.plain.rows(r, e)
+
+    def rows(self, r: int, e: np.ndarray) -> np.ndarray:
+        """Transform samples (N, outputs, ...) of recording r to whitened rows (rows, ...)."""
+        channels = zip(self.plain.coordinates.channels, self.weights, strict=True)
+        weight = np.concatenate([w for c, w in channels if c.recording == r])
+        x = self.unweighted(r, e)
+        return x * weight.reshape(-1, *([1] * (x.ndim - 1)))
 
     def log_likelihood(self, rows: np.ndarray) -> float:
         """Of whitened rows (all recordings, one after the other), noise and remainder averaged."""
         edges = np.cumsum([len(w) for w in self.weights])[:-1]
         plain = [x / w for x, w in zip(np.split(rows, edges), self.weights, strict=True)]
-        return averaged(self.grids, self.coordinates.powers(plain)).log_likelihood
+        return averaged(self.plain.grids, self.plain.coordinates.powers(plain)).log_likelihood
 
     def promise(self, d: Direction) -> float:
         """Return the predicted gain in log likelihood of a first-order step along the direction."""
@@ -124,9 +144,11 @@ def screened(case: Case, fitted: Fitted, clean: float) -> Screened:
 
     Where the residual is more than `clean` times the noise, in the noise alone, too: there by energy."""
     moving = bool(Structure(case.plant, [], []).velocities) if case.plant.nodes else False
-    most = MOVING_ROWS if moving else ROWS
-    average = as_refitted(case, fitted).average
-    metric = Rows(case, fitted, average, most, True)
+    refitted = as_refitted(case, fitted)
+    plain = Plain(case, fitted, MOVING_ROWS if moving else ROWS)
+    metric = Rows(plain, refitted.average, True)
+    large = max(over_noise(case, refitted, clean)) > clean
+    other = Rows(plain, refitted.average, False) if large else None
     rig = Structure(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()
@@ -136,12 +158,10 @@ def screened(case: Case, fitted: Fitted, clean: float) -> Screened:
         for c in candidates(rig, case.catalogue)
         if c.key not in fitted.hypothesis.keys and not c.place.parts() & added
     ]
-    best = screen(metric, rig, found)[:PROMISED]
-    promised = [(d, metric.promise(d)) for d in best]
-    other, by_energy = None, list[Direction]()
-    if max(over_noise(case, as_refitted(case, fitted), clean)) > clean:
-        other = Rows(case, fitted, average, most, False)
-        by_energy = screen(other, rig, found)
+    best, *rest = screen([metric, other] if other else [metric], rig, found)
+    promised = [(d, metric.promise(d)) for d in best[:PROMISED]]
+    by_energy = rest[0] if rest else []
+    if other:
         again = [(d, other.promise(d)) for d in by_energy[:PROMISED]]
         known = {d.candidate.key: promise for d, promise in promised}
         promised = [(d, p) for d, p in promised if p >= 0] + [

@@ -143,7 +143,8 @@ def extensions(
     looked = screened(case, parent.fitted, limits.clean)
     leading = max(w.score for w in tried.values())
     queue = shortlist(looked, where, limits)
-    for added, gain in queue:
+    for k, (added, gain) in enumerate(queue):
+        case.budget.planned = case.budget.fits_done + len(queue) - k
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
         if keys in tried or len(keys) > limits.effects or case.budget.spent:
             continue

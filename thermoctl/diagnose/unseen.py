@@ -10,7 +10,7 @@ from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import screen
-from thermoctl.diagnose.screening import ROWS, Rows
+from thermoctl.diagnose.screening import ROWS, Plain, Rows
 
 SEEN = 5.0  # standard errors of an effect's size, from which it would have been seen
 
@@ -20,10 +20,11 @@ def not_seen(found: Diagnosis) -> list[dict[str, Any]]:
 
     It holds beside a refit of the plant's own parameters. Effects without a size (lags, delays) are left out."""
     null = next(w.fitted for w in found.searched.tried if not w.fitted.hypothesis.effects)
-    metric = Rows(found.case, null, found.null.average, ROWS, True)
+    metric = Rows(Plain(found.case, null, ROWS), found.null.average, True)
     rig = Structure(null.rough_plant, metric.drives, [t.columns for t in found.case.tables])
     out = []
-    for d in screen(metric, rig, candidates(rig, found.case.catalogue)):
+    (directions,) = screen([metric], rig, candidates(rig, found.case.catalogue))
+    for d in directions:
         size = next((p for p in d.candidate.effect.parameters if p.amplitude), None)
         if size is None or d.gain <= 0:
             continue

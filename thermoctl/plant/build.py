@@ -38,7 +38,9 @@ def _compiler() -> tuple[list[str], str]:
                 flags = ""
             command = [
                 *candidate.split(),
-                "-O3",
+                # As fast as -O3 in 0.4 of the compiler time; -O1 alone: 7 times slower.
+                "-O1",
+                "-fexpensive-optimizations",
                 "-march=native",
                 "-fno-math-errno",
                 "-fno-trapping-math",
@@ -55,7 +57,7 @@ def _compiler() -> tuple[list[str], str]:
 def compiler() -> list[str]:
     """Return the command of the C compiler, without options. Raises InputError where there is none."""
     command = _compiler()[0]
-    return command[: command.index("-O3")]
+    return command[: command.index("-O1")]
 
 
 def cache_directory() -> Path:
@@ -92,12 +94,15 @@ def library(source: str, folders: Sequence[Path] = (), key: str = "") -> ctypes.
 
 def _build(work: Path, source: str, folders: Sequence[Path]) -> None:
     (work / "plant.c").write_text(source)
-    # -O1 compiles a large file's straight-line code as well as -O3, in a fraction of the time. A small plant
-    # runs a tenth slower with -O1, and compiles in less than half of the time. A diagnosis compiles many
-    # plants.
-    command = [("-O1" if a == "-O3" and not 10_000 < len(source) < 400_000 else a) for a in _compiler()[0]]
     done = subprocess.run(
-        [*command, *(f"-I{f}" for f in folders), "-o", str(work / "plant.so"), str(work / "plant.c"), "-lm"],
+        [
+            *_compiler()[0],
+            *(f"-I{f}" for f in folders),
+            "-o",
+            str(work / "plant.so"),
+            str(work / "plant.c"),
+            "-lm",
+        ],
         capture_output=True,
         text=True,
     )

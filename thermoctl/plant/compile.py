@@ -36,12 +36,14 @@ typedef double lanes __attribute__((vector_size(64), aligned(8)));
 
 
 class Code(Equations):
-    """A compiled plant: its equations with sensitivities to `active`, and the library that computes them."""
+    """A compiled plant: its equations with sensitivities to `active`, and the library that computes them.
 
-    def __init__(self, plant: Plant, active: tuple[str, ...]):
+    `stepper`: with the functions that advance by one period."""
+
+    def __init__(self, plant: Plant, active: tuple[str, ...], stepper: bool = False):
         super().__init__(plant)
         self.active = active
-        self.source = self._source()
+        self.source = "#define STEPPER\n" * stepper + self._source()
         headers = "".join(path.read_text() for path in _HEADERS)
         self.library = _typed(library(self.source, [_HEADERS[0].parent], headers))
         for number, path in enumerate(self.fmus):
@@ -127,6 +129,7 @@ class Code(Equations):
 
 # ------------------------------------------------------------------------------------------------------ loading
 
+
 _P, _I, _D = ctypes.c_void_p, ctypes.c_int, ctypes.c_double
 
 
@@ -136,17 +139,20 @@ def _typed(library: ctypes.CDLL) -> ctypes.CDLL:
     library.observe.restype = None
     library.slopes.argtypes = [_I, _P, _P, _P, _P, _P, _P]
     library.slopes.restype = None
-    library.advance_period.argtypes = [_D, _D, _P, _P, _P, _D, _P, _P, _P, _P, _P]
+    if hasattr(library, "advance_period"):
+        library.advance_period.argtypes = [_D, _D, _P, _P, _P, _D, _P, _P, _P, _P, _P]
     return library
 
 
-def machine_code(plant: Plant, active: tuple[str, ...]) -> Code:
-    """Return the plant's machine code with sensitivities to `active`; plants of one structure share it."""
-    identity = hashlib.sha256(repr((active, _structure(plant))).encode()).hexdigest()
+def machine_code(plant: Plant, active: tuple[str, ...], stepper: bool = False) -> Code:
+    """Return the plant's machine code with sensitivities to `active`; plants of one structure share it.
+
+    `stepper`: with the functions that advance by one period, which take a fifth of the compiler's time."""
+    identity = hashlib.sha256(repr((active, stepper, _structure(plant))).encode()).hexdigest()
     with _LOCK:
         found = _LOADED.get(identity)
     if found is None:
-        found = Code(plant, active)
+        found = Code(plant, active, stepper)
         with _LOCK:
             _LOADED[identity] = found
             if len(_LOADED) > 256:

@@ -176,6 +176,7 @@ void slopes(int N, const double *t, const double *U, const double *p, const doub
   for (int n = 0; n < N; n++) rhs_(t[n], X + (size_t)n * NX, U + (size_t)n * NU, p, w, F + (size_t)n * NX);
 }
 
+#ifdef STEPPER
 /* Steps of one fixed period by the exponential Rosenbrock-Euler method (Hochbruck, Ostermann, Acta Numerica 2010, sec. 2.4):
        x(t + h) = x + h phi1(h J) f(x),   phi1(z) = (exp(z) - 1) / z
    exact for a linear plant with held inputs, however stiff. h phi1(h J) is kept from step to step; what it leaves out,
@@ -282,3 +283,4 @@ int advance(double t, double h, const double *u, const double *p, const double *
             double *x, double *y, double *want) {
   return period_(t, h, u, p, w, rtol, atol, x, y, want);
 }
+#endif

@@ -508,6 +508,7 @@ class Stepper:
         code = self.model.code
         if code.input_delays or code.output_delays:
             raise InputError(f"{self.model.plant.file}: a plant with delay() cannot run as a simulated rig")
+        self._library = machine_code(self.model.plant, (), stepper=True).library
         self.reset(self.u0)
 
     def reset(self, u0: np.ndarray) -> None:
@@ -531,7 +532,7 @@ class Stepper:
         self._width = np.full(max(len(m.code.jumps), 1), 1e-6)
         self._scale = np.abs(self.x) * 1e-2 + 1e-3
         self._atol = self.rtol * self._scale
-        size = ctypes.c_int.in_dll(m.code.library, "memory_size").value
+        size = ctypes.c_int.in_dll(self._library, "memory_size").value
         self._memory = np.zeros(size)  # the matrix of the exponential method, see integrator.h
         tail = (self._atol, self.x, self._y, self._want, self._memory)
         self._pointers = tuple(
@@ -544,7 +545,7 @@ class Stepper:
         Returns the outputs (ny,), a view that the next step changes."""
         self._u[:] = u
         head, tail = self._pointers
-        if self.model.code.library.advance_period(self.t, self.period_s, *head, self.rtol, *tail):
+        if self._library.advance_period(self.t, self.period_s, *head, self.rtol, *tail):
             raise SimulationError(f"the simulated rig cannot be integrated at t = {self.t:.6g} s")
         self.t += self.period_s
         return self._y

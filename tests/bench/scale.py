@@ -1,0 +1,216 @@
+"""Cost of a diagnosis against the size of the data: rows of a recording, bodies of a plant.
+
+python -m tests.bench.scale rows [--rows 260000] [--before FOLDER]
+python -m tests.bench.scale bodies [--bodies 12 30 60 120]
+
+`rows`: a rig of two blocks whose free convection is concealed, logged every second, and the same record with
+one row in a hundred. Every diagnosis is a process of its own: CPU time (with the compiler's), memory, result.
+--before FOLDER: a checkout of an older version; it works on the same records, with a limit of 30 minutes.
+`bodies`: a chain of blocks, every third one measured, whose middle one has a heat source that the plant lacks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from thermoctl.plant import load
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
+
+BODY = """
+import json, resource, sys, time
+from thermoctl.diagnose.run import diagnose_files
+found = diagnose_files(sys.argv[1], [sys.argv[2]], sys.argv[3])
+used = [resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+print(json.dumps({"verdict": found["verdict"], "found": [f"{f['effect']} at {f['where']}" for f in found["findings"]],
+    "probability": [round(f["probability"], 3) for f in found["findings"]],
+    "cpu_s": sum(u.ru_utime + u.ru_stime for u in used), "MiB": used[0].ru_maxrss / 1024, "notes": found["notes"]}))
+"""
+LIMIT_S = 1800
+
+
+def block_plant(n: int) -> str:
+    """A chain of n blocks in air; every third one has a heater and a sensor."""
+    at = range(1, n + 1)
+    held = [k for k in at if k % 3 == 1]
+    lines = ["format: thermoctl-plant/1", f"title: A chain of {n} blocks", "inputs:"]
+    lines += [f"  heat_{k}: {{unit: W}}" for k in held]
+    lines += ["  air: {unit: degC, between_samples: linear}", "parameters:"]
+    lines += [
+        f"  {name}: {{value: {value}, unit: {unit}, range: [{low}, {high}]}}"
+        for name, value, unit, low, high in (
+            ("C", 60.0, "J/K", 20, 180),
+            ("G", 0.05, "W/K", 0.015, 0.15),
+            ("G_between", 0.5, "W/K", 0.1, 2.0),
+        )
+    ]
+    lines += ["nodes:"]
+    lines += [f"  block_{k}: {{unit: degC, storage: C, initial: air, initial_sigma: 0.5}}" for k in at]
+    lines += ["flows:"]
+    lines += [f"  power_{k}: {{into: block_{k}, rate: heat_{k}, unit: W}}" for k in held]
+    lines += [f"  loss_{k}: {{from: block_{k}, rate: G * (block_{k} - air), unit: W}}" for k in at]
+    lines += [
+        f"  link_{k}: {{from: block_{k}, into: block_{k + 1}, rate: G_between * (block_{k} - block_{k + 1}), unit: W}}"
+        for k in range(1, n)
+    ]
+    lines += ["outputs:"]
+    lines += [f"  temperature_{k}: {{value: block_{k}, unit: degC, noise: 0.05}}" for k in held]
+    return "\n".join(lines) + "\n"
+
+
+def recorded(folder: Path, plant_text: str, flow: str, rows: int, interval: float, power: float) -> None:
+    """Write plant.yaml and run_1.csv, recorded on the plant with one flow more. Heaters change at random times."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "plant.yaml").write_text(plant_text)
+    (folder / "truth.yaml").write_text(plant_text.replace("flows:\n", f"flows:\n  concealed: {flow}\n"))
+    plant = load(folder / "truth.yaml")
+    t, rng = np.arange(rows) * interval, np.random.default_rng(5)
+    columns: dict[str, np.ndarray] = {}
+    for i in plant.inputs.values():
+        if i.name == "air":
+            columns[i.column] = 20 + 0.5 * np.sin(2 * np.pi * t / 86_400)
+        else:
+            ends = np.sort(rng.uniform(0, t[-1], 60))
+            columns[i.column] = np.round(rng.uniform(0, power, 61), 2)[np.searchsorted(ends, t)]
+    table = compile_plant(plant).measure(Table("run_1", "run_1", t, columns), seed=7)
+    write(folder / "run_1.csv", table)
+
+
+def write(path: Path, table: Table) -> None:
+    """Write a table as text."""
+    names = list(table.columns)
+    values = np.column_stack([table.t, *(table.columns[n] for n in names)])
+    np.savetxt(path, values, fmt="%.7g", delimiter=",", header=",".join(["time", *names]), comments="")
+
+
+def diagnosed(folder: Path, name: str = "run_1.csv", checkout: Path | None = None) -> dict[str, object]:
+    """Diagnose one recording in a process of its own; return its figures."""
+    with tempfile.TemporaryDirectory() as work:
+        env = dict(os.environ, OPENBLAS_NUM_THREADS="1", THERMOCTL_CACHE=f"{work}/plants")
+        if checkout:
+            env["PYTHONPATH"] = str(checkout)
+        command = [sys.executable, "-c", BODY, str(folder / "plant.yaml"), str(folder / name), f"{work}/out"]
+        started = time.monotonic()
+        try:
+            done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=LIMIT_S, cwd=work)
+        except subprocess.TimeoutExpired:
+            return {
+                "verdict": f"none within {LIMIT_S} s",
+                "cpu_s": float("nan"),
+                "MiB": float("nan"),
+                "wall_s": LIMIT_S,
+            }
+        if done.returncode:
+            return {
+                "verdict": done.stderr.strip().splitlines()[-1][:100],
+                "cpu_s": float("nan"),
+                "MiB": float("nan"),
+            }
+    return {**json.loads(done.stdout.splitlines()[-1]), "wall_s": time.monotonic() - started}
+
+
+def line(label: str, found: dict[str, object]) -> None:
+    """Print one result."""
+    print(
+        f"{label:28} CPU {found['cpu_s']:7.1f} s  {found['MiB']:6.0f} MiB  {found['verdict']} {found.get('found', '')} "
+        f"{found.get('probability', '')}",
+        flush=True,
+    )
+    for note in found.get("notes", ()):  # type: ignore[attr-defined]
+        if "rows were needed" in note:
+            print(f"{'':28} {note}")
+
+
+def rows(number: int, before: Path | None) -> None:
+    """Print cost and result of a long record and of its thinned equivalent."""
+    with tempfile.TemporaryDirectory() as work:
+        folder = Path(work)
+        recorded(
+            folder,
+            TWO,
+            '{from: block_1, rate: "0.012 * max(block_1 - air, 0)**1.25", unit: W}',
+            number,
+            1.0,
+            5.0,
+        )
+        names = (folder / "run_1.csv").read_text().splitlines()
+        (folder / "few.csv").write_text("\n".join([names[0], *names[1::100]]) + "\n")
+        few, many = diagnosed(folder, "few.csv"), diagnosed(folder)
+        line(f"{number // 100} rows", few)
+        line(f"{number} rows", many)
+        print(f"{number} rows / {number // 100} rows: {many['cpu_s'] / few['cpu_s']:.2f} times the time")  # type: ignore[operator]
+        if before:
+            old = diagnosed(folder, checkout=before)
+            line(f"{number} rows, before", old)
+            print(f"before / now: {old['cpu_s'] / many['cpu_s']:.1f}")  # type: ignore[operator]
+
+
+TWO = """format: thermoctl-plant/1
+title: Two blocks in air
+inputs:
+  heat_1: {unit: W}
+  heat_2: {unit: W}
+  air: {unit: degC, between_samples: linear}
+parameters:
+  C_1: {value: 60.0, unit: J/K, range: [20, 180]}
+  C_2: {value: 80.0, unit: J/K, range: [25, 240]}
+  G_1: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
+  G_2: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
+  G_12: {value: 0.06, unit: W/K, range: [0.01, 0.2]}
+nodes:
+  block_1: {unit: degC, storage: C_1, initial: air, initial_sigma: 0.5}
+  block_2: {unit: degC, storage: C_2, initial: air, initial_sigma: 0.5}
+flows:
+  power_1: {into: block_1, rate: heat_1, unit: W}
+  power_2: {into: block_2, rate: heat_2, unit: W}
+  between: {from: block_1, into: block_2, rate: G_12 * (block_1 - block_2), unit: W}
+  loss_1: {from: block_1, rate: G_1 * (block_1 - air), unit: W}
+  loss_2: {from: block_2, rate: G_2 * (block_2 - air), unit: W}
+outputs:
+  temperature_1: {value: block_1, unit: degC, noise: 0.1}
+  temperature_2: {value: block_2, unit: degC, noise: 0.1}
+"""
+
+
+def bodies(numbers: list[int]) -> None:
+    """Print time and memory of a diagnosis against the number of bodies, and the exponent between neighbours."""
+    last: tuple[int, float] | None = None
+    for n in numbers:
+        with tempfile.TemporaryDirectory() as work:
+            middle = n // 6 * 3 + 1
+            flow = f"{{into: block_{middle}, rate: 1.5 * step(t - 4000), unit: W}}"
+            recorded(Path(work), block_plant(n), flow, 1200, 10.0, 10.0)
+            found = diagnosed(Path(work))
+        line(f"{n} bodies", found)
+        cpu = float(found["cpu_s"])  # type: ignore[arg-type]
+        if last:
+            print(f"{'':28} exponent from {last[0]}: {np.log(cpu / last[1]) / np.log(n / last[0]):.2f}")
+        last = n, cpu
+
+
+def main() -> int:
+    """Run one of the two benchmarks."""
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("what", choices=("rows", "bodies"))
+    p.add_argument("--rows", type=int, default=260_000)
+    p.add_argument("--before", type=Path)
+    p.add_argument("--bodies", type=int, nargs="*", default=[12, 30, 60, 120])
+    a = p.parse_args()
+    if a.what == "rows":
+        rows(a.rows, a.before)
+    else:
+        bodies(a.bodies)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

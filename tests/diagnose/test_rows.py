@@ -1,0 +1,100 @@
+"""Fewer rows of long recordings: the same information, exact times of events, and none where content is fast."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermoctl.diagnose.rows import LONG, reduced
+from thermoctl.plant import load
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import fit
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
+
+PLANT = """format: thermoctl-plant/1
+title: One block
+inputs:
+  heat: {unit: W}
+  air: {unit: degC, between_samples: linear}
+parameters:
+  C: {value: 60.0, unit: J/K, range: [20, 180]}
+  G: {value: 0.1, unit: W/K, range: [0.02, 0.4]}
+nodes:
+  block: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}
+flows:
+  power: {into: block, rate: heat, unit: W}
+  loss: {from: block, rate: G * (block - air), unit: W}
+outputs:
+  temperature: {value: block, unit: degC, noise: 0.1}
+"""
+ROWS = 30_000
+CHANGES = (3_001, 9_498, 17_777)  # s: when the heater changes
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Plant:
+    path: Path = tmp_path_factory.mktemp("rows") / "plant.yaml"
+    path.write_text(PLANT)
+    return load(path)
+
+
+def record(plant: Plant, heat: np.ndarray, rows: int = ROWS) -> Table:
+    t = np.arange(rows, dtype=float)
+    drive = {"heat": heat, "air": 20 + np.sin(t / 9_000)}
+    return compile_plant(plant).measure(Table("run", "run", t, drive), seed=3)
+
+
+def stepped(rows: int = ROWS) -> np.ndarray:
+    return np.array([0.0, 5.0, 1.0, 3.0])[np.searchsorted(CHANGES, np.arange(rows), side="right")]
+
+
+def test_means_hold_the_information_of_all_rows(plant):
+    table = record(plant, stepped())
+    few = reduced(plant, [table])
+    assert len(few.tables[0]) < ROWS / 5
+    assert str(ROWS) in few.note and str(few.after) in few.note
+    model = compile_plant(plant)
+    results = []
+    for t, share in ((table, 1), (few.tables[0], few.block)):
+        drives = [model.excitation(t)]
+        noise = few.noise(plant, drives) if share > 1 else None
+        found = fit(model, drives, noise)
+        results.append((found.z[:2], np.sqrt(np.diag(np.linalg.inv(found.hessian)))[:2]))
+    (z, sd), (z_few, sd_few) = results
+    assert sd_few == pytest.approx(sd, rel=0.05)
+    assert np.all(np.abs(z_few - z) < 0.5 * sd)
+
+
+def test_held_inputs_change_at_their_exact_times(plant):
+    (table,) = reduced(plant, [record(plant, stepped())]).tables
+    changed = np.flatnonzero(np.diff(table.columns["heat"])) + 1
+    assert tuple(table.t[changed]) == CHANGES
+
+
+def test_lost_cells_and_an_outlier_leave_the_means_right(plant):
+    whole = record(plant, stepped())
+    lost = whole.columns["temperature"].copy()
+    lost[np.random.default_rng(1).choice(ROWS, ROWS // 50, replace=False)] = np.nan
+    lost[20_000] += 80.0
+    few = reduced(plant, [Table("run", "run", whole.t, {**whole.columns, "temperature": lost})])
+    (table,) = few.tables
+    truth = compile_plant(plant).run(compile_plant(plant).excitation(table)).y[:, 0]
+    assert few.block > 1
+    late = table.t > 6_000  # s; ten time constants after the unknown start
+    assert np.nanmax(np.abs(table.columns["temperature"] - truth)[late]) < 0.3
+
+
+@pytest.mark.parametrize("what", ["short", "fast output", "fast input"])
+def test_rows_that_are_needed_are_kept(plant, what):
+    rows = LONG if what == "short" else ROWS
+    heat = stepped(rows)
+    if what == "fast input":  # its square has another mean
+        heat = np.where(np.random.default_rng(2).random(rows) < 0.5, 0.0, 2 * heat)
+    table = record(plant, heat, rows)
+    if what == "fast output":
+        table.columns["temperature"] += 0.3 * np.sin(2.4 * table.t)
+    few = reduced(plant, [table])
+    assert few.block == 1 and few.tables[0] is table
