@@ -45,6 +45,8 @@ from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 PIECES = 8  # of a free function of a signal
+NODES = 4  # of a plant, at which a free flow in time explains most
+SECOND = 10  # signals of a place that may be the second one of a form
 COMBINATIONS = 12  # places and signals whose forms are tried
 POOL = 60  # terms that a sum of terms is built from
 REFITS = 12
@@ -235,14 +237,15 @@ def propose_laws(case: Case, parent: Fitted) -> tuple[list[Proposal], Tracked]:
     rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
     where = places(rig)
     at = tracked(case, parent, [p.target for p in where if p.source is None])
-    combos = [(p, s) for p in where for s in signals(rig, p, at.runs)]
+    likely = sorted(at.explained, key=lambda n: -at.explained[n])[:NODES]
+    combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, at.runs)]
     free = [(_free(at, p, s), p, s) for p, s in combos]
     free.sort(key=lambda x: -x[0])
     chosen = free[:COMBINATIONS]
     pool: list[tuple[float, Place, Term, np.ndarray]] = []
     for place in dict.fromkeys(p for _, p, _ in chosen):
         found = [s for _, p, s in chosen if p == place]
-        every = [s for p, s in combos if p == place]
+        every = [s for _, p, s in free if p == place][:SECOND]
         pool += _singles(at, place, found, every)
     pool.sort(key=lambda x: -x[0])
     base = float(np.log(max(len(combos), 1)) + np.log(len(library())))

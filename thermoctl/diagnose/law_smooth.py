@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, as_refitted
@@ -40,12 +41,14 @@ class Tracked:
 
     - `metric`: whitened rows there, the plant's own parameters projected out
     - `target` (rows,): the misfit that a law has to explain
-    - `runs`: every signal of each recording, along the trajectory"""
+    - `runs`: every signal of each recording, along the trajectory
+    - `explained`: share of the target that a free flow in time into each node explains"""
 
     metric: Rows
     target: np.ndarray
     runs: list[dict[str, np.ndarray | float]]
     duration: float
+    explained: dict[str, float]
 
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
         """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording.
@@ -60,6 +63,12 @@ class Tracked:
 def _responses(
     metric: Rows, runs: Sequence[dict[str, np.ndarray | float]], place: Place, flows: Sequence[np.ndarray]
 ) -> np.ndarray:
+    return np.concatenate(_blocks(metric, runs, place, flows))
+
+
+def _blocks(
+    metric: Rows, runs: Sequence[dict[str, np.ndarray | float]], place: Place, flows: Sequence[np.ndarray]
+) -> list[np.ndarray]:
     blocks, model = [], metric.model
     for r, (d, q) in enumerate(zip(metric.drives, flows, strict=True)):
         k = q.shape[1]
@@ -71,7 +80,7 @@ def _responses(
         q = np.concatenate(values, axis=1)
         dy = model.respond(d, metric.fit.values[r], metric.fit.dx0[r], forces, q, k)
         blocks.append(metric.rows(r, dy))
-    return np.concatenate(blocks)
+    return blocks
 
 
 def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
@@ -117,7 +126,7 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
         scaled = np.concatenate([(w / np.array(sizes)).T.ravel() for w in weights])
         size = float(residual @ residual)
         if best is None or size < best[0]:
-            best = size, metric, runs, residual, wide @ scaled
+            best = size, metric, runs, residual + wide @ scaled, wide
         else:
             break
         new = _smoothed(wide, residual + wide @ scaled)
@@ -125,9 +134,20 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
         weights = [p.reshape(len(nodes), knots).T * np.array(sizes) for p in parts]
     if best is None:
         raise SimulationError("the plant cannot be tracked")
-    _, metric, runs, residual, explained = best
+    _, metric, runs, whole, wide = best
+    target = metric.project(whole)
     duration = max(float(d.t[-1]) for d in metric.drives)
-    return Tracked(metric, metric.project(residual + explained), runs, duration)
+    columns = np.arange(wide.shape[1]).reshape(len(hats), len(nodes), knots)
+    explained = {
+        n: _explained(metric.project(wide[:, columns[:, i].ravel()]), target) for i, n in enumerate(nodes)
+    }
+    return Tracked(metric, target, runs, duration, explained)
+
+
+def _explained(x: np.ndarray, target: np.ndarray) -> float:
+    u, s, _ = np.linalg.svd(x, full_matrices=False)
+    along = u[:, s > ABSORBED * s[0]].T @ target
+    return float(along @ along) / max(float(target @ target), 1e-300)
 
 
 def _hats(t: np.ndarray, knots: int) -> np.ndarray:
@@ -144,12 +164,10 @@ def _wide(
     hats: Sequence[np.ndarray],
 ) -> np.ndarray:
     """(rows, recordings * nodes * knots) responses to each knot, in units of the typical flows."""
-    parts = []
-    for r, h in enumerate(hats):
-        for n, s in zip(nodes, sizes, strict=True):
-            flows = [h * s if k == r else np.zeros((len(other), h.shape[1])) for k, other in enumerate(hats)]
-            parts.append(_responses(metric, runs, Place(n), flows))
-    return np.concatenate(parts, axis=1)
+    by_node = [
+        _blocks(metric, runs, Place(n), [h * s for h in hats]) for n, s in zip(nodes, sizes, strict=True)
+    ]
+    return block_diag(*(np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)))
 
 
 def _smoothed(wide: np.ndarray, target: np.ndarray) -> np.ndarray:
