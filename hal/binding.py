@@ -14,7 +14,7 @@ from pathlib import Path
 from hal.profile import BinaryFrame, Channel, Cia402, Modbus, Profile, Register, TextLine
 from hal.read_profile import load_profile
 from hal.units import role_units
-from thermoctl.channels import DEFAULT, Channels
+from thermoctl.channels import DEFAULT, AxesChannels, Channels
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 EXCLUSIVE = ("slcan:", "rtu:", "/")
@@ -51,6 +51,7 @@ class Binding:
     place: str
     channels: Channels = DEFAULT
     shared: bool = False  # other devices of this rig are on the same port
+    axis: str = ""  # whose amplifier it is; empty on a rig without axes, and for devices of several axes
 
 
 def resolve_port(port: str, folder: Path) -> str:
@@ -91,9 +92,23 @@ def bind(node: Node, folder: Path, channels: Channels = DEFAULT) -> Binding:
             if (found := s.get(key, False)) is not None:
                 raise found.error(f"{key}: a {profile.bus} device has none")
     port = resolve_port(s.text("port"), folder)
-    binding = Binding(s.text("name", profile.model), profile, port, address, bounds, node.place, channels)
+    name = s.text("name", profile.model)
+    axis = _axis(s, bounds, channels) if profile.amplifier is not None else ""
     s.end()
-    return binding
+    return Binding(name, profile, port, address, bounds, node.place, channels, axis=axis)
+
+
+def _axis(s: Section, bounds: Iterable[Bound], channels: Channels) -> str:
+    """Return the axis that an amplifier drives: that of its roles. Raises InputError for none or several."""
+    if not isinstance(channels, AxesChannels):
+        return ""
+    found = {b.role.partition(".")[0] for b in bounds}
+    if len(found) != 1 or not found <= set(channels.parts):
+        raise s.node.error(
+            f"roles: an amplifier has roles of the one axis that it drives, written AXIS.CHANNEL (axes: "
+            f"{', '.join(channels.parts)}); found {', '.join(b.role for b in bounds) or 'none'}"
+        )
+    return found.pop()
 
 
 def _drive_of_this_rig(s: Section, spec: Cia402, node: int) -> Cia402:
@@ -117,10 +132,10 @@ def _bound(profile: Profile, name: str, role: Node, channels: Channels) -> Bound
             f"roles: {profile.model} has no channel '{name}'{suggest(name, profile.channels)}; "
             f"it has {', '.join(profile.channels)}"
         )
-    if role.value not in channels.names:
+    if role.value not in channels.index:
         raise role.error(
-            f"roles: '{role.value}' is no role{suggest(role.value, channels.names)}; "
-            f"roles: {', '.join(channels.names)}"
+            f"roles: '{role.value}' is no role{suggest(role.value, channels.index)}; "
+            f"roles: {', '.join(channels.index)}"
         )
     units = role_units(role.value)
     if channel.unit not in units:
@@ -146,7 +161,9 @@ def check_rig(bindings: Iterable[Binding]) -> list[Binding]:
     bindings = list(bindings)
     claimed: dict[str, Binding] = {}
     for b in bindings:
-        for role in [x.role for x in b.bounds] + (["drive"] if b.profile.amplifier else []):
+        drive = [f"{b.axis}.drive" if b.axis else "drive"] if b.profile.amplifier else []
+        places = [r for x in b.bounds for r in (b.channels.index[x.role], *_copies(b.channels, x.role))]
+        for role in [*(b.channels.names[k] for k in places), *drive]:
             if role in claimed:
                 raise InputError(
                     f"{b.place}: '{role}' is given by {b.name} and by {claimed[role].name} "
@@ -161,6 +178,10 @@ def check_rig(bindings: Iterable[Binding]) -> list[Binding]:
                 _check_shared(o, b)
         found.append(replace(b, shared=bool(others) and b.port.split(":")[0] not in FREE))
     return found
+
+
+def _copies(channels: Channels, role: str) -> list[int]:
+    return channels.copies(role) if isinstance(channels, AxesChannels) else []
 
 
 def _check_shared(first: Binding, second: Binding) -> None:

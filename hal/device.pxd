@@ -6,6 +6,7 @@ cdef class Device:
     cdef public dict problems
     cdef public list roles
     cdef public bint slow, drives, up
+    cdef public int axis
     cdef public Channels _channels
 
     cpdef read(self, sample, double now_s)

@@ -16,6 +16,7 @@ import numpy as np
 from hal.backend import ERROR, STALE, Sample
 from hal.binding import Binding
 from hal.wire import Channels
+from thermoctl.channels import AxesChannels
 
 SLOW_BUSES = ("modbus",)
 
@@ -37,6 +38,9 @@ class Device:
         self.problems: dict[int, str] = {}  # by role: the present problem; a good reading clears it
         self.counts: dict[str, int] = {"frames": 0, "errors": 0, "reconnections": 0}
         self.up = False
+        parts = binding.channels.parts if isinstance(binding.channels, AxesChannels) else {}
+        self.axis = list(parts).index(binding.axis) if binding.axis else 0
+        """Number of the axis that it drives."""
 
     def connect(self) -> None:
         """Open and configure the device; may block.

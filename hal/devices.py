@@ -18,7 +18,7 @@ from hal.board import Board
 from hal.device import Device
 from hal.poller import RECONNECT_S, poll_until, ports
 from hal.wire import Ages, wait_readable
-from thermoctl.channels import AT, DEFAULT, Channels
+from thermoctl.channels import AT, DEFAULT, AxesChannels, Channels
 from thermoctl.yamlfile import InputError
 
 
@@ -49,6 +49,16 @@ class DevicesBackend:
         for b in (b for d in self._owner.values() for b in d.binding.bounds):
             limit_s[self.roles[b.role]] = b.channel.stale_after_s
         self._ages = Ages(self.sample, limit_s)
+        shared = [
+            (self.roles[b.role], k)
+            for d in self._owner.values()
+            for b in d.binding.bounds
+            if isinstance(channels, AxesChannels)
+            for k in channels.copies(b.role)
+        ]
+        self._copied, self._copies = [r for r, _ in shared], [k for _, k in shared]
+        self._owner |= {k: self._owner[r] for r, k in shared}
+        self._read_as = dict(zip(self._copies, self._copied, strict=True))
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self._repairs: dict[Device, threading.Thread] = {}
@@ -103,7 +113,15 @@ class DevicesBackend:
             for device in self.slow:
                 self._seen[device] = board.merge(sample, device.roles, self._seen[device])
         self._ages.judge(now_s)
+        for k in range(len(self._copied)):
+            self._copy(self._copied[k], self._copies[k])
         return sample
+
+    def _copy(self, read: int, further: int) -> None:
+        """Copy a reading that several axes share to its place in another axis."""
+        s = self.sample
+        s.value[further], s.time_s[further] = s.value[read], s.time_s[read]
+        s.fresh[further], s.status[further] = s.fresh[read], s.status[read]
 
     def check_pacing(self) -> None:
         """Raise InputError where the position's device cannot start the ticks (loop.pace: device)."""
@@ -128,19 +146,20 @@ class DevicesBackend:
                 self._lost(device, e)
         wait_readable(-1, due_ns)
 
-    def write(self, drive: float, enable: bool) -> None:
-        """Send the command to the device that drives; see hal.backend."""
+    def write(self, drive: float, enable: bool, axis: int = 0) -> None:
+        """Send the command to the device that drives this axis; see hal.backend."""
         if not enable or drive - drive != 0.0:  # not finite
             drive, enable = 0.0, False
         for device in self.fast:
-            if device.drives and device.up:
+            if device.drives and device.up and device.axis == axis:
                 try:
                     device.write(drive, enable, self._now_s)
                 except (OSError, HardwareError) as e:
                     self._lost(device, e)
         if self.board is not None:
             for device in self._slow_drives:
-                self.board.send(device, drive, enable, self._now_s)
+                if device.axis == axis:
+                    self.board.send(device, drive, enable, self._now_s)
 
     def close(self) -> None:
         """Disable and release everything; see hal.backend."""
@@ -164,6 +183,7 @@ class DevicesBackend:
         i = self.roles[role]
         if i not in self._owner:
             return f"{role}: no device of hal.devices has this role"
+        i = self._read_as.get(i, i)
         text = self._owner[i].explain(self.sample, i)
         if text and self.board is not None and self._owner[i].slow:
             return self.board.problem(i) or text

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hal.backend import Backend
+from hal.axes import AxisBackend
+from hal.backend import Backend, HardwareError
 from hal.binding import Binding, bind, check_rig, rig_notes
 from hal.board import Board
 from hal.dbc import DbcDevice, DbcDrive
@@ -17,6 +18,7 @@ from hal.replay import replay_backend
 from hal.serial_drive import SerialDrive
 from hal.serial_port import SerialDevice
 from hal.simulated import simulated_backend
+from thermoctl.channels import AxesChannels
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
@@ -27,17 +29,45 @@ def make_backend(settings: Settings, board: Board | None = None) -> Backend:
     It is wrapped in a fault injector when `hal.faults` lists any. board: filled by poller processes, or None
     to poll slow devices from threads of this process. Raises InputError: a mistake in the configuration, a
     profile or the plant."""
+    backend = _plain_backend(settings, board)
+    return _with_faults(backend, settings)
+
+
+def make_backends(settings: Settings, board: Board | None = None) -> list[Backend]:
+    """Make the back end of each axis, not yet open; of a rig without axes the only one. See make_backend.
+
+    Devices are opened once, with the first of them, and read once a tick, by the first of them.
+    """
+    if not isinstance(settings.channels, AxesChannels):
+        return [make_backend(settings, board)]
+    if settings.hal.backend != "devices":
+        return [make_backend(s) for s in settings.parts]
+    devices = _devices_backend(settings, board)
+    return [_with_faults(AxisBackend(devices, settings.channels, s.axis), s) for s in settings.parts]
+
+
+def _devices_backend(settings: Settings, board: Board | None) -> DevicesBackend:
+    needed = list(settings.protection.required)
+    if isinstance(settings.channels, AxesChannels):
+        required = [(s.axis, r) for s in settings.parts for r in s.protection.required]
+        needed = [f"{axis}.{r}" for axis, r in required] + [
+            r for _, r in required if r in settings.channels.shared
+        ]
+    return DevicesBackend(fast_devices(settings), slow_devices(settings), board, needed, settings.channels)
+
+
+def _plain_backend(settings: Settings, board: Board | None) -> Backend:
     kind = settings.hal.backend
-    backend: Backend
     if kind == "simulated":
-        backend = simulated_backend(settings)
-    elif kind == "replay":
-        backend = replay_backend(settings)
-    elif kind == "devices":
-        fast, slow = fast_devices(settings), slow_devices(settings)
-        backend = DevicesBackend(fast, slow, board, settings.protection.required, settings.channels)
-    else:
-        raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated, devices or replay")
+        return simulated_backend(settings)
+    if kind == "replay":
+        return replay_backend(settings)
+    if kind == "devices":
+        return _devices_backend(settings, board)
+    raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated, devices or replay")
+
+
+def _with_faults(backend: Backend, settings: Settings) -> Backend:
     if settings.hal.faults:
         backend = FaultInjector(
             backend,
@@ -65,8 +95,14 @@ def disable_amplifier(settings: Settings) -> None:
     OSError, InputError."""
     if settings.hal.backend != "devices":
         return
+    failed = []
     for device in driving_devices(settings):
-        device.switch_off()
+        try:
+            device.switch_off()
+        except (HardwareError, OSError) as e:  # the other axes' amplifiers are switched off all the same
+            failed.append(f"{device.name}: {e}")
+    if failed:
+        raise HardwareError("; ".join(failed))
 
 
 def make_devices(settings: Settings) -> list[Device]:

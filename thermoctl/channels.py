@@ -178,6 +178,41 @@ class Channels:
         return json.dumps(self.plain())
 
 
+@dataclass(frozen=True)
+class AxesChannels(Channels):
+    """The channels of all axes in one sample: those of the first axis, then those of the next.
+
+    A role is AXIS.CHANNEL. A channel of `shared` also has a role without an axis. Its reading is stored in
+    the first axis' place, and copied to its places in the other axes.
+    """
+
+    axes: tuple[tuple[str, Channels], ...] = ()
+    shared: tuple[str, ...] = ()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Return the channels' roles, each with its axis."""
+        return tuple(f"{axis}.{role}" for axis, channels in self.axes for role in channels.names)
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Return the index of each role; a shared role has its place in the first axis."""
+        found = {role: i for i, role in enumerate(self.names)}
+        return found | {role: found[f"{self.axes[0][0]}.{role}"] for role in self.shared}
+
+    @cached_property
+    def parts(self) -> dict[str, slice]:
+        """Return each axis' place in the sample."""
+        ends = [0]
+        for _, channels in self.axes:
+            ends.append(ends[-1] + len(channels.names))
+        return {axis: slice(a, b) for (axis, _), a, b in zip(self.axes, ends[:-1], ends[1:], strict=True)}
+
+    def copies(self, role: str) -> list[int]:
+        """Return the further indices that a reading in `role` belongs to: none for a role of one axis."""
+        return [self.index[f"{axis}.{role}"] for axis, _ in self.axes[1:]] if role in self.shared else []
+
+
 def _channel(point: Point) -> Channel:
     """Return the temperature of one point."""
     group = "coil" if point.role == "coil" else "monitored"
@@ -209,12 +244,38 @@ def of_text(text: str) -> Channels:
     return of_points(Point(name, **keys) for name, keys in found.items())
 
 
-def read_points(node: Node, folder: Path) -> Channels:
+def read_points(node: Node, folder: Path, shared: Iterable[Point] = ()) -> Channels:
     """Read `points` of a rig file: a mapping name: {role, label}, or the path of a file that holds one.
 
-    `folder` is what the path is relative to. Raises InputError for a name that is not a plain word, no coil
-    or several, more than MAX_POINTS.
+    `folder` is what the path is relative to; shared: further points, those of all axes. Raises InputError
+    for a name that is not a plain word or stands in both, no coil or several, more than MAX_POINTS.
     """
+    points = [*_listed(node, folder), *shared]
+    if twice := {p.name for p in points if [q.name for q in points].count(p.name) > 1}:
+        raise node.error(f"points: '{min(twice)}' is a point of all axes already; choose another name")
+    coils = [p.name for p in points if p.role == "coil"]
+    if len(coils) != 1:
+        raise node.error(
+            f"points: one point with role: coil was expected (it takes the power, and its sensor corrects the "
+            f"estimates), found {', '.join(coils) or 'none'}"
+        )
+    if len(points) > MAX_POINTS:
+        raise node.error(f"points: {len(points)}; at most {MAX_POINTS} were expected")
+    return of_points(points)
+
+
+def read_shared_points(node: Node, folder: Path) -> tuple[Point, ...]:
+    """Read `points` of a rig file with axes: points of all axes, none of them a coil. Raises InputError."""
+    points = _listed(node, folder)
+    if coils := [p.name for p in points if p.role]:
+        raise node.error(
+            f"points: {coils[0]} is a coil: every axis has its own; declare it in axes.NAME.points"
+        )
+    return tuple(points)
+
+
+def _listed(node: Node, folder: Path) -> list[Point]:
+    """Read a mapping of points, or the file that holds it."""
     if isinstance(node.value, str):
         node = load(folder / node.value)
     points: list[Point] = []
@@ -227,15 +288,7 @@ def read_points(node: Node, folder: Path) -> Channels:
         s = Section(replace(item, value={}) if item.value is None else item, name, name)
         points.append(Point(name, s.text("label", ""), s.text("role", "", choices=("", "coil"))))
         s.end()
-    coils = [p.name for p in points if p.role == "coil"]
-    if len(coils) != 1:
-        raise node.error(
-            f"points: one point with role: coil was expected (it takes the power, and its sensor corrects the "
-            f"estimates), found {', '.join(coils) or 'none'}"
-        )
-    if len(points) > MAX_POINTS:
-        raise node.error(f"points: {len(points)}; at most {MAX_POINTS} were expected")
-    return of_points(points)
+    return points
 
 
 def points_of_file(path: str | Path) -> Channels:

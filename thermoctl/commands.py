@@ -48,6 +48,8 @@ CONFIG = _arg(
     help="configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, /etc/thermoctl/rig.yaml)",
 )
 """The option of every command that needs a rig; `which_rig.choose` stores the path that it found."""
+AXIS = _arg("--axis", metavar="NAME", help="the axis of a rig with several")
+"""Goes with CONFIG: a command that takes the one takes the other."""
 _FILE = _arg("file", nargs="?", metavar="CONFIG", help="the same as --config CONFIG")
 _YES = _arg(
     "--yes", action="store_true", help="start without asking; without a terminal, required to move a rig"
@@ -841,10 +843,31 @@ def call(command: Command, args: argparse.Namespace) -> int:
     function = getattr(importlib.import_module(module), name)
     takes = command.takes.split()
     if "settings" in takes:
-        from thermoctl.settings import load_settings
+        from thermoctl.settings import load_rig, load_settings
 
-        args.settings = load_settings(args.config)
+        each = command.name in EACH_AXIS and "#" not in args.config
+        whole = each or command.name in WHOLE_RIG and "#" not in args.config
+        args.settings = load_rig(args.config) if whole else load_settings(args.config)
+        if each and args.settings.axes:
+            return _each_axis(function, takes, args)
     return (function(*(getattr(args, t) for t in takes)) if takes else function(args)) or 0
+
+
+EACH_AXIS = frozenset({"status", "disarm", "reload", "latency"})
+"""Commands that, without --axis, do their work for every axis of a rig, one after the other."""
+WHOLE_RIG = frozenset({"start", "stop", "restart", "check", "doctor", "virtual-rig"})
+"""Commands that take a whole rig; --axis names one for `check` and `doctor` only."""
+
+
+def _each_axis(function: Any, takes: list[str], args: argparse.Namespace) -> int:
+    """Run a command for every axis; return the largest exit status."""
+    found = []
+    for part in args.settings.axes:
+        args.settings = part
+        if not getattr(args, "json", False):
+            print(f"axis {part.axis}:", flush=True)
+        found.append(function(*(getattr(args, t) for t in takes)) or 0)
+    return max(found)
 
 
 # Commands that join the work of two packages.
@@ -852,16 +875,15 @@ def call(command: Command, args: argparse.Namespace) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Run the daemon in the foreground, or its tick in simulated time."""
-    from thermoctl.settings import load_settings
+    from thermoctl.settings import load_rig, load_settings
 
-    settings = load_settings(args.config)
     if args.hours is None:
         from thermoctl.daemon import supervisor
 
-        return supervisor.run(settings)
+        return supervisor.run(load_rig(args.config))
     from thermoctl.daemon.simulate import trapezoids
 
-    return trapezoids(settings, args.hours, not args.no_compensation, args.out)
+    return trapezoids(load_settings(args.config), args.hours, not args.no_compensation, args.out)
 
 
 def virtual_rig(settings: Any, line: str) -> int:

@@ -12,16 +12,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from thermoctl.channels import CODES, DEFAULT, Channels, read_points
+from thermoctl.channels import CODES, DEFAULT, AxesChannels, Channels, Point, read_points, read_shared_points
 from thermoctl.control.limits import Limits
 from thermoctl.option import Option, option
 from thermoctl.signals import Row, of_channels
@@ -176,10 +177,18 @@ class ReadingLimits:
 
 @dataclass(frozen=True)
 class ProtectionSettings(Limits, ReadingLimits):
-    """Limits that disable the amplifier when they are exceeded.
+    """Conditions that disable the amplifier.
 
     The options `low` to `frozen_s` are mappings of channel: limit. A channel without an entry has no limit.
     The entry `temperatures_c` sets the limit of every temperature without an entry of its own."""
+
+    on_other_axis_fault: str = option(
+        "what this axis does when another axis of the rig (`axes`) goes to FAULT. disarm: it goes to FAULT, too "
+        "(other_axis), and cannot be armed before the other one is acknowledged. go_on: nothing",
+        "disarm",
+        restart=True,
+        choices=("disarm", "go_on"),
+    )
 
 
 @dataclass(frozen=True)
@@ -278,7 +287,12 @@ class SocketSettings:
 
 @dataclass(frozen=True)
 class Settings:
-    """A whole configuration; `path` is the file it came from, `channels` those of its points."""
+    """A whole configuration; `path` is the file it came from, `channels` those of its points.
+
+    A rig file with `axes` gives two kinds. Those of one axis are what a rig without axes has; `axis` is its
+    name, `rig_socket` the rig's socket. Those of the whole rig have `axes`, and the channels of all axes.
+    Their sections `control`, `compensation` and `protection` are the first axis'.
+    """
 
     path: str
     rig: RigSettings
@@ -290,6 +304,23 @@ class Settings:
     hal: HalSettings
     socket: SocketSettings
     channels: Channels = DEFAULT
+    axis: str = ""
+    rig_socket: str = ""
+    axes: tuple[Settings, ...] = ()
+
+    @property
+    def parts(self) -> tuple[Settings, ...]:
+        """Return the settings of each axis; of a rig without axes its own."""
+        return self.axes or (self,)
+
+    def of_axis(self, name: str) -> Settings:
+        """Return the settings of one axis. Raises InputError for an unknown name."""
+        for part in self.axes:
+            if part.axis == name:
+                return part
+        names = [part.axis for part in self.axes]
+        known = f"expected one of {', '.join(names)}" if names else "this rig has no axes"
+        raise InputError(f"{self.path}: no axis '{name}'{suggest(name, names)}; {known}")
 
     @property
     def row(self) -> Row:
@@ -299,6 +330,12 @@ class Settings:
 
 POINTS = "points"
 """Key of the declaration of the temperature points."""
+AXES = "axes"
+"""Key of the declaration of the axes."""
+OF_AN_AXIS = ("control", "compensation", "protection", "hal")
+"""Sections whose keys an axis may set for itself; of `hal` those of simulated rigs and injected faults."""
+SHARED_CHANNELS = ("air_c", "supply_v")
+"""Channels that one device may give to all axes, besides those of the rig's points."""
 SECTIONS: dict[str, type] = {
     "rig": RigSettings,
     "loop": LoopSettings,
@@ -348,14 +385,148 @@ def _plain(value: Any) -> Any:
     return [_plain(v) for v in value] if isinstance(value, tuple) else value
 
 
-def load_settings(path: str | Path) -> Settings:
-    """Read and check a configuration. Raises InputError with file:line:column for the first error."""
-    root = Section(load(path), "configuration")
+def load_settings(path: str | Path, axis: str = "") -> Settings:
+    """Read and check a configuration, of one axis where the rig has several: `axis`, or PATH#AXIS.
+
+    Raises InputError with file:line:column for the first error, or where an axis must be chosen.
+    """
+    file, _, named = str(path).rpartition("#") if not Path(path).exists() else (str(path), "", "")
+    rig = load_rig(file or path)
+    if axis := axis or (named if file else ""):
+        return rig.of_axis(axis)
+    if rig.axes:
+        names = ", ".join(part.axis for part in rig.axes)
+        raise InputError(f"{path}: this rig has the axes {names}; name one by --axis")
+    return rig
+
+
+def load_rig(path: str | Path) -> Settings:
+    """Read and check a configuration: that of the whole rig, where it has axes. Raises InputError."""
+    node, folder = load(path), Path(path).absolute().parent
+    root = Section(node, "configuration")
     root.asked.update(SECTIONS)
-    points = root.given(POINTS)
+    points, axes = root.given(POINTS), root.given(AXES)
     root.end()
-    folder = Path(path).absolute().parent
-    channels = DEFAULT if points is None else _points(points, folder)
+    if axes is None:
+        return _settings(node, path, DEFAULT if points is None else _points(points, folder))
+    shared = () if points is None else read_shared_points(points, folder)
+    if not axes.value or not isinstance(axes.value, dict):
+        raise axes.error("axes: a mapping NAME: {points, control, compensation, protection} was expected")
+    rig = node.value.get("rig")
+    if rig is None or "name" not in (rig.value or {}):
+        raise axes.error("axes: 'rig.name' is missing: the recordings of each axis are named RIG-AXIS")
+    parts = []
+    for name, item in axes.value.items():
+        own = Section(item, f"axes.{name}")
+        own.asked.update(OF_AN_AXIS)
+        if not _AXIS.fullmatch(name):
+            raise item.error(f"axes: '{name[:60]}': small letters and digits were expected, a letter first")
+        declared = own.given(POINTS)
+        own.end()
+        if declared is None and points is not None:
+            raise item.error(
+                f"axes.{name}.points is missing: the axis' own points, one of them with role: coil"
+            )
+        channels = DEFAULT if declared is None else _points(declared, folder, shared)
+        part = _settings(_axis_node(node, name, item), path, channels)
+        parts.append(_named(part, name, len(axes.value)))
+    union = AxesChannels(
+        (),
+        tuple((part.axis, part.channels) for part in parts),
+        (*SHARED_CHANNELS, *(f"{p.name}_c" for p in shared)),
+    )
+    first, hal = parts[0], node.value.get("hal")
+    whole = _settings(_axis_node(node, first.axis, axes.value[first.axis]), path, first.channels)
+    devices = _section("hal", HalSettings, hal, node, union).devices
+    for device in devices:
+        _check_roles(device, union)
+    return dataclasses.replace(
+        whole, hal=dataclasses.replace(whole.hal, devices=devices), channels=union, axes=tuple(parts)
+    )
+
+
+_AXIS = re.compile(r"[a-z][a-z0-9]*")
+
+
+def _named(part: Settings, axis: str, count: int) -> Settings:
+    """Return an axis' settings with its own name, socket and folder, and its share of the disk space."""
+    path, recording = Path(part.socket.path), part.recording
+    return dataclasses.replace(
+        part,
+        axis=axis,
+        rig_socket=part.socket.path,
+        rig=dataclasses.replace(part.rig, name=f"{part.rig.name}-{axis}"),
+        socket=dataclasses.replace(part.socket, path=str(path.with_name(f"{path.stem}-{axis}{path.suffix}"))),
+        recording=dataclasses.replace(
+            recording,
+            directory=str(Path(recording.directory) / axis),
+            budget_gb=recording.budget_gb / count,
+            tier_budget_gb=recording.tier_budget_gb / count,
+        ),
+    )
+
+
+def _axis_node(root: Node, axis: str, own: Node) -> Node:
+    """Return one axis' configuration: the rig's sections, the axis' keys over them, its devices only."""
+    sections = {k: v for k, v in root.value.items() if k not in (AXES, POINTS)}
+    for name in OF_AN_AXIS:
+        if name in own.value:
+            sections[name] = _over(sections[name], own.value[name]) if name in sections else own.value[name]
+    hal = sections.get("hal")
+    if hal is not None and isinstance(hal.value, dict) and isinstance(hal.value.get("devices"), Node):
+        listed = hal.value["devices"]
+        if isinstance(listed.value, list):
+            mine = [d for d in (_device_of(device, axis) for device in listed.value) if d is not None]
+            devices = dataclasses.replace(listed, value=mine)
+            sections["hal"] = dataclasses.replace(hal, value={**hal.value, "devices": devices})
+    return dataclasses.replace(root, value=sections)
+
+
+def _over(common: Node, own: Node) -> Node:
+    """Return `common` with the keys of `own` in place of its own; mappings in them key by key."""
+    if not (isinstance(common.value, dict) and isinstance(own.value, dict)):
+        return own
+    merged = {**common.value}
+    for key, value in own.value.items():
+        merged[key] = _over(merged[key], value) if key in merged else value
+    return dataclasses.replace(own, value=merged)
+
+
+def _device_of(device: Node, axis: str) -> Node | None:
+    """Return a device with the roles that it has for this axis, without the axis' name; None without any."""
+    roles = device.value.get("roles") if isinstance(device.value, dict) else None
+    if roles is None or not isinstance(roles.value, dict):
+        return device
+    mine = {}
+    for channel, role in roles.value.items():
+        of, dot, plain = str(role.value).rpartition(".")
+        if not dot or of == axis:
+            mine[channel] = dataclasses.replace(role, value=plain) if dot else role
+    if not mine:
+        return None
+    return dataclasses.replace(
+        device, value={**device.value, "roles": dataclasses.replace(roles, value=mine)}
+    )
+
+
+def _check_roles(device: Node, channels: AxesChannels) -> None:
+    """Raise InputError for a role that no axis has, or that needs its axis."""
+    roles = device.value.get("roles") if isinstance(device.value, dict) else None
+    if roles is None or not isinstance(roles.value, dict):
+        return
+    for role in roles.value.values():
+        if role.value not in channels.index:
+            axes = [f"{a}.{role.value}" for a in channels.parts if f"{a}.{role.value}" in channels.index]
+            expected = f"write {' or '.join(axes)}" if axes else f"roles: {', '.join(channels.index)}"
+            raise role.error(
+                f"roles: '{role.value}' is no role of all axes{'' if axes else suggest(str(role.value), channels.index)}; "
+                f"{expected}"
+            )
+
+
+def _settings(node: Node, path: str | Path, channels: Channels) -> Settings:
+    """Read the sections of a rig without axes, or of one axis."""
+    root, folder = Section(node, "configuration"), Path(path).absolute().parent
     sections = {
         name: _section(name, cls, root.given(name), root.node, channels) for name, cls in SECTIONS.items()
     }
@@ -373,9 +544,9 @@ def load_settings(path: str | Path) -> Settings:
     )
 
 
-def _points(node: Node, folder: Path) -> Channels:
+def _points(node: Node, folder: Path, shared: Iterable[Point] = ()) -> Channels:
     """Read `points`. Raises InputError also where a name would give two signals of one name."""
-    channels = read_points(node, folder)
+    channels = read_points(node, folder, shared)
     if twice := of_channels(channels).duplicates():
         raise node.error(
             f"points: two signals would have the name {twice[0]}; choose another name for the point"
@@ -534,4 +705,4 @@ def _check_together(settings: Settings, root: Node) -> None:
         )
 
 
-__all__ = ["InputError", "Option", "Settings", "changed", "load_settings", "options"]
+__all__ = ["InputError", "Option", "Settings", "changed", "load_rig", "load_settings", "options"]

@@ -174,6 +174,8 @@ def choose(args: argparse.Namespace) -> None:
         args.config, how = str(shipped("config") / "simulated.yaml"), "the simulated rig of the program"
     if not given and _acts(args):
         print(f"thermoctl: configuration {args.config} ({how})", file=sys.stderr)
+    if getattr(args, "axis", None):
+        args.config = f"{args.config}#{args.axis}"
 
 
 def _means_a_rig(args: argparse.Namespace) -> bool:

@@ -1,4 +1,4 @@
-"""`make bench-points`: processor time of a whole tick (sample, law, record, ring) against the number of points.
+"""`make bench-points`: processor time of a whole tick (sample, law, record, ring) against the number of points and axes.
 
 The back end gives prepared readings at once: a new position and drive state every tick, current and voltage every 50 and
 temperatures every 100 ticks. Devices cost the same for any points and are left out. The least of many repeats counts, because
@@ -60,20 +60,25 @@ def model(points: int) -> CompensatorModel:
     )
 
 
-def microseconds(points: int) -> float:
-    """Return the processor time of one tick, us: the least mean of REPEATS runs."""
+def microseconds(points: int, axes: int = 1) -> float:
+    """Return the processor time of one tick of all axes, us: the least mean of REPEATS runs."""
     names = [Point("coil", role="coil"), *(Point(f"p{k}") for k in range(1, points))]
     channels = DEFAULT if points == len(DEFAULT.points) else of_points(names)
     n = COIL + points
     limits = {name: np.full(n, np.inf) for name in ("high", "rate", "stale_s", "frozen_s")}
     parameters = Parameters(0.01, 0.01, 0.0, 1.0, low=np.full(n, -np.inf), required=np.zeros(n), **limits)
-    ring = Ring(np.zeros(1, np.uint64), np.zeros((8192, len(of_channels(channels)))))
-    rig = Rig(Prepared(channels), model(points), parameters, 1e-3, ring, channels=channels)
+    rigs = []
+    for _ in range(axes):
+        ring = Ring(np.zeros(1, np.uint64), np.zeros((8192, len(of_channels(channels)))))
+        rigs.append(Rig(Prepared(channels), model(points), parameters, 1e-3, ring, channels=channels))
+    for rig in rigs:
+        rig.guards = [other for other in rigs if other is not rig]
     best = np.inf
     for repeat in range(REPEATS):
         begin = time.thread_time()
         for k in range(TICKS):
-            rig.tick((repeat * TICKS + k) * 1e-3, 1e-3)
+            for rig in rigs:
+                rig.tick((repeat * TICKS + k) * 1e-3, 1e-3)
         best = min(best, (time.thread_time() - begin) / TICKS * 1e6)
     return best
 
@@ -87,6 +92,9 @@ def main() -> int:
     found = {points: microseconds(points) for points in (12, 4, 8, 16, 32, 64)}
     for points, us in sorted(found.items()):
         print(f"{points:6d} {us:10.2f} {us / found[12]:10.2f}")
+    print("\naxes of twelve points   tick of all, us")
+    for axes in (1, 2, 4):
+        print(f"{axes:6d} {microseconds(12, axes):26.2f}")
     return 0
 
 

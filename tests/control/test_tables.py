@@ -149,12 +149,12 @@ print(json.dumps({{
 
 
 def test_a_fault_is_added_in_one_row():
-    """A new fault takes bit 53, is recorded in the second word, and is shown, explained and decoded."""
+    """A new fault takes bit 54, is recorded in the second word, and is shown, explained and decoded."""
     found = run_with(
         {
             "thermoctl.control.faults": (
                 "_ROWS = (",
-                '_ROWS = (Fault(53, "door_open", "critical", "its door is open", "Somebody.", "look", "close it"),',
+                '_ROWS = (Fault(54, "door_open", "critical", "its door is open", "Somebody.", "look", "close it"),',
             )
         },
         """
@@ -169,14 +169,14 @@ row = np.zeros(len(signals.NAMES))
 row[signals.AT["state"]:][:len(law.OUTPUTS)] = tick.outputs[:len(law.OUTPUTS)]
 print(json.dumps({
     "state": arming.STATES[tick.state], "shown": "door_open" in [f.name for f in faults.decode(signals.fault_word(row))],
-    "second word": row[signals.INDEX["fault_bits_2"]], "page": "`fault_bits_2` (value 1)" in reference.fault(faults.BY_NAME["door_open"]),
-    "recorded": faults.NAMES[53], "others": all(faults.NAMES[b] == n for b, n in enumerate(recorded_faults.NAMES_2)),
+    "second word": row[signals.INDEX["fault_bits_2"]], "page": "`fault_bits_2` (value 2)" in reference.fault(faults.BY_NAME["door_open"]),
+    "recorded": faults.NAMES[54], "others": all(faults.NAMES[b] == n for b, n in enumerate(recorded_faults.NAMES_2)),
 }))""",
     )
     assert found == {
         "state": "FAULT",
         "shown": True,
-        "second word": 1.0,
+        "second word": 2.0,
         "page": True,
         "recorded": "door_open",
         "others": True,

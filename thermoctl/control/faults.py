@@ -478,6 +478,15 @@ _ROWS = (
         "let the rig rest until it is cold: all points must show the air's temperature",
         "correct the order of the sensors; replace the one that is off; calibrate again",
     ),
+    Fault(
+        53,
+        "other_axis",
+        "fault",
+        "another axis of this rig is in FAULT",
+        "The other axis tripped; protection.on_other_axis_fault: disarm then disarms this one, too.",
+        "`thermoctl status` without --axis shows every axis, and which one is in FAULT",
+        "repair the cause on that axis; `thermoctl disarm` acknowledges all axes",
+    ),
 )
 
 FAULTS = tuple(sorted(_ROWS, key=lambda f: f.bit))

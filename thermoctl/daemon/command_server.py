@@ -56,6 +56,10 @@ class Commands:
 
     def answer(self, line: bytes, peer: str) -> dict[str, Any]:
         """Answer one request line; nothing that a client sends raises an exception."""
+        answer = self._answer(line, peer)
+        return {"axis": self.started.axis, **answer} if self.started.axis else answer
+
+    def _answer(self, line: bytes, peer: str) -> dict[str, Any]:
         try:
             request = json.loads(line)
             if not isinstance(request, dict) or not isinstance(request.get("command"), str):

@@ -10,12 +10,12 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from hal.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
-from hal.make import device_notes, fast_devices, make_backend
+from hal.make import device_notes, fast_devices, make_backend, make_backends
 from hal.serial_line import latency_timer_ms
 from thermoctl.daemon.arrival import expected_hz, slow
 from thermoctl.daemon.assemble import check_mode, compensator, lacks, law_parameters, power_warning
@@ -27,6 +27,9 @@ from thermoctl.yamlfile import InputError
 
 def check(settings: Settings) -> int:
     """Check the configuration, the model, the plant and the profiles; no hardware is touched."""
+    if settings.axes:
+        make_backends(settings)
+        return _each_axis(settings, check)
     law_parameters(settings)
     model = compensator(settings)
     make_backend(settings)
@@ -42,6 +45,15 @@ def check(settings: Settings) -> int:
         for note in [*device_notes(settings), *without]:
             print(f"note: {note}")
     return 0
+
+
+def _each_axis(settings: Settings, examine: Callable[[Settings], int]) -> int:
+    """Examine every axis; return the largest exit status."""
+    found = []
+    for part in settings.axes:
+        print(f"axis {part.axis}:", flush=True)
+        found.append(examine(part))
+    return max(found)
 
 
 @dataclass
@@ -62,6 +74,8 @@ def doctor(settings: Settings, seconds: float = 2.0) -> int:
         raise InputError(
             f"{settings.path}: pid {pid} holds the rig; look with `thermoctl status`, or stop it first"
         )
+    if settings.axes:
+        return _each_axis(settings, lambda part: doctor(part, seconds))
     backend = make_backend(settings)
     try:
         backend.open()

@@ -18,8 +18,8 @@ PROBE_S = 0.2
 
 
 def lock_path(settings: Settings) -> Path:
-    """Return the lock's file, beside the rig's socket."""
-    return Path(settings.socket.path).with_suffix(".lock")
+    """Return the lock's file, beside the rig's socket: one for all its axes."""
+    return Path(settings.rig_socket or settings.socket.path).with_suffix(".lock")
 
 
 def hold(settings: Settings) -> int:

@@ -6,7 +6,8 @@ from thermoctl.control.law cimport Law
 from thermoctl.daemon.clock cimport now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.ring cimport Histogram, Mailbox, Record, Remarks, Ring
 
-cdef int _STATE_EVERY, _COUNTERS_AT, _SUSPEND_EVERY, _SUSPEND_NS, _THERMAL, _LATEST, _OFF, _STATE, _CODE, _ABSENT
+cdef unsigned long long _OTHER_AXIS, _OWN_FAULTS
+cdef int _FAULT, _STATE_EVERY, _COUNTERS_AT, _SUSPEND_EVERY, _SUSPEND_NS, _THERMAL, _LATEST, _OFF, _STATE, _CODE, _ABSENT
 cdef double _DELAY_S
 
 cdef class Rig:
@@ -14,7 +15,7 @@ cdef class Rig:
     cdef int _n
     cdef public Record record
     cdef public Remarks remarks
-    cdef public list said
+    cdef public list said, guards
     cdef unsigned char[::1] _status
     cdef public Mailbox mailbox
     cdef public Law law
@@ -26,8 +27,9 @@ cdef class Rig:
 
     @cython.locals(begin=cython.longlong, end=cython.longlong)
     cpdef tick(self, double now_s, double dt_s, double lateness_us=*, clock_ns=*)
-    @cython.locals(devices=DevicesBackend, c=cython.int, age=cython.double)
+    @cython.locals(devices=DevicesBackend, other=Rig, c=cython.int, age=cython.double)
     cpdef sample(self, double now_s)
+    cpdef bint trips_others(self)
     cpdef _obey(self, double kind, double value)
     @cython.locals(devices=DevicesBackend)
     cpdef actuate(self)
@@ -39,8 +41,11 @@ cdef class Rig:
     cdef _say(self, int c, double t_s)
     cpdef keep_state(self)
 
-@cython.locals(paced=cython.bint, counted=cython.bint, lateness=Histogram, busy=Histogram, period_ns=cython.longlong, spin_ns=cython.longlong,
+@cython.locals(lateness=Histogram, busy=Histogram)
+cdef _count(Rig rig, shared, double lateness_us, long long warm_up_ticks)
+
+@cython.locals(paced=cython.bint, counted=cython.bint, period_ns=cython.longlong, spin_ns=cython.longlong,
                before=cython.longlong, now=cython.longlong, deadline=cython.longlong, slept=cython.longlong,
                slept_before=cython.longlong, gap_ns=cython.longlong, late_ns=cython.longlong, skipped=cython.longlong,
-               lateness_us=cython.double)
-cpdef run_loop(settings, shared, Rig rig, stopping, long long warm_up_ticks=*)
+               lateness_us=cython.double, now_s=cython.double, dt_s=cython.double, other=Rig)
+cpdef run_loop(settings, shared, Rig rig, stopping, long long warm_up_ticks=*, further=*)

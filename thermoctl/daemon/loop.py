@@ -16,7 +16,7 @@ import ctypes
 import gc
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,8 @@ _OFF, _STATE, _CODE = arming.OFF, SIGNAL_AT["state"], SIGNAL_AT["amplifier_fault
 _THERMAL = AT["air_c"]  # the air is the first thermal channel, all later ones are thermal
 _ABSENT = ABSENT
 _AMPLIFIER_WRITE = 1 << faults.BIT["amplifier_write"]
+_FAULT, _OTHER_AXIS = arming.FAULT, 1 << faults.BIT["other_axis"]
+_OWN_FAULTS = (1 << 64) - 1 - _OTHER_AXIS
 
 
 class Rig:
@@ -88,6 +90,7 @@ class Rig:
         self.said = [(0.0, "")] * self._n
         self._status = np.zeros(self._n, np.uint8)
         self.slips = self.generation = self.external = self.write_failed = 0
+        self.guards: list[Rig] = []  # axes whose FAULT disarms this one
         self.command, self.value, self.busy_us = arming.NONE, 0.0, 0.0
         self.wall_s: Callable[[], float] | None = None
         self.suspended_ns: Callable[[], int] | None = None
@@ -129,10 +132,17 @@ class Rig:
                 age = (now_s - self._time_s[c]) / _DELAY_S
                 self._delay[c] = 0 if age < 0.0 else _LATEST if age >= _LATEST else int(age)
         self.command, self.value, self.external = 0, 0.0, self.write_failed
+        for other in self.guards:
+            if other.trips_others() and self.law.state != _FAULT:  # in FAULT both would wait for each other
+                self.external |= _OTHER_AXIS
         if self.mailbox is not None and self.mailbox.waiting():
             command = self.mailbox.take()
             if command is not None:
                 self._obey(*command)
+
+    def trips_others(self) -> bool:
+        """Return whether this axis is in FAULT by a fault of its own, not of another axis."""
+        return self.law.state == _FAULT and self.law.latched & _OWN_FAULTS != 0
 
     def _obey(self, kind: float, value: float) -> None:
         if kind == RELOAD:
@@ -224,16 +234,24 @@ class Rig:
 
 
 def run_loop(
-    settings: Settings, shared: Shared, rig: Rig, stopping: Callable[[], bool], warm_up_ticks: int = 100
+    settings: Settings,
+    shared: Shared,
+    rig: Rig,
+    stopping: Callable[[], bool],
+    warm_up_ticks: int = 100,
+    further: Sequence[tuple[Rig, Shared]] = (),
 ) -> None:
-    """Tick until `stopping()`; the caller opens the back end before and disables the amplifier after."""
+    """Tick until `stopping()`; the caller opens the back end before and disables the amplifier after.
+
+    further: the other axes; they tick after the first one, with its time and step.
+    """
     period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
     paced = settings.loop.pace == "device"
     counted = settings.loop.pace == "tick"
     if paced:
         rig.backend.check_pacing()
-    shared.counters[START_S], shared.counters[LOOP_PID] = rig.start_s, os.getpid()
-    lateness, busy = shared.lateness, shared.busy
+    for s in [shared, *[s for _, s in further]]:
+        s.counters[START_S], s.counters[LOOP_PID] = rig.start_s, os.getpid()
     before = now_ns()
     slept_before = suspended_ns() if rig.suspended_ns is None else int(rig.suspended_ns())
     deadline = before + period_ns
@@ -254,14 +272,15 @@ def run_loop(
             gap_ns = slept - slept_before if slept - slept_before > _SUSPEND_NS else 0
             slept_before = slept
         if counted:  # time is counted in ticks: a stall of the machine also stops the simulated rig
-            rig.tick(rig.start_s + (rig.law.tick + 1) * rig.law.period_s, rig.law.period_s, lateness_us)
+            now_s, dt_s = rig.start_s + (rig.law.tick + 1) * rig.law.period_s, rig.law.period_s
         else:
-            rig.tick(now * 1e-9, (now - before + gap_ns) * 1e-9, lateness_us)
-        if rig.law.tick % _STATE_EVERY == _COUNTERS_AT:
-            put_counters(shared, rig.backend.counters())
-        if rig.law.tick > warm_up_ticks:
-            lateness.add(lateness_us)
-            busy.add(rig.busy_us)
+            now_s, dt_s = now * 1e-9, (now - before + gap_ns) * 1e-9
+        rig.tick(now_s, dt_s, lateness_us)
+        _count(rig, shared, lateness_us, warm_up_ticks)
+        for other, its in further:
+            other.slips = rig.slips
+            other.tick(now_s, dt_s, lateness_us)
+            _count(other, its, lateness_us, warm_up_ticks)
         before = now
         deadline = now + period_ns if paced else deadline + period_ns
         late_ns = now_ns() - deadline
@@ -269,6 +288,16 @@ def run_loop(
             skipped = late_ns // period_ns + (1 if late_ns % period_ns else 0)
             rig.slips += skipped
             deadline += skipped * period_ns
+
+
+def _count(rig: Rig, shared: Shared, lateness_us: float, warm_up_ticks: int) -> None:
+    """Add a tick to the histograms; at intervals publish the devices' counters."""
+    if rig.law.tick % _STATE_EVERY == _COUNTERS_AT:
+        put_counters(shared, rig.backend.counters())
+    if rig.law.tick > warm_up_ticks:
+        lateness, busy = shared.lateness, shared.busy
+        lateness.add(lateness_us)
+        busy.add(rig.busy_us)
 
 
 def run_reference(settings: Settings, shared: Shared, stopping: Callable[[], bool]) -> None:

@@ -8,14 +8,14 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hal.backend import HardwareError
+from hal.backend import Backend, HardwareError
 from hal.board import Board
-from hal.make import make_backend, slow_devices
+from hal.make import make_backends, slow_devices
 from hal.poller import ports, run_poller
 from thermoctl.daemon import keep
 from thermoctl.daemon import loop as loops
@@ -60,39 +60,60 @@ class Stop:
         return self.asked
 
 
-def _loop_process(settings: Settings, shared: Shared, board: Any) -> int:
+def _loop_process(settings: Settings, shared: list[Shared], board: Any) -> int:
+    """Tick all axes. shared: the segment of each axis."""
     stop = Stop()
     loops.die_with_parent()
-    backend = make_backend(settings, board)
-    backend.open()
+    backends = make_backends(settings, board)
     try:
-        rig = loops.Rig(
-            backend,
-            compensator(settings),
-            law_parameters(settings),
-            settings.loop.period_s,
-            shared.ring,
-            shared.mailbox,
-            shared.parameters,
-            shared.state,
-            time.monotonic(),
-            shared.make_remarks(settings.loop.period_s),
-            settings.channels,
-        )
-        _resume(settings, shared, rig)
+        start_s = time.monotonic()
+        for backend in backends if settings.hal.backend != "devices" else backends[:1]:
+            backend.open()  # devices are opened together
+        rigs = [_rig(*axis, start_s) for axis in zip(settings.parts, shared, backends, strict=True)]
+        guard(rigs, settings.parts)
 
         def warn(text: str) -> None:
-            shared.counters[WARNINGS] += 1
+            for s in shared:
+                s.counters[WARNINGS] += 1
             console_log("warning", what=text)
 
         kept = loops.become_real_time(settings, warn)
-        loops.run_loop(settings, shared, rig, stop)
+        further = list(zip(rigs[1:], shared[1:], strict=True))
+        loops.run_loop(settings, shared[0], rigs[0], stop, further=further)
         for file in kept:
             os.close(file)
     finally:
-        backend.write(0.0, False)
-        backend.close()
+        for backend in backends:
+            backend.write(0.0, False)
+        for backend in backends:
+            backend.close()
     return EXIT_OK
+
+
+def _rig(settings: Settings, shared: Shared, backend: Backend, start_s: float) -> loops.Rig:
+    """Make the rig of one axis, with the estimates of the previous run where they are recent."""
+    rig = loops.Rig(
+        backend,
+        compensator(settings),
+        law_parameters(settings),
+        settings.loop.period_s,
+        shared.ring,
+        shared.mailbox,
+        shared.parameters,
+        shared.state,
+        start_s,
+        shared.make_remarks(settings.loop.period_s),
+        settings.channels,
+    )
+    _resume(settings, shared, rig)
+    return rig
+
+
+def guard(rigs: list[loops.Rig], parts: Sequence[Settings]) -> None:
+    """Let each axis with `on_other_axis_fault: disarm` watch the others."""
+    for rig, settings in zip(rigs, parts, strict=True):
+        if settings.protection.on_other_axis_fault == "disarm":
+            rig.guards = [other for other in rigs if other is not rig]
 
 
 def _resume(settings: Settings, shared: Shared, rig: loops.Rig) -> None:
@@ -127,8 +148,9 @@ def _command_process(settings: Settings, shared: Shared, board: Any) -> int:
     loops.die_with_parent()
     path = Path(settings.socket.path)
     listener = listen(path, settings.socket.group)
+    log = partial(console_log, axis=settings.axis) if settings.axis else console_log
     try:
-        serve(listener, Commands(shared, settings, reload_settings, console_log), stop)
+        serve(listener, Commands(shared, settings, reload_settings, log), stop)
     finally:
         listener.close()
         with contextlib.suppress(FileNotFoundError):
@@ -245,21 +267,26 @@ def restart(children: list[Child], now: float, log: Log) -> None:
             child.start()
 
 
-def make_children(settings: Settings, shared: Shared) -> tuple[Board | None, Child, list[Child]]:
-    """Make the board of slow readings (None without slow devices), the loop and the helpers."""
+def make_children(settings: Settings, shared: list[Shared]) -> tuple[Board | None, Child, list[Child]]:
+    """Make the board of slow readings (None without slow devices), the loop and the helpers.
+
+    shared: the segment of each axis; an axis has a recorder, a command socket and a tuner of its own.
+    """
     slow = slow_devices(settings) if settings.hal.backend == "devices" else []
     board = Board.create(shared_name(settings) + "-board", len(settings.channels.names)) if slow else None
 
-    def child(name: str, main: Callable[..., int], beat: int | None = None) -> Child:
-        beats = None if beat is None else partial(shared.beats, beat)
-        return Child(name, main, settings, shared, board, beats=beats)
+    def child(
+        name: str, main: Callable[..., int], own: Settings, s: Shared, beat: int | None = None
+    ) -> Child:
+        beats = None if beat is None else partial(s.beats, beat)
+        return Child(f"{name} {own.axis}".strip(), main, own, s, board, beats=beats)
 
     others = [
         Child(
             f"poller {group[0].name}",
             _poller_process,
             settings,
-            shared,
+            shared[0],
             board,
             group[0].name,
             beats=partial(board.beat, group[0].roles),
@@ -267,11 +294,12 @@ def make_children(settings: Settings, shared: Shared) -> tuple[Board | None, Chi
         for group in ports(slow)
         if board is not None
     ]
-    if settings.recording.enable:
-        others.append(child("recorder", _recorder_process, RECORDER))
-    others.append(child("commands", _command_process, COMMANDS))
-    if settings.compensation.tune:
-        others.append(child("tuner", _tuner_process))
+    for axis in zip(settings.parts, shared, strict=True):
+        if settings.recording.enable:
+            others.append(child("recorder", _recorder_process, *axis, RECORDER))
+        others.append(child("commands", _command_process, *axis, COMMANDS))
+        if axis[0].compensation.tune:
+            others.append(child("tuner", _tuner_process, *axis))
     if settings.loop.reference:
-        others.append(child("reference", _reference_process, REFERENCE))
-    return board, child("loop", _loop_process), others
+        others.append(child("reference", _reference_process, settings, shared[0], REFERENCE))
+    return board, Child("loop", _loop_process, settings, shared, board), others

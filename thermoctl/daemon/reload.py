@@ -15,7 +15,7 @@ def reload_settings(current: Settings, started: Settings) -> tuple[Any, Paramete
     current: the settings in force; started: those at the daemon's start. Raises InputError for an invalid
     file; then nothing is applied.
     """
-    settings = load_settings(current.path)
+    settings = load_settings(current.path, current.axis)
     applied = [key for key, restart in changed(current, settings) if not restart]
     waiting = [key for key, restart in changed(started, settings) if restart]
     return settings, law_parameters(settings), applied, waiting

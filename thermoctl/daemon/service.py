@@ -18,7 +18,7 @@ from pathlib import Path
 from thermoctl.daemon.control_socket import ask, settled
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.loop import die_with_parent
-from thermoctl.settings import Settings, load_settings
+from thermoctl.settings import Settings, load_rig
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 
@@ -83,9 +83,9 @@ def start(settings: Settings) -> int:
     while time.monotonic() < deadline and (process is None or process.poll() is None):
         pid = holder(settings)
         with contextlib.suppress(InputError):
-            now = ask(settings.socket.path, {"command": "status"})
-            if settled(now) and pid is not None and (process is None or pid == process.pid):
-                print(f"started (pid {pid}, {now['state']}, log {log})")
+            found = [ask(part.socket.path, {"command": "status"}) for part in settings.parts]
+            if all(map(settled, found)) and pid is not None and (process is None or pid == process.pid):
+                print(f"started (pid {pid}, {', '.join(now['state'] for now in found)}, log {log})")
                 return 0
         time.sleep(0.1)
     if process is not None:
@@ -100,7 +100,7 @@ def start(settings: Settings) -> int:
 def _state(settings: Settings) -> str:
     """Return the state of the daemon that holds the rig, for a message."""
     try:
-        return ask(settings.socket.path, {"command": "status"})["state"]
+        return ", ".join(ask(p.socket.path, {"command": "status"})["state"] for p in settings.parts)
     except InputError:
         return "it does not answer"
 
@@ -114,10 +114,11 @@ def stop(settings: Settings) -> int:
     if pid is None:
         print("not running")
         return 0
-    with contextlib.suppress(
-        InputError
-    ):  # a process that does not answer is ended all the same; its end disables the amplifier
-        ask(settings.socket.path, {"command": "disarm"})
+    for part in settings.parts:
+        with contextlib.suppress(
+            InputError
+        ):  # a process that does not answer is ended all the same; its end disables the amplifier
+            ask(part.socket.path, {"command": "disarm"})
     unit = _unit_of(pid)
     if unit:
         if _systemctl("stop", unit):
@@ -147,7 +148,7 @@ def restart(settings: Settings) -> int:
 
 def log_path(settings: Settings) -> Path:
     """Return the log file of a daemon that `start` put in the background, beside its socket."""
-    return Path(settings.socket.path).with_suffix(".log")
+    return Path(settings.rig_socket or settings.socket.path).with_suffix(".log")
 
 
 class Background(subprocess.Popen[bytes]):
@@ -204,7 +205,7 @@ def install(config: Path, root: Path = Path("/")) -> int:
     stay as they are. systemd is informed where `root` is the running system. Raises InputError where a
     file cannot be written or two rigs collide.
     """
-    settings = load_settings(config)
+    settings = load_rig(config)
     config = config.resolve()
     unit = _unit_name(settings, config, root)
     text = (SOURCE / FIRST).read_text().replace("@PROGRAM@", str(_program())).replace("@CONFIG@", str(config))
@@ -253,7 +254,7 @@ def _unit_name(settings: Settings, config: Path, root: Path) -> str:
 
 def _socket_of(config: Path) -> str | None:
     try:
-        return load_settings(config).socket.path
+        return load_rig(config).socket.path
     except InputError:  # missing or broken: no collision
         return None
 

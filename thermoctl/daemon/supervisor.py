@@ -7,10 +7,12 @@
               ├── tuner       learns the expansion model, when compensation.tune is on
               └── reference   an idle loop beside it, when loop.reference is on
 
-The loop ends: the supervisor disables the amplifier over its own link, and the daemon ends. systemd starts it
-again, into SAFE, with the estimates that were kept. The loop stands still: it is killed, then as if it had
-ended. Any other process ends or hangs: it is started again while the loop runs on. The supervisor ends: the
-kernel signals every child (PDEATHSIG), and the loop disables the amplifier.
+A rig with axes has one loop and its pollers; recorder, commands and tuner are an axis each.
+
+The loop ends: the supervisor disables every amplifier over its own link, and the daemon ends. systemd
+starts it again, into SAFE, with the estimates that were kept. The loop stands still: it is killed, then
+as if it had ended. Any other process ends or hangs: it is started again while the loop runs on. The
+supervisor ends: the kernel signals every child (PDEATHSIG), and the loop disables the amplifiers.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import os
 import signal
 import socket
 import time
+from functools import partial
 
 from hal.backend import HardwareError
 from hal.make import disable_amplifier
@@ -91,20 +94,24 @@ def run(settings: Settings, log: Log = console_log) -> int:
             what="the law runs interpreted, not compiled: far too slow for a rig; run `make install`",
         )
     lock = hold(settings)
-    compensator(settings)
-    law_parameters(settings)
-    check_mode(settings)
-    if settings.compensation.tune:  # loaded only on demand, because it loads scipy
-        from thermoctl.daemon import tuner
+    for part in settings.parts:
+        compensator(part)
+        law_parameters(part)
+        check_mode(part)
+        if part.compensation.tune:  # loaded only on demand, because it loads scipy
+            from thermoctl.daemon import tuner
 
-        tuner.check(settings)
-    shared = Shared.create(shared_name(settings), settings.channels)
+            tuner.check(part)
+    shared: list[Shared] = []
     board = None
     try:
+        for part in settings.parts:
+            shared.append(Shared.create(shared_name(part), part.channels))
         board, loop, others = make_children(settings, shared)
         return _Supervision(settings, shared, loop, others, log).run()
     finally:
-        shared.remove()
+        for s in shared:
+            s.remove()
         if board is not None:
             board.close()
         os.close(lock)
@@ -114,18 +121,23 @@ class _Supervision:
     """One run of the daemon: starts the processes and watches them until a signal or the loop's end."""
 
     def __init__(
-        self, settings: Settings, shared: Shared, loop: Child, others: list[Child], log: Log
+        self, settings: Settings, shared: list[Shared], loop: Child, others: list[Child], log: Log
     ) -> None:
-        self.settings, self.shared, self.loop, self.others, self.log = settings, shared, loop, others, log
+        self.settings, self.loop, self.others, self.log = settings, loop, others, log
+        self.axes = list(zip(settings.parts, shared, map(compensator, settings.parts), strict=True))
+        self.shared = shared[0]
         self.asked: list[int] = []
         self.reload_asked: list[int] = []
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda n, _: self.asked.append(n))
         signal.signal(signal.SIGHUP, lambda *_: self.reload_asked.append(1))
-        self.notify, self.watcher, self.model = _Notify(), Watcher(shared, log), compensator(settings)
+        self.notify = _Notify()
+        self.watchers = [
+            Watcher(s, partial(log, axis=part.axis) if part.axis else log) for part, s, _ in self.axes
+        ]
         self.started = self.kept_at = self.looked = time.monotonic()
         self.ready, self.ticks, self.stood_s = False, 0, 0.0
-        self.stall_s = max(STALL_S, settings.protection.late_s)
+        self.stall_s = max(STALL_S, *(part.protection.late_s for part in settings.parts))
 
     def run(self) -> int:
         """Supervise; return the daemon's exit status."""
@@ -135,7 +147,7 @@ class _Supervision:
                 child.start()
             while code is None and not self.asked:
                 time.sleep(LOOK_S)
-                self.watcher.look()
+                self._look()
                 now = time.monotonic()
                 self._count_ticks(now)
                 code = self._loop_failure()
@@ -183,10 +195,15 @@ class _Supervision:
             self.reload_asked.clear()
             _reload(self.settings, self.log)
 
+    def _look(self) -> None:
+        for watcher in self.watchers:
+            watcher.look()
+
     def _keep(self) -> None:
-        state = self.shared.state.get()
-        if state is not None:
-            keep.save(keep.kept_path(self.settings), self.model, state[2:])
+        for part, shared, model in self.axes:
+            state = shared.state.get()
+            if state is not None:
+                keep.save(keep.kept_path(part), model, state[2:])
 
     def _end(self) -> None:
         """End all processes, the loop first; disable the amplifier where the loop did not end well."""
@@ -195,15 +212,16 @@ class _Supervision:
         self.loop.end(LOOP_STOP_S)
         if ended_by_itself or self.loop.process.exitcode != 0:
             safe_amplifier(self.settings, self.log)
-        self.watcher.look()
+        self._look()
         self._keep()
         for child in self.others:
             child.end()
 
 
 def _reload(settings: Settings, log: Log) -> None:
-    try:
-        answer = ask(settings.socket.path, {"command": "reload"})
-        log("reload", **answer)
-    except InputError as e:
-        log("reload", error=e)
+    for part in settings.parts:
+        try:
+            answer = ask(part.socket.path, {"command": "reload"})
+            log("reload", axis=part.axis or None, **answer)
+        except InputError as e:
+            log("reload", axis=part.axis or None, error=e)
