@@ -70,7 +70,7 @@ class VirtualRig:
         folder = Path(settings.path).parent
         self.run_dir = (folder / settings.hal.run_dir).resolve()
         self.plant = make_rig(settings)
-        bindings = [bind(node, folder) for node in settings.hal.devices]
+        bindings = [bind(node, folder, settings.channels) for node in settings.hal.devices]
         check_rig(bindings)
         self.devices = {b.name: virtual_device(b, self.plant) for b in bindings}
         self._amplifier = next((d for d in self.devices.values() if isinstance(d, DriveOnSlcan)), None)

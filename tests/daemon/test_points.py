@@ -5,7 +5,9 @@ import urllib.request
 
 import numpy as np
 import pytest
+import yaml
 
+from hal.virtual.rig import VirtualRig
 from tests.people.running import Running
 from tests.rigs.chain import plants, rig_text
 from thermoctl.channels import DEFAULT, MAX_POINTS, of_text
@@ -109,6 +111,26 @@ def test_a_recording_holds_the_points(spindle, tmp_path):
     assert result.ticks == len(rows) and not result.differences
     (tmp_path / "again.yaml").write_text(effective(spindle))
     assert load_settings(tmp_path / "again.yaml").channels == spindle.channels
+
+
+def test_the_virtual_rig_plays_devices_at_the_files_own_points(tmp_path):
+    path = make(tmp_path)
+    text = "vendor: test\nmodel: test\nbus: modbus\nmodbus: {timeout_s: 0.1}\nchannels:\n"
+    text += "  t: {register: 0, type: int16, scale: 0.1, unit: degC, range: [-50, 300], rate_hz: 10, stale_after_s: 1}\n"
+    (tmp_path / "meter.yaml").write_text(f"format: thermoctl-device/1\n{text}")
+    rig = yaml.safe_load(path.read_text())
+    rig["hal"]["devices"] = [
+        {
+            "name": "meter",
+            "profile": "meter.yaml",
+            "port": f"rtu:{tmp_path}/line",
+            "roles": {"t": "rear_bearing_c"},
+        }
+    ]
+    path.write_text(yaml.safe_dump(rig))
+    virtual = VirtualRig(load_settings(path))
+    (bound,) = virtual.devices["meter"].binding.bounds
+    assert virtual.devices["meter"].reading(bound) == pytest.approx(200, abs=30)  # of 0.1 degC, at rest
 
 
 def test_a_full_row_of_64_points_is_replayed(tmp_path):
