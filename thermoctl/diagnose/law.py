@@ -38,7 +38,7 @@ from thermoctl.diagnose.law_smooth import Tracked, tracked
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.misfit import energies, physics
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.search import ALIKE, Searched, Weighed
+from thermoctl.diagnose.search import ALIKE, HALF, Searched, Weighed
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
@@ -171,11 +171,16 @@ def find_law(
         return None
     tried: list[tuple[Proposal, Fitted]] = []
     queue, more = list(proposals), SIMPLER
+    gain, leader = 0.0, parent
     for k, p in enumerate(queue):
+        if p.cost + gain > HALF * p.promise:
+            continue
         say(f"looking for a law of the remainder: refit {k + 1}")
-        f = refitted_law(case, parent, p, at)
+        f = refitted_law(case, parent, p, at, leader)
         if f is None:
             continue
+        gain = max(gain, f.log_evidence - p.cost - parent.log_evidence)
+        leader = max(leader, f, key=lambda x: x.log_likelihood)
         if not f.absent and not at_bound(f):
             tried.append((p, f))
         if len(p.terms) > 1 and more and (f.doubtful or at_bound(f)):
@@ -411,8 +416,10 @@ def law_candidate(case: Case, rig: Structure, p: Proposal) -> Candidate:
     return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig)
 
 
-def refitted_law(case: Case, parent: Fitted, p: Proposal, at: Tracked) -> Fitted | None:
-    """Refit the parent with a law from its proposed sizes; None where the plant cannot be simulated."""
+def refitted_law(case: Case, parent: Fitted, p: Proposal, at: Tracked, leader: Fitted) -> Fitted | None:
+    """Refit the parent with a law from its proposed sizes; None where the plant cannot be simulated.
+
+    The refit ends early if it stays far from `leader`, the likeliest one so far."""
     rig = Structure(parent.rough_plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
     c = law_candidate(case, rig, p)
     values, ranges = _start(p, at.duration)
@@ -422,7 +429,7 @@ def refitted_law(case: Case, parent: Fitted, p: Proposal, at: Tracked) -> Fitted
     c = dataclasses.replace(c, effect=_bounded(c, free))
     try:
         return fitted(
-            case, plant, (*parent.hypothesis.effects, Placed(c, own)), None, None, parent.rough.cost
+            case, plant, (*parent.hypothesis.effects, Placed(c, own)), None, leader, parent.rough.cost
         )
     except (SimulationError, InputError, np.linalg.LinAlgError, ex.ExpressionError):
         return None
