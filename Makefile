@@ -30,8 +30,11 @@ bench-law: develop                 # cost of a call of the law, by compiler
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/law_call.py
 
+# Tests that only compute share two cores; then those that run in real time have both to themselves.
+COMPUTED := $(addprefix tests/,advice api calibration checks concealed diagnose export fleet identify laws plant proof recording reproduction rigs)
 test: develop lint                 # lint and all quick tests
-	$(BIN)/python -m pytest -m "not slow" tests
+	$(BIN)/python -m pytest -m "not slow" -n 2 $(COMPUTED)
+	$(BIN)/python -m pytest -m "not slow" $(addprefix --ignore=,$(COMPUTED)) tests
 
 PROOF ?= build/proof
 SEED ?= 7

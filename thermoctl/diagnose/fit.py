@@ -25,7 +25,7 @@ from thermoctl.diagnose.noise import Averaged, Grid, averaged
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
-from thermoctl.plant.residuals import Evaluation
+from thermoctl.plant.residuals import HUGE, Evaluation
 from thermoctl.plant.simulate import SimulationError, compile_plant
 
 SIGNIFICANT = 2.0  # standard deviations
@@ -41,7 +41,6 @@ FAR = 8.0  # standard deviations that a start may be off
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
 MOST = 0.9  # of a curvature that not knowing the spectrum may take
 ENOUGH = 0.05  # gain in the log posterior, below which no further step is taken
-HUGE = 1e100  # errors from here on count as infinite: the sums of their squares would be
 LOG_2PI = float(np.log(2 * np.pi))
 
 

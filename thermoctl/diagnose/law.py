@@ -40,6 +40,7 @@ from thermoctl.diagnose.misfit import energies, physics
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.search import ALIKE, HALF, Searched, Weighed
 from thermoctl.plant import expression as ex
+from thermoctl.plant.residuals import HUGE
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
@@ -308,7 +309,7 @@ def _singles(
             n = len(t.form.sizes)
             own = x[:, column : column + n]
             column += n
-            if np.isfinite(own).all() and np.any(own) and (not t.signals or not _alike(own, still)):
+            if np.all(np.abs(own) < HUGE) and np.any(own) and (not t.signals or not _alike(own, still)):
                 c = np.linalg.lstsq(own, at.target, rcond=1e-10)[0]
                 gain = float(at.target @ at.target - np.sum((at.target - own @ c) ** 2))
                 out.append((gain, place, t, own))
@@ -317,8 +318,9 @@ def _singles(
 
 def _alike(x: np.ndarray, y: np.ndarray) -> bool:
     """Return whether single columns (rows, 1) point the same way."""
-    return x.shape[1] == 1 and abs(float(x[:, 0] @ y[:, 0])) > ALIKE * float(
-        np.linalg.norm(x) * np.linalg.norm(y)
+    a, b = x / np.abs(x).max(), y / max(np.abs(y).max(), 1e-300)
+    return x.shape[1] == 1 and abs(float(a[:, 0] @ b[:, 0])) > ALIKE * float(
+        np.linalg.norm(a) * np.linalg.norm(b)
     )
 
 

@@ -25,6 +25,7 @@ from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
 from thermoctl.yamlfile import InputError
 
+HUGE = 1e100  # outputs from here on count as infinite: the sums of their squares would be
 HUBER = 4.0  # residuals beyond this many standard deviations count linearly
 PRIOR_WEIGHT = 0.02  # moving a parameter over its whole range costs as much as one residual of 0.02 sigma
 PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
@@ -271,7 +272,7 @@ class Problem:
         residuals = []
         for r, d in enumerate(self.excitations):
             run = self.model.run(d, values[r], dx0[r], sensitivities=jacobian, buffers=self.buffers)
-            if not np.all(np.isfinite(run.y)):
+            if not np.all(np.abs(run.y) < HUGE):
                 raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
             e = d.y - run.y
             residuals.append(e)
