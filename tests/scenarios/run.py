@@ -215,7 +215,7 @@ def _say(scenario: Scenario, rigs: Rigs) -> str:
         try:
             wait(said, "said", 8.0)
         except AssertionError:
-            raise Wrong(f"`thermoctl {command}` does not say so") from None
+            raise Wrong(f"`thermoctl {command}` does not say so: {printed}") from None
     finally:
         write_rig(rigs.folder, scenario.rig, rigs.bench.ports[0])
     found = next(text for text in printed.splitlines() if re.search(scenario.words, text))
