@@ -92,6 +92,8 @@ def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
 
 def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
     """Track the recordings from a fitted hypothesis. Raises SimulationError."""
+    if not nodes:
+        raise SimulationError("the plant has no node that an unknown flow could enter")
     f = as_refitted(case, f)
     plant = with_latent(f.rough_plant, nodes)
     model = compile_plant(plant)
