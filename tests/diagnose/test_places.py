@@ -12,7 +12,6 @@ from thermoctl.diagnose.extend import ranges_of
 from thermoctl.diagnose.rig import Rig
 from thermoctl.diagnose.screen import Direction
 from thermoctl.diagnose.shapes import shape_grid
-from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import compile_plant
@@ -87,30 +86,3 @@ def test_a_period_that_has_not_come_once_is_not_offered():
     for shape in grid:
         direction = Direction(found, shape, 1.0, 2, {**start, "P": shape["period"]})
         assert ranges_of(direction, 8.0)["P"][1] <= 1.001 * travel
-
-
-@pytest.mark.parametrize(
-    ("effect", "where", "sizes", "deviations"),
-    [
-        ("sensor_drift", "winding_c", {"A": 2.5 / 1000}, 1.0),  # 2.5 K in 1000 s
-        ("sensor_offset_step", "housing_c", {"A": -5.0, "T0": 300.0}, 2.0),
-        ("sensor_offset_step", "current", {"A": 0.1, "T0": 300.0}, 2.0),  # the largest current is 2 A
-        ("sensor_offset_step", "error", {"A": 100.0, "T0": 300.0}, None),  # an unknown range
-    ],
-)
-def test_an_instruments_error_counts_in_deviations_of_one_in_order(effect, where, sizes, deviations):
-    t = np.arange(0.0, 1001.0)
-    columns = {"current": 2 * np.sin(t / 50), "speed": 0 * t, "air": 20 + 0 * t}
-    columns |= {o: 20 + 0 * t for o in ("winding_c", "housing_c", "error")}
-    plant = loads(MOTOR)
-    drive = compile_plant(plant).excitation(Table("run", "run", t, columns))
-    offered = candidates(Rig(plant, [drive], [columns]), catalogue())
-    placed = next(c for c in offered if c.key == (effect, where))
-    extended = placed.extend(sizes)
-    found = placed.beliefs(extended)
-    if deviations is None:
-        assert found == []
-        return
-    (belief,) = found
-    values = {n: extended.parameters[n].value for n in ex.names(belief.neg2_log)}
-    assert ex.evaluate(belief.neg2_log, values) == pytest.approx(deviations**2, rel=1e-3)
