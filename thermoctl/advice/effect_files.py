@@ -131,9 +131,6 @@ def _structure(root: Node) -> tuple[str, str]:
     prior = top.given("prior")
     if prior:
         _expression(prior, {*parameters, "duration", "first_air"}, "prior")
-    usual = top.given("usual")
-    if usual:
-        _expression(usual, {*parameters, "duration", "tolerance"}, "usual")
     _lists_of_changes(top, known, set(parameters), where)
     top.end()
     return name, where

@@ -21,10 +21,6 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Flow, Input, Node, Parameter, Plant
 from thermoctl.plant.refit import Prior
-from thermoctl.plant.units import in_si
-
-INSTRUMENT_K = 2.5  # K: tolerance of a thermocouple of class 2, IEC 60584-1
-INSTRUMENT = 0.025  # of the largest reading: half of 5, the widest accuracy class of IEC 60051-1
 
 
 @dataclass
@@ -57,47 +53,43 @@ class Candidate:
         )
 
     def beliefs(self, plant: Plant) -> list[Prior]:
-        """Return the priors of the effect's parameters in `plant`, for each recording.
-
-        They are what the entry states as `prior`, and the square of its `usual` size."""
-        own = {p.name: self.own(p.name) for p in self.effect.parameters}
-        own = {key: q for key, q in own.items() if q in plant.parameters}
-        forms: list[tuple[Expr, dict[str, Expr]]] = []
-        if self.effect.prior is not None:
-            forms.append((self.effect.prior, {k: name(q) for k, q in own.items()}))
-        tolerance, usual = self.tolerance, self.effect.usual
-        if usual is not None and (tolerance is not None or "tolerance" not in ex.names(usual)):
-            si = {k: ex.mul(num(in_si(plant.parameters[q].unit)), name(q)) for k, q in own.items()}
-            forms.append((ex.mul(usual, usual), {**si, "tolerance": num(tolerance or 1.0)}))
+        """Return the priors of the effect's parameters in `plant`, for each recording."""
+        if self.effect.prior is None:
+            return []
         # what has no value of its own in each recording is believed once
         share = 1.0 if any(p.per_recording for p in self.effect.parameters) else 1.0 / len(self.rig.drives)
         out = []
         for d in self.rig.drives:
-            at = {"duration": num(float(d.t[-1] - d.t[0])), "first_air": num(self.rig.first_air(d))}
-            for form, symbols in forms:
+            known = {
+                "duration": num(float(d.t[-1] - d.t[0])),
+                "first_air": num(self.rig.first_air(d)),
+                **{
+                    p.name: name(self.own(p.name))
+                    for p in self.effect.parameters
+                    if self.own(p.name) in plant.parameters
+                },
+            }
 
-                def told(e: Expr, known: Mapping[str, Expr] = {**at, **symbols}) -> Expr | None:
-                    return known.get(str(e.value)) if e.op == "name" else None
+            def told(e: Expr, known: Mapping[str, Expr] = known) -> Expr | None:
+                return known.get(str(e.value)) if e.op == "name" else None
 
-                out.append(Prior(d.name, ex.mul(num(share), ex.substitute(form, told))))
+            out.append(Prior(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, told))))
         return out
 
-    @property
-    def tolerance(self) -> float | None:
-        """Standard deviation of the error of an instrument in order that reads this place, in SI units.
-
-        Of a temperature: INSTRUMENT_K. Of a recorded input: the share INSTRUMENT of its largest value. Of
-        other outputs: None, because their instrument's range is not known."""
-        place, plant = self.place, self.rig.plant
-        read = plant.inputs.get(place.input or "") or plant.outputs.get(place.output or "")
-        if read is None:
-            return None
-        if read.unit in TEMPERATURE:
-            return INSTRUMENT_K
-        if place.input is None:
-            return None
-        k = list(plant.inputs).index(place.input)
-        return INSTRUMENT * in_si(read.unit) * max(float(np.abs(d.u[:, k]).max()) for d in self.rig.drives)
+    def surprise(self, plant: Plant) -> float:
+        """-2 log of how likely the values are that `plant` holds for the effect, over all recordings."""
+        total = 0.0
+        for b in self.beliefs(plant):
+            total += float(
+                ex.evaluate(
+                    b.neg2_log,
+                    {
+                        n: plant.parameters[n].values.get(b.recording, plant.parameters[n].value)
+                        for n in ex.names(b.neg2_log)
+                    },
+                )
+            )
+        return total
 
     def own(self, parameter: str) -> str:
         """The plant's name of one of the effect's parameters."""

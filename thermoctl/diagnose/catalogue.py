@@ -29,7 +29,6 @@ KEYS = (
     "parameters",
     "dims",
     "prior",
-    "usual",
     "caution",
     "excited_by",
     "mimics",
@@ -105,7 +104,6 @@ class Effect:
     source: str
     caution: str | None = None  # what a finding of it cannot tell, in words
     prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
-    usual: Expr | None = None  # its size in standard deviations of an instrument in order, from SI units
     reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
 
 
@@ -170,12 +168,10 @@ def _read(root: yamlfile.Node) -> Effect:
                 p.get("origin"),
             )
         )
-    form = {}
-    for key in ("prior", "usual"):
-        try:
-            form[key] = ex.parse(str(top[key].value)) if key in top else None
-        except ex.ExpressionError as e:
-            raise top[key].error(str(e)) from None
+    try:
+        prior = ex.parse(str(top["prior"].value)) if "prior" in top else None
+    except ex.ExpressionError as e:
+        raise top["prior"].error(str(e)) from None
     dims = (
         tuple(map(tuple, top["dims"].plain()))
         if "dims" in top
@@ -207,7 +203,6 @@ def _read(root: yamlfile.Node) -> Effect:
         tuple(top["mimics"].plain()) if "mimics" in top else (),
         top["source"].value,
         top["caution"].value if "caution" in top else None,
-        form["prior"],
-        form["usual"],
+        prior,
         tuple(top["reads"].plain()) if "reads" in top else (),
     )

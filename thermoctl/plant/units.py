@@ -326,13 +326,6 @@ def conversion(given: str, wanted: str) -> tuple[float, float]:
     return ends[1] - ends[0], ends[0]
 
 
-def in_si(unit: str | None) -> float:
-    """Return the factor from a unit to SI units; a temperature counts as a difference. Raises ValueError."""
-    if unit is None or dimension(unit) == dimension("K"):
-        return 1.0
-    return float(_registry().Quantity(1.0, _spelled(unit)).to_base_units().magnitude)
-
-
 def _spelled(unit: str) -> str:
     plain = unit.replace("°C", "degC").replace("°", "deg").translate(_RAISED)
     return "dimensionless" if plain == "1" else plain
