@@ -20,14 +20,14 @@ from tests.hal.conftest import CONFIG
 from tests.limits import OFF
 from thermoctl import yamlfile
 from thermoctl.control.model import Parameters, zero_model
-from thermoctl.daemon.arrival import device_counters, put_counters
+from thermoctl.daemon.arrival import device_counters, put_counters, slow_readings
 from thermoctl.daemon.clock import now_ns
 from thermoctl.daemon.command_server import Commands
 from thermoctl.daemon.display import counter_lines
 from thermoctl.daemon.loop import Rig, run_loop
 from thermoctl.daemon.shared import Shared
 from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX
+from thermoctl.signals import AT, INDEX
 from thermoctl.yamlfile import InputError
 
 PERIOD_S = 0.005
@@ -146,3 +146,25 @@ def test_who_cannot_give_the_time_is_told_so(tmp_path):
     (tmp_path / "rig.yaml").write_text(text)
     with pytest.raises(InputError, match=r"rig.yaml:\d+.*pace"):
         load_settings(tmp_path / "rig.yaml")
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        ((), "slow, 100 of 1000 Hz"),
+        (range(500, 503), "slow, 100 of 1000 Hz"),  # late for a moment: still too slow
+        (range(2000), ""),  # lost: a fault says so
+    ],
+)
+def test_a_slow_reading_is_said_though_it_was_late_for_a_moment(bad, said):
+    rows = np.zeros((2000, AT["t_s"] + 1))
+    rows[:, AT["t_s"]] = np.arange(2000) * 1e-3
+    arrived, states = np.zeros((2000, 1), bool), np.zeros((2000, 1), int)
+    arrived[::10], states[list(bad)] = True, 1
+    shared = SimpleNamespace(
+        ring=SimpleNamespace(head=len(rows), read=lambda start: (rows, 0, 0)),
+        row=SimpleNamespace(arrived=lambda r: arrived, states=lambda r: states),
+        channels=SimpleNamespace(names=("position_um",)),
+    )
+    lines = slow_readings(shared, {"position_um": 1000.0})
+    assert said in " ".join(lines) if said else lines == []

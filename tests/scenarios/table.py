@@ -155,7 +155,7 @@ UNNOTICED = (
     Scenario("stage jammed, then asked for 20 um more", "A", (("A.plant.jam", True),), TRIPS, AGREE_S + SATURATION_S + SLACK_S,
              ("position_disagrees", "following_error", "drive_saturated"), then_um=60.0, bad="not noticed"),
     Scenario("encoder at a tenth of its rate", "A", (("A.sensor.divider", 10),), SAYS, command="status",
-             words=r"position_um.*slow, [\d.]+ of 1000 Hz", bad="not noticed", quick=True),
+             words=r"position_um.*slow, (?:[5-9]\d(?:\.\d)?|1\d\d) of 1000 Hz", bad="not noticed", quick=True),
     Scenario("encoder at a tenth of its rate, doctor", "A", (("A.sensor.divider", 10),), SAYS, command="doctor",
              words=r"position_um.*slow, \d+ of 1000 Hz", bad="not noticed"),
     Scenario("meter asked for 50 Hz", "A", (), SAYS, command="doctor-50", words=r"voltage_v.*slow, [\d.]+ of 50 Hz",

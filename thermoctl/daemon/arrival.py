@@ -72,17 +72,18 @@ def device_counters(shared: Shared) -> dict[str, dict[str, int]]:
 def slow_readings(shared: Shared, expected: Mapping[str, float]) -> list[str]:
     """List a line for each reading that arrived too slowly in the last LOOK_ROWS ticks.
 
-    A reading that is lost altogether is a fault and not listed.
+    Only ticks in which the reading was good count: one that is lost is a fault and not listed.
     """
     rows, _, _ = shared.ring.read(max(0, shared.ring.head - LOOK_ROWS))
     if len(rows) < 2:
         return []
-    seconds = rows[-1, AT["t_s"]] - rows[0, AT["t_s"]]
-    arrived, states = shared.row.arrived(rows), shared.row.states(rows)
+    tick_s = (rows[-1, AT["t_s"]] - rows[0, AT["t_s"]]) / (len(rows) - 1)
+    arrived, good = shared.row.arrived(rows), shared.row.states(rows) == 0
     lines = []
     for c, role in enumerate(shared.channels.names):
-        if role in expected and expected[role] * seconds >= FEWEST and not states[:, c].any():
-            found_hz = arrived[:, c].sum() / seconds
-            if said := slow(role, found_hz, expected, len(rows) / seconds):
+        seconds = good[:, c].sum() * tick_s
+        if role in expected and expected[role] * seconds >= FEWEST:
+            found_hz = arrived[good[:, c], c].sum() / seconds
+            if said := slow(role, found_hz, expected, 1 / tick_s):
                 lines.append(f"{role}: {said}")
     return lines
