@@ -152,7 +152,7 @@ def test_who_cannot_give_the_time_is_told_so(tmp_path):
     ("bad", "said"),
     [
         ((), "slow, 100 of 1000 Hz"),
-        (range(500, 503), "slow, 100 of 1000 Hz"),  # late for a moment: still too slow
+        (range(505, 510), "slow, 100 of 1000 Hz"),  # late before the next one: still too slow
         (range(2000), ""),  # lost: a fault says so
     ],
 )
