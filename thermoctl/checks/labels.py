@@ -1,6 +1,7 @@
 """Wrong labels: swapped columns, other units, signs, a clock in other units, by comparing hypotheses.
 
-Each hypothesis changes the recordings as a person would correct them. It is weighed against the recordings as
+Each hypothesis changes the recordings as a person would correct them, or turns a flow of the plant that drives
+its own node away, where nature would hold it back. It is weighed against the recordings as
 they are, both after a short refit inside the parameters' ranges:
 
     gain = sum over outputs of n log(rms as it is / rms corrected)        (each rms over the output's spread)
@@ -21,12 +22,13 @@ from math import log
 import numpy as np
 
 from thermoctl.checks.data import driving_inputs, moves
+from thermoctl.checks.file import driving_away
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.model import NYQUIST, rates_of
 from thermoctl.plant.language import Input, Output, Plant
 from thermoctl.plant.refit import fit
 from thermoctl.plant.residuals import default_noise
-from thermoctl.plant.simulate import Model, SimulationError
+from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.plant.units import conversion, dimension
 from thermoctl.recording.table import Table
 
@@ -49,13 +51,14 @@ Change = Callable[[Table], Table]
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A wrong label: a sentence about it, its correction in words, and the correction of a table."""
+    """A wrong label: a sentence about it, its correction in words, and the correction of a table or of the plant."""
 
     kind: str
     what: str
     suggestion: str
-    change: Change
+    change: Change = lambda table: table
     columns: tuple[str, ...] = ()
+    plant: Plant | None = None
 
 
 def label_findings(model: Model, tables: Sequence[Table]) -> tuple[list[Finding], list[Table]]:
@@ -69,6 +72,7 @@ def label_findings(model: Model, tables: Sequence[Table]) -> tuple[list[Finding]
         where = tables[0].path if len(tables) == 1 else f"{tables[0].path} and {len(tables) - 1} more"
         found.append(Finding(best.kind, where, best.what, best.suggestion))
         tables = [best.change(t) for t in tables]
+        model = _model(model, best)
     if not found:
         found = _ambient(model.plant, tables)
     return found, tables
@@ -85,17 +89,17 @@ def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
     now = _misfit(model, tables, refit=True)
     if now is None or np.all(now.rms <= CLOSE * now.noise):
         return None
-    hypotheses = [*_clocks(model, tables), *_hypotheses(model.plant, tables)]
+    hypotheses = [*_clocks(model, tables), *_hypotheses(model.plant, tables), *_turned(model.plant)]
     proof = log(RARITY * max(len(hypotheses), 1))
     screened: list[tuple[float, Hypothesis]] = []
     plain = _screened(model, tables)
     for h in hypotheses:
-        tried = _screened(model, [h.change(t) for t in tables])
+        tried = _screened(_model(model, h), [h.change(t) for t in tables])
         screened.append((float(np.sum(now.independent * np.log(plain / tried))), h))
     screened.sort(key=lambda pair: -pair[0])
     best: tuple[float, Hypothesis] | None = None
     for _, h in screened[:REFITTED]:
-        then = _misfit(model, [h.change(t) for t in tables], refit=True)
+        then = _misfit(_model(model, h), [h.change(t) for t in tables], refit=True)
         if then is None:
             continue
         gain = float(np.sum(then.independent * np.log(now.share / then.share)))
@@ -221,6 +225,22 @@ def _hypotheses(plant: Plant, tables: Sequence[Table]) -> Iterator[Hypothesis]:
         both_inputs = a.name in plant.inputs and b.name in plant.inputs
         if same or (len(items) <= MAX_COLUMNS and both_inputs) or len(items) <= MAX_COLUMNS // 2:
             yield _swapped(a, b)
+
+
+def _model(model: Model, h: Hypothesis) -> Model:
+    return compile_plant(h.plant) if h.plant else model
+
+
+def _turned(plant: Plant) -> Iterator[Hypothesis]:
+    """Yield the flows of the wrong sign: in passive physics a flow grows with its source and falls with its target."""
+    for flow in driving_away(plant):
+        turned = replace(flow, source=flow.target, target=flow.source)
+        yield Hypothesis(
+            "sign",
+            f"the rate of flow '{flow.name}' is of the other sign, if the recordings are right",
+            f"Exchange 'from' and 'into', or turn the sign of its rate: {plant.file}:{flow.at}.",
+            plant=replace(plant, flows={**plant.flows, flow.name: turned}),
+        )
 
 
 def _clocks(model: Model, tables: Sequence[Table]) -> Iterator[Hypothesis]:

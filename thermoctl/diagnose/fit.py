@@ -339,7 +339,7 @@ def _led(posterior: Posterior, parent: float) -> np.ndarray:
     with the least cost is the start."""
     problem = posterior.problem
     full = problem.start({})
-    costs = [_cost(problem, full)]
+    costs = [cost(problem, full)]
     plant = posterior.plant.parameters
     names = {problem.unknowns[k][0]: p for k, (_, p) in posterior.amplitudes.items()}
     if costs[0] < parent or not names:
@@ -352,11 +352,12 @@ def _led(posterior: Posterior, parent: float) -> np.ndarray:
     except SimulationError:
         return full
     starts = [full, small, led]
-    costs += [_cost(problem, small), _cost(problem, led)]
+    costs += [cost(problem, small), cost(problem, led)]
     return starts[int(np.argmin(costs))]
 
 
-def _cost(problem: Problem, z: np.ndarray) -> float:
+def cost(problem: Problem, z: np.ndarray) -> float:
+    """Return the cost in white noise at the unknowns `z`; infinite where the simulation fails."""
     try:
         return problem.evaluate(z, False).cost
     except SimulationError:

@@ -1,0 +1,60 @@
+"""Rivals of every effect: a number that the plant file fixes is off by a factor.
+
+A refit cannot move a fixed storage or rate, so its error takes the shape of an effect: a mass that is missing,
+a conductance that changes. The entries of config/mistakes/ free one such number each. They are refitted
+like hypotheses of the search and share the probabilities with them. A factor of many decades has no
+slope at 1 (a storage far too small acts like none), so each refit starts at the best decade.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thermoctl.diagnose.candidates import Candidate, candidates
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.catalogue import catalogue
+from thermoctl.diagnose.decide import Key
+from thermoctl.diagnose.fit import Fitted, Placed, Posterior, cost, fitted
+from thermoctl.diagnose.roles import Structure
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.shipped import shipped
+
+MISTAKES = shipped("config/mistakes")
+DECADES = tuple(10.0**k for k in range(-6, 7))  # a slip of a digit up to one of two prefixes
+
+
+def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
+    """Return the refits with one factor each that is significant; of more than `most` places the best ones.
+
+    `null`: the refit of the plant without any effect."""
+    entries = catalogue((MISTAKES,))
+    starts: dict[Key, list[tuple[float, Plant, Placed]]] = {}
+    for plant in (case.plant, null.rough_plant):
+        drives = case.drives(compile_plant(plant))
+        rig = Structure(plant, drives, [t.columns for t in case.tables])
+        for c in candidates(rig, entries):
+            starts.setdefault(c.key, []).append(_start(case, c))
+    best = sorted((min(s, key=lambda x: x[0]) for s in starts.values()), key=lambda x: x[0])
+    found = []
+    for _, plant, placed in best[:most]:
+        if case.budget.spent:
+            break
+        try:
+            f = fitted(case, plant, (placed,), parent=null.rough.cost)
+        except (SimulationError, np.linalg.LinAlgError):
+            continue
+        if not f.absent:
+            found.append(f)
+    return found
+
+
+def _start(case: Case, c: Candidate) -> tuple[float, Plant, Placed]:
+    """Return (least cost, the plant with the factor at its best decade, the factor)."""
+    (p,) = c.effect.parameters
+    own = c.own(p.name)
+    placed = Placed(c, {p.name: own})
+    problem = Posterior(case, c.extend({}, {p.name: (p.low, p.high)}), (placed,)).problem
+    costs = [cost(problem, problem.start({own: f})) for f in DECADES]
+    k = int(np.argmin(costs))
+    return costs[k], c.extend({p.name: DECADES[k]}, {p.name: (p.low, p.high)}), placed
