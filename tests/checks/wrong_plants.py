@@ -27,6 +27,7 @@ RIG = "two blocks"
 LINK = "  between: {from: one, into: two, rate: G_12 * (one - two), unit: W}\n"
 CAPACITY = "C_1: {value: 6, unit: J/K, range: [2, 14]}"
 CONDUCTANCE = "G_2: {value: 0.05, unit: W/K, range: [0.015, 0.15]}"
+CONDUCTANCE_WARMS = {"natural_convection", "radiation", "temperature_dependent_conductance"}
 LOSS = "rate: G_1 * (one - air)"
 SENSOR = "temperature_1: {value: one,"
 PLANTS_WRONG: Mapping[str, tuple[list[tuple[str, str]], set[str]]] = {  # replacements, right names
@@ -44,9 +45,9 @@ PLANTS_WRONG: Mapping[str, tuple[list[tuple[str, str]], set[str]]] = {  # replac
     "half of the heat": ([("rate: heat,", "rate: 0.5 * heat,")], {"sensor_gain"}),
     "sensor in degF": ([(SENSOR, "temperature_1: {value: 1.8 * one + 32,")], set()),
     "sensor with a gain": ([(SENSOR, "temperature_1: {value: 1.1 * one,")], {"sensor_gain", "cold_junction_drift"}),
-    "sensor with an offset": ([(SENSOR, "temperature_1: {value: one + 5,")], {"sensor_offset_step", "second_ambient"}),
+    "sensor with an offset": ([(SENSOR, "temperature_1: {value: one + 5,")], {"wrong_offset"}),
     "late sensor": ([(SENSOR, 'temperature_1: {value: "delay(one, 60)",')], {"sensor_lag", "sensor_delay"}),
-    "loss as the square": ([(LOSS, "rate: 0.1 * G_1 * (one - air) * abs(one - air)")], {"natural_convection", "radiation"}),
+    "loss as the square": ([(LOSS, "rate: 0.1 * G_1 * (one - air) * abs(one - air)")], CONDUCTANCE_WARMS),
     "start 20 K too warm": ([("one: {unit: degC, storage: C_1, initial: air,", "one: {unit: degC, storage: C_1, initial: air + 20,")], set()),
     "noise of a hundredth": ([("noise: 0.1", "noise: 0.001")], set()),
 }  # fmt: skip

@@ -1,7 +1,7 @@
 """Wrong labels: swapped columns, other units, signs, a clock in other units, by comparing hypotheses.
 
-Each hypothesis changes the recordings as a person would correct them, or turns a flow of the plant that drives
-its own node away, where nature would hold it back. It is weighed against the recordings as
+Each hypothesis changes the recordings as a person would correct them. Or it turns a flow of the plant that
+drives its own node away. It is weighed against the recordings as
 they are, both after a short refit inside the parameters' ranges:
 
     gain = sum over outputs of n log(rms as it is / rms corrected)        (each rms over the output's spread)
@@ -51,7 +51,7 @@ Change = Callable[[Table], Table]
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A wrong label: a sentence about it, its correction in words, and the correction of a table or of the plant."""
+    """A wrong label: a sentence about it, its correction in words, and the corrected table or plant."""
 
     kind: str
     what: str
@@ -232,7 +232,7 @@ def _model(model: Model, h: Hypothesis) -> Model:
 
 
 def _turned(plant: Plant) -> Iterator[Hypothesis]:
-    """Yield the flows of the wrong sign: in passive physics a flow grows with its source and falls with its target."""
+    """Yield the flows of the wrong sign. A passive flow grows with its source and falls with its target."""
     for flow in driving_away(plant):
         turned = replace(flow, source=flow.target, target=flow.source)
         yield Hypothesis(
@@ -274,7 +274,9 @@ def _corrections(item: Input | Output) -> list[Correction]:
     temperature = kind == dimension("K")
     found: list[Correction] = []
     if temperature and unit is not None:
-        found += [(f"in {u}", conversion(u, unit)) for u in ("degC", "degF", "K") if u != unit]
+        others = [u for u in ("degC", "degF", "K") if u != unit]
+        found += [(f"in {u}", conversion(u, unit)) for u in others]
+        found += [(f"converted from {u} twice", conversion(unit, u)) for u in others]
         found += [("1000 times too large", (1e-3, 0.0)), ("in tenths of a degree", (0.1, 0.0))]
         return found
     for factor in FACTORS:

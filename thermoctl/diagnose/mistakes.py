@@ -1,9 +1,9 @@
 """Rivals of every effect: a number that the plant file fixes is off by a factor.
 
-A refit cannot move a fixed storage or rate, so its error takes the shape of an effect: a mass that is missing,
-a conductance that changes. The entries of config/mistakes/ free one such number each. They are refitted
-like hypotheses of the search and share the probabilities with them. A factor of many decades has no
-slope at 1 (a storage far too small acts like none), so each refit starts at the best decade.
+A refit cannot move a fixed storage or rate. So its error takes the shape of an effect, such as a missing
+mass. The entries of config/mistakes/ free one such number each. They are refitted and weighed like the
+hypotheses of the search. A refit starts at the best decade: a storage that is far too small acts like
+none, so the factor has no slope at 1. A reading whose first sample contradicts the plant's start may be off by a constant.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.shipped import shipped
 
 MISTAKES = shipped("config/mistakes")
+WIDE = 10.0  # range of a constant, in differences between the first sample and the plant's start
 DECADES = tuple(10.0**k for k in range(-6, 7))  # a slip of a digit up to one of two prefixes
 
 
@@ -34,7 +35,8 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
         drives = case.drives(compile_plant(plant))
         rig = Structure(plant, drives, [t.columns for t in case.tables])
         for c in candidates(rig, entries):
-            starts.setdefault(c.key, []).append(_start(case, c))
+            if c.effect.where != "sensor" or c.place.output in case.off:
+                starts.setdefault(c.key, []).append(_start(case, c))
     best = sorted((min(s, key=lambda x: x[0]) for s in starts.values()), key=lambda x: x[0])
     found = []
     for _, plant, placed in best[:most]:
@@ -50,11 +52,14 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
 
 
 def _start(case: Case, c: Candidate) -> tuple[float, Plant, Placed]:
-    """Return (least cost, the plant with the factor at its best decade, the factor)."""
+    """Return (least cost, the plant with the number at the best of some values, the number)."""
     (p,) = c.effect.parameters
+    off = case.off.get(c.place.output or "")
+    tried = DECADES if off is None else (off,)
+    span = {p.name: (p.low, p.high) if off is None else (-WIDE * abs(off), WIDE * abs(off))}
     own = c.own(p.name)
     placed = Placed(c, {p.name: own})
-    problem = Posterior(case, c.extend({}, {p.name: (p.low, p.high)}), (placed,)).problem
-    costs = [cost(problem, problem.start({own: f})) for f in DECADES]
+    problem = Posterior(case, c.extend({}, span), (placed,)).problem
+    costs = [cost(problem, problem.start({own: value})) for value in tried]
     k = int(np.argmin(costs))
-    return costs[k], c.extend({p.name: DECADES[k]}, {p.name: (p.low, p.high)}), placed
+    return costs[k], c.extend({p.name: tried[k]}, span), placed

@@ -224,7 +224,7 @@ def _free(rig: Rig, e: Expr) -> bool:
 
 
 def _fixed_nodes(rig: Rig) -> Iterator[Place]:
-    """Nodes whose storage a refit cannot move. A storage of 1 is a definition: dn/dt is the sum of the flows."""
+    """Yield nodes whose storage a refit cannot move. A storage of 1 is a definition: dn/dt = sum of flows."""
     storages = {n: rig.physics.nodes[n].storage for n in _storing(rig)}
     yield from _nodes(rig, [n for n, e in storages.items() if e is not ex.ONE and not _free(rig, e)], "T")
 
