@@ -111,7 +111,7 @@ DAMAGES = {
         lambda t: stretched(t, lambda now, at, v, last: np.round(np.interp(now, at, v), 4)),
         "resampled",
         "interpolated between every 4th",
-        False,
+        True,
     ),
     "sensor converted twice": (TWO, column("temperature_1", lambda v: (v - 32) / 1.8), "unit", "converted from degF twice", True),
     "sampled too slowly": ("carriage", rows(lambda n: np.arange(0, n, 1000 // 4)), "sampling", "miss", False),

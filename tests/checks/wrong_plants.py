@@ -60,7 +60,7 @@ TEXT = """# Wrong plants and damaged recordings
 
 | outcome | meaning |
 |---|---|
-| refused | the plant file cannot be read |
+| refused | the plant file cannot be read, or too little was measured |
 | found | a severe finding of the checks, before any refit |
 | right | the mistake, or physics that is equal to it, is named with a probability above 0.9 |
 | unsure | nothing is named with a probability above 0.9 |
@@ -76,9 +76,10 @@ def plant_result(name: str) -> tuple[str, str]:
         assert old in text, f"{name}: '{old}' is not in the plant"
         text = text.replace(old, new)
     try:
-        return judged(loads(text), rig(RIG)[1], right)
+        plant = loads(text)
     except InputError as e:
-        return "refused", str(e)[:60]
+        return "refused", str(e)[:90]
+    return judged(plant, rig(RIG)[1], right)
 
 
 def damage_result(name: str) -> tuple[str, str]:
@@ -93,7 +94,10 @@ def judged(plant: Plant, table: Table, right: set[str]) -> tuple[str, str]:
     severe = [f for f in checks(plant, [table]) if f.severe]
     if severe:
         return "found", f"{severe[0].kind}: {severe[0].what}"[:90]
-    found = contract(diagnose(plant, [table], catalogue((CATALOGUE,)), limits()))
+    try:
+        found = contract(diagnose(plant, [table], catalogue((CATALOGUE,)), limits()))
+    except InputError as e:
+        return "refused", str(e)[:90]
     named = {f["effect"]: f["probability"] for f in found["findings"]}
     text = f"{found['verdict']}: " + ", ".join(f"{e} {p:.2f}" for e, p in named.items())
     sure = {e for e, p in named.items() if p > CONFIDENT}

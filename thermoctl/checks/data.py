@@ -84,7 +84,8 @@ def _quantum(values: np.ndarray) -> float:
 def _resampled(table: Table, column: str, values: np.ndarray) -> list[Finding]:
     """Find readings that change at every k-th sample only, or on straight lines between them.
 
-    Changes at free instants are all multiples of k apart with probability k^(1 - changes)."""
+    Straight lines between readings are severe: no sensor makes them. Changes at free instants are all
+    multiples of k apart with probability k^(1 - changes)."""
     quantum = _quantum(values)
     if not np.isfinite(quantum):
         return []
@@ -101,7 +102,7 @@ def _resampled(table: Table, column: str, values: np.ndarray) -> list[Finding]:
                     f"'{column}' is {how} between every {every}th sample: its {len(values)} values hold "
                     f"{len(values) // every} readings",
                     "Leave the cells between two readings empty; else their errors count several times.",
-                    severe=False,
+                    severe=difference > 1,
                 )
             ]
     return []

@@ -42,6 +42,7 @@ ITERATIONS = 20  # of a refit
 REFITTED = 6  # best screened hypotheses that are refitted
 ROUNDS = 3  # corrections in a row
 MAX_COLUMNS = 8  # up to so many columns every pair may have been swapped, beyond that pairs of one unit only
+TEMPERATURES = ("degC", "degF", "K")
 FACTORS = (1e3, 1e-3, 1e6, 1e-6)
 CLOCKS = (("ms", 1e-3), ("us", 1e-6), ("min", 60.0), ("h", 3600.0))
 SPREAD = 10.0  # an rms that stands for "cannot be simulated", in spreads
@@ -215,6 +216,7 @@ def _hypotheses(plant: Plant, tables: Sequence[Table]) -> Iterator[Hypothesis]:
     for item in items:
         for what, forward in _corrections(item):
             yield _corrected((item,), what, forward, first)
+    yield from _twice([o for o in plant.outputs.values() if o.column in there], first)
     for unit in {o.unit for o in plant.outputs.values()}:  # all sensors of one kind
         group = tuple(o for o in plant.outputs.values() if o.unit == unit and o.column in there)
         if len(group) > 1:
@@ -225,6 +227,15 @@ def _hypotheses(plant: Plant, tables: Sequence[Table]) -> Iterator[Hypothesis]:
         both_inputs = a.name in plant.inputs and b.name in plant.inputs
         if same or (len(items) <= MAX_COLUMNS and both_inputs) or len(items) <= MAX_COLUMNS // 2:
             yield _swapped(a, b)
+
+
+def _twice(outputs: Sequence[Output], first: Table) -> Iterator[Hypothesis]:
+    """Yield the temperatures that both the logger and the plant's value convert."""
+    for o in outputs:
+        for unit in TEMPERATURES if o.unit in TEMPERATURES else ():
+            if unit != o.unit:
+                change = conversion(str(o.unit), unit)
+                yield _corrected((o,), f"converted from {unit} twice", change, first)
 
 
 def _model(model: Model, h: Hypothesis) -> Model:
@@ -274,9 +285,7 @@ def _corrections(item: Input | Output) -> list[Correction]:
     temperature = kind == dimension("K")
     found: list[Correction] = []
     if temperature and unit is not None:
-        others = [u for u in ("degC", "degF", "K") if u != unit]
-        found += [(f"in {u}", conversion(u, unit)) for u in others]
-        found += [(f"converted from {u} twice", conversion(unit, u)) for u in others]
+        found += [(f"in {u}", conversion(u, unit)) for u in TEMPERATURES if u != unit]
         found += [("1000 times too large", (1e-3, 0.0)), ("in tenths of a degree", (0.1, 0.0))]
         return found
     for factor in FACTORS:

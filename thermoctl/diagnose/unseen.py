@@ -27,7 +27,7 @@ from thermoctl.diagnose.screening import ROWS, Plain, Rows
 SEEN = 5.0  # standard errors of an effect's size, from which it would have been seen
 ABSORBED = 1e-4  # share of a direction that is left, below which the plant's own parameters imitate it
 STILL = 1e-9  # norm of a whitened direction, below which nothing moves
-LIMITS = {"drive_levels", "end_levels"}
+SIZES = {"times", "lags", "delays", "small_levels"}  # shapes that are a size: absent at 0
 NOT_EXCITED = "these inputs do not excite it"
 IMITATED = "the plant's own parameters imitate it"
 TOO_LARGE = "its largest size would not show"
@@ -84,8 +84,8 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
 
 
 def sized(effect: Effect) -> bool:
-    """Return whether an effect has a size: a limit of a drive or a reading has only a place in its range."""
-    return any(p.amplitude for p in effect.parameters) or not LIMITS & set(effect.shapes.values())
+    """Return whether an effect has a size. A limit of a drive, a reading or a level has none."""
+    return any(p.amplitude for p in effect.parameters) or bool(SIZES & set(effect.shapes.values()))
 
 
 def _keep(best: dict[tuple[str, str], Visible], new: Visible) -> None:
@@ -117,7 +117,7 @@ def _visible(column: Column, full: float, left: float) -> Visible:
         smallest, most = abs(found[p.name] - absent[p.name]), max(abs(np.array(c.bounds(p)) - absent[p.name]))
         return Visible(c, p.name, _unit(c, p.name), smallest, TOO_LARGE if smallest > most else None)
     # A lag, delay or dead zone: near a value on the grid the outputs change in proportion to it.
-    (p,) = c.effect.parameters
+    p = next(p for p in c.effect.parameters if p.shape)
     smallest = column.item[2][0][str(p.shape)] * max(SEEN / left, 1 / NEAR)
     return Visible(c, p.name, _unit(c, p.name), smallest, TOO_LARGE if left < SEEN else None)
 
