@@ -10,9 +10,11 @@ from tests.checks.rigs import PLANTS, inputs, rig
 from thermoctl.advice.plan import plan
 from thermoctl.cli import main
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
-from thermoctl.plant import loads
+from thermoctl.plant import load, loads
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.shipped import shipped
+from thermoctl.yamlfile import InputError
 
 EFFECTS = catalogue((CATALOGUE,))
 
@@ -79,3 +81,18 @@ def test_a_plan_without_a_recording_settles_and_says_it_as_json(tmp_path, capsys
     assert "smallest size" in capsys.readouterr().out
     assert main(["plan", "--plant", str(path)]) == 2
     assert "--limit NAME=LOW:HIGH" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "path", sorted(shipped("config/plants/templates").glob("*.yaml")), ids=lambda p: p.stem
+)
+def test_every_template_can_be_planned(path):
+    plant = load(path)
+    driven = next(i.name for i in plant.inputs.values() if i.unit not in ("degC", "K"))
+    if path.stem == "tank":  # at rest it is empty, and a square root has no slope there
+        with pytest.raises(InputError, match="give --like REC"):
+            planned(plant, limits={driven: (0.0, 1.0)})
+        return
+    found, _ = planned(plant, limits={driven: (0.0, 1.0)})
+    assert found.parameters and any(v.reason is None for v in found.effects)
+    assert all(v.smallest > 0 for v in found.effects)
