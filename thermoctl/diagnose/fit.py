@@ -339,7 +339,7 @@ def _led(posterior: Posterior, parent: float) -> np.ndarray:
     with the least cost is the start."""
     problem = posterior.problem
     full = problem.start({})
-    costs = [cost(problem, full)]
+    costs = [_cost(problem, full)]
     plant = posterior.plant.parameters
     names = {problem.unknowns[k][0]: p for k, (_, p) in posterior.amplitudes.items()}
     if costs[0] < parent or not names:
@@ -352,12 +352,11 @@ def _led(posterior: Posterior, parent: float) -> np.ndarray:
     except SimulationError:
         return full
     starts = [full, small, led]
-    costs += [cost(problem, small), cost(problem, led)]
+    costs += [_cost(problem, small), _cost(problem, led)]
     return starts[int(np.argmin(costs))]
 
 
-def cost(problem: Problem, z: np.ndarray) -> float:
-    """Return the cost in white noise at the unknowns `z`; infinite where the simulation fails."""
+def _cost(problem: Problem, z: np.ndarray) -> float:
     try:
         return problem.evaluate(z, False).cost
     except SimulationError:

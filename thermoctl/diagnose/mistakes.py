@@ -9,15 +9,18 @@ contradicts the plant's start may be off by a constant.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from thermoctl.diagnose.candidates import Candidate, candidates
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.decide import Key
-from thermoctl.diagnose.fit import Fitted, Placed, Posterior, cost, fitted
+from thermoctl.diagnose.fit import Fitted, Placed, Posterior, fitted
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.shipped import shipped
 
@@ -61,6 +64,13 @@ def _start(case: Case, c: Candidate) -> tuple[float, Plant, Placed]:
     own = c.own(p.name)
     placed = Placed(c, {p.name: own})
     problem = Posterior(case, c.extend({}, span), (placed,)).problem
-    costs = [cost(problem, problem.start({own: value})) for value in tried]
+    costs = [_cost(problem, {own: value}) for value in tried]
     k = int(np.argmin(costs))
     return costs[k], c.extend({p.name: tried[k]}, span), placed
+
+
+def _cost(problem: Problem, values: Mapping[str, float]) -> float:
+    try:
+        return problem.evaluate(problem.start(values), False).cost
+    except SimulationError:
+        return float("inf")
