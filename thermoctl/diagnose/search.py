@@ -13,6 +13,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.extend import extend, sticking, weaker
 from thermoctl.diagnose.fit import Fitted, Placed, fitted, over_noise
 from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.mistakes import mistakes
 from thermoctl.diagnose.places import PLACES
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Metric, sharpened
@@ -79,7 +80,11 @@ def search(case: Case, limits: Limits) -> Searched:
     """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent."""
     where = places(case)
     null = Weighed(fitted(case, case.plant, (), case.null), 0.0)
-    tried: dict[frozenset[tuple[str, str]], Weighed] = {frozenset(): null}
+    rivals = (
+        Weighed(f, odds(f.hypothesis.effects, where, limits))
+        for f in mistakes(case, null.fitted, limits.shortlist)
+    )
+    tried = {w.fitted.hypothesis.keys: w for w in (null, *rivals)}
     beam, seen = [null], set()
     for _ in range(limits.effects):
         best, close = beam[0].score, max(over_noise(case, beam[0].fitted, limits.clean)) <= limits.clean
