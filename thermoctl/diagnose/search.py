@@ -14,6 +14,7 @@ from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.extend import extend, sticking, weaker
 from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, over_noise
 from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.mistakes import mistakes
 from thermoctl.diagnose.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnose.odds import odds
 from thermoctl.diagnose.roles import Structure
@@ -91,9 +92,14 @@ class Search:
 def search(case: Case, limits: Limits) -> Searched:
     """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent.
 
-    A rig that drifts far is searched with an observer first."""
+    A rig that drifts far is searched with an observer first. Wrong numbers of the plant file are rivals."""
     s = started(case, limits)
+    null = s.best
     with_observer(s)
+    rivals = [s.weighed(f) for f in mistakes(case, null.fitted, limits.shortlist)]
+    if rivals:
+        s.keep(rivals)
+        s.extended(null)  # also where a rival fits better
     grow(s)
     swap(s)
     return Searched(tuple(sorted(s.tried.values(), key=lambda w: -w.score)), case.budget.spent)
