@@ -93,7 +93,7 @@ def diagnose(args: argparse.Namespace) -> int:
                 held_out,
                 progress,
                 args.drive or (),
-                _limits(args.limit or ()),
+                parsed_limits(args.limit or ()),
             )
 
     try:
@@ -132,7 +132,7 @@ def _read(folder: Path) -> dict[str, Any]:
     return found
 
 
-def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
+def parsed_limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
     """NAME=LOW:HIGH of each. Raises InputError."""
     out = {}
     for text in told:

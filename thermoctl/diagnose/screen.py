@@ -176,7 +176,7 @@ def changes(
 
 
 def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], at: Trajectory) -> np.ndarray:
-    """Integrate a new node alone along the trajectory: dn/dt = a(t) - b(t) n, a and b constant in a sample."""
+    """Integrate a new node alone along the trajectory: dn/dt = a - b n, a and b constant in a sample."""
     n = plant.nodes[node]
     net: ex.Expr = ex.ZERO
     for f in plant.flows.values():
@@ -212,7 +212,7 @@ def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], 
 
 
 @dataclass
-class _Column:
+class Column:
     """A direction to be built: per recording its forces and its changes of outputs."""
 
     item: tuple[Any, ...]
@@ -220,10 +220,10 @@ class _Column:
     outputs: list[dict[int, np.ndarray]] = field(default_factory=list)
 
 
-_Entry = tuple[_Column, np.ndarray, float]  # its projected rows, and the norm of the whole ones
+_Entry = tuple[Column, np.ndarray, float]  # its projected rows, and the norm of the whole ones
 
 
-def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Sequence[_Column], np.ndarray]]:
+def directions(metric: Metric, columns: Sequence[Column]) -> Iterable[tuple[Sequence[Column], np.ndarray]]:
     """Rows (rows, k) of columns, not whitened, a chunk at a time."""
     buffers: dict[str, np.ndarray] = {}
     for at in range(0, len(columns), CHUNK):
@@ -258,9 +258,9 @@ def screen(
     The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid."""
     first = metrics[0]
     at = [Trajectory(first, rig, r) for r in range(len(first.drives))]
-    columns: list[_Column] = []
+    columns: list[Column] = []
     for c in found:
-        columns += _columns(c, first, at, edges)
+        columns += columns_of(c, first, at, edges)
     best: list[dict[int, Direction]] = [{} for _ in metrics]
     pending: dict[tuple[Any, ...], list[_Entry]] = {}
     for part, plain in directions(first, columns):
@@ -303,9 +303,9 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
     return found
 
 
-def _columns(
+def columns_of(
     c: Candidate, metric: Metric, at: Sequence[Trajectory], edges: np.ndarray | None = None
-) -> list[_Column]:
+) -> list[Column]:
     """Return the columns that one candidate needs. item = (candidate, group, (shape, dim), columns in the group).
 
     `edges`: onsets to try instead of the grid."""
@@ -338,7 +338,7 @@ def _columns(
         for dim in dims:
             for phase in phases:
                 values = parameter_values(c, {**shape, **phase}, [EPSILON * v for v in dim])
-                column = _Column((c, group, ({**shape, **phase}, dim), count))
+                column = Column((c, group, ({**shape, **phase}, dim), count))
                 extended = c.extend(values)
                 own = {c.own(k): v for k, v in values.items()}
                 for trajectory in at:
@@ -403,7 +403,7 @@ def _score(c: Candidate, entries: Sequence[_Entry], metric: Metric, best: dict[i
     _keep(best, c, shape, gain, int(useful.sum()), start, rows @ coefficient, excited)
 
 
-def _possible(c: Candidate, column: _Column, coefficient: float) -> bool:
+def _possible(c: Candidate, column: Column, coefficient: float) -> bool:
     """Return whether the catalogue allows the size of a direction that has only one."""
     amplitudes = [p for p in c.effect.parameters if p.amplitude]
     shape, _ = column.item[2]
