@@ -143,7 +143,7 @@ test-resolve: develop              # two equally good effects, separated by the 
 
 .PHONY: test-wire
 test-wire: develop                 # pulled cables and killed programs, with the daemon and the virtual rig as two programs
-	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py tests/people/test_driving.py
+	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py tests/people/test_driving.py tests/rigs/test_examples.py
 
 .PHONY: test-browser
 test-browser: develop              # the dashboard in headless Chromium (Debian: apt-get install chromium)

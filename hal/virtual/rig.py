@@ -6,7 +6,8 @@
 - a Lawicel adapter, and behind it CiA-402 drives, amplifiers and senders of DBC files
 - Modbus TCP servers and RTU units
 
-One plant feeds them all, of a rig with axes one for each; the drive's command moves it. It writes to `hal.run_dir`
+One plant feeds them all (of a rig with axes one for each). The drive's command moves it. It writes to
+`hal.run_dir`:
 
     reference.csv   data that the daemon never gets: the output's reference encoder and the true state,
                     100 rows a second, `t` on the machine's monotonic clock; columns of an axis: AXIS.NAME

@@ -14,6 +14,7 @@ from tests.hal.conftest import free_port
 from tests.rigs.axes import Axes
 from thermoctl.settings import load_rig
 
+pytestmark = pytest.mark.slow  # in real time: make test-wire
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
 
@@ -25,6 +26,8 @@ def example(tmp_path):
     def start(name):
         for folder in ("devices", "examples"):
             shutil.copytree(CONFIG / folder, tmp_path / "config" / folder)
+        odrive = tmp_path / "config/devices/library/odrive-cansimple.yaml"  # patient with a loaded machine
+        odrive.write_text(odrive.read_text().replace("watchdog_s: 0.1", "watchdog_s: 1"))
         path = tmp_path / "config/examples" / f"{name}.yaml"
         path.write_text(re.sub(r"(127\.0\.0\.1:)\d+", rf"\g<1>{free_port()}", path.read_text()))
         settings = load_rig(path)
