@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hal.binding import Binding, Bound
-from hal.simulated import PlantRig
+from hal.virtual.plants import Readings
 from thermoctl.yamlfile import InputError
 
 SUPPLY_V = 24.0
@@ -62,7 +62,7 @@ class Pty:
 class VirtualDevice:
     """One device of the rig. `verbs` are the commands of the control socket to it, beside plug and unplug."""
 
-    def __init__(self, binding: Binding, rig: PlantRig) -> None:
+    def __init__(self, binding: Binding, rig: Readings) -> None:
         self.binding, self.rig, self.name = binding, rig, binding.name
         self.verbs: dict[str, Callable[[str], None]] = {}
 
@@ -100,17 +100,22 @@ class VirtualDevice:
 
     def reading(self, bound: Bound) -> float | None:
         """Return the sensor's raw reading now; None where the plant has no such role."""
-        if bound.role == "supply_v":
+        if channel_of(bound.role) == "supply_v":
             return self.raw(bound, SUPPLY_V)
         return self.raw(bound, self.rig.sense(bound.role)) if bound.role in self.rig.index else None
+
+
+def channel_of(role: str) -> str:
+    """Return the channel of a role: without the axis."""
+    return role.rpartition(".")[2]
 
 
 class PtyDevice(VirtualDevice):
     """A device on a serial port of its own."""
 
-    def __init__(self, binding: Binding, rig: PlantRig, path: str) -> None:
+    def __init__(self, binding: Binding, rig: Readings, port: str | Pty) -> None:
         super().__init__(binding, rig)
-        self.pty = Pty(path)
+        self.pty = Pty(port) if isinstance(port, str) else port
 
     def plug(self) -> None:
         """Connect the device to its wire (again)."""

@@ -58,6 +58,8 @@ def _dictionary(node: int) -> dict[tuple[int, int], Entry]:
         (0x6077, 0): Entry("h"),
         (0x6078, 0): Entry("h"),
         (0x6079, 0): Entry("I", 24000),
+        (0x6064, 0): Entry("i"),
+        (0x607A, 0): Entry("i", 0, True),
         (0x2071, 0): Entry("i", 0, True),
         (0x2078, 0): Entry("i"),
     }
@@ -76,8 +78,9 @@ def _dictionary(node: int) -> dict[tuple[int, int], Entry]:
 class Cia402Drive:
     """The drive. The rig sets readings in `od[index, 0].value` and takes `command` (counts of the target).
 
-    `command_object` is the target object (0x2071 or 0x6071). With `alive` False the drive is unpowered and
-    mute. With `heartbeat` False it sends no heartbeat. Its stop input is active until `stop_until_s`.
+    `command_object` is the target object (0x2071, 0x6071 or 0x607A). With `alive` False the drive has no
+    power and is mute. With `heartbeat` False it sends no heartbeat. Its stop input is active until
+    `stop_until_s`.
     """
 
     node: int
@@ -100,7 +103,7 @@ class Cia402Drive:
 
     def power_up(self) -> None:
         """Start as after power-on: default objects, boot-up message, pre-operational."""
-        readings = {k: self.od[k, 0].value for k in (0x6078, 0x6079, 0x2078)}
+        readings = {k: self.od[k, 0].value for k in (0x6064, 0x6078, 0x6079, 0x2078)}
         self.od = _dictionary(self.node)
         for k, value in readings.items():
             self.od[k, 0].value = value

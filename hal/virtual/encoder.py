@@ -6,15 +6,15 @@ import os
 
 from hal.binding import Binding
 from hal.profile import BinaryFrame, typed
-from hal.simulated import PlantRig
 from hal.virtual.device import PtyDevice
+from hal.virtual.plants import Readings
 from hal.wire import Framer
 
 
 class EncoderStream(PtyDevice):
     """An encoder that sends one binary frame each period."""
 
-    def __init__(self, binding: Binding, rig: PlantRig) -> None:
+    def __init__(self, binding: Binding, rig: Readings) -> None:
         super().__init__(binding, rig, binding.port)
         spec = typed(binding.profile.bus_spec, BinaryFrame)
         self._framer, self._spec = Framer(spec), spec

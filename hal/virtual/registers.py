@@ -8,9 +8,9 @@ import socket
 
 from hal.binding import Binding
 from hal.profile import Register, typed
-from hal.simulated import PlantRig
-from hal.virtual.device import PtyDevice
+from hal.virtual.device import PtyDevice, channel_of
 from hal.virtual.modbus import ModbusUnit
+from hal.virtual.plants import Readings
 from thermoctl.yamlfile import InputError, suggest
 
 MEANS = ("voltage_v", "current_a")  # roles whose register holds the mean since its last refresh
@@ -21,7 +21,7 @@ MAX_REQUEST = 1024  # bytes: longest input read at once (TCP) or kept in the buf
 class ModbusOnWire(PtyDevice):
     """A register device over TCP or RTU. Voltage and current are means since the last refresh."""
 
-    def __init__(self, binding: Binding, rig: PlantRig) -> None:
+    def __init__(self, binding: Binding, rig: Readings) -> None:
         super().__init__(binding, rig, binding.port.removeprefix("rtu:"))
         self.unit = ModbusUnit(binding.address)
         tcp = re.fullmatch(r"tcp:(.+):(\d+)", binding.port)
@@ -123,7 +123,7 @@ class ModbusOnWire(PtyDevice):
     def tick(self, now_s: float, tick: int) -> None:
         """Add to the means, and refresh the registers when they are due."""
         for i, b in enumerate(self.binding.bounds):
-            if b.role in MEANS:
+            if channel_of(b.role) in MEANS:
                 self._sums[i] += self.rig.true(b.role)
         self._summed += 1
         if self._summed >= self._every:
@@ -134,8 +134,9 @@ class ModbusOnWire(PtyDevice):
             register = typed(b.channel.source, Register)
             if b.channel.name in self._open and register.sentinels:
                 raw: float | None = register.sentinels[0]
-            elif b.role in MEANS and self._summed:
-                raw = self.raw(b, self.rig.measured(self.rig.index[b.role], self._sums[i] / self._summed))
+            elif channel_of(b.role) in MEANS and self._summed:
+                mean = self._sums[i] / self._summed
+                raw = self.raw(b, self.rig.measured(self.rig.index[b.role], mean))
             else:
                 raw = self.reading(b)
             self.unit.store(register, raw or 0.0)

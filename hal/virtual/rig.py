@@ -3,13 +3,14 @@
 `hal.devices` lists the devices that the daemon uses; this program simulates them by the same profiles:
 
 - a pty for each serial port, with a symbolic link at the port's path
-- a Lawicel adapter, and behind it a CiA-402 drive or the sender of a DBC file
+- a Lawicel adapter, and behind it CiA-402 drives, amplifiers and senders of DBC files
 - Modbus TCP servers and RTU units
 
-One plant feeds them all; the drive's current moves it. It writes to `hal.run_dir`
+One plant feeds them all (of a rig with axes one for each). The drive's command moves it. It writes to
+`hal.run_dir`:
 
     reference.csv   data that the daemon never gets: the output's reference encoder and the true state,
-                    100 rows a second, `t` on the machine's monotonic clock
+                    100 rows a second, `t` on the machine's monotonic clock; columns of an axis: AXIS.NAME
     control.sock    one command line in, one line out: unplug cables and inject faults (`help` lists them)
 """
 
@@ -20,6 +21,7 @@ import ctypes
 import errno
 import gc
 import os
+import re
 import select
 import signal
 import socket
@@ -29,13 +31,14 @@ from pathlib import Path
 from typing import TextIO
 
 from hal.binding import Binding, bind, check_rig
-from hal.simulated import PlantRig, make_rig
+from hal.simulated import make_rig
 from hal.virtual.device import VirtualDevice
-from hal.virtual.drive import ENABLED
 from hal.virtual.encoder import EncoderStream
+from hal.virtual.plants import Plants, Readings
 from hal.virtual.registers import ModbusOnWire
-from hal.virtual.slcan import DbcSender, DriveOnSlcan
+from hal.virtual.slcan import DbcAmplifier, DbcSender, DriveOnSlcan, SlcanLine
 from hal.virtual.text_meter import TextMeter
+from thermoctl.channels import AxesChannels
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, suggest
 
@@ -44,23 +47,32 @@ REFERENCE_HZ = 100
 PRIORITY = 70  # below the daemon's loop
 MAX_COMMAND = 400  # bytes of a line to the control socket
 _REFERENCE = ("output_reference_um", "position_um", "coil_c", "air_c")
+_COLUMNS = (*_REFERENCE, "drive", "enabled")
 
-_KINDS: dict[str, Callable[[Binding, PlantRig], VirtualDevice]] = {
+_KINDS: dict[str, Callable[[Binding, Readings], VirtualDevice]] = {
     "serial-binary": EncoderStream,
     "serial-lines": TextMeter,
-    "can-cia402": DriveOnSlcan,
-    "can-dbc": DbcSender,
     "modbus": ModbusOnWire,
 }
 
 
-def virtual_device(binding: Binding, rig: PlantRig) -> VirtualDevice:
-    """Make the device that simulates `binding`. Raises InputError for a CAN port that is not slcan."""
-    if binding.profile.bus.startswith("can") and not binding.port.startswith("slcan:"):
+def virtual_device(
+    binding: Binding, rig: Readings, lines: dict[str, SlcanLine] | None = None
+) -> VirtualDevice:
+    """Make the device that simulates `binding`; lines: the CAN adapters of the rig so far, by path.
+
+    Raises InputError for a CAN port that is not slcan."""
+    bus, amplifier = binding.profile.bus, binding.profile.amplifier
+    if not bus.startswith("can"):
+        return _KINDS[bus](binding, rig)
+    if not binding.port.startswith("slcan:"):
         raise InputError(
             f"{binding.place}: the virtual rig plays CAN devices on slcan ports only, found '{binding.port}'"
         )
-    return _KINDS[binding.profile.bus](binding, rig)
+    path = re.sub(r"^slcan:|@\d+$", "", binding.port)
+    line = ({} if lines is None else lines).setdefault(path, SlcanLine(path))
+    kind = DriveOnSlcan if bus == "can-cia402" else DbcSender if amplifier is None else DbcAmplifier
+    return kind(binding, rig, line)
 
 
 class VirtualRig:
@@ -69,11 +81,15 @@ class VirtualRig:
     def __init__(self, settings: Settings) -> None:
         folder = Path(settings.path).parent
         self.run_dir = (folder / settings.hal.run_dir).resolve()
-        self.plant = make_rig(settings)
+        several = isinstance(settings.channels, AxesChannels)
+        self.axes = {p.axis: make_rig(p) for p in settings.parts} if several else {"": make_rig(settings)}
+        self.plant: Readings = Plants(self.axes) if several else self.axes[""]
         bindings = [bind(node, folder, settings.channels) for node in settings.hal.devices]
         check_rig(bindings)
-        self.devices = {b.name: virtual_device(b, self.plant) for b in bindings}
-        self._amplifier = next((d for d in self.devices.values() if isinstance(d, DriveOnSlcan)), None)
+        lines: dict[str, SlcanLine] = {}
+        self.devices = {b.name: virtual_device(b, self.plant, lines) for b in bindings}
+        drives = [d for d in self.devices.values() if isinstance(d, DriveOnSlcan | DbcAmplifier)]
+        self._amplifiers = {d.binding.axis: d for d in drives if d.binding.profile.amplifier is not None}
         self.period_s = settings.loop.period_s
         self.stopping = False
         self.tick = self.slips = 0
@@ -89,7 +105,7 @@ class VirtualRig:
             with open(self.run_dir / "reference.csv", "w", buffering=1) as reference:
                 reference.write(
                     "# the virtual rig's own truth; t is CLOCK_MONOTONIC\n"
-                    f"t,{','.join(_REFERENCE)},drive,enabled\n"
+                    f"t,{','.join(f'{a}.{n}' if a else n for a in self.axes for n in _COLUMNS)}\n"
                 )
                 for device in self.devices.values():
                     announce(f"{device.name}: {device.binding.port}")
@@ -131,17 +147,21 @@ class VirtualRig:
                     owners[fd].ready(fd, now_s)
 
     def _step(self, now_s: float) -> None:
-        self.plant.step(self._amplifier.output if self._amplifier else 0.0)
+        for axis, plant in self.axes.items():
+            plant.step(self._amplifiers[axis].output if axis in self._amplifiers else 0.0)
         self.tick += 1
         for device in self.devices.values():
             device.tick(now_s, self.tick)
 
     def _record(self, reference: TextIO, t: float) -> None:
-        amplifier = self._amplifier
-        values = [self.plant.true(r) if r in self.plant.index else float("nan") for r in _REFERENCE]
-        if "output_reference_um" in self.plant.index:
-            values[0] = self.plant.sense("output_reference_um")
-        values += [amplifier.output, float(amplifier.drive.state == ENABLED)] if amplifier else [0.0, 0.0]
+        values = []
+        for axis, plant in self.axes.items():
+            amplifier = self._amplifiers.get(axis)
+            own = [plant.true(r) if r in plant.index else float("nan") for r in _REFERENCE]
+            if "output_reference_um" in plant.index:
+                own[0] = plant.sense("output_reference_um")
+            own += [amplifier.output, float(amplifier.enabled)] if amplifier else [0.0, 0.0]
+            values += own
         reference.write(f"{t:.6f}," + ",".join(f"{v:.6g}" for v in values) + "\n")
 
     def _serve(self, control: socket.socket) -> None:

@@ -7,14 +7,14 @@ import re
 from hal.binding import Binding
 from hal.profile import TextField, TextLine, typed
 from hal.serial_line import LineReader
-from hal.simulated import PlantRig
 from hal.virtual.device import PtyDevice
+from hal.virtual.plants import Readings
 
 
 class TextMeter(PtyDevice):
     """A meter that answers each request with a line that the profile's own pattern accepts."""
 
-    def __init__(self, binding: Binding, rig: PlantRig) -> None:
+    def __init__(self, binding: Binding, rig: Readings) -> None:
         super().__init__(binding, rig, binding.port)
         self._lines, self._text = LineReader(), typed(binding.profile.bus_spec, TextLine)
         self.mute = self.half = False

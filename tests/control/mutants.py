@@ -2,7 +2,8 @@
 
     python -m tests.control.mutants [--page docs/proof/mutants.md] [--only NAME]
 
-Mutated are arming.py and faults.py whole, and of law.py the functions that judge, compare, protect and arm: a comparison takes
+Mutated are arming.py and faults.py whole, of law.py the functions that judge, compare, protect and arm, and what the axes of a
+rig have in common (tests/control/axes.py): a comparison takes
 its neighbour (< <=, > >=, == !=) or is turned round, and / or change places, `not` goes, + - and * / change places, a number grows
 by one, an assignment or a call goes, a condition is always true or never, |= becomes = and &=. A mutant that no scenario breaks is
 listed; WHY says of each why it means the same, or the run fails. One that does not end within LIMIT_S of processor time is broken,
@@ -23,10 +24,12 @@ import sys
 import time
 import types
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from tests.control import protection
+from tests.control import axes, protection
 from tests.control.test_protection import CONTROL, PROTECTION
 
 LIMIT_S = 10.0  # all scenarios take about 2 s on the source as it is
@@ -54,7 +57,8 @@ SWAPS: dict[type, list[type]] = {
 _FLAG = "a flag: only ever looked at as zero or not"
 _NO_DRIVE = "v is 0 wherever enable is 0: control() and _arm() empty it; a second lock on the same door"
 WHY: dict[str, str] = {
-    "law.py:_agree: `if self.fresh[_COIL]: self._compare_order()` condition True in `if self.fresh[_COIL]:`": "means and estimates move over seconds: looked at in every tick the same is found, up to 0.1 s earlier, at a cost",
+    "axes.py:__init__: `0` + 1 in `self.sample = Sample(0)`": "the sample's arrays are replaced in the next lines",
+    "law.py:_agree: `if self.coil_fresh: self._compare_order()` condition True in `if self.coil_fresh:`": "means and estimates move over seconds: looked at in every tick the same is found, up to 0.1 s earlier, at a cost",
     "law.py:protect: `clip(self.v, -self.p.output_limit, self.p.output_limit) if s` condition True in "
     "`self.drive = clip(self.v, -self.p.output_limit, self.p.output_limit) if self.enable > 0.0 `": _NO_DRIVE,
     "law.py:protect: `self.enable > 0.0` Gt -> GtE in "
@@ -116,12 +120,17 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
 
 
 def mutants(path: Path, functions: tuple[str, ...] | None) -> Iterator[tuple[str, ast.Module]]:
-    """(name, tree) of every mutant of a file; of some functions only, or of the whole module but its texts. Lines that are the
-    same have their number behind the name. The tree is the same object every time, changed in one place until the next one
+    """(name, tree) of every mutant of a file; of some functions and loops only, or of the whole module but its texts. A loop is
+    named by its line, as `for k in range(n):`. Lines that are the same have their number behind the name. The tree is the same object every time, changed in one place until the next one
     is asked for."""
     source, seen = path.read_text(), dict[str, int]()
     lines, tree = source.splitlines(), ast.parse(source)
     owners = [(f.lineno, f.end_lineno or 0, f.name) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef)]
+    loops = [
+        (f.lineno, f.end_lineno or 0, lines[f.lineno - 1].strip())
+        for f in ast.walk(tree)
+        if isinstance(f, ast.For)
+    ]
     places = [
         (parent, field, k, node)
         for parent in ast.walk(tree)
@@ -132,7 +141,8 @@ def mutants(path: Path, functions: tuple[str, ...] | None) -> Iterator[tuple[str
     for parent, field, k, node in places:
         line = getattr(node, "lineno", 0)
         owner = next((name for first, last, name in owners if first <= line <= last), "module")
-        if not line or functions is not None and owner not in functions:
+        within = {owner, *(name for first, last, name in loops if first <= line <= last)}
+        if not line or functions is not None and within.isdisjoint(functions):
             continue
         segment = " ".join((ast.get_source_segment(source, node) or "").split())
         context = " ".join(lines[line - 1].split())
@@ -181,10 +191,10 @@ def build(trees: dict[str, ast.Module]) -> types.ModuleType:
     return made["law"]
 
 
-def survives(trees: dict[str, ast.Module], order: list) -> bool:
+def survives(make: Callable[[], Any], order: list) -> bool:
     """Whether every scenario holds. The scenario that breaks comes first the next time: neighbours often break the same."""
     try:
-        module = build(trees)
+        module = make()
     except Exception:
         return False
     for k, scenario in enumerate(order):
@@ -194,6 +204,15 @@ def survives(trees: dict[str, ast.Module], order: list) -> bool:
             order.insert(0, order.pop(k))
             return False
     return True
+
+
+TARGETS = (
+    (CONTROL / "arming.py", None, build, protection.SCENARIOS),
+    (CONTROL / "faults.py", None, build, protection.SCENARIOS),
+    (CONTROL / "law.py", PROTECTION, build, protection.SCENARIOS),
+    *((path, functions, axes.build, axes.SCENARIOS) for path, functions in axes.MUTATED),
+)
+"""Files, their functions (None: all), how a law or the code of axes is made of them, and what must break."""
 
 
 class Endless(BaseException):
@@ -208,16 +227,17 @@ def share(which: int, of: int, only: str) -> tuple[int, list[str]]:
     """(mutants tried, those that survive) of every of-th mutant, beginning with number `which`."""
     warnings.simplefilter("ignore")  # numbers that are not finite are meant
     signal.signal(signal.SIGPROF, _endless)
-    order, number, tried, left = list(protection.SCENARIOS), 0, 0, []
-    for name, functions in (("arming", None), ("faults", None), ("law", PROTECTION)):
-        for what, tree in mutants(CONTROL / f"{name}.py", functions):
+    number, tried, left = 0, 0, []
+    orders = {id(s): list(s) for s in (protection.SCENARIOS, axes.SCENARIOS)}
+    for path, functions, make, scenarios in TARGETS:
+        for what, tree in mutants(path, functions):
             number += 1
             if only not in what or number % of != which:
                 continue
             tried += 1
             try:
                 signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
-                found = survives({name: tree}, order)
+                found = survives(partial(make, {path.stem: tree}), orders[id(scenarios)])
             except Endless:
                 found = False
             finally:
@@ -233,17 +253,19 @@ def main() -> int:
     parser.add_argument("--page")
     parser.add_argument("--only", default="")
     args = parser.parse_args()
-    begun, order, count = time.perf_counter(), list(protection.SCENARIOS), os.cpu_count() or 1
+    begun, count = time.perf_counter(), os.cpu_count() or 1
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        assert survives({}, order), "a scenario fails on the source as it is"
+        for make, scenarios in ((build, protection.SCENARIOS), (axes.build, axes.SCENARIOS)):
+            assert survives(partial(make, {}), list(scenarios)), "a scenario fails on the source as it is"
     with multiprocessing.get_context("fork").Pool(count) as pool:
         found = pool.starmap(share, [(which, count, args.only) for which in range(count)], chunksize=1)
     total, left = sum(tried for tried, _ in found), sorted(m for _, survivors in found for m in survivors)
     unexplained = [m for m in left if m not in WHY]
     text = (
-        f"{total} mutants of the protection (arming.py, faults.py, {', '.join(PROTECTION)} of law.py), {total - len(left)} broken by "
-        f"{len(order)} scenarios, {len(left)} survive, {len(unexplained)} of them unexplained.\n"
+        f"{total} mutants of the protection (arming.py, faults.py, {', '.join(PROTECTION)} of law.py) and of what axes have in "
+        f"common ({', '.join(p.name for p, _ in axes.MUTATED)}), {total - len(left)} broken by "
+        f"{len(protection.SCENARIOS)} and {len(axes.SCENARIOS)} scenarios, {len(left)} survive, {len(unexplained)} of them unexplained.\n"
     )
     print(f"{text}{time.perf_counter() - begun:.0f} s on {count} processors")
     if args.page:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.control import protection
+from tests.control import axes, protection
 from thermoctl.control import law
 
 CONTROL = Path(law.__file__).parent
@@ -91,3 +91,8 @@ def own_lines(file):
         if isinstance(node, ast.FunctionDef) and node.name in PROTECTION
         for line in range(node.lineno, node.end_lineno + 1)
     }
+
+
+@pytest.mark.parametrize("scenario", axes.SCENARIOS, ids=lambda s: s.__name__)
+def test_axes(scenario):
+    scenario(axes.PRODUCT)

@@ -75,15 +75,18 @@ def test_a_device_is_read_as_its_manual_says(tmp_path, name, capsys):
         device.wire.plug()
         if device.port.startswith("tcp:"):
             device.port = f"tcp:127.0.0.1:{device.wire.number}"
+        plugged = time.monotonic()
         read(device, profile, good)
+        again_s = time.monotonic() - plugged
         device.fault()
         found = {r.channel: r for r in read(device, profile, lambda f: bool(f[device.bad].problem))}
         assert "\n" not in found[device.bad].problem
         if os.environ.get("THERMOCTL_TABLE"):
             with capsys.disabled():
-                print(
-                    f"\n| {name} | {profile.bus} | {len(device.expected)} | {first_s:.2f} | {found[device.bad].problem} |"
-                )
+                value = ", ".join(f"{c} {v:g}" for c, v in list(device.expected.items())[:2])
+                more = f" and {len(device.expected) - 2} more" if len(device.expected) > 2 else ""
+                row = (name, profile.bus, profile.manual, value + more, f"{first_s:.2f}", f"{again_s:.2f}")
+                print("\n| " + " | ".join((*row, found[device.bad].problem.replace("|", "/"))) + " |")
     finally:
         device.wire.close()
 

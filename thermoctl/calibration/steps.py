@@ -18,7 +18,6 @@ from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import Recorded, read
 from thermoctl.calibration.schedules import triangles
-from thermoctl.channels import Channels
 from thermoctl.identify import modelfile, tuning
 from thermoctl.identify.expansion import Expansion
 from thermoctl.identify.filter import Kalman
@@ -127,9 +126,12 @@ class Proof:
 Result = Doctor | Response | Pid | Test | Model | Proof
 
 
-def doctor(states: Mapping[str, str], channels: Channels) -> Doctor:
-    """Check the channels. Raises InputError with the invalid ones."""
-    found = {n: states.get(n, "ABSENT") for n in (*NEEDED, *channels.temperatures)}
+def doctor(states: Mapping[str, str], settings: Settings) -> Doctor:
+    """Check the channels; the power needs no voltage where the coil's resistance is known.
+
+    Raises InputError with the invalid ones."""
+    needed = [n for n in NEEDED if n != "voltage_v" or settings.protection.resistance_ohm == 0.0]
+    found = {n: states.get(n, "ABSENT") for n in (*needed, *settings.channels.temperatures)}
     if bad := [f"{n} is {s}" for n, s in found.items() if s != "OK"]:
         raise InputError(
             "a calibration needs the second encoder and the thermometers of all points; "

@@ -154,7 +154,7 @@ class Wizard:
         recordings = {name: self._recording(name) for name in TESTS}
         match step:
             case "doctor":
-                return steps.doctor(self.rig.now()["channels"], self.settings.channels)
+                return steps.doctor(self.rig.now()["channels"], self.settings)
             case "step":
                 return steps.response(self.settings, self.rig)
             case "pid":

@@ -12,7 +12,11 @@ enum { B_STOPPED = 34, B_FOLLOWING = 35, B_HOT, B_HOT_MODEL, B_HEATING, B_DISAGR
        B_MONITORED };
 enum { OFF, SAFE, READY, ARMED, FAULT };
 enum { NONE, ARM, DISARM, SETPOINT };
+enum { B_OTHER_AXIS = 53 };
 #define AIR_READINGS 30.0
+#define COPPER 0.00393
+#define RESISTANCE_S 1.0
+#define RESISTANCE_LATE_S 10.0
 #define BIT(b) ((uint64_t)1 << (b))
 
 static int finite_(double v) { return v - v == 0.0; }
@@ -26,10 +30,10 @@ static const double *take(const double *p, double *to, int count) {
 }
 
 int law_load(law_t *l, const char *path) {
-    static double numbers[4096];
+    static double numbers[4 * ORDER * ORDER + 4096];
     FILE *f = fopen(path, "rb");
     if (!f) return -1;
-    size_t count = fread(numbers, sizeof(double), 4096, f);
+    size_t count = fread(numbers, sizeof(double), sizeof numbers / sizeof *numbers, f);
     fclose(f);
     const double *p = numbers;
     memset(l, 0, sizeof *l);
@@ -45,14 +49,14 @@ int law_load(law_t *l, const char *path) {
         &l->kp, &l->ti_s, &l->td_s, &l->output_limit,
         &l->setpoint_rate_um_s, &l->setpoint_low_um, &l->setpoint_high_um};
     for (unsigned k = 0; k < sizeof scalars / sizeof *scalars; k++) *scalars[k] = *p++;
-    l->average_length = (int)*p++, l->compensate_on = *p++ > 0.0;
+    l->average_length = (int)*p++, l->compensate_on = *p++ > 0.0, l->position_mode = *p++ > 0.0;
     l->bound_um = *p++, l->slew_um_s = *p++;
     p = take(p, l->low, N), p = take(p, l->high, N), p = take(p, l->rate, N);
     p = take(p, l->stale_s, N), p = take(p, l->frozen_s, N), p = take(p, l->required, N);
     double *limits[] = {&l->following_um, &l->following_limit_s, &l->coil_limit_c, &l->coil_rate_limit, &l->coil_rate_time_s,
         &l->innovation_limit_c, &l->innovation_time_s, &l->power_limit_w, &l->power_time_s, &l->idle_current_a,
         &l->idle_power_w, &l->idle_limit_s, &l->saturation_limit_s, &l->amplifier_limit_s, &l->late_s, &l->agree_time_s,
-        &l->drift_limit_c, &l->monitored_limit_c, &l->resistance_ohm, &l->resistance_tolerance, &l->resistance_v,
+        &l->drift_limit_c, &l->monitored_limit_c, &l->resistance_current_a, &l->resistance_ohm, &l->resistance_tolerance, &l->resistance_v,
         &l->current_per_drive, &l->current_tolerance_a, &l->flexure_um_per_a, &l->position_tolerance_um,
         &l->reference_tolerance_um, &l->order_limit_c};
     for (unsigned k = 0; k < sizeof limits / sizeof *limits; k++) *limits[k] = *p++;
@@ -90,8 +94,15 @@ static void judge_readings(law_t *l, double dt) {
     for (int c = 0; c < N; c++) {
         l->age[c] += l->dt;
         l->since_s[c] += l->dt;
-        int status = l->status[c];
-        if (status == ABSENT && l->required[c] == 0.0) {
+        int status = l->status[c], fresh = l->fresh[c];
+        double value = l->value[c];
+        if (status == ABSENT && c == COIL && l->by_resistance) {
+            if (!l->coil_fresh) {
+                if (l->seen[c] == 0.0 || l->age[c] > RESISTANCE_LATE_S) l->verdict[c] = 1.0 + K_ERROR;
+                continue;
+            }
+            status = OK, fresh = 1, value = l->ohm_c;
+        } else if (status == ABSENT && l->required[c] == 0.0) {
             l->verdict[c] = 1.0 + K_ERROR;
             continue;
         }
@@ -99,8 +110,8 @@ static void judge_readings(law_t *l, double dt) {
             l->verdict[c] = 1.0 + K_ERROR;
         } else if (status == STALE) {
             l->verdict[c] = 1.0 + K_STALE;
-        } else if (l->fresh[c]) {
-            judge_reading(l, c, l->value[c]);
+        } else if (fresh) {
+            judge_reading(l, c, value);
             l->age[c] = 0.0;
         } else if (l->age[c] > l->stale_s[c] || (l->seen[c] == 0.0 && l->verdict[c] == 0.0)) {
             l->verdict[c] = 1.0 + K_STALE;
@@ -145,7 +156,25 @@ static double resistance(law_t *l) {
     double s = 20.0;
     if (l->predicts[0] && l->air_known > 0.0) s = l->T[0] + l->air_c;
     else if (l->verdict[COIL] == 0.0) s = l->last[COIL];
-    return l->resistance_ohm * (1.0 + 0.00393 * (s - 20.0));
+    return l->resistance_ohm * (1.0 + COPPER * (s - 20.0));
+}
+
+static void measure_resistance(law_t *l) {
+    l->coil_fresh = 0;
+    l->by_resistance = l->resistance_ohm > 0.0 && l->required[COIL] == 0.0 && l->status[VOLTAGE] != ABSENT
+                       && l->status[CURRENT] != ABSENT;
+    if (!l->by_resistance) return;
+    double part = least(1.0, l->dt / RESISTANCE_S);
+    if (l->verdict[VOLTAGE] == 0.0 && l->verdict[CURRENT] == 0.0) {
+        l->ohm_w += part * (l->last[VOLTAGE] * l->last[CURRENT] - l->ohm_w);
+        l->ohm_a2 += part * (l->last[CURRENT] * l->last[CURRENT] - l->ohm_a2);
+    }
+    l->ohm_s = l->ohm_a2 > l->resistance_current_a * l->resistance_current_a ? l->ohm_s + l->dt : 0.0;
+    if (l->ohm_s >= 2.0 * RESISTANCE_S) {
+        l->ohm_s -= RESISTANCE_S;
+        l->ohm_c = 20.0 + (l->ohm_w / (l->resistance_ohm * l->ohm_a2) - 1.0) / COPPER;
+        l->coil_fresh = 1;
+    }
 }
 
 static void power_and_air(law_t *l) {
@@ -183,25 +212,29 @@ static void predict_corrections(law_t *l, double elapsed) {
 }
 
 static void correct(law_t *l) {
-    int coil_new = l->fresh[COIL] && l->verdict[COIL] == 0.0 && l->suspect[COIL] == 0.0, n = l->n;
+    int coil_new = l->coil_fresh && l->verdict[COIL] == 0.0 && l->suspect[COIL] == 0.0, n = l->n;
     if (l->resumed > 0.0 && coil_new) {
-        double s = l->value[COIL] - l->air_c;
+        double s = l->last[COIL] - l->air_c;
         for (int j = 0; j < n; j++) s -= l->C[j] * l->x[j];
         l->resumed = 0.0;
-        l->coil_slow_c = l->value[COIL];
+        l->coil_slow_c = l->last[COIL];
         if (!(fabs(s) <= 2.0)) {
             forget(l);
             l->air_started = 0.0;
             if (l->verdict[AIR] == 0.0) start_air(l, l->last[AIR]);
         }
     }
-    if (l->air_known == 0.0 && coil_new) start_air(l, l->value[COIL]);
-    if (l->corrected == 0.0 && !coil_new) return;
+    if (l->air_known == 0.0 && coil_new) start_air(l, l->last[COIL]);
+    if (l->corrected == 0.0 && !coil_new) {
+        if (l->status[COIL] == ABSENT && l->air_started >= AIR_READINGS) l->corrected = 1.0;
+        return;
+    }
     for (int k = 0; k < l->sensors_used; k++) {
         int c = COIL + l->sensors[k];
         l->e[k] = 0.0;
-        if (l->fresh[c] && l->verdict[c] == 0.0 && l->suspect[c] == 0.0) {
-            double s = l->value[c] - l->air_c;
+        int new = c == COIL ? coil_new : l->fresh[c] && l->verdict[c] == 0.0 && l->suspect[c] == 0.0;
+        if (new) {
+            double s = l->last[c] - l->air_c;
             for (int j = 0; j < n; j++) s -= l->C[l->sensors[k] * n + j] * l->x[j];
             l->e[k] = s;
         }
@@ -211,7 +244,7 @@ static void correct(law_t *l) {
         l->coil_elapsed_s = 0.0;
         if (l->corrected == 0.0) {
             for (int i = 0; i < n; i++) l->x[i] += l->first_gain * l->K[i * l->sensors_used] * l->e[0];
-            l->coil_slow_c = l->value[COIL];
+            l->coil_slow_c = l->last[COIL];
             l->coil_rate_k_s = 0.0;
             l->corrected = 1.0;
             l->primed = 0.0;
@@ -220,7 +253,7 @@ static void correct(law_t *l) {
         predict_corrections(l, elapsed);
         l->innovation_c = l->e[0];
         l->innovation_mean_c += (l->e[0] - l->innovation_mean_c) * least(1.0, elapsed / l->innovation_time_s);
-        l->coil_rate_k_s = (l->value[COIL] - l->coil_slow_c) / l->coil_rate_time_s;
+        l->coil_rate_k_s = (l->last[COIL] - l->coil_slow_c) / l->coil_rate_time_s;
         l->coil_slow_c += l->coil_rate_k_s * least(elapsed, l->coil_rate_time_s);
     }
     double gain = 1.0;
@@ -245,6 +278,8 @@ static void estimate(law_t *l, double dt) {
     l->tick += 1;
     l->coil_elapsed_s += l->dt;
     if (dt > 10.0) forget(l);
+    l->coil_fresh = l->fresh[COIL];
+    if (l->status[COIL] == ABSENT) measure_resistance(l);
     judge_readings(l, dt);
     power_and_air(l);
     double scale = l->dt / l->model_period_s;
@@ -300,6 +335,10 @@ static void compensate(law_t *l) {
     l->compensation_um = target;
 }
 
+static double target(law_t *l) {
+    return clip(l->reference_um - l->compensation_um, -l->output_limit, l->output_limit);
+}
+
 static void control(law_t *l, int command, double command_value) {
     if (l->fresh[POSITION] && l->verdict[POSITION] == 0.0) {
         if (l->averaged == 0)
@@ -321,11 +360,16 @@ static void control(law_t *l, int command, double command_value) {
     if (l->state != ARMED || (l->reports && !l->enabled)) {
         l->reference_um = l->compensated_um;
         l->v = l->eps1 = l->d1 = 0.0;
+        if (l->position_mode) l->v = target(l);
         return;
     }
     double step = l->setpoint_rate_um_s * l->dt;
     l->reference_um = clip(l->setpoint_um, l->reference_um - step, l->reference_um + step);
     double eps = l->reference_um - l->compensated_um, change = eps - l->eps1;
+    if (l->position_mode) {
+        l->v = target(l), l->eps1 = eps;
+        return;
+    }
     double d = l->dt > 0.0 ? change / l->dt : 0.0;
     l->v = clip(l->v + l->kp * (change + l->dt / l->ti_s * eps + l->td_s * (d - l->d1)), -l->output_limit, l->output_limit);
     l->eps1 = eps;
@@ -412,7 +456,7 @@ static void agree(law_t *l) {
             l->apart_c[m] += part * (l->last[COIL + m] - l->air_c - l->T[m] - l->apart_c[m]);
             if (m > 0 && fabs(l->apart_c[m]) > l->monitored_limit_c) l->faults |= BIT(B_MONITORED);
         }
-    if (l->fresh[COIL]) compare_order(l);
+    if (l->coil_fresh) compare_order(l);
     if (l->exchanged > 0.0) l->faults |= BIT(B_MONITORED);
     if (l->expands && l->verdict[REFERENCE] == 0.0 && l->verdict[POSITION] == 0.0) {
         s = l->last[REFERENCE] - l->last[POSITION] - l->expansion_um;
@@ -484,6 +528,35 @@ void law_step(law_t *l, double dt, int command, double command_value, uint64_t e
     compensate(l);
     control(l, command, command_value);
     protect(l, command, external);
+}
+
+/* Axes of one daemon, one after the other, as run_loop ticks them: an axis in FAULT by a fault of its own disarms the others.
+ * The readings of every tick go in, each row of outputs into a ring. */
+static law_t axes[AXES];
+static double rows[8192][OUTPUTS + N];
+int axes_load(const char *path) {
+    for (int a = 0; a < AXES; a++)
+        if (law_load(&axes[a], path)) return -1;
+    return 0;
+}
+void axes_run(long count, int used, const double *values, const uint8_t *fresh, const uint8_t *status, double dt,
+              double *outputs) {
+    for (long k = 0; k < count; k++)
+        for (int a = 0; a < used; a++) {
+            law_t *l = &axes[a];
+            uint64_t external = 0;
+            for (int b = 0; b < used; b++)
+                if (b != a && axes[b].state == FAULT && axes[b].latched & ~BIT(B_OTHER_AXIS) && l->state != FAULT)
+                    external = BIT(B_OTHER_AXIS);
+            memcpy(l->value, values + k * N, sizeof l->value);
+            memcpy(l->fresh, fresh + k * N, N);
+            memcpy(l->status, status + k * N, N);
+            law_step(l, dt, 0, 0.0, external);
+            double *row = rows[l->tick % 8192];
+            memcpy(row, l->value, sizeof l->value);
+            memcpy(row + N, l->out, sizeof l->out);
+        }
+    memcpy(outputs, axes[0].out, sizeof axes[0].out);
 }
 
 /* For the batch figure: `count` ticks with readings (count, N) as the loop would get them; outputs (count, OUTPUTS). */
