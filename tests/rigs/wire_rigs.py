@@ -248,11 +248,11 @@ class OnWire:
             minutes = (time.monotonic() - begun) / 60
             self.command("restart")
             self.on_all("experiment", "test_4b", "--yes", "--out", "{axis}-on.parquet")
-            return [self._row(axis, part, minutes) for axis, part in self.rig.parts.items()]
         finally:
             subprocess.run([*PROGRAM, "stop", "--config", str(self.config)], capture_output=True)
             other_end.terminate()
             other_end.wait(20)
+        return [self._row(axis, part, minutes) for axis, part in self.rig.parts.items()]
 
     def _row(self, axis: str, part: Part, minutes: float) -> list[str]:
         tests = self.folder / "calibration" / (axis or "rig")
