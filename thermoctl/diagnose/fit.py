@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -148,9 +149,12 @@ class Posterior:
         """Free-run errors. Raises SimulationError."""
         values, dx0 = self.problem.unpack(z)
         out = [d.y - self.model.run(d, values[r], dx0[r]).y for r, d in enumerate(self.drives)]
-        if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(out, self.drives, strict=True)):
-            raise SimulationError("the simulation gives values that are not numbers")
+        self._check(out)
         return out
+
+    def _check(self, errors: Sequence[np.ndarray]) -> None:
+        if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(errors, self.drives, strict=True)):
+            raise SimulationError("the simulation gives values that are not numbers")
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Between which the unknowns lie."""
@@ -174,14 +178,27 @@ class Posterior:
 
         The result is kept for the next call with the same z."""
         if self.kept is None or not np.array_equal(self.kept[0], z):
-            found, r = [], -1
-            for c in self.case.coordinates.channels:
-                if c.recording != r:
-                    r = c.recording
-                    unknown, jac = self.problem.jacobian(z, r)
-                found.append((unknown, self.case.coordinates.transform(c, jac[:, c.output])))
-            self.kept = z.copy(), found
+            self.errors_and_slopes(z)
+        assert self.kept is not None
         return self.kept[1]
+
+    def errors_and_slopes(self, z: np.ndarray) -> list[np.ndarray]:
+        """Free-run errors; `slopes` are kept. One run costs less than two. Raises SimulationError."""
+        errors, found = [], []
+        by_recording = {
+            r: list(channels)
+            for r, channels in groupby(self.case.coordinates.channels, lambda c: c.recording)
+        }
+        for r, d in enumerate(self.drives):
+            unknown, y, jac = self.problem.jacobian(z, r)
+            errors.append(d.y - y)
+            found += [
+                (unknown, self.case.coordinates.transform(c, jac[:, c.output]))
+                for c in by_recording.get(r, ())
+            ]
+        self._check(errors)
+        self.kept = z.copy(), found
+        return errors
 
     def slope(
         self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
@@ -225,17 +242,17 @@ class Posterior:
 
         Stop early if `goal` is out of reach."""
         low, high = self.bounds()
-        errors = self.errors(z)
+        errors = self.errors_and_slopes(z)
         rows = self.rows(errors)
         now, powers = self.likelihood(rows)
         gradient, matrix = self.slope(z, rows, now.inverse)
         for left in range(ROUNDS, 0, -1):
             base = now.log_likelihood + self.prior(z)
-            step, gained = _step(z, gradient, matrix, low, high), 0.0
+            step, gained, here = _step(z, gradient, matrix, low, high), 0.0, self.kept
             for length in LENGTHS:
                 trial = np.clip(z + length * step, low, high)
-                try:
-                    e = self.errors(trial)
+                try:  # most first trials succeed
+                    e = self.errors_and_slopes(trial) if length == LENGTHS[0] else self.errors(trial)
                 except SimulationError:
                     continue
                 trial_rows = self.rows(e)
@@ -245,6 +262,7 @@ class Posterior:
                     z, errors, rows, now, powers = trial, e, trial_rows, then, trial_powers
                     gradient, matrix = self.slope(z, rows, now.inverse)
                     break
+                self.kept = here
             if gained < ENOUGH or now.log_likelihood + left * gained < goal:
                 break
         return z, now, powers, matrix, errors

@@ -20,6 +20,7 @@ from thermoctl.diagnose.page import write_report
 from thermoctl.diagnose.propose import propose
 from thermoctl.diagnose.result import contract
 from thermoctl.diagnose.threads import one_thread
+from thermoctl.diagnose.trend import told, trends
 from thermoctl.diagnose.unseen import not_seen
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
@@ -27,6 +28,11 @@ from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
+
+STOPPED = (
+    "stopped by hand after {} refits: probabilities compare the hypotheses that were tried; what was not tried may be "
+    "likelier; diagnose again for the whole search"
+)
 
 
 @one_thread()
@@ -39,6 +45,7 @@ def diagnose(
     progress: Callable[[str], None] | None = None,
     drivable: Sequence[str] = (),
     limits: Limits = NONE,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
     """Diagnose recordings, write the result into the folder `out` (all of its files, or none), and return it.
 
@@ -46,6 +53,7 @@ def diagnose(
     - `held_out`: recordings that take no part in any choice
     - `drivable`: inputs that the next experiment may drive (default: those that changed, without surroundings)
     - `limits`: ranges of inputs and outputs in the next experiment
+    - `stopped`: once true, the result is that of the hypotheses tried so far, and says so
 
     Raises InputError for unusable inputs."""
     if not tables:
@@ -55,14 +63,18 @@ def diagnose(
     chosen_on, reserve = named[: len(tables)], named[len(tables) :]
     try:
         found = engine.diagnose(
-            plant, chosen_on, catalogue((CATALOGUE, *effects)), numbers(), reserve, progress
+            plant, chosen_on, catalogue((CATALOGUE, *effects)), numbers(), reserve, progress, stopped
         )
     except SimulationError as e:
         raise InputError(f"{plant.file}: the plant cannot follow these recordings at all: {e}") from None
-    proposed = propose(found, drivable, limits, progress)
+    proposed = None if stopped() else propose(found, drivable, limits, progress)
     result = contract(found)
     result["next_experiment"] = proposed[0] if proposed else None
-    result["not_seen"] = not_seen(found) if found.decision.verdict == "consistent" else []
+    result["trends"] = trends(found.case, found.best, found.shown)
+    result["notes"] += told(result["trends"])
+    if stopped():
+        result["notes"].insert(0, STOPPED.format(found.case.budget.fits_done))
+    result["not_seen"] = not_seen(found) if found.decision.verdict == "consistent" and not stopped() else []
     result["seconds"] = round(time.monotonic() - started, 1)
     with tempfile.TemporaryDirectory(dir=folder.parent) as part_name:
         part = Path(part_name)

@@ -13,8 +13,9 @@ where something moves.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -331,7 +332,8 @@ def _columns(
     ] or [{}]
     amplitudes = [p for p in effect.parameters if p.amplitude]
     dims = effect.dims if amplitudes else ((1.0,),)
-    out = []
+    out: list[_Column] = []
+    extended: Plant | None = None
     for g, shape in enumerate(shapes):
         group: tuple[Any, ...] = ("all",) if windowed else (g,)
         count = len(shapes) if windowed else len(dims) * len(phases)
@@ -339,7 +341,9 @@ def _columns(
             for phase in phases:
                 values = parameter_values(c, {**shape, **phase}, [EPSILON * v for v in dim])
                 column = _Column((c, group, ({**shape, **phase}, dim), count))
-                extended = c.extend(values)
+                extended = extended or c.extend(
+                    values
+                )  # the values alone differ, and they are given to `changes`
                 own = {c.own(k): v for k, v in values.items()}
                 for trajectory in at:
                     try:
@@ -398,9 +402,12 @@ def _score(c: Candidate, entries: Sequence[_Entry], metric: Metric, best: dict[i
     if len(g) == 1 and not _possible(c, entries[0][0], float(coefficient[0])):
         gain = 0.0
     shape, s = _sizes(c, entries, shape, coefficient)
-    excited = float(left[useful].max())
-    start = parameter_values(c, shape, s)
-    _keep(best, c, shape, gain, int(useful.sum()), start, rows @ coefficient, excited)
+    _keep(
+        best,
+        Direction(c, shape, gain, int(useful.sum()), {}, None, float(left[useful].max())),
+        s,
+        lambda: rows @ coefficient,
+    )
 
 
 def _possible(c: Candidate, column: _Column, coefficient: float) -> bool:
@@ -458,7 +465,7 @@ def _score_windows(
     shape = {"start": edges[a], "end": edges[b] if b < last else 10 * edges[-1]}
     vector = rows[:, a] - (rows[:, b] if b < last else 0)
     excited = float(np.linalg.norm(vector)) / max(full[a], 1e-300)
-    _keep(best, c, shape, gain, 1, parameter_values(c, shape, [amplitude]), vector, excited)
+    _keep(best, Direction(c, shape, gain, 1, {}, None, excited), [amplitude], lambda: vector)
 
 
 def _allowed(p: EffectParameter, coefficient: float) -> bool:
@@ -472,26 +479,18 @@ def _allowed(p: EffectParameter, coefficient: float) -> bool:
 
 
 def _keep(
-    best: dict[int, Direction],
-    c: Candidate,
-    shape: dict[str, float],
-    gain: float,
-    dims: int,
-    start: dict[str, float],
-    vector: np.ndarray,
-    excited: float,
+    best: dict[int, Direction], new: Direction, sizes: Sequence[float], along: Callable[[], np.ndarray]
 ) -> None:
-    size = float(np.linalg.norm(vector))
-    new = Direction(
-        c,
-        {k: v for k, v in shape.items() if k != "picked_from"},
-        gain,
-        dims,
-        start,
-        (vector / size).astype(np.float32) if size > 0 else None,
-        excited,
-        float(np.log10(shape.get("picked_from", 1.0))),
-    )
-    old = best.get(id(c))
+    """Keep a direction if it is its candidate's best so far. `along`: its projected rows, computed only then."""
+    shape = {k: v for k, v in new.shape.items() if k != "picked_from"}
+    new = dataclasses.replace(new, elsewhere=float(np.log10(new.shape.get("picked_from", 1.0))))
+    old = best.get(id(new.candidate))
     if old is None or new.log_p < old.log_p:
-        best[id(c)] = new
+        vector = along()
+        size = float(np.linalg.norm(vector))
+        best[id(new.candidate)] = dataclasses.replace(
+            new,
+            shape=shape,
+            start=parameter_values(new.candidate, new.shape, sizes),
+            vector=(vector / size).astype(np.float32) if size > 0 else None,
+        )

@@ -84,6 +84,9 @@ def search(case: Case, limits: Limits) -> Searched:
     for _ in range(limits.effects):
         best, close = beam[0].score, max(over_noise(case, beam[0].fitted, limits.clean)) <= limits.clean
         for parent in beam:
+            if case.budget.spent:
+                case.budget.untried += 1
+                break
             if parent.fitted.hypothesis.keys in seen or (close and parent.score < best - BEATEN):
                 continue
             seen.add(parent.fitted.hypothesis.keys)
@@ -146,9 +149,10 @@ def extensions(
     for k, (added, gain) in enumerate(queue):
         case.budget.planned = case.budget.fits_done + len(queue) - k
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-        if keys in tried or len(keys) > limits.effects or case.budget.spent:
+        if keys in tried or len(keys) > limits.effects or parent.score + HALF * gain < leading:
             continue
-        if parent.score + HALF * gain < leading:
+        if case.budget.spent:
+            case.budget.untried += 1
             continue
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
         fits = _followed(case, parent, looked, added, leader)

@@ -48,8 +48,7 @@ def shape_grid(
     """The values of a shape to look at in screening. Beside them `picked_from`: of how many the residual itself picked this one, and
     `longest`: beyond which a period would not have come once."""
     rig = candidate.rig
-    duration = max(float(d.t[-1]) for d in rig.drives)
-    dt = min(float(np.median(np.diff(d.t))) for d in rig.drives if len(d.t) > 1)
+    duration, dt = rig.duration, rig.sample
 
     def signal(e: Expr) -> np.ndarray:
         parts = []

@@ -150,6 +150,7 @@ class Problem:
         self._number_unknowns()
         self.z_plant = self.start({})
         self.buffers: dict[str, np.ndarray] = {}
+        self.kept_buffers: dict[str, np.ndarray] = {}
         self.huber = np.full(len(self.noise), HUBER)
         self.rows = [[_rows(d, j, n) for j, n in enumerate(self.noise)] for d in excitations]
         self.samples = sum(len(e[0]) for entry in self.rows for e in entry)
@@ -248,25 +249,29 @@ class Problem:
         self.huber = new
         return changed
 
+    def keep(self) -> None:
+        """Leave the rows of the newest evaluation as they are until the next call."""
+        self.buffers, self.kept_buffers = self.kept_buffers, self.buffers
+
     def prior(self) -> np.ndarray:
         """Return the weight of each unknown's default prior (its entry in the Gauss-Newton matrix)."""
         return np.concatenate(
             [np.full(self.n_parameters, PRIOR_WEIGHT**2), np.ones(len(self.unknowns) - self.n_parameters)]
         )
 
-    def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the unknowns (k,) of recording r and the outputs' slopes by them (N, ny, k)."""
+    def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the unknowns (k,) of recording r, its outputs (N, ny) and their slopes by them (N, ny, k)."""
         values, dx0 = self.unpack(z)
         run = self.model.run(self.excitations[r], values[r], dx0[r], sensitivities=True)
         used, k, slope = self._slopes(r, values[r])
         assert run.dy is not None
-        return k, run.dy[:, :, used] * slope
+        return k, run.y, run.dy[:, :, used] * slope
 
     def evaluate(self, z: np.ndarray, jacobian: bool, keep: list[Rows] | None = None) -> Evaluation:
         """Evaluate the cost, and with `jacobian` its derivatives. Raises SimulationError.
 
-        The rows that `curvature` needs are appended to `keep`.
-        """
+        The rows that `curvature` needs are appended to `keep`. The next evaluation with derivatives
+        overwrites them, unless `self.keep` is called."""
         values, dx0 = self.unpack(z)
         cost, gradient, matrix = 0.0, np.zeros(len(z)), np.zeros((len(z), len(z)))
         residuals = []

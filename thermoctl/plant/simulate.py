@@ -33,7 +33,8 @@ class Excitation:
     - `t` (N,): seconds from the first sample
     - `u` (N, inputs): gaps filled, held or linear as the input
     - `y` (N, outputs): measured, NaN where missing
-    - `first`: first recorded value of each input and output"""
+    - `first`: first recorded value of each input and output
+    - `rtol`: local error a step of a run, as a share of each state's range"""
 
     name: str
     t: np.ndarray
@@ -43,6 +44,7 @@ class Excitation:
     linear: np.ndarray
     scale: np.ndarray | None = None  # (nx,) range of each state
     width: np.ndarray | None = None  # (jumps,) half width of each smoothed jump
+    rtol: float = RTOL
 
     def part(self, start: int, stop: int) -> Excitation:
         """Return the samples start..stop-1 (scales kept). Time still counts from the recording's start."""
@@ -281,17 +283,22 @@ class Model:
         parameters: Mapping[str, float] | np.ndarray | None = None,
         dx0: np.ndarray | None = None,
         sensitivities: bool = False,
-        rtol: float = RTOL,
+        rtol: float | None = None,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> Simulation:
         """Simulate freely on an excitation. Raises SimulationError.
 
-        `buffers` keeps the large arrays between runs. A later run with the same dict overwrites the
+        `rtol`: in place of the excitation's. `buffers` keeps the large arrays between runs. A later run with the same dict overwrites the
         sensitivities that an earlier one returned."""
         if excitation.scale is None:
             self.prepare(excitation, parameters)
         return self._run(
-            excitation, self.vector(parameters, excitation.name), dx0, sensitivities, rtol, buffers
+            excitation,
+            self.vector(parameters, excitation.name),
+            dx0,
+            sensitivities,
+            rtol or excitation.rtol,
+            buffers,
         )
 
     def simulate(
