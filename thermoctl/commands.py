@@ -601,6 +601,12 @@ _DIAGNOSIS = (
             metavar="DIR",
             help="folder of diagnosis.json, plant.yaml and report.html (with folders: DIR/RIG)",
         ),
+        _arg(
+            "--continue",
+            dest="continued",
+            metavar="DIR",
+            help="go on from the diagnosis in DIR with recordings that it has not seen, without its old ones",
+        ),
         _arg("--explain", metavar="DIR", help="print in ten lines the reasons of the diagnosis in DIR"),
         _arg(
             "--last",

@@ -11,6 +11,7 @@ from scipy.ndimage import median_filter
 
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.noise import Grid, grid
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.rows import reduced
@@ -69,13 +70,20 @@ class Case:
     notes: list[str] = field(default_factory=list)
     block: int = 1  # rows of the recordings whose mean is one row here
     rtol: float = RTOL  # of every simulation
+    memory: Memory = NOTHING  # of earlier recordings
 
     def drives(self, model: Model) -> list[Excitation]:
         """The recordings as a model reads them."""
         return [dataclasses.replace(model.excitation(t), rtol=self.rtol) for t in self.tables]
 
 
-def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect], budget: Budget) -> Case:
+def case(
+    plant: Plant,
+    tables: Sequence[Table],
+    catalogue: Mapping[str, Effect],
+    budget: Budget,
+    memory: Memory = NOTHING,
+) -> Case:
     """Refit the original plant, drop single outliers, fix the coordinates and grids of all hypotheses.
 
     Rows of long recordings are put together (rows.py).
@@ -119,6 +127,7 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
         ],
         fewer.block,
         rtol,
+        memory,
     )
 
 

@@ -123,6 +123,7 @@ def diagnose(args: argparse.Namespace) -> int:
                 args.drive or (),
                 _limits(args.limit or ()),
                 stopped,
+                Path(args.continued) if args.continued else None,
             )
 
     try:

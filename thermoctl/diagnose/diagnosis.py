@@ -12,6 +12,7 @@ from thermoctl.diagnose.fit import as_refitted
 from thermoctl.diagnose.held_out import split, worth
 from thermoctl.diagnose.law import find_law
 from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.misfit import energies, standing
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.search import search
@@ -32,15 +33,17 @@ def diagnose(
     held_out: Sequence[Table] = (),
     progress: Callable[[str], None] | None = None,
     stopped: Callable[[], bool] = lambda: False,
+    memory: Memory = NOTHING,
 ) -> Diagnosis:
     """Find the physics that a plant lacks, from recordings. Raises InputError.
 
     `held_out`: recordings that take no part in any choice. `progress` is called with each stage and refit.
-    Once `stopped`, the search ends after the present refit, and no law is looked for."""
+    Once `stopped`, the search ends after the present refit, and no law is looked for. `memory`: what earlier
+    recordings said."""
     say = progress or (lambda text: None)
     say("refitting the plant's own parameters")
     chosen_on, reserve = split(tables, held_out)
-    known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped))
+    known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped), memory)
     searched = search(known, numbers)
     energy = energies(known, searched, numbers)
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}

@@ -22,6 +22,7 @@ from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.memory import Past, PlacedBefore
 from thermoctl.diagnose.noise import Averaged, Grid, averaged
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
@@ -85,6 +86,8 @@ class Fitted:
     sd: Mapping[str, float]  # of the effects' parameters
     rough_plant: Plant
     rough: Fit  # refit in white noise, whose free run is closest to the data: extensions start there
+    curvature: np.ndarray  # H
+    past: Past  # of earlier recordings
 
     @property
     def absent(self) -> bool:
@@ -99,7 +102,7 @@ class Fitted:
     @property
     def log_evidence(self) -> float:
         """Log p(D | h)"""
-        return self.log_likelihood + self.log_prior + self.volume
+        return self.log_likelihood + self.log_prior + self.volume + self.past.log_evidence
 
 
 def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]) -> bool:
@@ -129,8 +132,13 @@ class Posterior:
         for d in self.drives:
             self.model.prepare(d)
         self.problem = Problem(self.model, self.drives, case.noise)
-        self.amplitudes, mean, precision = _priors(case, self.problem, effects)
-        self.mean, self.precision = mean, precision
+        self.amplitudes, self.mean, precision = _priors(case, self.problem, effects)
+        self.past = case.memory.of(frozenset(e.key for e in effects), plant)
+        place = {q: k for k, (q, r) in enumerate(self.problem.unknowns) if r is None}
+        self.shared = np.array([place[q] for q in self.past.unknowns], int)
+        self.mean[self.shared], precision[self.shared] = self.past.z, 0.0
+        self.precision = np.diag(precision)
+        self.precision[np.ix_(self.shared, self.shared)] = self.past.precision
         beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
         self.problem.priors = tuple(beliefs)
         self.kept: tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]] | None = None
@@ -169,7 +177,7 @@ class Posterior:
         It is the sum of the Gaussian priors and of the priors that the catalogue's entries state."""
         values, _ = self.problem.unpack(z)
         return (
-            -0.5 * float(self.precision @ (z - self.mean) ** 2)
+            -0.5 * float((z - self.mean) @ self.precision @ (z - self.mean))
             - 0.5 * self.problem.prior_terms(values, False)[0]
         )
 
@@ -215,7 +223,7 @@ class Posterior:
             matrix[np.ix_(unknown, unknown)] += j.T @ j
         values, _ = self.problem.unpack(z)
         _, push, bend = self.problem.prior_terms(values, True)
-        return gradient - self.precision * (z - self.mean) - push, matrix + np.diag(self.precision) + bend
+        return gradient - self.precision @ (z - self.mean) - push, matrix + self.precision + bend
 
     def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
         """Return E[1/V] J'J minus the curvature: the gradient's variance over the unknown V (Louis 1982)."""
@@ -344,7 +352,9 @@ def fitted(
             seconds=np.inf,
         )
     goal = best.log_likelihood - HOPELESS if best else -np.inf
-    z, average, powers, matrix, errors = posterior.climb(start.z, goal)
+    z = start.z.copy()
+    z[posterior.shared] = posterior.past.z
+    z, average, powers, matrix, errors = posterior.climb(z, goal)
     return _weighed(case, posterior, z, average, powers, matrix, errors, start)
 
 
@@ -465,6 +475,8 @@ def _weighed(
         names,
         refit.updated(posterior.plant, rough, posterior.drives),
         rough,
+        confined,
+        posterior.past,
     )
 
 
@@ -477,6 +489,37 @@ def _relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
     share, p = np.linalg.eigh(0.5 * (inner + inner.T))
     left = root @ (p * (1 - np.clip(share, 0.0, MOST))) @ p.T @ root.T
     return left * np.outer(size, size)
+
+
+def remembered(case: Case, f: Fitted) -> Past:
+    """Return what all recordings so far say of a hypothesis. Own initial states are eliminated."""
+    unknowns, h = f.fit.unknowns, f.curvature
+    shared = np.array([k for k, (_, r) in enumerate(unknowns) if r is None], int)
+    own = np.array([k for k, (_, r) in enumerate(unknowns) if r is not None], int)
+    absorbed = (
+        h[np.ix_(shared, own)] @ np.linalg.pinv(h[np.ix_(own, own)], hermitian=True) @ h[np.ix_(own, shared)]
+    )
+    names = tuple(unknowns[k][0] for k in shared)
+    at = [(case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids]
+    effects = tuple(
+        PlacedBefore(
+            e.key,
+            e.candidate.label,
+            {p: f.plant.parameters[n].value for p, n in e.own.items()},
+            {p: r for p, n in e.own.items() if (r := f.plant.parameters[n].range)},
+        )
+        for e in f.hypothesis.effects
+    )
+    return Past(
+        effects,
+        names,
+        tuple(f.plant.parameters[q].range or (0.0, 0.0) for q in names),
+        f.fit.z[shared],
+        h[np.ix_(shared, shared)] - absorbed,
+        f.log_evidence,
+        {o: f.past.squares.get(o, 0.0) + sum(float(f.powers[k].sum()) for k in g.channels) for o, g in at},
+        {o: f.past.counts.get(o, 0.0) + float(g.count.sum()) for o, g in at},
+    )
 
 
 def levels(case: Case, f: Fitted, clean: float) -> list[float]:
@@ -520,15 +563,17 @@ def as_refitted(case: Case, f: Fitted) -> Fitted:
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
     """Return log p(z): Gaussians, uniform shapes, and the effects' sizes with standard deviations `sd`."""
     values, _ = posterior.problem.unpack(z)
+    normal = _gaussian(posterior)
     out = posterior.prior(z) + 0.5 * float(
-        np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi)))
+        np.linalg.slogdet(posterior.precision[np.ix_(normal, normal)] / (2 * np.pi))[1]
     )
     for k, (c, p) in posterior.amplitudes.items():
         q = posterior.problem.unknowns[k][0]
-        if c.effect.prior is None:
+        if c.effect.prior is None and k not in posterior.shared:
             value = float(values[0, posterior.model.parameters.index(q)])
             out += _size(p, value, sd[q]) + np.log(posterior.problem.scales[q].slope(value))
-    periods = sum(kind == "periods" for e in posterior.effects for kind in e.candidate.effect.shapes.values())
+    new = [e for e in posterior.effects if e.key not in posterior.past.keys]
+    periods = sum(kind == "periods" for e in new for kind in e.candidate.effect.shapes.values())
     return out - periods * float(np.log(PERIODS))
 
 
@@ -540,9 +585,12 @@ def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
 
 
 def _gaussian(posterior: Posterior) -> np.ndarray:
-    """The unknowns whose prior is a Gaussian (those of effects have their own)."""
+    """The unknowns whose prior is a Gaussian (those of effects have their own until recordings were seen)."""
     names = {n for e in posterior.effects for n in e.own.values()}
-    return np.array([k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names], int)
+    return np.array(
+        [k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names or k in posterior.shared],
+        int,
+    )
 
 
 def _size(p: EffectParameter, value: float, sd: float) -> float:

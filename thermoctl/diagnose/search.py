@@ -13,6 +13,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.extend import extend, sticking, weaker
 from thermoctl.diagnose.fit import Fitted, Placed, fitted, over_noise
 from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.memory import rebuilt
 from thermoctl.diagnose.places import PLACES
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Metric, sharpened
@@ -80,7 +81,9 @@ def search(case: Case, limits: Limits) -> Searched:
     where = places(case)
     null = Weighed(fitted(case, case.plant, (), case.null), 0.0)
     tried: dict[frozenset[tuple[str, str]], Weighed] = {frozenset(): null}
-    beam, seen = [null], set()
+    for w in recalled(case, where, limits, null):
+        tried[w.fitted.hypothesis.keys] = w
+    beam, seen = leaders(list(tried.values()), limits), set()
     for _ in range(limits.effects):
         best, close = beam[0].score, max(over_noise(case, beam[0].fitted, limits.clean)) <= limits.clean
         for parent in beam:
@@ -99,6 +102,25 @@ def search(case: Case, limits: Limits) -> Searched:
         if beam[0].score <= best or case.budget.spent:
             break
     return Searched(tuple(sorted(tried.values(), key=lambda w: -w.score)), case.budget.spent)
+
+
+def recalled(case: Case, where: Mapping[str, set[str]], limits: Limits, null: Weighed) -> list[Weighed]:
+    """Return the hypotheses of an earlier diagnosis, refitted to these recordings from where they were."""
+    out: list[Weighed] = []
+    drives, columns = case.drives(case.null.model), [t.columns for t in case.tables]
+    likeliest = max((h.log_evidence for h in case.memory.hypotheses), default=0.0)
+    for past in case.memory.hypotheses:
+        if not past.effects or case.budget.spent or past.log_evidence < likeliest - BEATEN * limits.effects:
+            continue
+        try:
+            plant, made = rebuilt(past, case.plant, drives, columns, case.catalogue)
+            effects = [Placed(c, own) for c, own in made]
+            leader = max((w.fitted for w in (null, *out)), key=lambda f: f.log_likelihood)
+            f = fitted(case, free_starts(case.plant, plant), effects, None, leader)
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            continue
+        out.append(Weighed(f, odds(effects, where, limits)))
+    return out
 
 
 def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:

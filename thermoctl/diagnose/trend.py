@@ -90,9 +90,11 @@ def _sizes(posterior: Posterior, f: Fitted, parameter: str) -> list[tuple[float,
     errors = posterior.errors(z)
     rows, slopes = posterior.rows(errors), posterior.slopes(z)
     inverse = posterior.likelihood(rows)[0].inverse
+    initial = np.arange(len(z)) >= problem.n_parameters
+    prior = np.where(np.outer(initial, initial), posterior.precision, 0.0)
     out = []
     for r in range(len(posterior.drives)):
-        gradient, matrix = posterior.precision * (posterior.mean - z), np.diag(posterior.precision)
+        gradient, matrix = prior @ (posterior.mean - z), prior.copy()
         for k, c in enumerate(posterior.case.coordinates.channels):
             if c.recording == r:
                 unknown, jac = slopes[k]
@@ -100,19 +102,15 @@ def _sizes(posterior: Posterior, f: Fitted, parameter: str) -> list[tuple[float,
                 gradient[unknown] += (jac * w).T @ (w[:, 0] * rows[k])
                 matrix[np.ix_(unknown, unknown)] += (jac * w).T @ (jac * w)
         mine = [k for k, (q, of) in enumerate(problem.unknowns) if q == parameter and of in (None, r)]
-        starts = [k for k, (q, of) in enumerate(problem.unknowns) if k >= problem.n_parameters and of == r]
+        starts = [k for k, (q, of) in enumerate(problem.unknowns) if initial[k] and of == r]
         value = float(f.fit.values[r, index])
         if not mine:
             out.append((value, math.inf))
             continue
         a = mine[0]
         absorbed = np.linalg.solve(matrix[np.ix_(starts, starts)], matrix[np.ix_(starts, [a])])[:, 0]
-        h = matrix[a, a] - posterior.precision[a] - float(absorbed @ matrix[starts, a])
-        g = (
-            gradient[a]
-            - posterior.precision[a] * (posterior.mean[a] - z[a])
-            - float(absorbed @ gradient[starts])
-        )
+        h = matrix[a, a] - float(absorbed @ matrix[starts, a])
+        g = gradient[a] - float(absorbed @ gradient[starts])
         slope = problem.scales[parameter].slope(value)
         least = 1e-12 * max(matrix[a, a], 1e-300)
         shift = 0.0 if problem.unknowns[a][1] is not None else slope * g / h if h > least else 0.0
