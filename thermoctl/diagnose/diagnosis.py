@@ -38,8 +38,8 @@ def diagnose(
     """Find the physics that a plant lacks, from recordings. Raises InputError.
 
     `held_out`: recordings that take no part in any choice. `progress` is called with each stage and refit.
-    Once `stopped`, the search ends after the present refit, and no law is looked for. `memory`: what earlier
-    recordings said."""
+    Once `stopped`, the search ends after the present refit, and no law is looked for. `memory`: the posterior
+    of earlier recordings."""
     say = progress or (lambda text: None)
     say("refitting the plant's own parameters")
     chosen_on, reserve = split(tables, held_out)
@@ -57,7 +57,7 @@ def diagnose(
     after, before = left(known, best, reach, numbers.clean), left(known, null, reach, numbers.clean)
     say("measuring what the findings are worth")
     value = worth(known, null, best, reserve)
-    sure = not (stopped() and known.budget.untried)  # what was not tried may be likelier
+    sure = not (stopped() and known.budget.untried)  # an untried hypothesis may be likelier
     named = tuple(e.key for e in best.hypothesis.effects if sure and posterior.effects[e.key] >= numbers.name)
     # data that took part in the choice cannot speak against it
     ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects and value.reserved else 1.0

@@ -1,11 +1,11 @@
-"""What earlier recordings said of each hypothesis: a diagnosis goes on with new recordings, without the old ones.
+"""The posterior that earlier recordings left of each hypothesis: a diagnosis goes on without their data.
 
     log p(D_new, D_old | h) = log p(D_old | h) + log p(D_new | D_old, h)
 
-The second term is the evidence of the new recordings with the posterior of the old ones as prior: a Gaussian
-about the old optimum z, with the curvature H there, own initial states eliminated. Noise and remainder are
-averaged for each part of the data alone. A hypothesis that the old diagnosis did not try starts from the
-largest part of it that was tried: the old recordings say nothing of the effects beyond.
+The second term is the evidence of the new recordings. Its prior is the posterior of the old ones: a Gaussian
+about the old optimum z with the curvature H there, own initial states eliminated. Noise and remainder are
+averaged for each part of the data alone. A hypothesis that the old diagnosis did not try has the prior of its
+largest part that was tried. Of its other effects the old recordings tell nothing.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class PlacedBefore:
 
 @dataclass(frozen=True)
 class Past:
-    """What the old recordings said of one hypothesis.
+    """The posterior that the old recordings left of one hypothesis.
 
     - `unknowns` (k,): parameters that all recordings share, `spans` their ranges; `z` (k,) their optimum in
       these, `precision` (k, k)
@@ -108,7 +108,7 @@ def rebuilt(
 
 
 def stated(plant: Plant) -> dict[str, Any]:
-    """Return what has to be the same for a diagnosis to go on: the plant's free parameters and its outputs."""
+    """Return the parts of a plant that must stay the same: its free parameters and its outputs."""
     return {
         "parameters": {n: [p.value, *p.range] for n, p in plant.parameters.items() if p.range},
         "outputs": list(plant.outputs),

@@ -49,13 +49,13 @@ def diagnose(
     stopped: Callable[[], bool] = lambda: False,
     earlier: Path | None = None,
 ) -> dict[str, Any]:
-    """Diagnose recordings, write the result into the folder `out` (all of its files, or none), and return it.
+    """Diagnose recordings, write the result into the folder `out` (all files or none), and return it.
 
     - `effects`: folders of effects beside the catalogue
     - `held_out`: recordings that take no part in any choice
     - `drivable`: inputs that the next experiment may drive (default: those that changed, without surroundings)
     - `limits`: ranges of inputs and outputs in the next experiment
-    - `stopped`: once true, the result is that of the hypotheses tried so far, and says so
+    - `stopped`: once true, the result is that of the hypotheses tried so far, with a note
     - `earlier`: the folder of an earlier diagnosis, which goes on with these recordings
 
     Raises InputError for unusable inputs."""
@@ -134,7 +134,7 @@ def diagnose_files(
 
 
 def _writable(folder: Path) -> Path:
-    """Return the folder of a result, if files can be written there. Raises InputError: before the work, not after."""
+    """Return the folder of a result, if files can be written there. Raises InputError."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: a file; a folder for the result was expected (--out)")
     try:

@@ -91,7 +91,7 @@ def _advice(newest: Summary, drifts: dict[str, Drift]) -> list[str]:
 
 
 def drift(times_s: Sequence[float], estimates: Sequence[tuple[float, float]]) -> Drift:
-    """Judge a parameter's estimates (value, standard error) over time; fewer than three never drift."""
+    """Check a parameter's estimates (value, standard error) over time; fewer than three never drift."""
     slope, sigma = line(times_s, estimates)
     value, sd = np.array(estimates, dtype=float).reshape(-1, 2).T
     mean = np.average(value, weights=np.maximum(sd, 1e-300) ** -2.0) if len(value) else 0.0

@@ -260,7 +260,7 @@ class Problem:
         )
 
     def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the unknowns (k,) of recording r, its outputs (N, ny) and their slopes by them (N, ny, k)."""
+        """Return recording r's unknowns (k,), its outputs (N, ny) and their slopes (N, ny, k)."""
         values, dx0 = self.unpack(z)
         run = self.model.run(self.excitations[r], values[r], dx0[r], sensitivities=True)
         used, k, slope = self._slopes(r, values[r])

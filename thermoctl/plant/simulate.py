@@ -288,8 +288,8 @@ class Model:
     ) -> Simulation:
         """Simulate freely on an excitation. Raises SimulationError.
 
-        `rtol`: in place of the excitation's. `buffers` keeps the large arrays between runs. A later run with the same dict overwrites the
-        sensitivities that an earlier one returned."""
+        `rtol`: in place of the excitation's. `buffers` keeps the large arrays between runs. A later run with
+        the same dict overwrites the sensitivities that an earlier one returned."""
         if excitation.scale is None:
             self.prepare(excitation, parameters)
         return self._run(
