@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from thermoctl import __version__, which_rig
-from thermoctl.commands import AXIS, COMMANDS, CONFIG, GROUPS, call
+from thermoctl.commands import AXIS, COMMANDS, GROUPS, call, takes_axis
 from thermoctl.yamlfile import InputError
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
             below = levels[""].add_parser(group, help=GROUPS[group])
             levels[group] = below.add_subparsers(metavar="WHAT", required=True)
         own = levels[group].add_parser(name, help=command.help, description=command.help)
-        for argument in (*command.arguments, *((AXIS,) if CONFIG in command.arguments else ())):
+        for argument in (*command.arguments, *((AXIS,) if takes_axis(command) else ())):
             own.add_argument(*argument.flags, **argument.options)
         own.set_defaults(row=command)
     return top

@@ -49,7 +49,7 @@ CONFIG = _arg(
 )
 """The option of every command that needs a rig; `which_rig.choose` stores the path that it found."""
 AXIS = _arg("--axis", metavar="NAME", help="the axis of a rig with several")
-"""Goes with CONFIG: a command that takes the one takes the other."""
+"""Goes with CONFIG, except for ALL_AXES (see `takes_axis`)."""
 _FILE = _arg("file", nargs="?", metavar="CONFIG", help="the same as --config CONFIG")
 _YES = _arg(
     "--yes", action="store_true", help="start without asking; without a terminal, required to move a rig"
@@ -80,7 +80,9 @@ _COLUMNS = _arg(
 _EFFECTS = _arg(
     "--effects", action="append", metavar="DIR", help="a further folder of effect files (repeatable)"
 )
-_MODELS = _arg("--models", metavar="DIR", default="models", help="folder of calibrations (default models)")
+_MODELS = _arg(
+    "--models", metavar="DIR", help="folder of calibrations (default models; of an axis models/AXIS)"
+)
 _ORDER = _arg("--order", type=int, default=0, help="number of real poles (default 0: chosen by BIC)")
 _ROOT = _arg("--root", default="/", metavar="DIR", help="install below this directory")
 
@@ -867,8 +869,15 @@ def call(command: Command, args: argparse.Namespace) -> int:
 
 EACH_AXIS = frozenset({"status", "disarm", "reload", "latency"})
 """Commands that, without --axis, do their work for every axis of a rig, one after the other."""
-WHOLE_RIG = frozenset({"start", "stop", "restart", "check", "doctor", "virtual-rig"})
-"""Commands that take a whole rig; --axis names one for `check` and `doctor` only."""
+ALL_AXES = frozenset({"start", "stop", "restart", "virtual-rig", "service"})
+"""Commands that act on the whole rig: they take no --axis."""
+WHOLE_RIG = ALL_AXES | {"check", "doctor"}
+"""Commands that take a whole rig; --axis names one for `check` and `doctor`."""
+
+
+def takes_axis(command: Command) -> bool:
+    """Return whether a command takes --axis."""
+    return CONFIG in command.arguments and command.name not in ALL_AXES
 
 
 def _each_axis(function: Any, takes: list[str], args: argparse.Namespace) -> int:
@@ -891,6 +900,12 @@ def run(args: argparse.Namespace) -> int:
 
     if args.hours is None:
         from thermoctl.daemon import supervisor
+        from thermoctl.yamlfile import InputError
+
+        if args.axis:
+            raise InputError(
+                "run: --axis goes with --simulated-time and --hours; the daemon runs all axes of a rig"
+            )
 
         return supervisor.run(load_rig(args.config))
     from thermoctl.daemon.simulate import trapezoids

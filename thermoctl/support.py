@@ -5,6 +5,7 @@ Values of keys that are called password, token, secret or key, and passwords in 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import re
@@ -59,8 +60,8 @@ def report(settings: Settings, out: str, seconds: float) -> int:
     except OSError:
         missing.append(f"no log: {log} does not exist; a service's log is in `journalctl -u thermoctl`")
     folder = Path(settings.recording.directory)
-    recorded = recording_files(folder, FULL) if folder.is_dir() else []
-    if not recorded:
+    newest = _newest(recording_files(folder, FULL) if folder.is_dir() else [])
+    if newest is None:
         missing.append(f"no recording in {folder}")
     try:
         with (
@@ -69,15 +70,24 @@ def report(settings: Settings, out: str, seconds: float) -> int:
         ):
             for name, text in files.items():
                 archive.writestr(name, text)
-            if recorded:
-                part = Path(work) / f"{recorded[-1].stem}.parquet"
-                export(recorded[-1], part, begin_s=info(recorded[-1]).ends_s - seconds)
+            if newest is not None:
+                path, ends_s = newest
+                part = Path(work) / f"{path.stem}.parquet"
+                export(path, part, begin_s=ends_s - seconds)
                 archive.write(part, part.name)
             names = archive.namelist()
     except OSError as e:
         raise InputError(f"{out}: cannot be written: {e.strerror or e}") from None
     print(f"wrote {out}: {', '.join(names)}", *missing, "Read it before you send it.", sep="\n")
     return 0
+
+
+def _newest(recorded: list[Path]) -> tuple[Path, float] | None:
+    """Return the newest recording that has rows, and its end, s."""
+    for path in reversed(recorded):
+        with contextlib.suppress(InputError):
+            return path, info(path).ends_s
+    return None
 
 
 def _tail(path: Path) -> str:

@@ -30,6 +30,12 @@ def wait(condition, what, limit_s=LIMIT_S):
     raise AssertionError(f"{what}: not within {limit_s} s")
 
 
+def forget(settings):
+    """Remove the shared memory of a daemon that was killed: nobody is left to do it."""
+    for name in (*map(shared_name, settings.parts), shared_name(settings) + "-board"):
+        Path("/dev/shm", name).unlink(missing_ok=True)
+
+
 def patient(text):
     """config/simulated.yaml's text for a machine that runs tests: it stalls for longer than a rig's may, and is forgiven."""
     for strict, instead in (
@@ -92,4 +98,4 @@ class Daemon:
             with contextlib.suppress(psutil.Error, OSError):
                 process.kill()
         self.process.wait()
-        Path("/dev/shm", shared_name(self.settings)).unlink(missing_ok=True)  # nobody is left to remove it
+        forget(self.settings)

@@ -1,10 +1,13 @@
 """A rig file with axes: what each axis gets, and the mistakes that are told with their place."""
 
+import json
 from pathlib import Path
 
 import pytest
 
 from tests.rigs.axes import simulated_axes
+from thermoctl import cli
+from thermoctl.daemon.assemble import shared_name
 from thermoctl.settings import load_rig, load_settings
 from thermoctl.yamlfile import InputError
 
@@ -71,3 +74,61 @@ def test_a_role_needs_its_axis(tmp_path, role, message):
     path.write_text(path.read_text().replace("  backend: simulated\n", f"  backend: simulated\n{devices}"))
     with pytest.raises(InputError, match=message):
         load_rig(path)
+
+
+def run(command, path, *more):
+    """The exit status of a command on this rig."""
+    return cli.main([*command.split(), "--config", str(path), *more])
+
+
+def test_gains_are_proposed_and_written_for_one_axis(tmp_path, capsys):
+    path = simulated_axes(tmp_path)
+    path.write_text(path.read_text().replace("    hal: {seed: 2}", "    control:\n      kp: 0.002\n"))
+    assert run("tune", path, "--axis", "y", "--write") == 0
+    assert "rig 'stage-y'" in capsys.readouterr().out
+    x, y = load_rig(path).axes
+    assert x.control.kp == 0.001 and y.control.kp > 0.002 and y.control.ti_s != x.control.ti_s
+    assert run("tune", path, "--axis", "x", "--write") == 0
+    x, again = load_rig(path).axes
+    assert x.control.kp > 0.002 and again.control == y.control
+
+
+def test_commands_of_the_whole_rig_take_no_axis(tmp_path, capsys):
+    path = simulated_axes(tmp_path)
+    for command in ("start", "stop", "restart", "virtual-rig", "service install"):
+        with pytest.raises(SystemExit):
+            run(command, path, "--axis", "x")
+    assert "unrecognized arguments: --axis x" in capsys.readouterr().err
+    assert run("run", path, "--axis", "x") == 2 and "--simulated-time" in capsys.readouterr().err
+    assert run("arm", path) == 2 and "x, y; name one by --axis" in capsys.readouterr().err
+
+
+def test_every_command_of_a_daemon_knows_its_axis(tmp_path, capsys):
+    path = simulated_axes(tmp_path, more="  late_s: 10\n")
+    rig = load_rig(path)
+    assert run("start", path) == 0
+    try:
+        said = capsys.readouterr().out
+        assert "READY, READY" in said
+        assert run("arm", path, "--axis", "y") == 0 and run("setpoint 5", path, "--axis", "y") == 0
+        capsys.readouterr()
+        assert run("status", path) == 0
+        both = capsys.readouterr().out
+        assert both.index("axis x:\nREADY") < both.index("axis y:\nARMED")
+        assert run("status", path, "--axis", "y", "--json") == 0
+        status = json.loads(capsys.readouterr().out)
+        assert (status["axis"], status["state"], status["setpoint_um"]) == ("y", "ARMED", 5.0)
+        assert run("monitor", path, "--axis", "y", "--once") == 0 and "ARMED" in capsys.readouterr().out
+        assert run("latency", path, "--axis", "x") == run("reload", path, "--axis", "x") == 0
+        assert run("disarm", path) == 0
+    finally:
+        assert run("stop", path) == 0
+    left = [*(shared_name(part) for part in rig.parts), shared_name(rig) + "-board"]
+    assert not any(Path("/dev/shm", name).exists() for name in left)
+    assert run("report", path, "--axis", "x", "--out", str(tmp_path / "r.zip")) == 0
+    assert "stage-x-" in capsys.readouterr().out, "the report has this axis' recording"
+    assert cli.main(["recordings", "list", str(tmp_path / "recordings"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {f["rig"] for f in found} == {"stage-x", "stage-y"}
+    full = next(f["path"] for f in found if f["rig"] == "stage-y" and "10hz" not in f["path"])
+    assert cli.main(["replay", full]) == 0 and "bit for bit" in capsys.readouterr().out

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from hal.virtual.rig import tell
+from tests.daemon.process import forget
 from tests.hal.conftest import CONFIG, free_port
 from thermoctl.daemon.control_socket import ask
 from thermoctl.recording.files import read_table
@@ -156,6 +157,8 @@ def test_killed_daemon_leaves_the_amplifier_off(chain):
     ).stdout.split():
         os.kill(int(process), signal.SIGKILL)  # our own children: loop, pollers, recorder
     chain.daemon.kill()
+    chain.daemon.wait()
+    forget(load_settings(chain.config))
     killed = time.monotonic()
     while time.monotonic() < killed + 1.0:
         assert "encoder" in tell(chain.run_dir / "control.sock", "help")  # the rig itself lives on

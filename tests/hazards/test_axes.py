@@ -3,13 +3,12 @@
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import psutil
 import pytest
 
 from hal.make import make_backends
-from tests.daemon.process import wait
+from tests.daemon.process import forget, wait
 from tests.rigs.axes import Axes, simulated_axes
 from tests.rigs.wire import WireRig
 from thermoctl.channels import AT
@@ -160,5 +159,4 @@ def test_a_dead_daemon_leaves_both_amplifiers_off(wired, how):
     finally:
         daemon.kill()
         daemon.wait()
-        for part in settings.axes:
-            Path("/dev/shm", shared_name(part)).unlink(missing_ok=True)
+        forget(settings)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import yaml
 from scipy import linalg, signal
 
 from tests.identify.peers import block_ls, time_constant_s
@@ -286,6 +287,26 @@ def test_a_proposal_changes_only_the_three_lines(tmp_path):
     path.write_text("control: {kp: 1}\n")
     with pytest.raises(InputError):
         tuning.write(path, tuning.Gains(0.02, 0.005, 0.002, "test"))
+
+
+def test_a_proposal_for_an_axis_changes_no_other(tmp_path):
+    path = tmp_path / "rig.yaml"
+    common = "control:\n  kp: 0.01\n  ti_s: 0.004\n  td_s: 0.001\n"
+    x, y = "  x:\n    points: {coil: {role: coil}}\n", "  y:\n    control:\n      kp: 3  # own\n"
+    path.write_text(f"axes:\n{x}{y}{common}")
+    gains = tuning.Gains(0.02, 0.005, 0.002, "test")
+    for axis in "xyx":
+        tuning.write(path, gains, axis)
+    written = yaml.safe_load(path.read_text())
+    own = {"kp": 0.02, "ti_s": 0.005, "td_s": 0.002}
+    assert written["axes"]["x"] == {"points": {"coil": {"role": "coil"}}, "control": own}
+    assert written["axes"]["y"] == {"control": own} and "# own" in path.read_text()
+    assert path.read_text().endswith(common)
+    for flow in ("axes: {x: {}}\n", "axes:\n  x: {}\n", "axes:\n  x:\n    control: {kp: 1}\n"):
+        path.write_text(flow + common)
+        with pytest.raises(InputError, match=r"no section 'axes.x.control'.*write by hand: kp: 0.02"):
+            tuning.write(path, gains, "x")
+        assert path.read_text() == flow + common
 
 
 # calibrations

@@ -16,9 +16,12 @@ from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.wizard import Wizard
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.recording.files import read_table
-from thermoctl.settings import load_settings
+from thermoctl.settings import Settings, load_settings
 from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
+
+MODELS = Path("models")
+"""Folder of calibrations where none is given; those of an axis are in a folder of its name below it."""
 
 
 def run_experiment(
@@ -69,7 +72,7 @@ def record(experiment_file: Path, recording: Path, config: str, plant: str | Non
 
 
 def identify(
-    test_2: str, test_3: str, test_4a: str, config: str, models: str, method: str, order: int
+    test_2: str, test_3: str, test_4a: str, config: str, models: str | None, method: str, order: int
 ) -> int:
     """Run `thermoctl identify`.
 
@@ -98,15 +101,22 @@ def identify(
         }
         print(f"prediction-error refinement: {refined}")
     figures["expansion_rms_um"] = float(np.sqrt(np.nanmean(left**2)))
-    path = modelfile.install(models, model, settings.rig.name, [test_2, test_3, test_4a], figures)
+    folder = _models(models, settings)
+    path = modelfile.install(folder, model, settings.rig.name, [test_2, test_3, test_4a], figures)
     print(
-        f"{path}: expansion left {figures['expansion_rms_um']:.3g} um rms over test 4A; set compensation.model to it, or to {models}"
+        f"{path}: expansion left {figures['expansion_rms_um']:.3g} um rms over test 4A; set compensation.model to it, or to {folder}"
     )
     return 0
 
 
-def model(action: str, models: str, name: str | None) -> int:
+def _models(given: str | None, settings: Settings) -> Path:
+    """Return the folder of calibrations: a folder for each axis, because one of them is current."""
+    return Path(given) if given else MODELS / settings.axis
+
+
+def model(action: str, models: str | None, name: str | None) -> int:
     """Run `thermoctl model`: list, show or roll back calibrations."""
+    models = models or str(MODELS)
     if action == "rollback":
         print(f"current is now {modelfile.roll_back(models, name)}")
         return 0
@@ -160,8 +170,8 @@ def tune(config: str, method: str, write: bool, yes: bool) -> int:
             raise InputError(
                 f"{config}: not written, the proposed gains make this loop unstable; take --method imc"
             )
-        tuning.write(Path(config), proposed)
-        print(f"written to {config}; 'thermoctl reload' applies it")
+        tuning.write(Path(settings.path), proposed, settings.axis)
+        print(f"written to {settings.path}; 'thermoctl reload' applies it")
     return 0
 
 
@@ -175,7 +185,14 @@ def evaluate(recordings: list[str]) -> int:
 
 
 def calibrate(
-    config: str, out: str | None, models: str, order: int, gains: bool, accept: bool, again: bool, yes: bool
+    config: str,
+    out: str | None,
+    models: str | None,
+    order: int,
+    gains: bool,
+    accept: bool,
+    again: bool,
+    yes: bool,
 ) -> int:
     """Run `thermoctl calibrate`: 0 when every step is done (and accepted, when asked).
 
@@ -196,7 +213,8 @@ def calibrate(
         return 1
     if not wizard.run(keyboard):
         return experiment.ENDED
-    print("to accept it means to:\n" + "\n".join(f"- {line}" for line in wizard.changes(Path(models), gains)))
+    installed = _models(models, settings)
+    print("to accept it means to:\n" + "\n".join(f"- {line}" for line in wizard.changes(installed, gains)))
     if not accept and keyboard.interactive:
         accept = (
             input("type 'accept' to do so; anything else leaves everything as it is: ").strip() == "accept"
@@ -204,5 +222,5 @@ def calibrate(
     if not accept:
         print("nothing was changed; `thermoctl calibrate --accept` takes it")
         return 0
-    wizard.accept(Path(models), gains)
+    wizard.accept(installed, gains)
     return 0

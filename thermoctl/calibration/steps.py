@@ -218,9 +218,11 @@ def proof(settings: Settings, recordings: Mapping[str, Path], order: int, acting
     `acting`: the model acted in that test."""
     t = read_table(recordings["test_4b"])
     c = t.columns
-    growth = _from_start(c["output_reference_um"] - c["position_raw_um"])
+    growth = c["output_reference_um"] - c["position_raw_um"]
+    origin_um = np.nanmean(growth[:SETTLED])  # of the two encoders; the output may move at the start
+    growth = growth - origin_um
     if acting:
-        left = _from_start(c["output_reference_um"] - c["reference_um"])
+        left = c["output_reference_um"] - c["reference_um"] - origin_um
         how = "the loop with the new model acting, judged by the second encoder, which it does not use"
     else:
         points = settings.channels.point_names
@@ -245,10 +247,6 @@ def proof(settings: Settings, recordings: Mapping[str, Path], order: int, acting
         _series(left[::thin]),
         _worst(after) < _worst(before),
     )
-
-
-def _from_start(error_um: np.ndarray) -> np.ndarray:
-    return error_um - np.nanmean(error_um[:SETTLED])
 
 
 def _estimate(kalman: Kalman, expansion: Expansion, r: Recorded) -> np.ndarray:

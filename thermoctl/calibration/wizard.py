@@ -38,7 +38,7 @@ from thermoctl.identify import modelfile, tuning
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
-from thermoctl.settings import Settings
+from thermoctl.settings import Settings, effective
 from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
 
@@ -107,7 +107,7 @@ class Wizard:
             )
 
     def _fingerprint(self) -> str:
-        files = Path(self.settings.path).read_bytes() + self.experiments.read_bytes()
+        files = effective(self.settings).encode() + self.experiments.read_bytes()
         return hashlib.sha256(files).hexdigest()
 
     def _save(self) -> None:
@@ -281,11 +281,12 @@ class Wizard:
         recordings = [self._recording(n) for n in steps.FITTED]
         path = modelfile.install(models, c.model, c.rig, recordings, figures)
         if gains:
-            tuning.write(Path(self.settings.path), self.result("pid", steps.Pid).gains()[1])
+            gains_found = self.result("pid", steps.Pid).gains()[1]
+            tuning.write(Path(self.settings.path), gains_found, self.settings.axis)
         if not self._in_use(models):
             try:
                 values = {"model": self._model_option(models)}
-                tuning.write_values(Path(self.settings.path), "compensation", values)
+                tuning.write_values(Path(self.settings.path), "compensation", values, self.settings.axis)
             except InputError as e:  # the model is installed; the user has to enter its name
                 self.say(str(e))
         self.fingerprint = self._fingerprint()

@@ -88,6 +88,7 @@ def _own(settings: Settings) -> Any:
         ),
         recording=dataclasses.replace(settings.recording, directory=str(folder / "recordings")),
         socket=dataclasses.replace(settings.socket, path=str(folder / "rig.sock")),
+        rig_socket="",  # a lock of its own, also for one axis of a rig
     )
     if (pid := holder(own)) is not None:
         raise InputError(f"{folder}: another demo runs here (pid {pid}); stop it first")

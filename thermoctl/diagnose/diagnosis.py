@@ -11,6 +11,7 @@ from thermoctl.diagnose.decide import Facts, decide, weigh
 from thermoctl.diagnose.fit import as_refitted
 from thermoctl.diagnose.held_out import split, worth
 from thermoctl.diagnose.law import find_law
+from thermoctl.diagnose.law_smooth import missing_flow
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.misfit import energies, standing
@@ -75,6 +76,8 @@ def diagnose(
         energy,
         physics,
     )
+    if found.decision.verdict != "consistent" and before.node:
+        found = replace(found, missing_flow=missing_flow(known, null, before.node))
     if (
         found.decision.verdict not in WITHOUT_REMAINDER
         and not stopped()

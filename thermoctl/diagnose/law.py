@@ -34,7 +34,7 @@ from thermoctl.diagnose.law_forms import (
     signals,
     terms,
 )
-from thermoctl.diagnose.law_smooth import Tracked, tracked
+from thermoctl.diagnose.law_smooth import Tracked, flow_unit, tracked
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.misfit import energies, physics
 from thermoctl.diagnose.roles import Structure
@@ -208,7 +208,16 @@ def find_law(
     )
     curve = _curve(at, p, f)
     return Law(
-        p, f, float(gains[best]), sure, float(probability), value, shut, curve, rivals, _unit(case, p.place)
+        p,
+        f,
+        float(gains[best]),
+        sure,
+        float(probability),
+        value,
+        shut,
+        curve,
+        rivals,
+        flow_unit(case.plant, p.place.target),
     )
 
 
@@ -406,14 +415,9 @@ def _curve(at: Tracked, p: Proposal, f: Fitted) -> Curve | None:
 # --------------------------------------------------------------------------------------------------- refits
 
 
-def _unit(case: Case, place: Place) -> str | None:
-    flows = (f for f in case.plant.flows.values() if {f.source, f.target} & set(place.nodes) and f.unit)
-    return next((f.unit for f in flows), None)
-
-
 def law_candidate(case: Case, rig: Structure, p: Proposal) -> Candidate:
     """Return a law as an effect at its place."""
-    effect = law_effect(p.terms, p.place, _unit(case, p.place))
+    effect = law_effect(p.terms, p.place, flow_unit(case.plant, p.place.target))
     ends = {"target": p.place.target, **({"source": p.place.source} if p.place.source else {})}
     return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig)
 

@@ -146,6 +146,22 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
     return Tracked(metric, target, runs, duration, explained)
 
 
+def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
+    """Return the rms of the flow into a node, in its unit, that brings the plant to the recordings.
+
+    `f`: the fitted plant. None where it cannot be tracked."""
+    try:
+        runs = tracked(case, f, [node]).runs
+    except (SimulationError, np.linalg.LinAlgError):
+        return None
+    return float(np.sqrt(np.mean(np.concatenate([run[f"{LATENT}{node}"] for run in runs]) ** 2)))
+
+
+def flow_unit(plant: Plant, node: str) -> str | None:
+    """Return the unit of the flows at a node, None where none is stated."""
+    return next((f.unit for f in plant.flows.values() if node in (f.source, f.target) and f.unit), None)
+
+
 def _explained(x: np.ndarray, target: np.ndarray) -> float:
     u, s, _ = np.linalg.svd(x, full_matrices=False)
     along = u[:, s > ABSORBED * s[0]].T @ target

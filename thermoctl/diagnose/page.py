@@ -197,6 +197,10 @@ def _remains(found: Diagnosis, result: Mapping[str, Any]) -> str:
         facts.append(f"Small random forces at {r['node']} would explain the remainder best.")
     follows = ", ".join(r["follows"])
     facts.append(f"It follows {follows}." if follows else "It follows none of the recorded signals.")
+    for m in result["mismatch"][:1]:
+        if m["missing_flow_rms"] and not found.shown:
+            size = f"{m['missing_flow_rms']:.3g} {unit(m['missing_flow_unit'])}".strip()
+            facts.append(f"A flow of {size} (rms) into {m['node']} would bring the plant to the recordings.")
     for m in result["mismatch"]:
         if m["when"] and not found.shown:
             spans = "; ".join(f"{a:.4g} to {b:.4g} s" for a, b in m["when"][:6])

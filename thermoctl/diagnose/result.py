@@ -14,6 +14,7 @@ from thermoctl.diagnose.fit import Fitted, Placed
 from thermoctl.diagnose.held_out import Worth
 from thermoctl.diagnose.law import Law
 from thermoctl.diagnose.law_result import law_entry
+from thermoctl.diagnose.law_smooth import flow_unit
 from thermoctl.diagnose.misfit import Energy
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import Left
@@ -42,6 +43,7 @@ class Diagnosis:
     - `energy`: of each hypothesis' residuals
     - `physics`: for hypotheses whose every effect stands out of the misfit that they leave: each effect's
       probability of being physics
+    - `missing_flow`: rms of the flow into `before.node` that would close the misfit of `null`
     - `law`: a law for the remainder of the outcome"""
 
     case: Case
@@ -55,6 +57,7 @@ class Diagnosis:
     decision: Decision
     energy: Mapping[frozenset[Key], Energy]
     physics: Mapping[frozenset[Key], Mapping[Key, float]]
+    missing_flow: float | None = None
     law: Law | None = None
 
     @property
@@ -227,6 +230,8 @@ def _mismatch(d: Diagnosis) -> list[dict[str, Any]]:
             "rms": rms[o],
             "expected_rms": d.before.noise[o],
             "node": d.before.node,
+            "missing_flow_rms": d.missing_flow,
+            "missing_flow_unit": flow_unit(d.case.plant, d.before.node) if d.before.node else None,
             "when": _when(d, o),
             "follows": d.before.follows,
         }

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -254,29 +255,55 @@ def difference(present: Gains, proposed: Gains) -> str:
     )
 
 
-def write(config: Path, proposed: Gains) -> None:
+def write(config: Path, proposed: Gains, axis: str = "") -> None:
     """Write kp, ti_s, td_s into a configuration. Raises InputError as `write_values`."""
     numbers = {"kp": proposed.kp, "ti_s": proposed.ti_s, "td_s": proposed.td_s}
-    write_values(config, "control", {n: f"{v:.6g}" for n, v in numbers.items()})
+    write_values(config, "control", {n: f"{v:.6g}" for n, v in numbers.items()}, axis)
 
 
-def write_values(config: Path, section: str, values: dict[str, str]) -> None:
+def write_values(config: Path, section: str, values: dict[str, str], axis: str = "") -> None:
     """Write values into a section of a configuration, other lines and all comments untouched.
 
-    Raises InputError when the section does not name each on a line of its own."""
+    axis: into the section of this axis; section and keys are added where the axis has none of its own.
+    Raises InputError when the place has no lines of its own, or without an axis names no such key."""
     text = config.read_text(encoding="utf-8")
-    found = re.search(rf"^{section}:.*\n((?:[ \t]+.*\n|\s*\n|#.*\n)*)", text, re.MULTILINE)
+    place = ["axes", axis, section] if axis else [section]
     by_hand = ", ".join(f"{n}: {v}" for n, v in values.items())
+    found = _body(text, place)
+    if found is None and axis and (above := _body(text, place[:-1])) is not None:
+        begin, _, indent = above
+        if not re.search(rf"^{indent}{section}:", text[slice(*above[:2])], re.MULTILINE):
+            head = f"{indent}{section}:\n"
+            text = text[:begin] + head + text[begin:]
+            found = begin + len(head), begin + len(head), indent + "  "
     if found is None:
-        raise InputError(f"{config}: no section '{section}' with lines of its own; write by hand: {by_hand}")
-    body = found.group(1)
-    for name, value in values.items():
-        line = re.compile(rf"^([ \t]+{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$", re.MULTILINE)
-        body, n = line.subn(lambda m, value=value: f"{m[1]}{value}{m[2]}", body)
-        if n != 1:
+        raise InputError(
+            f"{config}: no section '{'.'.join(place)}' with lines of its own; write by hand: {by_hand}"
+        )
+    begin, end, indent = found
+    body = text[begin:end]
+    for name, value in reversed(values.items()):  # a new line goes before those that are there
+        line = re.compile(rf"^({indent}{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$", re.MULTILINE)
+        body, n = line.subn(rf"\g<1>{value}\g<2>", body)
+        if n == 0 and axis:
+            body = f"{indent}{name}: {value}\n{body}"
+        elif n != 1:
             raise InputError(
                 f"{config}: {section}.{name} does not stand on a line of its own; write by hand: {by_hand}"
             )
     temporary = config.with_name(f".{config.name}.writing")
-    temporary.write_text(text[: found.start(1)] + body + text[found.end(1) :], encoding="utf-8")
+    temporary.write_text(text[:begin] + body + text[end:], encoding="utf-8")
     os.replace(temporary, config)
+
+
+def _body(text: str, place: Sequence[str]) -> tuple[int, int, str] | None:
+    """Find the lines below a key of a YAML file: begin, end, their indent. None without such lines."""
+    begin, end, indent = 0, len(text), ""
+    for key in place:
+        below = rf"^{indent}{key}:[ \t]*(?:#.*)?\n((?:{indent}[ \t]+.*\n|\s*\n|[ \t]*#.*\n)*)"
+        found = re.compile(below, re.MULTILINE).search(text, begin, end)
+        inner = found and re.search(r"^([ \t]+)[^\s#]", found[1], re.MULTILINE)
+        if not (found and inner):
+            return None
+        begin, end, indent = found.start(1), found.end(1), inner[1]
+    return begin, end, indent

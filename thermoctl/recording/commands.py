@@ -29,7 +29,8 @@ def list_recordings(args: argparse.Namespace) -> int:
             f"{folder}: no such folder; name the one that recording.directory of the configuration says"
         )
     found: list[dict[str, Any]] = []
-    for path in sorted(p for kind in (FULL, TIER) for p in recording_files(folder, kind)):
+    places = [folder, *(p for p in folder.iterdir() if p.is_dir())]  # an axis' recordings: its own folder
+    for path in sorted(p for place in places for kind in (FULL, TIER) for p in recording_files(place, kind)):
         try:
             i = info(path)
         except InputError as e:
