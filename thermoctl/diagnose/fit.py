@@ -259,8 +259,9 @@ class Posterior:
             step, gained, here = _step(z, gradient, matrix, low, high), 0.0, self.kept
             for length in LENGTHS:
                 trial = np.clip(z + length * step, low, high)
-                try:  # most first trials succeed
-                    e = self.errors_and_slopes(trial) if length == LENGTHS[0] else self.errors(trial)
+                try:
+                    at_once = self.problem.few and length == LENGTHS[0]
+                    e = self.errors_and_slopes(trial) if at_once else self.errors(trial)
                 except SimulationError:
                     continue
                 trial_rows = self.rows(e)

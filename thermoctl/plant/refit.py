@@ -225,8 +225,7 @@ def _improve(
 ) -> tuple[np.ndarray, Evaluation, float, list[Rows]] | None:
     """Return a point of less cost, its evaluation with derivatives, the next damping, and its rows.
 
-    None if no damping up to the twelfth gives one. Most first trials succeed, so they run with derivatives
-    at once."""
+    None if no damping up to the twelfth gives one."""
     for tries in range(12):
         step, left = _bounded_step(z, now, free, damping, bounds)
         predicted = float(2 * now.gradient @ step - step @ now.matrix @ step)
@@ -234,12 +233,13 @@ def _improve(
         try:
             bend = _acceleration(problem, z, step, now.matrix, damping, left, kept)
             trial = np.clip(z + step + bend, *bounds)
-            then = problem.evaluate(trial, not tries, rows)
+            at_once = problem.few and not tries
+            then = problem.evaluate(trial, at_once, rows)
         except SimulationError:
             damping = min(damping * 8, 1e8)
             continue
         if then.cost < now.cost:
-            if tries:
+            if not at_once:
                 then = problem.evaluate(trial, True, rows)
             problem.keep()
             half = now.cost - then.cost > 0.5 * predicted
