@@ -14,7 +14,7 @@ from thermoctl.diagnose.coordinates import Coordinates
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.noise import Grid, grid
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.rows import reduced
+from thermoctl.diagnose.rows import OUTLIER, reduced
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Noise, fit
 from thermoctl.plant.simulate import RTOL, Excitation, Model, compile_plant
@@ -24,7 +24,6 @@ from thermoctl.yamlfile import InputError
 LEAST = 40  # measured values of one output, below which nothing is decided
 ACCURATE = 1e-3  # local error of a simulation over noise / range of an output; at most LARGEST
 LARGEST = 1e-5
-OUTLIER = 6.0  # robust standard deviations from the median of five neighbours
 
 
 @dataclass
