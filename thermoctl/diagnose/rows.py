@@ -34,11 +34,11 @@ from thermoctl.plant.refit import Noise, default_noise
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
-# None of these numbers chooses a hypothesis. They bound what the reduction may cost: about 2 % of the information.
+# None of these numbers chooses a hypothesis. They limit the reduction's loss to about 2 % of the information.
 LONG = 12_000  # rows of all recordings, up to which a diagnosis takes seconds: all are kept
 FEWEST = 1_000  # rows that each recording keeps: forty bands, the highest with a tenth of them
-# At half of the new highest frequency the mean of a block keeps sinc(1/4)^2 = 81 % of the power. What is faster
-# than that has at most WHITE - 1 = 10 % of the noise's power. So 19 % of 10 % of the highest band are lost.
+# At half of the new highest frequency the mean of a block keeps sinc(1/4)^2 = 81 % of the power. Faster content
+# has at most WHITE - 1 = 10 % of the noise's power. So 19 % of 10 % of the highest band are lost.
 HALF_BAND = 2.0  # the new highest frequency over that of the fastest content
 WHITE = 1.1  # times the power of the highest rows, up to which a band is white
 DEVIATIONS = 4.0  # of a band's power that are chance: one output in a thousand is taken for faster than it is

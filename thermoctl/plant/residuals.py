@@ -31,8 +31,8 @@ PRIOR_WEIGHT = 0.02  # moving a parameter over its whole range costs as much as 
 PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
 DOWNDATE_SHARE = 0.25  # up to this share of down-weighted rows, their excess is subtracted from J'J
 MIN_DIFFERENCED = 4  # fewest samples of a recording for second differences
-# Unknowns of a recording up to which a run with sensitivities costs less than about ten without: eight go through the
-# processor at once (integrator.h). There a trial step that succeeds nine times of ten runs with them at once.
+# Unknowns up to which a run with sensitivities costs less than ten without: eight go through the processor at
+# once (integrator.h). There a trial step, which succeeds nine times of ten, runs with them at once.
 FEW_UNKNOWNS = 16
 LOG_RATIO = 3.0  # a range that spans this factor is fitted on a log scale
 
