@@ -34,7 +34,7 @@ from thermoctl.plant.refit import Noise, default_noise
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
-# None of these numbers chooses a hypothesis. They limit the reduction's loss to about 2 % of the information.
+# None of these numbers chooses a hypothesis. They limit the loss to about 2 % of the information.
 LONG = 12_000  # rows of all recordings, up to which a diagnosis takes seconds: all are kept
 FEWEST = 1_000  # rows that each recording keeps: forty bands, the highest with a tenth of them
 # At half of the new highest frequency the mean of a block keeps sinc(1/4)^2 = 81 % of the power. Faster content

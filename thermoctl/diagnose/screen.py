@@ -481,7 +481,7 @@ def _allowed(p: EffectParameter, coefficient: float) -> bool:
 def _keep(
     best: dict[int, Direction], new: Direction, sizes: Sequence[float], along: Callable[[], np.ndarray]
 ) -> None:
-    """Keep a direction if it is its candidate's best so far. Only then `along` computes its projected rows."""
+    """Keep a direction if it is its candidate's best so far. Only then `along` computes its rows."""
     shape = {k: v for k, v in new.shape.items() if k != "picked_from"}
     new = dataclasses.replace(new, elsewhere=float(np.log10(new.shape.get("picked_from", 1.0))))
     old = best.get(id(new.candidate))
