@@ -22,6 +22,7 @@ from thermoctl.plant.simulate import Excitation
 
 SINGLE = 6  # lowest rows that are bands of their own
 WIDTH = 1.19  # of a band: a quarter of an octave
+SHORT = 4_000  # samples whose DCT takes no time whatever their number
 FEWEST = 8  # samples of an output in a recording, below which it says nothing
 
 
@@ -80,7 +81,7 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
 
 @cache
 def quick(n: int) -> int:
-    """Return the largest number up to n without a large prime factor, whose DCT takes four times as long."""
+    """Return the largest number up to n without a large prime factor; with one a long DCT takes four times as long."""
 
     def rest(m: int) -> int:
         for p in (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31):
@@ -88,7 +89,7 @@ def quick(n: int) -> int:
                 m //= p
         return m
 
-    return next(m for m in range(n, 0, -1) if rest(m) == 1)
+    return next(m for m in range(n, 0, -1) if rest(m) == 1) if n > SHORT else n
 
 
 class Coordinates:

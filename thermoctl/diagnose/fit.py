@@ -25,6 +25,7 @@ from thermoctl.diagnose.coordinates import Coordinates
 from thermoctl.diagnose.memory import Past, PlacedBefore
 from thermoctl.diagnose.noise import Averaged, Grid, averaged
 from thermoctl.plant import refit
+from thermoctl.plant.cores import each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
 from thermoctl.plant.residuals import HUGE, Evaluation
@@ -156,7 +157,11 @@ class Posterior:
     def errors(self, z: np.ndarray) -> list[np.ndarray]:
         """Free-run errors. Raises SimulationError."""
         values, dx0 = self.problem.unpack(z)
-        out = [d.y - self.model.run(d, values[r], dx0[r]).y for r, d in enumerate(self.drives)]
+        out = each(
+            lambda r: self.drives[r].y - self.model.run(self.drives[r], values[r], dx0[r]).y,
+            range(len(self.drives)),
+            self.problem.numbers,
+        )
         self._check(out)
         return out
 
@@ -192,18 +197,18 @@ class Posterior:
 
     def errors_and_slopes(self, z: np.ndarray) -> list[np.ndarray]:
         """Free-run errors; `slopes` are kept. One run costs less than two. Raises SimulationError."""
-        errors, found = [], []
         by_recording = {
             r: list(channels)
             for r, channels in groupby(self.case.coordinates.channels, lambda c: c.recording)
         }
-        for r, d in enumerate(self.drives):
+
+        def part(r: int) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
             unknown, y, jac = self.problem.jacobian(z, r)
-            errors.append(d.y - y)
-            found += [
-                (unknown, self.case.coordinates.transform(c, jac[:, c.output]))
-                for c in by_recording.get(r, ())
-            ]
+            rows = [self.case.coordinates.transform(c, jac[:, c.output]) for c in by_recording.get(r, ())]
+            return self.drives[r].y - y, [(unknown, x) for x in rows]
+
+        parts = each(part, range(len(self.drives)), 2 * self.problem.numbers)
+        errors, found = [e for e, _ in parts], [x for _, rows in parts for x in rows]
         self._check(errors)
         self.kept = z.copy(), found
         return errors

@@ -17,6 +17,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.rig import STRAIGHT, Rig
 from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import expression as ex
+from thermoctl.plant.cores import each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit
 from thermoctl.plant.simulate import Excitation, Model, Simulation
@@ -227,28 +229,31 @@ _Entry = tuple[_Column, np.ndarray, float]  # its projected rows, and the norm o
 def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Sequence[_Column], np.ndarray]]:
     """Rows (rows, k) of columns, not whitened, a chunk at a time."""
     buffers: dict[str, np.ndarray] = {}
+    model, recordings = metric.model, range(len(metric.drives))
     for at in range(0, len(columns), CHUNK):
         part = columns[at : at + CHUNK]
-        blocks = []
-        for r, d in enumerate(metric.drives):
-            forces, values = [], []
-            for c, column in enumerate(part):
-                for state, q in column.forces[r].items():
-                    forces.append((state, c))
-                    values.append(q)
-            shape = (len(d.t), len(metric.model.outputs), len(part))
-            if forces:
-                q = np.nan_to_num(np.stack(values, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
-                dy = metric.model.respond(
-                    d, metric.fit.values[r], metric.fit.dx0[r], forces, q, len(part), buffers=buffers
-                )
-            else:
-                dy = np.zeros(shape)
-            for c, column in enumerate(part):
-                for j, delta in column.outputs[r].items():
-                    dy[:, j, c] += np.nan_to_num(delta)
-            blocks.append(metric.unweighted(r, dy))
+        numbers = sum(len(d.t) for d in metric.drives) * len(model.states) * len(part)
+        blocks = each(partial(_rows, metric, part, buffers), recordings, numbers)
         yield part, np.concatenate(blocks)
+
+
+def _rows(metric: Metric, part: Sequence[_Column], buffers: dict[str, np.ndarray], r: int) -> np.ndarray:
+    """Return the rows (rows, k) of columns in one recording, not whitened."""
+    d, forces, values = metric.drives[r], [], []
+    for c, column in enumerate(part):
+        for state, q in column.forces[r].items():
+            forces.append((state, c))
+            values.append(q)
+    if forces:
+        q = np.nan_to_num(np.stack(values, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
+        at = (metric.fit.values[r], metric.fit.dx0[r])
+        dy = metric.model.respond(d, *at, forces, q, len(part), buffers=buffers)
+    else:
+        dy = np.zeros((len(d.t), len(metric.model.outputs), len(part)))
+    for c, column in enumerate(part):
+        for j, delta in column.outputs[r].items():
+            dy[:, j, c] += np.nan_to_num(delta)
+    return metric.unweighted(r, dy)
 
 
 def screen(

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from thermoctl.plant import expression as ex
+from thermoctl.plant.cores import each
 from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
 from thermoctl.yamlfile import InputError
@@ -136,6 +137,17 @@ class Evaluation(NamedTuple):
     residuals: list[np.ndarray]
 
 
+class _Part(NamedTuple):
+    """One recording's cost, numbers of its unknowns, half its negative gradient, matrix, residuals, rows."""
+
+    cost: float
+    unknowns: np.ndarray
+    gradient: np.ndarray
+    matrix: np.ndarray
+    residual: np.ndarray
+    rows: list[Rows]
+
+
 class Problem:
     """Residuals and Jacobian of a model on several recordings, in the metric of the noise."""
 
@@ -156,6 +168,8 @@ class Problem:
         self.kept_buffers: dict[str, np.ndarray] = {}
         self.huber = np.full(len(self.noise), HUBER)
         self.rows = [[_rows(d, j, n) for j, n in enumerate(self.noise)] for d in excitations]
+        # computed in a run without sensitivities; with them, at least as many again
+        self.numbers = sum(len(d.t) for d in excitations) * len(model.states) * (len(model.unknowns) + 1)
         self.samples = sum(len(e[0]) for entry in self.rows for e in entry)
         if self.samples == 0:
             raise InputError("no recording has a column that an output of the plant reads; nothing to fit")
@@ -284,37 +298,49 @@ class Problem:
         values, dx0 = self.unpack(z)
         cost, gradient, matrix = 0.0, np.zeros(len(z)), np.zeros((len(z), len(z)))
         residuals = []
-        for r, d in enumerate(self.excitations):
-            run = self.model.run(d, values[r], dx0[r], sensitivities=jacobian, buffers=self.buffers)
-            if not np.all(np.abs(run.y) < HUGE):
-                raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
-            e = d.y - run.y
-            residuals.append(e)
-            used, k, slope = self._slopes(r, values[r])
-            part_gradient, part_matrix = np.zeros(len(k)), np.zeros((len(k), len(k)))
-            for j in range(len(self.noise)):
-                if not len(self.rows[r][j][0]):
-                    continue
-                w = self.whiten(r, j, e[:, j])
-                size, limit = np.abs(w), self.huber[j]
-                cost += float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
-                if run.dy is None:
-                    continue
-                weight = np.where(size <= limit, 1.0, limit / np.maximum(size, limit))
-                dy = run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used]
-                rows = self._weighted(r, j, k, slope, w, weight, dy)
-                if keep is not None:
-                    keep.append(rows)
-                part_gradient += rows.slope * (rows.jac.T @ (rows.weight * rows.w))
-                part_matrix += _gram(rows.jac, rows.weight) * np.outer(rows.slope, rows.slope)
+        parts = each(
+            lambda r: self._part(r, values[r], dx0[r], jacobian),
+            range(len(self.excitations)),
+            self.numbers * (jacobian + 1),
+        )
+        for part in parts:
+            cost += part.cost
+            residuals.append(part.residual)
+            if keep is not None:
+                keep.extend(part.rows)
             if jacobian:
-                np.add.at(gradient, k, part_gradient)
-                matrix[np.ix_(k, k)] += part_matrix
+                np.add.at(gradient, part.unknowns, part.gradient)
+                matrix[np.ix_(part.unknowns, part.unknowns)] += part.matrix
         prior_cost, prior_gradient, prior_matrix = self.prior_terms(values, jacobian)
         weight, distance = self.prior(), z - self.z_plant
         cost = cost + prior_cost + float(np.sum(weight * distance**2))
         gradient = gradient + prior_gradient - weight * distance
         return Evaluation(cost, gradient, matrix + prior_matrix + np.diag(weight), residuals)
+
+    def _part(self, r: int, values: np.ndarray, dx0: np.ndarray, jacobian: bool) -> _Part:
+        """Return what one recording adds to an evaluation. Raises SimulationError."""
+        d = self.excitations[r]
+        run = self.model.run(d, values, dx0, sensitivities=jacobian, buffers=self.buffers)
+        if not np.all(np.abs(run.y) < HUGE):
+            raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
+        e, cost, kept = d.y - run.y, 0.0, []
+        used, k, slope = self._slopes(r, values)
+        gradient, matrix = np.zeros(len(k)), np.zeros((len(k), len(k)))
+        for j in range(len(self.noise)):
+            if not len(self.rows[r][j][0]):
+                continue
+            w = self.whiten(r, j, e[:, j])
+            size, limit = np.abs(w), self.huber[j]
+            cost += float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
+            if run.dy is None:
+                continue
+            weight = np.where(size <= limit, 1.0, limit / np.maximum(size, limit))
+            dy = run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used]
+            rows = self._weighted(r, j, k, slope, w, weight, dy)
+            kept.append(rows)
+            gradient += rows.slope * (rows.jac.T @ (rows.weight * rows.w))
+            matrix += _gram(rows.jac, rows.weight) * np.outer(rows.slope, rows.slope)
+        return _Part(cost, k, gradient, matrix, e, kept)
 
     def prior_terms(self, values: np.ndarray, derivatives: bool) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the priors' cost, half its negative gradient and half its second derivatives."""
@@ -342,10 +368,14 @@ class Problem:
 
         Raises SimulationError."""
         values, dx0 = self.unpack(z + PROBE * step)
-        errors = [
-            d.y - self.model.run(d, values[r], dx0[r], buffers=self.buffers).y
-            for r, d in enumerate(self.excitations)
-        ]
+        errors = each(
+            lambda r: (
+                self.excitations[r].y
+                - self.model.run(self.excitations[r], values[r], dx0[r], buffers=self.buffers).y
+            ),
+            range(len(self.excitations)),
+            self.numbers,
+        )
         out = np.zeros(len(z))
         for rows in kept:
             r, j = rows.recording, rows.output

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -87,6 +88,11 @@ def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]
     if key not in kept or kept[key].size < size:
         kept[key] = np.empty(size)
     return kept[key][:size].reshape(shape)
+
+
+def _own(key: str) -> str:
+    """Return the key of a buffer that each thread has for itself."""
+    return f"{key} {threading.get_ident()}"
 
 
 def _call(function: Callable[..., int], *arguments: object) -> int:
@@ -342,7 +348,7 @@ class Model:
         width = excitation.width if excitation.width is not None else np.ones(1)
         x0, s0 = self.start(excitation, p, dx0)
         x = np.empty((n, nx))
-        dx = _buffer(buffers, "dx", (n, nx, nq)) if sensitivities else None
+        dx = _buffer(buffers, _own("dx"), (n, nx, nq)) if sensitivities else None
         info = np.zeros(2)
         if nx:
             if not np.all(np.isfinite(x0)):
@@ -394,7 +400,7 @@ class Model:
         q = np.ascontiguousarray(q, float)
         force = _Forces(len(rows), rows.ctypes.data, cols.ctypes.data, q.ctypes.data)
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
-        dx = _buffer(buffers, "dx", (n, nx, columns))
+        dx = _buffer(buffers, _own("dx"), (n, nx, columns))
         atol = rtol * excitation.scale
         start = (n, excitation.t, u, excitation.linear, p, excitation.width, x0, s0)
         limits = (rtol, atol, MAX_STEPS)
