@@ -114,12 +114,19 @@ class Trajectory:
             "pi": np.pi,
         }
         self.first = d.first
+        self.known: dict[int, np.ndarray] = {}
         # inputs that hold, as they were until each sample
         self.until = {
             i: np.concatenate([u[:1], u[:-1]])
             for i, u, linear in zip(rig.plant.inputs, d.u.T, d.linear, strict=False)
             if not linear
         }
+
+    def own(self, e: ex.Expr) -> np.ndarray:
+        """The value of an expression of the plant itself, computed once."""
+        if id(e) not in self.known:
+            self.known[id(e)] = self.value(e, {})
+        return self.known[id(e)]
 
     def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
         """The value of an expression along the trajectory."""
@@ -142,31 +149,27 @@ def changes(
     for n in extended.nodes.values():
         if n.name not in base.nodes:
             extra[n.name] = _new_node(extended, n.name, extra, at)
-    touched: dict[str, list[tuple[ex.Expr, float]]] = {}
+    touched: dict[str, list[tuple[np.ndarray, float]]] = {}
     for f in extended.flows.values():
         old = base.flows.get(f.name)
         if old is not None and old.rate is f.rate:
             continue
+        delta = at.value(f.rate, extra) - (0.0 if old is None else at.own(old.rate))
         for end, sign in ((f.source, -1.0), (f.target, 1.0)):
             if end in base.nodes:
-                delta = touched.setdefault(end, [])  # type: ignore[arg-type]
-                delta.append((f.rate, sign))
-                if old is not None:
-                    delta.append((old.rate, -sign))
+                touched.setdefault(end, []).append((delta, sign))  # type: ignore[arg-type]
     states = list(base.nodes)
     slopes: dict[int, np.ndarray] = {}
     for node, terms in touched.items():
-        total = np.zeros(at.drive.t.shape)
-        for e, sign in terms:
-            total += sign * at.value(e, extra)
-        slopes[states.index(node)] = total / at.value(base.nodes[node].storage, extra)
+        total = sum(sign * delta for delta, sign in terms)
+        slopes[states.index(node)] = total / at.own(base.nodes[node].storage)
     for node, n in base.nodes.items():
         changed = extended.nodes[node]
         if changed.storage is not n.storage:
             net = np.zeros(at.drive.t.shape)
             for f in base.flows.values():
                 if node in (f.source, f.target):
-                    net += (1.0 if f.target == node else -1.0) * at.value(f.rate, extra)
+                    net += (1.0 if f.target == node else -1.0) * at.own(f.rate)
             slopes[states.index(node)] = net / at.value(changed.storage, extra) - net / at.value(
                 n.storage, extra
             )
@@ -174,7 +177,7 @@ def changes(
     for j, (key, o) in enumerate(base.outputs.items()):
         new = extended.outputs[key]
         if new.value is not o.value:
-            outputs[j] = at.value(new.value, extra) - at.value(o.value, extra)
+            outputs[j] = at.value(new.value, extra) - at.own(o.value)
     return slopes, outputs
 
 
