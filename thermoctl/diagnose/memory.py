@@ -86,7 +86,7 @@ class Memory:
 NOTHING = Memory()
 
 
-def rebuilt(
+def remade(
     past: Past,
     plant: Plant,
     drives: Sequence[Excitation],

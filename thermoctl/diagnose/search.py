@@ -13,7 +13,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.extend import extend, sticking, weaker
 from thermoctl.diagnose.fit import Fitted, Placed, fitted, over_noise
 from thermoctl.diagnose.limits import Limits
-from thermoctl.diagnose.memory import rebuilt
+from thermoctl.diagnose.memory import remade
 from thermoctl.diagnose.places import PLACES
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Metric, sharpened
@@ -113,7 +113,7 @@ def recalled(case: Case, where: Mapping[str, set[str]], limits: Limits, null: We
         if not past.effects or case.budget.spent or past.log_evidence < likeliest - BEATEN * limits.effects:
             continue
         try:
-            plant, made = rebuilt(past, case.plant, drives, columns, case.catalogue)
+            plant, made = remade(past, case.plant, drives, columns, case.catalogue)
             effects = [Placed(c, own) for c, own in made]
             leader = max((w.fitted for w in (null, *out)), key=lambda f: f.log_likelihood)
             f = fitted(case, free_starts(case.plant, plant), effects, None, leader)
