@@ -125,8 +125,12 @@ size: install                      # the wheel in a fresh environment: megabytes
 stranger: develop                  # another simulator's log with ; and decimal commas, up to the right name: commands, edits, times
 	$(BIN)/python -m pytest -q -s -k strangers_rig tests/plant/test_plant_new.py
 
+.PHONY: notebooks
+notebooks: develop                 # every notebook of docs/notebooks from the first cell to the last
+	$(BIN)/python -m pytest -m "slow or not slow" tests/api/test_notebooks.py
+
 .PHONY: wrong-plants
-wrong-plants: develop              # twenty wrong plants: found by the checks, named rightly, or not named with confidence; minutes
+wrong-plants: develop              # wrong plants and damaged recordings: docs/proof/wrong-plants.md; two minutes
 	$(BIN)/python -m tests.checks.wrong_plants
 
 .PHONY: fmu-back

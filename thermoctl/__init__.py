@@ -4,25 +4,16 @@
     plant = tc.load_plant("plant.yaml")
     result = tc.diagnose(plant, ["run_1.csv", frame])
 
-The functions are those of `thermoctl.api`, loaded when one of them is used.
+The functions are those of `thermoctl.api`, loaded when one of them is used. `__init__.pyi` lists them.
 """
 
 import importlib
+import re
+from pathlib import Path
 from typing import Any
 
 __version__ = "0.1.0"
-_API = (
-    "Diagnosis",
-    "Plant",
-    "Refit",
-    "Simulation",
-    "check",
-    "diagnose",
-    "load_plant",
-    "read",
-    "refit",
-    "simulate",
-)
+_API = re.findall(r" as (\w+)$", Path(__file__).with_suffix(".pyi").read_text(), re.MULTILINE)
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,5 @@
 from thermoctl.api import Diagnosis as Diagnosis
+from thermoctl.api import Finding as Finding
 from thermoctl.api import Plant as Plant
 from thermoctl.api import Refit as Refit
 from thermoctl.api import Simulation as Simulation

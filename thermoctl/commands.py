@@ -668,6 +668,30 @@ _DIAGNOSIS = (
         _arg("--quiet", action="store_true", help="print neither progress nor summary"),
     ),
     _command(
+        "plan",
+        "say what a diagnosis could see with a plant, its sensors and an experiment: effects, parameters, a better course",
+        "thermoctl.advice.commands:plan_experiment",
+        "",
+        _PLANT,
+        _MAP,
+        _arg(
+            "--like",
+            action="append",
+            metavar="REC",
+            help="a recording with the inputs and times of the experiment (repeatable); its readings do not count",
+        ),
+        _arg(
+            "--limit",
+            action="append",
+            metavar="NAME=LOW:HIGH",
+            help="range of an input that can be driven; without --like it goes through levels (repeatable)",
+        ),
+        _TIME,
+        _COLUMNS,
+        _EFFECTS,
+        _JSON,
+    ),
+    _command(
         "effects",
         "list the catalogue of effects, show one (`effects show NAME`), check files of your own (`effects check FILE`), "
         "or save the law of a diagnosis as one (`effects save DIR NAME`)",

@@ -5,6 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -42,3 +43,10 @@ def test_new_effect(tmp_path, monkeypatch):
     assert finding.effect == "fan_heating"
     (value,) = finding.parameters.values()
     assert value["value"] == pytest.approx(2e-5, abs=3 * value["sd"])
+
+
+def test_compensation(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    names, _ = run("compensation", tmp_path, monkeypatch)
+    on, off = (np.abs(e[t > t[-1] / 2]).mean() for t, e in (names["errors"][k] for k in ("on", "off")))
+    assert off > 0.5 and on < 0.1 * off

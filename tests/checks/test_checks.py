@@ -102,7 +102,8 @@ DAMAGES = {
     "dead sensor": (TWO, column("temperature_2", lambda v: 0 * v + 21.5), "still", "temperature_2", True),
     "dead input": (TWO, column("heat", lambda v: 0 * v), "still", "no input moves", True),
     "sensor that hangs": (TWO, column("temperature_1", frozen(420, 540)), "stuck", "temperature_1", True),
-    "gap": (TWO, rows(lambda n: np.r_[0:300, 420:n]), "gap", "t = 598 to 840", False),
+    "gap": (TWO, rows(lambda n: np.r_[0:300, 420:n]), "gap", "t = 598 to 840 s; they are 2 s apart elsewhere; 'heat' changed", True),
+    "gap at rest": (TWO, rows(lambda n: np.r_[0:310, 390:n]), "gap", "t = 618 to 780", False),
     "copied twice": (TWO, twice, "repeated", "digit for digit", True),
     "held": (TWO, lambda t: stretched(t, lambda now, at, v, last: last), "resampled", "held between every 4th", False),
     "interpolated": (
@@ -110,8 +111,9 @@ DAMAGES = {
         lambda t: stretched(t, lambda now, at, v, last: np.round(np.interp(now, at, v), 4)),
         "resampled",
         "interpolated between every 4th",
-        False,
+        True,
     ),
+    "sensor converted twice": (TWO, column("temperature_1", lambda v: (v - 32) / 1.8), "unit", "converted from degF twice", True),
     "sampled too slowly": ("carriage", rows(lambda n: np.arange(0, n, 1000 // 4)), "sampling", "miss", False),
 }  # fmt: skip
 

@@ -1,12 +1,24 @@
-"""The command `effects check`."""
+"""The commands `effects check` and `plan`."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
 
 from thermoctl.advice.effect_files import check_file, files_of, own_plants
+from thermoctl.advice.plan import Planned, contract, plan
+from thermoctl.checks.commands import report
+from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnose.commands import parsed_limits
 from thermoctl.plant import load
+from thermoctl.plant.recordings import read_recordings
+from thermoctl.recording.logger import parsed_columns
 from thermoctl.yamlfile import InputError
 
 
@@ -29,3 +41,61 @@ def check_effects(args: argparse.Namespace) -> int:
         )
         print(f"{path}: good; {name} {where}")
     return int(wrong > 0)
+
+
+def plan_experiment(args: argparse.Namespace) -> int:
+    """`thermoctl plan`: print what recordings like these would show of a plant. Raises InputError."""
+    plant = load(args.plant, args.map)
+    tables = read_recordings(plant, args.like or (), args.time, parsed_columns(args.columns))
+    entries = catalogue((CATALOGUE, *map(Path, args.effects or ())))
+    planned = plan(plant, tables, entries, parsed_limits(args.limit or ()))
+    if args.json:
+        print(json.dumps(contract(planned), indent=1))
+    else:
+        _show(planned)
+    return 0
+
+
+def _show(planned: Planned) -> None:
+    console = Console() if sys.stdout.isatty() else Console(width=120)
+    report(planned.checks, sys.stdout)
+    span = f"{planned.duration_s:.4g} s, a sample every {planned.interval_s:.3g} s"
+    if planned.slowest_s:
+        share = planned.duration_s / planned.slowest_s
+        span += f"; the plant's slowest time constant, {planned.slowest_s:.3g} s, fits in {share:.1f} times"
+    console.print(f"[bold]experiment[/] {span}")
+    if planned.parameters:
+        console.print(_parameters(planned))
+    shown = Table("effect", "where", "smallest size that would be seen", "as", box=None, header_style="bold")
+    for v in planned.effects:
+        if v.reason is None:
+            name = v.parameter + (f", {v.unit}" if v.unit and v.unit != "1" else "")
+            shown.add_row(v.candidate.effect.name, v.candidate.place.where, f"{v.smallest:.3g}", name)
+    console.print(shown)
+    for reason in sorted({v.reason for v in planned.effects if v.reason}):
+        hidden = [v.candidate for v in planned.effects if v.reason == reason]
+        console.print(
+            f"not seen, {reason}: {_listed(f'{c.effect.name} at {c.place.where}' for c in hidden)}",
+            markup=False,
+        )
+        helps = dict.fromkeys(c.effect.excited_by for c in hidden if c.effect.excited_by)
+        console.print(f"    would show with: {_listed(helps)}", markup=False)
+    if planned.better:
+        console.print(
+            f"better for the parameters: {planned.better.title} (last column of standard errors)",
+            markup=False,
+        )
+
+
+def _listed(texts: Iterable[str]) -> str:
+    return "; ".join(texts)
+
+
+def _parameters(planned: Planned) -> Table:
+    heads = ["parameter", "value", "± standard error", "the recording gives it"]
+    shown = Table(*heads, *(["better course: ±"] if planned.better else []), box=None, header_style="bold")
+    for p in planned.parameters:
+        known = "yes" if p.identified else "no" + (f": tied to {p.tied}" if p.tied else "")
+        row = [p.name, f"{p.value:.4g} {p.unit or ''}", f"{p.sd:.2g}", known]
+        shown.add_row(*row, *([f"{planned.better.sd[p.name]:.2g}"] if planned.better else []))
+    return shown

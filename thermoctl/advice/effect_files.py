@@ -44,6 +44,8 @@ SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "level_node": ("a", "b"),
     "orifice": (),
     "resistive": (),
+    "fixed_node": ("T",),
+    "fixed_flow": (),
 }
 """The symbols of each place that an effect's expressions may read; its nodes are also ends of flows."""
 EVERYWHERE = ("air", "reference", "duration", "sample", "t")

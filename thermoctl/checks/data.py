@@ -21,7 +21,7 @@ FEW = 8  # samples of which nothing can be stated
 
 def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
     """Check the columns that the plant reads."""
-    found = _gaps(table)
+    found = _gaps(model, table, excitation)
     read = [i for i in model.plant.readings() if i.column in table.columns]
     for item in read:
         there = np.isfinite(table.columns[item.column])
@@ -45,11 +45,12 @@ def _empty(table: Table, name: str, column: str) -> Finding:
     )
 
 
-def _gaps(table: Table) -> list[Finding]:
+def _gaps(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
     """Report intervals without samples, beyond the longest of as many random (exponential) ones.
 
     Of n such intervals with median m, one is longer than m log2(n / ALARM) with probability ALARM. Intervals
-    that a logger leaves on purpose (more than one in a hundred) are its sampling."""
+    that a logger leaves on purpose (more than one in a hundred) are its sampling. A gap in which a held input
+    changed is severe: the wrong time of the change would be taken for physics."""
     steps = np.diff(table.t)
     if len(steps) < FEW:
         return []
@@ -58,15 +59,19 @@ def _gaps(table: Table) -> list[Finding]:
     if not 0 < len(long) <= max(1, len(steps) // 100):
         return []
     k = long[np.argmax(steps[long])]
+    u = dict(zip(model.inputs, excitation.u.T, strict=False))
+    held = [i for i in driving_inputs(model.plant) if not i.linear]
+    changed = [i.column for i in held if np.any(u[i.name][long] != u[i.name][long + 1])]
+    unknown = f"; {', '.join(map(repr, changed))} changed meanwhile" if changed else ""
     more = f" and {len(long) - 1} more" if len(long) > 1 else ""
     return [
         Finding(
             "gap",
             table.path,
             f"no samples from t = {table.t[k]:.6g} to {table.t[k + 1]:.6g} s{more}; they are "
-            f"{np.median(steps):.3g} s apart elsewhere",
+            f"{np.median(steps):.3g} s apart elsewhere{unknown}",
             "The inputs are unknown there: cut the recording at the gap and give both parts.",
-            severe=False,
+            severe=bool(changed),
         )
     ]
 
@@ -79,7 +84,8 @@ def _quantum(values: np.ndarray) -> float:
 def _resampled(table: Table, column: str, values: np.ndarray) -> list[Finding]:
     """Find readings that change at every k-th sample only, or on straight lines between them.
 
-    Changes at free instants are all multiples of k apart with probability k^(1 - changes)."""
+    Straight lines between readings are severe: no sensor makes them. Changes at free instants are all
+    multiples of k apart with probability k^(1 - changes)."""
     quantum = _quantum(values)
     if not np.isfinite(quantum):
         return []
@@ -96,7 +102,7 @@ def _resampled(table: Table, column: str, values: np.ndarray) -> list[Finding]:
                     f"'{column}' is {how} between every {every}th sample: its {len(values)} values hold "
                     f"{len(values) // every} readings",
                     "Leave the cells between two readings empty; else their errors count several times.",
-                    severe=False,
+                    severe=difference > 1,
                 )
             ]
     return []

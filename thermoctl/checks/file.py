@@ -11,7 +11,7 @@ from thermoctl.checks.model import jacobian, unit_findings
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
-from thermoctl.plant.language import Input, Node
+from thermoctl.plant.language import Flow, Input, Node
 
 _TEMPERATURES = ("degC", "K", "degF")
 POINTS = 3  # random values at which an expression is tried
@@ -57,26 +57,31 @@ def _storages(plant: Plant) -> list[Finding]:
     return found
 
 
+def driving_away(plant: Plant) -> list[Flow]:
+    """Return the flows that drive their own nodes away: they grow with the target or fall with the source."""
+    values = [_values(plant, seed) for seed in range(POINTS)]
+    found = []
+    for flow in plant.flows.values():
+        read = ex.names(flow.rate)
+        own = [(e, way) for e, way in ((flow.source, -1.0), (flow.target, 1.0)) if e in read]
+        slopes = [way * _value(ex.derivative(flow.rate, str(e)), v) for e, way in own for v in values]
+        if slopes and min(slopes) > 0:
+            found.append(flow)
+    return found
+
+
 def _signs(plant: Plant) -> list[Finding]:
     """Find a flow of a node by itself that drives the node away: it should hold it back."""
     found = []
-    values = [_values(plant, seed) for seed in range(POINTS)]
-    for flow in plant.flows.values():
-        ends = [(e, way) for e, way in ((flow.source, -1.0), (flow.target, 1.0)) if e is not None]
-        own = [(e, way) for e, way in ends if e in ex.names(flow.rate)]
-        if not own:
-            continue
-        slopes = [[way * _value(ex.derivative(flow.rate, e), v) for e, way in own] for v in values]
-        if (
-            np.all(np.array(slopes) > 0)
-            and _grows(plant, values[0])
-            and not _grows(plant, values[0], flow.name)
-        ):
+    values = _values(plant)
+    for flow in driving_away(plant):
+        if _grows(plant, values) and not _grows(plant, values, flow.name):
+            own = next(e for e in (flow.source, flow.target) if e in ex.names(flow.rate))
             found.append(
                 Finding(
                     "sign",
                     f"{plant.file}:{flow.at}",
-                    f"flow '{flow.name}' grows with '{own[0][0]}' and drives it further away, so the plant is unstable",
+                    f"flow '{flow.name}' grows with '{own}' and drives it further away, so the plant is unstable",
                     "Is the sign of its rate right, or its 'from' and 'into'?",
                     severe=False,
                 )

@@ -1,6 +1,7 @@
 """Wrong labels: swapped columns, other units, signs, a clock in other units, by comparing hypotheses.
 
-Each hypothesis changes the recordings as a person would correct them. It is weighed against the recordings as
+Each hypothesis changes the recordings as a person would correct them. Or it turns a flow of the plant that
+drives its own node away. It is weighed against the recordings as
 they are, both after a short refit inside the parameters' ranges:
 
     gain = sum over outputs of n log(rms as it is / rms corrected)        (each rms over the output's spread)
@@ -21,12 +22,13 @@ from math import log
 import numpy as np
 
 from thermoctl.checks.data import driving_inputs, moves
+from thermoctl.checks.file import driving_away
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.model import NYQUIST, rates_of
 from thermoctl.plant.language import Input, Output, Plant
 from thermoctl.plant.refit import fit
 from thermoctl.plant.residuals import default_noise
-from thermoctl.plant.simulate import Model, SimulationError
+from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.plant.units import conversion, dimension
 from thermoctl.recording.table import Table
 
@@ -40,6 +42,7 @@ ITERATIONS = 20  # of a refit
 REFITTED = 6  # best screened hypotheses that are refitted
 ROUNDS = 3  # corrections in a row
 MAX_COLUMNS = 8  # up to so many columns every pair may have been swapped, beyond that pairs of one unit only
+TEMPERATURES = ("degC", "degF", "K")
 FACTORS = (1e3, 1e-3, 1e6, 1e-6)
 CLOCKS = (("ms", 1e-3), ("us", 1e-6), ("min", 60.0), ("h", 3600.0))
 SPREAD = 10.0  # an rms that stands for "cannot be simulated", in spreads
@@ -49,13 +52,14 @@ Change = Callable[[Table], Table]
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A wrong label: a sentence about it, its correction in words, and the correction of a table."""
+    """A wrong label: a sentence about it, its correction in words, and the corrected table or plant."""
 
     kind: str
     what: str
     suggestion: str
-    change: Change
+    change: Change = lambda table: table
     columns: tuple[str, ...] = ()
+    plant: Plant | None = None
 
 
 def label_findings(model: Model, tables: Sequence[Table]) -> tuple[list[Finding], list[Table]]:
@@ -69,6 +73,7 @@ def label_findings(model: Model, tables: Sequence[Table]) -> tuple[list[Finding]
         where = tables[0].path if len(tables) == 1 else f"{tables[0].path} and {len(tables) - 1} more"
         found.append(Finding(best.kind, where, best.what, best.suggestion))
         tables = [best.change(t) for t in tables]
+        model = _model(model, best)
     if not found:
         found = _ambient(model.plant, tables)
     return found, tables
@@ -85,17 +90,17 @@ def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
     now = _misfit(model, tables, refit=True)
     if now is None or np.all(now.rms <= CLOSE * now.noise):
         return None
-    hypotheses = [*_clocks(model, tables), *_hypotheses(model.plant, tables)]
+    hypotheses = [*_clocks(model, tables), *_hypotheses(model.plant, tables), *_turned(model.plant)]
     proof = log(RARITY * max(len(hypotheses), 1))
     screened: list[tuple[float, Hypothesis]] = []
     plain = _screened(model, tables)
     for h in hypotheses:
-        tried = _screened(model, [h.change(t) for t in tables])
+        tried = _screened(_model(model, h), [h.change(t) for t in tables])
         screened.append((float(np.sum(now.independent * np.log(plain / tried))), h))
     screened.sort(key=lambda pair: -pair[0])
     best: tuple[float, Hypothesis] | None = None
     for _, h in screened[:REFITTED]:
-        then = _misfit(model, [h.change(t) for t in tables], refit=True)
+        then = _misfit(_model(model, h), [h.change(t) for t in tables], refit=True)
         if then is None:
             continue
         gain = float(np.sum(then.independent * np.log(now.share / then.share)))
@@ -211,6 +216,7 @@ def _hypotheses(plant: Plant, tables: Sequence[Table]) -> Iterator[Hypothesis]:
     for item in items:
         for what, forward in _corrections(item):
             yield _corrected((item,), what, forward, first)
+    yield from _twice([o for o in plant.outputs.values() if o.column in there], first)
     for unit in {o.unit for o in plant.outputs.values()}:  # all sensors of one kind
         group = tuple(o for o in plant.outputs.values() if o.unit == unit and o.column in there)
         if len(group) > 1:
@@ -221,6 +227,31 @@ def _hypotheses(plant: Plant, tables: Sequence[Table]) -> Iterator[Hypothesis]:
         both_inputs = a.name in plant.inputs and b.name in plant.inputs
         if same or (len(items) <= MAX_COLUMNS and both_inputs) or len(items) <= MAX_COLUMNS // 2:
             yield _swapped(a, b)
+
+
+def _twice(outputs: Sequence[Output], first: Table) -> Iterator[Hypothesis]:
+    """Yield the temperatures that both the logger and the plant's value convert."""
+    for o in outputs:
+        for unit in TEMPERATURES if o.unit in TEMPERATURES else ():
+            if unit != o.unit:
+                change = conversion(str(o.unit), unit)
+                yield _corrected((o,), f"converted from {unit} twice", change, first)
+
+
+def _model(model: Model, h: Hypothesis) -> Model:
+    return compile_plant(h.plant) if h.plant else model
+
+
+def _turned(plant: Plant) -> Iterator[Hypothesis]:
+    """Yield the flows of the wrong sign. A passive flow grows with its source and falls with its target."""
+    for flow in driving_away(plant):
+        turned = replace(flow, source=flow.target, target=flow.source)
+        yield Hypothesis(
+            "sign",
+            f"the rate of flow '{flow.name}' is of the other sign, if the recordings are right",
+            f"Exchange 'from' and 'into', or turn the sign of its rate: {plant.file}:{flow.at}.",
+            plant=replace(plant, flows={**plant.flows, flow.name: turned}),
+        )
 
 
 def _clocks(model: Model, tables: Sequence[Table]) -> Iterator[Hypothesis]:
@@ -254,7 +285,7 @@ def _corrections(item: Input | Output) -> list[Correction]:
     temperature = kind == dimension("K")
     found: list[Correction] = []
     if temperature and unit is not None:
-        found += [(f"in {u}", conversion(u, unit)) for u in ("degC", "degF", "K") if u != unit]
+        found += [(f"in {u}", conversion(u, unit)) for u in TEMPERATURES if u != unit]
         found += [("1000 times too large", (1e-3, 0.0)), ("in tenths of a degree", (0.1, 0.0))]
         return found
     for factor in FACTORS:

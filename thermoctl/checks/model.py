@@ -163,35 +163,41 @@ def _time_constants(model: Model, excitation: Excitation) -> list[Finding]:
     ]
 
 
-def start_findings(model: Model, excitation: Excitation) -> list[Finding]:
-    """Compare first samples with the plant's start, within noise, initial_sigma and parameter ranges."""
+def start_errors(model: Model, excitation: Excitation) -> dict[str, tuple[float, float]]:
+    """Return by output how far the first sample is above the plant's start, and in standard deviations.
+
+    Noise, initial_sigma and the parameters' ranges count. An output without a state is left out."""
     plant = model.plant
     if not model.states:
-        return []
+        return {}
     try:
         run = model.run(excitation, sensitivities=True)
     except SimulationError:
-        return []
+        return {}
     assert run.dy is not None
     spread = [np.ptp(p.range) / 12**0.5 if (p := plant.parameters[q]).range else 0.0 for q in model.active]
     spread += [plant.nodes[n].initial_sigma or 0.0 for n in model.uncertain]
-    found = []
-    for j, (o, noise) in enumerate(
-        zip(plant.outputs.values(), default_noise(plant, [excitation]), strict=True)
-    ):
-        if not ex.names(o.value) & set(model.states) or not np.isfinite(excitation.y[0, j]):
-            continue
-        error = excitation.y[0, j] - run.y[0, j]
-        sd = float(np.hypot(noise.sigma, np.linalg.norm(run.dy[0, j] * spread)))
-        if abs(error) > SIGMAS * sd:
-            found.append(
-                Finding(
-                    "start",
-                    excitation.name,
-                    f"'{o.name}' starts at {excitation.y[0, j]:.5g}, where the plant starts at {run.y[0, j]:.5g}: "
-                    f"{abs(error) / sd:.0f} standard deviations apart",
-                    f"Start the node from the data (initial: first({o.name})), or give it an initial_sigma.",
-                    severe=False,
-                )
-            )
+    found = {}
+    noises = default_noise(plant, [excitation])
+    for j, (o, noise) in enumerate(zip(plant.outputs.values(), noises, strict=True)):
+        if ex.names(o.value) & set(model.states) and np.isfinite(excitation.y[0, j]):
+            error = float(excitation.y[0, j] - run.y[0, j])
+            sd = float(np.hypot(noise.sigma, np.linalg.norm(run.dy[0, j] * spread)))
+            found[o.name] = error, abs(error) / sd
     return found
+
+
+def start_findings(model: Model, excitation: Excitation) -> list[Finding]:
+    """Report first samples that are far from the plant's start."""
+    return [
+        Finding(
+            "start",
+            excitation.name,
+            f"'{name}' starts {abs(error):.4g} {'above' if error > 0 else 'below'} the plant's start: "
+            f"{sigmas:.0f} standard deviations apart",
+            f"Start the node from the data (initial: first({name})), or give it an initial_sigma.",
+            severe=False,
+        )
+        for name, (error, sigmas) in start_errors(model, excitation).items()
+        if sigmas > SIGMAS
+    ]

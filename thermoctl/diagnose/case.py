@@ -9,12 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import median_filter
 
+from thermoctl.checks.model import SIGMAS, start_errors
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.coordinates import Coordinates
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.noise import Grid, grid
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.rows import OUTLIER, reduced
+from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Noise, fit
 from thermoctl.plant.simulate import RTOL, Excitation, Model, compile_plant
@@ -68,6 +70,9 @@ class Case:
     budget: Budget
     notes: list[str] = field(default_factory=list)
     block: int = 1  # rows of the recordings whose mean is one row here
+    off: Mapping[str, float] = field(
+        default_factory=dict
+    )  # outputs' first samples less a start that they contradict
     rtol: float = RTOL  # of every simulation
     memory: Memory = NOTHING  # of earlier recordings
 
@@ -87,6 +92,7 @@ def case(
 
     Rows of long recordings are put together (rows.py).
     Raises InputError where too few values were measured."""
+    plant, off, freed = _free_starts(plant, tables)
     fewer = reduced(plant, tables)
     tables = fewer.tables
     model = compile_plant(plant)
@@ -120,11 +126,13 @@ def case(
         ),
         budget,
         [
+            *freed,
             *([fewer.note] if fewer.block > 1 else []),
             *([f"{dropped} single outliers were left out"] if dropped else []),
             *rig.guesses(),
         ],
         fewer.block,
+        off,
         rtol,
         memory,
     )
@@ -139,6 +147,26 @@ def _rtol(drives: Sequence[Excitation], noise: Sequence[Noise]) -> float:
     span = np.nanmax(values[:, seen], axis=0) - np.nanmin(values[:, seen], axis=0)
     sigma = np.array([n.sigma for n in noise])[seen]
     return float(np.clip(ACCURATE * np.min(sigma / np.maximum(span, 1e-300)), RTOL, LARGEST))
+
+
+def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str, float], list[str]]:
+    """Return the plant with free starts of bodies that first samples contradict, `Case.off`, and notes.
+
+    Such a start is not known. A refit that is bound to it would take the way back from it for physics."""
+    model, nodes, notes = compile_plant(plant), dict(plant.nodes), []
+    off: dict[str, float] = {}
+    for table in tables:
+        for output, (error, sigmas) in start_errors(model, model.excitation(table)).items():
+            if sigmas <= SIGMAS:
+                continue
+            off[output] = max(error, off.get(output, 0.0), key=abs)
+            for n in sorted(ex.names(plant.outputs[output].value) & nodes.keys()):
+                sigma = max(abs(error), nodes[n].initial_sigma or 0.0)
+                nodes[n] = dataclasses.replace(nodes[n], initial_sigma=sigma)
+                notes.append(
+                    f"'{output}' starts {error:+.3g} from the plant's start: the start of '{n}' was fitted"
+                )
+    return dataclasses.replace(plant, nodes=nodes), off, list(dict.fromkeys(notes))
 
 
 def _swing(drives: Sequence[Excitation], j: int) -> float:

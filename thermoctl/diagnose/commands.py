@@ -121,7 +121,7 @@ def diagnose(args: argparse.Namespace) -> int:
                 held_out,
                 progress,
                 args.drive or (),
-                _limits(args.limit or ()),
+                parsed_limits(args.limit or ()),
                 stopped,
                 Path(args.continued) if args.continued else None,
             )
@@ -162,7 +162,7 @@ def _read(folder: Path) -> dict[str, Any]:
     return found
 
 
-def _limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
+def parsed_limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
     """NAME=LOW:HIGH of each. Raises InputError."""
     out = {}
     for text in told:

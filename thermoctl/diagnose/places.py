@@ -218,6 +218,25 @@ def _resistive(rig: Rig) -> Iterator[Place]:
             yield Place(f.name, {}, flow=f.name)
 
 
+def _free(rig: Rig, e: Expr) -> bool:
+    parameters = rig.physics.parameters
+    return any(parameters[n].range for n in ex.names(e) & parameters.keys())
+
+
+def _fixed_nodes(rig: Rig) -> Iterator[Place]:
+    """Yield nodes whose storage a refit cannot move. A storage of 1 is a definition: dn/dt = sum of flows."""
+    storages = {n: rig.physics.nodes[n].storage for n in _storing(rig)}
+    yield from _nodes(rig, [n for n, e in storages.items() if e is not ex.ONE and not _free(rig, e)], "T")
+
+
+def _fixed_flows(rig: Rig) -> Iterator[Place]:
+    """Flows that follow their own node, and whose size a refit cannot move."""
+    for f in rig.physics.flows.values():
+        ends = {e for e in (f.source, f.target) if e}
+        if ends & ex.names(f.rate) & set(_storing(rig)) and not _free(rig, f.rate):
+            yield Place(f.name, {}, flow=f.name)
+
+
 PLACES = {
     "node": lambda rig: _nodes(rig, _storing(rig), "n"),
     "node_pair": _exchanging,
@@ -239,4 +258,6 @@ PLACES = {
     "level_node": _levels,
     "orifice": _orifices,
     "resistive": _resistive,
+    "fixed_node": _fixed_nodes,
+    "fixed_flow": _fixed_flows,
 }

@@ -28,6 +28,8 @@ def motions(plant: Plant) -> dict[str, str]:
         if len(flows) != 1 or flows[0].target != x.name or flows[0].source is not None:
             continue
         rate, read = flows[0].rate, ex.names(flows[0].rate) - values.keys()
+        if any(e.op == "delay" for e in ex.walk(rate)):
+            continue  # not the velocity of now
         for v in plant.nodes.keys() & read - {x.name}:
             driven = any(v in (f.source, f.target) for f in plant.flows.values())
             constant = ex.names(x.storage) | ex.names(ex.derivative(rate, v)) <= values.keys()

@@ -218,7 +218,7 @@ def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], 
 
 
 @dataclass
-class _Column:
+class Column:
     """A direction to be built: per recording its forces and its changes of outputs."""
 
     item: tuple[Any, ...]
@@ -226,10 +226,10 @@ class _Column:
     outputs: list[dict[int, np.ndarray]] = field(default_factory=list)
 
 
-_Entry = tuple[_Column, np.ndarray, float]  # its projected rows, and the norm of the whole ones
+_Entry = tuple[Column, np.ndarray, float]  # its projected rows, and the norm of the whole ones
 
 
-def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Sequence[_Column], np.ndarray]]:
+def directions(metric: Metric, columns: Sequence[Column]) -> Iterable[tuple[Sequence[Column], np.ndarray]]:
     """Rows (rows, k) of columns, not whitened, a chunk at a time."""
     buffers: dict[str, np.ndarray] = {}
     model, recordings = metric.model, range(len(metric.drives))
@@ -240,7 +240,7 @@ def directions(metric: Metric, columns: Sequence[_Column]) -> Iterable[tuple[Seq
         yield part, np.concatenate(blocks)
 
 
-def _rows(metric: Metric, part: Sequence[_Column], buffers: dict[str, np.ndarray], r: int) -> np.ndarray:
+def _rows(metric: Metric, part: Sequence[Column], buffers: dict[str, np.ndarray], r: int) -> np.ndarray:
     """Return the rows (rows, k) of columns in one recording, not whitened."""
     d, forces, values = metric.drives[r], [], []
     for c, column in enumerate(part):
@@ -267,9 +267,9 @@ def screen(
     The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid."""
     first = metrics[0]
     at = [Trajectory(first, rig, r) for r in range(len(first.drives))]
-    columns: list[_Column] = []
+    columns: list[Column] = []
     for c in found:
-        columns += _columns(c, first, at, edges)
+        columns += columns_of(c, first, at, edges)
     best: list[dict[int, Direction]] = [{} for _ in metrics]
     pending: dict[tuple[Any, ...], list[_Entry]] = {}
     for part, plain in directions(first, columns):
@@ -312,9 +312,9 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
     return found
 
 
-def _columns(
+def columns_of(
     c: Candidate, metric: Metric, at: Sequence[Trajectory], edges: np.ndarray | None = None
-) -> list[_Column]:
+) -> list[Column]:
     """Return the columns that one candidate needs. item = (candidate, group, (shape, dim), columns in the group).
 
     `edges`: onsets to try instead of the grid."""
@@ -340,7 +340,7 @@ def _columns(
     ] or [{}]
     amplitudes = [p for p in effect.parameters if p.amplitude]
     dims = effect.dims if amplitudes else ((1.0,),)
-    out: list[_Column] = []
+    out: list[Column] = []
     extended: Plant | None = None
     for g, shape in enumerate(shapes):
         group: tuple[Any, ...] = ("all",) if windowed else (g,)
@@ -348,10 +348,8 @@ def _columns(
         for dim in dims:
             for phase in phases:
                 values = parameter_values(c, {**shape, **phase}, [EPSILON * v for v in dim])
-                column = _Column((c, group, ({**shape, **phase}, dim), count))
-                extended = extended or c.extend(
-                    values
-                )  # the values alone differ, and they are given to `changes`
+                column = Column((c, group, ({**shape, **phase}, dim), count))
+                extended = extended or c.extend(values)  # only the values differ: `changes` gets them
                 own = {c.own(k): v for k, v in values.items()}
                 for trajectory in at:
                     try:
@@ -418,7 +416,7 @@ def _score(c: Candidate, entries: Sequence[_Entry], metric: Metric, best: dict[i
     )
 
 
-def _possible(c: Candidate, column: _Column, coefficient: float) -> bool:
+def _possible(c: Candidate, column: Column, coefficient: float) -> bool:
     """Return whether the catalogue allows the size of a direction that has only one."""
     amplitudes = [p for p in c.effect.parameters if p.amplitude]
     shape, _ = column.item[2]

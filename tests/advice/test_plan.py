@@ -1,0 +1,98 @@
+"""`thermoctl plan`: sizes as a refit gives them, parameters that no recording gives, and inputs that excite nothing."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from tests.checks.rigs import PLANTS, inputs, rig
+from thermoctl.advice.plan import plan
+from thermoctl.cli import main
+from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
+from thermoctl.plant import load, loads
+from thermoctl.plant.refit import fit
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.shipped import shipped
+from thermoctl.yamlfile import InputError
+
+EFFECTS = catalogue((CATALOGUE,))
+
+
+def planned(plant, *tables, limits=None):
+    found = plan(plant, tables, EFFECTS, limits or {})
+    return found, {v.candidate.key: v for v in found.effects}
+
+
+def test_a_visible_size_is_five_standard_errors_of_a_refit():
+    plant, _ = rig("two blocks")
+    _, effects = planned(plant, inputs("two blocks"))
+    extended = (
+        PLANTS["two blocks"]
+        .replace("G_1 * (one - air)", "G_1 * (one - air) * (1 + A * (one - 20))")
+        .replace("nodes:", "  A: {value: 0, unit: 1/K, range: [-0.1, 0.1]}\nnodes:")
+    )
+    model = compile_plant(loads(extended))
+    found = fit(model, [model.excitation(model.measure(inputs("two blocks"), 1))])
+    k = [q for q, _ in found.unknowns].index("A")
+    sd = 0.2 * np.sqrt(np.linalg.inv(found.hessian)[k, k])  # of z, which is 0..1 over the range of 0.2 / K
+    assert effects["temperature_dependent_conductance", "loss_1"].smallest == pytest.approx(5 * sd, rel=0.25)
+    assert effects["temperature_dependent_conductance", "loss_1"].unit == "1/K"
+
+
+def test_inputs_that_rest_show_nothing_of_what_they_excite():
+    plant, _ = rig("two blocks")
+    table = inputs("two blocks")
+    rest = dataclasses.replace(table, columns={**table.columns, "heat": np.zeros(len(table))})
+    found, effects = planned(plant, rest)
+    assert effects["heat_split", "one-two"].reason == "these inputs do not excite it"
+    moved, seen = planned(plant, table)
+    assert seen["heat_split", "one-two"].reason is None
+    assert all(a.sd < b.sd for a, b in zip(moved.parameters, found.parameters, strict=True))
+    assert {p.name for p in moved.parameters if p.identified} > {
+        p.name for p in found.parameters if p.identified
+    }
+
+
+def test_ratios_are_not_identified_and_a_better_course_is_better():
+    ratio = (
+        PLANTS["one block"]
+        .replace("rate: heat,", "rate: gain * heat,")
+        .replace("nodes:", "  gain: {value: 1, range: [0.3, 3]}\nnodes:")
+    )
+    found, _ = planned(loads(ratio), inputs("one block"))
+    assert {p.name: p.identified for p in found.parameters} == {"C": False, "G": False, "gain": False}
+    assert all(p.tied in ("C", "G", "gain") for p in found.parameters)
+    found, _ = planned(rig("two blocks")[0], inputs("two blocks"))
+    better = found.better
+    assert better and better.duration_s <= found.duration_s
+    assert np.mean([np.log(better.sd[p.name] / p.sd) for p in found.parameters]) < 0
+
+
+def test_a_plan_without_a_recording_settles_and_says_it_as_json(tmp_path, capsys):
+    path = tmp_path / "plant.yaml"
+    path.write_text(PLANTS["one block"])
+    assert main(["plan", "--plant", str(path), "--limit", "heat=0:3", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (
+        told["duration_s"] > 10 * told["slowest_time_constant_s"] and told["visible"] and told["parameters"]
+    )
+    assert main(["plan", "--plant", str(path), "--limit", "heat=0:3"]) == 0
+    assert "smallest size" in capsys.readouterr().out
+    assert main(["plan", "--plant", str(path)]) == 2
+    assert "--limit NAME=LOW:HIGH" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "path", sorted(shipped("config/plants/templates").glob("*.yaml")), ids=lambda p: p.stem
+)
+def test_every_template_can_be_planned(path):
+    plant = load(path)
+    driven = next(i.name for i in plant.inputs.values() if i.unit not in ("degC", "K"))
+    if path.stem == "tank":  # at rest it is empty, and a square root has no slope there
+        with pytest.raises(InputError, match="give --like REC"):
+            planned(plant, limits={driven: (0.0, 1.0)})
+        return
+    found, _ = planned(plant, limits={driven: (0.0, 1.0)})
+    assert found.parameters and any(v.reason is None for v in found.effects)
+    assert all(v.smallest > 0 for v in found.effects)
