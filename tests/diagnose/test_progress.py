@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 from pathlib import Path
 
@@ -57,7 +56,7 @@ def test_a_stopped_diagnosis_leaves_the_result_so_far(tmp_path):
 
         def progress(text: str) -> None:
             if "refit 2 of" in text:
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
 
         found = diagnose(load(path), [table], tmp_path / "out", progress=progress, stopped=stopped)
     assert len(found["hypotheses"]) == 2  # without an effect, and the one whose refit was under way
@@ -69,6 +68,6 @@ def test_a_stopped_diagnosis_leaves_the_result_so_far(tmp_path):
 def test_the_second_interrupt_gives_up():
     with pytest.raises(KeyboardInterrupt), on_interrupt() as stopped:
         assert not stopped()
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
         assert stopped()
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
