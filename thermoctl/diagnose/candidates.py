@@ -56,7 +56,7 @@ class Candidate:
         """Return the priors of the effect's parameters in `plant`, for each recording."""
         if self.effect.prior is None:
             return []
-        # what has no value of its own in each recording is believed once
+        # a parameter without a value of its own in each recording counts once
         share = 1.0 if any(p.per_recording for p in self.effect.parameters) else 1.0 / len(self.rig.drives)
         out = []
         for d in self.rig.drives:

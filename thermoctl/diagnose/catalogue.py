@@ -102,13 +102,13 @@ class Effect:
     excited_by: str
     mimics: tuple[str, ...]
     source: str
-    caution: str | None = None  # what a finding of it cannot tell, in words
+    caution: str | None = None  # limits of a finding of it, in words
     prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
     reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
 
 
 def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
-    """All entries of these folders, a later one replacing an earlier one of the same name. Raises InputError."""
+    """Return all entries of these folders; a later one replaces one of the same name. Raises InputError."""
     found = {}
     for folder in folders:
         files = sorted(Path(folder).glob("*.yaml"))

@@ -14,7 +14,7 @@ from thermoctl.diagnose.law import find_law
 from thermoctl.diagnose.law_smooth import missing_flow
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, Memory
-from thermoctl.diagnose.misfit import energies, standing
+from thermoctl.diagnose.misfit import energies, standing, standouts
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.search import search
 from thermoctl.diagnose.threads import one_thread
@@ -53,7 +53,9 @@ def diagnose(
     posterior = weigh({keys: scores[keys] for keys in physics}, physics, numbers)
     fits = {w.fitted.hypothesis.keys: w.fitted for w in searched.tried}
     null = as_refitted(known, fits[frozenset()])
-    best = fits[next(iter(posterior.hypotheses))] if posterior.something >= numbers.name else null
+    likeliest = next(iter(posterior.hypotheses))
+    stand = standouts(physics[likeliest])  # the other effects are part of the remainder
+    best = fits.get(stand, fits[likeliest]) if posterior.something >= numbers.name else null
     reach = reached(known)
     after, before = left(known, best, reach, numbers.clean), left(known, null, reach, numbers.clean)
     say("measuring what the findings are worth")

@@ -86,7 +86,7 @@ def sticking(direction: Direction) -> Direction | None:
 
 
 def extend(base: Plant, direction: Direction, drives: Sequence[Excitation]) -> tuple[Plant, dict[str, str]]:
-    """Return the plant with a screened effect at its starting values, and the names of its parameters there."""
+    """Return the plant with a screened effect at its starting values, and the names of its parameters."""
     duration = max(float(d.t[-1]) for d in drives)
     ranges = ranges_of(direction, duration)
     values: dict[str, float] = {}

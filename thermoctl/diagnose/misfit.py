@@ -39,28 +39,28 @@ class Energy:
 def standing(
     energy: Mapping[frozenset[Key], Energy], dims: Mapping[Key, int], limits: Limits
 ) -> dict[frozenset[Key], dict[Key, float]]:
-    """Return the hypotheses that stand out of their misfit, with each effect's probability of being physics.
+    """Return the hypotheses of which an effect stands out of the misfit: the probability of each.
 
-    Every effect has to stand out against the best tried hypothesis that holds part of the others. Where the
-    misfit is more than the noise, log evidence says little of rivals. There the hypothesis has to stand out
-    against every tried one with fewer parameters, too. `dims`: number of parameters of each effect."""
-
-    def sure(rival: Energy, mine: Energy, parameters: int) -> float:
-        return physics(rival.all - mine.all, mine.misfit, 1 - (1 - limits.alike) ** parameters)
-
-    size = {keys: sum(dims[k] for k in keys) for keys in energy}
-    out = {}
-    for home, mine in energy.items():
-        found = {}
+    An effect has to stand out against the best tried hypothesis that holds part of the others. Effects that
+    do not are part of the misfit. The others then have to stand out beside them or without them.
+    `dims`: number of parameters of each effect."""
+    found: dict[frozenset[Key], dict[Key, float]] = {}
+    for home in sorted(energy, key=len):
+        mine, own = energy[home], {}
         for key in home:
             part = (e for keys, e in energy.items() if keys < home and key not in keys)
-            found[key] = sure(min(part, key=lambda e: e.all), mine, dims[key])
-        far = mine.misfit > limits.clean**2
-        simpler = (k for k in energy if far and k and size[k] < size[home])
-        against = [sure(energy[k], mine, size[home] - size[k]) for k in simpler]
-        if all(p > MISFIT for p in [*found.values(), *against]):
-            out[home] = found
-    return out
+            removed = min(part, key=lambda e: e.all).all - mine.all
+            own[key] = physics(removed, mine.misfit, 1 - (1 - limits.alike) ** dims[key])
+        stand = standouts(own)
+        for key, p in found.get(stand, {}).items() if stand < home else ():
+            own[key] = max(own[key], p)
+        found[home] = own
+    return {home: own for home, own in found.items() if not home or standouts(own)}
+
+
+def standouts(of: Mapping[Key, float]) -> frozenset[Key]:
+    """Return the effects that are rather physics than a misfit."""
+    return frozenset(key for key, p in of.items() if p > MISFIT)
 
 
 def physics(removed: float, left: float, share: float) -> float:

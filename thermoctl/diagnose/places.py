@@ -129,7 +129,7 @@ def _motors(rig: Rig) -> Iterator[Place]:
 
 
 def driven(rig: Rig) -> Iterator[Place]:
-    """Yield each input that drives a motor or a pump, by its flow, or by its own name where the flow is an FMU's."""
+    """Yield each input that drives a motor or a pump by its flow; by its own name where that is an FMU's."""
     for f in rig.physics.flows.values():
         if rig.is_motor(f) or rig.is_pump(f):
             for u in rig.drives_of(f):

@@ -15,7 +15,7 @@ from thermoctl.diagnose.held_out import Worth
 from thermoctl.diagnose.law import Law
 from thermoctl.diagnose.law_result import law_entry
 from thermoctl.diagnose.law_smooth import flow_unit
-from thermoctl.diagnose.misfit import Energy
+from thermoctl.diagnose.misfit import Energy, standouts
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import Left
 from thermoctl.plant import expression as ex
@@ -41,7 +41,7 @@ class Diagnosis:
     - `best`: the leading hypothesis; `null`: the plant without any effect, after an ordinary refit
     - `left`, `before`: the residual of `best` and of `null`
     - `energy`: of each hypothesis' residuals
-    - `physics`: for hypotheses whose every effect stands out of the misfit that they leave: each effect's
+    - `physics`: for hypotheses of which an effect stands out of the misfit that they leave: each effect's
       probability of being physics
     - `missing_flow`: rms of the flow into `before.node` that would close the misfit of `null`
     - `law`: a law for the remainder of the outcome"""
@@ -279,7 +279,7 @@ def _as_it_came(d: Diagnosis) -> dict[str, float]:
 def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
     """Return every hypothesis that was fitted, the likeliest first.
 
-    `physics`: each effect's probability to be no unnamed misfit; null where one does not stand out of it.
+    `physics`: each effect's probability to be no unnamed misfit; null where none stands out of it.
     `remainder`: the largest probability of a remainder at an output."""
     tried = d.searched.tried
     null = next(w.fitted.log_evidence for w in tried if not w.fitted.hypothesis.effects)
@@ -323,7 +323,7 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
                     "probability": d.posterior.effects.get(key, 0.0),
                     "below_best": final - w.score,
                     "reason": "less likely than the findings"
-                    if keys in d.physics
+                    if key in standouts(d.physics.get(keys, {}))
                     else "does not stand out of the misfit that it leaves",
                 }
     return sorted(out.values(), key=lambda e: (-e["probability"], e["below_best"]))

@@ -1,4 +1,4 @@
-"""A plant and its recordings as the catalogue sees them: kinds of signals, what moves, what is air."""
+"""A plant and its recordings as the catalogue sees them: kinds of signals, moving inputs, the air."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
 from thermoctl.plant.simulate import Excitation
 from thermoctl.plant.units import dimension
 
-STRAIGHT = "_straight"  # what an input that holds is called where it goes on straight lines
+SEEN, CORRECT = "seen_", "correct_"  # an observer's inputs and flows (observer.py): no physics
+STRAIGHT = "_straight"  # of the name of an input that holds, where it goes on straight lines
 KELVIN = {"K", "kelvin"}
 ZERO_DEGC = 273.15  # K
 TEMPERATURE = {"degC", "celsius", "degree_Celsius", "delta_degC", "°C", *KELVIN}
@@ -54,7 +55,7 @@ def zero_of(unit: str | None) -> float:
 _ROLE_KINDS = {"ambient": "temperature", "position": "length"}  # the other roles are kinds of their own
 
 
-# Nodes that an effect brought to model a reading (lag, memory of the start): no body, so no physics can sit there.
+# Nodes that an effect brought to model a reading (lag, memory of the start): no bodies, no places.
 _READINGS = re.compile(
     r"(lagged|memory|grown)_(sensor_lag|cold_junction_drift|missing_member|expansion_lag)_"
 )
@@ -66,14 +67,18 @@ MEANINGS = {"v": "velocity", "x": "position", "i": "current", "T": "temperature"
 
 
 class Rig:
-    """A plant and its recordings as the catalogue sees them: which node is a temperature, what moves, what is air."""
+    """A plant and its recordings as the catalogue sees them: kinds of nodes, moving inputs, the air."""
 
     def __init__(
         self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
     ):
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
         p = dataclasses.replace(
-            plant, inputs={k: v for k, v in plant.inputs.items() if not k.endswith(STRAIGHT)}
+            plant,
+            inputs={
+                k: v for k, v in plant.inputs.items() if not k.endswith(STRAIGHT) and not k.startswith(SEEN)
+            },
+            flows={k: v for k, v in plant.flows.items() if not k.startswith(CORRECT)},
         )
         self.physics = p
         self.temperatures = [

@@ -134,7 +134,7 @@ def diagnose_files(
 
 
 def _writable(folder: Path) -> Path:
-    """Return the folder of a result, if files can be written there. Raises InputError."""
+    """Return the folder of a result, if files can be written there; else InputError before the work."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: a file; a folder for the result was expected (--out)")
     try:

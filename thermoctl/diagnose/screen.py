@@ -182,7 +182,7 @@ def changes(
 
 
 def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], at: Trajectory) -> np.ndarray:
-    """Integrate a new node alone along the trajectory: dn/dt = a(t) - b(t) n, a and b constant in a sample."""
+    """Integrate a new node alone along the trajectory: dn/dt = a - b n, a and b constant in a sample."""
     n = plant.nodes[node]
     net: ex.Expr = ex.ZERO
     for f in plant.flows.values():

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermoctl.diagnose.candidates import Candidate
-from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.candidates import Candidate, candidates
+from thermoctl.diagnose.case import Budget, Case
+from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.extend import extend, sticking, weaker
-from thermoctl.diagnose.fit import Fitted, Placed, fitted, over_noise
+from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, over_noise
 from thermoctl.diagnose.limits import Limits
-from thermoctl.diagnose.memory import remade
+from thermoctl.diagnose.memory import NOTHING, remade
+from thermoctl.diagnose.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnose.places import PLACES
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Metric, sharpened
 from thermoctl.diagnose.screening import Screened, places, screened
 from thermoctl.plant import expression as ex
+from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.yamlfile import InputError
@@ -30,6 +33,7 @@ BEATEN = 10.0  # nats below the best: such a parent is not extended where the be
 HALF = 2.0  # times its first-order promise that a refit may gain
 PLACES_EACH = 3  # of one effect in a shortlist
 ALIKE = 0.999  # cosine of two directions, above which they are one
+Keys = frozenset[Key]
 START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
 
@@ -76,50 +80,169 @@ def _class(c: Candidate, limits: Limits) -> float:
     )
 
 
+@dataclass
+class Search:
+    """A search under way: where each effect fits, hypotheses by their effects, and those already extended."""
+
+    case: Case
+    limits: Limits
+    where: Mapping[str, set[str]]
+    tried: dict[Keys, Weighed] = field(default_factory=dict)
+    seen: set[Keys] = field(default_factory=set)
+
+    @property
+    def best(self) -> Weighed:
+        """Return the likeliest hypothesis so far."""
+        return max(self.tried.values(), key=lambda w: w.score)
+
+    def keep(self, found: Iterable[Weighed]) -> None:
+        """Add hypotheses; of two refits of one the likelier stays."""
+        for w in found:
+            keys = w.fitted.hypothesis.keys
+            if keys not in self.tried or w.score > self.tried[keys].score:
+                self.tried[keys] = w
+
+    def extended(self, parent: Weighed) -> list[Weighed]:
+        """Extend a hypothesis, once."""
+        if parent.fitted.hypothesis.keys in self.seen:
+            return []
+        if self.case.budget.spent:
+            self.case.budget.untried += 1
+            return []
+        self.seen.add(parent.fitted.hypothesis.keys)
+        found = extensions(self.case, parent, self.where, self.limits, self.tried)
+        self.keep(found)
+        return found
+
+    def weighed(self, f: Fitted) -> Weighed:
+        """Return a refit with its prior odds."""
+        return Weighed(f, odds(f.hypothesis.effects, self.where, self.limits))
+
+
 def search(case: Case, limits: Limits) -> Searched:
-    """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent."""
-    where = places(case)
-    null = Weighed(fitted(case, case.plant, (), case.null), 0.0)
-    tried: dict[frozenset[tuple[str, str]], Weighed] = {frozenset(): null}
-    for w in recalled(case, where, limits, null):
-        tried[w.fitted.hypothesis.keys] = w
-    beam, seen = leaders(list(tried.values()), limits), set()
-    for _ in range(limits.effects):
-        best, close = beam[0].score, max(over_noise(case, beam[0].fitted, limits.clean)) <= limits.clean
+    """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent.
+
+    A rig that drifts far is searched with an observer first."""
+    s = started(case, limits)
+    with_observer(s)
+    grow(s)
+    swap(s)
+    return Searched(tuple(sorted(s.tried.values(), key=lambda w: -w.score)), case.budget.spent)
+
+
+def started(case: Case, limits: Limits) -> Search:
+    """Return a search that holds the plant without effects."""
+    s = Search(case, limits, places(case))
+    s.keep([s.weighed(fitted(case, case.plant, (), case.null))])
+    s.keep(recalled(s))
+    return s
+
+
+def grow(s: Search) -> None:
+    """Extend the beam until none of its extensions is better."""
+    for _ in range(s.limits.effects):
+        beam = leaders(list(s.tried.values()), s.limits)
+        best = beam[0].score
+        close = max(over_noise(s.case, beam[0].fitted, s.limits.clean)) <= s.limits.clean
         for parent in beam:
-            if case.budget.spent:
-                case.budget.untried += 1
-                break
-            if parent.fitted.hypothesis.keys in seen or (close and parent.score < best - BEATEN):
+            if close and parent.score < best - BEATEN:
                 continue
-            seen.add(parent.fitted.hypothesis.keys)
-            found = extensions(case, parent, where, limits, tried)
-            if parent is beam[0] and not found:
+            known = parent.fitted.hypothesis.keys in s.seen
+            if not s.extended(parent) and parent is beam[0] and not known:
                 break  # the best cannot be extended: no rival with more effects is needed
-            for w in found:
-                tried[w.fitted.hypothesis.keys] = w
-        beam = leaders(list(tried.values()), limits)
-        if beam[0].score <= best or case.budget.spent:
+        if s.best.score <= best or s.case.budget.spent:
             break
-    return Searched(tuple(sorted(tried.values(), key=lambda w: -w.score)), case.budget.spent)
 
 
-def recalled(case: Case, where: Mapping[str, set[str]], limits: Limits, null: Weighed) -> list[Weighed]:
+def swap(s: Search) -> None:
+    """Leave out each effect of the best hypothesis in turn, and extend the rest, until none replaces it.
+
+    So each effect meets its rivals beside the same others, whichever way the beam took."""
+    while True:
+        best = s.best
+        effects = best.fitted.hypothesis.effects
+        for e in effects if len(effects) > 1 else ():
+            rest = tuple(o for o in effects if o is not e)
+            if s.case.budget.spent or frozenset(o.key for o in rest) in s.seen:
+                continue
+            parent = s.tried.get(frozenset(o.key for o in rest)) or rebuilt(s, rest, best.fitted, best.fitted)
+            if parent:
+                s.extended(parent)
+        if s.best is best:
+            return
+
+
+def rebuilt(s: Search, effects: Sequence[Placed], values: Fitted, leader: Fitted | None) -> Weighed | None:
+    """Refit the case's plant with some effects of a hypothesis, from its values; None where this fails."""
+    case, known = s.case, values.rough_plant.parameters
+    parameters = {n: known.get(n, p) for n, p in case.plant.parameters.items()}
+    plant = dataclasses.replace(case.plant, parameters=parameters)
+    drives, placed = case.drives(case.null.model), tuple[Placed, ...]()
+    try:
+        for e in effects:  # an expression of its place may hold what an effect left out had added
+            found = candidates(
+                Structure(plant, drives, [t.columns for t in case.tables]), {e.key[0]: e.candidate.effect}
+            )
+            c = next(c for c in found if (c.key, c.label) == (e.key, e.candidate.label))
+            start = {
+                p.name: known[e.own[p.name]].value if p.name in e.own else p.null for p in c.effect.parameters
+            }
+            inputs = plant.inputs.keys()
+            plant, own = extend(plant, Direction(c, {}, 0.0, len(e.own), start), drives)
+            if plant.inputs.keys() != inputs:
+                drives = case.drives(compile_plant(plant))
+            placed = (*placed, Placed(c, own))
+        return s.weighed(fitted(case, free_starts(case.plant, plant), placed, None, leader))
+    except (StopIteration, SimulationError, InputError, np.linalg.LinAlgError):
+        return None
+
+
+def with_observer(s: Search) -> None:
+    """Search with a plant that follows its recordings, and refit its best hypotheses in the free run.
+
+    Only for a rig that drifts: there a free run from a wrong hypothesis leads no refit to the right one."""
+    case = s.case
+    drives = case.drives(case.null.model)
+    about = linear(case.null, drives)
+    if about is None or not drifts(about, max(float(d.t[-1]) for d in drives)):
+        return
+    for trust in TRUSTS:
+        if max(over_noise(case, as_refitted(case, s.best.fitted), s.limits.clean)) <= s.limits.clean:
+            return
+        plant = held(case.plant, about, case.noise, float(np.median(np.diff(drives[0].t))), trust)
+        if plant is None:
+            return
+        model = compile_plant(plant)
+        null = refit.fit(model, case.drives(model), case.noise, iterations=WHITE, seconds=np.inf)
+        budget = Budget(s.limits.fits, case.budget.progress, case.budget.stopped)
+        following = started(
+            dataclasses.replace(case, plant=plant, null=null, budget=budget, memory=NOTHING), s.limits
+        )
+        grow(following)
+        for w in leaders(list(following.tried.values()), s.limits):
+            effects = w.fitted.hypothesis.effects
+            free = rebuilt(s, effects, w.fitted, None) if effects else None
+            if free and not free.fitted.absent:
+                s.keep([free])
+
+
+def recalled(s: Search) -> list[Weighed]:
     """Return the hypotheses of an earlier diagnosis, refitted to these recordings from where they were."""
-    out: list[Weighed] = []
+    case, out = s.case, list[Weighed]()
     drives, columns = case.drives(case.null.model), [t.columns for t in case.tables]
     likeliest = max((h.log_evidence for h in case.memory.hypotheses), default=0.0)
     for past in case.memory.hypotheses:
-        if not past.effects or case.budget.spent or past.log_evidence < likeliest - BEATEN * limits.effects:
+        far = past.log_evidence < likeliest - BEATEN * s.limits.effects
+        if not past.effects or case.budget.spent or far:
             continue
         try:
             plant, made = remade(past, case.plant, drives, columns, case.catalogue)
             effects = [Placed(c, own) for c, own in made]
-            leader = max((w.fitted for w in (null, *out)), key=lambda f: f.log_likelihood)
+            leader = max((w.fitted for w in (*s.tried.values(), *out)), key=lambda f: f.log_likelihood)
             f = fitted(case, free_starts(case.plant, plant), effects, None, leader)
         except (SimulationError, InputError, np.linalg.LinAlgError):
             continue
-        out.append(Weighed(f, odds(effects, where, limits)))
+        out.append(s.weighed(f))
     return out
 
 
@@ -128,7 +251,7 @@ def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
 
     By error too: the remainder may absorb an effect that a later extension explains."""
     ranked = [sorted(tried, key=lambda w: -w.score), sorted(tried, key=lambda w: w.fitted.rough.cost)]
-    out: dict[frozenset[tuple[str, str]], Weighed] = {}
+    out: dict[Keys, Weighed] = {}
     for pair in zip(*ranked, strict=True):
         for w in pair:
             out.setdefault(w.fitted.hypothesis.keys, w)
@@ -156,22 +279,22 @@ def _free_member(c: Candidate, side: str) -> bool:
 
 
 def extensions(
-    case: Case,
-    parent: Weighed,
-    where: Mapping[str, set[str]],
-    limits: Limits,
-    tried: Mapping[frozenset[tuple[str, str]], Weighed],
+    case: Case, parent: Weighed, where: Mapping[str, set[str]], limits: Limits, tried: Mapping[Keys, Weighed]
 ) -> list[Weighed]:
     """Refit the parent with each direction, and with each pair of directions, of the shortlist."""
     out: list[Weighed] = []
     doubtful: list[Weighed] = []
+    ahead = max(tried.values(), key=lambda w: w.score)
+    # beside a hypothesis that leaves no more than noise only promises count
+    promised = parent is not ahead and max(over_noise(case, ahead.fitted, limits.clean)) <= limits.clean
     looked = screened(case, parent.fitted, limits.clean)
-    leading = max(w.score for w in tried.values())
     queue = shortlist(looked, where, limits)
     for k, (added, gain) in enumerate(queue):
         case.budget.planned = case.budget.fits_done + len(queue) - k
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-        if keys in tried or len(keys) > limits.effects or parent.score + HALF * gain < leading:
+        if keys in tried or len(keys) > limits.effects:
+            continue
+        if parent.score + HALF * gain < ahead.score or promised and np.isinf(gain):
             continue
         if case.budget.spent:
             case.budget.untried += 1

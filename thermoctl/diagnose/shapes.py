@@ -11,15 +11,14 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
 from thermoctl.plant.simulate import Simulation
 
-SLOW_TURNS, FINE_TURNS = (
-    60.0,
-    4000,
-)  # periods over the span: each looked at up to the first, the strongest up to the second
+REPEATED = 2.0  # periods over the span: fewer do not repeat
+SLOW_TURNS, FINE_TURNS = 60.0, 4000  # each is looked at up to the first, the strongest up to the second
 
 
 def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count: int = 16) -> np.ndarray:
-    """The strongest numbers of turns beyond SLOW_TURNS in output errors (N,) per recording, over the signal x of all of them:
-    peaks of their spectrum over x. What moves slowly in time is taken off first."""
+    """Return the strongest numbers of turns over the signal x beyond SLOW_TURNS.
+
+    They are peaks of the spectrum over x of the `errors`, (N,) by recording, without their slow part in time."""
     fast = []
     for e in errors:
         e = np.nan_to_num(e)
@@ -45,8 +44,10 @@ def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count:
 def shape_grid(
     kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24
 ) -> list[dict[str, float]]:
-    """The values of a shape to look at in screening. Beside them `picked_from`: of how many the residual itself picked this one, and
-    `longest`: beyond which a period would not have come once."""
+    """Return the values of a shape to look at in screening.
+
+    `picked_from`: of how many values the residual itself picked this one. `longest`: a longer period does not
+    repeat in the recordings."""
     rig = candidate.rig
     duration, dt = rig.duration, rig.sample
 
@@ -86,13 +87,16 @@ def shape_grid(
         span = float(np.ptp(x[np.isfinite(x)])) or 1.0
         if kind == "periods":
             # neighbouring periods differ by a quarter of a turn over the span
-            slow = [{"period": float(span / n), "longest": span} for n in np.arange(1.0, SLOW_TURNS, 0.25)]
+            longest = span / REPEATED
+            slow = [
+                {"period": float(span / n), "longest": longest} for n in np.arange(REPEATED, SLOW_TURNS, 0.25)
+            ]
             errors = [d.y - run.y for d, run in zip(rig.drives, runs, strict=True)]
             if candidate.place.output:
                 j = list(rig.plant.outputs).index(candidate.place.output)
                 fine = _fine_turns(x, [e[:, j] for e in errors], span)
                 return slow + [
-                    {"period": float(span / n), "longest": span, "picked_from": 4.0 * FINE_TURNS}
+                    {"period": float(span / n), "longest": longest, "picked_from": 4.0 * FINE_TURNS}
                     for n in fine
                 ]
             return slow
