@@ -81,7 +81,7 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
 
 @cache
 def quick(n: int) -> int:
-    """Return the largest number up to n without a large prime factor; with one a long DCT takes four times as long."""
+    """Return the largest number up to n without a large prime factor, for a fast DCT."""
 
     def rest(m: int) -> int:
         for p in (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31):

@@ -41,9 +41,9 @@ FEWEST = 1_000  # rows that each recording keeps: forty bands, the highest with 
 # has at most WHITE - 1 = 10 % of the noise's power. So 19 % of 10 % of the highest band are lost.
 HALF_BAND = 2.0  # the new highest frequency over that of the fastest content
 WHITE = 1.1  # times the power of the highest rows, up to which a band is white
-DEVIATIONS = 4.0  # of a band's power that are chance: one output in a thousand is taken for faster than it is
+DEVIATIONS = 4.0  # of a band's power that are chance: wrong at one output in a thousand
 AVERAGED = 1e-3  # share of an input's variance that averaging may remove: the mean of its square is as exact
-OUTLIER = 6.0  # robust standard deviations from the median of its neighbours, beyond which a cell is left out
+OUTLIER = 6.0  # robust standard deviations from the median of its neighbours, beyond which a cell is dropped
 GAP = 1.5  # times the usual duration of a block, beyond which rows are missing in it: it gives no value
 
 

@@ -49,7 +49,7 @@ def diagnose(
     stopped: Callable[[], bool] = lambda: False,
     earlier: Path | None = None,
 ) -> dict[str, Any]:
-    """Diagnose recordings, write the result into the folder `out` (all files or none), and return it.
+    """Diagnose recordings, write the result into the folder `out` (all files or none), return it.
 
     - `effects`: folders of effects beside the catalogue
     - `held_out`: recordings that take no part in any choice
