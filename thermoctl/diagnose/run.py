@@ -53,7 +53,7 @@ def diagnose(
 
     - `effects`: folders of effects beside the catalogue
     - `held_out`: recordings that take no part in any choice
-    - `drivable`: inputs that the next experiment may drive (default: those that changed, without surroundings)
+    - `drivable`: inputs that the next experiment may drive (default: those that changed)
     - `limits`: ranges of inputs and outputs in the next experiment
     - `stopped`: once true, the result is that of the hypotheses tried so far, with a note
     - `earlier`: the folder of an earlier diagnosis, which goes on with these recordings
