@@ -50,7 +50,7 @@ def test_findings_are_told_by_size_with_units():
     first, gain, rest = sentences(FOUND)
     assert (
         first
-        == "Found: radiation at block (probability 1.00) and sensor lag of 4.21 s at reading (probability 0.98)."
+        == "Found: radiation at block (probability above 0.99) and sensor lag of 4.21 s at reading (probability 0.98)."
     )
     assert gain == (
         "They take the error of reading from 3.2 K after a refit alone (40.9 K as the plant came) to 0.252 K; "

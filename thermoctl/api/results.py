@@ -16,7 +16,7 @@ from thermoctl.api.plants import Plant
 from thermoctl.api.plots import Picture, over_time
 from thermoctl.diagnose.result import Diagnosis as Found
 from thermoctl.diagnose.result import contract
-from thermoctl.diagnose.words import words
+from thermoctl.diagnose.words import chance, words
 from thermoctl.plant import save
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.plant.simulate import Simulation as Run
@@ -134,7 +134,7 @@ class Diagnosis:
 
     def _repr_html_(self) -> str:
         rows = "".join(
-            f"<tr><td>{f.effect}</td><td>{f.where}</td><td>{f.probability:.2f}</td>"
+            f"<tr><td>{f.effect}</td><td>{f.where}</td><td>{chance(f.probability)}</td>"
             f"<td><code>{html.escape(f.equation)}</code></td></tr>"
             for f in self.findings
         )

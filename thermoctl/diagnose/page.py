@@ -14,7 +14,7 @@ from thermoctl.diagnose.experiment_file import peaks
 from thermoctl.diagnose.fit import Fitted, Placed
 from thermoctl.diagnose.law_result import law_section
 from thermoctl.diagnose.result import Diagnosis
-from thermoctl.diagnose.words import name, sentences, what_next
+from thermoctl.diagnose.words import chance, name, sentences, what_next
 from thermoctl.plant.refit import Estimate, Fit, report
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, page, table, unit
@@ -88,7 +88,7 @@ def _findings(found: Diagnosis, result: Mapping[str, Any]) -> str:
     body = ""
     for f, e in zip(result["findings"], found.shown, strict=True):
         effect = e.candidate.effect
-        body += f"<h3>{html.escape(name(f))} (probability {f['probability']:.2f})</h3>"
+        body += f"<h3>{html.escape(name(f))} (probability {chance(f['probability'])})</h3>"
         body += f"{_p(effect.title + '.')}<pre>{html.escape(f['equation'])}</pre>"
         rows = [
             (n, p["value"], unit(p["unit"]), _interval(p["value"], p["sd"]))
@@ -246,7 +246,7 @@ def _lost(result: Mapping[str, Any]) -> str:
     rows = [
         (
             f"{e['effect'].replace('_', ' ')} at {e['where']}",
-            f"{e['probability']:.3f}",
+            chance(e["probability"]),
             f"{e['below_best']:.1f}",
             e["reason"]
             + (f"; best beside {' + '.join(e['beside'])}".replace("_", " ") if e["beside"] else ""),

@@ -61,6 +61,11 @@ def name(finding: Mapping[str, Any]) -> str:
     return f"{text} at {finding['where']}"
 
 
+def chance(p: float) -> str:
+    """Return a probability in two digits; none is certain."""
+    return "above 0.99" if p >= 0.995 else "below 0.01" if p < 0.005 else f"{p:.2f}"
+
+
 def listed(items: Sequence[str]) -> str:
     """Return `a, b and c`."""
     return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
@@ -79,11 +84,11 @@ def amount(found: Result, output: str, value: float | None) -> str:
 
 
 def _found(found: Result) -> str:
-    names = [f"{name(f)} (probability {f['probability']:.2f})" for f in found["findings"]]
+    names = [f"{name(f)} (probability {chance(f['probability'])})" for f in found["findings"]]
     if found["verdict"] == "consistent":
         return "The recordings agree with the plant within its sensors' noise: nothing is missing."
     if found["verdict"] == "ambiguous":
-        others = [f"{name(a)} ({a['probability']:.2f})" for a in found["alternatives"][:3]]
+        others = [f"{name(a)} ({chance(a['probability'])})" for a in found["alternatives"][:3]]
         text = "Something is missing, but these recordings do not name it for sure"
         text += f": most likely {listed(names)}" if names else ""
         return text + (f"; also possible: {', '.join(others)}." if others else ".")
@@ -100,7 +105,7 @@ def law_sentence(entry: Result | None) -> str:
         f"{n} = {p['value']:.4g} {p['unit'] or ''}".strip() for n, p in entry["parameters"].items()
     )
     at = f"from {entry['from']} into {entry['into']}" if entry["from"] else f"into {entry['into']}"
-    return f"A law for it: a flow {at} of {entry['expression']} with {values} (probability {entry['probability']:.2f})."
+    return f"A law for it: a flow {at} of {entry['expression']} with {values} (probability {chance(entry['probability'])})."
 
 
 def _worst(found: Result) -> str | None:
