@@ -28,7 +28,7 @@ from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.decide import Key, weigh
 from thermoctl.diagnose.limits import Limits, limits
 from thermoctl.diagnose.misfit import Energy, standing
-from thermoctl.diagnose.search import EVENTS
+from thermoctl.diagnose.odds import EVENTS
 from thermoctl.plant import load
 
 NUMBERS = {

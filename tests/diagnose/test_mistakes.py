@@ -48,7 +48,6 @@ def test_only_what_a_refit_cannot_move_may_be_off():
     assert places(defined) == set()  # a storage of 1 is a definition
 
 
-@pytest.mark.skip(reason="search.py does not weigh mistakes yet: merge own-hook")
 @pytest.mark.parametrize(
     ("name", "factor", "effect"), [("C", 1e-3, "wrong_storage"), ("G", 0.1, "wrong_rate")]
 )

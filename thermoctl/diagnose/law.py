@@ -38,7 +38,8 @@ from thermoctl.diagnose.law_smooth import Tracked, flow_unit, tracked
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.misfit import energies, physics
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.search import ALIKE, HALF, Searched, Weighed
+from thermoctl.diagnose.search import Searched, Weighed
+from thermoctl.diagnose.shortlist import ALIKE, HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.residuals import HUGE
 from thermoctl.plant.simulate import SimulationError

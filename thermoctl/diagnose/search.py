@@ -8,31 +8,27 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermoctl.diagnose.candidates import Candidate, candidates
+from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, Case
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.extend import extend, sticking, weaker
 from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, over_noise
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, remade
+from thermoctl.diagnose.mistakes import mistakes
 from thermoctl.diagnose.observer import TRUSTS, drifts, held, linear
-from thermoctl.diagnose.places import PLACES
+from thermoctl.diagnose.odds import odds
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Direction, Metric, sharpened
+from thermoctl.diagnose.screen import Direction, sharpened
 from thermoctl.diagnose.screening import Screened, places, screened
-from thermoctl.plant import expression as ex
+from thermoctl.diagnose.shortlist import HALF, PAIR, shortlist, simpler
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.yamlfile import InputError
 
-EVENTS = ("onsets", "windows")  # shapes that happen at one moment
-PAIR = 2
 SURPLUS = 5.0  # nats over every other extension, from which one with an insignificant part is kept
 BEATEN = 10.0  # nats below the best: such a parent is not extended where the best leaves no more than noise
-HALF = 2.0  # times its first-order promise that a refit may gain
-PLACES_EACH = 3  # of one effect in a shortlist
-ALIKE = 0.999  # cosine of two directions, above which they are one
 Keys = frozenset[Key]
 START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
@@ -56,28 +52,6 @@ class Searched:
 
     tried: tuple[Weighed, ...]
     truncated: bool
-
-
-def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limits) -> float:
-    """Return the log prior odds of a hypothesis against no effect.
-
-    The odds are shared equally among the entries, and each entry's among its places."""
-    total = 0.0
-    for e in effects:
-        c = e.candidate
-        share = len(where) * len(where.get(c.effect.name, {c.place.where}))
-        total += np.log(limits.missing / (1 - limits.missing) / share) + np.log(_class(c, limits))
-    return float(total)
-
-
-def _class(c: Candidate, limits: Limits) -> float:
-    """Odds of an entry's class against constant physics."""
-    event = any(kind in EVENTS for kind in c.effect.shapes.values()) or any(
-        p.per_recording for p in c.effect.parameters
-    )
-    return (limits.rare if event else 1.0) * (
-        limits.rare if c.place.input and c.effect.where != "drive" else 1.0
-    )
 
 
 @dataclass
@@ -122,9 +96,14 @@ class Search:
 def search(case: Case, limits: Limits) -> Searched:
     """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent.
 
-    A rig that drifts far is searched with an observer first."""
+    A rig that drifts far is searched with an observer first. Wrong numbers of the plant file are rivals."""
     s = started(case, limits)
+    null = s.best
     with_observer(s)
+    rivals = [s.weighed(f) for f in mistakes(case, null.fitted, limits.shortlist)]
+    if rivals:
+        s.keep(rivals)
+        s.extended(null)  # also where a rival fits better
     grow(s)
     swap(s)
     return Searched(tuple(sorted(s.tried.values(), key=lambda w: -w.score)), case.budget.spent)
@@ -206,9 +185,9 @@ def with_observer(s: Search) -> None:
     about = linear(case.null, drives)
     if about is None or not drifts(about, max(float(d.t[-1]) for d in drives)):
         return
+    if max(over_noise(case, as_refitted(case, s.best.fitted), s.limits.clean)) <= s.limits.clean:
+        return
     for trust in TRUSTS:
-        if max(over_noise(case, as_refitted(case, s.best.fitted), s.limits.clean)) <= s.limits.clean:
-            return
         plant = held(case.plant, about, case.noise, float(np.median(np.diff(drives[0].t))), trust)
         if plant is None:
             return
@@ -224,6 +203,8 @@ def with_observer(s: Search) -> None:
             free = rebuilt(s, effects, w.fitted, None) if effects else None
             if free and not free.fitted.absent:
                 s.keep([free])
+        if s.best.fitted.hypothesis.effects:
+            return
 
 
 def recalled(s: Search) -> list[Weighed]:
@@ -256,26 +237,6 @@ def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
         for w in pair:
             out.setdefault(w.fitted.hypothesis.keys, w)
     return list(out.values())[: limits.beam]
-
-
-def relabels(c: Candidate) -> bool:
-    """Return whether the plant or a simpler entry at the same place already contains this physics."""
-    if c.effect.where == "bending_pair":
-        return any(_free_member(c, side) for side in ("TA", "TB"))
-    displaced = PLACES["displacement"](c.rig)
-    return (
-        c.effect.where == "sensor"
-        and "tau" in c.effect.shapes
-        and any(p.output == c.place.output for p in displaced)
-    )
-
-
-def _free_member(c: Candidate, side: str) -> bool:
-    """Does the displacement hold this side's temperature already, with a coefficient that a refit moves?"""
-    now = ex.substitute(c.place.symbols["y"], lambda e: e.args[0] if e.op == "delay" else None)
-    slope = ex.derivative(now, str(c.place.symbols[side].value))
-    parameters = c.rig.plant.parameters
-    return any(n in parameters and parameters[n].range for n in ex.names(slope))
 
 
 def extensions(
@@ -311,98 +272,6 @@ def extensions(
             queue += [((d,), gain) for d in simpler(added, looked) if d.candidate.key not in queued]
     simplest = max((w.score for w in (parent, *out)), default=parent.score)
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
-
-
-def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
-    """Return the entries at the same places with fewer parameters, to try without an insignificant part."""
-    return [
-        d
-        for d in looked.directions
-        if any(
-            d.candidate.place.where == a.candidate.place.where
-            and len(d.candidate.effect.parameters) < len(a.candidate.effect.parameters)
-            for a in added
-        )
-        and d.gain > 0
-    ]
-
-
-def shortlist(
-    looked: Screened, where: Mapping[str, set[str]], limits: Limits
-) -> list[tuple[tuple[Direction, ...], float]]:
-    """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
-
-    The best is first; at most PLACES_EACH of one effect. Those with the largest gain in energy follow."""
-    paying = []
-    for d, promise in zip(looked.directions, looked.promises, strict=True):
-        gain = promise + odds((Placed(d.candidate, {}),), where, limits)
-        if gain > 0 and d.gain > 0 and not relabels(d.candidate):
-            paying.append((d, gain))
-    paying.sort(key=lambda x: -x[1])
-    out: list[tuple[tuple[Direction, ...], float]] = []
-    for d, gain in paying:
-        alike = [o for (o,), _ in out if o.candidate.effect is d.candidate.effect]
-        if len(alike) < PLACES_EACH and d.candidate.key not in {o.candidate.key for o in alike}:
-            out.append(((d,), gain))
-    out = [(d, gain) for d, gain in out[: limits.shortlist] if HALF * gain > out[0][1]]
-    known = {d.candidate.key for (d,), _ in out}
-    out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in known]
-    together = pairs([d for d, _ in paying], looked.metric, limits)
-    if looked.energy:
-        together += pairs(looked.by_energy, looked.energy, limits)
-    return [*out, *((p, np.inf) for p in together)]
-
-
-def largest(looked: Screened) -> list[Direction]:
-    """Return the direction of each candidate whose gain in energy is at least half of the best one's."""
-    first: dict[tuple[str, str], Direction] = {}
-    for d in looked.by_energy:
-        if HALF * d.gain > looked.by_energy[0].gain and not relabels(d.candidate):
-            first.setdefault(d.candidate.key, dataclasses.replace(d, vector=None))
-    return list(first.values())
-
-
-def pairs(directions: Sequence[Direction], metric: Metric, limits: Limits) -> list[tuple[Direction, ...]]:
-    """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
-
-    The plant's own parameters may imitate each alone, but not both together."""
-    best: dict[tuple[str, str], Direction] = {}
-    for d in directions:
-        if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values()):
-            best.setdefault(d.candidate.key, d)
-    kept = list(best.values())
-    if len(kept) < PAIR:
-        return []
-    v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
-    g = np.maximum(v @ metric.residual, np.finfo(float).tiny)
-    c = np.clip(v @ v.T, -ALIKE, ALIKE)
-    first = (g[:, None] - c * g[None]) / (
-        1 - c**2
-    )  # size of the first beside the second, along its unit vector
-    joint = g[:, None] * first + g[None] * first.T
-    alone = np.array([d.gain for d in kept])
-    extra = np.triu(joint - np.maximum.outer(alone, alone), 1)
-    out: list[tuple[Direction, ...]] = []
-    for k in np.argsort(-extra, axis=None):
-        a, b = np.unravel_index(k, extra.shape)
-        if len(out) >= limits.shortlist // PAIR or extra[a, b] <= max(alone[a], alone[b]):
-            break
-        pair = (resized(kept[a], first[a, b] / g[a]), resized(kept[b], first[b, a] / g[b]))
-        if all(d is not None for d in pair):
-            out.append(tuple(d for d in pair if d is not None))
-    return out
-
-
-def resized(d: Direction, factor: float) -> Direction | None:
-    """Return the direction with its size multiplied by `factor`; None if the size leaves its bounds."""
-    start = dict(d.start)
-    for p in d.candidate.effect.parameters:
-        if p.amplitude:
-            start[p.name] = p.null + factor * (start[p.name] - p.null)
-            low, high = d.candidate.bounds(p)
-            if not low <= start[p.name] <= high:
-                return None
-    return dataclasses.replace(d, start=start)
 
 
 def _followed(

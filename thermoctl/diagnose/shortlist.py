@@ -1,0 +1,134 @@
+"""The screened directions that are worth a refit, alone or in pairs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from thermoctl.diagnose.candidates import Candidate
+from thermoctl.diagnose.fit import Placed
+from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.odds import EVENTS, odds
+from thermoctl.diagnose.places import PLACES
+from thermoctl.diagnose.screen import Direction, Metric
+from thermoctl.diagnose.screening import Screened
+from thermoctl.plant import expression as ex
+
+PAIR = 2
+HALF = 2.0  # times its first-order promise that a refit may gain
+PLACES_EACH = 3  # of one effect in a shortlist
+ALIKE = 0.999  # cosine of two directions, above which they are one
+
+
+def relabels(c: Candidate) -> bool:
+    """Return whether the plant or a simpler entry at the same place already contains this physics."""
+    if c.effect.where == "bending_pair":
+        return any(_free_member(c, side) for side in ("TA", "TB"))
+    displaced = PLACES["displacement"](c.rig)
+    return (
+        c.effect.where == "sensor"
+        and "tau" in c.effect.shapes
+        and any(p.output == c.place.output for p in displaced)
+    )
+
+
+def _free_member(c: Candidate, side: str) -> bool:
+    """Does the displacement hold this side's temperature already, with a coefficient that a refit moves?"""
+    now = ex.substitute(c.place.symbols["y"], lambda e: e.args[0] if e.op == "delay" else None)
+    slope = ex.derivative(now, str(c.place.symbols[side].value))
+    parameters = c.rig.plant.parameters
+    return any(n in parameters and parameters[n].range for n in ex.names(slope))
+
+
+def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
+    """Return the entries at the same places with fewer parameters, to try without an insignificant part."""
+    return [
+        d
+        for d in looked.directions
+        if any(
+            d.candidate.place.where == a.candidate.place.where
+            and len(d.candidate.effect.parameters) < len(a.candidate.effect.parameters)
+            for a in added
+        )
+        and d.gain > 0
+    ]
+
+
+def shortlist(
+    looked: Screened, where: Mapping[str, set[str]], limits: Limits
+) -> list[tuple[tuple[Direction, ...], float]]:
+    """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
+
+    The best is first; at most PLACES_EACH of one effect. Those with the largest gain in energy follow."""
+    paying = []
+    for d, promise in zip(looked.directions, looked.promises, strict=True):
+        gain = promise + odds((Placed(d.candidate, {}),), where, limits)
+        if gain > 0 and d.gain > 0 and not relabels(d.candidate):
+            paying.append((d, gain))
+    paying.sort(key=lambda x: -x[1])
+    out: list[tuple[tuple[Direction, ...], float]] = []
+    for d, gain in paying:
+        alike = [o for (o,), _ in out if o.candidate.effect is d.candidate.effect]
+        if len(alike) < PLACES_EACH and d.candidate.key not in {o.candidate.key for o in alike}:
+            out.append(((d,), gain))
+    out = [(d, gain) for d, gain in out[: limits.shortlist] if HALF * gain > out[0][1]]
+    known = {d.candidate.key for (d,), _ in out}
+    out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in known]
+    together = pairs([d for d, _ in paying], looked.metric, limits)
+    if looked.energy:
+        together += pairs(looked.by_energy, looked.energy, limits)
+    return [*out, *((p, np.inf) for p in together)]
+
+
+def largest(looked: Screened) -> list[Direction]:
+    """Return the direction of each candidate whose gain in energy is at least half of the best one's."""
+    first: dict[tuple[str, str], Direction] = {}
+    for d in looked.by_energy:
+        if HALF * d.gain > looked.by_energy[0].gain and not relabels(d.candidate):
+            first.setdefault(d.candidate.key, dataclasses.replace(d, vector=None))
+    return list(first.values())
+
+
+def pairs(directions: Sequence[Direction], metric: Metric, limits: Limits) -> list[tuple[Direction, ...]]:
+    """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
+
+    The plant's own parameters may imitate each alone, but not both together."""
+    best: dict[tuple[str, str], Direction] = {}
+    for d in directions:
+        if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values()):
+            best.setdefault(d.candidate.key, d)
+    kept = list(best.values())
+    if len(kept) < PAIR:
+        return []
+    v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
+    g = np.maximum(v @ metric.residual, np.finfo(float).tiny)
+    c = np.clip(v @ v.T, -ALIKE, ALIKE)
+    first = (g[:, None] - c * g[None]) / (
+        1 - c**2
+    )  # size of the first beside the second, along its unit vector
+    joint = g[:, None] * first + g[None] * first.T
+    alone = np.array([d.gain for d in kept])
+    extra = np.triu(joint - np.maximum.outer(alone, alone), 1)
+    out: list[tuple[Direction, ...]] = []
+    for k in np.argsort(-extra, axis=None):
+        a, b = np.unravel_index(k, extra.shape)
+        if len(out) >= limits.shortlist // PAIR or extra[a, b] <= max(alone[a], alone[b]):
+            break
+        pair = (resized(kept[a], first[a, b] / g[a]), resized(kept[b], first[b, a] / g[b]))
+        if all(d is not None for d in pair):
+            out.append(tuple(d for d in pair if d is not None))
+    return out
+
+
+def resized(d: Direction, factor: float) -> Direction | None:
+    """Return the direction with its size multiplied by `factor`; None if the size leaves its bounds."""
+    start = dict(d.start)
+    for p in d.candidate.effect.parameters:
+        if p.amplitude:
+            start[p.name] = p.null + factor * (start[p.name] - p.null)
+            low, high = d.candidate.bounds(p)
+            if not low <= start[p.name] <= high:
+                return None
+    return dataclasses.replace(d, start=start)
