@@ -580,7 +580,13 @@ _DIAGNOSIS = (
             "recordings",
             nargs="*",
             metavar="REC",
-            help="recordings (.csv, .xlsx, .parquet, .arrow), or folders of many rigs' recordings: one diagnosis a rig",
+            help="recordings (.csv, .xlsx, .parquet, .arrow) or patterns of them ('runs/*.csv'), or folders of many rigs' "
+            "recordings: one diagnosis a rig",
+        ),
+        _arg(
+            "--together",
+            action="store_true",
+            help="with folders: all recordings in them are of one rig, for one diagnosis",
         ),
         _arg("--plant", metavar="FILE", help="the plant file, or an FMU"),
         _MAP,
@@ -602,6 +608,12 @@ _DIAGNOSIS = (
             "--out",
             metavar="DIR",
             help="folder of diagnosis.json, plant.yaml and report.html (with folders: DIR/RIG)",
+        ),
+        _arg(
+            "--continue",
+            dest="continued",
+            metavar="DIR",
+            help="go on from the diagnosis in DIR with recordings that it has not seen, without its old ones",
         ),
         _arg("--explain", metavar="DIR", help="print in ten lines the reasons of the diagnosis in DIR"),
         _arg(
@@ -979,6 +991,9 @@ def diagnose(args: argparse.Namespace) -> int:
         args.recordings = live_recordings(args)
         if not args.recordings:
             return 0
+    from thermoctl.fleet.recordings import expanded
+
+    args.recordings = expanded(args.recordings, args.together)
     if any(Path(r).is_dir() for r in args.recordings):
         if args.time or args.columns or args.held_out:
             raise InputError(

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.plants import TWO_BLOCKS
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -36,6 +37,7 @@ print(json.dumps({"verdict": found["verdict"], "found": [f"{f['effect']} at {f['
     "cpu_s": sum(u.ru_utime + u.ru_stime for u in used), "MiB": used[0].ru_maxrss / 1024, "notes": found["notes"]}))
 """
 LIMIT_S = 1800
+THINNED = 100  # rows of the long record for one of the short
 
 
 def block_plant(n: int) -> str:
@@ -67,8 +69,12 @@ def block_plant(n: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def recorded(folder: Path, plant_text: str, flow: str, rows: int, interval: float, power: float) -> None:
-    """Write plant.yaml and run_1.csv, recorded on the plant with one flow more. Heaters change at random times."""
+def recorded(
+    folder: Path, plant_text: str, flow: str, rows: int, interval: float, power: float, grid: int = 1
+) -> None:
+    """Write plant.yaml and run_1.csv, recorded on the plant with one flow more.
+
+    Heaters change at random rows, at every `grid`-th one at most: a record thinned by `grid` keeps their times."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "plant.yaml").write_text(plant_text)
     (folder / "truth.yaml").write_text(plant_text.replace("flows:\n", f"flows:\n  concealed: {flow}\n"))
@@ -79,8 +85,8 @@ def recorded(folder: Path, plant_text: str, flow: str, rows: int, interval: floa
         if i.name == "air":
             columns[i.column] = 20 + 0.5 * np.sin(2 * np.pi * t / 86_400)
         else:
-            ends = np.sort(rng.uniform(0, t[-1], 60))
-            columns[i.column] = np.round(rng.uniform(0, power, 61), 2)[np.searchsorted(ends, t)]
+            ends = np.sort(rng.integers(0, rows // grid, 60)) * grid * interval
+            columns[i.column] = np.round(rng.uniform(0, power, 61), 2)[np.searchsorted(ends, t, side="right")]
     table = compile_plant(plant).measure(Table("run_1", "run_1", t, columns), seed=7)
     write(folder / "run_1.csv", table)
 
@@ -136,49 +142,23 @@ def rows(number: int, before: Path | None) -> None:
         folder = Path(work)
         recorded(
             folder,
-            TWO,
-            '{from: block_1, rate: "0.012 * max(block_1 - air, 0)**1.25", unit: W}',
+            TWO_BLOCKS,
+            '{from: one, rate: "0.006 * max(one - air, 0)**1.25", unit: W}',
             number,
             1.0,
-            5.0,
+            2.0,
+            THINNED,
         )
         names = (folder / "run_1.csv").read_text().splitlines()
-        (folder / "few.csv").write_text("\n".join([names[0], *names[1::100]]) + "\n")
+        (folder / "few.csv").write_text("\n".join([names[0], *names[1::THINNED]]) + "\n")
         few, many = diagnosed(folder, "few.csv"), diagnosed(folder)
-        line(f"{number // 100} rows", few)
+        line(f"{number // THINNED} rows", few)
         line(f"{number} rows", many)
-        print(f"{number} rows / {number // 100} rows: {many['cpu_s'] / few['cpu_s']:.2f} times the time")  # type: ignore[operator]
+        print(f"{number} rows / {number // THINNED} rows: {many['cpu_s'] / few['cpu_s']:.2f} times the time")  # type: ignore[operator]
         if before:
             old = diagnosed(folder, checkout=before)
             line(f"{number} rows, before", old)
             print(f"before / now: {old['cpu_s'] / many['cpu_s']:.1f}")  # type: ignore[operator]
-
-
-TWO = """format: thermoctl-plant/1
-title: Two blocks in air
-inputs:
-  heat_1: {unit: W}
-  heat_2: {unit: W}
-  air: {unit: degC, between_samples: linear}
-parameters:
-  C_1: {value: 60.0, unit: J/K, range: [20, 180]}
-  C_2: {value: 80.0, unit: J/K, range: [25, 240]}
-  G_1: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
-  G_2: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
-  G_12: {value: 0.06, unit: W/K, range: [0.01, 0.2]}
-nodes:
-  block_1: {unit: degC, storage: C_1, initial: air, initial_sigma: 0.5}
-  block_2: {unit: degC, storage: C_2, initial: air, initial_sigma: 0.5}
-flows:
-  power_1: {into: block_1, rate: heat_1, unit: W}
-  power_2: {into: block_2, rate: heat_2, unit: W}
-  between: {from: block_1, into: block_2, rate: G_12 * (block_1 - block_2), unit: W}
-  loss_1: {from: block_1, rate: G_1 * (block_1 - air), unit: W}
-  loss_2: {from: block_2, rate: G_2 * (block_2 - air), unit: W}
-outputs:
-  temperature_1: {value: block_1, unit: degC, noise: 0.1}
-  temperature_2: {value: block_2, unit: degC, noise: 0.1}
-"""
 
 
 def bodies(numbers: list[int]) -> None:

@@ -39,7 +39,7 @@ def test_two_runs_at_once_on_one_and_on_two_threads_write_the_same_bytes(tmp_pat
         ]
         started.append(subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL))
     assert [p.wait(timeout=300) for p in started] == [0, 0]
-    assert set(written(outs[0])) == {"diagnosis.json", "plant.yaml", "report.html"}
+    assert set(written(outs[0])) == {"diagnosis.json", "memory.json", "plant.yaml", "report.html"}
     assert written(outs[0]) == written(outs[1])
 
 

@@ -1,15 +1,21 @@
-"""Progress of a diagnosis counts what was planned; an output folder that cannot be written ends it at once."""
+"""Progress counts what was planned; a diagnosis can be stopped; an output folder is checked before the work."""
 
 from __future__ import annotations
 
+import json
+import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from tests.plants import ONE_BLOCK
 from thermoctl import shipped
 from thermoctl.diagnose.case import Budget
+from thermoctl.diagnose.commands import on_interrupt
 from thermoctl.diagnose.run import diagnose
 from thermoctl.plant import load
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
@@ -33,3 +39,35 @@ def test_a_file_in_place_of_the_folder_is_refused_before_the_work(tmp_path, insi
     with pytest.raises(InputError, match="--out"):
         diagnose(plant, [Table("none", "none", None, {})], taken / inside)  # type: ignore[arg-type]
     assert taken.read_text() == ""
+
+
+def test_a_stopped_diagnosis_leaves_the_result_so_far(tmp_path):
+    """Radiation is concealed; Ctrl-C comes during the second refit of the search."""
+    path = tmp_path / "plant.yaml"
+    lost = "{from: block, rate: 3e-9 * ((block + 273.15)**4 - (air + 273.15)**4), unit: W}"
+    path.write_text(ONE_BLOCK.replace("flows:\n", f"flows:\n  concealed: {lost}\n"))
+    t = np.arange(400.0)
+    heat = 12.0 * np.random.default_rng(4).integers(0, 2, 8)[(t // 50).astype(int)]
+    table = compile_plant(load(path)).measure(
+        Table("run", "run", t, {"heat": heat, "air": 20 + 0 * t}), seed=1
+    )
+    path.write_text(ONE_BLOCK)
+    with on_interrupt() as stopped:
+
+        def progress(text: str) -> None:
+            if "refit 2 of" in text:
+                signal.raise_signal(signal.SIGINT)
+
+        found = diagnose(load(path), [table], tmp_path / "out", progress=progress, stopped=stopped)
+    assert len(found["hypotheses"]) == 2  # without an effect, and the one whose refit was under way
+    assert found["truncated"] and found["notes"][0].startswith("stopped by hand after 2 refits")
+    assert found["verdict"] == "ambiguous"  # a likelier one may be among those not tried
+    assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["notes"] == found["notes"]
+
+
+def test_the_second_interrupt_gives_up():
+    with pytest.raises(KeyboardInterrupt), on_interrupt() as stopped:
+        assert not stopped()
+        signal.raise_signal(signal.SIGINT)
+        assert stopped()
+        signal.raise_signal(signal.SIGINT)

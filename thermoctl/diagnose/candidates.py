@@ -165,9 +165,8 @@ class _Builder:
             air = name(self.rig.air or "")
             shift = zero_of(self._unit_of_y()) - zero_of(self._signal_unit(air))
             self.symbols["reference"] = ex.add(air, num(shift)) if warm else num(0.0)
-        dts = [float(np.median(np.diff(d.t))) for d in self.rig.drives if len(d.t) > 1]
-        self.symbols["duration"] = num(max((float(d.t[-1]) for d in self.rig.drives), default=1.0))
-        self.symbols["sample"] = num(float(f"{min(dts):.6g}") if dts else 1.0)
+        self.symbols["duration"] = num(self.rig.duration)
+        self.symbols["sample"] = num(float(f"{self.rig.sample:.6g}"))
         for e in c.effect.parameters:
             own = c.own(e.name)
             self.symbols[e.name] = name(own)

@@ -12,35 +12,40 @@ from scipy.ndimage import median_filter
 from thermoctl.checks.model import SIGMAS, start_errors
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.noise import Grid, grid
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.rows import reduced
+from thermoctl.diagnose.rows import OUTLIER, reduced
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Noise, fit
-from thermoctl.plant.simulate import Excitation, Model, compile_plant
+from thermoctl.plant.simulate import RTOL, Excitation, Model, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 LEAST = 40  # measured values of one output, below which nothing is decided
-OUTLIER = 6.0  # robust standard deviations from the median of five neighbours
+ACCURATE = 1e-3  # local error of a simulation over noise / range of an output; at most LARGEST
+LARGEST = 1e-5
 
 
 @dataclass
 class Budget:
     """Largest number of refits, and the number done. Counted, never timed: the same on every machine.
 
-    `planned`: number of refits after this step of the search; each step may plan more."""
+    `planned`: number of refits after this step of the search; each step may plan more. `stopped`: does a
+    person want the result of what is done so far? `untried`: refits of promising hypotheses left out."""
 
     fits: int
     progress: Callable[[str], None] = lambda text: None
+    stopped: Callable[[], bool] = lambda: False
     fits_done: int = 0
     planned: int = 1
+    untried: int = 0
 
     @property
     def spent(self) -> bool:
         """Is there nothing left for another refit?"""
-        return self.fits_done >= self.fits
+        return self.fits_done >= self.fits or self.stopped()
 
     def spend(self) -> None:
         """Count one refit, and report it."""
@@ -68,13 +73,21 @@ class Case:
     off: Mapping[str, float] = field(
         default_factory=dict
     )  # outputs' first samples less a start that they contradict
+    rtol: float = RTOL  # of every simulation
+    memory: Memory = NOTHING  # of earlier recordings
 
     def drives(self, model: Model) -> list[Excitation]:
         """The recordings as a model reads them."""
-        return [model.excitation(t) for t in self.tables]
+        return [dataclasses.replace(model.excitation(t), rtol=self.rtol) for t in self.tables]
 
 
-def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect], budget: Budget) -> Case:
+def case(
+    plant: Plant,
+    tables: Sequence[Table],
+    catalogue: Mapping[str, Effect],
+    budget: Budget,
+    memory: Memory = NOTHING,
+) -> Case:
     """Refit the original plant, drop single outliers, fix the coordinates and grids of all hypotheses.
 
     Rows of long recordings are put together (rows.py).
@@ -91,9 +104,12 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
             f"output ({', '.join(o.column for o in plant.outputs.values())}); {LEAST} or more are needed"
         )
     noise = fewer.noise(plant, drives)
+    rtol = _rtol(drives, noise)
+    for d in drives:
+        d.rtol = rtol
     null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
     tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
-    drives = [model.excitation(t) for t in tables]
+    drives = [dataclasses.replace(model.excitation(t), rtol=rtol) for t in tables]
     coordinates = Coordinates(drives)
     sensors = [fewer.sensor(o.noise) for o in plant.outputs.values()]
     rig = Structure(plant, drives, [t.columns for t in tables])
@@ -117,7 +133,20 @@ def case(plant: Plant, tables: Sequence[Table], catalogue: Mapping[str, Effect],
         ],
         fewer.block,
         off,
+        rtol,
+        memory,
     )
+
+
+def _rtol(drives: Sequence[Excitation], noise: Sequence[Noise]) -> float:
+    """Return the local error whose sum stays far below the sensors' noise.
+
+    With ACCURATE times noise over range it was 0.001 to 0.02 of the noise on six real rigs."""
+    values = np.concatenate([d.y for d in drives])
+    seen = np.isfinite(values).any(axis=0)
+    span = np.nanmax(values[:, seen], axis=0) - np.nanmin(values[:, seen], axis=0)
+    sigma = np.array([n.sigma for n in noise])[seen]
+    return float(np.clip(ACCURATE * np.min(sigma / np.maximum(span, 1e-300)), RTOL, LARGEST))
 
 
 def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str, float], list[str]]:

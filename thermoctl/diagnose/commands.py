@@ -7,10 +7,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import signal
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,30 @@ class StageReporter:
                 self(self.last)
 
 
+@contextlib.contextmanager
+def on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Yield whether Ctrl-C was pressed; the second one raises KeyboardInterrupt, as usual."""
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+
+    def ask(*_: object) -> None:
+        asked.set()
+        signal.signal(signal.SIGINT, before)
+        print(
+            "thermoctl: the search ends after this refit, with the result so far; Ctrl-C again gives up",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def diagnose(args: argparse.Namespace) -> int:
     """`thermoctl diagnose`: run the diagnosis and print its summary, or explain an earlier one.
 
@@ -84,7 +109,10 @@ def diagnose(args: argparse.Namespace) -> int:
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
         added = read_recordings(plant, recordings[len(given) :])  # of --resolve: written by thermoctl
-        with contextlib.nullcontext() if args.quiet else StageReporter() as progress:
+        with (
+            contextlib.nullcontext() if args.quiet else StageReporter() as progress,
+            on_interrupt() as stopped,
+        ):
             return run.diagnose(
                 plant,
                 [*given, *added],
@@ -94,6 +122,8 @@ def diagnose(args: argparse.Namespace) -> int:
                 progress,
                 args.drive or (),
                 parsed_limits(args.limit or ()),
+                stopped,
+                Path(args.continued) if args.continued else None,
             )
 
     try:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.fft import dct
@@ -21,6 +22,7 @@ from thermoctl.plant.simulate import Excitation
 
 SINGLE = 6  # lowest rows that are bands of their own
 WIDTH = 1.19  # of a band: a quarter of an octave
+SHORT = 4_000  # samples whose DCT takes no time whatever their number
 FEWEST = 8  # samples of an output in a recording, below which it says nothing
 
 
@@ -57,6 +59,7 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
     index = np.flatnonzero(np.isfinite(d.y[:, j]))
     if len(index) < FEWEST:
         return None
+    index = index[: quick(len(index))]
     block = max(1, len(index) // (2 * most)) if most else 1
     n = len(index) // block
     rows = min(n, most or n)
@@ -74,6 +77,19 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
         np.maximum(middle, 0.5) / (2 * span),
         span / (n * block),
     )
+
+
+@cache
+def quick(n: int) -> int:
+    """Return the largest number up to n without a large prime factor, for a fast DCT."""
+
+    def rest(m: int) -> int:
+        for p in (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31):
+            while m % p == 0:
+                m //= p
+        return m
+
+    return next(m for m in range(n, 0, -1) if rest(m) == 1) if n > SHORT else n
 
 
 class Coordinates:

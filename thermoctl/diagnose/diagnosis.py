@@ -13,6 +13,7 @@ from thermoctl.diagnose.held_out import split, worth
 from thermoctl.diagnose.law import find_law
 from thermoctl.diagnose.law_smooth import missing_flow
 from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.misfit import energies, standing, standouts
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.search import search
@@ -32,14 +33,18 @@ def diagnose(
     numbers: Limits,
     held_out: Sequence[Table] = (),
     progress: Callable[[str], None] | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+    memory: Memory = NOTHING,
 ) -> Diagnosis:
     """Find the physics that a plant lacks, from recordings. Raises InputError.
 
-    `held_out`: recordings that take no part in any choice. `progress` is called with each stage and refit."""
+    `held_out`: recordings that take no part in any choice. `progress` is called with each stage and refit.
+    Once `stopped`, the search ends after the present refit, and no law is looked for. `memory`: the posterior
+    of earlier recordings."""
     say = progress or (lambda text: None)
     say("refitting the plant's own parameters")
     chosen_on, reserve = split(tables, held_out)
-    known = case(plant, chosen_on, entries, Budget(numbers.fits, say))
+    known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped), memory)
     searched = search(known, numbers)
     energy = energies(known, searched, numbers)
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
@@ -55,7 +60,8 @@ def diagnose(
     after, before = left(known, best, reach, numbers.clean), left(known, null, reach, numbers.clean)
     say("measuring what the findings are worth")
     value = worth(known, null, best, reserve)
-    named = tuple(e.key for e in best.hypothesis.effects if posterior.effects[e.key] >= numbers.name)
+    sure = not (stopped() and known.budget.untried)  # an untried hypothesis may be likelier
+    named = tuple(e.key for e in best.hypothesis.effects if sure and posterior.effects[e.key] >= numbers.name)
     # data that took part in the choice cannot speak against it
     ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects and value.reserved else 1.0
     facts = Facts(posterior.something, named, max(after.over_noise.values()), ratio)
@@ -76,6 +82,7 @@ def diagnose(
         found = replace(found, missing_flow=missing_flow(known, null, before.node))
     if (
         found.decision.verdict not in WITHOUT_REMAINDER
+        and not stopped()
         and max(found.remainder.over_noise.values()) > numbers.clean
     ):
         found = replace(found, law=find_law(known, found.final, numbers, reserve, say))

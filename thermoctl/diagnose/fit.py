@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -21,8 +22,10 @@ from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.memory import Past, PlacedBefore
 from thermoctl.diagnose.noise import Averaged, Grid, averaged
 from thermoctl.plant import refit
+from thermoctl.plant.cores import each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
 from thermoctl.plant.residuals import HUGE, Evaluation
@@ -84,6 +87,8 @@ class Fitted:
     sd: Mapping[str, float]  # of the effects' parameters
     rough_plant: Plant
     rough: Fit  # refit in white noise, whose free run is closest to the data: extensions start there
+    curvature: np.ndarray  # H
+    past: Past  # of earlier recordings
 
     @property
     def absent(self) -> bool:
@@ -98,7 +103,7 @@ class Fitted:
     @property
     def log_evidence(self) -> float:
         """Log p(D | h)"""
-        return self.log_likelihood + self.log_prior + self.volume
+        return self.log_likelihood + self.log_prior + self.volume + self.past.log_evidence
 
 
 def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]) -> bool:
@@ -133,8 +138,13 @@ class Posterior:
         for d in self.drives:
             self.model.prepare(d)
         self.problem = Problem(self.model, self.drives, case.noise)
-        self.amplitudes, mean, precision = _priors(case, self.problem, effects)
-        self.mean, self.precision = mean, precision
+        self.amplitudes, self.mean, precision = _priors(case, self.problem, effects)
+        self.past = case.memory.of(frozenset(e.key for e in effects), plant)
+        place = {q: k for k, (q, r) in enumerate(self.problem.unknowns) if r is None}
+        self.shared = np.array([place[q] for q in self.past.unknowns], int)
+        self.mean[self.shared], precision[self.shared] = self.past.z, 0.0
+        self.precision = np.diag(precision)
+        self.precision[np.ix_(self.shared, self.shared)] = self.past.precision
         beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
         self.problem.priors = tuple(beliefs)
         self.kept: tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]] | None = None
@@ -152,10 +162,17 @@ class Posterior:
     def errors(self, z: np.ndarray) -> list[np.ndarray]:
         """Free-run errors. Raises SimulationError."""
         values, dx0 = self.problem.unpack(z)
-        out = [d.y - self.model.run(d, values[r], dx0[r]).y for r, d in enumerate(self.drives)]
-        if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(out, self.drives, strict=True)):
-            raise SimulationError("the simulation gives values that are not numbers")
+        out = each(
+            lambda r: self.drives[r].y - self.model.run(self.drives[r], values[r], dx0[r]).y,
+            range(len(self.drives)),
+            self.problem.numbers,
+        )
+        self._check(out)
         return out
+
+    def _check(self, errors: Sequence[np.ndarray]) -> None:
+        if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(errors, self.drives, strict=True)):
+            raise SimulationError("the simulation gives values that are not numbers")
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Between which the unknowns lie."""
@@ -170,7 +187,7 @@ class Posterior:
         It is the sum of the Gaussian priors and of the priors that the catalogue's entries state."""
         values, _ = self.problem.unpack(z)
         return (
-            -0.5 * float(self.precision @ (z - self.mean) ** 2)
+            -0.5 * float((z - self.mean) @ self.precision @ (z - self.mean))
             - 0.5 * self.problem.prior_terms(values, False)[0]
         )
 
@@ -179,14 +196,27 @@ class Posterior:
 
         The result is kept for the next call with the same z."""
         if self.kept is None or not np.array_equal(self.kept[0], z):
-            found, r = [], -1
-            for c in self.case.coordinates.channels:
-                if c.recording != r:
-                    r = c.recording
-                    unknown, jac = self.problem.jacobian(z, r)
-                found.append((unknown, self.case.coordinates.transform(c, jac[:, c.output])))
-            self.kept = z.copy(), found
+            self.errors_and_slopes(z)
+        assert self.kept is not None
         return self.kept[1]
+
+    def errors_and_slopes(self, z: np.ndarray) -> list[np.ndarray]:
+        """Free-run errors; `slopes` are kept. One run costs less than two. Raises SimulationError."""
+        by_recording = {
+            r: list(channels)
+            for r, channels in groupby(self.case.coordinates.channels, lambda c: c.recording)
+        }
+
+        def part(r: int) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+            unknown, y, jac = self.problem.jacobian(z, r)
+            rows = [self.case.coordinates.transform(c, jac[:, c.output]) for c in by_recording.get(r, ())]
+            return self.drives[r].y - y, [(unknown, x) for x in rows]
+
+        parts = each(part, range(len(self.drives)), 2 * self.problem.numbers)
+        errors, found = [e for e, _ in parts], [x for _, rows in parts for x in rows]
+        self._check(errors)
+        self.kept = z.copy(), found
+        return errors
 
     def slope(
         self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
@@ -203,7 +233,7 @@ class Posterior:
             matrix[np.ix_(unknown, unknown)] += j.T @ j
         values, _ = self.problem.unpack(z)
         _, push, bend = self.problem.prior_terms(values, True)
-        return gradient - self.precision * (z - self.mean) - push, matrix + np.diag(self.precision) + bend
+        return gradient - self.precision @ (z - self.mean) - push, matrix + self.precision + bend
 
     def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
         """Return E[1/V] J'J minus the curvature: the gradient's variance over the unknown V (Louis 1982)."""
@@ -230,17 +260,18 @@ class Posterior:
 
         Stop early if `goal` is out of reach."""
         low, high = self.bounds()
-        errors = self.errors(z)
+        errors = self.errors_and_slopes(z)
         rows = self.rows(errors)
         now, powers = self.likelihood(rows)
         gradient, matrix = self.slope(z, rows, now.inverse)
         for left in range(ROUNDS, 0, -1):
             base = now.log_likelihood + self.prior(z)
-            step, gained = _step(z, gradient, matrix, low, high), 0.0
+            step, gained, here = _step(z, gradient, matrix, low, high), 0.0, self.kept
             for length in LENGTHS:
                 trial = np.clip(z + length * step, low, high)
                 try:
-                    e = self.errors(trial)
+                    at_once = self.problem.few and length == LENGTHS[0]
+                    e = self.errors_and_slopes(trial) if at_once else self.errors(trial)
                 except SimulationError:
                     continue
                 trial_rows = self.rows(e)
@@ -250,6 +281,7 @@ class Posterior:
                     z, errors, rows, now, powers = trial, e, trial_rows, then, trial_powers
                     gradient, matrix = self.slope(z, rows, now.inverse)
                     break
+                self.kept = here
             if gained < ENOUGH or now.log_likelihood + left * gained < goal:
                 break
         return z, now, powers, matrix, errors
@@ -331,7 +363,9 @@ def fitted(
             seconds=np.inf,
         )
     goal = best.log_likelihood - HOPELESS if best else -np.inf
-    z, average, powers, matrix, errors = posterior.climb(start.z, goal)
+    z = start.z.copy()
+    z[posterior.shared] = posterior.past.z
+    z, average, powers, matrix, errors = posterior.climb(z, goal)
     return _weighed(case, posterior, z, average, powers, matrix, errors, start)
 
 
@@ -452,6 +486,8 @@ def _weighed(
         names,
         refit.updated(posterior.plant, rough, posterior.drives),
         rough,
+        confined,
+        posterior.past,
     )
 
 
@@ -464,6 +500,37 @@ def _relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
     share, p = np.linalg.eigh(0.5 * (inner + inner.T))
     left = root @ (p * (1 - np.clip(share, 0.0, MOST))) @ p.T @ root.T
     return left * np.outer(size, size)
+
+
+def remembered(case: Case, f: Fitted) -> Past:
+    """Return what all recordings so far say of a hypothesis. Own initial states are eliminated."""
+    unknowns, h = f.fit.unknowns, f.curvature
+    shared = np.array([k for k, (_, r) in enumerate(unknowns) if r is None], int)
+    own = np.array([k for k, (_, r) in enumerate(unknowns) if r is not None], int)
+    absorbed = (
+        h[np.ix_(shared, own)] @ np.linalg.pinv(h[np.ix_(own, own)], hermitian=True) @ h[np.ix_(own, shared)]
+    )
+    names = tuple(unknowns[k][0] for k in shared)
+    at = [(case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids]
+    effects = tuple(
+        PlacedBefore(
+            e.key,
+            e.candidate.label,
+            {p: f.plant.parameters[n].value for p, n in e.own.items()},
+            {p: r for p, n in e.own.items() if (r := f.plant.parameters[n].range)},
+        )
+        for e in f.hypothesis.effects
+    )
+    return Past(
+        effects,
+        names,
+        tuple(f.plant.parameters[q].range or (0.0, 0.0) for q in names),
+        f.fit.z[shared],
+        h[np.ix_(shared, shared)] - absorbed,
+        f.log_evidence,
+        {o: f.past.squares.get(o, 0.0) + sum(float(f.powers[k].sum()) for k in g.channels) for o, g in at},
+        {o: f.past.counts.get(o, 0.0) + float(g.count.sum()) for o, g in at},
+    )
 
 
 def levels(case: Case, f: Fitted, clean: float) -> list[float]:
@@ -507,15 +574,17 @@ def as_refitted(case: Case, f: Fitted) -> Fitted:
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
     """Return log p(z): Gaussians, uniform shapes, and the effects' sizes with standard deviations `sd`."""
     values, _ = posterior.problem.unpack(z)
+    normal = _gaussian(posterior)
     out = posterior.prior(z) + 0.5 * float(
-        np.sum(np.log(posterior.precision[_gaussian(posterior)] / (2 * np.pi)))
+        np.linalg.slogdet(posterior.precision[np.ix_(normal, normal)] / (2 * np.pi))[1]
     )
     for k, (c, p) in posterior.amplitudes.items():
         q = posterior.problem.unknowns[k][0]
-        if c.effect.prior is None:
+        if c.effect.prior is None and k not in posterior.shared:
             value = float(values[0, posterior.model.parameters.index(q)])
             out += _size(p, value, sd[q]) + np.log(posterior.problem.scales[q].slope(value))
-    periods = sum(kind == "periods" for e in posterior.effects for kind in e.candidate.effect.shapes.values())
+    new = [e for e in posterior.effects if e.key not in posterior.past.keys]
+    periods = sum(kind == "periods" for e in new for kind in e.candidate.effect.shapes.values())
     return out - periods * float(np.log(PERIODS))
 
 
@@ -527,9 +596,12 @@ def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
 
 
 def _gaussian(posterior: Posterior) -> np.ndarray:
-    """The unknowns whose prior is a Gaussian (those of effects have their own)."""
+    """The unknowns whose prior is a Gaussian (those of effects have their own until recordings were seen)."""
     names = {n for e in posterior.effects for n in e.own.values()}
-    return np.array([k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names], int)
+    return np.array(
+        [k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names or k in posterior.shared],
+        int,
+    )
 
 
 def _size(p: EffectParameter, value: float, sd: float) -> float:

@@ -175,7 +175,7 @@ def find_law(
     queue, more = list(proposals), SIMPLER
     gain, leader = 0.0, parent
     for k, p in enumerate(queue):
-        if p.cost + gain > HALF * p.promise:
+        if case.budget.stopped() or p.cost + gain > HALF * p.promise:
             continue
         say(f"looking for a law of the remainder: refit {k + 1}")
         f = refitted_law(case, parent, p, at, leader)

@@ -20,7 +20,7 @@ import numpy as np
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.decide import Key
-from thermoctl.diagnose.fit import DECADES, as_refitted
+from thermoctl.diagnose.fit import DECADES, Fitted, as_refitted
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.search import Searched
 
@@ -81,14 +81,16 @@ def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozense
     sensor = searched.tried[0].fitted.average.sensor
     out = {}
     for w in searched.tried:
-        both = [_energy(case, f.powers, sensor, limits) for f in (w.fitted, as_refitted(case, w.fitted))]
+        both = [_energy(case, f, sensor, limits) for f in (w.fitted, as_refitted(case, w.fitted))]
         out[w.fitted.hypothesis.keys] = min(both, key=lambda e: e.all)
     return out
 
 
-def _energy(case: Case, powers: Sequence[np.ndarray], sensor: Sequence[float], limits: Limits) -> Energy:
-    squares = [
-        sum(float(powers[k].sum()) for k in g.channels) / (g.count.sum() * max(own, g.variance))
-        for g, own in zip(case.grids, sensor, strict=True)
-    ]
+def _energy(case: Case, f: Fitted, sensor: Sequence[float], limits: Limits) -> Energy:
+    squares = []
+    for g, own in zip(case.grids, sensor, strict=True):
+        output = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
+        power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(output, 0.0)
+        count = float(g.count.sum()) + f.past.counts.get(output, 0.0)
+        squares.append(power / (count * max(own, g.variance)))
     return Energy(sum(squares), sum(max(s - limits.clean**2, 0.0) for s in squares))

@@ -95,6 +95,11 @@ class Rig:
             for v in self.velocities:
                 if f.target and f.target != v and ex.names(f.rate) == {v}:
                     self.position_of.setdefault(v, f.target)
+        long = [d.t for d in drives if len(d.t) > 1]
+        self.duration = max((float(d.t[-1]) for d in drives), default=1.0)  # s, of the longest recording
+        self.sample = min(
+            (float(np.median(np.diff(t))) for t in long), default=1.0
+        )  # s, the shortest interval
         common = set.intersection(*(set(c) for c in columns)) if columns else set()
         taken = {i.column for i in p.inputs.values()} | {o.column for o in p.outputs.values()}
         self.spare = sorted(

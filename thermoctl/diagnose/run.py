@@ -12,14 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.diagnose import diagnosis as engine
-from thermoctl.diagnose import experiment_file
+from thermoctl.diagnose import experiment_file, memory
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.design import NONE, Limits
+from thermoctl.diagnose.fit import remembered
 from thermoctl.diagnose.limits import limits as numbers
 from thermoctl.diagnose.page import write_report
 from thermoctl.diagnose.propose import propose
-from thermoctl.diagnose.result import contract
+from thermoctl.diagnose.result import Diagnosis, contract
 from thermoctl.diagnose.threads import one_thread
+from thermoctl.diagnose.trend import told, trends
 from thermoctl.diagnose.unseen import not_seen
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
@@ -27,6 +29,11 @@ from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
+
+STOPPED = (
+    "stopped by hand after {} refits: probabilities compare the hypotheses that were tried; what was not tried may be "
+    "likelier; diagnose again for the whole search"
+)
 
 
 @one_thread()
@@ -39,13 +46,17 @@ def diagnose(
     progress: Callable[[str], None] | None = None,
     drivable: Sequence[str] = (),
     limits: Limits = NONE,
+    stopped: Callable[[], bool] = lambda: False,
+    earlier: Path | None = None,
 ) -> dict[str, Any]:
-    """Diagnose recordings, write the result into the folder `out` (all of its files, or none), and return it.
+    """Diagnose recordings, write the result into the folder `out` (all files or none), return it.
 
     - `effects`: folders of effects beside the catalogue
     - `held_out`: recordings that take no part in any choice
-    - `drivable`: inputs that the next experiment may drive (default: those that changed, without surroundings)
+    - `drivable`: inputs that the next experiment may drive (default: those that changed)
     - `limits`: ranges of inputs and outputs in the next experiment
+    - `stopped`: once true, the result is that of the hypotheses tried so far, with a note
+    - `earlier`: the folder of an earlier diagnosis, which goes on with these recordings
 
     Raises InputError for unusable inputs."""
     if not tables:
@@ -53,16 +64,27 @@ def diagnose(
     started, folder = time.monotonic(), _writable(Path(out))
     named = _distinct([*tables, *held_out])
     chosen_on, reserve = named[: len(tables)], named[len(tables) :]
+    before = memory.read(earlier, plant) if earlier else memory.Memory()
+    if again := {t.name for t in named} & set(before.recordings):
+        raise InputError(
+            f"{earlier}: holds {', '.join(sorted(again))} already; recordings that it has not seen were expected"
+        )
     try:
         found = engine.diagnose(
-            plant, chosen_on, catalogue((CATALOGUE, *effects)), numbers(), reserve, progress
+            plant, chosen_on, catalogue((CATALOGUE, *effects)), numbers(), reserve, progress, stopped, before
         )
     except SimulationError as e:
         raise InputError(f"{plant.file}: the plant cannot follow these recordings at all: {e}") from None
-    proposed = propose(found, drivable, limits, progress)
+    proposed = None if stopped() else propose(found, drivable, limits, progress)
     result = contract(found)
     result["next_experiment"] = proposed[0] if proposed else None
-    result["not_seen"] = not_seen(found) if found.decision.verdict == "consistent" else []
+    result["trends"] = trends(found.case, found.best, found.shown, _trends(earlier))
+    result["notes"] += told(result["trends"])
+    if before.recordings:
+        result["notes"].insert(0, f"goes on from {len(before.recordings)} earlier recordings ({earlier})")
+    if stopped():
+        result["notes"].insert(0, STOPPED.format(found.case.budget.fits_done))
+    result["not_seen"] = not_seen(found) if found.decision.verdict == "consistent" and not stopped() else []
     result["seconds"] = round(time.monotonic() - started, 1)
     with tempfile.TemporaryDirectory(dir=folder.parent) as part_name:
         part = Path(part_name)
@@ -71,13 +93,32 @@ def diagnose(
         load(part / "plant.yaml")
         write_report(found, result, part / "report.html")
         (part / "diagnosis.json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
+        memory.write(part, plant, _remembered(found))
         written = experiment_file.write(part, found.case, *proposed) if proposed else []
         folder.mkdir(parents=True, exist_ok=True)
         for stale in experiment_file.FILES:
             (folder / stale).unlink(missing_ok=True)
-        for name in ("plant.yaml", "report.html", "diagnosis.json", *written):
+        for name in ("plant.yaml", "report.html", "diagnosis.json", memory.FILE, *written):
             shutil.move(part / name, folder / name)
     return result
+
+
+def _remembered(found: Diagnosis) -> memory.Memory:
+    """Return what is kept for a diagnosis that goes on: the likeliest hypotheses, and that of no effect."""
+    kept = [
+        w.fitted
+        for k, w in enumerate(found.searched.tried)
+        if k < memory.KEPT or not w.fitted.hypothesis.effects
+    ]
+    names = (*found.case.memory.recordings, *(t.name for t in found.case.tables))
+    return memory.Memory(tuple(remembered(found.case, f) for f in kept), names)
+
+
+def _trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
+    """Return the trends in the result of an earlier diagnosis."""
+    path = earlier / "diagnosis.json" if earlier else None
+    found = json.loads(path.read_text()) if path and path.exists() else {}
+    return found.get("trends", ()) if isinstance(found, dict) else ()
 
 
 def diagnose_files(

@@ -13,9 +13,11 @@ where something moves.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,7 @@ from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.rig import STRAIGHT, Rig
 from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import expression as ex
+from thermoctl.plant.cores import each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit
 from thermoctl.plant.simulate import Excitation, Model, Simulation
@@ -111,12 +114,19 @@ class Trajectory:
             "pi": np.pi,
         }
         self.first = d.first
+        self.known: dict[int, np.ndarray] = {}
         # inputs that hold, as they were until each sample
         self.until = {
             i: np.concatenate([u[:1], u[:-1]])
             for i, u, linear in zip(rig.plant.inputs, d.u.T, d.linear, strict=False)
             if not linear
         }
+
+    def own(self, e: ex.Expr) -> np.ndarray:
+        """The value of an expression of the plant itself, computed once."""
+        if id(e) not in self.known:
+            self.known[id(e)] = self.value(e, {})
+        return self.known[id(e)]
 
     def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
         """The value of an expression along the trajectory."""
@@ -139,31 +149,27 @@ def changes(
     for n in extended.nodes.values():
         if n.name not in base.nodes:
             extra[n.name] = _new_node(extended, n.name, extra, at)
-    touched: dict[str, list[tuple[ex.Expr, float]]] = {}
+    touched: dict[str, list[tuple[np.ndarray, float]]] = {}
     for f in extended.flows.values():
         old = base.flows.get(f.name)
         if old is not None and old.rate is f.rate:
             continue
+        delta = at.value(f.rate, extra) - (0.0 if old is None else at.own(old.rate))
         for end, sign in ((f.source, -1.0), (f.target, 1.0)):
             if end in base.nodes:
-                delta = touched.setdefault(end, [])  # type: ignore[arg-type]
-                delta.append((f.rate, sign))
-                if old is not None:
-                    delta.append((old.rate, -sign))
+                touched.setdefault(end, []).append((delta, sign))  # type: ignore[arg-type]
     states = list(base.nodes)
     slopes: dict[int, np.ndarray] = {}
     for node, terms in touched.items():
-        total = np.zeros(at.drive.t.shape)
-        for e, sign in terms:
-            total += sign * at.value(e, extra)
-        slopes[states.index(node)] = total / at.value(base.nodes[node].storage, extra)
+        total = sum(sign * delta for delta, sign in terms)
+        slopes[states.index(node)] = total / at.own(base.nodes[node].storage)
     for node, n in base.nodes.items():
         changed = extended.nodes[node]
         if changed.storage is not n.storage:
             net = np.zeros(at.drive.t.shape)
             for f in base.flows.values():
                 if node in (f.source, f.target):
-                    net += (1.0 if f.target == node else -1.0) * at.value(f.rate, extra)
+                    net += (1.0 if f.target == node else -1.0) * at.own(f.rate)
             slopes[states.index(node)] = net / at.value(changed.storage, extra) - net / at.value(
                 n.storage, extra
             )
@@ -171,7 +177,7 @@ def changes(
     for j, (key, o) in enumerate(base.outputs.items()):
         new = extended.outputs[key]
         if new.value is not o.value:
-            outputs[j] = at.value(new.value, extra) - at.value(o.value, extra)
+            outputs[j] = at.value(new.value, extra) - at.own(o.value)
     return slopes, outputs
 
 
@@ -226,28 +232,31 @@ _Entry = tuple[Column, np.ndarray, float]  # its projected rows, and the norm of
 def directions(metric: Metric, columns: Sequence[Column]) -> Iterable[tuple[Sequence[Column], np.ndarray]]:
     """Rows (rows, k) of columns, not whitened, a chunk at a time."""
     buffers: dict[str, np.ndarray] = {}
+    model, recordings = metric.model, range(len(metric.drives))
     for at in range(0, len(columns), CHUNK):
         part = columns[at : at + CHUNK]
-        blocks = []
-        for r, d in enumerate(metric.drives):
-            forces, values = [], []
-            for c, column in enumerate(part):
-                for state, q in column.forces[r].items():
-                    forces.append((state, c))
-                    values.append(q)
-            shape = (len(d.t), len(metric.model.outputs), len(part))
-            if forces:
-                q = np.nan_to_num(np.stack(values, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
-                dy = metric.model.respond(
-                    d, metric.fit.values[r], metric.fit.dx0[r], forces, q, len(part), buffers=buffers
-                )
-            else:
-                dy = np.zeros(shape)
-            for c, column in enumerate(part):
-                for j, delta in column.outputs[r].items():
-                    dy[:, j, c] += np.nan_to_num(delta)
-            blocks.append(metric.unweighted(r, dy))
+        numbers = sum(len(d.t) for d in metric.drives) * len(model.states) * len(part)
+        blocks = each(partial(_rows, metric, part, buffers), recordings, numbers)
         yield part, np.concatenate(blocks)
+
+
+def _rows(metric: Metric, part: Sequence[Column], buffers: dict[str, np.ndarray], r: int) -> np.ndarray:
+    """Return the rows (rows, k) of columns in one recording, not whitened."""
+    d, forces, values = metric.drives[r], [], []
+    for c, column in enumerate(part):
+        for state, q in column.forces[r].items():
+            forces.append((state, c))
+            values.append(q)
+    if forces:
+        q = np.nan_to_num(np.stack(values, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
+        at = (metric.fit.values[r], metric.fit.dx0[r])
+        dy = metric.model.respond(d, *at, forces, q, len(part), buffers=buffers)
+    else:
+        dy = np.zeros((len(d.t), len(metric.model.outputs), len(part)))
+    for c, column in enumerate(part):
+        for j, delta in column.outputs[r].items():
+            dy[:, j, c] += np.nan_to_num(delta)
+    return metric.unweighted(r, dy)
 
 
 def screen(
@@ -331,7 +340,8 @@ def columns_of(
     ] or [{}]
     amplitudes = [p for p in effect.parameters if p.amplitude]
     dims = effect.dims if amplitudes else ((1.0,),)
-    out = []
+    out: list[Column] = []
+    extended: Plant | None = None
     for g, shape in enumerate(shapes):
         group: tuple[Any, ...] = ("all",) if windowed else (g,)
         count = len(shapes) if windowed else len(dims) * len(phases)
@@ -339,7 +349,7 @@ def columns_of(
             for phase in phases:
                 values = parameter_values(c, {**shape, **phase}, [EPSILON * v for v in dim])
                 column = Column((c, group, ({**shape, **phase}, dim), count))
-                extended = c.extend(values)
+                extended = extended or c.extend(values)  # only the values differ: `changes` gets them
                 own = {c.own(k): v for k, v in values.items()}
                 for trajectory in at:
                     try:
@@ -398,9 +408,12 @@ def _score(c: Candidate, entries: Sequence[_Entry], metric: Metric, best: dict[i
     if len(g) == 1 and not _possible(c, entries[0][0], float(coefficient[0])):
         gain = 0.0
     shape, s = _sizes(c, entries, shape, coefficient)
-    excited = float(left[useful].max())
-    start = parameter_values(c, shape, s)
-    _keep(best, c, shape, gain, int(useful.sum()), start, rows @ coefficient, excited)
+    _keep(
+        best,
+        Direction(c, shape, gain, int(useful.sum()), {}, None, float(left[useful].max())),
+        s,
+        lambda: rows @ coefficient,
+    )
 
 
 def _possible(c: Candidate, column: Column, coefficient: float) -> bool:
@@ -458,7 +471,7 @@ def _score_windows(
     shape = {"start": edges[a], "end": edges[b] if b < last else 10 * edges[-1]}
     vector = rows[:, a] - (rows[:, b] if b < last else 0)
     excited = float(np.linalg.norm(vector)) / max(full[a], 1e-300)
-    _keep(best, c, shape, gain, 1, parameter_values(c, shape, [amplitude]), vector, excited)
+    _keep(best, Direction(c, shape, gain, 1, {}, None, excited), [amplitude], lambda: vector)
 
 
 def _allowed(p: EffectParameter, coefficient: float) -> bool:
@@ -472,26 +485,18 @@ def _allowed(p: EffectParameter, coefficient: float) -> bool:
 
 
 def _keep(
-    best: dict[int, Direction],
-    c: Candidate,
-    shape: dict[str, float],
-    gain: float,
-    dims: int,
-    start: dict[str, float],
-    vector: np.ndarray,
-    excited: float,
+    best: dict[int, Direction], new: Direction, sizes: Sequence[float], along: Callable[[], np.ndarray]
 ) -> None:
-    size = float(np.linalg.norm(vector))
-    new = Direction(
-        c,
-        {k: v for k, v in shape.items() if k != "picked_from"},
-        gain,
-        dims,
-        start,
-        (vector / size).astype(np.float32) if size > 0 else None,
-        excited,
-        float(np.log10(shape.get("picked_from", 1.0))),
-    )
-    old = best.get(id(c))
+    """Keep a direction if it is its candidate's best so far. Only then `along` computes its rows."""
+    shape = {k: v for k, v in new.shape.items() if k != "picked_from"}
+    new = dataclasses.replace(new, elsewhere=float(np.log10(new.shape.get("picked_from", 1.0))))
+    old = best.get(id(new.candidate))
     if old is None or new.log_p < old.log_p:
-        best[id(c)] = new
+        vector = along()
+        size = float(np.linalg.norm(vector))
+        best[id(new.candidate)] = dataclasses.replace(
+            new,
+            shape=shape,
+            start=parameter_values(new.candidate, new.shape, sizes),
+            vector=(vector / size).astype(np.float32) if size > 0 else None,
+        )

@@ -14,6 +14,7 @@ from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.extend import extend, sticking, weaker
 from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, over_noise
 from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.memory import NOTHING, remade
 from thermoctl.diagnose.mistakes import mistakes
 from thermoctl.diagnose.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnose.odds import odds
@@ -77,7 +78,10 @@ class Search:
 
     def extended(self, parent: Weighed) -> list[Weighed]:
         """Extend a hypothesis, once."""
-        if parent.fitted.hypothesis.keys in self.seen or self.case.budget.spent:
+        if parent.fitted.hypothesis.keys in self.seen:
+            return []
+        if self.case.budget.spent:
+            self.case.budget.untried += 1
             return []
         self.seen.add(parent.fitted.hypothesis.keys)
         found = extensions(self.case, parent, self.where, self.limits, self.tried)
@@ -109,6 +113,7 @@ def started(case: Case, limits: Limits) -> Search:
     """Return a search that holds the plant without effects."""
     s = Search(case, limits, places(case))
     s.keep([s.weighed(fitted(case, case.plant, (), case.null))])
+    s.keep(recalled(s))
     return s
 
 
@@ -188,8 +193,10 @@ def with_observer(s: Search) -> None:
             return
         model = compile_plant(plant)
         null = refit.fit(model, case.drives(model), case.noise, iterations=WHITE, seconds=np.inf)
-        budget = Budget(s.limits.fits, case.budget.progress)
-        following = started(dataclasses.replace(case, plant=plant, null=null, budget=budget), s.limits)
+        budget = Budget(s.limits.fits, case.budget.progress, case.budget.stopped)
+        following = started(
+            dataclasses.replace(case, plant=plant, null=null, budget=budget, memory=NOTHING), s.limits
+        )
         grow(following)
         for w in leaders(list(following.tried.values()), s.limits):
             effects = w.fitted.hypothesis.effects
@@ -198,6 +205,26 @@ def with_observer(s: Search) -> None:
                 s.keep([free])
         if s.best.fitted.hypothesis.effects:
             return
+
+
+def recalled(s: Search) -> list[Weighed]:
+    """Return the hypotheses of an earlier diagnosis, refitted to these recordings from where they were."""
+    case, out = s.case, list[Weighed]()
+    drives, columns = case.drives(case.null.model), [t.columns for t in case.tables]
+    likeliest = max((h.log_evidence for h in case.memory.hypotheses), default=0.0)
+    for past in case.memory.hypotheses:
+        far = past.log_evidence < likeliest - BEATEN * s.limits.effects
+        if not past.effects or case.budget.spent or far:
+            continue
+        try:
+            plant, made = remade(past, case.plant, drives, columns, case.catalogue)
+            effects = [Placed(c, own) for c, own in made]
+            leader = max((w.fitted for w in (*s.tried.values(), *out)), key=lambda f: f.log_likelihood)
+            f = fitted(case, free_starts(case.plant, plant), effects, None, leader)
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            continue
+        out.append(s.weighed(f))
+    return out
 
 
 def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
@@ -226,9 +253,12 @@ def extensions(
     for k, (added, gain) in enumerate(queue):
         case.budget.planned = case.budget.fits_done + len(queue) - k
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-        if keys in tried or len(keys) > limits.effects or case.budget.spent:
+        if keys in tried or len(keys) > limits.effects:
             continue
         if parent.score + HALF * gain < ahead.score or promised and np.isinf(gain):
+            continue
+        if case.budget.spent:
+            case.budget.untried += 1
             continue
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
         fits = _followed(case, parent, looked, added, leader)

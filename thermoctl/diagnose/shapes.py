@@ -49,8 +49,7 @@ def shape_grid(
     `picked_from`: of how many values the residual itself picked this one. `longest`: a longer period does not
     repeat in the recordings."""
     rig = candidate.rig
-    duration = max(float(d.t[-1]) for d in rig.drives)
-    dt = min(float(np.median(np.diff(d.t))) for d in rig.drives if len(d.t) > 1)
+    duration, dt = rig.duration, rig.sample
 
     def signal(e: Expr) -> np.ndarray:
         parts = []

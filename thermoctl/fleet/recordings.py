@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import glob
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,24 @@ def find_recordings(folder: str | Path) -> list[str]:
             f"{folder}: no recordings in it; files ending in {', '.join(SUFFIXES)} were expected"
         )
     return found
+
+
+def expanded(given: Sequence[str], together: bool) -> list[str]:
+    """Return recordings, with the files that match in place of each pattern (`runs/2026-*.csv`).
+
+    `together`: folders, too, by all recordings in them. Raises InputError where nothing matches."""
+    out: list[str] = []
+    for name in given:
+        if together and ("://" in name or Path(name).is_dir()):
+            out += find_recordings(name)
+        elif glob.has_magic(name) and not Path(name).exists():
+            found = sorted(glob.glob(name, recursive=True))
+            if not found:
+                raise InputError(f"{name}: no file matches; a pattern of recordings was expected")
+            out += found
+        else:
+            out.append(name)
+    return out
 
 
 def _store(url: str) -> tuple[Any, str]:

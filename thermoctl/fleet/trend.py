@@ -16,10 +16,9 @@ import numpy as np
 
 from thermoctl.control import faults
 from thermoctl.fleet.health import Summary
+from thermoctl.recording.dates import MONTH_S, line
 
 DRIFT_SIGMA, DRIFT_SHARE, FIT_LIMIT = 4.0, 0.05, 3.0
-FEWEST = 3  # fewest estimates whose scatter about a line can be computed
-MONTH_S = 30 * 86400.0
 
 
 @dataclass(frozen=True)
@@ -92,23 +91,10 @@ def _advice(newest: Summary, drifts: dict[str, Drift]) -> list[str]:
 
 
 def drift(times_s: Sequence[float], estimates: Sequence[tuple[float, float]]) -> Drift:
-    """Fit a weighted straight line through (value, standard error) over time.
-
-    The slope's standard error comes from the estimates' own, or from the scatter about the line if that is
-    larger. A parameter with fewer than FEWEST estimates never drifts.
-    """
-    t = np.asarray(times_s) / MONTH_S
+    """Check a parameter's estimates (value, standard error) over time; fewer than three never drift."""
+    slope, sigma = line(times_s, estimates)
     value, sd = np.array(estimates, dtype=float).reshape(-1, 2).T
-    if len(t) < FEWEST or np.ptp(t) == 0.0:
-        return Drift(0.0, math.inf, 0.0, False)
-    weight = 1.0 / np.maximum(sd, 1e-9 * np.abs(value) + 1e-300) ** 2
-    middle = np.average(t, weights=weight)
-    mean = np.average(value, weights=weight)
-    spread = np.sum(weight * (t - middle) ** 2)
-    slope = np.sum(weight * (t - middle) * (value - mean)) / spread
-    scatter = np.sum(weight * (value - mean - slope * (t - middle)) ** 2) / (len(t) - 2)
-    sigma = math.sqrt(max(scatter, 1.0) / spread)
-    share = float(slope * np.ptp(t) / abs(mean)) if mean else 0.0
-    return Drift(
-        float(slope), sigma, share, bool(abs(slope) > DRIFT_SIGMA * sigma and abs(share) > DRIFT_SHARE)
-    )
+    mean = np.average(value, weights=np.maximum(sd, 1e-300) ** -2.0) if len(value) else 0.0
+    share = slope * float(np.ptp(times_s)) / MONTH_S / abs(mean) if mean else 0.0
+    drifts = abs(slope) > DRIFT_SIGMA * sigma and abs(share) > DRIFT_SHARE
+    return Drift(slope, sigma, float(share), bool(drifts))

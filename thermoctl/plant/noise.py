@@ -71,7 +71,7 @@ class _Restricted:
         """Return channel j's moments under a noise; residuals beyond CLIP robust sigmas are clipped."""
         own = self.problem.with_noise(j, candidate)
         gram, gradient, square, log_size = np.zeros_like(self.prior), np.zeros(len(self.prior)), 0.0, 0.0
-        for r, (columns, dy) in enumerate(self.slopes):
+        for r, (columns, _, dy) in enumerate(self.slopes):
             e = self.found.residuals[r][:, j]
             spread = 1.4826 * np.nanmedian(np.abs(e)) if np.isfinite(e).any() else 1.0
             e = np.clip(e, -CLIP * spread, CLIP * spread) if spread > 0 else e

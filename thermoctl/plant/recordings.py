@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +27,8 @@ def read_recordings(
     """Read the recordings of any logger for a plant, in its units. Raises InputError.
 
     `time`: the column of times; `columns`: name that the plant reads: name in the file."""
-    return [in_plant_units(plant, read_recording(p, time, columns)) for p in paths]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is Arrow's and numpy's
+        return list(pool.map(lambda p: in_plant_units(plant, read_recording(p, time, columns)), paths))
 
 
 def in_plant_units(plant: Plant, table: Table) -> Table:

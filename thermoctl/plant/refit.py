@@ -195,6 +195,7 @@ def _descend(problem: Problem, z: np.ndarray, limits: _Limits) -> Fit:
     z = np.clip(z, low, high)
     kept: list[Rows] = []
     now = problem.evaluate(z, True, kept)
+    problem.keep()
     damping, done, out_of_reach = 1e-3, 0, 0
     for done in range(1, limits.iterations + 1):  # noqa: B007 the count is reported
         held = ((z <= low) & (now.gradient < 0)) | ((z >= high) & (now.gradient > 0))
@@ -204,10 +205,8 @@ def _descend(problem: Problem, z: np.ndarray, limits: _Limits) -> Fit:
         better = _improve(problem, z, now, free, damping, (low, high), kept, limits.tolerance)
         if better is None:
             break
-        z, new_cost, damping = better
-        gain = now.cost - new_cost
-        kept.clear()
-        now = problem.evaluate(z, True, kept)
+        z, then, damping, kept = better
+        gain, now = now.cost - then.cost, then
         out_of_reach = out_of_reach + 1 if STEPS_TO_GOAL * gain < now.cost - limits.goal else 0
         if gain < limits.tolerance * max(1.0, 1e-3 * now.cost) or out_of_reach >= SLOW_STEPS:
             break
@@ -223,22 +222,29 @@ def _improve(
     bounds: tuple[np.ndarray, np.ndarray],
     kept: Sequence[Rows],
     tolerance: float,
-) -> tuple[np.ndarray, float, float] | None:
-    """Return a point of less cost, its cost and the next damping.
+) -> tuple[np.ndarray, Evaluation, float, list[Rows]] | None:
+    """Return a point of less cost, its evaluation with derivatives, the next damping, and its rows.
 
     None if no damping up to the twelfth gives one."""
-    for _ in range(12):
+    for tries in range(12):
         step, left = _bounded_step(z, now, free, damping, bounds)
         predicted = float(2 * now.gradient @ step - step @ now.matrix @ step)
+        rows: list[Rows] = []
         try:
             bend = _acceleration(problem, z, step, now.matrix, damping, left, kept)
             trial = np.clip(z + step + bend, *bounds)
-            cost = problem.evaluate(trial, False).cost
+            at_once = problem.few and not tries
+            then = problem.evaluate(trial, at_once, rows)
         except SimulationError:
-            trial, cost = z, np.inf
-        if cost < now.cost:
-            return trial, cost, max(damping * (0.2 if now.cost - cost > 0.5 * predicted else 1.0), 1e-9)
-        if predicted < 1e-3 * tolerance * max(now.cost, 1.0) and np.isfinite(cost):
+            damping = min(damping * 8, 1e8)
+            continue
+        if then.cost < now.cost:
+            if not at_once:
+                then = problem.evaluate(trial, True, rows)
+            problem.keep()
+            half = now.cost - then.cost > 0.5 * predicted
+            return trial, then, max(damping * (0.2 if half else 1.0), 1e-9), rows
+        if predicted < 1e-3 * tolerance * max(now.cost, 1.0):
             return None
         damping = min(damping * 8, 1e8)
     return None

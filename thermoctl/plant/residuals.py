@@ -21,6 +21,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from thermoctl.plant import expression as ex
+from thermoctl.plant.cores import each
 from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
 from thermoctl.yamlfile import InputError
@@ -31,6 +32,9 @@ PRIOR_WEIGHT = 0.02  # moving a parameter over its whole range costs as much as 
 PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
 DOWNDATE_SHARE = 0.25  # up to this share of down-weighted rows, their excess is subtracted from J'J
 MIN_DIFFERENCED = 4  # fewest samples of a recording for second differences
+# Unknowns up to which a run with sensitivities costs less than ten without: eight go through the processor at
+# once (integrator.h). There a trial step, which succeeds nine times of ten, runs with them at once.
+FEW_UNKNOWNS = 16
 LOG_RATIO = 3.0  # a range that spans this factor is fitted on a log scale
 
 
@@ -133,6 +137,17 @@ class Evaluation(NamedTuple):
     residuals: list[np.ndarray]
 
 
+class _Part(NamedTuple):
+    """One recording's cost, numbers of its unknowns, half its negative gradient, matrix, residuals, rows."""
+
+    cost: float
+    unknowns: np.ndarray
+    gradient: np.ndarray
+    matrix: np.ndarray
+    residual: np.ndarray
+    rows: list[Rows]
+
+
 class Problem:
     """Residuals and Jacobian of a model on several recordings, in the metric of the noise."""
 
@@ -150,8 +165,11 @@ class Problem:
         self._number_unknowns()
         self.z_plant = self.start({})
         self.buffers: dict[str, np.ndarray] = {}
+        self.kept_buffers: dict[str, np.ndarray] = {}
         self.huber = np.full(len(self.noise), HUBER)
         self.rows = [[_rows(d, j, n) for j, n in enumerate(self.noise)] for d in excitations]
+        # computed in a run without sensitivities; with them, at least as many again
+        self.numbers = sum(len(d.t) for d in excitations) * len(model.states) * (len(model.unknowns) + 1)
         self.samples = sum(len(e[0]) for entry in self.rows for e in entry)
         if self.samples == 0:
             raise InputError("no recording has a column that an output of the plant reads; nothing to fit")
@@ -248,59 +266,81 @@ class Problem:
         self.huber = new
         return changed
 
+    @property
+    def few(self) -> bool:
+        """Whether a trial step should run with sensitivities at once."""
+        return len(self.model.unknowns) <= FEW_UNKNOWNS
+
+    def keep(self) -> None:
+        """Leave the rows of the newest evaluation as they are until the next call."""
+        if self.few:  # else nothing runs with sensitivities before these rows are used up
+            self.buffers, self.kept_buffers = self.kept_buffers, self.buffers
+
     def prior(self) -> np.ndarray:
         """Return the weight of each unknown's default prior (its entry in the Gauss-Newton matrix)."""
         return np.concatenate(
             [np.full(self.n_parameters, PRIOR_WEIGHT**2), np.ones(len(self.unknowns) - self.n_parameters)]
         )
 
-    def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the unknowns (k,) of recording r and the outputs' slopes by them (N, ny, k)."""
+    def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return recording r's unknowns (k,), its outputs (N, ny) and their slopes (N, ny, k)."""
         values, dx0 = self.unpack(z)
         run = self.model.run(self.excitations[r], values[r], dx0[r], sensitivities=True)
         used, k, slope = self._slopes(r, values[r])
         assert run.dy is not None
-        return k, run.dy[:, :, used] * slope
+        return k, run.y, run.dy[:, :, used] * slope
 
     def evaluate(self, z: np.ndarray, jacobian: bool, keep: list[Rows] | None = None) -> Evaluation:
         """Evaluate the cost, and with `jacobian` its derivatives. Raises SimulationError.
 
-        The rows that `curvature` needs are appended to `keep`.
-        """
+        The rows that `curvature` needs are appended to `keep`. The next evaluation with derivatives
+        overwrites them, unless `self.keep` is called."""
         values, dx0 = self.unpack(z)
         cost, gradient, matrix = 0.0, np.zeros(len(z)), np.zeros((len(z), len(z)))
         residuals = []
-        for r, d in enumerate(self.excitations):
-            run = self.model.run(d, values[r], dx0[r], sensitivities=jacobian, buffers=self.buffers)
-            if not np.all(np.abs(run.y) < HUGE):
-                raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
-            e = d.y - run.y
-            residuals.append(e)
-            used, k, slope = self._slopes(r, values[r])
-            part_gradient, part_matrix = np.zeros(len(k)), np.zeros((len(k), len(k)))
-            for j in range(len(self.noise)):
-                if not len(self.rows[r][j][0]):
-                    continue
-                w = self.whiten(r, j, e[:, j])
-                size, limit = np.abs(w), self.huber[j]
-                cost += float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
-                if run.dy is None:
-                    continue
-                weight = np.where(size <= limit, 1.0, limit / np.maximum(size, limit))
-                dy = run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used]
-                rows = self._weighted(r, j, k, slope, w, weight, dy)
-                if keep is not None:
-                    keep.append(rows)
-                part_gradient += rows.slope * (rows.jac.T @ (rows.weight * rows.w))
-                part_matrix += _gram(rows.jac, rows.weight) * np.outer(rows.slope, rows.slope)
+        parts = each(
+            lambda r: self._part(r, values[r], dx0[r], jacobian),
+            range(len(self.excitations)),
+            self.numbers * (jacobian + 1),
+        )
+        for part in parts:
+            cost += part.cost
+            residuals.append(part.residual)
+            if keep is not None:
+                keep.extend(part.rows)
             if jacobian:
-                np.add.at(gradient, k, part_gradient)
-                matrix[np.ix_(k, k)] += part_matrix
+                np.add.at(gradient, part.unknowns, part.gradient)
+                matrix[np.ix_(part.unknowns, part.unknowns)] += part.matrix
         prior_cost, prior_gradient, prior_matrix = self.prior_terms(values, jacobian)
         weight, distance = self.prior(), z - self.z_plant
         cost = cost + prior_cost + float(np.sum(weight * distance**2))
         gradient = gradient + prior_gradient - weight * distance
         return Evaluation(cost, gradient, matrix + prior_matrix + np.diag(weight), residuals)
+
+    def _part(self, r: int, values: np.ndarray, dx0: np.ndarray, jacobian: bool) -> _Part:
+        """Return what one recording adds to an evaluation. Raises SimulationError."""
+        d = self.excitations[r]
+        run = self.model.run(d, values, dx0, sensitivities=jacobian, buffers=self.buffers)
+        if not np.all(np.abs(run.y) < HUGE):
+            raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
+        e, cost, kept = d.y - run.y, 0.0, []
+        used, k, slope = self._slopes(r, values)
+        gradient, matrix = np.zeros(len(k)), np.zeros((len(k), len(k)))
+        for j in range(len(self.noise)):
+            if not len(self.rows[r][j][0]):
+                continue
+            w = self.whiten(r, j, e[:, j])
+            size, limit = np.abs(w), self.huber[j]
+            cost += float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
+            if run.dy is None:
+                continue
+            weight = np.where(size <= limit, 1.0, limit / np.maximum(size, limit))
+            dy = run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used]
+            rows = self._weighted(r, j, k, slope, w, weight, dy)
+            kept.append(rows)
+            gradient += rows.slope * (rows.jac.T @ (rows.weight * rows.w))
+            matrix += _gram(rows.jac, rows.weight) * np.outer(rows.slope, rows.slope)
+        return _Part(cost, k, gradient, matrix, e, kept)
 
     def prior_terms(self, values: np.ndarray, derivatives: bool) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the priors' cost, half its negative gradient and half its second derivatives."""
@@ -328,10 +368,14 @@ class Problem:
 
         Raises SimulationError."""
         values, dx0 = self.unpack(z + PROBE * step)
-        errors = [
-            d.y - self.model.run(d, values[r], dx0[r], buffers=self.buffers).y
-            for r, d in enumerate(self.excitations)
-        ]
+        errors = each(
+            lambda r: (
+                self.excitations[r].y
+                - self.model.run(self.excitations[r], values[r], dx0[r], buffers=self.buffers).y
+            ),
+            range(len(self.excitations)),
+            self.numbers,
+        )
         out = np.zeros(len(z))
         for rows in kept:
             r, j = rows.recording, rows.output

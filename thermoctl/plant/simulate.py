@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -33,7 +34,8 @@ class Excitation:
     - `t` (N,): seconds from the first sample
     - `u` (N, inputs): gaps filled, held or linear as the input
     - `y` (N, outputs): measured, NaN where missing
-    - `first`: first recorded value of each input and output"""
+    - `first`: first recorded value of each input and output
+    - `rtol`: local error a step of a run, as a share of each state's range"""
 
     name: str
     t: np.ndarray
@@ -43,6 +45,7 @@ class Excitation:
     linear: np.ndarray
     scale: np.ndarray | None = None  # (nx,) range of each state
     width: np.ndarray | None = None  # (jumps,) half width of each smoothed jump
+    rtol: float = RTOL
 
     def part(self, start: int, stop: int) -> Excitation:
         """Return the samples start..stop-1 (scales kept). Time still counts from the recording's start."""
@@ -85,6 +88,11 @@ def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]
     if key not in kept or kept[key].size < size:
         kept[key] = np.empty(size)
     return kept[key][:size].reshape(shape)
+
+
+def _own(key: str) -> str:
+    """Return the key of a buffer that each thread has for itself."""
+    return f"{key} {threading.get_ident()}"
 
 
 def _call(function: Callable[..., int], *arguments: object) -> int:
@@ -281,17 +289,22 @@ class Model:
         parameters: Mapping[str, float] | np.ndarray | None = None,
         dx0: np.ndarray | None = None,
         sensitivities: bool = False,
-        rtol: float = RTOL,
+        rtol: float | None = None,
         buffers: dict[str, np.ndarray] | None = None,
     ) -> Simulation:
         """Simulate freely on an excitation. Raises SimulationError.
 
-        `buffers` keeps the large arrays between runs. A later run with the same dict overwrites the
-        sensitivities that an earlier one returned."""
+        `rtol`: in place of the excitation's. `buffers` keeps the large arrays between runs. A later run with
+        the same dict overwrites the sensitivities that an earlier one returned."""
         if excitation.scale is None:
             self.prepare(excitation, parameters)
         return self._run(
-            excitation, self.vector(parameters, excitation.name), dx0, sensitivities, rtol, buffers
+            excitation,
+            self.vector(parameters, excitation.name),
+            dx0,
+            sensitivities,
+            rtol or excitation.rtol,
+            buffers,
         )
 
     def simulate(
@@ -335,7 +348,7 @@ class Model:
         width = excitation.width if excitation.width is not None else np.ones(1)
         x0, s0 = self.start(excitation, p, dx0)
         x = np.empty((n, nx))
-        dx = _buffer(buffers, "dx", (n, nx, nq)) if sensitivities else None
+        dx = _buffer(buffers, _own("dx"), (n, nx, nq)) if sensitivities else None
         info = np.zeros(2)
         if nx:
             if not np.all(np.isfinite(x0)):
@@ -387,7 +400,7 @@ class Model:
         q = np.ascontiguousarray(q, float)
         force = _Forces(len(rows), rows.ctypes.data, cols.ctypes.data, q.ctypes.data)
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
-        dx = _buffer(buffers, "dx", (n, nx, columns))
+        dx = _buffer(buffers, _own("dx"), (n, nx, columns))
         atol = rtol * excitation.scale
         start = (n, excitation.t, u, excitation.linear, p, excitation.width, x0, s0)
         limits = (rtol, atol, MAX_STEPS)

@@ -1,0 +1,189 @@
+"""The posterior that earlier recordings left of each hypothesis: a diagnosis goes on without their data.
+
+    log p(D_new, D_old | h) = log p(D_old | h) + log p(D_new | D_old, h)
+
+The second term is the evidence of the new recordings. Its prior is the posterior of the old ones: a Gaussian
+about the old optimum z with the curvature H there, own initial states eliminated. Noise and remainder are
+averaged for each part of the data alone. A hypothesis that the old diagnosis did not try has the prior of its
+largest part that was tried. Of its other effects the old recordings tell nothing.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnose.candidates import Candidate, candidates
+from thermoctl.diagnose.catalogue import Effect
+from thermoctl.diagnose.roles import Structure
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import Excitation
+from thermoctl.yamlfile import InputError
+
+FILE = "memory.json"
+FORMAT = "thermoctl-memory/1"
+KEPT = 12  # likeliest hypotheses that are remembered, beside the plant without any effect
+
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class PlacedBefore:
+    """An effect of a remembered hypothesis: its candidate's label, and value and range of its parameters."""
+
+    key: Key
+    label: str
+    values: Mapping[str, float]
+    ranges: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Past:
+    """The posterior that the old recordings left of one hypothesis.
+
+    - `unknowns` (k,): parameters that all recordings share, `spans` their ranges; `z` (k,) their optimum in
+      these, `precision` (k, k)
+    - `squares`, `counts`: sum of squared residuals and number of rows of each output"""
+
+    effects: tuple[PlacedBefore, ...] = ()
+    unknowns: tuple[str, ...] = ()
+    spans: tuple[tuple[float, float], ...] = ()
+    z: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    precision: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    log_evidence: float = 0.0
+    squares: Mapping[str, float] = field(default_factory=dict)
+    counts: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def keys(self) -> frozenset[Key]:
+        """Return the (effect, where) of each effect."""
+        return frozenset(e.key for e in self.effects)
+
+
+@dataclass(frozen=True)
+class Memory:
+    """All remembered hypotheses, and the names of the recordings that they rest on."""
+
+    hypotheses: tuple[Past, ...] = ()
+    recordings: tuple[str, ...] = ()
+
+    def of(self, keys: frozenset[Key], plant: Plant) -> Past:
+        """Return what is known of a hypothesis, else of the largest, then likeliest, part of it."""
+        ranges = {n: p.range for n, p in plant.parameters.items()}
+        parts = [
+            h
+            for h in self.hypotheses
+            if h.keys <= keys and all(ranges.get(q) == r for q, r in zip(h.unknowns, h.spans, strict=True))
+        ]
+        return max(parts, key=lambda h: (len(h.effects), h.log_evidence), default=Past())
+
+
+NOTHING = Memory()
+
+
+def remade(
+    past: Past,
+    plant: Plant,
+    drives: Sequence[Excitation],
+    columns: Sequence[Any],
+    entries: Mapping[str, Effect],
+) -> tuple[Plant, list[tuple[Candidate, dict[str, str]]]]:
+    """Return the plant with the effects of a remembered hypothesis, each with its parameters' names there.
+
+    Raises InputError where the new recordings have no place for one of them."""
+    out = []
+    for e in past.effects:
+        rig = Structure(plant, drives, columns)
+        fits = [c for c in candidates(rig, entries) if c.key == e.key and c.label == e.label]
+        if not fits:
+            raise InputError(f"{e.key[0]} at {e.key[1]}: these recordings have no place for it")
+        plant = fits[0].extend(e.values, e.ranges)
+        out.append((fits[0], {p: fits[0].own(p) for p in e.values if fits[0].own(p) in plant.parameters}))
+    return plant, out
+
+
+def stated(plant: Plant) -> dict[str, Any]:
+    """Return the parts of a plant that must stay the same: its free parameters and its outputs."""
+    return {
+        "parameters": {n: [p.value, *p.range] for n, p in plant.parameters.items() if p.range},
+        "outputs": list(plant.outputs),
+    }
+
+
+def write(folder: Path, plant: Plant, memory: Memory) -> None:
+    """Write a memory into the folder of a result."""
+    found = {
+        "format": FORMAT,
+        "plant": stated(plant),
+        "recordings": list(memory.recordings),
+        "hypotheses": [
+            {
+                "effects": [
+                    {
+                        "effect": e.key[0],
+                        "where": e.key[1],
+                        "label": e.label,
+                        "values": dict(e.values),
+                        "ranges": {n: list(r) for n, r in e.ranges.items()},
+                    }
+                    for e in h.effects
+                ],
+                "unknowns": list(h.unknowns),
+                "spans": [list(r) for r in h.spans],
+                "z": h.z.tolist(),
+                "precision": h.precision.tolist(),
+                "log_evidence": h.log_evidence,
+                "squares": dict(h.squares),
+                "counts": dict(h.counts),
+            }
+            for h in memory.hypotheses
+        ],
+    }
+    (folder / FILE).write_text(json.dumps(found, allow_nan=False) + "\n")
+
+
+def read(folder: Path, plant: Plant) -> Memory:
+    """Read the memory of an earlier diagnosis of this plant. Raises InputError."""
+    path = folder / FILE
+    try:
+        found = json.loads(path.read_text())
+        known = found["plant"]
+        memory = Memory(tuple(_past(h) for h in found["hypotheses"]), tuple(found["recordings"]))
+    except OSError:
+        raise InputError(
+            f"{path}: no such file; the folder of an earlier diagnosis (its --out) was expected (--continue)"
+        ) from None
+    except (ValueError, KeyError, TypeError) as e:
+        raise InputError(f"{path}: no memory of a diagnosis ({e}); diagnose all recordings again") from None
+    if known != stated(plant):
+        raise InputError(
+            f"{plant.file}: its free parameters or outputs are not those of {path}: a diagnosis goes on with the plant "
+            "file that it began with; diagnose all recordings again"
+        )
+    return memory
+
+
+def _past(h: Mapping[str, Any]) -> Past:
+    return Past(
+        tuple(
+            PlacedBefore(
+                (e["effect"], e["where"]),
+                e["label"],
+                e["values"],
+                {n: (float(low), float(high)) for n, (low, high) in e["ranges"].items()},
+            )
+            for e in h["effects"]
+        ),
+        tuple(h["unknowns"]),
+        tuple((float(low), float(high)) for low, high in h["spans"]),
+        np.array(h["z"], float),
+        np.array(h["precision"], float).reshape(len(h["z"]), len(h["z"])),
+        float(h["log_evidence"]),
+        h["squares"],
+        h["counts"],
+    )
