@@ -16,32 +16,21 @@ from pathlib import Path
 
 from hal.simulated import PlantRig, Surrounding
 from tests.devices.emulators import Frame, ModbusLine, Port, SlcanAdapter, Unit, encode
-from tests.devices.test_drives import POSITION_DRIVE, Drive, Positioner
+from tests.devices.test_drives import AXIS_DBC, POSITION_DRIVE, Drive, Positioner
 from tests.rigs.chain import plants
 from thermoctl.channels import Channels, Point, of_points
 
 PERIOD_S, AIR_C, WATCHDOG_S = 0.005, 22.0, 0.6
 READ = "rate_hz: 100, stale_after_s: 1"
 HEAD = "format: thermoctl-device/1\nvendor: test\nmodel: test\n"
-DBC = """VERSION ""
-NS_ :
-BS_:
-BU_: A
-BO_ 1 Heartbeat: 8 A
- SG_ Error : 0|32@1+ (1,0) [0|0] "" A
- SG_ State : 32|8@1+ (1,0) [0|0] "" A
-BO_ 7 Set_State: 4 A
- SG_ Requested : 0|32@1+ (1,0) [0|0] "" A
-BO_ 9 Encoders: 8 A
+ENCODERS_AND_METER = """BO_ 9 Encoders: 8 A
  SG_ Position : 0|32@1- (1,0) [0|0] "nm" A
  SG_ Output : 32|32@1- (1,0) [0|0] "nm" A
 BO_ 10 Electric: 8 A
  SG_ Voltage : 0|32@1- (0.0001,0) [0|0] "V" A
  SG_ Current : 32|32@1- (0.0001,0) [0|0] "A" A
-BO_ 14 Set_Torque: 4 A
- SG_ Torque : 0|32@1- (1,0) [0|0] "A" A
-SIG_VALTYPE_ 14 Torque : 1;
 """
+DBC = AXIS_DBC.replace('"Nm"', '"A"').replace("BO_ 14", f"{ENCODERS_AND_METER}BO_ 14", 1)
 SENSORS = f"""
   position: {{message: Encoders, signal: Position, unit: nm, range: [-1e6, 1e6], {READ}}}
   output: {{message: Encoders, signal: Output, unit: nm, range: [-1e6, 1e6], {READ}}}

@@ -29,6 +29,8 @@ import numpy as np
 from thermoctl.recording.files import read_table
 
 ROOT = Path(__file__).resolve().parents[2]
+KEPT = Path("build/wire-rigs")
+"""Calibrations and diagnoses, in a folder for each rig."""
 PROGRAM = [sys.executable, "-m", "thermoctl.cli"]
 PAPER_QUICK = 15.0  # how much lighter the paper's bodies are; those of config/examples are ten times lighter
 THERMOMETER_HZ = 50
@@ -248,11 +250,11 @@ class OnWire:
             minutes = (time.monotonic() - begun) / 60
             self.command("restart")
             self.on_all("experiment", "test_4b", "--yes", "--out", "{axis}-on.parquet")
-            return [self._row(axis, part, minutes) for axis, part in self.rig.parts.items()]
         finally:
             subprocess.run([*PROGRAM, "stop", "--config", str(self.config)], capture_output=True)
             other_end.terminate()
             other_end.wait(20)
+        return [self._row(axis, part, minutes) for axis, part in self.rig.parts.items()]
 
     def _row(self, axis: str, part: Part, minutes: float) -> list[str]:
         tests = self.folder / "calibration" / (axis or "rig")
@@ -299,6 +301,9 @@ def main(names: Sequence[str]) -> int:
         try:
             for row in OnWire(rig, folder).prove():
                 print("| " + " | ".join(row) + " |", flush=True)
+            kept = KEPT / Path(rig.config).stem
+            for part in (*folder.glob("diagnosis-*"), *folder.glob("calibration")):
+                shutil.copytree(part, kept / part.name, dirs_exist_ok=True)
             shutil.rmtree(folder)
         except (AssertionError, subprocess.SubprocessError) as e:
             failed = 1
