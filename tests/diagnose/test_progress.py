@@ -41,7 +41,15 @@ def test_a_file_in_place_of_the_folder_is_refused_before_the_work(tmp_path, insi
     assert taken.read_text() == ""
 
 
-def test_a_stopped_diagnosis_leaves_the_result_so_far(tmp_path):
+@pytest.fixture
+def foreground():
+    """Ctrl-C as in a terminal: a shell starts background jobs with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_a_stopped_diagnosis_leaves_the_result_so_far(tmp_path, foreground):
     """Radiation is concealed; Ctrl-C comes during the second refit of the search."""
     path = tmp_path / "plant.yaml"
     lost = "{from: block, rate: 3e-9 * ((block + 273.15)**4 - (air + 273.15)**4), unit: W}"
@@ -65,9 +73,16 @@ def test_a_stopped_diagnosis_leaves_the_result_so_far(tmp_path):
     assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["notes"] == found["notes"]
 
 
-def test_the_second_interrupt_gives_up():
+def test_the_second_interrupt_gives_up(foreground):
     with pytest.raises(KeyboardInterrupt), on_interrupt() as stopped:
         assert not stopped()
         signal.raise_signal(signal.SIGINT)
         assert stopped()
         signal.raise_signal(signal.SIGINT)
+
+
+def test_a_background_job_that_ignores_interrupts_goes_on(foreground):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with on_interrupt() as stopped:
+        signal.raise_signal(signal.SIGINT)
+        assert not stopped()

@@ -65,9 +65,12 @@ class StageReporter:
 
 @contextlib.contextmanager
 def on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yield whether Ctrl-C was pressed; the second one raises KeyboardInterrupt, as usual."""
+    """Yield whether Ctrl-C was pressed; the second one raises KeyboardInterrupt, as usual.
+
+    A process in the background that ignores Ctrl-C goes on doing so."""
     asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if ignored or threading.current_thread() is not threading.main_thread():
         yield asked.is_set
         return
 
