@@ -66,3 +66,12 @@ def test_a_heated_block_forgets_where_it_started():
     drives = [model.excitation(Table("run", "run", t, columns))]
     about = linear(fit(model, drives, default_noise(plant, drives), iterations=1), drives)
     assert about is not None and not drifts(about, 2000.0)
+
+
+def test_a_plant_with_a_delay_is_searched_without_an_observer():
+    text = FREE_CARRIAGE.replace("value: position,", "value: 'delay(position, 0.004)',")
+    assert text != FREE_CARRIAGE
+    plant, table = loads(text), _recorded()
+    model = compile_plant(plant)
+    drives = [model.excitation(table)]
+    assert linear(fit(model, drives, default_noise(plant, drives), iterations=1), drives) is None

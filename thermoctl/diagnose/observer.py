@@ -36,7 +36,14 @@ class Linear:
 
 
 def linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
-    """Linearise a fitted plant about its trajectories; None where a slope reads a delayed signal."""
+    """Linearise a fitted plant about its trajectories; None where a delay or an FMU has no derivative."""
+    try:
+        return _linear(fit, drives)
+    except ex.ExpressionError:
+        return None
+
+
+def _linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
     model, n = fit.model, len(drives)
     states, outputs = model.states, model.plant.outputs.values()
     a, c, rate = np.zeros((len(states),) * 2), np.zeros((len(outputs), len(states))), np.zeros(len(states))
@@ -56,8 +63,9 @@ def linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
 
 
 def drifts(plant: Linear, duration: float) -> bool:
-    """Return whether a mode of the plant does not decay within the recordings."""
-    return bool(len(plant.a)) and bool(np.max(np.linalg.eigvals(plant.a).real) > -1 / duration)
+    """Return whether a mode of the plant does not decay within the recordings (False where that is unknown)."""
+    known = bool(len(plant.a)) and bool(np.isfinite(plant.a).all())  # the slope of a root may be infinite
+    return known and bool(np.max(np.linalg.eigvals(plant.a).real) > -1 / duration)
 
 
 def held(plant: Plant, about: Linear, noise: Sequence[Noise], interval: float, trust: float) -> Plant | None:
