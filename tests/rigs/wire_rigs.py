@@ -241,7 +241,7 @@ class OnWire:
                 assert other_end.poll() is None and time.monotonic() < begun + 60, (
                     "the virtual rig did not start"
                 )
-                time.sleep(0.1)
+                time.sleep(0.1)  # how often we look
             self.command("start")
             calibrate = ["calibrate", "--yes", "--order", str(self.rig.order), "--out", "calibration/{axis}"]
             self.on_all(*calibrate)

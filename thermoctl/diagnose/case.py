@@ -58,7 +58,8 @@ class Budget:
 class Case:
     """Data, catalogue and budget of a diagnosis.
 
-    All hypotheses are scored in the same `coordinates` and `grids`."""
+    All hypotheses are scored in the same `coordinates` and `grids`. `off`: first samples less the plant's
+    start, of the outputs that contradict it. `rtol`: local error of every simulation."""
 
     plant: Plant
     tables: tuple[Table, ...]
@@ -70,10 +71,8 @@ class Case:
     budget: Budget
     notes: list[str] = field(default_factory=list)
     block: int = 1  # rows of the recordings whose mean is one row here
-    off: Mapping[str, float] = field(
-        default_factory=dict
-    )  # outputs' first samples less a start that they contradict
-    rtol: float = RTOL  # of every simulation
+    off: Mapping[str, float] = field(default_factory=dict)
+    rtol: float = RTOL
     memory: Memory = NOTHING  # of earlier recordings
 
     def drives(self, model: Model) -> list[Excitation]:

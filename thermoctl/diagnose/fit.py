@@ -512,17 +512,8 @@ def remembered(case: Case, f: Fitted) -> Past:
     )
     names = tuple(unknowns[k][0] for k in shared)
     at = [(case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids]
-    effects = tuple(
-        PlacedBefore(
-            e.key,
-            e.candidate.label,
-            {p: f.plant.parameters[n].value for p, n in e.own.items()},
-            {p: r for p, n in e.own.items() if (r := f.plant.parameters[n].range)},
-        )
-        for e in f.hypothesis.effects
-    )
     return Past(
-        effects,
+        placed_before(f.hypothesis.effects, f.plant),
         names,
         tuple(f.plant.parameters[q].range or (0.0, 0.0) for q in names),
         f.fit.z[shared],
@@ -530,6 +521,19 @@ def remembered(case: Case, f: Fitted) -> Past:
         f.log_evidence,
         {o: f.past.squares.get(o, 0.0) + sum(float(f.powers[k].sum()) for k in g.channels) for o, g in at},
         {o: f.past.counts.get(o, 0.0) + float(g.count.sum()) for o, g in at},
+    )
+
+
+def placed_before(effects: Sequence[Placed], plant: Plant) -> tuple[PlacedBefore, ...]:
+    """Return the effects with the values and ranges that the plant has for them."""
+    return tuple(
+        PlacedBefore(
+            e.key,
+            e.candidate.label,
+            {p: plant.parameters[n].value for p, n in e.own.items()},
+            {p: r for p, n in e.own.items() if (r := plant.parameters[n].range)},
+        )
+        for e in effects
     )
 
 

@@ -11,18 +11,14 @@ largest part that was tried. Of its other effects the old recordings tell nothin
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.candidates import Candidate, candidates
-from thermoctl.diagnose.catalogue import Effect
-from thermoctl.diagnose.roles import Structure
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Excitation
 from thermoctl.yamlfile import InputError
 
 FILE = "memory.json"
@@ -84,27 +80,6 @@ class Memory:
 
 
 NOTHING = Memory()
-
-
-def remade(
-    past: Past,
-    plant: Plant,
-    drives: Sequence[Excitation],
-    columns: Sequence[Any],
-    entries: Mapping[str, Effect],
-) -> tuple[Plant, list[tuple[Candidate, dict[str, str]]]]:
-    """Return the plant with the effects of a remembered hypothesis, each with its parameters' names there.
-
-    Raises InputError where the new recordings have no place for one of them."""
-    out = []
-    for e in past.effects:
-        rig = Structure(plant, drives, columns)
-        fits = [c for c in candidates(rig, entries) if c.key == e.key and c.label == e.label]
-        if not fits:
-            raise InputError(f"{e.key[0]} at {e.key[1]}: these recordings have no place for it")
-        plant = fits[0].extend(e.values, e.ranges)
-        out.append((fits[0], {p: fits[0].own(p) for p in e.values if fits[0].own(p) in plant.parameters}))
-    return plant, out
 
 
 def stated(plant: Plant) -> dict[str, Any]:

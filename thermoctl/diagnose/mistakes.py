@@ -3,8 +3,8 @@
 A refit cannot move a fixed storage or rate. So its error takes the shape of an effect, such as a missing
 mass. The entries of config/mistakes/ free one such number each. They are refitted and weighed like the
 hypotheses of the search. A refit starts at the best decade: a storage that is far too small acts like
-none, so the factor has no slope at 1. A reading whose first sample
-contradicts the plant's start may be off by a constant.
+none, so the factor has no slope at 1. A reading whose first sample contradicts the plant's start may be off
+by a constant.
 """
 
 from __future__ import annotations

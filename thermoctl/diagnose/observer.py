@@ -23,6 +23,9 @@ from thermoctl.plant.language import Flow, Input, Plant
 from thermoctl.plant.refit import Fit, Noise
 from thermoctl.plant.simulate import Excitation
 
+LASTING = 20.0  # samples for which a missing flow holds: turns its variance into an intensity
+RESTING = 1e-3  # of the fastest state's slope: least slope of another, so that no state is without noise
+PURE = 1e-6  # share of the noise at a state that only integrates another: as good as none
 TRUSTS = 0.01, 0.1  # process noise as a share of the slopes' own size; a larger one follows more closely
 
 
@@ -70,9 +73,10 @@ def drifts(plant: Linear, duration: float) -> bool:
 
 def held(plant: Plant, about: Linear, noise: Sequence[Noise], interval: float, trust: float) -> Plant | None:
     """Return the plant with an observer; None where there is no stable gain."""
-    q = (trust * np.maximum(about.rate, 1e-3 * about.rate.max())) ** 2 * 20 * interval
+    rate = np.maximum(about.rate, RESTING * about.rate.max())
+    q = (trust * rate) ** 2 * LASTING * interval
     pure = (np.count_nonzero(about.a, axis=1) == 1) & (np.diag(about.a) == 0)
-    q[pure] *= 1e-6  # the position of a speed has no noise of its own
+    q[pure] *= PURE  # the position of a speed has no noise of its own
     r = np.array([n.sigma**2 * interval for n in noise])
     try:
         p = solve_continuous_are(about.a.T, about.c.T, np.diag(q), np.diag(r))

@@ -10,11 +10,12 @@ import numpy as np
 
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, Case
+from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.extend import extend, sticking, weaker
-from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, over_noise
+from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, over_noise, placed_before
 from thermoctl.diagnose.limits import Limits
-from thermoctl.diagnose.memory import NOTHING, remade
+from thermoctl.diagnose.memory import NOTHING, PlacedBefore
 from thermoctl.diagnose.mistakes import mistakes
 from thermoctl.diagnose.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnose.odds import odds
@@ -113,7 +114,7 @@ def started(case: Case, limits: Limits) -> Search:
     """Return a search that holds the plant without effects."""
     s = Search(case, limits, places(case))
     s.keep([s.weighed(fitted(case, case.plant, (), case.null))])
-    s.keep(recalled(s))
+    recall(s)
     return s
 
 
@@ -153,24 +154,34 @@ def swap(s: Search) -> None:
 
 def rebuilt(s: Search, effects: Sequence[Placed], values: Fitted, leader: Fitted | None) -> Weighed | None:
     """Refit the case's plant with some effects of a hypothesis, from its values; None where this fails."""
-    case, known = s.case, values.rough_plant.parameters
-    parameters = {n: known.get(n, p) for n, p in case.plant.parameters.items()}
+    case, known = s.case, values.rough_plant
+    parameters = {n: known.parameters.get(n, p) for n, p in case.plant.parameters.items()}
     plant = dataclasses.replace(case.plant, parameters=parameters)
-    drives, placed = case.drives(case.null.model), tuple[Placed, ...]()
+    entries = {e.key[0]: e.candidate.effect for e in effects}
+    return remade(s, placed_before(effects, known), plant, entries, leader)
+
+
+def remade(
+    s: Search,
+    effects: Sequence[PlacedBefore],
+    plant: Plant,
+    entries: Mapping[str, Effect],
+    leader: Fitted | None,
+) -> Weighed | None:
+    """Refit a plant with effects of an earlier hypothesis, from their values; None where this fails.
+
+    Each place is looked up again: its expressions may have held an effect that is not there now."""
+    case, placed = s.case, tuple[Placed, ...]()
+    drives, columns = case.drives(case.null.model), [t.columns for t in case.tables]
     try:
-        for e in effects:  # an expression of its place may hold what an effect left out had added
-            found = candidates(
-                Structure(plant, drives, [t.columns for t in case.tables]), {e.key[0]: e.candidate.effect}
-            )
-            c = next(c for c in found if (c.key, c.label) == (e.key, e.candidate.label))
-            start = {
-                p.name: known[e.own[p.name]].value if p.name in e.own else p.null for p in c.effect.parameters
-            }
+        for e in effects:
+            found = candidates(Structure(plant, drives, columns), entries)
+            c = next(c for c in found if (c.key, c.label) == (e.key, e.label))
             inputs = plant.inputs.keys()
-            plant, own = extend(plant, Direction(c, {}, 0.0, len(e.own), start), drives)
-            if plant.inputs.keys() != inputs:
+            plant = c.extend(e.values, e.ranges)
+            if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
                 drives = case.drives(compile_plant(plant))
-            placed = (*placed, Placed(c, own))
+            placed = (*placed, Placed(c, {p: c.own(p) for p in e.values if c.own(p) in plant.parameters}))
         return s.weighed(fitted(case, free_starts(case.plant, plant), placed, None, leader))
     except (StopIteration, SimulationError, InputError, np.linalg.LinAlgError):
         return None
@@ -207,24 +218,16 @@ def with_observer(s: Search) -> None:
             return
 
 
-def recalled(s: Search) -> list[Weighed]:
-    """Return the hypotheses of an earlier diagnosis, refitted to these recordings from where they were."""
-    case, out = s.case, list[Weighed]()
-    drives, columns = case.drives(case.null.model), [t.columns for t in case.tables]
-    likeliest = max((h.log_evidence for h in case.memory.hypotheses), default=0.0)
-    for past in case.memory.hypotheses:
-        far = past.log_evidence < likeliest - BEATEN * s.limits.effects
-        if not past.effects or case.budget.spent or far:
-            continue
-        try:
-            plant, made = remade(past, case.plant, drives, columns, case.catalogue)
-            effects = [Placed(c, own) for c, own in made]
-            leader = max((w.fitted for w in (*s.tried.values(), *out)), key=lambda f: f.log_likelihood)
-            f = fitted(case, free_starts(case.plant, plant), effects, None, leader)
-        except (SimulationError, InputError, np.linalg.LinAlgError):
-            continue
-        out.append(s.weighed(f))
-    return out
+def recall(s: Search) -> None:
+    """Refit the hypotheses of an earlier diagnosis to these recordings, from where they were."""
+    past = s.case.memory.hypotheses
+    likeliest = max((h.log_evidence for h in past), default=0.0)
+    for h in past:
+        far = h.log_evidence < likeliest - BEATEN * s.limits.effects
+        if h.effects and not far and not s.case.budget.spent:
+            leader = max((w.fitted for w in s.tried.values()), key=lambda f: f.log_likelihood)
+            found = remade(s, h.effects, s.case.plant, s.case.catalogue, leader)
+            s.keep([found] if found else [])
 
 
 def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
