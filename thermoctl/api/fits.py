@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermoctl.api.plants import Plant
-from thermoctl.api.plots import Picture, profile_curve, residual_panels
 from thermoctl.plant.refit import Estimate, Fit, fit, report, updated
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.report.page import figure, table
 from thermoctl.yamlfile import InputError, suggest
+
+if TYPE_CHECKING:
+    from thermoctl.api.plots import Picture
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class Refit:
         """Return residuals of an output (default: the first), ACF, cumulated periodogram and QQ.
 
         White noise stays inside the 95 % bounds of the last three."""
+        from thermoctl.api.plots import residual_panels
+
         name = output or self.fit.model.outputs[0]
         return residual_panels(self.residuals(name), name, self.before.description.outputs[name].unit)
 
@@ -83,6 +88,8 @@ class Refit:
 
     def plot_profile(self, parameter: str) -> Picture:
         """Return the profile likelihood of a parameter. Raises InputError for one that was not fitted."""
+        from thermoctl.api.plots import profile_curve
+
         unit = (
             self.before.description.parameters[parameter].unit
             if parameter in self.before.parameters

@@ -8,12 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermoctl.api.plants import Plant
-from thermoctl.api.plots import Picture, over_time
 from thermoctl.diagnose.result import Diagnosis as Found
 from thermoctl.diagnose.result import contract
 from thermoctl.diagnose.words import chance, words
@@ -21,6 +20,9 @@ from thermoctl.plant import save
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.plant.simulate import Simulation as Run
 from thermoctl.report.page import figure
+
+if TYPE_CHECKING:
+    from thermoctl.api.plots import Picture
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,8 @@ class Simulation:
 
     def plot(self) -> Picture:
         """Return measured and simulated outputs over time."""
+        from thermoctl.api.plots import over_time
+
         return over_time(self.plant.description, self.excitation, {"simulated": self.run.y})
 
 
@@ -118,6 +122,8 @@ class Diagnosis:
 
     def plot(self, recording: int = 0) -> Picture:
         """Return one recording with the plant as it came, refitted, and with the findings."""
+        from thermoctl.api.plots import over_time
+
         table = self.found.case.tables[recording]
         stages = {"as it came": self.before.description, "refitted": self.found.null.plant}
         if self.found.shown:
