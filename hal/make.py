@@ -147,7 +147,7 @@ _DRIVERS = {
     "can-cia402": "drive:Cia402Device",
     "modbus": "modbus:ModbusDevice",
 }
-"""Module and class of each bus's driver, imported when a device of the bus is made: the buses' packages are an extra."""
+"""Module and class of each bus's driver, imported for a device of that bus only: it may need an extra."""
 
 
 _DRIVES = {

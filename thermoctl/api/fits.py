@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermoctl.api.plants import Plant
+from thermoctl.api.plots import profile_curve, residual_panels
 from thermoctl.plant.refit import Estimate, Fit, fit, report, updated
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.report.page import figure, table
 from thermoctl.yamlfile import InputError, suggest
 
 if TYPE_CHECKING:
-    from thermoctl.api.plots import Picture
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -47,12 +48,10 @@ class Refit:
         e = np.concatenate([r[:, j] for r in self.fit.residuals])
         return e[np.isfinite(e)]
 
-    def plot(self, output: str | None = None) -> Picture:
+    def plot(self, output: str | None = None) -> Figure:
         """Return residuals of an output (default: the first), ACF, cumulated periodogram and QQ.
 
         White noise stays inside the 95 % bounds of the last three."""
-        from thermoctl.api.plots import residual_panels
-
         name = output or self.fit.model.outputs[0]
         return residual_panels(self.residuals(name), name, self.before.description.outputs[name].unit)
 
@@ -86,10 +85,8 @@ class Refit:
             rise[k] = again.cost
         return values, rise - min(float(rise.min()), self.fit.cost)
 
-    def plot_profile(self, parameter: str) -> Picture:
+    def plot_profile(self, parameter: str) -> Figure:
         """Return the profile likelihood of a parameter. Raises InputError for one that was not fitted."""
-        from thermoctl.api.plots import profile_curve
-
         unit = (
             self.before.description.parameters[parameter].unit
             if parameter in self.before.parameters

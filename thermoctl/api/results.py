@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermoctl.api.plants import Plant
+from thermoctl.api.plots import over_time
 from thermoctl.diagnose.result import Diagnosis as Found
 from thermoctl.diagnose.result import contract
 from thermoctl.diagnose.words import chance, words
@@ -22,7 +23,7 @@ from thermoctl.plant.simulate import Simulation as Run
 from thermoctl.report.page import figure
 
 if TYPE_CHECKING:
-    from thermoctl.api.plots import Picture
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,8 @@ class Simulation:
             for o, e in self.errors.items()
         }
 
-    def plot(self) -> Picture:
+    def plot(self) -> Figure:
         """Return measured and simulated outputs over time."""
-        from thermoctl.api.plots import over_time
-
         return over_time(self.plant.description, self.excitation, {"simulated": self.run.y})
 
 
@@ -120,10 +119,8 @@ class Diagnosis:
         save(self.plant.description, folder / "plant.yaml")
         (folder / "diagnosis.json").write_text(json.dumps(self.json, indent=1, allow_nan=False) + "\n")
 
-    def plot(self, recording: int = 0) -> Picture:
+    def plot(self, recording: int = 0) -> Figure:
         """Return one recording with the plant as it came, refitted, and with the findings."""
-        from thermoctl.api.plots import over_time
-
         table = self.found.case.tables[recording]
         stages = {"as it came": self.before.description, "refitted": self.found.null.plant}
         if self.found.shown:

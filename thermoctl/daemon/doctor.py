@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hal.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
+from hal.latency_timer import latency_timer_ms
 from hal.make import device_notes, fast_devices, make_backend, make_backends
 from thermoctl.daemon.arrival import expected_hz, slow
 from thermoctl.daemon.assemble import check_mode, compensator, lacks, law_parameters, power_warning
@@ -269,8 +270,6 @@ def _governor(base: Path, cpu: int) -> Check:
 def _latency_timers(settings: Settings, sys_root: str) -> Iterator[Check]:
     if settings.hal.backend != "devices":
         return
-    from hal.serial_line import latency_timer_ms  # pyserial is of the extra 'rig'
-
     for device in fast_devices(settings):
         port = re.sub(r"^(slcan|rtu):|@\d+$", "", device.binding.port)
         wanted, found = device.binding.profile.line.latency_timer_ms, latency_timer_ms(port, sys_root)

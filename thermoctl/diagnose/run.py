@@ -109,7 +109,7 @@ def diagnose(
 
 
 def _report(found: Diagnosis, result: dict[str, Any], path: Path) -> None:
-    """Write report.html; without matplotlib only the summary, and a note in the result that says what to install."""
+    """Write report.html; without matplotlib only the summary, with a note in the result."""
     try:
         write_report(found, result, path)
     except ModuleNotFoundError as e:
@@ -139,7 +139,7 @@ def _trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         return [
-            {k: t[k] for k in ("effect", "where", "parameter")}
+            {k: str(t[k]) for k in ("effect", "where", "parameter")}
             | {"recordings": [_size(r) for r in t["recordings"]]}
             for t in found.get("trends", ())
         ]
@@ -153,7 +153,7 @@ def _trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
 
 
 def _size(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the size of an effect in one recording as the result holds it. Raises ValueError, KeyError, TypeError."""
+    """Return an effect's size in one recording. Raises ValueError, KeyError, TypeError."""
     begun = entry["begun_s"]
     numbers = {k: float(entry[k]) for k in ("value", "sd")} | (
         {} if begun is None else {"begun_s": float(begun)}
