@@ -1,12 +1,12 @@
 """Hold a device profile: vendor, model, bus and channels.
 
 A device is described, not programmed. A profile (`format: thermoctl-device/1`) describes the product; a
-binding (hal.binding) says where the device is on this rig. Every channel has
+binding (thermoctl_hal.binding) says where the device is on this rig. Every channel has
 
     reading = raw * scale + offset      in `unit`; outside `range`: error; older than `stale_after_s`: stale
 
 and the place of its raw number on the bus. Buses: serial-binary (framed bytes), serial-lines (text), can-dbc
-(any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). hal.read_profile reads the
+(any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). thermoctl_hal.read_profile reads the
 files.
 """
 
@@ -100,7 +100,7 @@ class Condition:
 class BinaryFrame:
     """sync | payload length (uint8, where has_length) | payload of typed fields | checksum | tail.
 
-    `crc` names the checksum (hal.checksum), over the bytes that `crc_over` says. `bits` are fields inside
+    `crc` names the checksum (thermoctl_hal.checksum), over the bytes that `crc_over` says. `bits` are fields inside
     fields. `sequence` names a counter field; its gaps are counted as lost frames. `invalid`: a frame is an
     error unless the test holds. `signs`: field -> test for minus. `constants`: field -> its number; other
     frames are ignored. `other_endian`: fields whose byte order is the other one. `request` is sent
