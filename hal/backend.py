@@ -41,9 +41,9 @@ Back ends of real devices also have, for `loop.pace: device`:
 exception, checksum, how often. `counters()` returns `<device>.frames`, `.errors`, `.reconnections` and the
 driver's other counters.
 
-A device with `bus: modbus` is slow: it blocks in its `poll()`. The daemon runs `thermoctl_hal.poller.run_poller` for
-each in its own process. That process writes the newest values to a `thermoctl_hal.board.Board` in shared memory, and
-`read` merges them. Without a board (doctor, tests) threads of the same process poll these devices.
+A device with `bus: modbus` is slow: it blocks in its `poll()`. The daemon runs `poller.run_poller` for each
+in its own process. That process writes the newest values to a `board.Board` in shared memory, and `read`
+merges them. Without a board (doctor, tests) threads of the same process poll these devices.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # cython: annotation_typing=False, cdivision=True
 """Serial devices: framed bytes with a checksum, and lines of text.
 
-thermoctl_hal.serial_line opens the port, thermoctl_hal.wire.Framer finds the frames in the bytes. Several devices that answer
-requests may share a line (RS-485): thermoctl_hal.shared_line opens it once and asks one of them at a time.
+serial_line.py opens the port, wire.Framer finds the frames in the bytes. Several devices that answer
+requests may share a line (RS-485): shared_line.py opens it once and asks one of them at a time.
 """
 
 from __future__ import annotations
