@@ -66,7 +66,7 @@ def _linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
 
 
 def drifts(plant: Linear, duration: float) -> bool:
-    """Return whether a mode of the plant does not decay within the recordings (False where that is unknown)."""
+    """Return whether a mode of the plant does not decay within the recordings; False if unknown."""
     known = bool(len(plant.a)) and bool(np.isfinite(plant.a).all())  # the slope of a root may be infinite
     return known and bool(np.max(np.linalg.eigvals(plant.a).real) > -1 / duration)
 
