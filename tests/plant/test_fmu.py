@@ -289,8 +289,8 @@ def test_what_cannot_be_asked_of_cosimulation_is_one_line(heater, tmp_path, caps
 
 def test_a_refit_of_cosimulation_by_pythonfmu3(tmp_path):
     builder = pytest.importorskip("pythonfmu3.builder")
-    (tmp_path / "block.py").write_text(STEPPED)
-    builder.FmuBuilder.build_FMU(tmp_path / "block.py", dest=tmp_path)
+    (tmp_path / "stepped.py").write_text(STEPPED)
+    builder.FmuBuilder.build_FMU(tmp_path / "stepped.py", dest=tmp_path)
     mapped = tmp_path / "map.yaml"
     mapped.write_text(
         "inputs: {power: {between_samples: hold}}\noutputs: {T: {noise: 0.01}}\nparameters: {C: {range: [50, 200]}}"

@@ -105,25 +105,23 @@ class Run:
         self._layout, self._make = layout, make
         self._at: Instance | None = None
         self._t, self._known = np.nan, b""
+        self._inputs = np.zeros(0)
         self._failed = False
 
     def at(self, row: np.ndarray) -> np.ndarray:
         """Return the outputs (m,) at the next row; NaN from a failure of the FMU on."""
         layout, t = self._layout, float(row[0])
-        parameters = row[layout.fixed :].tobytes()
+        parameters, at = row[layout.fixed :].tobytes(), self._at
+        begins = at is None or not t >= self._t or parameters != self._known
         try:
-            if not t >= self._t or parameters != self._known:
-                self._failed = False
-                at = self._begin(t, row)
-                inputs = np.append(row, layout.start)[self._take]
-            else:
-                at = self._at
-                inputs = np.append(row, layout.start)[self._take]
-                if at is None or self._failed:
-                    return np.full(len(layout.outputs), np.nan)
-                if t > self._t:
-                    at.put(layout.inputs, self._before * self._inputs + (1 - self._before) * inputs)
-                    at.step(self._t, t - self._t)
+            if at is None or begins:
+                at, self._failed = self._begin(t, row), False
+            inputs = np.append(row, layout.start)[self._take]
+            if self._failed:
+                return np.full(len(layout.outputs), np.nan)
+            if t > self._t and not begins:
+                at.put(layout.inputs, self._before * self._inputs + (1 - self._before) * inputs)
+                at.step(self._t, t - self._t)
             at.put(layout.inputs, inputs)
             self._inputs = inputs
             return at.get(layout.outputs)

@@ -29,7 +29,7 @@ import numpy as np
 
 from thermoctl.extras import load
 from thermoctl.plant.build import library
-from thermoctl.plant.cosimulation import Course, Layout
+from thermoctl.plant.cosimulation import Course, Layout, References
 from thermoctl.yamlfile import InputError, suggest
 
 if TYPE_CHECKING:
@@ -201,8 +201,7 @@ _STEPS = ctypes.CFUNCTYPE(
 _OPENED: dict[int, Cosimulation] = {}
 
 
-@_STEPS
-def _steps(number: int, course: int, k: int, row: Any, change: Any) -> float:
+def _advance(number: int, course: int, k: int, row: Any, change: Any) -> float:
     """Return result k of an FMU's course at a row, or its slope: called by a plant's machine code."""
     fmu = _OPENED[number]
     size = 1 + len(fmu.arguments)
@@ -211,6 +210,9 @@ def _steps(number: int, course: int, k: int, row: Any, change: Any) -> float:
     if not change:
         return float(runs.value(a)[k])
     return float(runs.slope(a, np.frombuffer(ctypes.string_at(change, 8 * size)))[k])
+
+
+_steps = _STEPS(_advance)
 
 
 class Cosimulation(Fmu):
@@ -238,12 +240,11 @@ class Cosimulation(Fmu):
             raise InputError(f"{path}: cannot be started: {' '.join(str(e).split())[:300]}") from None
         self._layout = Layout(
             self._version,
-            *(
-                (ctypes.c_uint * len(group))(*(v.valueReference for v in group))
-                for group in (inputs, parameters, [u.variable for u in unknowns])
-            ),
-            start=np.array([now[v.name] for v in settable]),
-            scale=np.array([float(v.nominal or 0) or _size(now[v.name]) for v in settable]),
+            _references(inputs),
+            _references(parameters),
+            _references([u.variable for u in unknowns]),
+            np.array([now[v.name] for v in settable]),
+            np.array([float(v.nominal or 0) or _size(now[v.name]) for v in settable]),
         )
         self.inputs, self.parameters = (
             {v.name: _variable(v, now) for v in group} for group in (inputs, parameters)
@@ -284,6 +285,10 @@ class Cosimulation(Fmu):
             changes = self._rows(names, [np.zeros_like(shaped[0]), *shaped[count:]], 0.0)
             out = [course.slope(row, change)[k] for row, change in zip(rows, changes, strict=True)]
         return np.array(out).reshape(shaped[0].shape)[()]
+
+
+def _references(variables: Sequence[ModelVariable]) -> References:
+    return (ctypes.c_uint * len(variables))(*(v.valueReference for v in variables))
 
 
 def _variable(v: ModelVariable, now: Mapping[str, float]) -> Variable:
