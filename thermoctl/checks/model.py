@@ -46,7 +46,7 @@ def unit_findings(plant: Plant) -> list[Finding]:
 
 
 def closed_findings(plant: Plant) -> list[Finding]:
-    """Return a warning for outputs that an FMU of co-simulation computes: what cannot be asked of it."""
+    """Return a warning where an FMU of co-simulation computes outputs: no effect inside it can be named."""
     closed = [
         o.name
         for o in plant.outputs.values()

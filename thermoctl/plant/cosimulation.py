@@ -1,6 +1,6 @@
 """Runs of an FMU of co-simulation (FMI 2 and 3) that go on from row to row of its arguments.
 
-The FMU keeps its states and its solver to itself. So an output belongs to the whole course a of its arguments:
+The FMU keeps its states and its solver to itself. So an output belongs to the arguments' whole course a:
 
     y(t) = F[a](t),   dy/dq (t) = (F[a + h da/dq](t) - F[a - h da/dq](t)) / 2h
 
@@ -35,9 +35,9 @@ References = ctypes.Array[ctypes.c_uint]
 
 @dataclass(frozen=True)
 class Layout:
-    """References of an FMU's variables, and its arguments' start values and sizes: inputs, then parameters.
+    """References of an FMU's variables; start values and sizes of its inputs, then parameters.
 
-    A row of arguments is time, the inputs, the held inputs, the parameters; NaN stands for the start value."""
+    A row of arguments: time, inputs, held inputs, parameters. NaN stands for the start value."""
 
     version: int
     inputs: References
@@ -63,7 +63,7 @@ class Instance:
             kind(ctypes.cast(getattr(fmu.dll, f"fmi{version}{name}"), _P).value or 0)
             for kind, name in ((values, put), (values, get), (_DO_STEP[version], "DoStep"))
         )
-        self._more = ctypes.create_string_buffer(32)  # what a step of FMI 3 returns: three flags and a time
+        self._more = ctypes.create_string_buffer(32)  # results of a step of FMI 3: three flags and a time
         at = ctypes.addressof(self._more)
         self._after: tuple[Any, ...] = (1,) if version == 2 else (True, at, at + 1, at + 2, at + 8)
         self._version = version
@@ -167,7 +167,7 @@ class Course:
         return self._last
 
     def slope(self, row: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Return d outputs / dq (m,) at the next row; `change`: d row / dq, 0 where an argument is not given."""
+        """Return d outputs / dq (m,) at the next row. `change`: d row / dq, 0 for missing arguments."""
         if (key := row.tobytes() + change.tobytes()) != self._key:
             self._runs = self._runs or tuple(Run(self._layout, self._make) for _ in range(2))
             if not row[0] >= self._t:

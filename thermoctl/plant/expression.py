@@ -62,8 +62,8 @@ class Expr:
     - 'table': args are x, the x points and the y points; value is the number of points;
     - 'delay': args are an expression and seconds; 'first': value is a name;
     - 'fmu': args are time and the values given; value is the file, its result, and the names of the values
-    - only in derivatives: 'fmu_slope', an 'fmu' whose value ends in the name that it is differentiated by;
-      'fmu_change', an 'fmu' of co-simulation, whose args go on with the slopes of the values given
+    - only in derivatives: 'fmu_slope', an 'fmu' whose value ends in the name that it is differentiated by
+    - only in derivatives: 'fmu_change', an 'fmu' of co-simulation; args: those of it, then the values' slopes
     - only in derivatives: 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope', 'bump' (slope of a smoothed
       step);
     - only in derivatives: 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed).

@@ -6,8 +6,9 @@ is the derivative that the FMU computes with its variables T and heater.P at the
 output gives that output. Time is passed on. Other variables keep the FMU's start values.
 Slopes are directional derivatives where the FMU gives them, else central differences (fmu.h).
 
-An FMU that is for co-simulation only has neither states nor derivatives, and an output is that of a run from
-the recording's first sample on (cosimulation.py); "hold(u)" instead of "u" is an input held between samples.
+An FMU of co-simulation only has neither states nor derivatives. Its output is that of a run from the first
+sample on (cosimulation.py). There "hold(u)" instead of "u" is an input held between samples.
+
 An FMU is a program: opening one runs it.
 """
 

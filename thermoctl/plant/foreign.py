@@ -153,7 +153,7 @@ class _Plant:
         return f'fmu("{fmu.path}", "{result}"' + "".join(f', "{n}", {v}' for n, v in values.items()) + ")"
 
     def _argument(self, name: str) -> str:
-        """Return what the FMU calls a state or input; one of co-simulation is told which inputs are held."""
+        """Return the argument for a state or an input; co-simulation distinguishes held inputs."""
         if not self.fmu.runs or name in self.constants:
             return name
         entry = self._entry("inputs", name, self._input(self.fmu.inputs[name]))
