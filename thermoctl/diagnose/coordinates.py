@@ -114,7 +114,7 @@ class Coordinates:
         return dct(part, axis=0, norm="ortho")[: c.rows]
 
     def transposed(self, c: Channel, rows: np.ndarray, samples: int) -> np.ndarray:
-        """(rows, k) of a channel as the values (samples, k) whose products with an output give these of rows."""
+        """Return the transpose of `transform`: rows (rows, k) of a channel as values (samples, k)."""
         n = len(c.index) // c.block
         part = idct(np.concatenate([rows, np.zeros((n - c.rows, rows.shape[1]))]), axis=0, norm="ortho")
         out = np.zeros((samples, rows.shape[1]))

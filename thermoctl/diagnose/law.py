@@ -21,7 +21,7 @@ import numpy as np
 from thermoctl.diagnose import places as catalogue_places
 from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted, Placed, fitted
+from thermoctl.diagnose.fit import Fitted, Placed, as_refitted, fitted
 from thermoctl.diagnose.held_out import Worth, worth
 from thermoctl.diagnose.law_forms import (
     Place,
@@ -40,6 +40,7 @@ from thermoctl.diagnose.misfit import energies, physics
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.search import Searched, Weighed
 from thermoctl.diagnose.shortlist import ALIKE, HALF
+from thermoctl.diagnose.unknown import located, reached
 from thermoctl.plant import expression as ex
 from thermoctl.plant.residuals import HUGE
 from thermoctl.plant.simulate import SimulationError
@@ -47,6 +48,7 @@ from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 PIECES = 8  # of a free function of a signal
+TRACKED = 20  # nodes with an unknown flow, those that explain the residual best: 24 knots each
 NODES = 4  # of a plant, at which a free flow in time explains most
 SECOND = 10  # signals of a place that may be the second one of a form
 COMBINATIONS = 12  # places and signals whose forms are tried
@@ -252,7 +254,10 @@ def propose_laws(case: Case, parent: Fitted) -> tuple[list[Proposal], Tracked]:
     drives = case.drives(parent.rough.model)
     rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
     where = places(rig)
-    at = tracked(case, parent, [p.target for p in where if p.source is None])
+    nodes = [p.target for p in where if p.source is None]
+    if len(nodes) > TRACKED:
+        nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
+    at = tracked(case, parent, nodes)
     likely = sorted(at.explained, key=lambda n: -at.explained[n])[:NODES]
     combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, at.runs)]
     free = [(_free(at, p, s), p, s) for p, s in combos]

@@ -108,7 +108,9 @@ def _predictor(f: Fitted, weight: float) -> _Predictor:
 def distances(
     predictions: Sequence[Prediction], columns: Sequence[Sequence[int]], sigma: np.ndarray
 ) -> np.ndarray:
-    """Compute D of (1) of every two predictions over their columns, noise `sigma` each, by Woodbury's identity.
+    """Compute D of (1) of every two predictions over their columns, by Woodbury's identity.
+
+    `sigma`: noise of each column.
 
     Each pair's matrix consists of products that several pairs share."""
     y, load = (

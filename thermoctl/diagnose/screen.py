@@ -147,7 +147,7 @@ def _hold(column: np.ndarray) -> np.ndarray:
 
 
 class Overlay:
-    """What an extension changes in a plant: flows, storages, outputs; nodes that it adds."""
+    """The changes of a plant by an extension: flows, storages, outputs, new nodes."""
 
     def __init__(self, base: Plant, extended: Plant):
         self.base, self.states = base, list(base.nodes)
@@ -369,7 +369,7 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
 
 @dataclass(frozen=True)
 class Group:
-    """The columns of an effect at a place that are scored together: its amplitudes at one shape, or all onsets.
+    """The columns of an effect at a place that are scored together: amplitudes at one shape, or onsets.
 
     `sizes`: shape and direction in the amplitudes of each column. `overlay` of the candidate, made once."""
 

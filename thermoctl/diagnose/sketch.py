@@ -2,15 +2,17 @@
 
     gain = (d' r)^2 / |P d|^2,    d = W B y(q)
 
-y(q): first-order response of the outputs to an effect's forces q (screen.py). B: samples to DCT rows. W: their
-weights. r: residual. P: projection past the plant's own parameters. The product of d with a row vector w is an
-inner product with the forces:
+- y(q): first-order response of the outputs to an effect's forces q (screen.py)
+- B: samples to DCT rows; W: the weights that whiten them; r: residual
+- P: projection that removes the part that the plant's own parameters absorb
+
+The product of d with a row vector w is an inner product with the forces:
 
     w' d = sum_n q_n' l_n,    -dl/dt = J' l + B' W w    (the adjoint plant, run backwards once for each w)
 
-So the numerator takes one adjoint run for all directions together. The norm takes SKETCHES more: with random
-signs s_k, the mean of (s_k' P d)^2 is |P d|^2, with a relative standard deviation of sqrt(2 / SKETCHES). Links
-between all pairs of N bodies then cost products, and no simulation."""
+So one adjoint run gives the numerators of all directions. SKETCHES more give the norms: with random signs s_k,
+the mean of (s_k' P d)^2 is |P d|^2. Its relative standard deviation is sqrt(2 / SKETCHES). Links between all
+pairs of N bodies then cost products, and no simulation."""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ from scipy.sparse.linalg import splu
 from thermoctl.diagnose.screen import Column, Direction, Group, Metric, Trajectory, score
 from thermoctl.plant import expression as ex
 
-# None of these numbers chooses a hypothesis: what is kept is screened exactly.
+# None of these numbers chooses a hypothesis: directions that are kept are screened exactly.
 SKETCHES = 32  # a gain is known within 25 %
 KEPT = 1_500  # columns that are simulated, for each metric
 SAMPLES = 4_000  # of an adjoint run, at most; forces are summed from one to the next
@@ -49,7 +51,7 @@ def likeliest(metrics: Sequence[Metric], at: Sequence[Trajectory], groups: list[
 def products(
     metrics: Sequence[Metric], at: Sequence[Trajectory], columns: Sequence[Column]
 ) -> list[np.ndarray]:
-    """Return, for each metric, the products (columns, 1 + SKETCHES) with the residual and with the sketches."""
+    """Return by metric the products (columns, 1 + SKETCHES) with the residual and the sketches."""
     vectors = [_vectors(metric) for metric in metrics]
     out = np.zeros((len(columns), len(metrics) * (1 + SKETCHES)))
     for r, trajectory in enumerate(at):
@@ -90,12 +92,13 @@ def _best(groups: Sequence[Group], found: Sequence[Direction | None]) -> set[int
 
 
 def _adjoint(metric: Metric, at: Trajectory, pull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return l (states, samples, k) for pulls (N, outputs, k) on the outputs, and the first row of each sample.
+    """Return l (states, samples, k) for `pull` (N, outputs, k), and the first row of each sample.
 
-    l is averaged over the rows of a sample. The transpose of two implicit stages over each interval h, with the
-    forces on straight lines between rows: M = 1 - GAMMA h J,
+    l is averaged over the rows of a sample. The method is the transpose of two implicit stages over each
+    interval h, with the forces on straight lines between rows:
 
-        M k1 = J x + q(GAMMA),   M k2 = J (x + (1 - GAMMA) h k1) + q(1),   x' = x + h ((1 - GAMMA) k1 + GAMMA k2)"""
+        M k1 = J x + q(GAMMA),   M k2 = J (x + (1 - GAMMA) h k1) + q(1),   M = 1 - GAMMA h J
+        x' = x + h ((1 - GAMMA) k1 + GAMMA k2)"""
     model, t = metric.model, at.drive.t
     nx, n, k = len(model.states), len(t), pull.shape[2]
     starts = np.arange(0, n, -(-n // SAMPLES))
