@@ -53,8 +53,9 @@ NODES = 4  # of a plant, at which a free flow in time explains most
 SECOND = 10  # signals of a place that may be the second one of a form
 COMBINATIONS = 12  # places and signals whose forms are tried
 POOL = 60  # terms that a sum of terms is built from
-REFITS = 12
+REFITS, FEWEST_REFITS = 12, 3  # the best proposals; of a plant of many bodies fewer, see NUMBERS
 SIMPLER = 6  # further refits, of sums of terms without their least significant one
+NUMBERS = 3e7  # that one run of each refit computes, with slopes: so that all refits take less than a minute
 TERMS = 3
 CHUNK = 256  # terms whose responses are computed at a time
 SEEN = 0.01  # of the strongest direction of a free function: weaker ones are not drawn
@@ -175,10 +176,11 @@ def find_law(
         return None
     tried: list[tuple[Proposal, Fitted]] = []
     queue, more = list(proposals), SIMPLER
-    gain, leader = 0.0, parent
+    gain, leader, left = 0.0, parent, affordable(case, parent)
     for k, p in enumerate(queue):
-        if case.budget.stopped() or p.cost + gain > HALF * p.promise:
+        if not left or case.budget.stopped() or p.cost + gain > HALF * p.promise:
             continue
+        left -= 1
         say(f"looking for a law of the remainder: refit {k + 1}")
         f = refitted_law(case, parent, p, at, leader)
         if f is None:
@@ -222,6 +224,14 @@ def find_law(
         rivals,
         flow_unit(case.plant, p.place.target),
     )
+
+
+def affordable(case: Case, parent: Fitted) -> int:
+    """Return how many laws may be refitted: a count of the work, the same on every machine."""
+    rows = sum(len(t) for t in case.tables)
+    model = parent.rough.model
+    numbers = rows * len(model.states) * (len(model.unknowns) + 1)
+    return int(np.clip(NUMBERS / max(numbers, 1), FEWEST_REFITS, REFITS + SIMPLER))
 
 
 def closed(value: Worth, noise: Mapping[str, float]) -> float:
@@ -302,7 +312,7 @@ def _promise(at: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
     scale = np.linalg.norm(x, axis=0)
     scale[scale == 0] = 1.0
     c = np.linalg.lstsq(x / scale, at.target, rcond=1e-8)[0] / scale
-    return at.metric.log_likelihood(at.target - x @ c) - at.metric.log_likelihood(at.target), c
+    return at.metric.log_likelihood(at.target - x @ c) - at.now, c
 
 
 def _singles(
