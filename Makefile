@@ -66,7 +66,7 @@ install: $(VENV)/.installed        # dependencies of the program, and its compil
 $(VENV)/.installed: $(SOURCES)
 	@echo "[1/3] a virtual environment in $(VENV)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(call listed,p['build-system']['requires'] + p['project']['dependencies'] + p['project']['optional-dependencies']['fleet']) > $(VENV)/needs
+	@$(call listed,p['build-system']['requires'] + p['project']['dependencies'] + sum((p['project']['optional-dependencies'][e] for e in ('rig', 'report', 'fleet')), [])) > $(VENV)/needs
 	@all=$$(wc -l < $(VENV)/needs); n=0; while read -r need; do n=$$((n + 1)); \
 		echo "[2/3] $$need ($$n of $$all)"; $(PIP) "$$need" || exit 1; done < $(VENV)/needs
 	@echo "[3/3] compiling the control loop and the drivers (a minute or two)"

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 from hal.axes import AxisBackend
 from hal.backend import Backend, HardwareError
 from hal.binding import Binding, bind, check_rig, rig_notes
 from hal.board import Board
-from hal.dbc import DbcDevice, DbcDrive
 from hal.device import Device
 from hal.devices import DevicesBackend
-from hal.drive import Cia402Device
 from hal.faulty import FaultInjector, schedule
-from hal.modbus import ModbusDevice, ModbusDrive
 from hal.replay import replay_backend
-from hal.serial_drive import SerialDrive
-from hal.serial_port import SerialDevice
 from hal.simulated import simulated_backend
 from thermoctl.channels import AxesChannels
 from thermoctl.settings import Settings
@@ -144,20 +140,21 @@ def can_drive(settings: Settings) -> bool:
     return settings.hal.backend != "devices" or bool(driving_devices(settings))
 
 
-_DRIVERS: dict[str, type[Device]] = {
-    "serial-binary": SerialDevice,
-    "serial-lines": SerialDevice,
-    "can-dbc": DbcDevice,
-    "can-cia402": Cia402Device,
-    "modbus": ModbusDevice,
+_DRIVERS = {
+    "serial-binary": "serial_port:SerialDevice",
+    "serial-lines": "serial_port:SerialDevice",
+    "can-dbc": "dbc:DbcDevice",
+    "can-cia402": "drive:Cia402Device",
+    "modbus": "modbus:ModbusDevice",
 }
+"""Module and class of each bus's driver, imported for a device of that bus only: it may need an extra."""
 
 
-_DRIVES: dict[str, type[Device]] = {
-    "serial-binary": SerialDrive,
-    "serial-lines": SerialDrive,
-    "can-dbc": DbcDrive,
-    "modbus": ModbusDrive,
+_DRIVES = {
+    "serial-binary": "serial_drive:SerialDrive",
+    "serial-lines": "serial_drive:SerialDrive",
+    "can-dbc": "dbc:DbcDrive",
+    "modbus": "modbus:ModbusDrive",
 }
 """Drivers of amplifiers that messages command."""
 
@@ -166,4 +163,6 @@ def driver(binding: Binding) -> Device:
     """Make the driver of a bound device, not connected. Raises InputError."""
     amplifier, bus = binding.profile.amplifier, binding.profile.bus
     by_messages = amplifier is not None and amplifier.command is not None
-    return (_DRIVES if by_messages else _DRIVERS)[bus](binding)
+    module, _, name = (_DRIVES if by_messages else _DRIVERS)[bus].partition(":")
+    made: Device = getattr(import_module(f"{__package__}.{module}"), name)(binding)
+    return made

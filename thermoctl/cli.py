@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from thermoctl import __version__, which_rig
 from thermoctl.commands import AXIS, COMMANDS, GROUPS, call, takes_axis
+from thermoctl.extras import lacking
 from thermoctl.yamlfile import InputError
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
@@ -57,6 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except KeyboardInterrupt:
         return 130
+    except ModuleNotFoundError as e:
+        if (line := lacking(e)) is None:
+            raise
+        print(f"thermoctl: {args.row.name}: {line}", file=sys.stderr)
+        return 2
     except Exception as e:
         from hal.backend import HardwareError
 

@@ -1,26 +1,30 @@
-"""The wheel in a fresh environment, from an empty folder: what works, its size, the time of its imports.
+"""The wheel in a fresh environment, from an empty folder: what works, its size and that of each extra, its imports.
 
-`make size`. The last step takes the C compiler away, and shows what asks for one.
+`make size`, or `python tests/bench/install.py WHEEL`. One step takes the C compiler away, and shows what asks for one.
 """
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+DIAGNOSE = "diagnose --plant examples/heater/plant.yaml examples/heater/run_1.csv examples/heater/run_2.csv --out result --quiet"
 STEPS = (
     "init",
     "check config/simulated.yaml",
     "demo --seconds 5",
-    "diagnose --plant examples/heater/plant.yaml examples/heater/run_1.csv examples/heater/run_2.csv --out result --quiet",
+    DIAGNOSE,
     "plant export result/plant.yaml --to python --out plant.py --data examples/heater/run_1.csv",
     "service install --config config/simulated.yaml --root root",
-    "devices",
 )
+WITH_ALL = ("check config/wire.yaml", "devices list", DIAGNOSE)
 IMPORTS = ("thermoctl", "thermoctl.api", "thermoctl.commands", "thermoctl.daemon.loop")
+PIP = ("-m", "pip", "--disable-pip-version-check", "-qq")
 
 
 def size(folder: Path) -> float:
@@ -28,28 +32,44 @@ def size(folder: Path) -> float:
     return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file() and not p.is_symlink()) / 1e6
 
 
+def step(program: Path, command: str, folder: Path, own: dict[str, str]) -> int:
+    """Run one command and print its time, its status and, where it failed, its last line."""
+    begin = time.monotonic()
+    done = subprocess.run([program, *command.split()], cwd=folder, env=own, capture_output=True, text=True)
+    says = (done.stderr or done.stdout).strip().splitlines()[-1:] if done.returncode else []
+    took = time.monotonic() - begin
+    print(f"{took:6.1f} s  status {done.returncode}  thermoctl {command[:60]}", *says, flush=True)
+    return done.returncode
+
+
 def main() -> int:
     """Print the tables; return 1 where a step fails."""
-    failed = 0
     with tempfile.TemporaryDirectory(prefix="thermoctl-wheel") as made:
-        work, pip = Path(made), [sys.executable, "-m", "pip", "--disable-pip-version-check", "-qq"]
-        wheels = sys.argv[1:]
+        work, wheels = Path(made), sys.argv[1:]
         if not wheels:
-            subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", work, ROOT], check=True)
+            subprocess.run(
+                [sys.executable, *PIP, "wheel", "--no-deps", "--no-build-isolation", "-w", work, ROOT],
+                check=True,
+            )
             wheels = [str(next(work.glob("*.whl")))]
         subprocess.run([sys.executable, "-m", "venv", work / "venv"], check=True)
         python, program = work / "venv/bin/python", work / "venv/bin/thermoctl"
-        subprocess.run([python, *pip[1:], "install", *wheels], check=True)
         site = next((work / "venv/lib").glob("python*/site-packages"))
+        empty = size(site)
+        subprocess.run([python, *PIP, "install", wheels[0]], check=True)
         sizes = sorted(((size(p), p.name) for p in site.iterdir() if p.is_dir()), reverse=True)
         print(
-            f"{sum(s for s, _ in sizes):.0f} MB: " + ", ".join(f"{n} {s:.0f}" for s, n in sizes[:8]),
+            f"{size(site) - empty:.0f} MB: "
+            + ", ".join(f"{n} {s:.0f}" for s, n in sizes if n != "pip" and s > 4),
             flush=True,
         )
         for module in IMPORTS:
-            begin = time.monotonic()
-            subprocess.run([python, "-c", f"import {module}"], check=True, cwd=work)
-            print(f"import {module}: {time.monotonic() - begin:.2f} s", flush=True)
+            took = []
+            for _ in range(4):  # the first also reads the disk
+                begin = time.monotonic()
+                subprocess.run([python, "-c", f"import {module}"], check=True, cwd=work)
+                took.append(time.monotonic() - begin)
+            print(f"import {module}: {min(took):.2f} s, the first time {took[0]:.2f} s", flush=True)
         folder = work / "empty"
         folder.mkdir()
         own = {
@@ -58,21 +78,21 @@ def main() -> int:
             "XDG_CACHE_HOME": str(work / "cache"),
             "XDG_STATE_HOME": str(work / "state"),
         }
-        for step, more in [
-            *((s, {}) for s in STEPS),
-            (STEPS[3], {"PATH": str(python.parent), "XDG_CACHE_HOME": str(work / "none")}),
-        ]:
-            begin = time.monotonic()
-            done = subprocess.run(
-                [program, *step.split()], cwd=folder, env=own | more, capture_output=True, text=True
-            )
-            failed += bool(done.returncode) and not more
-            says = (done.stderr or done.stdout).strip().splitlines()[-1:] if done.returncode else []
-            print(
-                f"{time.monotonic() - begin:6.1f} s  status {done.returncode}  thermoctl {step[:60]}",
-                *says,
-                flush=True,
-            )
+        failed = sum(step(program, s, folder, own) != 0 for s in STEPS)
+        print("without a C compiler, and without plants that were compiled before:")
+        step(
+            program,
+            DIAGNOSE,
+            folder,
+            own | {"PATH": str(python.parent), "XDG_CACHE_HOME": str(work / "none")},
+        )
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        for extra in re.split(r"[\[,\]]", project["optional-dependencies"]["all"][0])[1:-1]:
+            before = size(site)
+            subprocess.run([python, *PIP, "install", f"{wheels[0]}[{extra}]"], check=True)
+            print(f"extra {extra}: {size(site) - before:.0f} MB more", flush=True)
+        print(f"with all extras: {size(site) - empty:.0f} MB", flush=True)
+        failed += sum(step(program, s, folder, own) != 0 for s in WITH_ALL)
     return int(failed > 0)
 
 

@@ -86,3 +86,31 @@ def test_an_old_recording_and_another_plant_are_refused(rig, out, tmp_path):
         diagnose(load(other), tables[1:2], tmp_path / "1", earlier=out / "0")
     with pytest.raises(InputError, match="--continue"):
         diagnose(plant, tables[1:2], tmp_path / "1", earlier=tmp_path / "none")
+
+
+SIZE = '{"recording": "a", "begun_s": 0, "value": 1, "sd": %s}'
+TREND = '{"trends": [{"effect": "e", "where": "w", "parameter": "p", "recordings": [%s]}]}'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b'{"trends": [',
+        b"\xff\xfe",
+        b"[]",
+        b'{"trends": 3}',
+        b'{"trends": ["a"]}',
+        b'{"trends": [{"effect": "e"}]}',
+        (TREND % '{"recording": "a"}').encode(),
+        (TREND % SIZE % '"x"').encode(),
+        (TREND % SIZE % "NaN").encode(),
+    ],
+)
+@pytest.mark.usefixtures("results")
+def test_a_damaged_result_is_refused_before_the_work(rig, out, tmp_path, text):
+    plant, tables = rig
+    (tmp_path / "memory.json").write_bytes((out / "0/memory.json").read_bytes())
+    (tmp_path / "diagnosis.json").write_bytes(text)
+    with pytest.raises(InputError, match=r"diagnosis\.json: damaged .* was expected; diagnose all"):
+        diagnose(plant, tables[1:2], tmp_path / "1", earlier=tmp_path, progress=pytest.fail)

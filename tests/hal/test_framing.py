@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hal.latency_timer import latency_timer_ms, set_latency_timer
 from hal.profile import BinaryFrame
-from hal.serial_line import MAX_LINE, LineReader, latency_timer_ms, set_latency_timer
+from hal.serial_line import MAX_LINE, LineReader
 from hal.wire import Framer, checksum
 
 SPEC = BinaryFrame(

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermoctl.api.plants import Plant
-from thermoctl.api.plots import Picture, profile_curve, residual_panels
+from thermoctl.api.plots import profile_curve, residual_panels
 from thermoctl.plant.refit import Estimate, Fit, fit, report, updated
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.report.page import figure, table
 from thermoctl.yamlfile import InputError, suggest
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class Refit:
         e = np.concatenate([r[:, j] for r in self.fit.residuals])
         return e[np.isfinite(e)]
 
-    def plot(self, output: str | None = None) -> Picture:
+    def plot(self, output: str | None = None) -> Figure:
         """Return residuals of an output (default: the first), ACF, cumulated periodogram and QQ.
 
         White noise stays inside the 95 % bounds of the last three."""
@@ -81,7 +85,7 @@ class Refit:
             rise[k] = again.cost
         return values, rise - min(float(rise.min()), self.fit.cost)
 
-    def plot_profile(self, parameter: str) -> Picture:
+    def plot_profile(self, parameter: str) -> Figure:
         """Return the profile likelihood of a parameter. Raises InputError for one that was not fitted."""
         unit = (
             self.before.description.parameters[parameter].unit

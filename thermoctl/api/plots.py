@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from scipy.stats import norm
 
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _COLOURS = ("#b7791f", "#2b6cb0", "#c2410c")
 KOLMOGOROV = 1.358  # 95 % point of sqrt(n) times the largest deviation of a cumulated distribution
@@ -21,23 +22,26 @@ NORMAL = 1.96  # 95 % point of a standard normal deviate, two-sided
 CHI_SQUARE = 3.84  # 95 % point of chi square of one degree of freedom
 
 
-class Picture(Figure):
-    """A matplotlib Figure that a notebook shows without pyplot."""
+def _picture(width: float, height: float) -> Figure:
+    """Return a matplotlib Figure, sizes in inches, that a notebook shows without pyplot."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        FigureCanvasAgg(self)
+    class Picture(Figure):
+        def _repr_png_(self) -> bytes:
+            out = io.BytesIO()
+            self.savefig(out, format="png", dpi=90)
+            return out.getvalue()
 
-    def _repr_png_(self) -> bytes:
-        out = io.BytesIO()
-        self.savefig(out, format="png", dpi=90)
-        return out.getvalue()
+    picture = Picture(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(picture)
+    return picture
 
 
-def over_time(plant: Plant, excitation: Excitation, lines: Mapping[str, np.ndarray]) -> Picture:
+def over_time(plant: Plant, excitation: Excitation, lines: Mapping[str, np.ndarray]) -> Figure:
     """Return the measured outputs, and simulated ones (N, outputs) by label."""
     count = len(plant.outputs)
-    picture = Picture(figsize=(9, max(3.0, 1.9 * count)), layout="constrained")
+    picture = _picture(9, max(3.0, 1.9 * count))
     panels = picture.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
     for j, (axes, o) in enumerate(zip(panels, plant.outputs.values(), strict=True)):
         seen = np.isfinite(excitation.y[:, j])
@@ -65,9 +69,9 @@ def cumulated_periodogram(e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(1, len(power) + 1) / len(e), np.cumsum(power) / power.sum()
 
 
-def residual_panels(e: np.ndarray, name: str, unit: str | None) -> Picture:
+def residual_panels(e: np.ndarray, name: str, unit: str | None) -> Figure:
     """Return residuals (N,) over samples, autocorrelation, cumulated periodogram and normal quantiles."""
-    picture = Picture(figsize=(9, 5.5), layout="constrained")
+    picture = _picture(9, 5.5)
     axes = picture.subplots(2, 2)
     axes[0, 0].plot(e, lw=0.6, color="#2b6cb0")
     _titled(axes[0, 0], f"residuals of {name}", "sample", unit or "")
@@ -90,9 +94,9 @@ def residual_panels(e: np.ndarray, name: str, unit: str | None) -> Picture:
     return picture
 
 
-def profile_curve(values: np.ndarray, rise: np.ndarray, name: str, unit: str | None) -> Picture:
+def profile_curve(values: np.ndarray, rise: np.ndarray, name: str, unit: str | None) -> Figure:
     """Return the rise of -2 log likelihood over a parameter's values, with the 95 % bound."""
-    picture = Picture(figsize=(5, 3.2), layout="constrained")
+    picture = _picture(5, 3.2)
     axes = picture.subplots()
     axes.plot(values, rise, "o-", ms=3, color="#2b6cb0")
     axes.axhline(CHI_SQUARE, color="#c2410c", lw=0.8, ls="--")

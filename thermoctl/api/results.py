@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermoctl.api.plants import Plant
-from thermoctl.api.plots import Picture, over_time
+from thermoctl.api.plots import over_time
 from thermoctl.diagnose.result import Diagnosis as Found
 from thermoctl.diagnose.result import contract
 from thermoctl.diagnose.words import chance, words
@@ -21,6 +21,9 @@ from thermoctl.plant import save
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.plant.simulate import Simulation as Run
 from thermoctl.report.page import figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class Simulation:
             for o, e in self.errors.items()
         }
 
-    def plot(self) -> Picture:
+    def plot(self) -> Figure:
         """Return measured and simulated outputs over time."""
         return over_time(self.plant.description, self.excitation, {"simulated": self.run.y})
 
@@ -116,7 +119,7 @@ class Diagnosis:
         save(self.plant.description, folder / "plant.yaml")
         (folder / "diagnosis.json").write_text(json.dumps(self.json, indent=1, allow_nan=False) + "\n")
 
-    def plot(self, recording: int = 0) -> Picture:
+    def plot(self, recording: int = 0) -> Figure:
         """Return one recording with the plant as it came, refitted, and with the findings."""
         table = self.found.case.tables[recording]
         stages = {"as it came": self.before.description, "refitted": self.found.null.plant}

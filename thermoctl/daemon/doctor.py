@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hal.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
+from hal.latency_timer import latency_timer_ms
 from hal.make import device_notes, fast_devices, make_backend, make_backends
-from hal.serial_line import latency_timer_ms
 from thermoctl.daemon.arrival import expected_hz, slow
 from thermoctl.daemon.assemble import check_mode, compensator, lacks, law_parameters, power_warning
 from thermoctl.daemon.lock import holder

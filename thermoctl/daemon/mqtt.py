@@ -12,26 +12,18 @@ matters, and the recording has the rest.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import json
 import threading
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from thermoctl.daemon.control_socket import ask
+from thermoctl.extras import load
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 CONNECT_S = 10.0
 ONLINE, OFFLINE = "online", "offline"
-
-
-def _library() -> ModuleType:
-    try:
-        return importlib.import_module("paho.mqtt.client")
-    except ImportError:
-        raise InputError("mqtt: needs the package 'paho-mqtt': pip install 'thermoctl[mqtt]'") from None
 
 
 class Bridge:
@@ -62,7 +54,7 @@ class Bridge:
         self.connected, self.refused = threading.Event(), ""
         self._online: bool | None = None
         self._faults: str | None = None
-        mqtt = _library()
+        mqtt = load("paho.mqtt.client", "mqtt")
         self.client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
         self.client.will_set(f"{self.topic}/availability", OFFLINE, qos=1, retain=True)
         self.client.reconnect_delay_set(1, 30)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import json
+import math
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +25,14 @@ from thermoctl.diagnose.result import Diagnosis, contract
 from thermoctl.diagnose.threads import one_thread
 from thermoctl.diagnose.trend import told, trends
 from thermoctl.diagnose.unseen import not_seen
+from thermoctl.diagnose.words import words
+from thermoctl.extras import lacking
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
+from thermoctl.report.page import page
 from thermoctl.yamlfile import InputError
 
 STOPPED = (
@@ -64,7 +69,7 @@ def diagnose(
     started, folder = time.monotonic(), _writable(Path(out))
     named = _distinct([*tables, *held_out])
     chosen_on, reserve = named[: len(tables)], named[len(tables) :]
-    before = memory.read(earlier, plant) if earlier else memory.Memory()
+    before, sizes = memory.read(earlier, plant) if earlier else memory.Memory(), _trends(earlier)
     if again := {t.name for t in named} & set(before.recordings):
         raise InputError(
             f"{earlier}: holds {', '.join(sorted(again))} already; recordings that it has not seen were expected"
@@ -78,7 +83,7 @@ def diagnose(
     proposed = None if stopped() else propose(found, drivable, limits, progress)
     result = contract(found)
     result["next_experiment"] = proposed[0] if proposed else None
-    result["trends"] = trends(found.case, found.best, found.shown, _trends(earlier))
+    result["trends"] = trends(found.case, found.best, found.shown, sizes)
     result["notes"] += told(result["trends"])
     if before.recordings:
         result["notes"].insert(0, f"goes on from {len(before.recordings)} earlier recordings ({earlier})")
@@ -91,7 +96,7 @@ def diagnose(
         added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in found.shown)
         save(found.extended, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
         load(part / "plant.yaml")
-        write_report(found, result, part / "report.html")
+        _report(found, result, part / "report.html")
         (part / "diagnosis.json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
         memory.write(part, plant, _remembered(found))
         written = experiment_file.write(part, found.case, *proposed) if proposed else []
@@ -101,6 +106,18 @@ def diagnose(
         for name in ("plant.yaml", "report.html", "diagnosis.json", memory.FILE, *written):
             shutil.move(part / name, folder / name)
     return result
+
+
+def _report(found: Diagnosis, result: dict[str, Any], path: Path) -> None:
+    """Write report.html; without matplotlib only the summary, with a note in the result."""
+    try:
+        write_report(found, result, path)
+    except ModuleNotFoundError as e:
+        if (line := lacking(e)) is None:
+            raise
+        result["notes"].append(f"report.html without figures and tables: {line}")
+        summary = html.escape(f"{words(result)} {result['notes'][-1]}")
+        path.write_text(page("Diagnosis", [("", f"<p>{summary}</p>")]), encoding="utf-8")
 
 
 def _remembered(found: Diagnosis) -> memory.Memory:
@@ -115,10 +132,35 @@ def _remembered(found: Diagnosis) -> memory.Memory:
 
 
 def _trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
-    """Return the trends in the result of an earlier diagnosis."""
+    """Return the trends in the result of an earlier diagnosis. Raises InputError for a damaged one."""
     path = earlier / "diagnosis.json" if earlier else None
-    found = json.loads(path.read_text()) if path and path.exists() else {}
-    return found.get("trends", ()) if isinstance(found, dict) else ()
+    if path is None or not path.exists():
+        return ()
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return [
+            {k: str(t[k]) for k in ("effect", "where", "parameter")}
+            | {"recordings": [_size(r) for r in t["recordings"]]}
+            for t in found.get("trends", ())
+        ]
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read: {e.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as e:  # no JSON, or not what the engine wrote
+        raise InputError(
+            f"{path}: damaged ({type(e).__name__}: {e}); the result of a diagnosis was expected; diagnose all "
+            "recordings again"
+        ) from None
+
+
+def _size(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an effect's size in one recording. Raises ValueError, KeyError, TypeError."""
+    begun = entry["begun_s"]
+    numbers = {k: float(entry[k]) for k in ("value", "sd")} | (
+        {} if begun is None else {"begun_s": float(begun)}
+    )
+    if not all(map(math.isfinite, numbers.values())) or numbers["sd"] <= 0:
+        raise ValueError(f"finite numbers and an sd above 0 were expected, found {numbers}")
+    return {"recording": str(entry["recording"]), "begun_s": None, **numbers}
 
 
 def diagnose_files(

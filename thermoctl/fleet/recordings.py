@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from thermoctl.extras import load
 from thermoctl.recording.writer import NAME, TIER
 from thermoctl.yamlfile import InputError
 
@@ -56,12 +57,10 @@ def expanded(given: Sequence[str], together: bool) -> list[str]:
 
 def _store(url: str) -> tuple[Any, str]:
     """Return (file system, path in it) of an address. The store's library finds its own credentials."""
+    fsspec = load("fsspec", url)
     try:
-        import fsspec
-    except ImportError:
-        raise InputError(f"{url}: needs the package 'fsspec': pip install 'thermoctl[fleet]'") from None
-    try:
-        return fsspec.core.url_to_fs(url)
+        found: tuple[Any, str] = fsspec.core.url_to_fs(url)
+        return found
     except (ImportError, ValueError) as e:
         raise InputError(f"{url}: {e}") from None
 

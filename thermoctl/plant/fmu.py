@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thermoctl.extras import load
 from thermoctl.plant.build import library
 from thermoctl.yamlfile import InputError, suggest
 
@@ -203,12 +204,9 @@ def _opened(path: Path, changed: int) -> Fmu:
 
 
 def _description(path: Path) -> ModelDescription:
+    fmpy = load("fmpy", path)
     try:
-        from fmpy import read_model_description
-    except ImportError:
-        raise InputError(f"{path}: FMUs are read by FMPy; install it: pip install 'thermoctl[fmu]'") from None
-    try:
-        found = read_model_description(str(path), validate=False)
+        found = fmpy.read_model_description(str(path), validate=False)
     except Exception as e:  # FMPy raises bare Exceptions
         raise InputError(f"{path}: no usable FMU: {' '.join(str(e).split())[:300]}") from None
     if found.fmiVersion[0] not in "23":

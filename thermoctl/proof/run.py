@@ -16,6 +16,7 @@ from typing import Any, TextIO
 
 from thermoctl import __version__
 from thermoctl.diagnose.run import diagnose_files
+from thermoctl.extras import load
 from thermoctl.proof.jobs import Job, Run, done
 from thermoctl.yamlfile import InputError
 
@@ -55,14 +56,8 @@ def _run(job: Job, error: str | None, seconds: float | None) -> Run:
 
 def _dask() -> tuple[Any, Any]:
     """Return dask and distributed; their import takes a second. Raises InputError where one is missing."""
-    try:
-        import dask
-        import distributed
-    except ImportError:
-        raise InputError(
-            "many rigs or cases are diagnosed by Dask, which is not installed: pip install 'thermoctl[fleet]'"
-        ) from None
-    return dask, distributed
+    many = "many rigs or cases"
+    return load("dask", many), load("distributed", many)
 
 
 @contextmanager

@@ -7,26 +7,17 @@ with different rates are merged by time, so most cells of a slow channel are emp
 from __future__ import annotations
 
 import csv
-import importlib
 import io
 import json
 from datetime import date, time
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
+from thermoctl.extras import load
 from thermoctl.recording.table import Table
 from thermoctl.signals import units
 from thermoctl.yamlfile import InputError
-
-
-def _library(name: str, path: Path) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        package = name.split(".")[0]
-        raise InputError(f"{path}: needs the package '{package}': pip install 'thermoctl[formats]'") from None
 
 
 def _damaged(path: Path, kind: str, e: Exception) -> InputError:
@@ -68,7 +59,7 @@ def _united(path: Path, channels: list[tuple[str, np.ndarray, np.ndarray]]) -> d
 
 def read_mdf(path: Path) -> dict[str, np.ndarray]:
     """Read the columns of an ASAM MDF file by channel name, with `t`. Raises InputError."""
-    asammdf = _library("asammdf", path)
+    asammdf = load("asammdf", path)
     path.stat()
     try:
         with asammdf.MDF(str(path)) as mdf:
@@ -85,7 +76,7 @@ def read_tdms(path: Path) -> dict[str, np.ndarray]:
 
     `t` comes from the waveform properties or from a channel `t` of the same group. A name that several groups
     use becomes group_channel."""
-    nptdms = _library("nptdms", path)
+    nptdms = load("nptdms", path)
     path.stat()
     try:
         groups = [
@@ -121,7 +112,7 @@ def read_tdms(path: Path) -> dict[str, np.ndarray]:
 
 def read_excel(path: Path) -> bytes:
     """Return the first sheet of an Excel file as comma-separated text, row for row. Raises InputError."""
-    openpyxl = _library("openpyxl", path)
+    openpyxl = load("openpyxl", path)
     path.stat()
     try:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
@@ -138,7 +129,7 @@ def read_excel(path: Path) -> bytes:
 
 def write_mdf(path: str, table: Table) -> None:
     """Write MDF 4.10, one channel group, zipped; units of our signals."""
-    asammdf, unit = _library("asammdf", Path(path)), units(table.columns)
+    asammdf, unit = load("asammdf", Path(path)), units(table.columns)
     with asammdf.MDF(version="4.10") as mdf:
         mdf.append(
             [
@@ -155,7 +146,7 @@ def write_mcap(path: str, table: Table) -> None:
 
     A missing sample is left out of its message. Log time is `wall_s` if it is recorded, else `t`.
     """
-    writer_module = _library("mcap.writer", Path(path))
+    writer_module = load("mcap.writer", Path(path))
     clock = table.columns.get("wall_s", table.t - min(table.t[0], 0.0))
     unit = {"t": "s"} | units(table.columns)
     names, values = ["t", *table.columns], np.column_stack([table.t, *table.columns.values()])
