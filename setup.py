@@ -7,7 +7,7 @@ import numpy
 from Cython.Build import cythonize
 from setuptools import Extension, setup
 
-typed = [p for root in ("thermoctl", "hal") for p in Path(root).rglob("*.p[xy][xd]")]
+typed = [p for root in ("thermoctl", "thermoctl_hal") for p in Path(root).rglob("*.p[xy][xd]")]
 sources = sorted(
     {p.with_suffix(".pyx") if p.with_suffix(".pyx").exists() else p.with_suffix(".py") for p in typed}
 )

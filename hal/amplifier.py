@@ -17,7 +17,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from hal.backend import (
+from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import (
     AMP_DISABLED,
     AMP_ENABLED,
     AMP_FAULT,
@@ -26,9 +27,8 @@ from hal.backend import (
     HardwareError,
     Sample,
 )
-from hal.binding import Binding
-from hal.profile import Amplifier, Assumed, Message
-from thermoctl.yamlfile import InputError
+from thermoctl_hal.binding import Binding
+from thermoctl_hal.profile import Amplifier, Assumed, Message
 
 REPEAT_S = 0.1  # between repetitions of enabling and disabling messages
 RESET_S = 1.0  # between attempts to reset a fault

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from hal.backend import Sample
-from hal.devices import DevicesBackend
 from thermoctl.channels import AxesChannels
+from thermoctl_hal.backend import Sample
+from thermoctl_hal.devices import DevicesBackend
 
 
 class AxisBackend:
-    """`hal.backend.Backend` of one axis.
+    """`thermoctl_hal.backend.Backend` of one axis.
 
     The first axis reads all devices; the others, which tick after it, see what it read. Opening or closing
     one axis opens or closes all devices.
@@ -24,13 +24,13 @@ class AxisBackend:
         self.check_pacing, self.wait_frame = devices.check_pacing, devices.wait_frame
 
     def read(self, now_s: float) -> Sample:
-        """Return this axis' part of the sample; see hal.backend."""
+        """Return this axis' part of the sample; see thermoctl_hal.backend."""
         if self.axis == 0:
             self.devices.read(now_s)
         return self.sample
 
     def write(self, drive: float, enable: bool) -> None:
-        """Send the command to this axis' amplifier; see hal.backend."""
+        """Send the command to this axis' amplifier; see thermoctl_hal.backend."""
         self.devices.write(drive, enable, self.axis)
 
     def problem(self, role: str) -> str:

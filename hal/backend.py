@@ -2,7 +2,7 @@
 
 A back end has `open()`, `read(now_s) -> Sample`, `write(drive, enable)` and `close()`. `hal.backend` in the
 configuration selects it: real devices (serial, CAN, Modbus), the simulated plant or a replayed recording. A
-fault injector can wrap any of them. hal.make creates them.
+fault injector can wrap any of them. thermoctl_hal.make creates them.
 
 - `open()` may block. It drives nothing: the amplifier is disabled afterwards. It raises HardwareError (one
   line: device, port, expectation, remedy), or yamlfile.InputError for a wrong configuration. A device without
@@ -41,9 +41,9 @@ Back ends of real devices also have, for `loop.pace: device`:
 exception, checksum, how often. `counters()` returns `<device>.frames`, `.errors`, `.reconnections` and the
 driver's other counters.
 
-A device with `bus: modbus` is slow: it blocks in its `poll()`. The daemon runs `hal.poller.run_poller` for
-each in its own process. That process writes the newest values to a `hal.board.Board` in shared memory, and
-`read` merges them. Without a board (doctor, tests) threads of the same process poll these devices.
+A device with `bus: modbus` is slow: it blocks in its `poll()`. The daemon runs `poller.run_poller` for each
+in its own process. That process writes the newest values to a `board.Board` in shared memory, and `read`
+merges them. Without a board (doctor, tests) threads of the same process poll these devices.
 """
 
 from __future__ import annotations

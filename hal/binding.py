@@ -11,11 +11,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hal.profile import BinaryFrame, Channel, Cia402, Modbus, Profile, Register, TextLine
-from hal.read_profile import load_profile
-from hal.units import role_units
 from thermoctl.channels import DEFAULT, AxesChannels, Channels
 from thermoctl.yamlfile import InputError, Node, Section, suggest
+from thermoctl_hal.profile import BinaryFrame, Channel, Cia402, Modbus, Profile, Register, TextLine
+from thermoctl_hal.read_profile import load_profile
+from thermoctl_hal.units import role_units
 
 EXCLUSIVE = ("slcan:", "rtu:", "/")
 """Prefixes of ports that are a path, which only one program can open at a time."""

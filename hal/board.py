@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import ABSENT, ROLES, HardwareError, Sample
-from hal.device import Device
+from thermoctl_hal.backend import ABSENT, ROLES, HardwareError, Sample
+from thermoctl_hal.device import Device
 
 COUNTED = ("frames", "errors", "lost", "reconnections")
 """The counters that a poller posts, in the row of the device's first role."""

@@ -26,10 +26,10 @@ import threading
 from collections import deque
 from typing import Any
 
-from hal.backend import HardwareError
-from hal.profile import LineSettings
-from hal.serial_line import open_port
-from hal.wire import EXTENDED, CanPort, SlcanLine
+from thermoctl_hal.backend import HardwareError
+from thermoctl_hal.profile import LineSettings
+from thermoctl_hal.serial_line import open_port
+from thermoctl_hal.wire import EXTENDED, CanPort, SlcanLine
 
 MAX_TAKEN = 500  # most frames that one tick takes from a bus: bounds the time of a tick on a full bus
 READ_S = 0.1  # between looks of a reading thread at its end

@@ -16,10 +16,10 @@ import struct
 import time
 from typing import Any
 
-from hal.backend import HardwareError
-from hal.profile import ERROR_CODE, FIELD_TYPES, STATUS_WORD, Cia402, Object, object_name
-from hal.wire import CanPort
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import HardwareError
+from thermoctl_hal.profile import ERROR_CODE, FIELD_TYPES, STATUS_WORD, Cia402, Object, object_name
+from thermoctl_hal.wire import CanPort
 
 SYNC_ID, NMT_ID = 0x080, 0x000
 NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET_COMMUNICATION = 0x01, 0x80, 0x82

@@ -6,14 +6,14 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from hal.amplifier import Commanded
-from hal.backend import HardwareError, Sample
-from hal.binding import Binding
-from hal.can_bus import AnyPort, open_can
-from hal.device import Device
-from hal.message import can_frame
-from hal.profile import Assumed, Dbc, DbcSource, Message, typed
-from hal.wire import EXTENDED
+from thermoctl_hal.amplifier import Commanded
+from thermoctl_hal.backend import HardwareError, Sample
+from thermoctl_hal.binding import Binding
+from thermoctl_hal.can_bus import AnyPort, open_can
+from thermoctl_hal.device import Device
+from thermoctl_hal.message import can_frame
+from thermoctl_hal.profile import Assumed, Dbc, DbcSource, Message, typed
+from thermoctl_hal.wire import EXTENDED
 
 if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Message as DbcMessage

@@ -1,5 +1,5 @@
 # C types for device.py, which runs in every tick; see there.
-from hal.wire cimport Channels
+from thermoctl_hal.wire cimport Channels
 
 cdef class Device:
     cdef public object binding, name, counts

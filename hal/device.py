@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hal.backend import ERROR, STALE, Sample
-from hal.binding import Binding
-from hal.wire import Channels
 from thermoctl.channels import AxesChannels
+from thermoctl_hal.backend import ERROR, STALE, Sample
+from thermoctl_hal.binding import Binding
+from thermoctl_hal.wire import Channels
 
 SLOW_BUSES = ("modbus",)
 
@@ -68,7 +68,7 @@ class Device:
         """Send the command; never blocks. Raises the errors of `read`."""
 
     def wait_frame(self, until_ns: int) -> bool:
-        """Wait for a whole frame (only devices with `bus: serial-binary`); see hal.serial_port."""
+        """Wait for a whole frame (only devices with `bus: serial-binary`); see thermoctl_hal.serial_port."""
         raise NotImplementedError
 
     def poll(self, sample: Sample) -> None:

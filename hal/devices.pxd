@@ -1,7 +1,7 @@
 # C types for devices.py, which runs in every tick; see there.
 cimport cython
-from hal.device cimport Device
-from hal.wire cimport Ages
+from thermoctl_hal.device cimport Device
+from thermoctl_hal.wire cimport Ages
 
 cdef class DevicesBackend:
     cdef public list fast, slow, _slow_drives, _copied, _copies

@@ -13,17 +13,17 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from hal.backend import ABSENT, STALE, HardwareError, Sample
-from hal.board import Board
-from hal.device import Device
-from hal.poller import RECONNECT_S, poll_until, ports
-from hal.wire import Ages, wait_readable
 from thermoctl.channels import AT, DEFAULT, AxesChannels, Channels
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import ABSENT, STALE, HardwareError, Sample
+from thermoctl_hal.board import Board
+from thermoctl_hal.device import Device
+from thermoctl_hal.poller import RECONNECT_S, poll_until, ports
+from thermoctl_hal.wire import Ages, wait_readable
 
 
 class DevicesBackend:
-    """`hal.backend.Backend` over real devices.
+    """`thermoctl_hal.backend.Backend` over real devices.
 
     Other processes poll the slow devices and post to `board`; without a board, threads of this process poll
     them. A fast device may be absent at the start when none of its roles is `required` (None: every role
@@ -98,7 +98,7 @@ class DevicesBackend:
         self._threads.append(thread)
 
     def read(self, now_s: float) -> Sample:
-        """Read all devices once; see hal.backend."""
+        """Read all devices once; see thermoctl_hal.backend."""
         sample = self.sample
         self._now_s = now_s
         self._ages.begin()
@@ -147,7 +147,7 @@ class DevicesBackend:
         wait_readable(-1, due_ns)
 
     def write(self, drive: float, enable: bool, axis: int = 0) -> None:
-        """Send the command to the device that drives this axis; see hal.backend."""
+        """Send the command to the device that drives this axis; see thermoctl_hal.backend."""
         if not enable or drive - drive != 0.0:  # not finite
             drive, enable = 0.0, False
         for device in self.fast:
@@ -162,7 +162,7 @@ class DevicesBackend:
                     self.board.send(device, drive, enable, self._now_s)
 
     def close(self) -> None:
-        """Disable and release everything; see hal.backend."""
+        """Disable and release everything; see thermoctl_hal.backend."""
         self._stop.set()
         for repair in list(self._repairs.values()):
             repair.join(5.0)

@@ -1,7 +1,7 @@
 # C types for drive.py, which runs in every tick; see there.
 cimport cython
-from hal.device cimport Device
-from hal.wire cimport CanPort, nearest
+from thermoctl_hal.device cimport Device
+from thermoctl_hal.wire cimport CanPort, nearest
 
 cdef int _SYNC_ID, _PRE_OPERATIONAL
 cdef double _OFFLINE, _DISABLED, _ENABLED, _FAULT, _QUICK_STOP, _RESET_S

@@ -4,7 +4,7 @@
 RPDO 1 = control word | command, then SYNC. TPDO 1 answers the SYNC with status word | readings; it is read
 one tick later. Heartbeats go both ways: the drive stops by itself when ours is missing for `watchdog_s`, and
 its channels are ERROR when its own is missing. Set-up (identity, heartbeats, mode, PDO mapping, NMT start):
-hal.cia402.
+thermoctl_hal.cia402.
 
     status word & mask = value -> state          control word for the next step towards 'operation enabled'
       0x4F  0x00  not ready to switch on         -                        (the drive goes on by itself)
@@ -29,7 +29,8 @@ import struct
 import time
 from array import array
 
-from hal.backend import (
+from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import (
     AMP_DISABLED,
     AMP_ENABLED,
     AMP_FAULT,
@@ -38,9 +39,9 @@ from hal.backend import (
     HardwareError,
     Sample,
 )
-from hal.binding import Binding
-from hal.can_bus import AnyPort, open_can
-from hal.cia402 import (
+from thermoctl_hal.binding import Binding
+from thermoctl_hal.can_bus import AnyPort, open_can
+from thermoctl_hal.cia402 import (
     NMT_ID,
     NMT_RESET_COMMUNICATION,
     NMT_START,
@@ -52,11 +53,10 @@ from hal.cia402 import (
     set_up,
     switch_off,
 )
-from hal.device import Device
-from hal.profile import STATUS_WORD, Cia402, Object, typed
-from hal.read_drive import ACTUAL_POSITION, POSITION_MODES
-from hal.wire import nearest
-from thermoctl.yamlfile import InputError
+from thermoctl_hal.device import Device
+from thermoctl_hal.profile import STATUS_WORD, Cia402, Object, typed
+from thermoctl_hal.read_drive import ACTUAL_POSITION, POSITION_MODES
+from thermoctl_hal.wire import nearest
 
 MAX_STEP_S = 0.01  # longest time for which a position target moves in one write
 FAULT_RESET_S = 1.0  # between attempts to reset a drive's fault while `enable` is False
@@ -83,7 +83,7 @@ _STATES = (
 
 
 def drive_state(status_word: int) -> float:
-    """Return the amplifier_state (AMP_*, hal.backend) of a CiA-402 status word."""
+    """Return the amplifier_state (AMP_*, thermoctl_hal.backend) of a CiA-402 status word."""
     if status_word & 0x4F in (0x0F, 0x08):
         return _FAULT
     if status_word & 0x6F == 0x27:

@@ -27,9 +27,9 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import ABSENT, ERROR, OK, STALE, Backend, Sample
 from thermoctl.channels import AT, DEFAULT, Channels
 from thermoctl.yamlfile import Node, Section, suggest
+from thermoctl_hal.backend import ABSENT, ERROR, OK, STALE, Backend, Sample
 
 KINDS = (
     "drop",
@@ -107,7 +107,7 @@ def _roles(s: Section, kind: str, known: Mapping[str, int]) -> tuple[int, ...]:
 
 
 class FaultInjector:
-    """`hal.backend.Backend` that injects faults into another one; seeded, deterministic."""
+    """`thermoctl_hal.backend.Backend` that injects faults into another one; seeded, deterministic."""
 
     def __init__(
         self, inner: Backend, faults: Iterable[Fault], seed: int = 0, channels: Channels = DEFAULT

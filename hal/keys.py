@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from hal.checksum import ALIASES, SUMS
 from thermoctl.yamlfile import Section
+from thermoctl_hal.checksum import ALIASES, SUMS
 
 REQUIRED: Any = ...
 MAX_ADDRESS, MAX_MODBUS_BITS = 65535, 64

@@ -5,18 +5,18 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-from hal.axes import AxisBackend
-from hal.backend import Backend, HardwareError
-from hal.binding import Binding, bind, check_rig, rig_notes
-from hal.board import Board
-from hal.device import Device
-from hal.devices import DevicesBackend
-from hal.faulty import FaultInjector, schedule
-from hal.replay import replay_backend
-from hal.simulated import simulated_backend
 from thermoctl.channels import AxesChannels
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.axes import AxisBackend
+from thermoctl_hal.backend import Backend, HardwareError
+from thermoctl_hal.binding import Binding, bind, check_rig, rig_notes
+from thermoctl_hal.board import Board
+from thermoctl_hal.device import Device
+from thermoctl_hal.devices import DevicesBackend
+from thermoctl_hal.faulty import FaultInjector, schedule
+from thermoctl_hal.replay import replay_backend
+from thermoctl_hal.simulated import simulated_backend
 
 
 def make_backend(settings: Settings, board: Board | None = None) -> Backend:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from hal.profile import CanMessage, Dbc, FrameMessage, Message, Register, TextMessage
-from hal.wire import Framer
+from thermoctl_hal.profile import CanMessage, Dbc, FrameMessage, Message, Register, TextMessage
+from thermoctl_hal.wire import Framer
 
 _ADDRESS = re.compile(rb"\{address(:[^{}]*)?\}")
 _COMMAND = re.compile(rb"\{command(:[^{}]*)?\}")

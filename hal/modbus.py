@@ -4,7 +4,7 @@ Neighbours are read in one block. The profile gives the word order of a value of
 word are big-endian, by the protocol, unless the profile says otherwise. Sentinel numbers, such as an open
 thermocouple's, and status bits make the channel an ERROR while the others stay OK. After a lost or damaged
 answer, or while the device is busy, the last values are kept. A refused block is read register by register.
-One illegal address therefore does not invalidate its neighbours. hal.modbus_link opens the ports.
+One illegal address therefore does not invalidate its neighbours. thermoctl_hal.modbus_link opens the ports.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from hal.amplifier import Commanded
-from hal.backend import HardwareError, Sample
-from hal.binding import Binding, register_hint
-from hal.device import Device
-from hal.message import clipped
-from hal.modbus_link import Link, NoAnswer, join, leave
-from hal.profile import (
+from thermoctl_hal.amplifier import Commanded
+from thermoctl_hal.backend import HardwareError, Sample
+from thermoctl_hal.binding import Binding, register_hint
+from thermoctl_hal.device import Device
+from thermoctl_hal.message import clipped
+from thermoctl_hal.modbus_link import Link, NoAnswer, join, leave
+from thermoctl_hal.profile import (
     BIT_KINDS,
     REGISTER_TYPES,
     Assumed,

@@ -18,10 +18,10 @@ from pymodbus import FramerType, ModbusException
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException
 
-from hal.backend import HardwareError
-from hal.profile import LineSettings
-from hal.serial_line import NETWORK, open_port
-from hal.wire import checksum
+from thermoctl_hal.backend import HardwareError
+from thermoctl_hal.profile import LineSettings
+from thermoctl_hal.serial_line import NETWORK, open_port
+from thermoctl_hal.wire import checksum
 
 FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 """Modbus function code that reads a kind."""

@@ -9,11 +9,11 @@ import threading
 import time
 from collections.abc import Iterable
 
-from hal.backend import STALE, HardwareError, Sample
-from hal.binding import port_key
-from hal.board import Board
-from hal.device import Device
-from hal.profile import Assumed
+from thermoctl_hal.backend import STALE, HardwareError, Sample
+from thermoctl_hal.binding import port_key
+from thermoctl_hal.board import Board
+from thermoctl_hal.device import Device
+from thermoctl_hal.profile import Assumed
 
 RECONNECT_S = 0.25  # between attempts to open a device that is gone
 COMMAND_AGE_S = 0.25  # an amplifier is disabled when the loop's last command is older

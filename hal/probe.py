@@ -11,16 +11,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from hal.backend import ERROR, OK, ROLE, ROLES, HardwareError, Sample
-from hal.binding import Binding, Bound
-from hal.can_bus import open_can
-from hal.cia402 import Objects, Sdo
-from hal.device import Device
-from hal.make import driver
-from hal.modbus_link import FUNCTIONS, Link, NoAnswer
-from hal.profile import ERROR_CODE, Assumed, Cia402, LineSettings, Modbus, Object, Profile, typed
-from hal.serial_line import open_port
-from hal.wire import EXTENDED, read_available
+from thermoctl_hal.backend import ERROR, OK, ROLE, ROLES, HardwareError, Sample
+from thermoctl_hal.binding import Binding, Bound
+from thermoctl_hal.can_bus import open_can
+from thermoctl_hal.cia402 import Objects, Sdo
+from thermoctl_hal.device import Device
+from thermoctl_hal.make import driver
+from thermoctl_hal.modbus_link import FUNCTIONS, Link, NoAnswer
+from thermoctl_hal.profile import ERROR_CODE, Assumed, Cia402, LineSettings, Modbus, Object, Profile, typed
+from thermoctl_hal.serial_line import open_port
+from thermoctl_hal.wire import EXTENDED, read_available
 
 SHOWN_BYTES, FIRST_REGISTERS, PAUSE_S = 256, 10, 0.002
 

@@ -1,13 +1,12 @@
 """Hold a device profile: vendor, model, bus and channels.
 
 A device is described, not programmed. A profile (`format: thermoctl-device/1`) describes the product; a
-binding (hal.binding) says where the device is on this rig. Every channel has
+binding (thermoctl_hal.binding) says where the device is on this rig. Every channel has
 
     reading = raw * scale + offset      in `unit`; outside `range`: error; older than `stale_after_s`: stale
 
 and the place of its raw number on the bus. Buses: serial-binary (framed bytes), serial-lines (text), can-dbc
-(any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). hal.read_profile reads the
-files.
+(any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). read_profile.py reads the files.
 """
 
 from __future__ import annotations
@@ -100,7 +99,7 @@ class Condition:
 class BinaryFrame:
     """sync | payload length (uint8, where has_length) | payload of typed fields | checksum | tail.
 
-    `crc` names the checksum (hal.checksum), over the bytes that `crc_over` says. `bits` are fields inside
+    `crc` names the checksum (checksum.py), over the bytes that `crc_over` says. `bits` are fields inside
     fields. `sequence` names a counter field; its gaps are counted as lost frames. `invalid`: a frame is an
     error unless the test holds. `signs`: field -> test for minus. `constants`: field -> its number; other
     frames are ignored. `other_endian`: fields whose byte order is the other one. `request` is sent

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from hal.keys import take
-from hal.profile import (
+from thermoctl.yamlfile import Node, Section, integer_of, kind_of, number_of
+from thermoctl_hal.keys import take
+from thermoctl_hal.profile import (
     ERROR_CODE,
     FIELD_TYPES,
     STATUS_WORD,
@@ -19,8 +20,7 @@ from hal.profile import (
     object_name,
     typed,
 )
-from hal.read_serial import named
-from thermoctl.yamlfile import Node, Section, integer_of, kind_of, number_of
+from thermoctl_hal.read_serial import named
 
 MAX_SUB_INDEX = 255
 OBJECT_TYPES = {t: c for t, c in FIELD_TYPES.items() if t[-2:] != "64" and not t.startswith("float")}

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from hal.keys import take
-from hal.profile import (
+from thermoctl.yamlfile import Node, Section, integer_of, number_of
+from thermoctl_hal.keys import take
+from thermoctl_hal.profile import (
     FRAME_TYPES,
     Amplifier,
     BinaryFrame,
@@ -26,8 +27,7 @@ from hal.profile import (
     TextMessage,
     object_name,
 )
-from hal.read_serial import bytes_of, checksum_name, named
-from thermoctl.yamlfile import Node, Section, integer_of, number_of
+from thermoctl_hal.read_serial import bytes_of, checksum_name, named
 
 COMMAND, ADDRESS = "command", "address"
 POSITION_MODES, REFUSED_MODES = (8,), (1, 2, 6, 7)

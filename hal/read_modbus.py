@@ -5,9 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from hal.keys import take
-from hal.profile import BIT_KINDS, REGISTER_TYPES, WORD_BYTES, BusSpec, Condition, Modbus, Register, typed
 from thermoctl.yamlfile import Section, number_of
+from thermoctl_hal.keys import take
+from thermoctl_hal.profile import (
+    BIT_KINDS,
+    REGISTER_TYPES,
+    WORD_BYTES,
+    BusSpec,
+    Condition,
+    Modbus,
+    Register,
+    typed,
+)
 
 REGISTERS = 65536  # addresses of a Modbus unit
 _WORD_BITS = 8 * WORD_BYTES

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from hal.keys import take
-from hal.profile import Assumed, BusSpec, Channel, Dbc, DbcSource, Profile, Source, typed
-from hal.read_can import read_cia402, read_dbc, read_object, read_signal
-from hal.read_drive import read_amplifier
-from hal.read_modbus import read_modbus, read_register
-from hal.read_serial import read_field, read_frame, read_line, read_text, read_text_field
-from hal.units import dbc_unit, is_convertible
 from thermoctl import yamlfile
 from thermoctl.yamlfile import Section
+from thermoctl_hal.keys import take
+from thermoctl_hal.profile import Assumed, BusSpec, Channel, Dbc, DbcSource, Profile, Source, typed
+from thermoctl_hal.read_can import read_cia402, read_dbc, read_object, read_signal
+from thermoctl_hal.read_drive import read_amplifier
+from thermoctl_hal.read_modbus import read_modbus, read_register
+from thermoctl_hal.read_serial import read_field, read_frame, read_line, read_text, read_text_field
+from thermoctl_hal.units import dbc_unit, is_convertible
 
 FORMAT = "thermoctl-device/1"
 STATE = "state"  # channel of an amplifier that reports no state

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from hal.checksum import ALIASES, SUMS, algorithm, names
-from hal.keys import take
-from hal.profile import (
+from thermoctl.yamlfile import Node, Section, integer_of, suggest
+from thermoctl_hal.checksum import ALIASES, SUMS, algorithm, names
+from thermoctl_hal.keys import take
+from thermoctl_hal.profile import (
     FRAME_TYPES,
     BinaryFrame,
     Bits,
@@ -20,8 +21,7 @@ from hal.profile import (
     TextLine,
     typed,
 )
-from hal.text_number import BASES, takes_letters
-from thermoctl.yamlfile import Node, Section, integer_of, suggest
+from thermoctl_hal.text_number import BASES, takes_letters
 
 # limits of wire.Framer: sync and tail bytes, fields, payload bytes (a uint8 length)
 MAX_SYNC, MAX_FIELDS, MAX_PAYLOAD = 8, 64, 255

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.backend import OK, STALE, Sample
-from hal.units import role_units
 from thermoctl.channels import DEFAULT, Channels
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, suggest
+from thermoctl_hal.backend import OK, STALE, Sample
+from thermoctl_hal.units import role_units
 
 STALE_PERIODS = 5  # a channel is stale after this many of its usual (median) periods without a reading
 
@@ -32,7 +32,7 @@ def replay_backend(settings: Settings) -> ReplayBackend:
 
 
 class ReplayBackend:
-    """`hal.backend.Backend` over a Table."""
+    """`thermoctl_hal.backend.Backend` over a Table."""
 
     def __init__(self, table: Table, roles: Mapping[str, str], channels: Channels = DEFAULT) -> None:
         for column in roles:

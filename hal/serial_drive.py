@@ -6,12 +6,12 @@ import errno
 import os
 import time
 
-from hal.amplifier import Commanded
-from hal.backend import HardwareError, Sample
-from hal.binding import Binding
-from hal.message import serial_bytes
-from hal.profile import Message
-from hal.serial_port import SerialDevice
+from thermoctl_hal.amplifier import Commanded
+from thermoctl_hal.backend import HardwareError, Sample
+from thermoctl_hal.binding import Binding
+from thermoctl_hal.message import serial_bytes
+from thermoctl_hal.profile import Message
+from thermoctl_hal.serial_port import SerialDevice
 
 
 class SerialDrive(Commanded, SerialDevice):

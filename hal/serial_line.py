@@ -15,9 +15,9 @@ import termios
 
 import serial
 
-from hal.backend import HardwareError
-from hal.latency_timer import set_latency_timer
-from hal.profile import LineSettings
+from thermoctl_hal.backend import HardwareError
+from thermoctl_hal.latency_timer import set_latency_timer
+from thermoctl_hal.profile import LineSettings
 
 NETWORK = "socket://"
 CONNECT_S = 3.0  # longest time to connect to a network adapter

@@ -1,7 +1,7 @@
 # C types for serial_port.py, which runs in every tick; see there.
 cimport cython
-from hal.device cimport Device
-from hal.wire cimport Framer
+from thermoctl_hal.device cimport Device
+from thermoctl_hal.wire cimport Framer
 
 cdef class SerialDevice(Device):
     cdef public object _port, _line, _lines, _text, _fields

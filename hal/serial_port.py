@@ -1,8 +1,8 @@
 # cython: annotation_typing=False, cdivision=True
 """Serial devices: framed bytes with a checksum, and lines of text.
 
-hal.serial_line opens the port, hal.wire.Framer finds the frames in the bytes. Several devices that answer
-requests may share a line (RS-485): hal.shared_line opens it once and asks one of them at a time.
+serial_line.py opens the port, wire.Framer finds the frames in the bytes. Several devices that answer
+requests may share a line (RS-485): shared_line.py opens it once and asks one of them at a time.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import re
 from array import array
 from typing import Any
 
-from hal.backend import Sample
-from hal.binding import Binding
-from hal.device import Device
-from hal.message import with_address
-from hal.profile import Assumed, BinaryFrame, TextField, TextLine, typed
-from hal.serial_line import LineReader, open_port
-from hal.shared_line import SharedLine, join, leave
-from hal.text_number import cut_short, number, shown, why_no_match, why_no_number
-from hal.wire import Framer, checksum, read_available, wait_readable
+from thermoctl_hal.backend import Sample
+from thermoctl_hal.binding import Binding
+from thermoctl_hal.device import Device
+from thermoctl_hal.message import with_address
+from thermoctl_hal.profile import Assumed, BinaryFrame, TextField, TextLine, typed
+from thermoctl_hal.serial_line import LineReader, open_port
+from thermoctl_hal.shared_line import SharedLine, join, leave
+from thermoctl_hal.text_number import cut_short, number, shown, why_no_match, why_no_number
+from thermoctl_hal.wire import Framer, checksum, read_available, wait_readable
 
 
 class SerialDevice(Device):

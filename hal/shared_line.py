@@ -10,13 +10,13 @@ import contextlib
 import threading
 from typing import Protocol
 
-from hal.profile import LineSettings
-from hal.serial_line import open_port
-from hal.wire import read_available
+from thermoctl_hal.profile import LineSettings
+from thermoctl_hal.serial_line import open_port
+from thermoctl_hal.wire import read_available
 
 
 class Asked(Protocol):
-    """A device of a shared line, as the line sees it (hal.serial_port.SerialDevice)."""
+    """A device of a shared line, as the line sees it (thermoctl_hal.serial_port.SerialDevice)."""
 
     answer_s: float
 

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, STALE, Sample
 from thermoctl.channels import AT, DEFAULT, Channels
 from thermoctl.plant import load
 from thermoctl.plant.language import SensorNoise
@@ -28,6 +27,7 @@ from thermoctl.plant.sensor import SlowError
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, Node, Section, suggest
+from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, STALE, Sample
 
 MAX_CATCH_UP = 1000  # periods in one read; when the clock jumps further (suspend), the plant skips that time
 SLOWEST_S = 3600.0  # longest time constant of a simulated 1/f error; slower parts count as offset
@@ -212,7 +212,7 @@ def simulated_backend(settings: Settings) -> SimulatedBackend:
 
 
 class SimulatedBackend:
-    """`hal.backend.Backend` over a PlantRig."""
+    """`thermoctl_hal.backend.Backend` over a PlantRig."""
 
     def __init__(
         self, rig: PlantRig, period_s: float, sensor_period_s: float, channels: Channels = DEFAULT

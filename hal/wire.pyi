@@ -3,8 +3,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.backend import Sample
-from hal.profile import BinaryFrame
+from thermoctl_hal.backend import Sample
+from thermoctl_hal.profile import BinaryFrame
 
 EXTENDED: int
 _Bytes = bytes | bytearray | memoryview

@@ -21,8 +21,8 @@ from libc.string cimport memcmp, memcpy, memmove
 from posix.time cimport CLOCK_MONOTONIC, clock_gettime, timespec
 from posix.unistd cimport read as c_read, write as c_write
 
-from hal.checksum import algorithm
-from hal.profile import FRAME_TYPES
+from thermoctl_hal.checksum import algorithm
+from thermoctl_hal.profile import FRAME_TYPES
 
 EXTENDED = 0x80000000
 """Bit 31 of an identifier: it has 29 bits. An 11-bit identifier of the same number is another one."""
@@ -39,7 +39,7 @@ cdef extern from "<poll.h>" nogil:
     int ppoll(pollfd *what, unsigned long count, const timespec *timeout, const void *mask)
 
 cdef class Checksum:
-    """A checksum of hal.checksum by its name. Raises ValueError for an unknown one."""
+    """A checksum of thermoctl_hal.checksum by its name. Raises ValueError for an unknown one."""
 
     def __init__(self, str name):
         cdef int byte, k
@@ -156,7 +156,7 @@ cdef class Framer:
     `quiet_` counters restart at every good frame: bytes received, wrong checksums (`sums`) and wrong length
     bytes since then.
 
-    spec: hal.profile.BinaryFrame. Raises ValueError for a frame that is too long.
+    spec: thermoctl_hal.profile.BinaryFrame. Raises ValueError for a frame that is too long.
     """
 
     def __init__(self, spec):

@@ -1,4 +1,4 @@
-"""The import graph of thermoctl and hal, read from the source: `python -m tests.architecture` prints it.
+"""The import graph of thermoctl and thermoctl_hal, read from the source: `python -m tests.architecture` prints it.
 
 Every import counts: at the top of a module, inside a function, under TYPE_CHECKING, and `cimport` in Cython sources.
 So does a function that a row of thermoctl/commands.py names as text, "module:function".
@@ -14,10 +14,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs/explanation/architecture.md"
-_CYTHON = re.compile(
-    r"^\s*(?:from\s+((?:thermoctl|hal)[\w.]*)\s+c?import\s+(.+)|c?import\s+((?:thermoctl|hal)[\w.]*))"
-)
-_FUNCTION = re.compile(r"((?:thermoctl|hal)\.[\w.]+):\w+$")
+_CYTHON = re.compile(r"^\s*(?:from\s+(thermoctl[\w.]*)\s+c?import\s+(.+)|c?import\s+(thermoctl[\w.]*))")
+_FUNCTION = re.compile(r"(thermoctl(?:_hal)?\.[\w.]+):\w+$")
 
 Graph = dict[str, set[str]]
 
@@ -25,7 +23,7 @@ Graph = dict[str, set[str]]
 def modules() -> dict[str, Path]:
     """Every module of the product by its dotted name; a package is its `__init__`."""
     found = {}
-    for top in ("thermoctl", "hal"):
+    for top in ("thermoctl", "thermoctl_hal"):
         for path in sorted((ROOT / top).rglob("*.py*")):
             if path.suffix in (".py", ".pyx", ".pxd"):
                 parts = path.relative_to(ROOT).with_suffix("").parts
@@ -67,7 +65,7 @@ def module_graph() -> Graph:
 def package(module: str) -> str:
     """The package or loose module of the product that a module belongs to: `plant`, `yamlfile`, `hal`, `hal.virtual`."""
     parts = module.split(".")
-    if parts[0] == "hal":
+    if parts[0] == "thermoctl_hal":
         return "hal.virtual" if parts[1:2] == ["virtual"] else "hal"
     return parts[1] if len(parts) > 1 else "thermoctl"
 

@@ -939,8 +939,8 @@ def run(args: argparse.Namespace) -> int:
 
 def virtual_rig(settings: Any, line: str) -> int:
     """Simulate the devices of a configuration, or send `line` to a running virtual rig."""
-    from hal.virtual.rig import main
     from thermoctl.yamlfile import InputError
+    from thermoctl_hal.virtual.rig import main
 
     if settings.hal.backend != "devices":
         raise InputError(

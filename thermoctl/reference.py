@@ -20,7 +20,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from hal.keys import REQUIRED, TABLES, Key
 from thermoctl import api
 from thermoctl.channels import DEFAULT
 from thermoctl.cli import parser
@@ -30,6 +29,7 @@ from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.settings import SECTIONS, options
 from thermoctl.signals import FAULT_WORD_BITS, SIGNALS
 from thermoctl.which_rig import ACTS
+from thermoctl_hal.keys import REQUIRED, TABLES, Key
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 _HEAD = "<!-- Written by `python -m thermoctl.reference`; change the table in the code, not this page. -->\n"

@@ -8,9 +8,9 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
-from hal.binding import Binding, Bound
-from hal.virtual.plants import Readings
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.binding import Binding, Bound
+from thermoctl_hal.virtual.plants import Readings
 
 SUPPLY_V = 24.0
 MAX_READ = 4096

@@ -11,7 +11,7 @@ import math
 import struct
 from dataclasses import dataclass, field
 
-from hal.wire import EXTENDED
+from thermoctl_hal.wire import EXTENDED
 
 NOT_READY, DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
 BOOT, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F

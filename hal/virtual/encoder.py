@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 
-from hal.binding import Binding
-from hal.profile import BinaryFrame, typed
-from hal.virtual.device import PtyDevice
-from hal.virtual.plants import Readings
-from hal.wire import Framer
+from thermoctl_hal.binding import Binding
+from thermoctl_hal.profile import BinaryFrame, typed
+from thermoctl_hal.virtual.device import PtyDevice
+from thermoctl_hal.virtual.plants import Readings
+from thermoctl_hal.wire import Framer
 
 
 class EncoderStream(PtyDevice):

@@ -9,8 +9,8 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from hal.profile import REGISTER_TYPES, Register
-from hal.wire import checksum
+from thermoctl_hal.profile import REGISTER_TYPES, Register
+from thermoctl_hal.wire import checksum
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from hal.simulated import PlantRig
+from thermoctl_hal.simulated import PlantRig
 
 
 class Plants:

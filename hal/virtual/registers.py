@@ -6,12 +6,12 @@ import contextlib
 import re
 import socket
 
-from hal.binding import Binding
-from hal.profile import Register, typed
-from hal.virtual.device import PtyDevice, channel_of
-from hal.virtual.modbus import ModbusUnit
-from hal.virtual.plants import Readings
 from thermoctl.yamlfile import InputError, suggest
+from thermoctl_hal.binding import Binding
+from thermoctl_hal.profile import Register, typed
+from thermoctl_hal.virtual.device import PtyDevice, channel_of
+from thermoctl_hal.virtual.modbus import ModbusUnit
+from thermoctl_hal.virtual.plants import Readings
 
 MEANS = ("voltage_v", "current_a")  # roles whose register holds the mean since its last refresh
 MAX_EXCEPTION = 11  # largest exception code of Modbus

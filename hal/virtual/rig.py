@@ -30,17 +30,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
-from hal.binding import Binding, bind, check_rig
-from hal.simulated import make_rig
-from hal.virtual.device import VirtualDevice
-from hal.virtual.encoder import EncoderStream
-from hal.virtual.plants import Plants, Readings
-from hal.virtual.registers import ModbusOnWire
-from hal.virtual.slcan import DbcAmplifier, DbcSender, DriveOnSlcan, SlcanLine
-from hal.virtual.text_meter import TextMeter
 from thermoctl.channels import AxesChannels
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, suggest
+from thermoctl_hal.binding import Binding, bind, check_rig
+from thermoctl_hal.simulated import make_rig
+from thermoctl_hal.virtual.device import VirtualDevice
+from thermoctl_hal.virtual.encoder import EncoderStream
+from thermoctl_hal.virtual.plants import Plants, Readings
+from thermoctl_hal.virtual.registers import ModbusOnWire
+from thermoctl_hal.virtual.slcan import DbcAmplifier, DbcSender, DriveOnSlcan, SlcanLine
+from thermoctl_hal.virtual.text_meter import TextMeter
 
 MAX_STEPS = 50  # most periods simulated at once; after a longer stop the plant skips the rest
 REFERENCE_HZ = 100

@@ -6,8 +6,9 @@ import math
 import time
 from collections.abc import Callable
 
-from hal.binding import Binding, Bound
-from hal.profile import (
+from thermoctl.yamlfile import InputError
+from thermoctl_hal.binding import Binding, Bound
+from thermoctl_hal.profile import (
     ERROR_CODE,
     STATUS_WORD,
     Amplifier,
@@ -19,12 +20,11 @@ from hal.profile import (
     Object,
     typed,
 )
-from hal.read_drive import POSITION_MODES
-from hal.virtual.device import Pty, PtyDevice
-from hal.virtual.drive import ENABLED, Cia402Drive, Frame, SlcanAdapter
-from hal.virtual.plants import Readings
-from hal.wire import encode_slcan
-from thermoctl.yamlfile import InputError
+from thermoctl_hal.read_drive import POSITION_MODES
+from thermoctl_hal.virtual.device import Pty, PtyDevice
+from thermoctl_hal.virtual.drive import ENABLED, Cia402Drive, Frame, SlcanAdapter
+from thermoctl_hal.virtual.plants import Readings
+from thermoctl_hal.wire import encode_slcan
 
 
 class SlcanLine(Pty):

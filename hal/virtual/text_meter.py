@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 
-from hal.binding import Binding
-from hal.profile import TextField, TextLine, typed
-from hal.serial_line import LineReader
-from hal.virtual.device import PtyDevice
-from hal.virtual.plants import Readings
+from thermoctl_hal.binding import Binding
+from thermoctl_hal.profile import TextField, TextLine, typed
+from thermoctl_hal.serial_line import LineReader
+from thermoctl_hal.virtual.device import PtyDevice
+from thermoctl_hal.virtual.plants import Readings
 
 
 class TextMeter(PtyDevice):

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.backend import ABSENT, OK, Sample
 from tests.bench.realtime.run import law_numbers
 from thermoctl.channels import AT, COIL, DEFAULT, Channels, Point, of_points
 from thermoctl.control.law import COMPILED, Law
@@ -28,6 +27,7 @@ from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.loop import Rig
 from thermoctl.daemon.ring import Ring
 from thermoctl.signals import OUTPUTS, of_channels
+from thermoctl_hal.backend import ABSENT, OK, Sample
 
 TICKS, REPEATS = 5000, 15
 HERE = Path(__file__).parent

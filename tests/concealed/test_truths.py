@@ -209,7 +209,7 @@ def test_a_case_is_a_function_of_seed_and_number():
 
 
 def test_the_generator_knows_nothing_of_the_product():
-    code = "import sys, tests.concealed.generate; print([m for m in sys.modules if m.split('.')[0] in ('thermoctl','hal')])"
+    code = "import sys, tests.concealed.generate; print([m for m in sys.modules if m.split('.')[0] in ('thermoctl','thermoctl_hal')])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
 

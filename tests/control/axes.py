@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-import hal.axes
-from hal.backend import AMP_DISABLED, AMP_ENABLED, OK, Sample
+import thermoctl_hal.axes
 from thermoctl import channels
 from thermoctl.channels import AT, COIL
 from thermoctl.control import arming, faults
@@ -25,11 +24,12 @@ from thermoctl.daemon import loop, processes
 from thermoctl.daemon.ring import Mailbox
 from thermoctl.signals import AT as SIGNAL_AT
 from thermoctl.signals import fault_word
+from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, OK, Sample
 
 MUTATED = (
     (Path(loop.__file__).with_name("loop.py"), ("for other in self.guards:", "trips_others")),
     (Path(processes.__file__), ("guard",)),
-    (Path(hal.axes.__file__), ("__init__", "read", "write", "problem")),
+    (Path(thermoctl_hal.axes.__file__), ("__init__", "read", "write", "problem")),
     (Path(channels.__file__), ("names", "index", "parts", "copies")),
 )
 """Files and their functions: of channels.py those of AxesChannels."""
@@ -57,7 +57,7 @@ def build(trees: dict[str, ast.Module]) -> SimpleNamespace:
 
 
 PRODUCT = SimpleNamespace(
-    Rig=loop.Rig, guard=processes.guard, AxisBackend=hal.axes.AxisBackend, channels=channels
+    Rig=loop.Rig, guard=processes.guard, AxisBackend=thermoctl_hal.axes.AxisBackend, channels=channels
 )
 
 

@@ -87,7 +87,7 @@ def test_a_channel_is_added_in_one_row():
         {"thermoctl.channels": (end, end + row)},
         """
 import numpy as np
-from hal.backend import ROLES, Sample
+from thermoctl_hal.backend import ROLES, Sample
 from thermoctl import channels, signals, reference
 from thermoctl.control import causes, faults, law, model
 from thermoctl.daemon import readings

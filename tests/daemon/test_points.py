@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import yaml
 
-from hal.virtual.rig import VirtualRig
 from tests.people.running import Running
 from tests.rigs.chain import plants, rig_text
 from thermoctl.channels import DEFAULT, MAX_POINTS, of_text
@@ -23,6 +22,7 @@ from thermoctl.recording.writer import FULL, RecordingWriter, recording_files
 from thermoctl.settings import effective, load_settings
 from thermoctl.signals import AT, of_channels, recorded_states
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.virtual.rig import VirtualRig
 
 SPINDLE = ("motor", "spindle_front_bearing", "rear_bearing", "frame")
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import thermoctl
-from hal.backend import ERROR, OK, ROLE, ROLES, STALE
 from tests.daemon.conftest import make_model
 from thermoctl.channels import CHANNELS, DEFAULT
 from thermoctl.control import arming, faults
@@ -18,6 +17,7 @@ from thermoctl.daemon.replay import replay
 from thermoctl.daemon.simulate import Simulation, run_simulated
 from thermoctl.signals import INDEX, NAMES, SIGNALS
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import ERROR, OK, ROLE, ROLES, STALE
 
 
 def column(rows, name):

@@ -8,12 +8,12 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
-from hal.backend import ROLE, STATUS_NAMES, Sample
-from hal.binding import bind, check_rig
-from hal.device import Device
-from hal.devices import DevicesBackend
-from hal.make import driver
 from thermoctl import yamlfile
+from thermoctl_hal.backend import ROLE, STATUS_NAMES, Sample
+from thermoctl_hal.binding import bind, check_rig
+from thermoctl_hal.device import Device
+from thermoctl_hal.devices import DevicesBackend
+from thermoctl_hal.make import driver
 
 HEAD = "format: thermoctl-device/1\nvendor: test\nmodel: test\n"
 POSITION = "unit: um, range: [-1e9, 1e9], rate_hz: 10, stale_after_s: 5"

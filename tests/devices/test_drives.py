@@ -12,14 +12,14 @@ import time
 
 import pytest
 
-from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, ROLE, STALE
-from hal.binding import bind, check_rig, rig_notes
-from hal.make import driver
-from hal.read_profile import load_profile
 from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, Unit, encode
 from tests.devices.harness import HEAD, Rig, wait
 from thermoctl import yamlfile
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, ROLE, STALE
+from thermoctl_hal.binding import bind, check_rig, rig_notes
+from thermoctl_hal.make import driver
+from thermoctl_hal.read_profile import load_profile
 
 AXIS_DBC = """VERSION ""
 NS_ :
@@ -469,8 +469,8 @@ def test_a_drive_that_takes_can_fd_frames(tmp_path):
     """The library's moteus profile: mode, torque and a query in one frame of 32 bytes; a watchdog of its own."""
     import can
 
-    from hal.probe import Probe
     from thermoctl.devices.library import find
+    from thermoctl_hal.probe import Probe
 
     name = f"moteus-{tmp_path.name}"
     bus = can.Bus(name, interface="virtual", fd=True)

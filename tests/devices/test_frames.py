@@ -10,12 +10,12 @@ import zlib
 
 import pytest
 
-from hal.backend import ERROR, ROLE, Sample
-from hal.checksum import algorithm, names
-from hal.read_profile import load_profile
-from hal.wire import checksum
 from tests.devices.harness import HEAD, POSITION, Line, make, wait
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import ERROR, ROLE, Sample
+from thermoctl_hal.checksum import algorithm, names
+from thermoctl_hal.read_profile import load_profile
+from thermoctl_hal.wire import checksum
 
 P = ROLE["position_um"]
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from hal.keys import REQUIRED, TABLES, take
 from thermoctl import yamlfile
 from thermoctl.yamlfile import InputError, Section
+from thermoctl_hal.keys import REQUIRED, TABLES, take
 
 KEYS = [(table, key) for table, keys in TABLES.items() for key in keys]
 

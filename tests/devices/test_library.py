@@ -10,15 +10,15 @@ from dataclasses import replace
 
 import pytest
 
-from hal.backend import HardwareError
-from hal.probe import Probe, read_for
-from hal.read_profile import load_profile
 from tests.devices.library import CASES, UNTRIED
 from thermoctl import cli
 from thermoctl.devices.library import find
 from thermoctl.devices.new import new
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import HardwareError
+from thermoctl_hal.probe import Probe, read_for
+from thermoctl_hal.read_profile import load_profile
 
 NAMES = sorted(p.stem for p in shipped("config/devices/library").glob("*.yaml"))
 

@@ -7,15 +7,15 @@ import time
 import can
 import pytest
 
-from hal import modbus_link
-from hal.backend import HardwareError, Sample
-from hal.binding import bind, check_rig
-from hal.can_bus import open_can
-from hal.profile import LineSettings
 from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, Unit, encode, words
 from tests.devices.harness import HEAD, Line, Rig
 from thermoctl import yamlfile
 from thermoctl.yamlfile import InputError
+from thermoctl_hal import modbus_link
+from thermoctl_hal.backend import HardwareError, Sample
+from thermoctl_hal.binding import bind, check_rig
+from thermoctl_hal.can_bus import open_can
+from thermoctl_hal.profile import LineSettings
 
 READ = "rate_hz: 50, stale_after_s: 5"
 TC = f"""{HEAD}bus: modbus

@@ -26,15 +26,15 @@ from typing import Any
 
 import can
 
-from hal.backend import ABSENT, ERROR, OK, STALE, HardwareError, Sample
-from hal.binding import bind
-from hal.can_bus import open_can
-from hal.dbc import DbcDevice
-from hal.drive import Cia402Device
-from hal.modbus import ModbusDevice
-from hal.serial_port import SerialDevice
-from hal.wire import Framer
 from thermoctl import yamlfile
+from thermoctl_hal.backend import ABSENT, ERROR, OK, STALE, HardwareError, Sample
+from thermoctl_hal.binding import bind
+from thermoctl_hal.can_bus import open_can
+from thermoctl_hal.dbc import DbcDevice
+from thermoctl_hal.drive import Cia402Device
+from thermoctl_hal.modbus import ModbusDevice
+from thermoctl_hal.serial_port import SerialDevice
+from thermoctl_hal.wire import Framer
 
 CONFIG = Path(__file__).parents[2] / "config/devices"
 FOLDER = Path(tempfile.mkdtemp(prefix="thermoctl-fuzz-"))

@@ -59,11 +59,11 @@ def plant() -> tuple[Callable[[bytes], Any], list[bytes]]:
 
 def config() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """A configuration, with its device profiles and faults."""
-    from hal.binding import bind
-    from hal.faulty import schedule
-    from hal.read_profile import load_profile
     from thermoctl.daemon.assemble import law_parameters
     from thermoctl.settings import effective, load_settings
+    from thermoctl_hal.binding import bind
+    from thermoctl_hal.faulty import schedule
+    from thermoctl_hal.read_profile import load_profile
 
     def one(data: bytes) -> None:
         settings = load_settings(_file(data, ".yaml"))
@@ -115,9 +115,9 @@ def _cut(data: bytes) -> list[bytes]:
 
 def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """Encoder frames and text lines in any pieces; what the framer keeps stays small."""
-    from hal.profile import BinaryFrame
-    from hal.serial_line import LineReader
-    from hal.wire import Framer
+    from thermoctl_hal.profile import BinaryFrame
+    from thermoctl_hal.serial_line import LineReader
+    from thermoctl_hal.wire import Framer
 
     fields = (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8"))
     specs = [
@@ -148,8 +148,8 @@ def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
 
 def slcan() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """An adapter's answers, and a drive's frames behind them."""
-    from hal.drive import drive_state, next_control_word
-    from hal.wire import SlcanParser, encode_slcan
+    from thermoctl_hal.drive import drive_state, next_control_word
+    from thermoctl_hal.wire import SlcanParser, encode_slcan
 
     def one(data: bytes) -> None:
         parser = SlcanParser()
@@ -176,10 +176,10 @@ def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
     import socket
     import threading
 
-    from hal.backend import HardwareError, Sample
-    from hal.binding import bind
-    from hal.modbus import ModbusDevice
     from thermoctl import yamlfile
+    from thermoctl_hal.backend import HardwareError, Sample
+    from thermoctl_hal.binding import bind
+    from thermoctl_hal.modbus import ModbusDevice
 
     listener = socket.create_server(("127.0.0.1", 0))
     answer = [b""]
@@ -412,7 +412,7 @@ def guided(args: argparse.Namespace) -> int:
         with log.open("w") as f:
             os.dup2(f.fileno(), 1)
             os.dup2(f.fileno(), 2)
-        with atheris.instrument_imports(include=["thermoctl", "hal", "yaml", "pymodbus"]):
+        with atheris.instrument_imports(include=["thermoctl", "thermoctl_hal", "yaml", "pymodbus"]):
             one, seeds = TARGETS[args.name]()
         corpus = FOLDER / "corpus"
         corpus.mkdir()

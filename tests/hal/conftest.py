@@ -11,10 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from hal.backend import ROLE, STATUS_NAMES, Sample
-from hal.virtual.rig import VirtualRig
 from thermoctl import yamlfile
 from thermoctl.channels import DEFAULT
+from thermoctl_hal.backend import ROLE, STATUS_NAMES, Sample
+from thermoctl_hal.virtual.rig import VirtualRig
 
 CONFIG = Path(__file__).parents[2] / "config"
 

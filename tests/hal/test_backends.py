@@ -7,16 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hal.backend import ABSENT, AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample
-from hal.faulty import FaultInjector, schedule
-from hal.make import make_backend
-from hal.replay import ReplayBackend
 from tests.hal.conftest import CONFIG, make_settings
 from thermoctl import yamlfile
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import ABSENT, AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample
+from thermoctl_hal.faulty import FaultInjector, schedule
+from thermoctl_hal.make import make_backend
+from thermoctl_hal.replay import ReplayBackend
 
 POSITION, COIL, AIR, STATE = (ROLE[r] for r in ("position_um", "coil_c", "air_c", "amplifier_state"))
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.backend import (
+from thermoctl_hal.backend import (
     AMP_DISABLED,
     AMP_ENABLED,
     AMP_FAULT,
@@ -15,9 +15,9 @@ from hal.backend import (
     HardwareError,
     Sample,
 )
-from hal.can_bus import open_can
-from hal.drive import drive_state, next_control_word
-from hal.virtual.drive import (
+from thermoctl_hal.can_bus import open_can
+from thermoctl_hal.drive import drive_state, next_control_word
+from thermoctl_hal.virtual.drive import (
     DISABLED,
     ENABLED,
     FAULT,
@@ -26,7 +26,7 @@ from hal.virtual.drive import (
     Cia402Drive,
     SlcanAdapter,
 )
-from hal.wire import EXTENDED, SlcanParser, encode_slcan
+from thermoctl_hal.wire import EXTENDED, SlcanParser, encode_slcan
 
 
 def test_slcan_ascii():
@@ -220,11 +220,11 @@ def test_library_port_over_the_virtual_interface():
 
 
 def test_dbc_device_decodes_what_cantools_encodes(tmp_path):
-    from hal.backend import ROLE
-    from hal.binding import bind
-    from hal.dbc import DbcDevice
     from tests.hal.conftest import CONFIG
     from thermoctl import yamlfile
+    from thermoctl_hal.backend import ROLE
+    from thermoctl_hal.binding import bind
+    from thermoctl_hal.dbc import DbcDevice
 
     node = yamlfile.loads(
         "{profile: meter-can.yaml, port: 'virtual:dbc', roles: {voltage: voltage_v, current: current_a}}"

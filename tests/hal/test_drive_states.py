@@ -8,12 +8,20 @@ import math
 
 import pytest
 
-from hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, AMP_QUICK_STOP, ROLE, Sample
-from hal.binding import bind
-from hal.drive import Cia402Device
-from hal.wire import CanPort
 from tests.hal.conftest import CONFIG
 from thermoctl import yamlfile
+from thermoctl_hal.backend import (
+    AMP_DISABLED,
+    AMP_ENABLED,
+    AMP_FAULT,
+    AMP_OFFLINE,
+    AMP_QUICK_STOP,
+    ROLE,
+    Sample,
+)
+from thermoctl_hal.binding import bind
+from thermoctl_hal.drive import Cia402Device
+from thermoctl_hal.wire import CanPort
 
 STATE = ROLE["amplifier_state"]
 NOT_READY, DISABLED, READY, SWITCHED_ON = 0x0000, 0x0250, 0x0231, 0x0233

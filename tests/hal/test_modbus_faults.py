@@ -14,13 +14,13 @@ import tty
 
 import pytest
 
-from hal.backend import ABSENT, ERROR, OK, ROLE, STALE, HardwareError, Sample
-from hal.binding import bind
-from hal.board import Board
-from hal.devices import DevicesBackend
-from hal.modbus import LOST_POLLS, ModbusDevice
-from hal.poller import poll_until
 from thermoctl import yamlfile
+from thermoctl_hal.backend import ABSENT, ERROR, OK, ROLE, STALE, HardwareError, Sample
+from thermoctl_hal.binding import bind
+from thermoctl_hal.board import Board
+from thermoctl_hal.devices import DevicesBackend
+from thermoctl_hal.modbus import LOST_POLLS, ModbusDevice
+from thermoctl_hal.poller import poll_until
 
 COIL, AIR, SHAFT = (ROLE[r] for r in ("coil_c", "air_c", "shaft_1_c"))
 PROFILE = """

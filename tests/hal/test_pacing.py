@@ -11,11 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hal.backend import ROLE
-from hal.binding import bind
-from hal.devices import DevicesBackend
-from hal.make import driver
-from hal.wire import Framer
 from tests.hal.conftest import CONFIG
 from tests.limits import OFF
 from thermoctl import yamlfile
@@ -29,6 +24,11 @@ from thermoctl.daemon.shared import Shared
 from thermoctl.settings import load_settings
 from thermoctl.signals import AT, INDEX
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import ROLE
+from thermoctl_hal.binding import bind
+from thermoctl_hal.devices import DevicesBackend
+from thermoctl_hal.make import driver
+from thermoctl_hal.wire import Framer
 
 PERIOD_S = 0.005
 

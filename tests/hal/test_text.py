@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.backend import ROLE, Sample
-from hal.binding import bind
-from hal.read_profile import load_profile
-from hal.serial_port import SerialDevice
-from hal.text_number import number, takes_letters
 from thermoctl import yamlfile
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import ROLE, Sample
+from thermoctl_hal.binding import bind
+from thermoctl_hal.read_profile import load_profile
+from thermoctl_hal.serial_port import SerialDevice
+from thermoctl_hal.text_number import number, takes_letters
 
 POSITION = ROLE["position_um"]
 PROFILE = """

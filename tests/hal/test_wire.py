@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from hal.backend import (
+from thermoctl_hal.backend import (
     ABSENT,
     AMP_DISABLED,
     AMP_ENABLED,
@@ -22,11 +22,11 @@ from hal.backend import (
     HardwareError,
     Sample,
 )
-from hal.board import Board
-from hal.make import make_backend, make_devices
-from hal.poller import poll_until
-from hal.virtual.drive import HEARTBEAT_LOST
-from hal.virtual.rig import tell
+from thermoctl_hal.board import Board
+from thermoctl_hal.make import make_backend, make_devices
+from thermoctl_hal.poller import poll_until
+from thermoctl_hal.virtual.drive import HEARTBEAT_LOST
+from thermoctl_hal.virtual.rig import tell
 
 POSITION, COIL, AIR, VOLTAGE, CURRENT = (
     ROLE[r] for r in ("position_um", "coil_c", "air_c", "voltage_v", "current_a")
@@ -294,8 +294,8 @@ def test_a_port_that_goes_while_it_is_opened_is_a_hardware_error(monkeypatch):
     """termios.error is no OSError: it would end the thread that connects a device again."""
     import termios
 
-    from hal.profile import LineSettings
-    from hal.serial_line import open_port
+    from thermoctl_hal.profile import LineSettings
+    from thermoctl_hal.serial_line import open_port
 
     master, slave = os.openpty()
 

@@ -13,13 +13,13 @@ import time
 import numpy as np
 import pytest
 
-from hal.virtual.rig import tell
 from tests.daemon.process import forget
 from tests.hal.conftest import CONFIG, free_port
 from thermoctl.daemon.control_socket import ask
 from thermoctl.recording.files import read_table
 from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.virtual.rig import tell
 
 pytestmark = pytest.mark.slow
 CLI = [sys.executable, "-m", "thermoctl.cli"]

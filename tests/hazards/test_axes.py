@@ -7,7 +7,6 @@ import time
 import psutil
 import pytest
 
-from hal.make import make_backends
 from tests.daemon.process import forget, wait
 from tests.rigs.axes import Axes, simulated_axes
 from tests.rigs.wire import WireRig
@@ -17,6 +16,7 @@ from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.shared import LOOP_PID, Shared
 from thermoctl.settings import load_rig
 from thermoctl.signals import AT as SIGNAL_AT
+from thermoctl_hal.make import make_backends
 
 GO_ON = "  on_other_axis_fault: go_on"
 

@@ -8,7 +8,6 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sample
 from tests.limits import OFF
 from thermoctl.control import arming, faults
 from thermoctl.control.law import WARM_UP_TICKS
@@ -16,6 +15,7 @@ from thermoctl.control.model import CompensatorModel, Parameters, packed_length
 from thermoctl.daemon.loop import RELOAD, Rig
 from thermoctl.daemon.ring import Box, Mailbox
 from thermoctl.signals import INDEX
+from thermoctl_hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sample
 
 NEEDED = ("position_um", "voltage_v", "current_a", "air_c", "coil_c", "amplifier_state")
 LIMIT = 1.5

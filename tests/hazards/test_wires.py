@@ -15,14 +15,14 @@ import types
 import numpy as np
 import pytest
 
-from hal.backend import ROLE, Sample
-from hal.devices import DevicesBackend
-from hal.make import make_devices
-from hal.virtual import drive as drives
-from hal.virtual.device import Pty
-from hal.wire import Framer
 from tests.hazards.harness import ROOT, HazardRig, say
 from thermoctl import yamlfile
+from thermoctl_hal.backend import ROLE, Sample
+from thermoctl_hal.devices import DevicesBackend
+from thermoctl_hal.make import make_devices
+from thermoctl_hal.virtual import drive as drives
+from thermoctl_hal.virtual.device import Pty
+from thermoctl_hal.wire import Framer
 
 ENCODER, DRIVE = ("position_um",), ("amplifier_state", "amplifier_fault", "supply_v")
 

@@ -1,7 +1,7 @@
 """Cause -> first line -> remedy: one thing is broken on an armed rig, and the first line a person reads has to name it.
 
 `make causes` writes docs/proof/causes.md. The devices of the wires are the real drivers; their other ends are played in
-simulated time (tests/hazards), as are the spoiled readings of hal.faulty.
+simulated time (tests/hazards), as are the spoiled readings of thermoctl_hal.faulty.
 """
 
 import math
@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from hal.backend import ROLE
 from tests.hazards.harness import HazardRig, quick_settings
 from tests.hazards.test_wires import ERROR_FRAME, KernelBus, WiredRig
 from thermoctl.daemon.display import fault_lines, message_lines
 from thermoctl.daemon.shared import Shared
 from thermoctl.daemon.snapshot import status
+from thermoctl_hal.backend import ROLE
 
 ROWS: list[tuple[str, str, str, str]] = []
 COUNT_UM = 0.005  # of config/devices/encoder-serial.yaml

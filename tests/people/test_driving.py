@@ -13,8 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hal.backend import ROLE
-from hal.faulty import Fault, FaultInjector
 from tests.daemon.process import LIMIT_S, Daemon, patient, wait
 from thermoctl import cli
 from thermoctl.calibration import drive
@@ -28,6 +26,8 @@ from thermoctl.identify.experiments import Schedule
 from thermoctl.settings import load_settings
 from thermoctl.signals import INDEX
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import ROLE
+from thermoctl_hal.faulty import Fault, FaultInjector
 
 STATE, COMMAND = INDEX["state"], INDEX["command"]
 EXPERIMENT = """\
@@ -268,7 +268,7 @@ def test_a_connection_that_ends_disarms_only_what_it_armed(folder, running):
 @pytest.mark.parametrize("kind", ["nan", "drop", "disconnect"])
 def test_the_simulated_rig_runs_the_same_law(kind, folder, capsys, monkeypatch):
     """Without a daemon, in simulated time: a hazard trips the law there, too."""
-    from hal.simulated import SimulatedBackend
+    from thermoctl_hal.simulated import SimulatedBackend
 
     sent, write = [], SimulatedBackend.write
     monkeypatch.setattr(

@@ -14,8 +14,6 @@ from rich.console import Console
 from running import Running
 from test_dashboard import served
 
-from hal.backend import ERROR, OK, ROLE, STALE
-from hal.drive_errors import describe
 from thermoctl.channels import CHANNELS
 from thermoctl.control import causes, faults
 from thermoctl.control.causes import Standing, in_order
@@ -29,6 +27,8 @@ from thermoctl.recording.commands import list_recordings
 from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter
 from thermoctl.signals import INDEX, POINTS, SIGNALS
+from thermoctl_hal.backend import ERROR, OK, ROLE, STALE
+from thermoctl_hal.drive_errors import describe
 
 SENSORS = (
     "position_um",

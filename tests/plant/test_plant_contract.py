@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.simulated import PlantRig
 from tests.plants import ONE_BLOCK, SPRING_STAGE, TWO_BLOCKS
 from thermoctl import yamlfile
 from thermoctl.plant import load, loads, save
@@ -18,6 +17,7 @@ from thermoctl.plant.sensor import error
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.simulated import PlantRig
 
 BLOCK = """\
 format: thermoctl-plant/1

@@ -19,13 +19,13 @@ from pathlib import Path
 CHECKOUT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(CHECKOUT), str(CHECKOUT / f".venv/lib/python3.{sys.version_info[1]}/site-packages")]
 
-from hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE  # noqa: E402
-from hal.binding import bind  # noqa: E402
-from hal.can_bus import LibraryPort, open_can  # noqa: E402
-from hal.devices import DevicesBackend  # noqa: E402
-from hal.drive import Cia402Device  # noqa: E402
-from hal.virtual.drive import DISABLED, ENABLED, Cia402Drive  # noqa: E402
 from thermoctl import yamlfile  # noqa: E402
+from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE  # noqa: E402
+from thermoctl_hal.binding import bind  # noqa: E402
+from thermoctl_hal.can_bus import LibraryPort, open_can  # noqa: E402
+from thermoctl_hal.devices import DevicesBackend  # noqa: E402
+from thermoctl_hal.drive import Cia402Device  # noqa: E402
+from thermoctl_hal.virtual.drive import DISABLED, ENABLED, Cia402Drive  # noqa: E402
 
 _FRAME = struct.Struct("=IB3x8s")
 STATE = ROLE["amplifier_state"]
@@ -215,7 +215,7 @@ def heartbeat_lost() -> dict:
 
 def a_missing_interface_is_one_line() -> dict:
     """An interface that is not there, and one that is down: an error that says what to do."""
-    from hal.backend import HardwareError
+    from thermoctl_hal.backend import HardwareError
 
     messages = []
     for channel in ("can7", "vcan1"):

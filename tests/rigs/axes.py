@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.make import make_backends
 from tests.rigs.chain import plants
 from thermoctl.control import arming, faults
 from thermoctl.daemon.assemble import compensator, law_parameters
@@ -18,6 +17,7 @@ from thermoctl.daemon.ring import Mailbox
 from thermoctl.daemon.simulate import COMMANDS
 from thermoctl.settings import Settings
 from thermoctl.signals import AT, fault_word
+from thermoctl_hal.make import make_backends
 
 NAMES = ("x", "y", "z", "u")
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from hal.make import make_backends
-from hal.virtual.rig import VirtualRig
 from tests.hal.conftest import free_port
 from tests.rigs.axes import Axes
 from thermoctl.settings import load_rig
+from thermoctl_hal.make import make_backends
+from thermoctl_hal.virtual.rig import VirtualRig
 
 pytestmark = pytest.mark.slow  # in real time: make test-wire
 CONFIG = Path(__file__).resolve().parents[2] / "config"

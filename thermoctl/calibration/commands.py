@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import HardwareError
 from thermoctl.calibration import chain, drive, experiment, iso230, recorded, schedules
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.wizard import Wizard
@@ -19,6 +18,7 @@ from thermoctl.recording.files import read_table
 from thermoctl.settings import Settings, load_settings
 from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import HardwareError
 
 MODELS = Path("models")
 """Folder of calibrations where none is given; those of an axis are in a folder of its name below it."""

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import HardwareError
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table, causes, rows_of
 from thermoctl.calibration.simulated_rig import EVERY_S
@@ -31,6 +30,7 @@ from thermoctl.recording.writer import TIER, recording_files
 from thermoctl.settings import Settings
 from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import HardwareError
 
 POLL_S = 0.01  # between two polls of the rig and of the keyboard
 # after this time without a tick the loop has ended (the supervisor's STALL_S; at least protection.late_s)

@@ -14,8 +14,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hal.backend import HardwareError
-from hal.make import make_devices
 from thermoctl.calibration.daemon_rig import DaemonRig
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.schedules import forecast, span, within_limits
@@ -26,6 +24,8 @@ from thermoctl.identify.experiments import Aborted, Schedule
 from thermoctl.settings import Settings
 from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import HardwareError
+from thermoctl_hal.make import make_devices
 
 DrivenRig = SimulatedRig | DaemonRig
 

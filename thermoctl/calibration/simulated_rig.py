@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import HardwareError
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import causes
 from thermoctl.control import arming
@@ -22,6 +21,7 @@ from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.table import Table
 from thermoctl.settings import Settings
 from thermoctl.signals import AT
+from thermoctl_hal.backend import HardwareError
 
 EVERY_S = 0.1  # between the rows that are kept
 READY_S = 20.0  # longest simulated time until the law is READY

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from hal.binding import bind
 from thermoctl.channels import Channels
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters, zero_model
 from thermoctl.settings import RigSettings, Settings
 from thermoctl.yamlfile import InputError, load
+from thermoctl_hal.binding import bind
 
 UNNAMED = RigSettings().name
 

@@ -18,7 +18,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hal.make import can_drive
 from thermoctl.control import arming
 from thermoctl.control.model import Parameters
 from thermoctl.daemon import arrival
@@ -29,6 +28,7 @@ from thermoctl.daemon.shared import Shared
 from thermoctl.daemon.snapshot import latency, status
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.make import can_drive
 
 MAX_LINE = 65536  # bytes of one request
 MAX_CLIENTS = 32

@@ -14,15 +14,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from hal.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
-from hal.latency_timer import latency_timer_ms
-from hal.make import device_notes, fast_devices, make_backend, make_backends
 from thermoctl.daemon.arrival import expected_hz, slow
 from thermoctl.daemon.assemble import check_mode, compensator, lacks, law_parameters, power_warning
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.loop import become_real_time
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
+from thermoctl_hal.latency_timer import latency_timer_ms
+from thermoctl_hal.make import device_notes, fast_devices, make_backend, make_backends
 
 
 def check(settings: Settings) -> int:

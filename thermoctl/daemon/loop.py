@@ -21,8 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from hal.backend import ABSENT
-from hal.devices import DevicesBackend
 from thermoctl.channels import AT, DEFAULT, Channels
 from thermoctl.control import arming, faults
 from thermoctl.control.law import DELAY_S, Law
@@ -34,6 +32,8 @@ from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
 from thermoctl.settings import Settings
 from thermoctl.signals import AT as SIGNAL_AT
 from thermoctl.signals import of_channels
+from thermoctl_hal.backend import ABSENT
+from thermoctl_hal.devices import DevicesBackend
 
 RELOAD = float(len(arming.COMMANDS))
 """The mailbox command that applies the parameter block; the others are arming's."""

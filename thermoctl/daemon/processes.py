@@ -13,10 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hal.backend import Backend, HardwareError
-from hal.board import Board
-from hal.make import make_backends, slow_devices
-from hal.poller import ports, run_poller
 from thermoctl.daemon import keep
 from thermoctl.daemon import loop as loops
 from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
@@ -26,6 +22,10 @@ from thermoctl.daemon.reload import reload_settings
 from thermoctl.daemon.shared import BEATS, RESUMED, WARNINGS, Shared
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import Backend, HardwareError
+from thermoctl_hal.board import Board
+from thermoctl_hal.make import make_backends, slow_devices
+from thermoctl_hal.poller import ports, run_poller
 
 HANG_S = 15.0  # a helper without a round for this time is killed and started again
 STOP_S = 10.0  # a helper that does not end within this time after the request is killed

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from hal.make import make_backend
 from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel, Parameters, packed_length
 from thermoctl.daemon.assemble import compensator, law_parameters
@@ -21,6 +20,7 @@ from thermoctl.daemon.loop import RELOAD, Rig
 from thermoctl.daemon.ring import Box, Mailbox
 from thermoctl.settings import Settings
 from thermoctl.signals import AT, fault_word
+from thermoctl_hal.make import make_backend
 
 COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reload": RELOAD}
 

@@ -1,7 +1,7 @@
 """The supervisor: starts the daemon's processes, watches them, and disables the amplifier on every way out.
 
     supervisor ── loop        reads, controls, drives; alone and real-time
-              ├── poller      one for each slow device (hal.board.run_poller)
+              ├── poller      one for each slow device (thermoctl_hal.board.run_poller)
               ├── recorder    ring -> recording
               ├── commands    the Unix socket
               ├── tuner       learns the expansion model, when compensation.tune is on
@@ -24,8 +24,6 @@ import socket
 import time
 from functools import partial
 
-from hal.backend import HardwareError
-from hal.make import disable_amplifier
 from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep
 from thermoctl.daemon import loop as loops
@@ -45,6 +43,8 @@ from thermoctl.daemon.processes import (
 from thermoctl.daemon.shared import LOOP_PID, Shared
 from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.backend import HardwareError
+from thermoctl_hal.make import disable_amplifier
 
 READY_S = 60.0  # time limit of the first tick: devices connect before it
 STALL_S = 1.0  # a loop without a tick for this time, or for protection.late_s if longer, is ended

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from hal.profile import Profile
-from hal.read_profile import load_profile
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError, suggest
+from thermoctl_hal.profile import Profile
+from thermoctl_hal.read_profile import load_profile
 
 EXIT_OK, EXIT_NONE = 0, 1
 FOLDERS = ("config/devices/library", "config/devices")

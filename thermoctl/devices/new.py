@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from hal.keys import REQUIRED, TABLES, Key
-from hal.read_profile import FORMAT, load_profile
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.keys import REQUIRED, TABLES, Key
+from thermoctl_hal.read_profile import FORMAT, load_profile
 
 BUSES = {
     "serial-binary": ("frame", "frame"),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from hal.probe import Probe, raw_traffic, read_for
-from hal.read_profile import load_profile
 from thermoctl.devices.library import find
+from thermoctl_hal.probe import Probe, raw_traffic, read_for
+from thermoctl_hal.read_profile import load_profile
 
 EXIT_OK, EXIT_PROBLEM = 0, 1
 

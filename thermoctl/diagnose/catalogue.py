@@ -67,8 +67,11 @@ CHANGES = (
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """One parameter of an effect. `trial`: its value in screening as an expression of the amplitudes s, s2, s3 and of
-    shapes; `shape`: the shape that it is; `null`: where the effect is absent."""
+    """One parameter of an effect.
+
+    - `trial`: its value in screening, an expression of the amplitudes s, s2, s3 and of shapes
+    - `shape`: the shape that it is
+    - `null`: its value where the effect is absent"""
 
     name: str
     unit: str | None

@@ -8,21 +8,25 @@ Bands of an output's recordings at the same frequency count as one.
 s is the noise that the plant file states, c its error, log-normal. Where slow parts are stated, s^2 follows
 their spectrum. q exp(u_b) is the remainder and every slow error of the sensor. u is a random walk over log
 frequency: smooth, and its size is learnt at each frequency. So an error of the plant at one frequency says
-little about another. But a plant with a large error is not exact at any frequency: at least the share FLOOR
-of the remainder's energy lies evenly over all of them. Errors that nobody will name are small:
-q = (SMALL swing)^2, and the remainder's share of the output's swing has a half-normal prior of width SMALL.
+little about another. But a plant with a large error is not exact at any frequency. So at least the share
+FLOOR of the remainder's energy lies evenly over all of them. Errors that nobody will name are small: the
+remainder's share of the output's swing has a half-normal prior of width SMALL, q = (SMALL swing)^2.
 
     log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
 
-Both parts are integrated over c and u by Laplace's method.
+Without a remainder the noise has the stated spectrum. Where no slow parts are stated, it has with even odds a
+first-order and a 1/f part: their shares and time are summed over a grid. c and u are integrated by Laplace's
+method.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
+from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.special import logsumexp
 
@@ -37,7 +41,14 @@ LEVEL = 2 * np.log(10.0)
 FLOOR = 0.1  # least share of the remainder's energy that is spread evenly over all frequencies
 DRAWS = 400  # random walks drawn for the normalisation of the remainder's prior
 WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a white force on one storage
-STEPS, CLOSE, LONGEST = 40, 1e-4, 2.0  # of Newton's method: their number, the step that ends it, the longest
+STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the gain that ends it
+LONGEST = 10.0  # step in a logarithm that is tried
+DAMPED = 0.01  # first damping of a step, as a share of the curvature
+SEEN = 1e-12  # of the largest power: a start needs a logarithm
+# Slow parts of a noise that nobody stated: a first-order part and a 1/f part. Their standard deviations (the
+# latter's over a decade) are shares of the white part's. Time constants are in sampling intervals. Slower or
+# larger errors of a sensor belong to the remainder: as noise they would imitate physics.
+SHARES, TIMES, FLICKERS = (1 / 3, 2 / 3, 1.0), (1.0, 3.0, 10.0), (0.0, 0.05)
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -51,7 +62,10 @@ class Grid:
     channels: tuple[int, ...]  # positions in Coordinates.channels
     node: np.ndarray
     count: np.ndarray
-    shape: np.ndarray  # of the stated noise's spectrum, its mean over all rows 1
+    shapes: (
+        np.ndarray
+    )  # (spectra, nodes) that the noise may have, their mean over all rows 1; the stated one first
+    log_prior: np.ndarray  # (spectra,) of each
     known: float  # prior sd of log c^2
     rough: np.ndarray  # (nodes, nodes) inverse covariance of u
     log_rough: float  # its log determinant
@@ -64,6 +78,11 @@ class Grid:
     def variance(self) -> float:
         """Variance of the stated noise, s^2."""
         return self.sigma**2
+
+    @property
+    def shape(self) -> np.ndarray:
+        """Spectrum of the stated noise, its mean over all rows 1."""
+        return self.shapes[0]
 
     @property
     def small(self) -> float:
@@ -98,12 +117,15 @@ def grid(
     log_small = float(logsumexp(-0.5 * count @ np.exp(walks) / count.sum()) - np.log(DRAWS))
     log_rough = float(np.linalg.slogdet(rough)[1])
     frequency = np.exp2(octave.min()) * WIDTH**known
-    shape = spectrum(sensor, frequency, channels[0].interval) if sensor else np.ones(len(known))
+    interval = channels[0].interval
+    slow = [] if sensor else _slow(frequency, interval)
+    shapes = np.array([spectrum(sensor or SensorNoise(1.0), frequency, interval), *slow])
     return Grid(
         tuple(positions),
         node,
         count,
-        shape * count.sum() / (count @ shape),
+        shapes * count.sum() / (shapes @ count)[:, None],
+        np.log([0.5, *np.full(len(slow), 0.5 / len(slow))]) if slow else np.zeros(1),
         2 * sensor.sd if sensor and sensor.sd else STATED,
         rough,
         log_rough,
@@ -129,6 +151,16 @@ def spectrum(sensor: SensorNoise, frequency: np.ndarray, interval: float) -> np.
     return out
 
 
+def _slow(frequency: np.ndarray, interval: float) -> list[np.ndarray]:
+    """Return spectra of noise with slow parts that nobody stated."""
+    first = [(0.0, 1.0), *product(SHARES, TIMES)]
+    return [
+        spectrum(SensorNoise(1.0, drift=r, time=tau * interval, flicker=f), frequency, interval)
+        for (r, tau), f in product(first, FLICKERS)
+        if r or f
+    ]
+
+
 @dataclass(frozen=True)
 class Averaged:
     """A log marginal likelihood and its by-products.
@@ -151,82 +183,97 @@ def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
     total, sensor, present, unsure = 0.0, [], [], []
     for g in grids:
         power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels]))
-        none, own = _sensor_only(g, power)
-        some, level, variance, spread = _with_remainder(g, power, own)
+        scores, owns = _sensor_only(g, power)
+        none = float(logsumexp(scores))
+        of = np.exp(scores - none)  # (spectra,) probability of each
+        some, level, variance, spread = _with_remainder(g, power)
         total += float(np.logaddexp(np.log(ABSENT) + none, np.log(1 - ABSENT) + some))
         p = 1 / (1 + np.exp(np.clip(none - some, -500, 500)) * ABSENT / (1 - ABSENT))
-        mean = ((1 - p) / (own * g.shape) + p / variance)[g.node]
+        each = np.vstack([1 / (owns[:, None] * g.shapes), 1 / variance])
+        weight = np.append((1 - p) * of, p)
+        mean = weight @ each
         at = 0
         for k in g.channels:
-            inverse[k] = mean[at : at + len(powers[k])]
+            inverse[k] = mean[g.node[at : at + len(powers[k])]]
             at += len(powers[k])
-        sensor.append((1 - p) * own + p * level)
+        sensor.append(float(weight @ np.append(owns, level)))
         present.append(float(p))
-        apart = 1 / (own * g.shape) - 1 / variance
-        unsure.append(p * spread + p * (1 - p) * np.outer(apart, apart))
+        apart = each - mean
+        unsure.append(p * spread + (apart.T * weight) @ apart)
     return Averaged(total, inverse, sensor, present, unsure)
 
 
-def _sensor_only(g: Grid, power: np.ndarray) -> tuple[float, float]:
-    """Log p(R | no remainder), and the noise's variance."""
-    n, ratio = float(g.count.sum()), float((power / g.shape).sum()) / g.variance
-    v = np.log(max(ratio / n, 1e-6))
+def _sensor_only(g: Grid, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return log p(R, spectrum | no remainder), and the noise's variance, by spectrum."""
+    n, ratio = float(g.count.sum()), (power / g.shapes).sum(axis=1) / g.variance
+    v = np.log(np.maximum(ratio / n, 1e-6))
     for _ in range(STEPS):
         step = (0.5 * (ratio * np.exp(-v) - n) - v / g.known**2) / (0.5 * n + g.known**-2)
         v += np.clip(step, -LONGEST, LONGEST)
-        if abs(step) < CLOSE:
+        if np.all(abs(step) < CLOSE):
             break
     own = g.variance * np.exp(v)
-    score = -0.5 * (n * (LOG_2PI + np.log(own)) + g.count @ np.log(g.shape) + ratio * g.variance / own)
+    score = -0.5 * (n * (LOG_2PI + np.log(own)) + np.log(g.shapes) @ g.count + ratio * g.variance / own)
     score -= 0.5 * (v / g.known) ** 2
-    return float(score - np.log(g.known) - 0.5 * np.log(0.5 * n + g.known**-2)), float(own)
+    return g.log_prior + score - np.log(g.known) - 0.5 * np.log(0.5 * n + g.known**-2), own
 
 
-def _with_remainder(g: Grid, power: np.ndarray, own: float) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """Return log p(R | remainder), the noise's variance, V at each frequency, and the covariance of 1/V.
+@dataclass(frozen=True)
+class _Remainder:
+    """The log density of an output's residual and of x = (log c^2, u), and its derivatives."""
 
-    Laplace's method over (log c^2, u); Fisher's scoring finds the maximum."""
-    n, rows, size = g.count, float(g.count.sum()), len(g.count) + 1
-    x = np.concatenate([[0.0], np.log(np.maximum(power / n - own * g.shape, 0.05 * own) / g.small)])
+    grid: Grid
+    power: np.ndarray
+    precision: np.ndarray  # of the Gaussian prior of x
 
-    def spectra(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    def spectra(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the log density, each frequency's part of the remainder's size, d log V / dx and V."""
+        g = self.grid
         noise, free = g.variance * g.shape * np.exp(x[0]), np.exp(x[1:])
-        mean = float(n @ free) / rows
-        v = noise + g.small * (free + FLOOR * mean)
-        log_p = -0.5 * float(n @ np.log(v) + (power / v).sum()) - 0.5 * mean - 0.5 * (x[0] / g.known) ** 2
-        return log_p - 0.5 * float(x[1:] @ (g.rough @ x[1:])), noise, free, v
+        part = g.count * free / g.count.sum()
+        v = noise + g.small * (free + FLOOR * part.sum())
+        slope = np.tile(g.small * FLOOR * np.concatenate([[0.0], part]), (len(free), 1))
+        slope[:, 0] = noise
+        slope[:, 1:] += np.diag(g.small * free)
+        fit = g.count @ np.log(v) + (self.power / v).sum()
+        density = -0.5 * float(fit + part.sum() + x @ self.precision @ x)
+        return density, np.concatenate([[0.0], part]), slope / v[:, None], v
 
-    def slopes(noise: np.ndarray, free: np.ndarray, v: np.ndarray) -> np.ndarray:
-        out = np.empty((size - 1, size))  # d log V / d (log c^2, u)
-        out[:, 0] = noise
-        out[:, 1:] = g.small * FLOOR / rows * n * free
-        out[inside, 1 + inside] += g.small * free
-        return out / v[:, None]
+    def curvature(self, part: np.ndarray, slope: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return gradient and curvature of minus the log density, the gradient without the Gaussian prior.
 
-    now, noise, free, v = spectra(x)
-    inside = np.arange(size - 1)
-    for _ in range(STEPS):
-        parts, slope = n * free / rows, slopes(noise, free, v)
-        gradient = slope.T @ (0.5 * (power / v - n))
-        gradient -= np.concatenate([[x[0] / g.known**2], g.rough @ x[1:] + 0.5 * parts])
-        h = slope.T @ (0.5 * n[:, None] * slope)
-        h[0, 0] += g.known**-2
-        h[1:, 1:] += g.rough
-        h[1 + inside, 1 + inside] += 0.5 * parts
-        factor = dpotrf(h, lower=1)[0]
-        step = np.clip(dpotrs(factor, gradient, lower=1)[0], -LONGEST, LONGEST)
-        for _ in range(8):
-            then = spectra(x + step)
-            if then[0] >= now:
+        The curvature is exact: the expected one (Fisher) misleads where a residual spans many decades."""
+        n, p = self.grid.count, self.power / v
+        pull = 0.5 * (slope.T @ (n - p) + part)
+        return pull, (slope.T * (p - 0.5 * n)) @ slope + self.precision + np.diag(pull)
+
+    def maximum(self) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return log density, x, curvature, slope and V at the maximum, by Newton's method with damping."""
+        g = self.grid
+        seen = np.maximum(self.power, SEEN * self.power.max()) / (g.small * g.count)
+        x = np.concatenate([[0.0], np.log(np.minimum(seen, np.sqrt(seen * g.count.sum())))])
+        now, part, slope, v = self.spectra(x)
+        damping, gain = 0.0, np.inf
+        for _ in range(STEPS):
+            pull, h = self.curvature(part, slope, v)
+            factor, indefinite = dpotrf(h + damping * np.diag(np.abs(np.diag(h))), lower=1)
+            if gain < CLOSE and not indefinite and not damping:
                 break
-            step *= 0.5
-        else:
-            break
-        gain = then[0] - now
-        x, (now, noise, free, v) = x + step, then
-        if gain < CLOSE:
-            break
-    score = now - 0.5 * rows * LOG_2PI - np.log(g.known) + 0.5 * g.log_rough - g.log_small
-    score -= float(np.sum(np.log(np.diag(factor))))
-    moves = slopes(noise, free, v).T / v  # -d(1/V) / d(log c^2, u)
-    return (float(score), float(g.variance * np.exp(x[0])), v, moves.T @ dpotrs(factor, moves, lower=1)[0])
+            step = dpotrs(factor, pull + self.precision @ x, lower=1)[0]
+            then = self.spectra(x - step) if not indefinite and np.abs(step).max() < LONGEST else None
+            if then and then[0] >= now:
+                gain, x, damping = then[0] - now, x - step, damping / 8 if damping > DAMPED else 0.0
+                now, part, slope, v = then
+            else:
+                damping = max(4 * damping, DAMPED)
+        return now, x, h, slope, v
+
+
+def _with_remainder(g: Grid, power: np.ndarray) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """Return log p(R | remainder), the noise's variance, V at each frequency, and the covariance of 1/V."""
+    density, x, h, slope, v = _Remainder(g, power, block_diag(g.known**-2, g.rough)).maximum()
+    factor = np.linalg.cholesky(h)
+    score = density - 0.5 * float(g.count.sum()) * LOG_2PI - np.log(g.known)
+    score += 0.5 * g.log_rough - g.log_small - float(np.log(np.diag(factor)).sum())
+    moves = solve_triangular(factor, (slope / v[:, None]).T, lower=True)
+    return float(score), float(g.variance * np.exp(x[0])), v, moves.T @ moves

@@ -69,7 +69,7 @@ def _linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
 
 
 def drifts(plant: Linear, duration: float) -> bool:
-    """Return whether a mode of the plant keeps an error over the recordings (False where that is unknown).
+    """Return whether a mode of the plant keeps an error over the recordings; False if unknown.
 
     A body that only cools slowly is no such mode: it is linear enough for a free run."""
     known = bool(len(plant.a)) and bool(np.isfinite(plant.a).all())  # the slope of a root may be infinite

@@ -1,6 +1,6 @@
 """Kinds of quantities from `role`, units and structure of the plant, never from its names.
 
-Only a column that the plant does not read has neither: what its name sounds like is a guess.
+Only a column that the plant does not read has neither: then its name gives a guess.
 Of a pair of nodes, one the rate of the other, one is a velocity and one its position, in any unit. The
 ambient is the temperature that losses of heat are counted from. Each assumption is a note in the result."""
 

@@ -1,13 +1,13 @@
 """Learn each sensor's own noise from recordings in which nothing else is expected: `thermoctl noise`.
 
-The plant is refitted to the recordings, and the residual of each output is taken for its noise. Its power in
-the bands of a DCT (coordinates.py) is compared with three spectra: white, white with a first-order part, and
-white with a 1/f part. The likelihood of a band with n rows and power P is the Gaussian one,
+The plant is refitted to the recordings, and the residual of each output is taken for its noise. Three spectra
+are compared: white, white with a first-order part, and white with a 1/f part. In a band of a DCT
+(coordinates.py) with n rows and power P the likelihood is the Gaussian one:
 
     log p = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
 
-and each further number costs log(rows) / 2 (Schwarz 1978). What the plant lacks would be learnt as noise, too:
-so the recordings should be quiet, or the plant complete.
+Each further number costs log(rows) / 2 (Schwarz 1978). Physics that the plant lacks would be learnt as noise,
+too: so the recordings should be quiet, or the plant complete.
 """
 
 from __future__ import annotations

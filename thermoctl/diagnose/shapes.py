@@ -18,7 +18,7 @@ SLOW_TURNS, FINE_TURNS = 60.0, 4000  # each is looked at up to the first, the st
 def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count: int = 16) -> np.ndarray:
     """Return the strongest numbers of turns over the signal x beyond SLOW_TURNS.
 
-    They are peaks of the spectrum over x of the `errors`, (N,) by recording, without their slow part in time."""
+    They are peaks of the spectrum over x of `errors` ((N,) by recording) without their slow part in time."""
     fast = []
     for e in errors:
         e = np.nan_to_num(e)

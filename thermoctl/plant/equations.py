@@ -51,6 +51,7 @@ class Equations:
         self.slopes = [div(net[n.name], n.storage) for n in plant.nodes.values()]
         self._widths()
         self.fmus = used(e for root in self._roots() for e in ex.walk(root))
+        self._courses: dict[tuple[Expr, ...], int] = {}
 
     def _take_out_delays(self) -> None:
         """Replace delays by names: of derived inputs in rates, of delayed values in outputs."""
@@ -144,9 +145,7 @@ class Equations:
                 elif e.op == "name":
                     done[id(e)] = place[e.value]
                 else:
-                    text = (
-                        self._foreign(e, a) if e.op in ("fmu", "fmu_slope") else self._statement(e, a, lines)
-                    )
+                    text = self._foreign(e, a) if e.op.startswith("fmu") else self._statement(e, a, lines)
                     done[id(e)] = f"c{len(lines)}"
                     lines.append(f"const double c{len(lines)} = {text};\n")
         return "".join(lines) + "".join(f"out[{i}] = {done[id(e)]};\n" for i, e in enumerate(exprs))
@@ -190,11 +189,20 @@ class Equations:
         """Return the call of an FMU; a missing argument is NaN and keeps its value."""
         path, result, names, *by = e.value
         fmu = opened(path)
-        given = dict(zip([0, *map(fmu.argument, names)], a, strict=True))
-        values = ", ".join(given.get(j, "NAN") for j in range(1 + len(fmu.arguments)))
+        number, at = self.fmus.index(path), [0, *map(fmu.argument, names)]
+
+        def row(given: list[str], missing: str) -> str:
+            known = dict(zip(at, given, strict=True))
+            return f"(const double[]){{{', '.join(known.get(j, missing) for j in range(1 + len(fmu.arguments)))}}}"
+
+        values = row(a[: len(at)], "NAN")
+        if fmu.runs:
+            course = self._courses.setdefault(e.args, len(self._courses))
+            change = row(["0.0", *a[len(at) :]], "0.0") if e.op == "fmu_change" else "0"
+            return f"fmu_steps_(fmus_[{number}], {course}, {fmu.result(result)}, {values}, {change})"
         places = ", ".join(str(k) for k in (fmu.result(result), *map(fmu.argument, by)))
         function = "fmu_slope_" if by else "fmu_value_"
-        return f"{function}(fmus_[{self.fmus.index(path)}], {places}, (const double[]){{{values}}})"
+        return f"{function}(fmus_[{number}], {places}, {values})"
 
 
 PRELUDE = """#include <math.h>

@@ -1,10 +1,14 @@
-"""FMUs of model exchange (FMI 2 and 3) as functions in a plant's expressions.
+"""FMUs (FMI 2 and 3) as functions in a plant's expressions.
 
     fmu("model.fmu", "der(T)", "T", block, "heater.P", power)
 
 is the derivative that the FMU computes with its variables T and heater.P at these values; the name of an
 output gives that output. Time is passed on. Other variables keep the FMU's start values.
 Slopes are directional derivatives where the FMU gives them, else central differences (fmu.h).
+
+An FMU of co-simulation only has neither states nor derivatives. Its output is that of a run from the first
+sample on (cosimulation.py). There "hold(u)" instead of "u" is an input held between samples.
+
 An FMU is a program: opening one runs it.
 """
 
@@ -15,6 +19,7 @@ import ctypes
 import hashlib
 import shutil
 import tempfile
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -25,6 +30,7 @@ import numpy as np
 
 from thermoctl.extras import load
 from thermoctl.plant.build import library
+from thermoctl.plant.cosimulation import Course, Layout, References
 from thermoctl.yamlfile import InputError, suggest
 
 if TYPE_CHECKING:
@@ -53,14 +59,17 @@ class Variable:
 
 
 class Fmu:
-    """An opened FMU: its variables by kind, and its results as functions.
+    """An opened FMU of model exchange: its variables by kind, and its results as functions.
 
     `depends`: the states and inputs that a result (a state's derivative, an output) depends on."""
 
-    def __init__(self, path: Path):
+    runs = False
+    """Whether a result belongs to a run from the first sample on, not to one row of arguments."""
+
+    def __init__(self, path: Path, d: ModelDescription):
         self.path = path
         self.digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        self._description = d = _description(path)
+        self._description = d
         self._library = _shim()
         self._instance = _instance(path, d)
         derivatives = [u.variable for u in d.derivatives]
@@ -149,15 +158,20 @@ class Fmu:
     ) -> Any:
         """Return a result, or its slope `by` an argument, at values that broadcast together; [0]: time."""
         shaped = np.broadcast_arrays(*(np.asarray(v, float) for v in values))
-        rows = np.full((shaped[0].size, 1 + len(self.arguments)), np.nan)
-        for name, value in zip((None, *names), shaped, strict=True):
-            rows[:, 0 if name is None else self.argument(name)] = value.ravel()
+        rows = self._rows(names, shaped, np.nan)
         out = np.empty(len(rows))
         j = -1 if by is None else self.argument(by)
         self._library.fmu_rows(
             self._handle, self.result(result), j, len(rows), rows.ctypes.data, out.ctypes.data
         )
         return out.reshape(shaped[0].shape)[()]
+
+    def _rows(self, names: Sequence[str], values: Sequence[np.ndarray], missing: float) -> np.ndarray:
+        """Return rows of all arguments (N, 1 + arguments) from the values (N,) of time and of some."""
+        rows = np.full((values[0].size, 1 + len(self.arguments)), missing)
+        for name, value in zip((None, *names), values, strict=True):
+            rows[:, 0 if name is None else self.argument(name)] = value.ravel()
+        return rows
 
     def argument(self, name: str) -> int:
         """Return the place of an argument. Raises InputError for another name."""
@@ -175,6 +189,107 @@ class Fmu:
                 f"there are {', '.join(self.results)}"[:600]
             )
         return self.results[name]
+
+
+_STEPS = ctypes.CFUNCTYPE(
+    ctypes.c_double,
+    ctypes.c_void_p,
+    ctypes.c_int,
+    ctypes.c_int,
+    ctypes.POINTER(ctypes.c_double),
+    ctypes.POINTER(ctypes.c_double),
+)
+_OPENED: dict[int, Cosimulation] = {}
+
+
+def _advance(number: int, course: int, k: int, row: Any, change: Any) -> float:
+    """Return result k of an FMU's course at a row, or its slope: called by a plant's machine code."""
+    fmu = _OPENED[number]
+    size = 1 + len(fmu.arguments)
+    runs = fmu.courses.setdefault((threading.get_ident(), course, bool(change)), fmu.course())
+    a = np.frombuffer(ctypes.string_at(row, 8 * size))
+    if not change:
+        return float(runs.value(a)[k])
+    return float(runs.slope(a, np.frombuffer(ctypes.string_at(change, 8 * size)))[k])
+
+
+_steps = _STEPS(_advance)
+
+
+class Cosimulation(Fmu):
+    """An opened FMU that is for co-simulation only: no states, and outputs of runs."""
+
+    runs = True
+
+    def __init__(self, path: Path, d: ModelDescription):
+        self.path = path
+        self.digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        self._description, self._folder = d, _extracted(path)
+        variables = [v for v in d.modelVariables if v.type in ("Real", "Float64") and not v.dimensions]
+        inputs = [v for v in variables if v.causality == "input"]
+        parameters = [v for v in variables if v.causality == "parameter" and v.variability != "constant"]
+        unknowns = [u for u in d.outputs if u.variable in variables]
+        settable = [*inputs, *parameters]
+        self._instance = self._made()
+        try:
+            if self._version == 2:
+                self._instance.setupExperiment(startTime=0.0)
+            self._instance.enterInitializationMode()
+            self._instance.exitInitializationMode()
+            now = self._values(settable)
+        except Exception as e:
+            raise InputError(f"{path}: cannot be started: {' '.join(str(e).split())[:300]}") from None
+        self._layout = Layout(
+            self._version,
+            _references(inputs),
+            _references(parameters),
+            _references([u.variable for u in unknowns]),
+            np.array([now[v.name] for v in settable]),
+            np.array([float(v.nominal or 0) or _size(now[v.name]) for v in settable]),
+        )
+        self.inputs, self.parameters = (
+            {v.name: _variable(v, now) for v in group} for group in (inputs, parameters)
+        )
+        self.states, self.derivatives = {}, {}
+        self.outputs = {u.variable.name: _variable(u.variable, {}) for u in unknowns}
+        names = [*self.inputs, *(f"hold({n})" for n in self.inputs), *self.parameters]
+        self.arguments = {n: 1 + j for j, n in enumerate(names)}
+        self.results = {o: k for k, o in enumerate(self.outputs)}
+        self.depends = dict.fromkeys(self.outputs, set(self.inputs))
+        self.courses: dict[tuple[int, int, bool], Course] = {}
+        _OPENED[id(self)] = self
+
+    def _made(self) -> Any:
+        return _instantiated(self.path, self._description, self._folder)
+
+    def course(self) -> Course:
+        """Return a new course."""
+        return Course(self._layout, self._made)
+
+    def link(self, library: ctypes.CDLL, index: int) -> None:
+        """Give a plant's machine code this FMU under its number."""
+        ctypes.c_void_p.in_dll(library, "fmu_steps_").value = ctypes.cast(_steps, ctypes.c_void_p).value
+        (ctypes.c_void_p * (index + 1)).in_dll(library, "fmus_")[index] = id(self)
+
+    def evaluate(
+        self, result: str, names: Sequence[str], values: Sequence[Any], by: str | None = None
+    ) -> Any:
+        """Return an output over rows of time and arguments, in order; [0]: time.
+
+        With as many values again, without a time, its slope where these are the arguments' slopes."""
+        shaped = np.broadcast_arrays(*(np.asarray(v, float) for v in values))
+        count, course, k = 1 + len(names), self.course(), self.result(result)
+        rows = self._rows(names, shaped[:count], np.nan)
+        if len(shaped) == count:
+            out = [course.value(row)[k] for row in rows]
+        else:
+            changes = self._rows(names, [np.zeros_like(shaped[0]), *shaped[count:]], 0.0)
+            out = [course.slope(row, change)[k] for row, change in zip(rows, changes, strict=True)]
+        return np.array(out).reshape(shaped[0].shape)[()]
+
+
+def _references(variables: Sequence[ModelVariable]) -> References:
+    return (ctypes.c_uint * len(variables))(*(v.valueReference for v in variables))
 
 
 def _variable(v: ModelVariable, now: Mapping[str, float]) -> Variable:
@@ -200,7 +315,8 @@ def opened(path: str) -> Fmu:
 
 @cache
 def _opened(path: Path, changed: int) -> Fmu:
-    return Fmu(path)
+    d = _description(path)
+    return Cosimulation(path, d) if d.modelExchange is None else Fmu(path, d)
 
 
 def _description(path: Path) -> ModelDescription:
@@ -211,29 +327,55 @@ def _description(path: Path) -> ModelDescription:
         raise InputError(f"{path}: no usable FMU: {' '.join(str(e).split())[:300]}") from None
     if found.fmiVersion[0] not in "23":
         raise InputError(f"{path}: FMI {found.fmiVersion}; FMI 2.0 or 3.0 was expected; export it anew")
-    if found.modelExchange is None:
+    only = found.coSimulation
+    if found.modelExchange is None and only is None:
+        raise InputError(f"{path}: an FMU of model exchange or of co-simulation was expected; export it anew")
+    if found.modelExchange is None and only.canBeInstantiatedOnlyOncePerProcess:
         raise InputError(
-            f"{path}: an FMU of co-simulation only; it keeps its states and its solver to itself, so no effect can "
-            "be put inside; export it for model exchange"
+            f"{path}: can be opened once a process only, but slopes need runs beside each other; export it for "
+            "model exchange"
         )
     return found
 
 
-def _instance(path: Path, d: ModelDescription) -> Any:
+def _extracted(path: Path) -> str:
     import fmpy
 
     folder = tempfile.mkdtemp(prefix="thermoctl-fmu")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    model = fmpy.fmi2.FMU2Model if d.fmiVersion[0] == "2" else fmpy.fmi3.FMU3Model
     try:
         fmpy.extract(str(path), folder)
+    except Exception as e:
+        raise InputError(f"{path}: cannot be unpacked: {' '.join(str(e).split())[:300]}") from None
+    return folder
+
+
+def _instantiated(path: Path, d: ModelDescription, folder: str) -> Any:
+    """Return a new instance, for model exchange where there is that. Raises InputError."""
+    import fmpy
+
+    interface = d.modelExchange or d.coSimulation
+    of_version = {
+        "2": (fmpy.fmi2.FMU2Model, fmpy.fmi2.FMU2Slave),
+        "3": (fmpy.fmi3.FMU3Model, fmpy.fmi3.FMU3Slave),
+    }
+    model = of_version[d.fmiVersion[0]][d.modelExchange is None]
+    try:
         found = model(
             guid=d.guid,
             unzipDirectory=folder,
-            modelIdentifier=d.modelExchange.modelIdentifier,
+            modelIdentifier=interface.modelIdentifier,
             instanceName="thermoctl",
         )
         found.instantiate()
+    except Exception as e:
+        raise InputError(f"{path}: cannot be started: {' '.join(str(e).split())[:300]}") from None
+    return found
+
+
+def _instance(path: Path, d: ModelDescription) -> Any:
+    found = _instantiated(path, d, _extracted(path))
+    try:
         if d.fmiVersion[0] == "2":
             found.setupExperiment(startTime=0.0)
         found.enterInitializationMode()

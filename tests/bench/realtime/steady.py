@@ -103,8 +103,8 @@ def simulated(work: Path, hours: float) -> list[Sample]:
 
 def drivers(bench: Bench, ticks: int) -> list[Sample]:
     """A sample every twentieth of the ticks."""
-    from hal.make import make_backend
     from thermoctl.settings import load_settings
+    from thermoctl_hal.make import make_backend
 
     backend = make_backend(load_settings(bench.config))
     backend.open()

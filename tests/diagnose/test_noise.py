@@ -1,0 +1,99 @@
+"""The averaged likelihood: against an independent optimizer, and what it keeps of an effect in coloured noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.fft import dct
+from scipy.optimize import minimize
+from scipy.signal import lfilter
+
+from thermoctl.diagnose import noise as module
+from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.noise import Averaged, Grid, averaged, grid
+from thermoctl.plant.simulate import Excitation
+
+ROWS, SIGMA, SWING = 2000, 0.05, 5.0
+SHARE = 0.4  # of the noise's variance, that is not white
+
+
+def banded(e: np.ndarray) -> tuple[list[Grid], list[np.ndarray]]:
+    d = Excitation("run", np.arange(ROWS) * 1.0, np.zeros((ROWS, 0)), e[:, None], {}, np.zeros(0, np.intc))
+    c = Coordinates([d])
+    return [grid(c, [0], SIGMA, SWING)], c.powers([c.transform(c.channels[0], e)])
+
+
+def likelihood(e: np.ndarray) -> Averaged:
+    return averaged(*banded(e))
+
+
+def coloured(seed: int, phi: float, size: float = 1.0) -> np.ndarray:
+    """Noise of `size` times the stated one: 60 % of its variance is white, the rest first-order."""
+    white, other = np.random.default_rng(seed).standard_normal((2, ROWS))
+    slow = lfilter([1], [1, -phi], other) * np.sqrt(1 - phi**2)
+    return (np.sqrt(1 - SHARE) * white + np.sqrt(SHARE) * slow) * SIGMA * size
+
+
+def effect(sigmas: float, phi: float) -> np.ndarray:
+    """A slow course that an ideal test, which knows the noise, sees with so many sigmas."""
+    levels = [0, 1, 0.2, 0.8, 0.1, 1, 0.3, 0.9, 0.2]
+    s = np.interp(np.arange(ROWS), np.linspace(0, ROWS, len(levels)), levels) - 0.5
+    turn = np.cos(np.pi * np.arange(ROWS) / ROWS)
+    spectrum = 1 - SHARE + SHARE * (1 - phi**2) / (1 - 2 * phi * turn + phi**2)
+    return s * sigmas * SIGMA / np.sqrt(np.sum(dct(s, norm="ortho") ** 2 / spectrum))
+
+
+def by_hand(g: Grid, power: np.ndarray) -> float:
+    """Laplace's log p(R | remainder), from the equations of the module's docstring and scipy's BFGS."""
+    n, q = g.count, g.small
+    known = g.known
+
+    def minus(x: np.ndarray) -> float:
+        u = np.exp(x[1:])
+        mean = n @ u / n.sum()
+        v = g.variance * np.exp(x[0]) + q * (u + module.FLOOR * mean)
+        prior = 0.5 * (x[0] / known) ** 2 + 0.5 * x[1:] @ g.rough @ x[1:] + 0.5 * mean
+        return 0.5 * float(n @ np.log(2 * np.pi * v) + (power / v).sum()) + prior
+
+    x = np.concatenate([[0.0], np.log(power / n / q)])
+    for _ in range(5):  # BFGS with numerical slopes ends early once
+        x = minimize(minus, x, method="L-BFGS-B", options={"maxfun": 10**6, "maxiter": 10**4}).x
+    h, step = np.empty((len(x), len(x))), 1e-3 * np.eye(len(x))
+    for i in range(len(x)):
+        for j in range(len(x)):
+            ends = [minus(x + a * step[i] + b * step[j]) for a in (1, -1) for b in (1, -1)]
+            h[i, j] = (ends[0] - ends[1] - ends[2] + ends[3]) / 4e-6
+    return -minus(x) - np.log(known) + 0.5 * g.log_rough - g.log_small - 0.5 * np.linalg.slogdet(h)[1]
+
+
+@pytest.mark.parametrize("steep", [0.0, 2.0, 5.0])
+def test_the_remainder_is_averaged_about_its_maximum_however_many_decades_it_spans(steep):
+    """A slow residual of 8 decades: Newton's steps by Fisher's curvature ended thousands of nats below."""
+    t = np.linspace(0, 1, ROWS)
+    slow = sum(np.cos(np.pi * k * t + k) / (1 + k) ** steep for k in range(1, 300))
+    g, power = banded(SWING * slow / np.std(slow) * 0.3 + 0.02 * SIGMA * coloured(3, 0.0))
+    assert averaged(g, power).log_likelihood == pytest.approx(
+        by_hand(g[0], np.bincount(g[0].node, power[0])) + np.log(1 - module.ABSENT), abs=0.1
+    )
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.3, 0.5, 0.7, 0.9])
+def test_half_of_an_effect_stays_in_noise_of_stated_size_and_any_colour(phi):
+    """An ideal test gains 24.5 nats. The colour has to be learnt from the same record."""
+    gains = []
+    for seed in range(8):
+        e = coloured(seed, phi)
+        gains.append(likelihood(e).log_likelihood - likelihood(e + effect(7, phi)).log_likelihood)
+    assert np.mean(gains) > 0.45 * 7**2 / 2  # 67 % in white noise, 48 % with phi 0.9
+
+
+def test_slow_errors_far_louder_than_the_stated_noise_are_a_remainder():
+    for seed in range(4):
+        steps = np.random.default_rng(seed).standard_normal(ROWS)
+        wandering = lfilter([1], [1, -0.995], steps) * np.sqrt(1 - 0.995**2) * 3 * SIGMA
+        assert likelihood(coloured(seed, 0.0) + wandering).remainder[0] > 0.95
+
+
+def test_noise_as_stated_is_no_remainder():
+    for phi in (0.0, 0.7, 0.9):
+        assert all(likelihood(coloured(seed, phi)).remainder[0] < 0.5 for seed in range(4)), phi
