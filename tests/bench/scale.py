@@ -1,12 +1,15 @@
 """Cost of a diagnosis against the size of the data: rows of a recording, bodies of a plant.
 
 python -m tests.bench.scale rows [--rows 260000] [--before FOLDER]
-python -m tests.bench.scale bodies [--bodies 12 30 60 120]
+python -m tests.bench.scale bodies [--bodies 12 30 60 120] [--shape chain network]
+python -m tests.bench.scale recordings [--recordings 1 6 12] [--workers 1 2]
 
 `rows`: a rig of two blocks whose free convection is concealed, logged every second, and the same record with
 one row in a hundred. Every diagnosis is a process of its own: CPU time (with the compiler's), memory, result.
 --before FOLDER: a checkout of an older version; it works on the same records, with a limit of 30 minutes.
-`bodies`: a chain of blocks, every third one measured, whose middle one has a heat source that the plant lacks.
+`bodies`: blocks of which every third one is heated and measured. In a chain the middle one has a heat source that
+the plant lacks. In a network, whose blocks are linked with near ones as in a CAD model, a link is missing.
+`recordings`: the actuator of twelve bodies, 30 000 rows a recording, with an effect that one leaves in doubt.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,21 +34,52 @@ from thermoctl.recording.table import Table
 BODY = """
 import json, resource, sys, time
 from thermoctl.diagnose.run import diagnose_files
-found = diagnose_files(sys.argv[1], [sys.argv[2]], sys.argv[3])
+found = diagnose_files(sys.argv[1], sys.argv[3:], sys.argv[2])
 used = [resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
 print(json.dumps({"verdict": found["verdict"], "found": [f"{f['effect']} at {f['where']}" for f in found["findings"]],
     "probability": [round(f["probability"], 3) for f in found["findings"]],
     "cpu_s": sum(u.ru_utime + u.ru_stime for u in used), "MiB": used[0].ru_maxrss / 1024, "notes": found["notes"]}))
 """
 LIMIT_S = 1800
+WEAK = "{from: outer_stator, rate: 1e-10 * ((outer_stator + 273.15)**4 - (air + 273.15)**4), unit: W}"  # radiation
 THINNED = 100  # rows of the long record for one of the short
 
 
-def block_plant(n: int) -> str:
-    """A chain of n blocks in air; every third one has a heater and a sensor."""
+Links = list[tuple[int, int]]
+
+
+def chain(n: int) -> Links:
+    """Return the links of a chain of n blocks."""
+    return [(k, k + 1) for k in range(1, n)]
+
+
+def network(n: int) -> tuple[Links, tuple[int, int]]:
+    """Return links of n blocks, each with its nearest three, and the one that the plant lacks.
+
+    That is the closest pair without a link, one of them heated and measured."""
+    at = np.random.default_rng(8).uniform(0, 1, (n, 3))
+    far = np.linalg.norm(at[:, None] - at, axis=2)
+    near = {(min(a, b), max(a, b)) for a in range(n) for b in np.argsort(far[a])[1:4]}
+    reached = {0}
+    while len(reached) < n:  # one piece: the closest pair of a reached and another block
+        a, b = min(
+            ((a, b) for a in reached for b in set(range(n)) - reached),
+            key=lambda p: (p not in near and p[::-1] not in near, far[p]),
+        )
+        near.add((min(a, b), max(a, b)))
+        reached.add(b)
+    pairs = [
+        (a, b) for a in range(0, n, 3) for b in range(n) if a != b and (min(a, b), max(a, b)) not in near
+    ]
+    a, b = min(pairs, key=lambda p: far[p])
+    return [(int(a) + 1, int(b) + 1) for a, b in sorted(near)], (a + 1, b + 1)
+
+
+def block_plant(n: int, links: Links | None = None) -> str:
+    """A plant of n blocks in air, a chain unless links are given; every third one has a heater and a sensor."""
     at = range(1, n + 1)
     held = [k for k in at if k % 3 == 1]
-    lines = ["format: thermoctl-plant/1", f"title: A chain of {n} blocks", "inputs:"]
+    lines = ["format: thermoctl-plant/1", f"title: {n} blocks", "inputs:"]
     lines += [f"  heat_{k}: {{unit: W}}" for k in held]
     lines += ["  air: {unit: degC, between_samples: linear}", "parameters:"]
     lines += [
@@ -61,8 +96,8 @@ def block_plant(n: int) -> str:
     lines += [f"  power_{k}: {{into: block_{k}, rate: heat_{k}, unit: W}}" for k in held]
     lines += [f"  loss_{k}: {{from: block_{k}, rate: G * (block_{k} - air), unit: W}}" for k in at]
     lines += [
-        f"  link_{k}: {{from: block_{k}, into: block_{k + 1}, rate: G_between * (block_{k} - block_{k + 1}), unit: W}}"
-        for k in range(1, n)
+        f"  link_{a}_{b}: {{from: block_{a}, into: block_{b}, rate: G_between * (block_{a} - block_{b}), unit: W}}"
+        for a, b in links or chain(n)
     ]
     lines += ["outputs:"]
     lines += [f"  temperature_{k}: {{value: block_{k}, unit: degC, noise: 0.05}}" for k in held]
@@ -98,13 +133,18 @@ def write(path: Path, table: Table) -> None:
     np.savetxt(path, values, fmt="%.7g", delimiter=",", header=",".join(["time", *names]), comments="")
 
 
-def diagnosed(folder: Path, name: str = "run_1.csv", checkout: Path | None = None) -> dict[str, object]:
-    """Diagnose one recording in a process of its own; return its figures."""
+def diagnosed(
+    folder: Path, names: Sequence[str] = ("run_1.csv",), checkout: Path | None = None, workers: int = 0
+) -> dict[str, object]:
+    """Diagnose recordings in a process of its own, on `workers` cores (0: all); return its figures."""
     with tempfile.TemporaryDirectory() as work:
         env = dict(os.environ, OPENBLAS_NUM_THREADS="1", THERMOCTL_CACHE=f"{work}/plants")
         if checkout:
             env["PYTHONPATH"] = str(checkout)
-        command = [sys.executable, "-c", BODY, str(folder / "plant.yaml"), str(folder / name), f"{work}/out"]
+        files = [str(folder / name) for name in names]
+        command = [sys.executable, "-c", BODY, str(folder / "plant.yaml"), f"{work}/out", *files]
+        cores = sorted(os.sched_getaffinity(0))[: workers or None]
+        command = ["taskset", "-c", ",".join(map(str, cores)), *command]
         started = time.monotonic()
         try:
             done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=LIMIT_S, cwd=work)
@@ -151,7 +191,7 @@ def rows(number: int, before: Path | None) -> None:
         )
         names = (folder / "run_1.csv").read_text().splitlines()
         (folder / "few.csv").write_text("\n".join([names[0], *names[1::THINNED]]) + "\n")
-        few, many = diagnosed(folder, "few.csv"), diagnosed(folder)
+        few, many = diagnosed(folder, ["few.csv"]), diagnosed(folder)
         line(f"{number // THINNED} rows", few)
         line(f"{number} rows", many)
         print(f"{number} rows / {number // THINNED} rows: {many['cpu_s'] / few['cpu_s']:.2f} times the time")  # type: ignore[operator]
@@ -161,34 +201,83 @@ def rows(number: int, before: Path | None) -> None:
             print(f"before / now: {old['cpu_s'] / many['cpu_s']:.1f}")  # type: ignore[operator]
 
 
-def bodies(numbers: list[int]) -> None:
+def concealed(shape: str, n: int) -> tuple[str, str, str]:
+    """Return a plant of n bodies, the flow that it lacks, and the finding that names it."""
+    if shape == "chain":
+        middle = n // 6 * 3 + 1
+        flow = f"{{into: block_{middle}, rate: 1.5 * step(t - 4000), unit: W}}"
+        return block_plant(n), flow, f"external_heat_source at block_{middle}"
+    links, (a, b) = network(n)
+    flow = f"{{from: block_{a}, into: block_{b}, rate: 0.3 * (block_{a} - block_{b}), unit: W}}"
+    first, second = sorted((a, b))
+    return block_plant(n, links), flow, f"missing_link at block_{first}-block_{second}"
+
+
+def bodies(numbers: list[int], shapes: list[str]) -> None:
     """Print time and memory of a diagnosis against the number of bodies, and the exponent between neighbours."""
-    last: tuple[int, float] | None = None
-    for n in numbers:
-        with tempfile.TemporaryDirectory() as work:
-            middle = n // 6 * 3 + 1
-            flow = f"{{into: block_{middle}, rate: 1.5 * step(t - 4000), unit: W}}"
-            recorded(Path(work), block_plant(n), flow, 1200, 10.0, 10.0)
-            found = diagnosed(Path(work))
-        line(f"{n} bodies", found)
-        cpu = float(found["cpu_s"])  # type: ignore[arg-type]
-        if last:
-            print(f"{'':28} exponent from {last[0]}: {np.log(cpu / last[1]) / np.log(n / last[0]):.2f}")
-        last = n, cpu
+    for shape in shapes:
+        last: tuple[int, float] | None = None
+        for n in numbers:
+            plant, flow, truth = concealed(shape, n)
+            with tempfile.TemporaryDirectory() as work:
+                recorded(Path(work), plant, flow, 1200, 10.0, 10.0)
+                found = diagnosed(Path(work))
+            line(f"{shape} of {n} bodies", found)
+            cpu = float(found["cpu_s"])  # type: ignore[arg-type]
+            exponent = (
+                f", exponent from {last[0]}: {np.log(cpu / last[1]) / np.log(n / last[0]):.2f}"
+                if last
+                else ""
+            )
+            named = truth in found.get("found", ())  # type: ignore[operator]
+            print(f"{'':28} {truth}: {'named' if named else 'not named'}{exponent}", flush=True)
+            last = n, cpu
+
+
+def recordings(numbers: list[int], workers: list[int]) -> None:
+    """Print time, memory and result against the number of recordings of a 12-body actuator, and of workers."""
+    source = Path(__file__).parents[2] / "config/plants/actuator_thermal.yaml"
+    with tempfile.TemporaryDirectory() as work:
+        folder = Path(work)
+        (folder / "plant.yaml").write_text(source.read_text())
+        (folder / "truth.yaml").write_text(
+            source.read_text().replace("flows:\n", f"flows:\n  concealed: {WEAK}\n")
+        )
+        truth, t = compile_plant(load(folder / "truth.yaml")), np.arange(30_000.0)
+        for k in range(1, max(numbers) + 1):
+            rng = np.random.default_rng(k)
+            ends = np.sort(rng.choice(np.arange(600, 30_000, 60), 20, replace=False))
+            current = np.round(rng.uniform(0, 2, 21), 2)[np.searchsorted(ends, t, side="right")]
+            inputs = {
+                "current_a": current,
+                "voltage_v": 4 * current,
+                "air_c": 22 + 0.2 * np.sin(t / 4000 + k),
+            }
+            write(folder / f"run_{k}.csv", truth.measure(Table(f"run_{k}", f"run_{k}", t, inputs), seed=k))
+        for n in numbers:
+            for w in workers if n == max(numbers) else workers[-1:]:
+                found = diagnosed(folder, [f"run_{k}.csv" for k in range(1, n + 1)], workers=w)
+                line(f"{n} recordings, {w} workers", found)
+                print(f"{'':28} {found.get('wall_s', float('nan')):.1f} s", flush=True)
 
 
 def main() -> int:
-    """Run one of the two benchmarks."""
+    """Run one of the benchmarks."""
     p = argparse.ArgumentParser(description=__doc__)
-    p.add_argument("what", choices=("rows", "bodies"))
+    p.add_argument("what", choices=("rows", "bodies", "recordings"))
     p.add_argument("--rows", type=int, default=260_000)
     p.add_argument("--before", type=Path)
     p.add_argument("--bodies", type=int, nargs="*", default=[12, 30, 60, 120])
+    p.add_argument("--shape", nargs="*", choices=("chain", "network"), default=["chain", "network"])
+    p.add_argument("--recordings", type=int, nargs="*", default=[1, 6, 12])
+    p.add_argument("--workers", type=int, nargs="*", default=[1, 2])
     a = p.parse_args()
     if a.what == "rows":
         rows(a.rows, a.before)
+    elif a.what == "bodies":
+        bodies(a.bodies, a.shape)
     else:
-        bodies(a.bodies)
+        recordings(a.recordings, a.workers)
     return 0
 
 

@@ -16,7 +16,7 @@ from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.design import Excitation, courses, levers
 from thermoctl.diagnose.experiment_file import peaks
 from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.propose import bits, distance, propose
+from thermoctl.diagnose.propose import bits, distances, propose
 from thermoctl.diagnose.resolve import resolve
 from thermoctl.diagnose.search import search
 from thermoctl.identify.experiments import load_experiments, load_inputs
@@ -155,7 +155,7 @@ def test_distance_is_what_dense_algebra_says():
     covariance = np.diag(np.repeat(sigma**2, 30)) + J[0] @ J[0].T + J[1] @ J[1].T
     difference = stacked[0] - stacked[1]
     dense = difference @ np.linalg.solve(covariance, difference)
-    assert distance(a, b, [(0, 0), (1, 1)], sigma) == pytest.approx(dense, rel=1e-9)
+    assert distances([a, b], [[0, 1], [0, 1]], sigma)[0, 1] == pytest.approx(dense, rel=1e-9)
 
 
 def test_bits_are_none_for_equals_and_one_for_two_that_differ():

@@ -12,7 +12,7 @@ from tests.diagnose.changes import Rig, kelvin, milliwatt, names, order
 from thermoctl.diagnose.candidates import Candidate, candidates
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Trajectory, changes
+from thermoctl.diagnose.screen import Overlay, Trajectory
 from thermoctl.plant import from_plain, loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import compile_plant
@@ -148,7 +148,7 @@ def _changes(rig: Rig) -> dict[tuple, tuple[dict, dict]]:
             if rig.plant["outputs"].get(c.place.where, {}).get("unit") == "K":
                 values = {k: v + 273.15 * (k == "YMAX") for k, v in values.items()}  # a level of that reading
             own = {c.own(k): v for k, v in values.items()}
-            out[c.key, c.variant, c.label] = changes(plant, c.extend(values), own, at)
+            out[c.key, c.variant, c.label] = Overlay(plant, c.extend(values)).changes(own, at)
     return out
 
 

@@ -1,6 +1,7 @@
 """A concealed law is found, written and found again by name; where nothing is missing, none is claimed."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import yaml
@@ -12,7 +13,7 @@ from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.fit import fitted
-from thermoctl.diagnose.law import find_law
+from thermoctl.diagnose.law import FEWEST_REFITS, REFITS, SIMPLER, affordable, find_law
 from thermoctl.diagnose.law_result import law_entry, law_section
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.rig import Rig
@@ -71,6 +72,13 @@ def test_a_saved_law_is_an_effect_that_finds_its_place(found, tmp_path, capsys):
     assert main(["effects", "check", str(own), "--plant", str(tmp_path / "plant.yaml")]) == 0
     assert main(["effects", "save", str(tmp_path), "peltier", "--effects", str(own)]) != 0
     assert "exists already" in capsys.readouterr().err
+
+
+def test_a_larger_plant_gets_fewer_refits_of_laws(found):
+    _, known, law = found
+    once = affordable(known, law.fitted)
+    often = affordable(replace(known, tables=known.tables * 200), law.fitted)
+    assert once == REFITS + SIMPLER and often == FEWEST_REFITS
 
 
 def test_no_law_is_claimed_where_nothing_is_missing():

@@ -144,6 +144,14 @@ def test_sensitivities_are_the_slopes_of_the_fine_simulation(kind):
         assert np.all(np.abs(run.dy[:, :, c] - slope) <= 2e-4 * np.abs(slope).max(axis=0) + 1e-8), name
 
 
+@pytest.mark.parametrize("kind", PLANTS)
+def test_outputs_without_states_have_the_same_slopes(kind):
+    model = compile_plant(loads(HEAD + PLANTS[kind], kind))
+    drive = model.excitation(recording())
+    whole, outputs = (model.run(drive, sensitivities=True, states=s) for s in (True, False))
+    assert outputs.dx is None and np.array_equal(whole.dy, outputs.dy) and np.array_equal(whole.y, outputs.y)
+
+
 def test_delay_of_a_reading_and_of_an_input():
     text = (
         HEAD

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.fft import dct
+from scipy.fft import dct, idct
 
 from thermoctl.plant.simulate import Excitation
 
@@ -112,6 +112,14 @@ class Coordinates:
             whole = len(part) // c.block * c.block
             part = part[:whole].reshape(-1, c.block, *part.shape[1:]).sum(axis=1) / np.sqrt(c.block)
         return dct(part, axis=0, norm="ortho")[: c.rows]
+
+    def transposed(self, c: Channel, rows: np.ndarray, samples: int) -> np.ndarray:
+        """Return the transpose of `transform`: rows (rows, k) of a channel as values (samples, k)."""
+        n = len(c.index) // c.block
+        part = idct(np.concatenate([rows, np.zeros((n - c.rows, rows.shape[1]))]), axis=0, norm="ortho")
+        out = np.zeros((samples, rows.shape[1]))
+        out[c.index[: n * c.block]] = np.repeat(part, c.block, axis=0) / np.sqrt(c.block)
+        return out
 
     def powers(self, rows: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Sum of squares of each channel's rows (rows,) in its bands (bands,)."""

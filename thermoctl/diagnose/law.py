@@ -21,7 +21,7 @@ import numpy as np
 from thermoctl.diagnose import places as catalogue_places
 from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted, Placed, fitted
+from thermoctl.diagnose.fit import Fitted, Placed, as_refitted, fitted
 from thermoctl.diagnose.held_out import Worth, worth
 from thermoctl.diagnose.law_forms import (
     Place,
@@ -40,6 +40,7 @@ from thermoctl.diagnose.misfit import energies, physics
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.search import Searched, Weighed
 from thermoctl.diagnose.shortlist import ALIKE, HALF
+from thermoctl.diagnose.unknown import located, reached
 from thermoctl.plant import expression as ex
 from thermoctl.plant.residuals import HUGE
 from thermoctl.plant.simulate import SimulationError
@@ -47,12 +48,14 @@ from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 PIECES = 8  # of a free function of a signal
+TRACKED = 20  # nodes with an unknown flow, those that explain the residual best: 24 knots each
 NODES = 4  # of a plant, at which a free flow in time explains most
 SECOND = 10  # signals of a place that may be the second one of a form
 COMBINATIONS = 12  # places and signals whose forms are tried
 POOL = 60  # terms that a sum of terms is built from
-REFITS = 12
+REFITS, FEWEST_REFITS = 12, 3  # the best proposals; of a plant of many bodies fewer, see NUMBERS
 SIMPLER = 6  # further refits, of sums of terms without their least significant one
+NUMBERS = 3e7  # that one run of each refit computes, with slopes: so that all refits take less than a minute
 TERMS = 3
 CHUNK = 256  # terms whose responses are computed at a time
 SEEN = 0.01  # of the strongest direction of a free function: weaker ones are not drawn
@@ -173,10 +176,11 @@ def find_law(
         return None
     tried: list[tuple[Proposal, Fitted]] = []
     queue, more = list(proposals), SIMPLER
-    gain, leader = 0.0, parent
+    gain, leader, left = 0.0, parent, affordable(case, parent)
     for k, p in enumerate(queue):
-        if case.budget.stopped() or p.cost + gain > HALF * p.promise:
+        if not left or case.budget.stopped() or p.cost + gain > HALF * p.promise:
             continue
+        left -= 1
         say(f"looking for a law of the remainder: refit {k + 1}")
         f = refitted_law(case, parent, p, at, leader)
         if f is None:
@@ -222,6 +226,14 @@ def find_law(
     )
 
 
+def affordable(case: Case, parent: Fitted) -> int:
+    """Return how many laws may be refitted: a count of the work, the same on every machine."""
+    rows = sum(len(t) for t in case.tables)
+    model = parent.rough.model
+    numbers = rows * len(model.states) * (len(model.unknowns) + 1)
+    return int(np.clip(NUMBERS / max(numbers, 1), FEWEST_REFITS, REFITS + SIMPLER))
+
+
 def closed(value: Worth, noise: Mapping[str, float]) -> float:
     """Return the share of the misfit's energy beyond the noise that a law closes."""
 
@@ -252,7 +264,10 @@ def propose_laws(case: Case, parent: Fitted) -> tuple[list[Proposal], Tracked]:
     drives = case.drives(parent.rough.model)
     rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
     where = places(rig)
-    at = tracked(case, parent, [p.target for p in where if p.source is None])
+    nodes = [p.target for p in where if p.source is None]
+    if len(nodes) > TRACKED:
+        nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
+    at = tracked(case, parent, nodes)
     likely = sorted(at.explained, key=lambda n: -at.explained[n])[:NODES]
     combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, at.runs)]
     free = [(_free(at, p, s), p, s) for p, s in combos]
@@ -297,7 +312,7 @@ def _promise(at: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
     scale = np.linalg.norm(x, axis=0)
     scale[scale == 0] = 1.0
     c = np.linalg.lstsq(x / scale, at.target, rcond=1e-8)[0] / scale
-    return at.metric.log_likelihood(at.target - x @ c) - at.metric.log_likelihood(at.target), c
+    return at.metric.log_likelihood(at.target - x @ c) - at.now, c
 
 
 def _singles(

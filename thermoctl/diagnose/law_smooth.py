@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -49,6 +50,11 @@ class Tracked:
     runs: list[dict[str, np.ndarray | float]]
     duration: float
     explained: dict[str, float]
+
+    @cached_property
+    def now(self) -> float:
+        """Log likelihood of the target without a law."""
+        return self.metric.log_likelihood(self.target)
 
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
         """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording.

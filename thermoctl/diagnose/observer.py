@@ -26,6 +26,9 @@ from thermoctl.plant.simulate import Excitation
 LASTING = 20.0  # samples for which a missing flow holds: turns its variance into an intensity
 RESTING = 1e-3  # of the fastest state's slope: least slope of another, so that no state is without noise
 PURE = 1e-6  # share of the noise at a state that only integrates another: as good as none
+# Share of an error that a drifting mode keeps to the end of the recordings. In 57 generated cases axes
+# keep all of it. The next mode, a coil that cools slowly, keeps 0.38.
+KEPT = 0.9
 TRUSTS = 0.01, 0.1  # process noise as a share of the slopes' own size; a larger one follows more closely
 
 
@@ -66,9 +69,11 @@ def _linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
 
 
 def drifts(plant: Linear, duration: float) -> bool:
-    """Return whether a mode of the plant does not decay within the recordings; False if unknown."""
+    """Return whether a mode of the plant keeps an error over the recordings; False if unknown.
+
+    A body that only cools slowly is no such mode: it is linear enough for a free run."""
     known = bool(len(plant.a)) and bool(np.isfinite(plant.a).all())  # the slope of a root may be infinite
-    return known and bool(np.max(np.linalg.eigvals(plant.a).real) > -1 / duration)
+    return known and bool(np.max(np.linalg.eigvals(plant.a).real) > np.log(KEPT) / duration)
 
 
 def held(plant: Plant, about: Linear, noise: Sequence[Noise], interval: float, trust: float) -> Plant | None:

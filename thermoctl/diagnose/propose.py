@@ -39,7 +39,8 @@ MOST = 5  # hypotheses that are compared
 LIKELY = 0.02  # a hypothesis below this share of the likeliest one is not worth rig time
 POINTS, READINGS = 700, 4000  # of a simulated experiment, at most; thinned readings count as less noisy ones
 FEWEST_POINTS = 150  # of a simulated experiment, however many outputs it has
-TRIALS = 150  # candidates that are simulated, at most; of more, evenly chosen ones
+TRIALS, FEWEST_TRIALS = 150, 40  # candidates that are simulated, at most; of more, evenly chosen ones
+NUMBERS = 2e8  # slopes that all trials compute, at most: a plant of many bodies gets fewer trials
 ENOUGH = 0.8  # of the best experiment's bits that a shorter one must reach
 SHARES = (
     1.0,
@@ -53,9 +54,7 @@ IN_RANGE = (
 )
 WORTH_A_SENSOR = 0.1  # bits by which a further sensor must better the experiment
 
-Prediction = tuple[
-    np.ndarray, np.ndarray
-]  # readings and states (N, ny + nx), and their uncertainty (N, ny + nx, z)
+Prediction = tuple[np.ndarray, np.ndarray]  # readings (N, ny), and their uncertainty (N, ny, z)
 
 
 @dataclass
@@ -68,15 +67,17 @@ class _Predictor:
     root: np.ndarray  # (z, z), P = root root'
     slopes: np.ndarray  # dq / dz of the model's uncertain unknowns, else 0
 
-    def predict(self, table: Table) -> Prediction | None:
-        """Simulate an experiment; None where that fails."""
+    def predict(self, table: Table, states: bool = False) -> Prediction | None:
+        """Simulate an experiment; None where that fails. With `states`, these follow the readings."""
         try:
-            run = self.model.run(self.model.excitation(table), sensitivities=True, rtol=1e-5)
+            run = self.model.run(self.model.excitation(table), sensitivities=True, rtol=1e-5, states=states)
         except (SimulationError, InputError):
             return None
-        assert run.dy is not None and run.dx is not None
-        slopes = np.concatenate([run.dy, run.dx], axis=1) * self.slopes @ self.root
-        y = np.concatenate([run.y, run.x], axis=1)
+        assert run.dy is not None
+        y, slopes = run.y, run.dy
+        if states and run.dx is not None:
+            y, slopes = np.concatenate([y, run.x], axis=1), np.concatenate([slopes, run.dx], axis=1)
+        slopes = slopes * self.slopes @ self.root
         return (y, slopes) if np.all(np.isfinite(y)) and np.all(np.isfinite(slopes)) else None
 
 
@@ -104,17 +105,31 @@ def _predictor(f: Fitted, weight: float) -> _Predictor:
     return _Predictor(label or "nothing missing", weight, model, root, slopes)
 
 
-def distance(a: Prediction, b: Prediction, columns: Sequence[tuple[int, int]], sigma: np.ndarray) -> float:
-    """Compute D of (1) over pairs of columns (of a, of b), noise `sigma` each, by Woodbury's identity."""
-    difference = np.concatenate(
-        [(a[0][:, i] - b[0][:, j]) / s for (i, j), s in zip(columns, sigma, strict=True)]
+def distances(
+    predictions: Sequence[Prediction], columns: Sequence[Sequence[int]], sigma: np.ndarray
+) -> np.ndarray:
+    """Compute D of (1) of every two predictions over their columns, by Woodbury's identity.
+
+    `sigma`: noise of each column.
+
+    Each pair's matrix consists of products that several pairs share."""
+    y, load = (
+        [
+            np.concatenate([p[part][:, j] / s for j, s in zip(own, sigma, strict=True)])
+            for p, own in zip(predictions, columns, strict=True)
+        ]
+        for part in (0, 1)
     )
-    load = np.concatenate(
-        [np.hstack([a[1][:, i], b[1][:, j]]) / s for (i, j), s in zip(columns, sigma, strict=True)]
-    )
-    inner = load.T @ difference
-    taken = np.linalg.solve(np.eye(load.shape[1]) + load.T @ load, inner)
-    return float(max(difference @ difference - inner @ taken, 0.0))
+    own = [np.eye(x.shape[1]) + x.T @ x for x in load]
+    D = np.zeros((len(y), len(y)))
+    for a in range(len(y)):
+        for b in range(a):
+            difference = y[a] - y[b]
+            inner = np.concatenate([load[a].T @ difference, load[b].T @ difference])
+            cross = load[a].T @ load[b]
+            taken = np.linalg.solve(np.block([[own[a], cross], [cross.T, own[b]]]), inner)
+            D[a, b] = D[b, a] = float(max(difference @ difference - inner @ taken, 0.0))
+    return D
 
 
 def bits(D: np.ndarray, weights: np.ndarray) -> float:
@@ -162,7 +177,7 @@ class _Trial:
     excitation: Excitation
     bits: float
     distances: np.ndarray
-    predictions: list[Prediction]
+    predictions: list[np.ndarray]  # readings (N, ny)
 
     @property
     def bits_per_second(self) -> float:
@@ -182,6 +197,9 @@ class _Comparison:
         self.outputs = list(case.null.model.outputs)
         self.seen = [j for j, _ in enumerate(self.outputs) if len(_recorded(case, j))]
         self.points = min(POINTS, max(READINGS // len(self.outputs), FEWEST_POINTS))
+        unknowns = sum(len(b.model.unknowns) for b in self.predictors)
+        numbers = self.points * len(self.outputs) * unknowns
+        self.trials = int(np.clip(NUMBERS / numbers, FEWEST_TRIALS, TRIALS))
 
     def grid(self, x: Excitation) -> float:
         """The step of a simulated experiment, s."""
@@ -194,7 +212,7 @@ class _Comparison:
         if len(predictions) < len(self.predictors) or self._leaves_limits(predictions):
             return None
         distances = self.distances(predictions, self.sigma[self.seen] * np.sqrt(self.step / self.grid(x)))
-        return _Trial(x, bits(distances, self.weights), distances, predictions)
+        return _Trial(x, bits(distances, self.weights), distances, [y for y, _ in predictions])
 
     def distances(
         self, predictions: Sequence[Prediction], sigma: np.ndarray, state: str | None = None
@@ -204,12 +222,7 @@ class _Comparison:
         for b in self.predictors:
             recorded = [b.model.outputs.index(self.outputs[j]) for j in self.seen]
             columns.append(recorded + ([len(b.model.outputs) + b.model.states.index(state)] if state else []))
-        D = np.zeros((len(columns), len(columns)))
-        for i, mine in enumerate(columns):
-            for k, other in enumerate(columns[:i]):
-                pairs = list(zip(mine, other, strict=True))
-                D[i, k] = D[k, i] = distance(predictions[i], predictions[k], pairs, sigma)
-        return D
+        return distances(predictions, columns, sigma)
 
     def _leaves_limits(self, predictions: Sequence[Prediction]) -> bool:
         """Whether any hypothesis predicts a reading outside its limits.
@@ -256,7 +269,7 @@ def propose(
     for share in SHARES:
         smaller = [_smaller(lever, share) for lever in drive]
         candidates = family(case.plant, case.tables, smaller, comparison.step)
-        candidates = candidates[:: -(-len(candidates) // TRIALS)]
+        candidates = candidates[:: -(-len(candidates) // comparison.trials)]
         with ThreadPoolExecutor(max_workers=2) as pool:
             trials = [t for t in pool.map(comparison.trial, candidates) if t is not None]
         if trials:
@@ -313,7 +326,7 @@ def _recorded(case: Case, j: int) -> np.ndarray:
     return np.concatenate([p[np.isfinite(p)] for p in parts]) if parts else np.zeros(0)
 
 
-def _predicted(comparison: _Comparison, predictions: Sequence[Prediction]) -> dict[str, dict[str, Any]]:
+def _predicted(comparison: _Comparison, predictions: Sequence[np.ndarray]) -> dict[str, dict[str, Any]]:
     """List each output's unit, predicted range over all hypotheses, and recorded range."""
     out = {}
     for j, o in enumerate(comparison.outputs):
@@ -321,8 +334,8 @@ def _predicted(comparison: _Comparison, predictions: Sequence[Prediction]) -> di
         out[o] = {
             "unit": comparison.case.plant.outputs[o].unit,
             "column": comparison.case.plant.outputs[o].column,
-            "low": float(min(p[:, j].min() for p, _ in predictions)),
-            "high": float(max(p[:, j].max() for p, _ in predictions)),
+            "low": float(min(p[:, j].min() for p in predictions)),
+            "high": float(max(p[:, j].max() for p in predictions)),
             "recorded": [float(y.min()), float(y.max())] if len(y) else None,
         }
     return out
@@ -333,7 +346,10 @@ def _sensor(comparison: _Comparison, best: _Trial) -> str:
 
     The stored quantity whose own sensor would tell most, in words."""
     plant, sigma, seen = comparison.case.plant, comparison.sigma, comparison.seen
-    share = np.sqrt(comparison.step / comparison.grid(best.excitation))
+    grid = comparison.grid(best.excitation)
+    share = np.sqrt(comparison.step / grid)
+    table = best.excitation.table(plant, grid)
+    predictions = [p for b in comparison.predictors if (p := b.predict(table, True)) is not None]
     shown = [plant.outputs[comparison.outputs[j]] for j in seen]
     most, where = bits(best.distances, comparison.weights) + WORTH_A_SENSOR, ""
     for node in plant.nodes.values():
@@ -345,7 +361,7 @@ def _sensor(comparison: _Comparison, best: _Trial) -> str:
         ):
             continue
         noise = np.append(sigma[seen], np.median(alike)) * share
-        told = bits(comparison.distances(best.predictions, noise, node.name), comparison.weights)
+        told = bits(comparison.distances(predictions, noise, node.name), comparison.weights)
         if told > most:
             most, where = told + WORTH_A_SENSOR, node.name
     if where:

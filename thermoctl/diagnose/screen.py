@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -29,12 +29,13 @@ from thermoctl.diagnose.rig import STRAIGHT, Rig
 from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import expression as ex
 from thermoctl.plant.cores import each
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Node, Plant
 from thermoctl.plant.refit import Fit
 from thermoctl.plant.simulate import Excitation, Model, Simulation
 
 EPSILON = 1e-4  # amplitude at which a direction is taken
 CHUNK = 96
+EXACT = 4_000  # columns, up to which all are simulated
 ONSETS = 24  # onset times of the grid over the recordings
 NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
 
@@ -90,6 +91,10 @@ class Metric:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
         raise NotImplementedError
 
+    def spread(self, r: int, w: np.ndarray) -> np.ndarray:
+        """Return (N, outputs, k): the transpose of `unweighted`, of all rows (rows, k), for recording r."""
+        raise NotImplementedError
+
     def project(self, d: np.ndarray) -> np.ndarray:
         """Return directions (rows, k) without the part that the plant's own parameters absorb."""
         return d - self.basis @ (self.basis.T @ d)
@@ -103,7 +108,7 @@ class Trajectory:
 
     def __init__(self, metric: Metric, rig: Rig, r: int):
         d, run = metric.drives[r], metric.runs[r]
-        self.drive, self.run = d, run
+        self.recording, self.drive, self.run = r, d, run
         self.values: dict[str, np.ndarray | float] = {
             **{c: _hold(rig.columns[r][c]) for c in rig.spare},
             **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
@@ -141,55 +146,73 @@ def _hold(column: np.ndarray) -> np.ndarray:
     return column[np.where(index < 0, int(np.argmax(good)), index)]
 
 
-def changes(
-    base: Plant, extended: Plant, values: Mapping[str, float], at: Trajectory
-) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
-    """Return the extension's changes along the trajectory: of slopes dx/dt by state, of outputs by output."""
-    extra: dict[str, np.ndarray | float] = {k: v for k, v in values.items()}
-    for n in extended.nodes.values():
-        if n.name not in base.nodes:
-            extra[n.name] = _new_node(extended, n.name, extra, at)
-    touched: dict[str, list[tuple[np.ndarray, float]]] = {}
-    for f in extended.flows.values():
-        old = base.flows.get(f.name)
-        if old is not None and old.rate is f.rate:
-            continue
-        delta = at.value(f.rate, extra) - (0.0 if old is None else at.own(old.rate))
-        for end, sign in ((f.source, -1.0), (f.target, 1.0)):
-            if end in base.nodes:
-                touched.setdefault(end, []).append((delta, sign))  # type: ignore[arg-type]
-    states = list(base.nodes)
-    slopes: dict[int, np.ndarray] = {}
-    for node, terms in touched.items():
-        total = sum(sign * delta for delta, sign in terms)
-        slopes[states.index(node)] = total / at.own(base.nodes[node].storage)
-    for node, n in base.nodes.items():
-        changed = extended.nodes[node]
-        if changed.storage is not n.storage:
-            net = np.zeros(at.drive.t.shape)
+class Overlay:
+    """The changes of a plant by an extension: flows, storages, outputs, new nodes."""
+
+    def __init__(self, base: Plant, extended: Plant):
+        self.base, self.states = base, list(base.nodes)
+        self.new = [(n, _net(extended, k)) for k, n in extended.nodes.items() if k not in base.nodes]
+        self.flows = [
+            (f, old)
+            for f in extended.flows.values()
+            if (old := base.flows.get(f.name)) is None or old.rate is not f.rate
+        ]
+        self.storages = [
+            (n, extended.nodes[n.name].storage)
+            for n in base.nodes.values()
+            if extended.nodes[n.name].storage is not n.storage
+        ]
+        self.outputs = [
+            (j, o.value, extended.outputs[key].value)
+            for j, (key, o) in enumerate(base.outputs.items())
+            if extended.outputs[key].value is not o.value
+        ]
+
+    def changes(
+        self, values: Mapping[str, float], at: Trajectory
+    ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+        """Return the changes along a trajectory: of slopes dx/dt by state, of outputs by output.
+
+        `values`: of the extension's parameters."""
+        base = self.base
+        extra: dict[str, np.ndarray | float] = {k: v for k, v in values.items()}
+        for n, net in self.new:
+            extra[n.name] = _new_node(n, net, extra, at)
+        touched: dict[str, list[tuple[np.ndarray, float]]] = {}
+        for f, old in self.flows:
+            delta = at.value(f.rate, extra) - (0.0 if old is None else at.own(old.rate))
+            for end, sign in ((f.source, -1.0), (f.target, 1.0)):
+                if end in base.nodes:
+                    touched.setdefault(end, []).append((delta, sign))  # type: ignore[arg-type]
+        slopes: dict[int, np.ndarray] = {}
+        for node, terms in touched.items():
+            total = sum(sign * delta for delta, sign in terms)
+            slopes[self.states.index(node)] = total / at.own(base.nodes[node].storage)
+        for n, storage in self.storages:
+            change = np.zeros(at.drive.t.shape)
             for f in base.flows.values():
-                if node in (f.source, f.target):
-                    net += (1.0 if f.target == node else -1.0) * at.own(f.rate)
-            slopes[states.index(node)] = net / at.value(changed.storage, extra) - net / at.value(
+                if n.name in (f.source, f.target):
+                    change += (1.0 if f.target == n.name else -1.0) * at.own(f.rate)
+            slopes[self.states.index(n.name)] = change / at.value(storage, extra) - change / at.value(
                 n.storage, extra
             )
-    outputs = {}
-    for j, (key, o) in enumerate(base.outputs.items()):
-        new = extended.outputs[key]
-        if new.value is not o.value:
-            outputs[j] = at.value(new.value, extra) - at.own(o.value)
-    return slopes, outputs
+        return slopes, {j: at.value(new, extra) - at.own(old) for j, old, new in self.outputs}
 
 
-def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], at: Trajectory) -> np.ndarray:
-    """Integrate a new node alone along the trajectory: dn/dt = a - b n, a and b constant in a sample."""
-    n = plant.nodes[node]
+def _net(plant: Plant, node: str) -> ex.Expr:
+    """Return what flows into a node, as one expression."""
     net: ex.Expr = ex.ZERO
     for f in plant.flows.values():
         if f.target == node:
             net = ex.add(net, f.rate)
         if f.source == node:
             net = ex.add(net, ex.neg(f.rate))
+    return net
+
+
+def _new_node(n: Node, net: ex.Expr, extra: Mapping[str, np.ndarray | float], at: Trajectory) -> np.ndarray:
+    """Integrate a new node alone along the trajectory: dn/dt = a - b n, a and b constant in a sample."""
+    node = n.name
     first = {
         **{k: float(np.asarray(v).flat[0]) for k, v in at.values.items()},
         **{k: float(np.asarray(v).flat[0]) for k, v in extra.items()},
@@ -217,62 +240,94 @@ def _new_node(plant: Plant, node: str, extra: Mapping[str, np.ndarray | float], 
 # ---------------------------------------------------------------------------------------------------------- screening
 
 
-@dataclass
+@dataclass(frozen=True)
 class Column:
-    """A direction to be built: per recording its forces and its changes of outputs."""
+    """A direction to be built: an effect at one shape, along one of its amplitudes.
+
+    item = (candidate, group, (shape, dim), columns in the group); `scale`: over the amplitude in `values`."""
 
     item: tuple[Any, ...]
-    forces: list[dict[int, np.ndarray]] = field(default_factory=list)
-    outputs: list[dict[int, np.ndarray]] = field(default_factory=list)
+    overlay: Callable[[], Overlay]
+    values: Mapping[str, float]
+    scale: float
+
+    def changes(self, at: Trajectory) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+        """Return its forces by state and its changes of outputs along a trajectory, all numbers finite."""
+        try:
+            parts = self.overlay().changes(self.values, at)
+        except (KeyError, ex.ExpressionError):
+            return {}, {}
+        forces, outputs = (
+            {k: _finite(v * self.scale) for k, v in part.items() if np.any(v)} for part in parts
+        )
+        return forces, outputs
 
 
-_Entry = tuple[Column, np.ndarray, float]  # its projected rows, and the norm of the whole ones
+def _finite(v: np.ndarray) -> np.ndarray:
+    return np.nan_to_num(v, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def directions(metric: Metric, columns: Sequence[Column]) -> Iterable[tuple[Sequence[Column], np.ndarray]]:
-    """Rows (rows, k) of columns, not whitened, a chunk at a time."""
+Entry = tuple[Column, np.ndarray, float]  # its projected rows, and the norm of the whole ones
+
+
+def directions(
+    metric: Metric, at: Sequence[Trajectory], columns: Iterable[Column]
+) -> Iterator[tuple[Sequence[Column], np.ndarray]]:
+    """Yield rows (rows, k) of columns, not whitened, a chunk at a time."""
     buffers: dict[str, np.ndarray] = {}
-    model, recordings = metric.model, range(len(metric.drives))
-    for at in range(0, len(columns), CHUNK):
-        part = columns[at : at + CHUNK]
+    model, left = metric.model, iter(columns)
+    while part := list(itertools.islice(left, CHUNK)):
         numbers = sum(len(d.t) for d in metric.drives) * len(model.states) * len(part)
-        blocks = each(partial(_rows, metric, part, buffers), recordings, numbers)
-        yield part, np.concatenate(blocks)
+        yield part, np.concatenate(each(partial(_rows, metric, part, buffers), at, numbers))
 
 
-def _rows(metric: Metric, part: Sequence[Column], buffers: dict[str, np.ndarray], r: int) -> np.ndarray:
+def _rows(
+    metric: Metric, part: Sequence[Column], buffers: dict[str, np.ndarray], at: Trajectory
+) -> np.ndarray:
     """Return the rows (rows, k) of columns in one recording, not whitened."""
-    d, forces, values = metric.drives[r], [], []
+    d, r = at.drive, at.recording
+    forces: list[tuple[int, int]] = []
+    values: list[np.ndarray] = []
+    outputs: list[dict[int, np.ndarray]] = []
     for c, column in enumerate(part):
-        for state, q in column.forces[r].items():
-            forces.append((state, c))
-            values.append(q)
+        pushed, read = column.changes(at)
+        forces += [(state, c) for state in pushed]
+        values += pushed.values()
+        outputs.append(read)
     if forces:
-        q = np.nan_to_num(np.stack(values, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
-        at = (metric.fit.values[r], metric.fit.dx0[r])
-        dy = metric.model.respond(d, *at, forces, q, len(part), buffers=buffers)
+        fit = (metric.fit.values[r], metric.fit.dx0[r])
+        dy = metric.model.respond(d, *fit, forces, np.stack(values, axis=1), len(part), buffers=buffers)
     else:
         dy = np.zeros((len(d.t), len(metric.model.outputs), len(part)))
-    for c, column in enumerate(part):
-        for j, delta in column.outputs[r].items():
-            dy[:, j, c] += np.nan_to_num(delta)
+    for c, read in enumerate(outputs):
+        for j, delta in read.items():
+            dy[:, j, c] += delta
     return metric.unweighted(r, dy)
 
 
+Select = Callable[[Sequence[Metric], Sequence[Trajectory], list["Group"]], list["Group"]]
+
+
 def screen(
-    metrics: Sequence[Metric], rig: Rig, found: Sequence[Candidate], edges: np.ndarray | None = None
+    metrics: Sequence[Metric],
+    rig: Rig,
+    found: Sequence[Candidate],
+    edges: np.ndarray | None = None,
+    select: Select = lambda metrics, at, groups: groups,
 ) -> list[list[Direction]]:
     """Return every candidate's best direction, best first, in each of the metrics.
 
-    The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid."""
+    The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid.
+    Of more than EXACT columns, `select` chooses the groups that are simulated (sketch.py)."""
     first = metrics[0]
     at = [Trajectory(first, rig, r) for r in range(len(first.drives))]
-    columns: list[Column] = []
-    for c in found:
-        columns += columns_of(c, first, at, edges)
+    groups = [g for c in found for g in groups_of(c, first, edges)]
+    if sum(len(g.sizes) for g in groups) > EXACT:
+        groups = select(metrics, at, groups)
     best: list[dict[int, Direction]] = [{} for _ in metrics]
-    pending: dict[tuple[Any, ...], list[_Entry]] = {}
-    for part, plain in directions(first, columns):
+    pending: dict[tuple[Any, ...], list[Entry]] = {}
+    columns = (column for g in groups for column in g.columns())
+    for part, plain in directions(first, at, columns):
         for metric, leaders in zip(metrics, best, strict=True):
             rows = plain * metric.weight[:, None]
             full = np.linalg.norm(rows, axis=0)
@@ -284,7 +339,7 @@ def screen(
                 entries.append((column, rows[:, k].copy(), float(full[k])))
                 if len(entries) == count:
                     del pending[key]
-                    _score(candidate, entries, metric, leaders)
+                    _scored(entries, metric, leaders)
     return [sorted(leaders.values(), key=lambda d: d.log_p) for leaders in best]
 
 
@@ -312,12 +367,32 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
     return found
 
 
-def columns_of(
-    c: Candidate, metric: Metric, at: Sequence[Trajectory], edges: np.ndarray | None = None
-) -> list[Column]:
-    """Return the columns that one candidate needs. item = (candidate, group, (shape, dim), columns in the group).
+@dataclass(frozen=True)
+class Group:
+    """The columns of an effect at a place that are scored together: amplitudes at one shape, or onsets.
 
-    `edges`: onsets to try instead of the grid."""
+    `sizes`: shape and direction in the amplitudes of each column. `overlay` of the candidate, made once."""
+
+    candidate: Candidate
+    number: Any
+    sizes: tuple[tuple[dict[str, float], tuple[float, ...]], ...]
+    overlay: Callable[[], Overlay]
+
+    def columns(self) -> Iterator[Column]:
+        """Yield the columns."""
+        c = self.candidate
+        scale = 1 / EPSILON if any(p.amplitude for p in c.effect.parameters) else 1.0
+        for shape, dim in self.sizes:
+            own = {c.own(k): v for k, v in _values(c, shape, dim).items()}
+            yield Column((c, self.number, (shape, dim), len(self.sizes)), self.overlay, own, scale)
+
+
+def _values(c: Candidate, shape: Mapping[str, float], dim: Sequence[float]) -> dict[str, float]:
+    return parameter_values(c, shape, [EPSILON * v for v in dim])
+
+
+def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> list[Group]:
+    """Return the groups of columns that one candidate needs. `edges`: onsets to try instead of the grid."""
     effect = c.effect
     grids = {
         key: shape_grid(kind, c, metric.runs)
@@ -338,31 +413,16 @@ def columns_of(
         {k: v for part in combination for k, v in part.items()}
         for combination in itertools.product(*grids.values())
     ] or [{}]
-    amplitudes = [p for p in effect.parameters if p.amplitude]
-    dims = effect.dims if amplitudes else ((1.0,),)
-    out: list[Column] = []
-    extended: Plant | None = None
-    for g, shape in enumerate(shapes):
-        group: tuple[Any, ...] = ("all",) if windowed else (g,)
-        count = len(shapes) if windowed else len(dims) * len(phases)
-        for dim in dims:
-            for phase in phases:
-                values = parameter_values(c, {**shape, **phase}, [EPSILON * v for v in dim])
-                column = Column((c, group, ({**shape, **phase}, dim), count))
-                extended = extended or c.extend(values)  # only the values differ: `changes` gets them
-                own = {c.own(k): v for k, v in values.items()}
-                for trajectory in at:
-                    try:
-                        slopes, outputs = changes(c.rig.plant, extended, own, trajectory)
-                    except (KeyError, ex.ExpressionError):
-                        slopes, outputs = {}, {}
-                    scale = 1 / EPSILON if amplitudes else 1.0
-                    column.forces.append({k: v * scale for k, v in slopes.items() if np.any(v)})
-                    column.outputs.append({k: v * scale for k, v in outputs.items() if np.any(v)})
-                out.append(column)
-    if not any(f or o for column in out for f, o in zip(column.forces, column.outputs, strict=True)):
-        return []
-    return out
+    dims = effect.dims if any(p.amplitude for p in effect.parameters) else ((1.0,),)
+    sizes = [tuple(({**shape, **phase}, dim) for dim in dims for phase in phases) for shape in shapes]
+    if windowed:
+        sizes = [tuple(s for part in sizes for s in part)]
+
+    @cache
+    def overlay() -> Overlay:  # of every group: only the values differ
+        return Overlay(c.rig.plant, c.extend(_values(c, *sizes[0][0])))
+
+    return [Group(c, ("all",) if windowed else (g,), part, overlay) for g, part in enumerate(sizes)]
 
 
 def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float]) -> dict[str, float]:
@@ -385,13 +445,23 @@ def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float
     return out
 
 
-def _score(c: Candidate, entries: Sequence[_Entry], metric: Metric, best: dict[int, Direction]) -> None:
-    """Score the columns of one candidate at one shape, and keep their best direction."""
+def _scored(entries: Sequence[Entry], metric: Metric, best: dict[int, Direction]) -> None:
+    """Score the columns of one group, and keep their best direction."""
     rows = np.stack([e[1] for e in entries], axis=1)
     full = np.array([e[2] for e in entries])
-    g, m = rows.T @ metric.residual, rows.T @ rows
+    score([e[0] for e in entries], rows, rows.T @ metric.residual, full, best)
+
+
+def score(
+    columns: Sequence[Column], rows: np.ndarray, g: np.ndarray, full: np.ndarray, best: dict[int, Direction]
+) -> None:
+    """Score the columns of one group, and keep their best direction if it is the candidate's best so far.
+
+    - `rows` (rows, k): projected; only their products count, so sketched ones will do
+    - `g` (k,): products with the residual; `full` (k,): norms of the whole rows"""
+    c, m = columns[0].item[0], rows.T @ rows
     if "windows" in c.effect.shapes.values():
-        _score_windows(c, entries, rows, full, g, m, best)
+        _score_windows(c, columns, rows, full, g, m, best)
         return
     left = np.sqrt(np.maximum(np.diag(m), 0)) / np.maximum(full, 1e-300)
     useful = (left > 1e-4) & (full > 1e-9)
@@ -403,11 +473,11 @@ def _score(c: Candidate, entries: Sequence[_Entry], metric: Metric, best: dict[i
     coefficient[useful] = (
         np.linalg.pinv(sub, rcond=1e-8, hermitian=True) @ (g[useful] / scale[useful]) / scale[useful]
     )
-    shape, _ = entries[0][0].item[2]
+    shape, _ = columns[0].item[2]
     gain = float(g @ coefficient)
-    if len(g) == 1 and not _possible(c, entries[0][0], float(coefficient[0])):
+    if len(g) == 1 and not _possible(c, columns[0], float(coefficient[0])):
         gain = 0.0
-    shape, s = _sizes(c, entries, shape, coefficient)
+    shape, s = _sizes(c, columns, shape, coefficient)
     _keep(
         best,
         Direction(c, shape, gain, int(useful.sum()), {}, None, float(left[useful].max())),
@@ -429,21 +499,21 @@ def _possible(c: Candidate, column: Column, coefficient: float) -> bool:
 
 
 def _sizes(
-    c: Candidate, entries: Sequence[_Entry], shape: dict[str, float], coefficient: np.ndarray
+    c: Candidate, columns: Sequence[Column], shape: dict[str, float], coefficient: np.ndarray
 ) -> tuple[dict[str, float], list[float]]:
     """Return the shape and the amplitudes at the best coefficients of the columns."""
     if "phases" in c.effect.shapes.values():
         phase = float(np.arctan2(coefficient[1], coefficient[0]))
         return {**shape, "phase": phase}, [float(np.hypot(*coefficient))]
     if any(p.amplitude for p in c.effect.parameters):
-        return shape, list(np.array([e[0].item[2][1] for e in entries]).T @ coefficient)
+        return shape, list(np.array([q.item[2][1] for q in columns]).T @ coefficient)
     factor = float(np.clip(coefficient[0], 1e-3, 5.0))  # a short lag changes the outputs in proportion
     return {k: v * factor if k == "tau" else v for k, v in shape.items()}, [1.0]
 
 
 def _score_windows(
     c: Candidate,
-    entries: Sequence[_Entry],
+    columns: Sequence[Column],
     rows: np.ndarray,
     full: np.ndarray,
     g: np.ndarray,
@@ -451,7 +521,7 @@ def _score_windows(
     best: dict[int, Direction],
 ) -> None:
     """Keep the best pair of a start and an end; an end beyond the last column is that of the recording."""
-    edges = [e[0].item[2][0]["start"] for e in entries]
+    edges = [q.item[2][0]["start"] for q in columns]
     last, floor = len(edges), 1e-12 * float(full.max()) ** 2
     gain, at = -1.0, (0, 0, 0.0)
     for a in range(last):

@@ -14,6 +14,7 @@ from thermoctl.diagnose.fit import Fitted, as_refitted, over_noise
 from thermoctl.diagnose.noise import Averaged, averaged, grid
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Metric, screen
+from thermoctl.diagnose.sketch import likeliest
 from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
 
@@ -43,7 +44,7 @@ class Plain:
         )
         at = 0
         for r, d in enumerate(self.drives):
-            run = self.model.run(d, self.fit.values[r], self.fit.dx0[r], sensitivities=True)
+            run = self.model.run(d, self.fit.values[r], self.fit.dx0[r], sensitivities=True, states=False)
             assert run.dy is not None
             self.runs.append(Simulation(run.t, run.x, run.y))
             residual.append(self.rows(r, d.y - run.y))
@@ -86,6 +87,16 @@ class Rows(Metric):
     def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
         return self.plain.rows(r, e)
+
+    def spread(self, r: int, w: np.ndarray) -> np.ndarray:
+        """Return (N, outputs, k): the transpose of `unweighted`, of all rows (rows, k), for recording r."""
+        d, at = self.drives[r], 0
+        out = np.zeros((*d.y.shape, w.shape[1]))
+        for c in self.plain.coordinates.channels:
+            if c.recording == r:
+                out[:, c.output] += self.plain.coordinates.transposed(c, w[at : at + c.rows], len(d.t))
+            at += c.rows
+        return out
 
     def rows(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to whitened rows (rows, ...)."""
@@ -158,7 +169,7 @@ def screened(case: Case, fitted: Fitted, clean: float) -> Screened:
         for c in candidates(rig, case.catalogue)
         if c.key not in fitted.hypothesis.keys and not c.place.parts() & added
     ]
-    best, *rest = screen([metric, other] if other else [metric], rig, found)
+    best, *rest = screen([metric, other] if other else [metric], rig, found, select=likeliest)
     promised = [(d, metric.promise(d)) for d in best[:PROMISED]]
     by_energy = rest[0] if rest else []
     if other:

@@ -39,7 +39,7 @@ def left(case: Case, f: Fitted, reach: Responses, clean: float) -> Left:
     rms = {o: noise[o] * float(np.sqrt(max(ratio**2 - 1, 0.0))) for o, ratio in over.items()}
     worst = max(over, key=lambda o: over[o]) if over else ""
     follow = follows(case, f, worst) if over and over[worst] > 1 else ()
-    return Left(rms, noise, over, _node(case, f, reach), follow)
+    return Left(rms, noise, over, next(iter(located(case, f, reach)), None), follow)
 
 
 def reached(case: Case) -> Responses:
@@ -49,8 +49,8 @@ def reached(case: Case) -> Responses:
     return responses(model, case.drives(model), case.null.values, case.null.dx0, case.coordinates, rates)
 
 
-def _node(case: Case, f: Fitted, reach: Responses) -> str | None:
-    """The node whose random forces explain the residuals best."""
+def located(case: Case, f: Fitted, reach: Responses) -> list[str]:
+    """Return the nodes, that whose random forces explain the residuals best first."""
     scores = {}
     for i, node in enumerate(reach.nodes):
         by_cell = np.zeros(len(reach.share))
@@ -60,7 +60,7 @@ def _node(case: Case, f: Fitted, reach: Responses) -> str | None:
             power = np.concatenate([f.powers[k] for k in g.channels])
             by_cell -= 0.5 * (count * np.log(own + cells) + power / (own + cells)).sum(axis=1)
         scores[node] = float(logsumexp(by_cell))
-    return max(scores, key=lambda n: scores[n]) if scores else None
+    return sorted(scores, key=lambda n: -scores[n])
 
 
 def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:

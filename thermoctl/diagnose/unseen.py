@@ -21,7 +21,7 @@ from thermoctl.diagnose.fit import Fitted
 from thermoctl.diagnose.noise import Averaged
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import NEAR, Column, Trajectory, columns_of, directions, parameter_values
+from thermoctl.diagnose.screen import NEAR, Column, Trajectory, directions, groups_of, parameter_values
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 
 SEEN = 5.0  # standard errors of an effect's size, from which it would have been seen
@@ -70,15 +70,9 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
     rig = Structure(null.rough_plant, metric.drives, [t.columns for t in case.tables])
     at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     best: dict[tuple[str, str], Visible] = {}
-    columns: list[Column] = []
-    for c in candidates(rig, case.catalogue):
-        if not sized(c.effect):
-            continue
-        mine = columns_of(c, metric, at)
-        columns += mine
-        if not mine:
-            _keep(best, Visible(c, "", None, np.inf, NOT_EXCITED))
-    for v in _sizes(metric, columns):
+    found = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]
+    columns = (column for c in found for g in groups_of(c, metric) for column in g.columns())
+    for v in _sizes(metric, at, columns):
         _keep(best, v)
     return [best[key] for key in sorted(best)]
 
@@ -94,8 +88,8 @@ def _keep(best: dict[tuple[str, str], Visible], new: Visible) -> None:
         best[new.candidate.key] = new
 
 
-def _sizes(metric: Rows, columns: Sequence[Column]) -> Iterable[Visible]:
-    for part, plain in directions(metric, columns):
+def _sizes(metric: Rows, at: Sequence[Trajectory], columns: Iterable[Column]) -> Iterable[Visible]:
+    for part, plain in directions(metric, at, columns):
         rows = plain * metric.weight[:, None]
         full = np.linalg.norm(rows, axis=0)
         left = np.linalg.norm(metric.project(rows), axis=0)

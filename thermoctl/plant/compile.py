@@ -135,7 +135,7 @@ _P, _I, _D = ctypes.c_void_p, ctypes.c_int, ctypes.c_double
 
 
 def _typed(library: ctypes.CDLL) -> ctypes.CDLL:
-    library.integrate.argtypes = [_I, _P, _P, _P, _P, _P, _P, _P, _I, _D, _P, _I, _P, _P, _P, _P]
+    library.integrate.argtypes = [_I, *[_P] * 7, _I, _D, _P, _I, *[_P] * 6, _I]
     library.observe.argtypes = [_I, _I, _P, _P, _P, _P, _P, _P, _I, _P, _P, _P, _P, _I]
     library.observe.restype = None
     library.slopes.argtypes = [_I, _P, _P, _P, _P, _P, _P]

@@ -95,11 +95,37 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
   return 1;
 }
 
+/* Outputs of one list (o = 0: the outputs, 1: the arguments of their delays) at N samples. D: N x ND values of the delays
+   and SD their sensitivities (N x ND x nc), NULL for list 1. Y: N x NYo, SY: N x NYo x nc or NULL. `own`: the columns of SX
+   are sensitivities, so that the outputs' own slopes by the parameters count. */
+void observe(int o, int N, const double *t, const double *U, const double *p, const double *w, const double *X,
+             const double *SX, int nc, const double *D, const double *SD, double *Y, double *SY, int own) {
+  int ny = o ? ND : NY;
+  for (int n = 0; n < N; n++) {
+    const double *x = X + (size_t)n * NX, *u = U + (size_t)n * NU, *d = D ? D + (size_t)n * ND : 0;
+    double *y = Y + (size_t)n * ny;
+    if (o) delayed_(t[n], x, u, p, w, d, y); else outputs_(t[n], x, u, p, w, d, y);
+    if (!SY) continue;
+    double V[NO + 1], *sy = SY + (size_t)n * ny * nc;
+    int count = o ? NO1 : NO0;
+    const int *row = o ? O1_ROW : O0_ROW, *kind = o ? O1_KIND : O0_KIND, *col = o ? O1_COL : O0_COL;
+    if (o) delayed_slopes_(t[n], x, u, p, w, d, V); else outputs_slopes_(t[n], x, u, p, w, d, V);
+    memset(sy, 0, (size_t)ny * nc * sizeof(double));
+    for (int q = 0; q < count; q++) {
+      double *to = sy + (size_t)row[q] * nc;
+      if (kind[q] == 1) { if (own) to[col[q]] += V[q]; continue; }                                  /* by a parameter */
+      const double *from = kind[q] == 0 ? SX + ((size_t)n * NX + col[q]) * nc : SD + ((size_t)n * ND + col[q]) * nc;
+      for (int c = 0; c < nc; c++) to[c] += V[q] * from[c];                                /* by a state or a delay */
+    }
+  }
+}
+
 /* Integrate over N samples. Returns 0, or 1 + the index of the interval that could not be integrated. info[0]: steps,
-   info[1]: rejected. X: N x NX, SX: N x NX x nc or NULL (S0: NX x nc). */
+   info[1]: rejected. X: N x NX, SX: N x NX x nc or NULL (S0: NX x nc). With SY (N x NY x nc, no delays of outputs) the outputs
+   are observed at each sample, and SX is one sample's (NX x nc): memory grows with the outputs, not with the states. */
 int integrate(int N, const double *t, const double *U, const int *lin, const double *p, const double *w, const double *x0,
               const double *S0, int nc, double rtol, const double *atol, int max_steps, double *X, double *SX,
-              double *info, const Forces *force) {
+              double *info, const Forces *force, double *Y, double *SY, int own) {
   double x[NX + 1], xn[NX + 1], k[STAGES * (NX + 1)], xs[STAGES * (NX + 1)], M[NM + 1], Ms[(LINEAR ? 1 : STAGES) * (NM + 1)];
   size_t block = (size_t)NX * nc;
   double want = 0, hfac = 0, hfac_s = 0;
@@ -112,6 +138,7 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
   memcpy(x, x0, NX * sizeof(double));
   memcpy(X, x0, NX * sizeof(double));
   info[0] = info[1] = 0;
+  if (SY) observe(0, 1, t, U, p, w, X, SX, nc, 0, 0, Y, SY, own);
   for (int n = 0; n + 1 < N; n++) {
     const double *u0 = U + (size_t)n * NU, *u1 = u0 + NU;
     double ta = t[n], dt = t[n + 1] - ta, at = ta;
@@ -138,37 +165,14 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
       at = last ? t[n + 1] : at + h;
     }
     memcpy(X + (size_t)(n + 1) * NX, x, NX * sizeof(double));
-    if (SX) columns_out_(&c, SX + (n + 1) * block);
+    if (SX) columns_out_(&c, SX + (SY ? 0 : (n + 1) * block));
+    if (SY) observe(0, 1, t + n + 1, u1, p, w, X + (size_t)(n + 1) * NX, SX, nc, 0, 0, Y + (size_t)(n + 1) * NY,
+                    SY + (size_t)(n + 1) * NY * nc, own);
   }
 out:
   free(c.S);
   free(c.begin);
   return failed_at;
-}
-
-/* Outputs of one list (o = 0: the outputs, 1: the arguments of their delays) at N samples. D: N x ND values of the delays
-   and SD their sensitivities (N x ND x nc), NULL for list 1. Y: N x NYo, SY: N x NYo x nc or NULL. `own`: the columns of SX
-   are sensitivities, so that the outputs' own slopes by the parameters count. */
-void observe(int o, int N, const double *t, const double *U, const double *p, const double *w, const double *X,
-             const double *SX, int nc, const double *D, const double *SD, double *Y, double *SY, int own) {
-  int ny = o ? ND : NY;
-  for (int n = 0; n < N; n++) {
-    const double *x = X + (size_t)n * NX, *u = U + (size_t)n * NU, *d = D ? D + (size_t)n * ND : 0;
-    double *y = Y + (size_t)n * ny;
-    if (o) delayed_(t[n], x, u, p, w, d, y); else outputs_(t[n], x, u, p, w, d, y);
-    if (!SY) continue;
-    double V[NO + 1], *sy = SY + (size_t)n * ny * nc;
-    int count = o ? NO1 : NO0;
-    const int *row = o ? O1_ROW : O0_ROW, *kind = o ? O1_KIND : O0_KIND, *col = o ? O1_COL : O0_COL;
-    if (o) delayed_slopes_(t[n], x, u, p, w, d, V); else outputs_slopes_(t[n], x, u, p, w, d, V);
-    memset(sy, 0, (size_t)ny * nc * sizeof(double));
-    for (int q = 0; q < count; q++) {
-      double *to = sy + (size_t)row[q] * nc;
-      if (kind[q] == 1) { if (own) to[col[q]] += V[q]; continue; }                                  /* by a parameter */
-      const double *from = kind[q] == 0 ? SX + ((size_t)n * NX + col[q]) * nc : SD + ((size_t)n * ND + col[q]) * nc;
-      for (int c = 0; c < nc; c++) to[c] += V[q] * from[c];                                /* by a state or a delay */
-    }
-  }
 }
 
 /* The slopes dx/dt at N samples (for delays in outputs). */

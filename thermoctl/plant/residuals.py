@@ -285,7 +285,7 @@ class Problem:
     def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return recording r's unknowns (k,), its outputs (N, ny) and their slopes (N, ny, k)."""
         values, dx0 = self.unpack(z)
-        run = self.model.run(self.excitations[r], values[r], dx0[r], sensitivities=True)
+        run = self.model.run(self.excitations[r], values[r], dx0[r], sensitivities=True, states=False)
         used, k, slope = self._slopes(r, values[r])
         assert run.dy is not None
         return k, run.y, run.dy[:, :, used] * slope
@@ -320,7 +320,7 @@ class Problem:
     def _part(self, r: int, values: np.ndarray, dx0: np.ndarray, jacobian: bool) -> _Part:
         """Return what one recording adds to an evaluation. Raises SimulationError."""
         d = self.excitations[r]
-        run = self.model.run(d, values, dx0, sensitivities=jacobian, buffers=self.buffers)
+        run = self.model.run(d, values, dx0, sensitivities=jacobian, buffers=self.buffers, states=False)
         if not np.all(np.abs(run.y) < HUGE):
             raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
         e, cost, kept = d.y - run.y, 0.0, []

@@ -291,11 +291,13 @@ class Model:
         sensitivities: bool = False,
         rtol: float | None = None,
         buffers: dict[str, np.ndarray] | None = None,
+        states: bool = True,
     ) -> Simulation:
         """Simulate freely on an excitation. Raises SimulationError.
 
         `rtol`: in place of the excitation's. `buffers` keeps the large arrays between runs. A later run with
-        the same dict overwrites the sensitivities that an earlier one returned."""
+        the same dict overwrites the sensitivities that an earlier one returned. Without `states` only the
+        outputs' sensitivities are computed: a plant of many states needs far less memory and time."""
         if excitation.scale is None:
             self.prepare(excitation, parameters)
         return self._run(
@@ -305,6 +307,7 @@ class Model:
             sensitivities,
             rtol or excitation.rtol,
             buffers,
+            states,
         )
 
     def simulate(
@@ -342,13 +345,16 @@ class Model:
         sensitivities: bool,
         rtol: float,
         buffers: dict[str, np.ndarray] | None = None,
+        states: bool = True,
     ) -> Simulation:
         lib, n, nx, nq = self.code.library, len(excitation.t), len(self.states), len(self.unknowns)
         u = self._delayed_inputs(excitation, p)
         width = excitation.width if excitation.width is not None else np.ones(1)
         x0, s0 = self.start(excitation, p, dx0)
         x = np.empty((n, nx))
-        dx = _buffer(buffers, _own("dx"), (n, nx, nq)) if sensitivities else None
+        at_once = sensitivities and not states and self._at_once
+        dx = _buffer(buffers, _own("dx"), (1 if at_once else n, nx, nq)) if sensitivities else None
+        y, dy = self._outputs(excitation, nq, buffers) if at_once else (None, None)
         info = np.zeros(2)
         if nx:
             if not np.all(np.isfinite(x0)):
@@ -362,15 +368,28 @@ class Model:
             )
             atol = rtol * scale
             start = (n, excitation.t, u, excitation.linear, p, width, x0, s0)
-            failed = _call(lib.integrate, *start, nq, rtol, atol, MAX_STEPS, x, dx, info, None)
+            failed = _call(lib.integrate, *start, nq, rtol, atol, MAX_STEPS, x, dx, info, None, y, dy, 1)
             if failed:
                 at = max(failed - 1, 0)
                 raise SimulationError(
                     f"{excitation.name}: the simulation does not get beyond t = {excitation.t[at]:.6g} s; states "
                     + ", ".join(f"{s} = {v:.3g}" for s, v in zip(self.states, x[at], strict=True))
                 )
-        y, dy = self._observe(excitation, u, p, width, x, dx, nq, sensitivities, buffers)
-        return Simulation(excitation.t, x, y, dx, dy, int(info[0]), int(info[1]))
+        if y is None:
+            y, dy = self._observe(excitation, u, p, width, x, dx, nq, sensitivities, buffers)
+        return Simulation(excitation.t, x, y, None if at_once else dx, dy, int(info[0]), int(info[1]))
+
+    @property
+    def _at_once(self) -> bool:
+        """Whether outputs can be observed during the integration: a delay of an output needs all samples."""
+        return bool(self.states) and not self.code.output_delays
+
+    def _outputs(
+        self, excitation: Excitation, columns: int, buffers: dict[str, np.ndarray] | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return arrays for outputs (N, ny) and their sensitivities (N, ny, columns)."""
+        n, ny = len(excitation.t), len(self.outputs)
+        return np.empty((n, ny)), _buffer(buffers, f"dy {id(excitation)}", (n, ny, columns))
 
     def respond(
         self,
@@ -400,12 +419,16 @@ class Model:
         q = np.ascontiguousarray(q, float)
         force = _Forces(len(rows), rows.ctypes.data, cols.ctypes.data, q.ctypes.data)
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
-        dx = _buffer(buffers, _own("dx"), (n, nx, columns))
+        at_once = self._at_once
+        dx = _buffer(buffers, _own("dx"), (1 if at_once else n, nx, columns))
+        y, dy = self._outputs(excitation, columns, buffers) if at_once else (None, None)
         atol = rtol * excitation.scale
         start = (n, excitation.t, u, excitation.linear, p, excitation.width, x0, s0)
-        limits = (rtol, atol, MAX_STEPS)
-        if nx and _call(lib.integrate, *start, columns, *limits, x, dx, info, ctypes.addressof(force)):
+        limits = (rtol, atol, MAX_STEPS, x, dx, info, ctypes.addressof(force), y, dy, 0)
+        if nx and _call(lib.integrate, *start, columns, *limits):
             raise SimulationError(f"{excitation.name}: the plant cannot be simulated")
+        if dy is not None:
+            return dy
         _, dy = self._observe(excitation, u, p, excitation.width, x, dx, columns, True, buffers, 0)
         assert dy is not None
         return dy
@@ -431,8 +454,9 @@ class Model:
             dg = np.empty((n, nd, nq)) if sensitivities else None
             _call(lib.observe, 1, *known, None, None, g, dg, own)
             delayed, slopes = self._shift(excitation.t, g, dg, p, own)
-        y = np.empty((n, ny))
-        dy = _buffer(buffers, f"dy {id(excitation)}", (n, ny, nq)) if sensitivities else None
+        y, dy = np.empty((n, ny)), None
+        if sensitivities:
+            y, dy = self._outputs(excitation, nq, buffers)
         _call(lib.observe, 0, *known, delayed, slopes, y, dy, own)
         return y, dy
 

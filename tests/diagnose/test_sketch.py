@@ -1,0 +1,60 @@
+"""Sketched products of directions are those of their simulated rows, and keep the right place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.bench.scale import block_plant, recorded
+from thermoctl.diagnose.candidates import candidates
+from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.catalogue import catalogue
+from thermoctl.diagnose.fit import fitted
+from thermoctl.diagnose.roles import Structure
+from thermoctl.diagnose.screen import Trajectory, directions, groups_of, screen
+from thermoctl.diagnose.screening import ROWS, Plain, Rows
+from thermoctl.diagnose.sketch import SKETCHES, likeliest, products
+from thermoctl.plant import load
+from thermoctl.plant.recordings import read_recordings
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory):
+    """A chain of six blocks with heat into the third that the plant lacks; metric, places and groups."""
+    folder = tmp_path_factory.mktemp("chain")
+    recorded(folder, block_plant(6), "{into: block_3, rate: 1.5 * step(t - 2000), unit: W}", 500, 10.0, 10.0)
+    plant = load(folder / "plant.yaml")
+    known = case(plant, read_recordings(plant, [folder / "run_1.csv"]), catalogue(), Budget(80))
+    first = fitted(known, known.plant, (), known.null)
+    metric = Rows(Plain(known, first, ROWS), first.average, False)
+    rig = Structure(first.rough_plant, metric.drives, [t.columns for t in known.tables])
+    found = candidates(rig, known.catalogue)
+    return metric, rig, found, [Trajectory(metric, rig, 0)]
+
+
+def test_sketched_products_are_those_of_the_rows(chain):
+    metric, _, found, at = chain
+    groups = [g for c in found for g in groups_of(c, metric)]
+    columns = [column for g in groups for column in g.columns()]
+    (sketched,) = products([metric], at, columns)
+    rows = np.concatenate([part for _, part in directions(metric, at, columns)], axis=1)
+    whole = rows * metric.weight[:, None]
+    rows = metric.project(whole)
+    size = np.linalg.norm(rows, axis=0)
+    clear = size > 0.05 * np.linalg.norm(whole, axis=0)
+    assert clear.sum() > 200
+    gain = (rows[:, clear].T @ metric.residual) / size[clear]
+    assert np.abs(sketched[clear, 0] / size[clear] - gain).max() < 0.02 * np.abs(gain).max()
+    norm = np.linalg.norm(sketched[clear, 1:], axis=1) / size[clear]
+    assert np.abs(norm - 1).max() < 4 / np.sqrt(2 * SKETCHES)  # four standard deviations
+
+
+def test_what_a_sketch_keeps_holds_the_best_directions(chain, monkeypatch):
+    metric, rig, found, _ = chain
+    (every,) = screen([metric], rig, found)
+    monkeypatch.setattr("thermoctl.diagnose.screen.EXACT", 0)
+    monkeypatch.setattr("thermoctl.diagnose.sketch.KEPT", 300)
+    (kept,) = screen([metric], rig, found, select=likeliest)
+    assert len(kept) < 0.8 * len(every)
+    assert [d.candidate.key for d in kept[:10]] == [d.candidate.key for d in every[:10]]
+    assert [d.gain for d in kept[:10]] == pytest.approx([d.gain for d in every[:10]], rel=0.05)
