@@ -106,9 +106,15 @@ bench: develop                     # speed of plants beside scipy and CasADi
 	$(BIN)/python tests/bench/plant.py
 
 .PHONY: bench-scale
-bench-scale: develop               # cost of a diagnosis by rows and by bodies; BEFORE=a checkout of an older version, beside it; minutes
+bench-scale: develop               # cost of a diagnosis by rows; BEFORE=a checkout of an older version, beside it; minutes
 	$(BIN)/python -m tests.bench.scale rows $(if $(BEFORE),--before $(BEFORE))
+
+.PHONY: bench-bodies bench-recordings
+bench-bodies: develop              # cost of a diagnosis by bodies: chains and networks of 12 to 120; half an hour
 	$(BIN)/python -m tests.bench.scale bodies
+
+bench-recordings: develop          # cost of a diagnosis by recordings of 30 000 rows, on one and on two cores; half an hour
+	$(BIN)/python -m tests.bench.scale recordings
 
 .PHONY: prove-refit refit-recordings
 prove-refit: develop               # share of 95 % intervals that contain the true parameter: 100 truths for each rig and noise

@@ -7,8 +7,8 @@ python -m tests.bench.scale recordings [--recordings 1 6 12] [--workers 1 2]
 `rows`: a rig of two blocks whose free convection is concealed, logged every second, and the same record with
 one row in a hundred. Every diagnosis is a process of its own: CPU time (with the compiler's), memory, result.
 --before FOLDER: a checkout of an older version; it works on the same records, with a limit of 30 minutes.
-`bodies`: blocks of which every third one is heated and measured. In a chain the middle one has a heat source that
-the plant lacks. In a network, whose blocks are linked with near ones as in a CAD model, a link is missing.
+`bodies`: blocks of which every third one is measured and every sixth one heated. In a chain a middle one, not heated,
+has a heat source that the plant lacks. In a network, whose blocks are linked with near ones as in a CAD model, a link is missing.
 `recordings`: the actuator of twelve bodies, 30 000 rows a recording, with an effect that one leaves in doubt.
 """
 
@@ -56,7 +56,7 @@ def chain(n: int) -> Links:
 def network(n: int) -> tuple[Links, tuple[int, int]]:
     """Return links of n blocks, each with its nearest three, and the one that the plant lacks.
 
-    That is the closest pair without a link, one of them heated and measured."""
+    That is the closest pair without a link, one of them heated."""
     at = np.random.default_rng(8).uniform(0, 1, (n, 3))
     far = np.linalg.norm(at[:, None] - at, axis=2)
     near = {(min(a, b), max(a, b)) for a in range(n) for b in np.argsort(far[a])[1:4]}
@@ -69,18 +69,18 @@ def network(n: int) -> tuple[Links, tuple[int, int]]:
         near.add((min(a, b), max(a, b)))
         reached.add(b)
     pairs = [
-        (a, b) for a in range(0, n, 3) for b in range(n) if a != b and (min(a, b), max(a, b)) not in near
+        (a, b) for a in range(0, n, 6) for b in range(n) if a != b and (min(a, b), max(a, b)) not in near
     ]
     a, b = min(pairs, key=lambda p: far[p])
     return [(int(a) + 1, int(b) + 1) for a, b in sorted(near)], (a + 1, b + 1)
 
 
 def block_plant(n: int, links: Links | None = None) -> str:
-    """A plant of n blocks in air, a chain unless links are given; every third one has a heater and a sensor."""
+    """A plant of n blocks in air, a chain unless links are given; every third one has a sensor, every sixth a heater."""
     at = range(1, n + 1)
-    held = [k for k in at if k % 3 == 1]
+    held, heated = [k for k in at if k % 3 == 1], [k for k in at if k % 6 == 1]
     lines = ["format: thermoctl-plant/1", f"title: {n} blocks", "inputs:"]
-    lines += [f"  heat_{k}: {{unit: W}}" for k in held]
+    lines += [f"  heat_{k}: {{unit: W}}" for k in heated]
     lines += ["  air: {unit: degC, between_samples: linear}", "parameters:"]
     lines += [
         f"  {name}: {{value: {value}, unit: {unit}, range: [{low}, {high}]}}"
@@ -93,7 +93,7 @@ def block_plant(n: int, links: Links | None = None) -> str:
     lines += ["nodes:"]
     lines += [f"  block_{k}: {{unit: degC, storage: C, initial: air, initial_sigma: 0.5}}" for k in at]
     lines += ["flows:"]
-    lines += [f"  power_{k}: {{into: block_{k}, rate: heat_{k}, unit: W}}" for k in held]
+    lines += [f"  power_{k}: {{into: block_{k}, rate: heat_{k}, unit: W}}" for k in heated]
     lines += [f"  loss_{k}: {{from: block_{k}, rate: G * (block_{k} - air), unit: W}}" for k in at]
     lines += [
         f"  link_{a}_{b}: {{from: block_{a}, into: block_{b}, rate: G_between * (block_{a} - block_{b}), unit: W}}"
@@ -204,7 +204,7 @@ def rows(number: int, before: Path | None) -> None:
 def concealed(shape: str, n: int) -> tuple[str, str, str]:
     """Return a plant of n bodies, the flow that it lacks, and the finding that names it."""
     if shape == "chain":
-        middle = n // 6 * 3 + 1
+        middle = n // 12 * 6 + 4
         flow = f"{{into: block_{middle}, rate: 1.5 * step(t - 4000), unit: W}}"
         return block_plant(n), flow, f"external_heat_source at block_{middle}"
     links, (a, b) = network(n)
