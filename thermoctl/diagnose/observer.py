@@ -26,7 +26,7 @@ from thermoctl.plant.simulate import Excitation
 LASTING = 20.0  # samples for which a missing flow holds: turns its variance into an intensity
 RESTING = 1e-3  # of the fastest state's slope: least slope of another, so that no state is without noise
 PURE = 1e-6  # share of the noise at a state that only integrates another: as good as none
-# Share of an error that a drifting mode keeps to the end of the recordings. In 57 generated cases axes
+# Share of an error that a drifting mode keeps to the end of the recordings. In 60 generated cases axes
 # keep all of it. The next mode, a coil that cools slowly, keeps 0.38.
 KEPT = 0.9
 TRUSTS = 0.01, 0.1  # process noise as a share of the slopes' own size; a larger one follows more closely
