@@ -32,7 +32,7 @@ from thermoctl.diagnose.odds import EVENTS
 from thermoctl.plant import load
 
 NUMBERS = {
-    "missing": (0.1, 0.2, 0.35, 0.5, 0.65, 0.8),
+    "missing": (0.02, 0.05, 0.1, 0.2, 0.35, 0.5),
     "rare": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
     "temperature": (0.7, 1.0, 1.5, 2.0, 3.0, 5.0),
     "alike": (0.02, 0.05, 0.1, 0.2, 0.3),

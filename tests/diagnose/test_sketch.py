@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -52,8 +54,9 @@ def test_sketched_products_are_those_of_the_rows(chain):
 def test_what_a_sketch_keeps_holds_the_best_directions(chain, monkeypatch):
     metric, rig, found, _ = chain
     (every,) = screen([metric], rig, found)
-    monkeypatch.setattr("thermoctl.diagnose.screen.EXACT", 0)
-    monkeypatch.setattr("thermoctl.diagnose.sketch.KEPT", 300)
+    # by module: as an attribute, thermoctl.diagnose may be the function of the API
+    monkeypatch.setattr(sys.modules[screen.__module__], "EXACT", 0)
+    monkeypatch.setattr(sys.modules[likeliest.__module__], "KEPT", 300)
     (kept,) = screen([metric], rig, found, select=likeliest)
     assert len(kept) < 0.8 * len(every)
     assert [d.candidate.key for d in kept[:10]] == [d.candidate.key for d in every[:10]]

@@ -303,7 +303,7 @@ class _Builder:
         def change(e: Expr) -> Expr | None:
             return new if e.op == "name" and e.value == p.input else None
 
-        # The start stays as read: an expression of inputs at the first sample knows no node, no time and no delay.
+        # The start stays as read: an expression of the first sample knows no node, no time and no delay.
         self.flows = {
             k: dataclasses.replace(f, rate=ex.substitute(f.rate, change)) if k in self.base.flows else f
             for k, f in self.flows.items()
@@ -361,8 +361,9 @@ class _Builder:
         return float(np.sqrt(total)) or None
 
     def _straight(self, symbol: str) -> None:
-        """Inputs that hold go on straight lines in this symbol: a sensor's lag is short against a sample, and would otherwise be a
-        sample late."""
+        """Let inputs that hold go on straight lines in this symbol.
+
+        A sensor's lag is short against a sample, and would otherwise be a sample late."""
 
         def change(e: Expr) -> Expr | None:
             i = self.base.inputs.get(e.value) if e.op == "name" else None
@@ -393,7 +394,7 @@ class _Builder:
         dt = self.symbols["sample"].value
         over = ex.parse(f"max({a} - {self.c.own(what['level'])}, 0) * {2.0 / dt!r}")
         share = name(self.c.own(what["share"]))
-        # spilled volume by time: level * storage / time; the rate is stiff enough to hold the level within a sample
+        # spilled volume by time; the rate is so stiff that it holds the level within a sample
         over = ex.mul(over, self.base.nodes[a].storage)
         unit = next((f.unit for f in self.base.flows.values() if f.source == a), None)
         if b:

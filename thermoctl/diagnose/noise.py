@@ -9,13 +9,13 @@ s is the noise that the plant file states, c its error, log-normal. Where slow p
 their spectrum. q exp(u_b) is the remainder and every slow error of the sensor. u is a random walk over log
 frequency: smooth, and its size is learnt at each frequency. So an error of the plant at one frequency says
 little about another. But a plant with a large error is not exact at any frequency. So at least the share
-FLOOR of the remainder's energy lies evenly over all of them. Errors that nobody will name are small: the
-remainder's share of the output's swing has a half-normal prior of width SMALL, q = (SMALL swing)^2.
+FLOOR of the remainder's energy lies evenly over all of them. Errors that nobody will name are small. So
+the remainder's share of the output's swing has a half-normal prior of width SMALL, and q = (SMALL swing)^2.
 
     log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
 
 Without a remainder the noise has the stated spectrum. Where no slow parts are stated, it has with even odds a
-first-order and a 1/f part: their shares and time are summed over a grid. c and u are integrated by Laplace's
+first-order and a 1/f part. Their shares and time are summed over a grid. c and u are integrated by Laplace's
 method.
 """
 

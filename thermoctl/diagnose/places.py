@@ -84,8 +84,9 @@ def _heated_pairs(rig: Rig) -> Iterator[Place]:
 
 
 def heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
-    """Flows of heat from outside into a node that follow inputs, not temperatures of the network: where these change it (copper's
-    resistance), there is none of it while the inputs rest."""
+    """Return the flows of heat from outside into a node that follow inputs, not temperatures of the network.
+
+    Temperatures may change such a flow (copper's resistance), but it is zero while the inputs rest."""
     return [
         f
         for f in plant.flows.values()

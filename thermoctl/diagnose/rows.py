@@ -12,10 +12,10 @@ A held input keeps the exact times of its changes: each change has a row of its 
 that changes too often for that is averaged from one row to the next. `block` is the largest number that
 passes two tests in every recording:
 
-- above half of the new highest frequency every measured output is white: no band of DCT rows has more power
-  than the highest half of all rows
-- averaged inputs vary within a block by little: AVERAGED of their variance. So functions that are not linear
-  in an input keep their mean
+- Every measured output is white above half of the new highest frequency. No band of DCT rows there has more
+  power than the highest half of all rows.
+- Averaged inputs vary within a block by little: AVERAGED of their variance. So functions that are not linear
+  in an input keep their mean.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 """Score test of every effect at every place: how much of the residual it could explain, without a refit.
 
-    r: whitened residual of the refit,  Q: orthonormal basis of the directions that the plant's parameters absorb
+    r: whitened residual of the refit,  Q: orthonormal basis of what the plant's parameters absorb
     d: first-order change of the outputs by an effect, whitened;  d' = d - Q Q^T d
     gain = (d'^T r)^2 / (d'^T d')
 
 The gain is chi-square with one degree of freedom (k for k amplitudes) where nothing is missing.
-d comes from the effect laid over the plant: its change of the slopes dx/dt along the fitted trajectory drives the linearised
-plant (`Model.respond`), its change of the outputs adds directly. New nodes are integrated alone along that trajectory.
-Rows are sums over blocks of samples (white noise stays white), so that thousands of directions fit in memory; shorter blocks
-where something moves.
+d comes from the effect laid over the plant. Its change of dx/dt along the fitted trajectory drives the
+linearised plant (`Model.respond`). Its change of the outputs adds directly. New nodes are integrated
+alone along that trajectory. Rows are sums over blocks of samples: white noise stays white, and thousands
+of directions fit in memory.
 """
 
 from __future__ import annotations

@@ -18,8 +18,7 @@ from thermoctl.diagnose.sketch import likeliest
 from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
 
-# Largest number of DCT rows, all outputs and recordings together; MOVING_ROWS for a plant with a moving axis.
-ROWS, MOVING_ROWS = 6_000, 16_000
+ROWS = 6_000  # largest number of DCT rows, all outputs and recordings together
 PROMISED = 30  # directions whose gain in log likelihood is predicted
 
 
@@ -154,9 +153,8 @@ def screened(case: Case, fitted: Fitted, clean: float) -> Screened:
     """Screen the catalogue at the places of the original plant; a part that an effect added is no place.
 
     Where the residual is more than `clean` times the noise, in the noise alone, too: there by energy."""
-    moving = bool(Structure(case.plant, [], []).velocities) if case.plant.nodes else False
     refitted = as_refitted(case, fitted)
-    plain = Plain(case, fitted, MOVING_ROWS if moving else ROWS)
+    plain = Plain(case, fitted, ROWS)
     metric = Rows(plain, refitted.average, True)
     large = max(over_noise(case, refitted, clean)) > clean
     other = Rows(plain, refitted.average, False) if large else None

@@ -8,11 +8,12 @@
 
 The product of d with a row vector w is an inner product with the forces:
 
-    w' d = sum_n q_n' l_n,    -dl/dt = J' l + B' W w    (the adjoint plant, run backwards once for each w)
+    w' d = sum_n q_n' l_n,    -dl/dt = J' l + B' W w
 
-So one adjoint run gives the numerators of all directions. SKETCHES more give the norms: with random signs s_k,
-the mean of (s_k' P d)^2 is |P d|^2. Its relative standard deviation is sqrt(2 / SKETCHES). Links between all
-pairs of N bodies then cost products, and no simulation."""
+l is a run of the adjoint plant, backwards, for each w. One run gives the numerators of all directions.
+SKETCHES more give the norms: with random signs s_k, the mean of (s_k' P d)^2 is |P d|^2. Its relative
+standard deviation is sqrt(2 / SKETCHES). Links between all pairs of N bodies then cost products, and no
+simulation."""
 
 from __future__ import annotations
 
