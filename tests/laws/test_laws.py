@@ -77,7 +77,7 @@ def test_a_saved_law_is_an_effect_that_finds_its_place(found, tmp_path, capsys):
 def test_a_larger_plant_gets_fewer_refits_of_laws(found):
     _, known, law = found
     once = affordable(known, law.fitted)
-    often = affordable(replace(known, tables=known.tables * 200), law.fitted)
+    often = affordable(replace(known, tables=known.tables * 2000), law.fitted)
     assert once == REFITS + SIMPLER and often == FEWEST_REFITS
 
 
