@@ -124,8 +124,8 @@ refit-recordings: develop          # fits of real recordings, beside the publish
 	$(BIN)/python -m pytest -m slow -s tests/plant/test_refit_recordings.py
 
 .PHONY: size
-size: install                      # the wheel in a fresh environment: megabytes by package, import times, demo, diagnose, service install
-	$(BIN)/python tests/bench/install.py
+size: wheel                        # the wheel in a fresh environment: megabytes by package, import times, demo, diagnose, service install
+	$(BIN)/python tests/bench/install.py build/wheel/*.whl
 
 .PHONY: wheel
 wheel: install                     # build/wheel: the wheel, with the manylinux tag that its compiled parts allow

@@ -1,6 +1,6 @@
 """The wheel in a fresh environment, from an empty folder: what works, its size and that of each extra, its imports.
 
-`make size`, or `python tests/bench/install.py WHEEL`. One step takes the C compiler away, and shows what asks for one.
+`make size`, which runs `python tests/bench/install.py WHEEL`. One step takes the C compiler away, and shows what asks for one.
 """
 
 import os
@@ -45,18 +45,12 @@ def step(program: Path, command: str, folder: Path, own: dict[str, str]) -> int:
 def main() -> int:
     """Print the tables; return 1 where a step fails."""
     with tempfile.TemporaryDirectory(prefix="thermoctl-wheel") as made:
-        work, wheels = Path(made), sys.argv[1:]
-        if not wheels:
-            subprocess.run(
-                [sys.executable, *PIP, "wheel", "--no-deps", "--no-build-isolation", "-w", work, ROOT],
-                check=True,
-            )
-            wheels = [str(next(work.glob("*.whl")))]
+        work, wheel = Path(made), sys.argv[1]
         subprocess.run([sys.executable, "-m", "venv", work / "venv"], check=True)
         python, program = work / "venv/bin/python", work / "venv/bin/thermoctl"
         site = next((work / "venv/lib").glob("python*/site-packages"))
         empty = size(site)
-        subprocess.run([python, *PIP, "install", wheels[0]], check=True)
+        subprocess.run([python, *PIP, "install", wheel], check=True)
         sizes = sorted(((size(p), p.name) for p in site.iterdir() if p.is_dir()), reverse=True)
         print(
             f"{size(site) - empty:.0f} MB: "
@@ -89,7 +83,7 @@ def main() -> int:
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
         for extra in re.split(r"[\[,\]]", project["optional-dependencies"]["all"][0])[1:-1]:
             before = size(site)
-            subprocess.run([python, *PIP, "install", f"{wheels[0]}[{extra}]"], check=True)
+            subprocess.run([python, *PIP, "install", f"{wheel}[{extra}]"], check=True)
             print(f"extra {extra}: {size(site) - before:.0f} MB more", flush=True)
         print(f"with all extras: {size(site) - empty:.0f} MB", flush=True)
         failed += sum(step(program, s, folder, own) != 0 for s in WITH_ALL)

@@ -1,12 +1,15 @@
 """Set the numbers of config/diagnosis.yaml that weigh hypotheses, from generated cases with known answers.
 
-    python -m tests.diagnose.calibrate CASES RESULTS [CASES RESULTS ...] [--write]
+    python -m tests.diagnose.calibrate CASES RESULTS [CASES RESULTS ...] [--real RECORDINGS OUT] [--write]
 
 CASES as of `python -m tests.concealed.generate --answers inside`; RESULTS: the folders that `thermoctl diagnose` wrote
 for them, by the same names. A diagnosis.json holds every hypothesis that was fitted, so it is decided again with
 other numbers, without a refit. The loss of a case is the mean log loss of its effects' probabilities: those that
 are there, and those that are not. Each number in turn takes the value of least loss; its flat range is where the
 loss of all cases grows by less than one. `--write` puts values and provenance into config/diagnosis.yaml.
+
+Beside each loss stand the right and the false names, of the cases and of the real rigs that `thermoctl prove
+--real RECORDINGS --out OUT` diagnosed: a least loss may cost right names.
 """
 
 from __future__ import annotations
@@ -25,11 +28,12 @@ import numpy as np
 import yaml
 
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.decide import Key, weigh
+from thermoctl.diagnose.decide import Key, Posterior, weigh
 from thermoctl.diagnose.limits import Limits, limits
 from thermoctl.diagnose.misfit import Energy, standing
 from thermoctl.diagnose.odds import EVENTS
 from thermoctl.plant import load
+from thermoctl.proof.rigs import RIGS, Rig
 
 NUMBERS = {
     "missing": (0.02, 0.05, 0.1, 0.2, 0.35, 0.5),
@@ -47,7 +51,7 @@ class Judged:
     """A case's hypotheses, and what the answer says is there.
 
     `likelihood` and `share`: log evidence and log prior share of places; `rare`: number of rare classes; `truths`: the
-    accepted (effect, where) of each effect that is there."""
+    accepted (effect, where) of each effect that is there; `tolerated`: further names that are not false."""
 
     name: str
     likelihood: Mapping[frozenset[Key], float]
@@ -56,12 +60,13 @@ class Judged:
     energy: Mapping[frozenset[Key], Energy]
     dims: Mapping[Key, int]
     truths: tuple[frozenset[Key], ...]
+    tolerated: frozenset[Key] = frozenset()
 
 
-def judged(case: Path, result: Path, used: Limits) -> Judged:
-    """Read one case and its result; `used`: the numbers that made the result."""
+def judged(plant: Path, result: Path, used: Limits) -> Judged:
+    """Read one result, still without truths; `used`: the numbers that made it."""
     entries = catalogue((CATALOGUE,))
-    inputs = load(case / "plant.yaml").inputs
+    inputs = load(plant).inputs
     found = json.loads((result / "diagnosis.json").read_text())["hypotheses"]
     keyed = {frozenset(_key(e) for e in h["effects"]): h for h in found}
 
@@ -75,7 +80,7 @@ def judged(case: Path, result: Path, used: Limits) -> Judged:
     counts = {keys: sum(map(rare, keys)) for keys in keyed}
     missing = np.log(used.missing / (1 - used.missing))
     return Judged(
-        case.name,
+        result.name,
         {keys: h["log_evidence"] for keys, h in keyed.items()},
         {
             keys: h["log_prior_odds"] - counts[keys] * np.log(used.rare) - len(keys) * missing
@@ -84,7 +89,22 @@ def judged(case: Path, result: Path, used: Limits) -> Judged:
         counts,
         {keys: Energy(h["energy"], h["misfit"]) for keys, h in keyed.items()},
         dims,
-        _truths(yaml.safe_load((case / "answer.yaml").read_text())),
+        (),
+    )
+
+
+def concealed(case: Path, result: Path, used: Limits) -> Judged:
+    """Read a generated case, its answer and its result."""
+    answer = yaml.safe_load((case / "answer.yaml").read_text())
+    return dataclasses.replace(judged(case / "plant.yaml", result, used), truths=_truths(answer))
+
+
+def real(rig: Rig, folder: Path, result: Path, used: Limits) -> Judged:
+    """Read the result of a real rig: an accepted effect is right at any place."""
+    found = judged(folder / rig.folder / rig.plant, result, used)
+    truths = tuple(frozenset(k for k in found.dims if k[0] in names) for names in rig.accepted)
+    return dataclasses.replace(
+        found, truths=truths, tolerated=frozenset(k for k in found.dims if k[0] in rig.tolerated)
     )
 
 
@@ -105,8 +125,8 @@ def _truths(answer: Mapping[str, Any]) -> tuple[frozenset[Key], ...]:
     return tuple(out)
 
 
-def loss(case: Judged, numbers: Limits) -> float:
-    """Return the mean log loss of one case: of each effect that is there, and of all that are not."""
+def posterior(case: Judged, numbers: Limits) -> Posterior:
+    """Decide a case again with other numbers."""
     physics = standing(case.energy, case.dims, numbers)
     own = np.log(numbers.missing / (1 - numbers.missing))
     scores = {
@@ -116,7 +136,24 @@ def loss(case: Judged, numbers: Limits) -> float:
         + case.rare[keys] * np.log(numbers.rare)
         for keys in physics
     }
-    effects = weigh(scores, physics, numbers).effects
+    return weigh(scores, physics, numbers)
+
+
+def names(cases: Sequence[Judged], numbers: Limits) -> tuple[int, int]:
+    """Return the numbers of effects that are named rightly, and falsely."""
+    right = false = 0
+    for case in cases:
+        found = posterior(case, numbers)
+        likeliest = next(iter(found.hypotheses)) if found.something >= numbers.name else ()
+        named = {k for k in likeliest if found.effects[k] >= numbers.name}
+        right += sum(bool(named & accepted) for accepted in case.truths)
+        false += len(named.difference(*case.truths, case.tolerated))
+    return right, false
+
+
+def loss(case: Judged, numbers: Limits) -> float:
+    """Return the mean log loss of one case: of each effect that is there, and of all that are not."""
+    effects = posterior(case, numbers).effects
     right = [sum(effects.get(k, 0.0) for k in accepted) for accepted in case.truths]
     known = frozenset().union(*case.truths)
     wrong = [p for k, p in effects.items() if k not in known]
@@ -126,21 +163,22 @@ def loss(case: Judged, numbers: Limits) -> float:
 
 
 def calibrated(
-    cases: Sequence[Judged], numbers: Limits
+    cases: Sequence[Judged], rigs: Sequence[Judged], numbers: Limits
 ) -> tuple[Limits, dict[str, tuple[float, float, float]]]:
     """Return the numbers of least loss, and for each the loss and its flat range."""
     ranges = {}
     for name, values in NUMBERS.items():
-        tried = {v: sum(loss(c, dataclasses.replace(numbers, **{name: v})) for c in cases) for v in values}
+        others = {v: dataclasses.replace(numbers, **{name: v}) for v in values}
+        tried = {v: sum(loss(c, other) for c in cases) for v, other in others.items()}
         best = min(tried, key=lambda v: tried[v])
         flat = [v for v in values if tried[v] < tried[best] + FLAT]
         now = getattr(numbers, name)
         value = now if flat[0] <= now <= flat[-1] else best  # a value in the flat range stays
         numbers = dataclasses.replace(numbers, **{name: value})
         ranges[name] = (tried[best], flat[0], flat[-1])
-        print(
-            f"{name:12} {value:<6g} loss by value: " + ", ".join(f"{v:g} {x:.2f}" for v, x in tried.items())
-        )
+        print(f"{name} {value:g}; by value: loss; names of cases, of rigs (right, false)")
+        for v, x in tried.items():
+            print(f"  {v:<6g} {x:7.2f}  {names(cases, others[v])}  {names(rigs, others[v])}")
     return numbers, ranges
 
 
@@ -171,17 +209,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Calibrate on folders of cases and results."""
     p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     p.add_argument("folders", nargs="+", type=Path, help="CASES RESULTS [CASES RESULTS ...]")
+    p.add_argument("--real", nargs=2, type=Path, metavar=("RECORDINGS", "OUT"))
     p.add_argument("--write", action="store_true")
     args = p.parse_args(argv)
     used = limits()
     cases = [
-        judged(case, result, used)
+        concealed(case, result, used)
         for folder, results in zip(args.folders[::2], args.folders[1::2], strict=True)
         for case in sorted(folder.iterdir())
         if ((result := results / case.name) / "diagnosis.json").exists()
     ]
-    print(f"{len(cases)} cases")
-    numbers, ranges = calibrated(cases, used)
+    rigs = [
+        real(rig, args.real[0], result, used)
+        for rig in (RIGS if args.real else ())
+        if ((result := args.real[1] / "cases" / rig.name) / "diagnosis.json").exists()
+    ]
+    print(f"{len(cases)} cases, {len(rigs)} diagnoses of rigs")
+    numbers, ranges = calibrated(cases, rigs, used)
     if args.write:
         write(numbers, ranges, [f.name for f in args.folders[::2]], len(cases))
     return 0

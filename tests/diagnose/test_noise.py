@@ -94,6 +94,13 @@ def test_slow_errors_far_louder_than_the_stated_noise_are_a_remainder():
         assert likelihood(coloured(seed, 0.0) + wandering).remainder[0] > 0.95
 
 
+def test_a_residual_of_zero_has_a_finite_likelihood():
+    """A simulated recording without noise, or a sensor that stands still."""
+    found = likelihood(np.zeros(ROWS))
+    assert np.isfinite(found.log_likelihood)
+    assert all(np.isfinite(v).all() for v in (*found.inverse, *found.unsure))
+
+
 def test_noise_as_stated_is_no_remainder():
     for phi in (0.0, 0.7, 0.9):
         assert all(likelihood(coloured(seed, phi)).remainder[0] < 0.5 for seed in range(4)), phi

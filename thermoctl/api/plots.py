@@ -28,6 +28,8 @@ def _picture(width: float, height: float) -> Figure:
     from matplotlib.figure import Figure
 
     class Picture(Figure):
+        """A Figure that a notebook draws as PNG."""
+
         def _repr_png_(self) -> bytes:
             out = io.BytesIO()
             self.savefig(out, format="png", dpi=90)

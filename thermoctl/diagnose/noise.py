@@ -35,6 +35,7 @@ from thermoctl.plant.language import SensorNoise
 
 STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times
 ABSENT = 0.5  # prior of no remainder at an output
+WHITE = 0.5  # prior of no slow part in a noise whose parts nobody stated
 SMALL = 0.02  # of an output's swing: width of the prior of the remainder's rms
 # Prior sd of u (see above) at the lowest frequency: one sd is a factor of ten in the remainder's rms.
 LEVEL = 2 * np.log(10.0)
@@ -44,7 +45,7 @@ WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a wh
 STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the gain that ends it
 LONGEST = 10.0  # step in a logarithm that is tried
 DAMPED = 0.01  # first damping of a step, as a share of the curvature
-SEEN = 1e-12  # of the largest power: a start needs a logarithm
+LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm to start from
 # Slow parts of a noise that nobody stated: a first-order part and a 1/f part. Their standard deviations (the
 # latter's over a decade) are shares of the white part's. Time constants are in sampling intervals. Slower or
 # larger errors of a sensor belong to the remainder: as noise they would imitate physics.
@@ -62,9 +63,7 @@ class Grid:
     channels: tuple[int, ...]  # positions in Coordinates.channels
     node: np.ndarray
     count: np.ndarray
-    shapes: (
-        np.ndarray
-    )  # (spectra, nodes) that the noise may have, their mean over all rows 1; the stated one first
+    shapes: np.ndarray  # (spectra, nodes) of the noise, the stated one first; their mean over all rows is 1
     log_prior: np.ndarray  # (spectra,) of each
     known: float  # prior sd of log c^2
     rough: np.ndarray  # (nodes, nodes) inverse covariance of u
@@ -125,7 +124,7 @@ def grid(
         node,
         count,
         shapes * count.sum() / (shapes @ count)[:, None],
-        np.log([0.5, *np.full(len(slow), 0.5 / len(slow))]) if slow else np.zeros(1),
+        np.log([WHITE, *np.full(len(slow), (1 - WHITE) / len(slow))]) if slow else np.zeros(1),
         2 * sensor.sd if sensor and sensor.sd else STATED,
         rough,
         log_rough,
@@ -206,7 +205,7 @@ def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
 def _sensor_only(g: Grid, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return log p(R, spectrum | no remainder), and the noise's variance, by spectrum."""
     n, ratio = float(g.count.sum()), (power / g.shapes).sum(axis=1) / g.variance
-    v = np.log(np.maximum(ratio / n, 1e-6))
+    v = np.log(np.maximum(ratio / n, LEAST))
     for _ in range(STEPS):
         step = (0.5 * (ratio * np.exp(-v) - n) - v / g.known**2) / (0.5 * n + g.known**-2)
         v += np.clip(step, -LONGEST, LONGEST)
@@ -250,7 +249,7 @@ class _Remainder:
     def maximum(self) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return log density, x, curvature, slope and V at the maximum, by Newton's method with damping."""
         g = self.grid
-        seen = np.maximum(self.power, SEEN * self.power.max()) / (g.small * g.count)
+        seen = np.maximum(self.power / g.count, LEAST * g.variance) / g.small
         x = np.concatenate([[0.0], np.log(np.minimum(seen, np.sqrt(seen * g.count.sum())))])
         now, part, slope, v = self.spectra(x)
         damping, gain = 0.0, np.inf

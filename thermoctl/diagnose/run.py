@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import html
 import json
-import math
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from thermoctl.diagnose.page import write_report
 from thermoctl.diagnose.propose import propose
 from thermoctl.diagnose.result import Diagnosis, contract
 from thermoctl.diagnose.threads import one_thread
-from thermoctl.diagnose.trend import told, trends
+from thermoctl.diagnose.trend import earlier_trends, told, trends
 from thermoctl.diagnose.unseen import not_seen
 from thermoctl.diagnose.words import words
 from thermoctl.extras import lacking
@@ -69,7 +68,7 @@ def diagnose(
     started, folder = time.monotonic(), _writable(Path(out))
     named = _distinct([*tables, *held_out])
     chosen_on, reserve = named[: len(tables)], named[len(tables) :]
-    before, sizes = memory.read(earlier, plant) if earlier else memory.Memory(), _trends(earlier)
+    before, sizes = memory.read(earlier, plant) if earlier else memory.Memory(), earlier_trends(earlier)
     if again := {t.name for t in named} & set(before.recordings):
         raise InputError(
             f"{earlier}: holds {', '.join(sorted(again))} already; recordings that it has not seen were expected"
@@ -129,38 +128,6 @@ def _remembered(found: Diagnosis) -> memory.Memory:
     ]
     names = (*found.case.memory.recordings, *(t.name for t in found.case.tables))
     return memory.Memory(tuple(remembered(found.case, f) for f in kept), names)
-
-
-def _trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
-    """Return the trends in the result of an earlier diagnosis. Raises InputError for a damaged one."""
-    path = earlier / "diagnosis.json" if earlier else None
-    if path is None or not path.exists():
-        return ()
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        return [
-            {k: str(t[k]) for k in ("effect", "where", "parameter")}
-            | {"recordings": [_size(r) for r in t["recordings"]]}
-            for t in found.get("trends", ())
-        ]
-    except OSError as e:
-        raise InputError(f"{path}: cannot be read: {e.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as e:  # no JSON, or not what the engine wrote
-        raise InputError(
-            f"{path}: damaged ({type(e).__name__}: {e}); the result of a diagnosis was expected; diagnose all "
-            "recordings again"
-        ) from None
-
-
-def _size(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an effect's size in one recording. Raises ValueError, KeyError, TypeError."""
-    begun = entry["begun_s"]
-    numbers = {k: float(entry[k]) for k in ("value", "sd")} | (
-        {} if begun is None else {"begun_s": float(begun)}
-    )
-    if not all(map(math.isfinite, numbers.values())) or numbers["sd"] <= 0:
-        raise ValueError(f"finite numbers and an sd above 0 were expected, found {numbers}")
-    return {"recording": str(entry["recording"]), "begun_s": None, **numbers}
 
 
 def diagnose_files(

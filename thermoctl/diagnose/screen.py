@@ -339,7 +339,7 @@ def screen(
                 entries.append((column, rows[:, k].copy(), float(full[k])))
                 if len(entries) == count:
                     del pending[key]
-                    _scored(entries, metric, leaders)
+                    _score_rows(entries, metric, leaders)
     return [sorted(leaders.values(), key=lambda d: d.log_p) for leaders in best]
 
 
@@ -445,7 +445,7 @@ def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float
     return out
 
 
-def _scored(entries: Sequence[Entry], metric: Metric, best: dict[int, Direction]) -> None:
+def _score_rows(entries: Sequence[Entry], metric: Metric, best: dict[int, Direction]) -> None:
     """Score the columns of one group, and keep their best direction."""
     rows = np.stack([e[1] for e in entries], axis=1)
     full = np.array([e[2] for e in entries])

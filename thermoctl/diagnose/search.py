@@ -227,7 +227,8 @@ def recall(s: Search) -> None:
         if h.effects and not far and not s.case.budget.spent:
             leader = max((w.fitted for w in s.tried.values()), key=lambda f: f.log_likelihood)
             found = remade(s, h.effects, s.case.plant, s.case.catalogue, leader)
-            s.keep([found] if found else [])
+            if found:
+                s.keep([found])
 
 
 def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:

@@ -10,8 +10,10 @@ A straight line over the dates gives the change a month.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ import numpy as np
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import SIGNIFICANT, Fitted, Placed, Posterior
 from thermoctl.recording.dates import begun, line
+from thermoctl.yamlfile import InputError
 
 
 def trends(
@@ -66,6 +69,38 @@ def trends(
                 }
             )
     return out
+
+
+def earlier_trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
+    """Return the trends in the result of an earlier diagnosis. Raises InputError for a damaged one."""
+    path = earlier / "diagnosis.json" if earlier else None
+    if path is None or not path.exists():
+        return ()
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return [
+            {k: str(t[k]) for k in ("effect", "where", "parameter")}
+            | {"recordings": [_read_size(r) for r in t["recordings"]]}
+            for t in found.get("trends", ())
+        ]
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read: {e.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as e:  # no JSON, or not what the engine wrote
+        raise InputError(
+            f"{path}: damaged ({type(e).__name__}: {e}); the result of a diagnosis was expected; diagnose all "
+            "recordings again"
+        ) from None
+
+
+def _read_size(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an effect's size in one recording. Raises ValueError, KeyError, TypeError."""
+    begun = entry["begun_s"]
+    numbers = {k: float(entry[k]) for k in ("value", "sd")} | (
+        {} if begun is None else {"begun_s": float(begun)}
+    )
+    if not all(map(math.isfinite, numbers.values())) or numbers["sd"] <= 0:
+        raise ValueError(f"finite numbers and an sd above 0 were expected, found {numbers}")
+    return {"recording": str(entry["recording"]), "begun_s": None, **numbers}
 
 
 def told(found: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -206,7 +206,9 @@ def _advance(number: int, course: int, k: int, row: Any, change: Any) -> float:
     """Return result k of an FMU's course at a row, or its slope: called by a plant's machine code."""
     fmu = _OPENED[number]
     size = 1 + len(fmu.arguments)
-    runs = fmu.courses.setdefault((threading.get_ident(), course, bool(change)), fmu.course())
+    key = threading.get_ident(), course, bool(change)
+    if (runs := fmu.courses.get(key)) is None:
+        runs = fmu.courses[key] = fmu.course()
     a = np.frombuffer(ctypes.string_at(row, 8 * size))
     if not change:
         return float(runs.value(a)[k])

@@ -12,6 +12,7 @@ from typing import Any
 from thermoctl.proof.jobs import Job, Run, outcome
 from thermoctl.proof.rigs import RIGS, Rig
 from thermoctl.proof.run import OnCase, run_all
+from thermoctl.proof.score import CONFIDENT
 from thermoctl.yamlfile import InputError
 
 VARIABLE = "THERMOCTL_RECORDINGS"  # of the environment: the folder of the recordings
@@ -103,8 +104,9 @@ def totals(entries: Sequence[Entry]) -> str:
     """Return the effects found, the strays and the diagnoses with every effect and none beside, in words."""
     hits = [p for e in entries for p in e.hits]
     strays = sum(len(e.strays) for e in entries)
-    clean = sum(all(e.hits) and not e.strays and not e.error for e in entries)
+    found = sum(p >= CONFIDENT for p in hits)
+    clean = sum(min(e.hits, default=1) >= CONFIDENT and not e.strays and not e.error for e in entries)
     return (
-        f"{sum(p > 0 for p in hits)} of {len(hits)} accepted effects found; {strays} strays in {len(entries)} diagnoses; "
+        f"{found} of {len(hits)} accepted effects found; {strays} strays in {len(entries)} diagnoses; "
         f"{clean} with every effect and no stray"
     )
