@@ -187,7 +187,7 @@ class OnWire:
     def _papers(self) -> None:
         """The paper's rig without a model, as fast as the others."""
         text = re.sub(r"  model: models/wire.yaml.*", '  model: ""', self.config.read_text())
-        text = text.replace("setpoint_rate_um_s: 1 mm/min", "setpoint_rate_um_s: 100")
+        text = text.replace("setpoint_rate_um_s: 1 mm/min", "setpoint_rate_um_s: 300")
         text = text.replace(
             "  coil_limit_c: 80\n",
             "  coil_limit_c: 80\n  coil_rate_k_s: 20\n  following_um: 100\n  late_s: 5\n",
