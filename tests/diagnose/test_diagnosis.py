@@ -8,16 +8,17 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete, dlsim, lsim
 
-from tests.plants import SPRING_STAGE, TWO_BLOCKS
+from tests.plants import FREE_CARRIAGE, SPRING_STAGE, TWO_BLOCKS
 from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.result import doubts
 from thermoctl.diagnose.rig import Rig
-from thermoctl.plant import load
+from thermoctl.plant import load, loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table
+from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 LEVELS = (0.0, 2.5, 0.8, 0.0, 1.6, 3.0, 0.0, 2.0)
@@ -276,6 +277,26 @@ def test_dry_friction_that_sticks_is_no_load(tmp_path):
     ] != "unexplained"
     found = {k.split("_")[0]: v["value"] for k, v in r["findings"][0]["parameters"].items()}
     assert found["F"] == pytest.approx(dry, rel=0.15) and found["W"] < 2e-6  # m/s, of 0.3: it does not creep
+
+
+def test_hysteresis_of_no_width_is_dry_friction(tmp_path):
+    """The encoder does not resolve what comes before sliding: an entry that models it says no more than dry friction."""
+    played = FREE_CARRIAGE.replace(
+        "travel:", "rub: {from: velocity, rate: 1.5 * tanh(velocity / 0.0005), unit: N}\n  travel:"
+    )
+    t = np.arange(1500) * 0.002
+    rng = np.random.default_rng(1)
+    force = np.interp(t, np.arange(0, 9, 0.4), rng.uniform(-8, 8, 23))
+    ran = compile_plant(loads(played)).measure(
+        Table("run", "run", t, {"force": force, "encoder": np.zeros(len(t))})
+    )
+    plant, run = tmp_path / "plant.yaml", tmp_path / "run.csv"
+    plant.write_text(FREE_CARRIAGE.replace("noise: 5e-6, resolution: 1e-5", "noise: 5e-4"))
+    rows = np.column_stack([t, force, ran.columns["encoder"] + rng.normal(0, 5e-4, len(t))])
+    np.savetxt(run, rows, delimiter=",", comments="", header="t,force,encoder")
+    r = diagnosed([plant, run], tmp_path / "out")
+    assert [(f["effect"], f["probability"] > 0.99) for f in r["findings"]] == [("coulomb_friction", True)]
+    assert not any("backlash" in e for h in r["hypotheses"] for e in h["effects"])
 
 
 TANK = """

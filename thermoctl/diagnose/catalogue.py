@@ -71,7 +71,8 @@ class EffectParameter:
 
     - `trial`: its value in screening, an expression of the amplitudes s, s2, s3 and of shapes
     - `shape`: the shape that it is
-    - `null`: its value where the effect is absent"""
+    - `null`: its value where the effect is absent
+    - `at_zero`: the simpler effect that this one is where the parameter is 0"""
 
     name: str
     unit: str | None
@@ -83,6 +84,7 @@ class EffectParameter:
     per_recording: bool
     typical: float | None
     origin: str | None  # 'first_air': low and high are relative to the first ambient temperature
+    at_zero: str | None = None
 
     @property
     def amplitude(self) -> bool:
@@ -169,6 +171,7 @@ def _read(root: yamlfile.Node) -> Effect:
                 bool(p.get("per_recording")),
                 p.get("typical"),
                 p.get("origin"),
+                p.get("at_zero"),
             )
         )
     try:

@@ -98,7 +98,14 @@ class Fitted:
     @property
     def doubtful(self) -> bool:
         """Return whether a part of an effect is not significant: a simpler hypothesis may replace it."""
-        return any(_insignificant(self, e, any) for e in self.hypothesis.effects)
+        return any(
+            _insignificant(self, e, any)
+            or any(
+                p.at_zero and p.name in e.own and _near_null(self, e, p)
+                for p in e.candidate.effect.parameters
+            )
+            for e in self.hypothesis.effects
+        )
 
     @property
     def log_evidence(self) -> float:
@@ -122,10 +129,13 @@ def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]
         return False
     if not sizes:
         return any(f.fit.at_bound.get(n) == "low" for n in e.own.values())
-    return which(
-        abs(f.plant.parameters[e.own[p.name]].value - p.null) < SIGNIFICANT * f.sd[e.own[p.name]]
-        for p in sizes
-    )
+    return which(_near_null(f, e, p) for p in sizes)
+
+
+def _near_null(f: Fitted, e: Placed, p: EffectParameter) -> bool:
+    """Return whether a parameter is within SIGNIFICANT sd of the value at which it changes nothing."""
+    own = e.own[p.name]
+    return abs(f.plant.parameters[own].value - p.null) < SIGNIFICANT * f.sd[own]
 
 
 class Posterior:

@@ -43,17 +43,16 @@ def _free_member(c: Candidate, side: str) -> bool:
 
 
 def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
-    """Return the entries at the same places with fewer parameters, to try without an insignificant part."""
-    return [
-        d
-        for d in looked.directions
-        if any(
-            d.candidate.place.where == a.candidate.place.where
-            and len(d.candidate.effect.parameters) < len(a.candidate.effect.parameters)
-            for a in added
+    """Return the simpler entries at the same places, to try without an insignificant part."""
+
+    def is_simpler(d: Direction, a: Direction) -> bool:
+        new, old = d.candidate.effect, a.candidate.effect
+        fewer = len(new.parameters) < len(old.parameters)
+        return d.candidate.place.where == a.candidate.place.where and (
+            fewer or any(p.at_zero == new.name for p in old.parameters)
         )
-        and d.gain > 0
-    ]
+
+    return [d for d in looked.directions if d.gain > 0 and any(is_simpler(d, a) for a in added)]
 
 
 def shortlist(
