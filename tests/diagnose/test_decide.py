@@ -16,6 +16,11 @@ def weighed(scores):
     return weigh(scores, {keys: dict.fromkeys(keys, 1.0) for keys in scores}, limits())
 
 
+def test_a_small_remainder_that_is_certain_is_not_nothing():
+    found = weighed({NOTHING: 0.0, ONE: -9.0})
+    assert decide(found, Facts(found.something, (), 1.04, 1.0, 0.99), limits()).verdict == "unexplained"
+
+
 @pytest.mark.parametrize(
     ("scores", "named", "over_noise", "worth", "verdict"),
     [

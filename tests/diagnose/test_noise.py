@@ -7,6 +7,7 @@ import pytest
 from scipy.fft import dct
 from scipy.optimize import minimize
 from scipy.signal import lfilter
+from scipy.special import logsumexp
 
 from thermoctl.diagnose import noise as module
 from thermoctl.diagnose.coordinates import Coordinates
@@ -18,7 +19,8 @@ SHARE = 0.4  # of the noise's variance, that is not white
 
 
 def banded(e: np.ndarray) -> tuple[list[Grid], list[np.ndarray]]:
-    d = Excitation("run", np.arange(ROWS) * 1.0, np.zeros((ROWS, 0)), e[:, None], {}, np.zeros(0, np.intc))
+    n = len(e)
+    d = Excitation("run", np.arange(n) * 1.0, np.zeros((n, 0)), e[:, None], {}, np.zeros(0, np.intc))
     c = Coordinates([d])
     return [grid(c, [0], SIGMA, SWING)], c.powers([c.transform(c.channels[0], e)])
 
@@ -27,9 +29,9 @@ def likelihood(e: np.ndarray) -> Averaged:
     return averaged(*banded(e))
 
 
-def coloured(seed: int, phi: float, size: float = 1.0) -> np.ndarray:
+def coloured(seed: int, phi: float, size: float = 1.0, rows: int = ROWS) -> np.ndarray:
     """Noise of `size` times the stated one: 60 % of its variance is white, the rest first-order."""
-    white, other = np.random.default_rng(seed).standard_normal((2, ROWS))
+    white, other = np.random.default_rng(seed).standard_normal((2, rows))
     slow = lfilter([1], [1, -phi], other) * np.sqrt(1 - phi**2)
     return (np.sqrt(1 - SHARE) * white + np.sqrt(SHARE) * slow) * SIGMA * size
 
@@ -75,6 +77,41 @@ def test_the_remainder_is_averaged_about_its_maximum_however_many_decades_it_spa
     assert averaged(g, power).log_likelihood == pytest.approx(
         by_hand(g[0], np.bincount(g[0].node, power[0])) + np.log(1 - module.ABSENT), abs=0.1
     )
+
+
+@pytest.mark.parametrize("phi", [0.3, 0.84])
+def test_slow_noise_is_averaged_over_its_size_time_and_flicker(phi):
+    """Beside a sum over 30 000 spectra; the data determine each parameter in another way."""
+    (g,), (power,) = banded(coloured(1, phi))
+    power = np.bincount(g.node, power)
+    middle = (np.arange(30) + 0.5) / 30
+    size, time, flicker = (np.exp(a + (b - a) * middle) for a, b in module.SLOW)
+    r = np.exp(-1 / time)[:, None]
+    first = (1 - r**2) / (1 - 2 * r * np.cos(g.turn) + r**2)
+    shape = (
+        1
+        + (size[:, None, None] ** 2 * first)[:, :, None]
+        + (flicker[:, None] ** 2 * np.pi / np.log(10) / g.turn)
+    )
+    shape = shape * (g.count.sum() / (shape @ g.count))[..., None]
+    level = np.linspace(-0.4, 0.4, 81)
+    ratio = (power / g.variance / shape).sum(axis=-1)[..., None]
+    n = g.count.sum()
+    log_p = -0.5 * (
+        n * (np.log(2 * np.pi * g.variance) + level)
+        + (np.log(shape) @ g.count)[..., None]
+        + ratio * np.exp(-level)
+    )
+    log_p = log_p - 0.5 * (level / g.known) ** 2 - np.log(np.sqrt(2 * np.pi) * g.known)
+    whole = logsumexp(log_p) + np.log(0.01 / 30**3)
+    assert module._laplace(module._Noise(g, power, True)).log_p == pytest.approx(whole, abs=0.5)
+
+
+@pytest.mark.parametrize("phi", [0.3, 0.5, 0.7, 0.84, 0.9])
+def test_slow_noise_in_a_long_recording_is_no_remainder(phi):
+    """A few spectra of noise, apart by a factor of three, left 20 to 45 nats to the remainder."""
+    for seed in range(3):
+        assert likelihood(coloured(seed, phi, rows=20_000)).remainder[0] < 0.01
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.3, 0.5, 0.7, 0.9])

@@ -31,12 +31,14 @@ class Facts:
     - `something`: probability that some effect is there
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
+    - `remains`: the largest probability of a remainder at an output
     - `worth`: held-out error, divided by that of a refit alone"""
 
     something: float
     named: tuple[Key, ...]
     over_noise: float
     worth: float
+    remains: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def weigh(
 ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
     (
         "nothing is supported and the residual is the sensors' noise",
-        lambda f, q: f.something < q.name and f.over_noise <= q.clean,
+        lambda f, q: f.something < q.name and f.over_noise <= q.clean and f.remains < q.name,
         "consistent",
     ),
     ("nothing is supported and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
@@ -98,6 +100,7 @@ def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
         "something": facts.something,
         "over_noise": facts.over_noise,
         "worth": facts.worth,
+        "remains": facts.remains,
         **{f"{e} at {w}": posterior.effects[e, w] for e, w in facts.named},
     }
     named = facts.named if verdict in ("explained", "partly_explained") else ()

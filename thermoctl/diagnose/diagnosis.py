@@ -18,7 +18,7 @@ from thermoctl.diagnose.misfit import energies, standing, standouts
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.search import search
 from thermoctl.diagnose.threads import one_thread
-from thermoctl.diagnose.unknown import left, reached
+from thermoctl.diagnose.unknown import left, reached, remainder
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 
@@ -64,7 +64,8 @@ def diagnose(
     named = tuple(e.key for e in best.hypothesis.effects if sure and posterior.effects[e.key] >= numbers.name)
     # data that took part in the choice cannot speak against it
     ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects and value.reserved else 1.0
-    facts = Facts(posterior.something, named, max(after.over_noise.values()), ratio)
+    remains = remainder(known, fits[best.hypothesis.keys])
+    facts = Facts(posterior.something, named, max(after.over_noise.values()), ratio, remains)
     found = Diagnosis(
         known,
         searched,

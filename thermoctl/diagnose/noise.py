@@ -15,7 +15,7 @@ the remainder's share of the output's swing has a half-normal prior of width SMA
     log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
 
 Without a remainder the noise has the stated spectrum. Where no slow parts are stated, it has with even odds a
-first-order and a 1/f part. Their shares and time are summed over a grid. c and u are integrated by Laplace's
+first-order and a 1/f part, whose sizes and time are log-uniform. These, c and u are integrated by Laplace's
 method.
 """
 
@@ -23,12 +23,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotrs
-from scipy.special import logsumexp
+from scipy.special import logsumexp, ndtr
 
 from thermoctl.diagnose.coordinates import WIDTH, Coordinates
 from thermoctl.plant.language import SensorNoise
@@ -42,14 +41,17 @@ LEVEL = 2 * np.log(10.0)
 FLOOR = 0.1  # least share of the remainder's energy that is spread evenly over all frequencies
 DRAWS = 400  # random walks drawn for the normalisation of the remainder's prior
 WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a white force on one storage
-STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the gain that ends it
+STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the predicted gain that ends it
 LONGEST = 10.0  # step in a logarithm that is tried
+STEP = 1e-4  # of differences of slopes
 DAMPED = 0.01  # first damping of a step, as a share of the curvature
-LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm to start from
-# Slow parts of a noise that nobody stated: a first-order part and a 1/f part. Their standard deviations (the
-# latter's over a decade) are shares of the white part's. Time constants are in sampling intervals. Slower or
-# larger errors of a sensor belong to the remainder: as noise they would imitate physics.
-SHARES, TIMES, FLICKERS = (1 / 3, 2 / 3, 1.0), (1.0, 3.0, 10.0), (0.0, 0.05)
+LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm
+# Slow parts of a noise that nobody stated: least and largest size and time of a first-order part, and size
+# of a 1/f part. Sizes are standard deviations (of the 1/f part over a decade), as shares of the white part's.
+# The time is in sampling intervals. Slower or larger errors belong to the remainder: as noise they would
+# imitate physics.
+SLOW = np.log([[0.1, 1.0], [0.5, 15.0], [0.01, 0.1]])
+TIMES = (-1.0, 0.0, 1.0)  # of the first-order part, in sd: from the best one its maximum is sought
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -63,8 +65,8 @@ class Grid:
     channels: tuple[int, ...]  # positions in Coordinates.channels
     node: np.ndarray
     count: np.ndarray
-    shapes: np.ndarray  # (spectra, nodes) of the noise, the stated one first; their mean over all rows is 1
-    log_prior: np.ndarray  # (spectra,) of each
+    turn: np.ndarray  # angle in a sampling interval
+    shape: np.ndarray  # the stated noise's spectrum, its mean over all rows 1
     known: float  # prior sd of log c^2
     rough: np.ndarray  # (nodes, nodes) inverse covariance of u
     log_rough: float  # its log determinant
@@ -77,11 +79,6 @@ class Grid:
     def variance(self) -> float:
         """Variance of the stated noise, s^2."""
         return self.sigma**2
-
-    @property
-    def shape(self) -> np.ndarray:
-        """Spectrum of the stated noise, its mean over all rows 1."""
-        return self.shapes[0]
 
     @property
     def small(self) -> float:
@@ -117,14 +114,13 @@ def grid(
     log_rough = float(np.linalg.slogdet(rough)[1])
     frequency = np.exp2(octave.min()) * WIDTH**known
     interval = channels[0].interval
-    slow = [] if sensor else _slow(frequency, interval)
-    shapes = np.array([spectrum(sensor or SensorNoise(1.0), frequency, interval), *slow])
+    shape = spectrum(sensor or SensorNoise(1.0), frequency, interval)
     return Grid(
         tuple(positions),
         node,
         count,
-        shapes * count.sum() / (shapes @ count)[:, None],
-        np.log([WHITE, *np.full(len(slow), (1 - WHITE) / len(slow))]) if slow else np.zeros(1),
+        2 * np.pi * frequency * interval,
+        shape * count.sum() / (shape @ count),
         2 * sensor.sd if sensor and sensor.sd else STATED,
         rough,
         log_rough,
@@ -142,22 +138,33 @@ def spectrum(sensor: SensorNoise, frequency: np.ndarray, interval: float) -> np.
     the standard deviation `flicker` over a decade has the density flicker^2 / (ln 10 f)."""
     out = np.full(len(frequency), sensor.white**2)
     if sensor.drift is not None and sensor.time is not None:
-        phi = np.exp(-interval / sensor.time)
-        turn = np.cos(2 * np.pi * frequency * interval)
-        out += sensor.drift**2 * (1 - phi**2) / (1 - 2 * phi * turn + phi**2)
+        out += sensor.drift**2 * _first_order(sensor.time / interval, 2 * np.pi * frequency * interval)
     if sensor.flicker is not None:
-        out += sensor.flicker**2 / (2 * np.log(10.0) * frequency * interval)
+        out += sensor.flicker**2 * _flicker(2 * np.pi * frequency * interval)
     return out
 
 
-def _slow(frequency: np.ndarray, interval: float) -> list[np.ndarray]:
-    """Return spectra of noise with slow parts that nobody stated."""
-    first = [(0.0, 1.0), *product(SHARES, TIMES)]
-    return [
-        spectrum(SensorNoise(1.0, drift=r, time=tau * interval, flicker=f), frequency, interval)
-        for (r, tau), f in product(first, FLICKERS)
-        if r or f
-    ]
+def _first_order(time: float, turn: np.ndarray) -> np.ndarray:
+    phi = np.exp(-1 / time)
+    return (1 - phi**2) / (1 - 2 * phi * np.cos(turn) + phi**2)
+
+
+def _flicker(turn: np.ndarray) -> np.ndarray:
+    return np.pi / (np.log(10.0) * turn)
+
+
+def _slow(turn: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the spectrum (nodes,) of a noise whose white part is 1, and its slopes (nodes, 3) by x.
+
+    x: standard normal values, as probable as the first-order part's size and time, and the other's size."""
+    apart = SLOW[:, 1] - SLOW[:, 0]
+    size, time, flicker = np.exp(SLOW[:, 0] + apart * ndtr(x))
+    first, other = size**2 * _first_order(time, turn), flicker**2 * _flicker(turn)
+    phi = np.exp(-1 / time)
+    near = (np.cos(turn) - phi) / (1 - 2 * phi * np.cos(turn) + phi**2)
+    by_time = 2 * phi / time * (near - phi / (1 - phi**2)) * first
+    density = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+    return 1 + first + other, np.stack([2 * first, by_time, 2 * other], axis=1) * apart * density
 
 
 @dataclass(frozen=True)
@@ -182,39 +189,88 @@ def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
     total, sensor, present, unsure = 0.0, [], [], []
     for g in grids:
         power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels]))
-        scores, owns = _sensor_only(g, power)
-        none = float(logsumexp(scores))
-        of = np.exp(scores - none)  # (spectra,) probability of each
-        some, level, variance, spread = _with_remainder(g, power)
-        total += float(np.logaddexp(np.log(ABSENT) + none, np.log(1 - ABSENT) + some))
-        p = 1 / (1 + np.exp(np.clip(none - some, -500, 500)) * ABSENT / (1 - ABSENT))
-        each = np.vstack([1 / (owns[:, None] * g.shapes), 1 / variance])
-        weight = np.append((1 - p) * of, p)
+        power = np.maximum(power, LEAST * g.variance * g.count)
+        noises = [_Noise(g, power, slow) for slow in ([False] if g.sensor else [False, True])]
+        some = _Remainder(g, power, block_diag(g.known**-2, g.rough))
+        found = [*(_laplace(c) for c in noises), _laplace(some)]
+        odds = ABSENT * np.array([1.0] if g.sensor else [WHITE, 1 - WHITE])
+        scores = np.log(np.append(odds, 1 - ABSENT)) + [f.log_p for f in found]
+        whole = float(logsumexp(scores))
+        weight = np.exp(scores - whole)
+        each = np.array([1 / f.variance for f in found])
         mean = weight @ each
         at = 0
         for k in g.channels:
             inverse[k] = mean[g.node[at : at + len(powers[k])]]
             at += len(powers[k])
-        sensor.append(float(weight @ np.append(owns, level)))
-        present.append(float(p))
+        total += whole
+        sensor.append(float(weight @ [f.sensor for f in found]))
+        present.append(float(weight[-1]))
         apart = each - mean
-        unsure.append(p * spread + (apart.T * weight) @ apart)
+        within = sum(w * f.unsure for w, f in zip(weight, found, strict=True))
+        unsure.append(within + (apart.T * weight) @ apart)
     return Averaged(total, inverse, sensor, present, unsure)
 
 
-def _sensor_only(g: Grid, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return log p(R, spectrum | no remainder), and the noise's variance, by spectrum."""
-    n, ratio = float(g.count.sum()), (power / g.shapes).sum(axis=1) / g.variance
-    v = np.log(np.maximum(ratio / n, LEAST))
-    for _ in range(STEPS):
-        step = (0.5 * (ratio * np.exp(-v) - n) - v / g.known**2) / (0.5 * n + g.known**-2)
-        v += np.clip(step, -LONGEST, LONGEST)
-        if np.all(abs(step) < CLOSE):
-            break
-    own = g.variance * np.exp(v)
-    score = -0.5 * (n * (LOG_2PI + np.log(own)) + np.log(g.shapes) @ g.count + ratio * g.variance / own)
-    score -= 0.5 * (v / g.known) ** 2
-    return g.log_prior + score - np.log(g.known) - 0.5 * np.log(0.5 * n + g.known**-2), own
+@dataclass(frozen=True)
+class _At:
+    """A log density at x, with V and its slope d log V / dx.
+
+    `pull`: slope of minus the log density without the Gaussian prior."""
+
+    x: np.ndarray
+    log_density: float
+    variance: np.ndarray
+    slope: np.ndarray
+    pull: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """The log density of an output's residual without a remainder, and its derivatives.
+
+    x holds log c^2. With `slow` parts that nobody stated it holds their sizes and time, too: the standard
+    normal values of the same probability."""
+
+    grid: Grid
+    power: np.ndarray
+    slow: bool
+
+    @property
+    def precision(self) -> np.ndarray:
+        """Of the Gaussian prior of x."""
+        return np.diag(np.append(self.grid.known**-2, np.ones(3 * self.slow)))
+
+    @property
+    def log_prior(self) -> float:
+        """Log of the prior's normalisation, without 2 pi."""
+        return -float(np.log(self.grid.known))
+
+    def start(self) -> np.ndarray:
+        """Return the likeliest x of some."""
+        g = self.grid
+        v = np.log((self.power / g.shape).sum() / g.count.sum() / g.variance)
+        if not self.slow:
+            return np.array([v])
+        starts = [np.array([v, 0.0, x, 0.0]) for x in TIMES]
+        return max(starts, key=lambda x: self.at(x).log_density)
+
+    def at(self, x: np.ndarray) -> _At:
+        """Return the log density, V and their slopes at x."""
+        g, slope = self.grid, np.ones((len(self.power), len(x)))
+        v = g.variance * np.exp(x[0]) * g.shape
+        if self.slow:
+            shape, changes = _slow(g.turn, x[1:])
+            total = g.count @ shape
+            slope[:, 1:] = changes / shape[:, None] - g.count @ changes / total
+            v = v * shape * (g.count.sum() / total)
+        density = -0.5 * float(g.count @ np.log(v) + (self.power / v).sum() + x @ self.precision @ x)
+        return _At(x, density, v, slope, 0.5 * slope.T @ (g.count - self.power / v))
+
+    def curvature(self, at: _At) -> np.ndarray:
+        """Return the curvature of minus the log density, by differences of its slope."""
+        h = np.array([self.at(at.x + e).pull - at.pull for e in STEP * np.eye(len(at.x))]) / STEP
+        return 0.5 * (h + h.T) + self.precision
 
 
 @dataclass(frozen=True)
@@ -225,8 +281,13 @@ class _Remainder:
     power: np.ndarray
     precision: np.ndarray  # of the Gaussian prior of x
 
-    def spectra(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the log density, each frequency's part of the remainder's size, d log V / dx and V."""
+    @property
+    def log_prior(self) -> float:
+        """Log of the prior's normalisation, without 2 pi."""
+        return -float(np.log(self.grid.known)) + 0.5 * self.grid.log_rough - self.grid.log_small
+
+    def at(self, x: np.ndarray) -> _At:
+        """Return the log density, V and their slopes at x."""
         g = self.grid
         noise, free = g.variance * g.shape * np.exp(x[0]), np.exp(x[1:])
         part = g.count * free / g.count.sum()
@@ -234,45 +295,54 @@ class _Remainder:
         slope = np.tile(g.small * FLOOR * np.concatenate([[0.0], part]), (len(free), 1))
         slope[:, 0] = noise
         slope[:, 1:] += np.diag(g.small * free)
+        slope /= v[:, None]
         fit = g.count @ np.log(v) + (self.power / v).sum()
         density = -0.5 * float(fit + part.sum() + x @ self.precision @ x)
-        return density, np.concatenate([[0.0], part]), slope / v[:, None], v
+        pull = 0.5 * (slope.T @ (g.count - self.power / v) + np.concatenate([[0.0], part]))
+        return _At(x, density, v, slope, pull)
 
-    def curvature(self, part: np.ndarray, slope: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return gradient and curvature of minus the log density, the gradient without the Gaussian prior.
+    def curvature(self, at: _At) -> np.ndarray:
+        """Return the curvature of minus the log density.
 
-        The curvature is exact: the expected one (Fisher) misleads where a residual spans many decades."""
-        n, p = self.grid.count, self.power / v
-        pull = 0.5 * (slope.T @ (n - p) + part)
-        return pull, (slope.T * (p - 0.5 * n)) @ slope + self.precision + np.diag(pull)
+        It is exact: the expected one (Fisher) misleads where a residual spans many decades."""
+        excess = self.power / at.variance - 0.5 * self.grid.count
+        return (at.slope.T * excess) @ at.slope + self.precision + np.diag(at.pull)
 
-    def maximum(self) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return log density, x, curvature, slope and V at the maximum, by Newton's method with damping."""
+    def start(self) -> np.ndarray:
+        """Return an x near the maximum."""
         g = self.grid
-        seen = np.maximum(self.power / g.count, LEAST * g.variance) / g.small
-        x = np.concatenate([[0.0], np.log(np.minimum(seen, np.sqrt(seen * g.count.sum())))])
-        now, part, slope, v = self.spectra(x)
-        damping, gain = 0.0, np.inf
-        for _ in range(STEPS):
-            pull, h = self.curvature(part, slope, v)
-            factor, indefinite = dpotrf(h + damping * np.diag(np.abs(np.diag(h))), lower=1)
-            if gain < CLOSE and not indefinite and not damping:
-                break
-            step = dpotrs(factor, pull + self.precision @ x, lower=1)[0]
-            then = self.spectra(x - step) if not indefinite and np.abs(step).max() < LONGEST else None
-            if then and then[0] >= now:
-                gain, x, damping = then[0] - now, x - step, damping / 8 if damping > DAMPED else 0.0
-                now, part, slope, v = then
-            else:
-                damping = max(4 * damping, DAMPED)
-        return now, x, h, slope, v
+        seen = self.power / g.count / g.small
+        return np.concatenate([[0.0], np.log(np.minimum(seen, np.sqrt(seen * g.count.sum())))])
 
 
-def _with_remainder(g: Grid, power: np.ndarray) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """Return log p(R | remainder), the noise's variance, V at each frequency, and the covariance of 1/V."""
-    density, x, h, slope, v = _Remainder(g, power, block_diag(g.known**-2, g.rough)).maximum()
+@dataclass(frozen=True)
+class _Found:
+    """One case: log p(R), the noise's variance, V at each frequency, and the covariance of 1/V."""
+
+    log_p: float
+    sensor: float
+    variance: np.ndarray
+    unsure: np.ndarray
+
+
+def _laplace(d: _Noise | _Remainder) -> _Found:
+    """Integrate a density about its maximum, which Newton's method with damping finds."""
+    g, at = d.grid, d.at(d.start())
+    damping = 0.0
+    for _ in range(STEPS):
+        h = d.curvature(at)
+        factor, indefinite = dpotrf(h + damping * np.diag(np.abs(np.diag(h))), lower=1)
+        uphill = at.pull + d.precision @ at.x
+        step = dpotrs(factor, uphill, lower=1)[0]
+        if 0.5 * uphill @ step < CLOSE and not indefinite and not (damping and dpotrf(h, lower=1)[1]):
+            break
+        then = d.at(at.x - step) if not indefinite and np.abs(step).max() < LONGEST else None
+        if then and then.log_density >= at.log_density:
+            at, damping = then, damping / 4 if damping > DAMPED else 0.0
+        else:
+            damping = max(4 * damping, DAMPED)
     factor = np.linalg.cholesky(h)
-    score = density - 0.5 * float(g.count.sum()) * LOG_2PI - np.log(g.known)
-    score += 0.5 * g.log_rough - g.log_small - float(np.log(np.diag(factor)).sum())
-    moves = solve_triangular(factor, (slope / v[:, None]).T, lower=True)
-    return float(score), float(g.variance * np.exp(x[0])), v, moves.T @ moves
+    score = at.log_density - 0.5 * float(g.count.sum()) * LOG_2PI + d.log_prior
+    score -= float(np.log(np.diag(factor)).sum())
+    moves = solve_triangular(factor, (at.slope / at.variance[:, None]).T, lower=True)
+    return _Found(score, float(g.variance * np.exp(at.x[0])), at.variance, moves.T @ moves)

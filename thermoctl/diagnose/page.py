@@ -214,6 +214,7 @@ def _why(result: Mapping[str, Any]) -> str:
     meanings = {
         "something": "probability that some effect is missing",
         "over_noise": "largest residual rms over its sensor's noise",
+        "remains": "largest probability of a remainder at an output that does not rest on its rounding's steps",
         "worth": "held-out error with the findings over that of a refit alone (1: not measured)",
     }
     body = _p(f"Row of the decision table that applies: {decision['row']}.")

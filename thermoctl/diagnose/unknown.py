@@ -42,6 +42,21 @@ def left(case: Case, f: Fitted, reach: Responses, clean: float) -> Left:
     return Left(rms, noise, over, next(iter(located(case, f, reach)), None), follow)
 
 
+def remainder(case: Case, f: Fitted) -> float:
+    """Return the largest probability of a remainder at an output.
+
+    A reading that rests on the steps of its rounding errs with the signal: its remainder proves nothing."""
+    drives = case.drives(case.null.model)
+    found = [0.0]
+    for g, p in zip(case.grids, f.average.remainder, strict=True):
+        j = case.coordinates.channels[g.channels[0]].output
+        step = list(case.plant.outputs.values())[j].resolution or 0.0
+        moves = np.concatenate([np.abs(np.diff(d.y[:, j])) for d in drives])
+        if step <= g.sigma or np.nanmedian(moves) > step:
+            found.append(p)
+    return max(found)
+
+
 def reached(case: Case) -> Responses:
     """How random forces at the nodes of the plant, refitted as it came, reach its outputs."""
     model = case.null.model
