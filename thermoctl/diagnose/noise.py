@@ -23,11 +23,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotrs
-from scipy.special import logsumexp, ndtr
+from scipy.special import logsumexp, ndtr, ndtri
 
 from thermoctl.diagnose.coordinates import WIDTH, Coordinates
 from thermoctl.plant.language import SensorNoise
@@ -43,7 +44,6 @@ DRAWS = 400  # random walks drawn for the normalisation of the remainder's prior
 WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a white force on one storage
 STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the predicted gain that ends it
 LONGEST = 10.0  # step in a logarithm that is tried
-STEP = 1e-4  # of differences of slopes
 DAMPED = 0.01  # first damping of a step, as a share of the curvature
 LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm
 # Slow parts of a noise that nobody stated: least and largest size and time of a first-order part, and size
@@ -51,7 +51,8 @@ LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logari
 # The time is in sampling intervals. Slower or larger errors belong to the remainder: as noise they would
 # imitate physics.
 SLOW = np.log([[0.1, 1.0], [0.5, 15.0], [0.01, 0.1]])
-TIMES = (-1.0, 0.0, 1.0)  # of the first-order part, in sd: from the best one its maximum is sought
+# Sizes and times, as `_slow` takes them, that share their prior equally: a search starts at the likeliest.
+STARTS = np.array([*product(*(ndtri((np.arange(n) + 0.5) / n) for n in (3, 5, 3)))])
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -67,6 +68,7 @@ class Grid:
     count: np.ndarray
     turn: np.ndarray  # angle in a sampling interval
     shape: np.ndarray  # the stated noise's spectrum, its mean over all rows 1
+    slow: np.ndarray  # (starts, nodes) the same of noise with slow parts
     known: float  # prior sd of log c^2
     rough: np.ndarray  # (nodes, nodes) inverse covariance of u
     log_rough: float  # its log determinant
@@ -114,13 +116,16 @@ def grid(
     log_rough = float(np.linalg.slogdet(rough)[1])
     frequency = np.exp2(octave.min()) * WIDTH**known
     interval = channels[0].interval
+    turn = 2 * np.pi * frequency * interval
     shape = spectrum(sensor or SensorNoise(1.0), frequency, interval)
+    slow = np.array([_slow(turn, x)[0] for x in STARTS])
     return Grid(
         tuple(positions),
         node,
         count,
-        2 * np.pi * frequency * interval,
+        turn,
         shape * count.sum() / (shape @ count),
+        slow * count.sum() / (slow @ count)[:, None],
         2 * sensor.sd if sensor and sensor.sd else STATED,
         rough,
         log_rough,
@@ -153,18 +158,28 @@ def _flicker(turn: np.ndarray) -> np.ndarray:
     return np.pi / (np.log(10.0) * turn)
 
 
-def _slow(turn: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the spectrum (nodes,) of a noise whose white part is 1, and its slopes (nodes, 3) by x.
+def _slow(turn: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the spectrum (nodes,) of a noise whose white part is 1, and its two derivatives by x.
 
-    x: standard normal values, as probable as the first-order part's size and time, and the other's size."""
+    x: standard normal values, as probable as the first-order part's size and time, and the other's size.
+    The derivatives are (3, nodes) and (3, 3, nodes)."""
     apart = SLOW[:, 1] - SLOW[:, 0]
     size, time, flicker = np.exp(SLOW[:, 0] + apart * ndtr(x))
+    steps = apart * np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)  # d log of each by x
     first, other = size**2 * _first_order(time, turn), flicker**2 * _flicker(turn)
     phi = np.exp(-1 / time)
-    near = (np.cos(turn) - phi) / (1 - 2 * phi * np.cos(turn) + phi**2)
-    by_time = 2 * phi / time * (near - phi / (1 - phi**2)) * first
-    density = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
-    return 1 + first + other, np.stack([2 * first, by_time, 2 * other], axis=1) * apart * density
+    below = 1 - 2 * phi * np.cos(turn) + phi**2
+    near, far = (np.cos(turn) - phi) / below, phi / (1 - phi**2)
+    by_time = 2 * phi / time * (near - far)  # d log first / d log time
+    bend = (1 / time - 1) * by_time
+    bend += 2 * (phi / time) ** 2 * (2 * near**2 - 1 / below - (1 + phi**2) / (1 - phi**2) ** 2)
+    change = np.array([2 * first * steps[0], by_time * first * steps[1], 2 * other * steps[2]])
+    second = np.zeros((3, 3, len(turn)))
+    second[0, 0] = change[0] * (2 * steps[0] - x[0])
+    second[0, 1] = second[1, 0] = change[1] * 2 * steps[0]
+    second[1, 1] = change[1] * (by_time * steps[1] - x[1]) + first * bend * steps[1] ** 2
+    second[2, 2] = change[2] * (2 * steps[2] - x[2])
+    return 1 + first + other, change, second
 
 
 @dataclass(frozen=True)
@@ -214,15 +229,14 @@ def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
 
 @dataclass(frozen=True)
 class _At:
-    """A log density at x, with V and its slope d log V / dx.
-
-    `pull`: slope of minus the log density without the Gaussian prior."""
+    """A log density at x, V there, d log V / dx, and slope and curvature of minus the log density."""
 
     x: np.ndarray
     log_density: float
     variance: np.ndarray
     slope: np.ndarray
-    pull: np.ndarray
+    uphill: np.ndarray
+    curvature: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -237,40 +251,43 @@ class _Noise:
     slow: bool
 
     @property
-    def precision(self) -> np.ndarray:
-        """Of the Gaussian prior of x."""
-        return np.diag(np.append(self.grid.known**-2, np.ones(3 * self.slow)))
-
-    @property
     def log_prior(self) -> float:
         """Log of the prior's normalisation, without 2 pi."""
         return -float(np.log(self.grid.known))
 
     def start(self) -> np.ndarray:
         """Return the likeliest x of some."""
-        g = self.grid
-        v = np.log((self.power / g.shape).sum() / g.count.sum() / g.variance)
+        g, n = self.grid, self.grid.count.sum()
         if not self.slow:
-            return np.array([v])
-        starts = [np.array([v, 0.0, x, 0.0]) for x in TIMES]
-        return max(starts, key=lambda x: self.at(x).log_density)
+            return np.log([(self.power / g.shape).sum() / n / g.variance])
+        level = np.log((self.power / g.slow).sum(axis=1) / n / g.variance)
+        score = -0.5 * (n * level + (level / g.known) ** 2 + np.log(g.slow) @ g.count)
+        k = int(np.argmax(score))
+        return np.append(level[k], STARTS[k])
 
     def at(self, x: np.ndarray) -> _At:
-        """Return the log density, V and their slopes at x."""
-        g, slope = self.grid, np.ones((len(self.power), len(x)))
-        v = g.variance * np.exp(x[0]) * g.shape
+        """Return the log density, V and their derivatives at x."""
+        g = self.grid
+        precision = np.append(g.known**-2, np.ones(len(x) - 1))
+        v, slope, bend = (
+            g.variance * np.exp(x[0]) * g.shape,
+            np.ones((len(x), len(g.count))),
+            np.zeros((0, 0)),
+        )
         if self.slow:
-            shape, changes = _slow(g.turn, x[1:])
+            shape, change, second = _slow(g.turn, x[1:])
             total = g.count @ shape
-            slope[:, 1:] = changes / shape[:, None] - g.count @ changes / total
+            share, whole = change / shape, change @ g.count / total
+            slope[1:] = share - whole[:, None]
             v = v * shape * (g.count.sum() / total)
-        density = -0.5 * float(g.count @ np.log(v) + (self.power / v).sum() + x @ self.precision @ x)
-        return _At(x, density, v, slope, 0.5 * slope.T @ (g.count - self.power / v))
-
-    def curvature(self, at: _At) -> np.ndarray:
-        """Return the curvature of minus the log density, by differences of its slope."""
-        h = np.array([self.at(at.x + e).pull - at.pull for e in STEP * np.eye(len(at.x))]) / STEP
-        return 0.5 * (h + h.T) + self.precision
+            excess = g.count - self.power / v
+            bend = second @ (excess / shape) - (share * excess) @ share.T
+            bend -= excess.sum() * (second @ g.count / total - np.outer(whole, whole))
+        p = self.power / v
+        curvature = 0.5 * (slope * p) @ slope.T + np.diag(precision)
+        curvature[1:, 1:] += 0.5 * bend
+        density = -0.5 * float(g.count @ np.log(v) + p.sum() + precision @ x**2)
+        return _At(x, density, v, slope.T, 0.5 * slope @ (g.count - p) + precision * x, curvature)
 
 
 @dataclass(frozen=True)
@@ -287,7 +304,9 @@ class _Remainder:
         return -float(np.log(self.grid.known)) + 0.5 * self.grid.log_rough - self.grid.log_small
 
     def at(self, x: np.ndarray) -> _At:
-        """Return the log density, V and their slopes at x."""
+        """Return the log density, V and their derivatives at x.
+
+        The curvature is exact: the expected one (Fisher) misleads where a residual spans many decades."""
         g = self.grid
         noise, free = g.variance * g.shape * np.exp(x[0]), np.exp(x[1:])
         part = g.count * free / g.count.sum()
@@ -296,17 +315,11 @@ class _Remainder:
         slope[:, 0] = noise
         slope[:, 1:] += np.diag(g.small * free)
         slope /= v[:, None]
-        fit = g.count @ np.log(v) + (self.power / v).sum()
-        density = -0.5 * float(fit + part.sum() + x @ self.precision @ x)
-        pull = 0.5 * (slope.T @ (g.count - self.power / v) + np.concatenate([[0.0], part]))
-        return _At(x, density, v, slope, pull)
-
-    def curvature(self, at: _At) -> np.ndarray:
-        """Return the curvature of minus the log density.
-
-        It is exact: the expected one (Fisher) misleads where a residual spans many decades."""
-        excess = self.power / at.variance - 0.5 * self.grid.count
-        return (at.slope.T * excess) @ at.slope + self.precision + np.diag(at.pull)
+        p, prior = self.power / v, self.precision @ x
+        density = -0.5 * float(g.count @ np.log(v) + p.sum() + part.sum() + x @ prior)
+        pull = 0.5 * (slope.T @ (g.count - p) + np.concatenate([[0.0], part]))
+        curvature = (slope.T * (p - 0.5 * g.count)) @ slope + self.precision + np.diag(pull)
+        return _At(x, density, v, slope, pull + prior, curvature)
 
     def start(self) -> np.ndarray:
         """Return an x near the maximum."""
@@ -330,18 +343,17 @@ def _laplace(d: _Noise | _Remainder) -> _Found:
     g, at = d.grid, d.at(d.start())
     damping = 0.0
     for _ in range(STEPS):
-        h = d.curvature(at)
+        h = at.curvature
         factor, indefinite = dpotrf(h + damping * np.diag(np.abs(np.diag(h))), lower=1)
-        uphill = at.pull + d.precision @ at.x
-        step = dpotrs(factor, uphill, lower=1)[0]
-        if 0.5 * uphill @ step < CLOSE and not indefinite and not (damping and dpotrf(h, lower=1)[1]):
+        step = dpotrs(factor, at.uphill, lower=1)[0]
+        if 0.5 * at.uphill @ step < CLOSE and not indefinite and not (damping and dpotrf(h, lower=1)[1]):
             break
         then = d.at(at.x - step) if not indefinite and np.abs(step).max() < LONGEST else None
         if then and then.log_density >= at.log_density:
             at, damping = then, damping / 4 if damping > DAMPED else 0.0
         else:
             damping = max(4 * damping, DAMPED)
-    factor = np.linalg.cholesky(h)
+    factor = np.linalg.cholesky(at.curvature)
     score = at.log_density - 0.5 * float(g.count.sum()) * LOG_2PI + d.log_prior
     score -= float(np.log(np.diag(factor)).sum())
     moves = solve_triangular(factor, (at.slope / at.variance[:, None]).T, lower=True)
