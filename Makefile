@@ -46,12 +46,13 @@ prove: develop                     # the full proof on concealed cases: made, se
 	$(BIN)/thermoctl prove $(PROOF)/cases --answers $(PROOF)/answers --out $(PROOF)/result
 
 CALIBRATION ?= build/calibration
-calibrate-diagnosis: develop       # set the numbers of config/diagnosis.yaml from generated cases of the training seeds; hours; run again to continue
-	$(BIN)/python -m tests.concealed.generate --world open --answers inside --number 60 --seed 5001 --out $(CALIBRATION)/open_5001
-	$(BIN)/python -m tests.concealed.generate --world closed --answers inside --number 60 --seed 5002 --out $(CALIBRATION)/closed_5002
-	for world in open_5001 closed_5002; do for case in $(CALIBRATION)/$$world/*; do out=$(CALIBRATION)/results/$$world/$$(basename $$case); \
-		test -e $$out/diagnosis.json || $(BIN)/thermoctl diagnose --quiet --anyway --plant $$case/plant.yaml --out $$out $$case/run_*.csv; done; done
-	$(BIN)/python -m tests.diagnose.calibrate $(CALIBRATION)/open_5001 $(CALIBRATION)/results/open_5001 $(CALIBRATION)/closed_5002 $(CALIBRATION)/results/closed_5002 --write
+calibrate-diagnosis: develop       # set the numbers of config/diagnosis.yaml from generated cases and THERMOCTL_RECORDINGS; hours; run again to continue
+	$(BIN)/python -m tests.concealed.generate --world open --answers inside --number 40 --seed 5004 --out $(CALIBRATION)/open_5004
+	$(BIN)/python -m tests.concealed.generate --world closed --answers inside --number 48 --seed 5003 --out $(CALIBRATION)/closed_5003
+	for world in open_5004 closed_5003; do $(BIN)/thermoctl prove $(CALIBRATION)/$$world --out $(CALIBRATION)/results/$$world || exit 1; done
+	test -z "$$THERMOCTL_RECORDINGS" || $(BIN)/thermoctl prove --real --out $(CALIBRATION)/real
+	$(BIN)/python -m tests.diagnose.calibrate $(foreach w,open_5004 closed_5003,$(CALIBRATION)/$(w) $(CALIBRATION)/results/$(w)/cases) \
+		$${THERMOCTL_RECORDINGS:+--real "$$THERMOCTL_RECORDINGS" $(CALIBRATION)/real} --write
 
 lint: develop                      # ruff and mypy
 	$(BIN)/ruff check .
