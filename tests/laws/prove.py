@@ -211,7 +211,7 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
             "80 %",
             f"{100 * float(np.median(ratio)) if ratio else 0:.0f} %",
         ),
-        row("equivalent law, of all", "60 %", share(shown, [r for r in shown if r["difference"] < EQUAL])),
+        row("equivalent law, of all", "60 %", share(shown, [r for r in claimed if r["difference"] < EQUAL])),
         row("a law claimed where none is", "2 %", share(none, [r for r in none if r["claimed"]])),
         row(
             "processor time, median",
@@ -223,7 +223,7 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
         part = [r for r in shown if key in r["case"].split(" | ")[1:] or r["case"].startswith(key)]
         good = [r for r in part if r["claimed"] and r["place"]]
         right = [r for r in part if r["claimed"] and r["variable"]]
-        same = [r for r in part if r["difference"] < EQUAL]
+        same = [r for r in part if r["claimed"] and r["difference"] < EQUAL]
         out.append(
             row(
                 f"{key}: place, variable, equivalent, of {len(part)}",
