@@ -74,8 +74,9 @@ def physics(removed: float, left: float, share: float) -> float:
 
 
 def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozenset[Key], Energy]:
-    """Return the energies of all hypotheses. Up to `limits.clean` times its noise a residual is no misfit.
+    """Return the energies of all hypotheses.
 
+    Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there.
     The noise is what the leading hypothesis learnt, and at least the stated one. Of the two refits of a
     hypothesis the better one counts."""
     sensor = searched.tried[0].fitted.average.sensor
@@ -87,10 +88,12 @@ def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozense
 
 
 def _energy(case: Case, f: Fitted, sensor: Sequence[float], limits: Limits) -> Energy:
-    squares = []
-    for g, own in zip(case.grids, sensor, strict=True):
+    energy = misfit = 0.0
+    for g, own, remains in zip(case.grids, sensor, f.average.remainder, strict=True):
         output = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(output, 0.0)
         count = float(g.count.sum()) + f.past.counts.get(output, 0.0)
-        squares.append(power / (count * max(own, g.variance)))
-    return Energy(sum(squares), sum(max(s - limits.clean**2, 0.0) for s in squares))
+        square = power / (count * max(own, g.variance))
+        energy += square
+        misfit += max(square - (1.0 if remains >= limits.name else limits.clean**2), 0.0)
+    return Energy(energy, misfit)
