@@ -23,6 +23,7 @@ from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.fit import DECADES, Fitted, as_refitted
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.search import Searched
+from thermoctl.diagnose.unknown import rounded
 
 MISFIT = 0.5  # probability of being physics, below which an effect is rather a misfit
 SURE = 200.0  # r^2 beyond which the probability is 1 in any case
@@ -79,21 +80,24 @@ def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozense
     Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there.
     The noise is what the leading hypothesis learnt, and at least the stated one. Of the two refits of a
     hypothesis the better one counts."""
-    sensor = searched.tried[0].fitted.average.sensor
+    noise = list(zip(searched.tried[0].fitted.average.sensor, rounded(case), strict=True))
     out = {}
     for w in searched.tried:
-        both = [_energy(case, f, sensor, limits) for f in (w.fitted, as_refitted(case, w.fitted))]
+        both = [_energy(case, f, noise, limits) for f in (w.fitted, as_refitted(case, w.fitted))]
         out[w.fitted.hypothesis.keys] = min(both, key=lambda e: e.all)
     return out
 
 
-def _energy(case: Case, f: Fitted, sensor: Sequence[float], limits: Limits) -> Energy:
+def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: Limits) -> Energy:
+    """Return the energies of a refit.
+
+    `noise`: by output the noise's variance, and whether the reading is coarsely rounded."""
     energy = misfit = 0.0
-    for g, own, remains in zip(case.grids, sensor, f.average.remainder, strict=True):
+    for g, (own, coarse), p in zip(case.grids, noise, f.average.remainder, strict=True):
         output = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(output, 0.0)
         count = float(g.count.sum()) + f.past.counts.get(output, 0.0)
         square = power / (count * max(own, g.variance))
         energy += square
-        misfit += max(square - (1.0 if remains >= limits.name else limits.clean**2), 0.0)
+        misfit += max(square - (1.0 if p >= limits.name and not coarse else limits.clean**2), 0.0)
     return Energy(energy, misfit)

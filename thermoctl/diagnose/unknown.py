@@ -43,18 +43,23 @@ def left(case: Case, f: Fitted, reach: Responses, clean: float) -> Left:
 
 
 def remainder(case: Case, f: Fitted) -> float:
-    """Return the largest probability of a remainder at an output.
+    """Return the largest probability of a remainder at an output whose remainder proves something."""
+    known = zip(f.average.remainder, rounded(case), strict=True)
+    return max((p for p, coarse in known if not coarse), default=0.0)
 
-    A reading that rests on the steps of its rounding errs with the signal: its remainder proves nothing."""
-    drives = case.drives(case.null.model)
-    found = [0.0]
-    for g, p in zip(case.grids, f.average.remainder, strict=True):
+
+def rounded(case: Case) -> list[bool]:
+    """Return for each output whether its reading rests on the steps of its rounding.
+
+    Such a reading errs with the signal: a remainder there proves nothing."""
+    drives, outputs = case.drives(case.null.model), list(case.plant.outputs.values())
+    out = []
+    for g in case.grids:
         j = case.coordinates.channels[g.channels[0]].output
-        step = list(case.plant.outputs.values())[j].resolution or 0.0
-        moves = np.concatenate([np.abs(np.diff(d.y[:, j])) for d in drives])
-        if step <= g.sigma or np.nanmedian(moves) > step:
-            found.append(p)
-    return max(found)
+        step = outputs[j].resolution or 0.0
+        moves = [np.abs(np.diff(d.y[np.isfinite(d.y[:, j]), j])) for d in drives]
+        out.append(bool(step > g.sigma and np.median(np.concatenate(moves)) <= step))
+    return out
 
 
 def reached(case: Case) -> Responses:
