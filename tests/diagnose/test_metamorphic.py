@@ -11,6 +11,7 @@ from tests.diagnose.changes import (
     kelvin,
     milliwatt,
     names,
+    noise_stated,
     order,
     rows_lost,
     together,
@@ -37,3 +38,14 @@ def test_a_change_of_form_does_not_change_the_diagnosis(case, effects, changes, 
         changed = change(rig)
         after = diagnosed(changed, tmp_path / str(k))
         assert difference(before, after, changed.back) == ""
+
+
+def test_an_effect_on_an_input_that_another_replaced_is_no_hypothesis(tmp_path):
+    rig, _ = drawn("tanks", 2, "none", "open")
+    found = diagnosed(noise_stated(0.5)(rig), tmp_path)
+    assert found["findings"] == []
+    both = {
+        "sensor_lag at pump",
+        "actuator_dead_zone at pumped",
+    }  # the lag's state drives, no longer the pump
+    assert not any(both <= set(h["effects"]) for h in found["hypotheses"])

@@ -305,6 +305,8 @@ def _refitted(
             d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
             inputs = plant.inputs.keys()
             plant, own = extend(plant, d, drives)
+            if not own:  # an effect before took its place, and it changes nothing
+                return None
             if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
                 drives = case.drives(compile_plant(plant))
             effects = (*effects, Placed(d.candidate, own))
