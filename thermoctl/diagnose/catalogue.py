@@ -89,7 +89,7 @@ class EffectParameter:
     @property
     def amplitude(self) -> bool:
         """Does it scale with an amplitude of the screening?"""
-        return self.trial is not None and any(re.fullmatch(r"s\d?", n) for n in ex.names(self.trial))
+        return _amplitudes(self.trial) > 0
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,37 @@ def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
 
 
 def _read(root: yamlfile.Node) -> Effect:
+    top = _checked(root)
+
+    def plain(key: str, default: Any = ()) -> Any:
+        return top[key].plain() if key in top else default
+
+    shapes = plain("shapes", {})
+    for key, kind in shapes.items():
+        if kind not in SHAPES:
+            raise top["shapes"].value[key].error(f"a shape must be one of {', '.join(SHAPES)}")
+    parameters = tuple(_parameter(key, node) for key, node in top["parameters"].value.items())
+    amplitudes = max((_amplitudes(p.trial) for p in parameters), default=0)
+    return Effect(
+        plain("effect"),
+        plain("title"),
+        plain("where"),
+        tuple(plain("needs")),
+        _changes(top),
+        shapes,
+        parameters,
+        tuple(map(tuple, plain("dims", np.eye(max(amplitudes, 1)).tolist()))),
+        plain("excited_by", ""),
+        tuple(plain("mimics")),
+        plain("source"),
+        plain("caution", None),
+        _expression(top["prior"], top["prior"].value) if "prior" in top else None,
+        tuple(plain("reads")),
+    )
+
+
+def _checked(root: yamlfile.Node) -> dict[str, yamlfile.Node]:
+    """Return the entries of an effect file that has all that are needed and no unknown one."""
     top = root.value
     if not isinstance(top, dict):
         raise root.error("an effect file must be a mapping")
@@ -141,74 +172,46 @@ def _read(root: yamlfile.Node) -> Effect:
         raise top["where"].error(
             f"where must be one of {', '.join(PLACES)}{yamlfile.suggest(str(top['where'].value), PLACES)}"
         )
-    shapes = top["shapes"].plain() if "shapes" in top else {}
-    for key, kind in shapes.items():
-        if kind not in SHAPES:
-            raise top["shapes"].value[key].error(f"a shape must be one of {', '.join(SHAPES)}")
-    parameters = []
-    amplitudes = 0
-    for key, node in top["parameters"].value.items():
-        p = node.plain()
-        if not isinstance(p, dict):
-            raise node.error(f"parameter '{key}' must be a mapping")
-        try:
-            trial = ex.parse(str(p["trial"])) if "trial" in p else None if "shape" in p else ex.parse("s")
-        except ex.ExpressionError as e:
-            raise node.error(str(e)) from None
-        if trial is not None:
-            amplitudes = max(
-                [amplitudes, *(int(n[1:] or 1) for n in ex.names(trial) if re.fullmatch(r"s\d?", n))]
-            )
-        parameters.append(
-            EffectParameter(
-                key,
-                p.get("unit"),
-                float(p.get("low", -np.inf)),
-                float(p.get("high", np.inf)),
-                float(p.get("null", 0.0)),
-                trial,
-                p.get("shape"),
-                bool(p.get("per_recording")),
-                p.get("typical"),
-                p.get("origin"),
-                p.get("at_zero"),
-            )
-        )
+    return top
+
+
+def _expression(node: yamlfile.Node, text: Any) -> Expr:
     try:
-        prior = ex.parse(str(top["prior"].value)) if "prior" in top else None
+        return ex.parse(str(text))
     except ex.ExpressionError as e:
-        raise top["prior"].error(str(e)) from None
-    dims = (
-        tuple(map(tuple, top["dims"].plain()))
-        if "dims" in top
-        else tuple(tuple(1.0 if i == k else 0.0 for i in range(amplitudes)) for k in range(amplitudes))
-        or ((1.0,),)
+        raise node.error(str(e)) from None
+
+
+def _parameter(name: str, node: yamlfile.Node) -> EffectParameter:
+    p = node.plain()
+    if not isinstance(p, dict):
+        raise node.error(f"parameter '{name}' must be a mapping")
+    trial = p.get("trial", None if "shape" in p else "s")
+    return EffectParameter(
+        name,
+        p.get("unit"),
+        float(p.get("low", -np.inf)),
+        float(p.get("high", np.inf)),
+        float(p.get("null", 0.0)),
+        None if trial is None else _expression(node, trial),
+        p.get("shape"),
+        bool(p.get("per_recording")),
+        p.get("typical"),
+        p.get("origin"),
+        p.get("at_zero"),
     )
-    for node in [top["change"], *(top["variants"].value if "variants" in top else [])]:
-        for item in node.value if isinstance(node.value, list) else []:
-            if (
-                not isinstance(item.value, dict)
-                or len(item.value) != 1
-                or next(iter(item.value)) not in CHANGES
-            ):
-                raise item.error(f"a change must be one of {', '.join(CHANGES)}")
-    changes = (
-        tuple(top["change"].plain()),
-        *(tuple(v) for v in (top["variants"].plain() if "variants" in top else [])),
-    )
-    return Effect(
-        top["effect"].value,
-        top["title"].value,
-        top["where"].value,
-        tuple(top["needs"].plain()) if "needs" in top else (),
-        changes,
-        shapes,
-        tuple(parameters),
-        dims,
-        top["excited_by"].value if "excited_by" in top else "",
-        tuple(top["mimics"].plain()) if "mimics" in top else (),
-        top["source"].value,
-        top["caution"].value if "caution" in top else None,
-        prior,
-        tuple(top["reads"].plain()) if "reads" in top else (),
-    )
+
+
+def _amplitudes(trial: Expr | None) -> int:
+    """Return the number of amplitudes s, or s1, s2, ..., in a trial value."""
+    names = ex.names(trial) if trial is not None else ()
+    return max((int(n[1:] or 1) for n in names if re.fullmatch(r"s\d?", n)), default=0)
+
+
+def _changes(top: Mapping[str, yamlfile.Node]) -> tuple[tuple[Mapping[str, Any], ...], ...]:
+    """Return the change and its variants."""
+    found = [top["change"], *(top["variants"].value if "variants" in top else [])]
+    for item in (i for node in found if isinstance(node.value, list) for i in node.value):
+        if not isinstance(item.value, dict) or len(item.value) != 1 or next(iter(item.value)) not in CHANGES:
+            raise item.error(f"a change must be one of {', '.join(CHANGES)}")
+    return tuple(tuple(node.plain()) for node in found)
