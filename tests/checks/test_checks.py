@@ -8,6 +8,7 @@ import pytest
 from tests.checks.rigs import PLANTS, rig
 from thermoctl.checks import checks
 from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 
@@ -244,3 +245,39 @@ def test_two_recordings_share_a_finding():
     wrong: list[Table] = [swap("temperature_1", "temperature_2")(t) for t in (one, two)]
     found = checks(plant, wrong)
     assert [f.kind for f in found] == ["swapped"] and "and 1 more" in found[0].where
+
+
+RAMPS = """\
+format: thermoctl-plant/1
+inputs: {power: {unit: W}}
+nodes: {block: {unit: degC, storage: 5, initial: 20}}
+flows:
+  heating: {into: block, rate: power, unit: W}
+  loss: {from: block, rate: 0.2 * (block - 20), unit: W}
+outputs: {block_c: {value: block, unit: degC, noise: 0.02}}
+"""
+
+
+def ramps(said):
+    """A measured power that ramps between 0 and 20 W in a minute, sampled every second."""
+    t = np.arange(600.0)
+    plant = loads(RAMPS.replace("power: {unit: W}", f"power: {{unit: W, {said}}}"))
+    truth = loads(RAMPS.replace("power: {unit: W}", "power: {unit: W, between_samples: linear}"))
+    table = Table("ramps", "ramps.csv", t, {"power": 20 * np.abs((t / 60) % 2 - 1), "block_c": np.full(len(t), 20.0)})
+    model = compile_plant(truth)
+    y = model.run(model.excitation(table)).y[:, 0] + 0.02 * np.random.default_rng(1).standard_normal(len(t))
+    return plant, dataclasses.replace(table, columns=table.columns | {"block_c": y})
+
+
+def test_a_measured_ramp_that_the_plant_holds_by_default():
+    """Found on a rig at the wire: a sure second effect beside the right one."""
+    plant, table = ramps("column: power")
+    (found,) = checks(plant, [table])
+    assert (found.kind, found.severe) == ("between", False) and "'power'" in found.what
+    assert "between_samples" in found.suggestion
+
+
+@pytest.mark.parametrize("said", ["between_samples: linear", "between_samples: hold"])
+def test_what_the_plant_file_says_of_a_ramp_is_not_doubted(said):
+    plant, table = ramps(said)
+    assert not [f for f in checks(plant, [table]) if f.kind == "between"]

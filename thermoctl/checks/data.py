@@ -1,7 +1,11 @@
-"""Checks of one recording by itself: gaps, repeated and resampled data, columns that do not move."""
+"""Checks of one recording by itself: gaps, repeated and resampled data, columns that do not move.
+
+Of an input that changes in most rows the plant file should say how it goes on between them.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import gcd, log
 
 import numpy as np
@@ -11,7 +15,7 @@ from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Input
 from thermoctl.plant.residuals import default_noise
-from thermoctl.plant.simulate import Excitation, Model, SimulationError
+from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 ALARM = 1e-6  # false alarms a column and recording
@@ -32,7 +36,7 @@ def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Fi
             found += _copies(table, item.column, values, table.t[there])
             if item.name in model.plant.outputs:
                 found += _resampled(table, item.column, values)
-    return found + _dead(model, table, excitation)
+    return found + _between(model, table, excitation) + _dead(model, table, excitation)
 
 
 def _empty(table: Table, name: str, column: str) -> Finding:
@@ -72,6 +76,38 @@ def _gaps(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
             f"{np.median(steps):.3g} s apart elsewhere{unknown}",
             "The inputs are unknown there: cut the recording at the gap and give both parts.",
             severe=bool(changed),
+        )
+    ]
+
+
+def _between(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
+    """Find inputs that change in most rows, of which the plant file does not say how they go on between them.
+
+    Straight lines would move the readings. Half the energy of that, in the noise, is the most that they could
+    gain in log likelihood. It has to exceed -log(ALARM)."""
+    moving = {n for n, u in zip(model.inputs, excitation.u.T, strict=True) if np.mean(np.diff(u) != 0) > 0.5}
+    loose = [i for i in driving_inputs(model.plant) if i.name in moving and not i.stated]
+    if not loose:
+        return []
+    straight = {i.name: replace(i, linear=True) for i in loose}
+    lines = compile_plant(replace(model.plant, inputs={**model.plant.inputs, **straight}))
+    try:
+        moved = lines.run(lines.excitation(table)).y - model.run(excitation).y
+    except SimulationError:
+        return []
+    moved = moved / [n.sigma for n in default_noise(model.plant, [excitation])]
+    moved = moved[np.isfinite(excitation.y)]
+    if 0.5 * float(np.sum(moved**2)) <= -log(ALARM):
+        return []
+    names = ", ".join(f"'{i.name}'" for i in loose)
+    return [
+        Finding(
+            "between",
+            table.path,
+            f"{names}: changes in most rows and is held between them, as the plant file says nothing else; straight lines "
+            f"would move the readings by up to {np.abs(moved).max():.2g} times their noise",
+            "State between_samples in the plant file: linear for what is measured, hold for what a drive holds.",
+            severe=False,
         )
     ]
 

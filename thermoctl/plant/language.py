@@ -71,7 +71,9 @@ class Conversion:
 
 @dataclass(frozen=True)
 class Input:
-    """A recorded column that drives the simulation; `linear`: straight lines between samples, else held."""
+    """A recorded column that drives the simulation; `linear`: straight lines between samples, else held.
+
+    `stated`: whether the plant file says which; without a word an input is held."""
 
     name: str
     unit: str | None = None
@@ -79,6 +81,7 @@ class Input:
     linear: bool = False
     role: str | None = None
     conversion: Conversion | None = None
+    stated: bool = False
     at: str = _place()
 
 
@@ -176,7 +179,7 @@ def _given(**items: Any) -> dict[str, Any]:
 
 def _input(i: Input) -> dict[str, Any]:
     column = _column(i)
-    between = "linear" if i.linear else None
+    between = "linear" if i.linear else "hold" if i.stated else None
     return _given(unit=i.unit, column=column, between_samples=between, role=i.role)
 
 

@@ -107,9 +107,10 @@ def _check_name(name: str, item: YamlNode, section: str) -> None:
 
 
 def _input(name: str, s: Section) -> Input:
-    between = s.text("between_samples", "hold", ("hold", "linear"))
+    stated = s.get("between_samples", False) is not None
+    linear = s.text("between_samples", "hold", ("hold", "linear")) == "linear"
     column, conversion = _column(s, name)
-    found = Input(name, _unit(s), column, between == "linear", _role(s), conversion, _at(s))
+    found = Input(name, _unit(s), column, linear, _role(s), conversion, stated, _at(s))
     s.end()
     return found
 
