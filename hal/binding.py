@@ -13,7 +13,7 @@ from pathlib import Path
 
 from thermoctl.channels import DEFAULT, AxesChannels, Channels
 from thermoctl.yamlfile import InputError, Node, Section, suggest
-from thermoctl_hal.profile import BinaryFrame, Channel, Cia402, Modbus, Profile, Register, TextLine
+from thermoctl_hal.profile import BinaryFrame, Channel, Cia402, Profile, Register, TextLine
 from thermoctl_hal.read_profile import load_profile
 from thermoctl_hal.units import role_units
 
@@ -84,10 +84,10 @@ def bind(node: Node, folder: Path, channels: Channels = DEFAULT) -> Binding:
     )
     spec = profile.bus_spec
     if isinstance(spec, Cia402):
-        address = s.integer("address", spec.node_id, 1, 126)
+        address = s.integer("address", spec.address, 1, 126)
         profile = replace(profile, bus_spec=_drive_of_this_rig(s, spec, address))
     else:
-        address = s.integer("address", spec.unit_id if isinstance(spec, Modbus) else 0, 0, 247)
+        address = s.integer("address", spec.address, 0, 247)
         for key in ("watchdog_s", "master_id"):
             if (found := s.get(key, False)) is not None:
                 raise found.error(f"{key}: a {profile.bus} device has none")

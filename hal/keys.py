@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from thermoctl.yamlfile import Section
+from thermoctl_hal.buses import BUSES
 from thermoctl_hal.checksum import ALIASES, SUMS
 
 REQUIRED: Any = ...
@@ -73,7 +74,7 @@ TABLES: dict[str, tuple[Key, ...]] = {
         Key("model", "text", "its product name"),
         Key("manual", "text", "where the facts come from: document, edition, page", ""),
         Key("about", "text", "what else a user should know", ""),
-        Key("bus", "text", "serial-binary, serial-lines, can-dbc, can-cia402 or modbus"),
+        Key("bus", "text", ", ".join(BUSES)),
         Key("line", "section", "settings of a serial line", None),
         Key("channels", "section", "the readings, by name"),
         Key("drive", "section", "the command that an amplifier takes", None),

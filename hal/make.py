@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 
 from thermoctl.channels import AxesChannels
@@ -12,6 +11,7 @@ from thermoctl_hal.axes import AxisBackend
 from thermoctl_hal.backend import Backend, HardwareError
 from thermoctl_hal.binding import Binding, bind, check_rig, rig_notes
 from thermoctl_hal.board import Board
+from thermoctl_hal.buses import BUSES, part
 from thermoctl_hal.device import Device
 from thermoctl_hal.devices import DevicesBackend
 from thermoctl_hal.faulty import FaultInjector, schedule
@@ -140,29 +140,8 @@ def can_drive(settings: Settings) -> bool:
     return settings.hal.backend != "devices" or bool(driving_devices(settings))
 
 
-_DRIVERS = {
-    "serial-binary": "serial_port:SerialDevice",
-    "serial-lines": "serial_port:SerialDevice",
-    "can-dbc": "dbc:DbcDevice",
-    "can-cia402": "drive:Cia402Device",
-    "modbus": "modbus:ModbusDevice",
-}
-"""Module and class of each bus's driver, imported for a device of that bus only: it may need an extra."""
-
-
-_DRIVES = {
-    "serial-binary": "serial_drive:SerialDrive",
-    "serial-lines": "serial_drive:SerialDrive",
-    "can-dbc": "dbc:DbcDrive",
-    "modbus": "modbus:ModbusDrive",
-}
-"""Drivers of amplifiers that messages command."""
-
-
 def driver(binding: Binding) -> Device:
     """Make the driver of a bound device, not connected. Raises InputError."""
-    amplifier, bus = binding.profile.amplifier, binding.profile.bus
-    by_messages = amplifier is not None and amplifier.command is not None
-    module, _, name = (_DRIVES if by_messages else _DRIVERS)[bus].partition(":")
-    made: Device = getattr(import_module(f"{__package__}.{module}"), name)(binding)
+    amplifier, bus = binding.profile.amplifier, BUSES[binding.profile.bus]
+    made: Device = part(bus.drive if amplifier is not None and bus.drive else bus.driver)(binding)
     return made

@@ -18,7 +18,7 @@ from thermoctl_hal.cia402 import Objects, Sdo
 from thermoctl_hal.device import Device
 from thermoctl_hal.make import driver
 from thermoctl_hal.modbus_link import FUNCTIONS, Link, NoAnswer
-from thermoctl_hal.profile import ERROR_CODE, Assumed, Cia402, LineSettings, Modbus, Object, Profile, typed
+from thermoctl_hal.profile import ERROR_CODE, Assumed, Cia402, LineSettings, Object, Profile, typed
 from thermoctl_hal.serial_line import open_port
 from thermoctl_hal.wire import EXTENDED, read_available
 
@@ -49,14 +49,11 @@ class Probe:
             for role, c in zip(ROLES, channels[: len(ROLES)], strict=False)
         ]
         spec = profile.bus_spec
-        default = (
-            spec.unit_id if isinstance(spec, Modbus) else spec.node_id if isinstance(spec, Cia402) else 0
-        )
         self._binding = Binding(
             profile.model,
             self.profile,
             port,
-            default if address is None else address,
+            spec.address if address is None else address,
             tuple(bounds),
             profile.file,
         )

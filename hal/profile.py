@@ -5,8 +5,7 @@ binding (thermoctl_hal.binding) says where the device is on this rig. Every chan
 
     reading = raw * scale + offset      in `unit`; outside `range`: error; older than `stale_after_s`: stale
 
-and the place of its raw number on the bus. Buses: serial-binary (framed bytes), serial-lines (text), can-dbc
-(any DBC file), can-cia402 (a drive with an EDS file), modbus (register map). read_profile.py reads the files.
+and the place of its raw number on the bus. buses.py lists the buses; read_profile.py reads the files.
 """
 
 from __future__ import annotations
@@ -95,8 +94,17 @@ class Condition:
     value: int
 
 
+class BusSpec:
+    """The bus's part of a profile; each bus has a class of its own."""
+
+    @property
+    def address(self) -> int:
+        """Return the address on the bus where a binding gives none."""
+        return 0
+
+
 @dataclass(frozen=True)
-class BinaryFrame:
+class BinaryFrame(BusSpec):
     """sync | payload length (uint8, where has_length) | payload of typed fields | checksum | tail.
 
     `crc` names the checksum (checksum.py), over the bytes that `crc_over` says. `bits` are fields inside
@@ -135,7 +143,7 @@ class BinaryFrame:
 
 
 @dataclass(frozen=True)
-class TextLine:
+class TextLine(BusSpec):
     """Lines of text: the named groups of `pattern` are the readings.
 
     `request` is sent `request_hz` times a second. `decimal` is the decimal sign of the numbers, '.' or ','.
@@ -166,7 +174,7 @@ class TextField:
 
 
 @dataclass(frozen=True)
-class Dbc:
+class Dbc(BusSpec):
     """A CAN device that a DBC file describes."""
 
     file: Path
@@ -196,7 +204,7 @@ class DbcSource:
 
 
 @dataclass(frozen=True)
-class Cia402:
+class Cia402(BusSpec):
     """A CiA-402 drive: EDS file, command object, contents of the PDOs, heartbeats."""
 
     eds: Path | None  # None: standard objects, and those of `objects`
@@ -211,9 +219,14 @@ class Cia402:
     sdo_timeout_s: float = 0.3  # longest time that the drive may take for an answer at set-up
     objects: Mapping[Object, str] = field(default_factory=dict)  # types of objects where there is no EDS file
 
+    @property
+    def address(self) -> int:
+        """Return the node id."""
+        return self.node_id
+
 
 @dataclass(frozen=True)
-class Modbus:
+class Modbus(BusSpec):
     """A register device that answers within `timeout_s`.
 
     One request reads registers up to `max_gap` apart, and at most `max_block` of them."""
@@ -222,6 +235,11 @@ class Modbus:
     timeout_s: float = 0.3
     max_gap: int = 8
     max_block: int = 100
+
+    @property
+    def address(self) -> int:
+        """Return the unit."""
+        return self.unit_id
 
 
 REGISTER_TYPES = {
@@ -326,15 +344,13 @@ class Amplifier:
     watchdog_s: float | None = None
 
 
-BusSpec = BinaryFrame | TextLine | Dbc | Cia402 | Modbus
-
-
 @dataclass(frozen=True)
 class Assumed:
     """The state of an amplifier that cannot report it: the one that was commanded last."""
 
 
-Source = str | TextField | DbcSource | Object | Register | Assumed
+Source = object
+"""Place of a channel's value on its bus, of a type that the bus's driver knows."""
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,11 @@ from pathlib import Path
 
 from thermoctl import yamlfile
 from thermoctl.yamlfile import Section
+from thermoctl_hal.buses import BUSES, part
 from thermoctl_hal.keys import take
 from thermoctl_hal.profile import Assumed, BusSpec, Channel, Dbc, DbcSource, Profile, Source, typed
-from thermoctl_hal.read_can import read_cia402, read_dbc, read_object, read_signal
 from thermoctl_hal.read_drive import read_amplifier
-from thermoctl_hal.read_modbus import read_modbus, read_register
-from thermoctl_hal.read_serial import read_field, read_frame, read_line, read_text, read_text_field
+from thermoctl_hal.read_serial import read_line
 from thermoctl_hal.units import dbc_unit, is_convertible
 
 FORMAT = "thermoctl-device/1"
@@ -24,10 +23,10 @@ def load_profile(path: str | Path) -> Profile:
     top = Section(yamlfile.load(path), "device profile")
     if (found := top.text("format")) != FORMAT:
         raise top.get("format").error(f"format: '{FORMAT}' was expected, found '{found}'")
-    bus = top.text("bus", choices=_BUSES)
+    bus = top.text("bus", choices=BUSES)
     k = take(top, "profile")
-    read_spec, read_source = _BUSES[bus]
-    spec = read_spec(top, Path(path).parent)
+    read_source: _ReadSource = part(BUSES[bus].source)
+    spec: BusSpec = part(BUSES[bus].spec)(top, Path(path).parent)
     channels = {name: _channel(name, s, spec, read_source) for name, s in top.sections("channels").items()}
     if not channels:
         raise top.get("channels").error("channels: at least one was expected")
@@ -79,11 +78,3 @@ def _check_dbc_unit(s: Section, spec: Dbc, channel: Channel) -> None:
 
 
 _ReadSource = Callable[[Section, BusSpec], Source]
-_BUSES: dict[str, tuple[Callable[[Section, Path], BusSpec], _ReadSource]] = {
-    "serial-binary": (read_frame, read_field),
-    "serial-lines": (read_text, read_text_field),
-    "can-dbc": (read_dbc, read_signal),
-    "can-cia402": (read_cia402, read_object),
-    "modbus": (read_modbus, read_register),
-}
-"""Bus -> (reader of its section of a profile, reader of the keys that locate a channel's value)."""

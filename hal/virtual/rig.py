@@ -61,9 +61,11 @@ def virtual_device(
 ) -> VirtualDevice:
     """Make the device that simulates `binding`; lines: the CAN adapters of the rig so far, by path.
 
-    Raises InputError for a CAN port that is not slcan."""
+    Raises InputError for a bus that it does not play, and for a CAN port that is not slcan."""
     bus, amplifier = binding.profile.bus, binding.profile.amplifier
     if not bus.startswith("can"):
+        if bus not in _KINDS:
+            raise InputError(f"{binding.place}: the virtual rig plays no {bus} device")
         return _KINDS[bus](binding, rig)
     if not binding.port.startswith("slcan:"):
         raise InputError(

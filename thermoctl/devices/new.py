@@ -6,17 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.buses import BUSES
 from thermoctl_hal.keys import REQUIRED, TABLES, Key
 from thermoctl_hal.read_profile import FORMAT, load_profile
 
-BUSES = {
-    "serial-binary": ("frame", "frame"),
-    "serial-lines": ("text", "text"),
-    "can-dbc": ("", "can-dbc"),
-    "can-cia402": ("cia402", "cia402"),
-    "modbus": ("modbus", "modbus"),
-}
-"""Bus -> (its section of a profile, '' for none; the table of its keys)."""
 EXIT_OK, EXIT_INPUT = 0, 2
 _TOP = ("vendor", "model", "manual")
 
@@ -51,9 +44,9 @@ def _text(ask: Callable[[str], str]) -> str:
     while bus not in BUSES:
         bus = ask(f"bus ({', '.join(BUSES)}): ").strip()
     answers.append(f"bus: {bus}")
-    if bus != "can-cia402" and bus != "can-dbc":
+    if BUSES[bus].has_line:
         answers += ["line:", *_keys(ask, "line", 2)]
-    section, table = BUSES[bus]
+    section, table = BUSES[bus].section, BUSES[bus].table
     answers += [f"{section}:", *_keys(ask, table, 2)] if section else _keys(ask, table, 0)
     answers.append("channels:")
     while name := ask("name of a channel (empty: no more): ").strip():
