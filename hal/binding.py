@@ -14,6 +14,7 @@ from pathlib import Path
 from thermoctl.channels import DEFAULT, AxesChannels, Channels
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 from thermoctl_hal.profile import BinaryFrame, Channel, Cia402, Profile, Register, TextLine
+from thermoctl_hal.read_ethercat import LONGEST_WATCHDOG_S, Ethercat
 from thermoctl_hal.read_profile import load_profile
 from thermoctl_hal.units import role_units
 
@@ -51,6 +52,7 @@ class Binding:
     place: str
     channels: Channels = DEFAULT
     shared: bool = False  # other devices of this rig are on the same port
+    neighbours: tuple[Binding, ...] = ()  # the other devices of the port
     axis: str = ""  # whose amplifier it is; empty on a rig without axes, and for devices of several axes
 
 
@@ -86,6 +88,10 @@ def bind(node: Node, folder: Path, channels: Channels = DEFAULT) -> Binding:
     if isinstance(spec, Cia402):
         address = s.integer("address", spec.address, 1, 126)
         profile = replace(profile, bus_spec=_drive_of_this_rig(s, spec, address))
+    elif isinstance(spec, Ethercat):
+        address = s.integer("address", spec.address, 1, 199)
+        if (watchdog := s.number("watchdog_s", 0.0, 1e-3, LONGEST_WATCHDOG_S)) > 0.0:
+            profile = replace(profile, bus_spec=replace(spec, watchdog_s=watchdog))
     else:
         address = s.integer("address", spec.address, 0, 247)
         for key in ("watchdog_s", "master_id"):
@@ -155,7 +161,7 @@ def _bound(profile: Profile, name: str, role: Node, channels: Channels) -> Bound
 
 
 def check_rig(bindings: Iterable[Binding]) -> list[Binding]:
-    """Return the bindings with `shared` set where several are on one port.
+    """Return the bindings with `shared` and `neighbours` set where several are on one port.
 
     Raises InputError where two share a role or the command, or a port that they cannot share."""
     bindings = list(bindings)
@@ -176,7 +182,8 @@ def check_rig(bindings: Iterable[Binding]) -> list[Binding]:
         for o in others:
             if o in bindings[:k]:
                 _check_shared(o, b)
-        found.append(replace(b, shared=bool(others) and b.port.split(":")[0] not in FREE))
+        shared = bool(others) and b.port.split(":")[0] not in FREE
+        found.append(replace(b, shared=shared, neighbours=tuple(others)))
     return found
 
 
@@ -196,6 +203,8 @@ def _check_shared(first: Binding, second: Binding) -> None:
     if bus == "can":
         _check_can_bus(first, second, both)
         return
+    if bus == "ethercat" and first.address == second.address:
+        raise InputError(f"{both}, and both are slave {first.address}: give each its own 'address'")
     if first.profile.line != second.profile.line and not second.port.startswith("tcp:"):
         raise InputError(f"{both}, but their profiles' 'line' differs: one line has one baud rate and format")
     for b in (first, second):

@@ -56,6 +56,13 @@ BUSES = {
         "modbus",
         True,
     ),
+    "ethercat": Bus(
+        "read_ethercat:read_ethercat",
+        "read_ethercat:read_place",
+        "ethercat:EthercatDevice",
+        section="ethercat",
+        table="ethercat",
+    ),
 }
 
 

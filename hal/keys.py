@@ -7,41 +7,15 @@ is refused.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 from thermoctl.yamlfile import Section
 from thermoctl_hal.buses import BUSES
 from thermoctl_hal.checksum import ALIASES, SUMS
+from thermoctl_hal.key import REQUIRED, Key, bits_of
+from thermoctl_hal.keys_ethercat import ETHERCAT
 
-REQUIRED: Any = ...
 MAX_ADDRESS, MAX_MODBUS_BITS = 65535, 64
-
-
-@dataclass(frozen=True)
-class Key:
-    """A key of a profile.
-
-    kind: text, number, integer, flag, interval, list, section, or node (several of these). `default` is
-    REQUIRED, or the value where the key is missing. low, high: limits of a number."""
-
-    name: str
-    kind: str
-    meaning: str
-    default: Any = REQUIRED
-    unit: str = ""
-    low: float = -math.inf
-    high: float = math.inf
-    choices: tuple[str, ...] = ()
-    example: str = ""
-
-
-def _bits(of: str) -> tuple[Key, ...]:
-    return (
-        Key("low_bit", "integer", f"lowest bit of the value inside {of}", 0, "", 0, 63, example="4"),
-        Key("bits", "integer", f"number of bits of the value; 0: all of {of}", 0, "", 0, 64, example="19"),
-    )
-
 
 _ENDIAN = ("little", "big")
 _NMEA = (
@@ -168,7 +142,7 @@ TABLES: dict[str, tuple[Key, ...]] = {
         Key("type", "text", "int16 .. int64, uint16 .. uint64, float32, float64, bcd16, bcd32", "int16"),
         Key("word_order", "text", "order of the words of a value", "big", choices=("big", "little")),
         Key("byte_order", "text", "order of the two bytes of a word", "big", choices=("big", "little")),
-        *_bits("the register"),
+        *bits_of("the register"),
         Key("signed", "flag", "the bits are a two's complement", False),
         Key("sentinels", "list", "raw numbers that mean 'no sensor'", None, example="[32767]"),
         Key("invalid", "section", "a register or bit that says that the reading is wrong (open wire)", None),
@@ -240,7 +214,7 @@ TABLES: dict[str, tuple[Key, ...]] = {
             example="3",
         ),
         Key("of", "text", "instead of `type`: this field is some bits of that field", ""),
-        *_bits("that field"),
+        *bits_of("that field"),
         Key("signed", "flag", "the bits are a two's complement", False),
         Key("sign", "section", "bits of another field that say that the number is negative", None),
     ),
@@ -433,7 +407,7 @@ TABLES: dict[str, tuple[Key, ...]] = {
         Key("value", "node", "a number, `command` or `address`"),
         Key("endian", "text", "byte order, where it differs", "", choices=("", *_ENDIAN)),
     ),
-}
+} | ETHERCAT
 
 
 def take(s: Section, table: str) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from thermoctl_hal.profile import (
     TextMessage,
     object_name,
 )
+from thermoctl_hal.read_ethercat import Ethercat
 from thermoctl_hal.read_serial import bytes_of, checksum_name, named
 
 COMMAND, ADDRESS = "command", "address"
@@ -45,20 +46,22 @@ def read_amplifier(top: Section, spec: BusSpec, channels: dict[str, Channel]) ->
     if s.get("limits", False) is None:
         raise s.node.error("drive: 'limits' is missing: [low, high], the largest commands ever sent")
     k = take(s, "drive")
-    if isinstance(spec, Cia402):
+    if isinstance(spec, Cia402 | Ethercat):
         _check_mode(s, spec, k)
         more: dict[str, Any] = {"watchdog_s": spec.watchdog_s}
     else:
         more = _by_messages(s, spec, channels)
     low, high = k["limits"]
-    is_position = isinstance(spec, Cia402) and spec.mode in POSITION_MODES
+    is_position = isinstance(spec, Cia402 | Ethercat) and spec.mode in POSITION_MODES
     if not low <= 0.0 <= high and not is_position:
         raise s.node.error(f"limits: [{low:g}, {high:g}] must contain 0, the safe command")
     s.end()
     return Amplifier(k["unit"], k["scale"], k["limits"], k["slew_per_s"], **more)
 
 
-def _check_mode(s: Section, spec: Cia402, k: dict[str, Any]) -> None:
+def _check_mode(s: Section, spec: Cia402 | Ethercat, k: dict[str, Any]) -> None:
+    if isinstance(spec, Ethercat) and spec.command is None:
+        raise s.node.error("command: is missing in 'ethercat': the object that takes the command, as 0x6071")
     if spec.mode in REFUSED_MODES:
         raise s.node.error(
             f"mode: {spec.mode} is not supported, because it needs a handshake or moves by itself: use 8 (cyclic "

@@ -15,6 +15,7 @@ EXTRAS = {
         "canopen": "canopen",
         "cantools": "cantools",
     },
+    "ethercat": {"pysoem": "pysoem"},
     "report": {"matplotlib": "matplotlib"},
     "formats": {"asammdf": "asammdf", "mcap": "mcap", "nptdms": "npTDMS", "openpyxl": "openpyxl"},
     "mqtt": {"paho": "paho-mqtt"},

@@ -29,7 +29,8 @@ from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.settings import SECTIONS, options
 from thermoctl.signals import FAULT_WORD_BITS, SIGNALS
 from thermoctl.which_rig import ACTS
-from thermoctl_hal.keys import REQUIRED, TABLES, Key
+from thermoctl_hal.key import REQUIRED, Key
+from thermoctl_hal.keys import TABLES
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 _HEAD = "<!-- Written by `python -m thermoctl.reference`; change the table in the code, not this page. -->\n"

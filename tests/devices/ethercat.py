@@ -1,25 +1,14 @@
-"""EtherCAT slaves at the wire: a process answers the frames that arrive at one end of a pair of virtual cables.
+"""EtherCAT slaves, byte by byte: registers, EEPROM, states, sync managers, FMMUs, mailbox.
 
-Written from the public description of the slave controller (registers, EEPROM, sync managers, FMMUs, states) and
-of CANopen over EtherCAT; nothing of `hal` and nothing of a master is used. The process stands apart because a
-master may hold the interpreter's lock while it waits for an answer.
+Written from the public description of the slave controller and of CANopen over EtherCAT; nothing of `hal` and
+nothing of a master is used.
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
-import multiprocessing
-import os
-import select
-import socket
 import struct
-import subprocess
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
 
-ETHERCAT = 0x88A4
 INIT, PREOP, SAFEOP, OP, ERROR = 1, 2, 4, 8, 16
 AL_CONTROL, AL_STATUS, AL_CODE, STATION, EEPROM = 0x120, 0x130, 0x134, 0x10, 0x502
 FMMU, SM, WATCHDOG_DIVIDER, WATCHDOG_TIME, WATCHDOG_STATUS = 0x600, 0x800, 0x400, 0x420, 0x440
@@ -52,7 +41,7 @@ class Slave:
         self.name, self.vendor, self.product, self.coe = name, vendor, product, coe
         self.tx, self.rx, self.fixed, self.watched = tx, rx or [], fixed, watched
         self.own_objects = objects or {}
-        self.present, self.stuck, self.mute, self.refused = True, 0, False, 0
+        self.present, self.stuck, self.mute, self.deaf, self.refused = True, 0, False, False, 0
         self.written: list[tuple[int, int, int]] = []
         self.eeprom = self._eeprom()
         self.power_on()
@@ -104,7 +93,9 @@ class Slave:
         if not self.coe:
             managers = [(0, 0, 0, 0, 0), (0, 0, 0, 0, 0)]
         managers += [(OUTPUTS, 0, 0x64 if self.watched else 0x24, 1, 3), (INPUTS, 0, 0x20, 1, 4)]
-        sync = b"".join(struct.pack("<HHBBBB", a, n, control, 0, on, kind) for a, n, control, on, kind in managers)
+        sync = b"".join(
+            struct.pack("<HHBBBB", a, n, control, 0, on, kind) for a, n, control, on, kind in managers
+        )
         parts = [(10, strings), (30, general), (40, bytes((1, 2))), (41, sync)]
         if not self.coe:
             parts += [(50, self._pdos(0x1A00, self.tx, 3)), (51, self._pdos(0x1600, self.rx, 2))]
@@ -148,7 +139,7 @@ class Slave:
 
     def write(self, at: int, data: bytes) -> None:
         """Physical memory, with the effect of writing."""
-        if at == AL_STATUS or at == AL_CODE:
+        if at in (AL_STATUS, AL_CODE):
             return
         self.memory[at : at + len(data)] = data
         if at <= AL_CONTROL < at + len(data):
@@ -215,12 +206,14 @@ class Slave:
 
     def logical(self, start: int, data: bytearray, reads: bool, writes: bool) -> int:
         """Exchange the part of a logical datagram that the FMMUs map; return what it adds to the counter."""
-        if self.state & 0x0F not in (SAFEOP, OP):
+        if self.state & 0x0F not in (SAFEOP, OP) or self.deaf:
             return 0
         counter = 0
         source = bytes(data)
         for k in range(4):
-            first, size, _, _, place, _, kind, active = struct.unpack_from("<IHBBHBBB", self.memory, FMMU + 16 * k)
+            first, size, _, _, place, _, kind, active = struct.unpack_from(
+                "<IHBBHBBB", self.memory, FMMU + 16 * k
+            )
             begin, end = max(first, start), min(first + size, start + len(data))
             if not active & 1 or begin >= end:
                 continue
@@ -245,7 +238,8 @@ class Slave:
         if kind & 0x0F != 3 or service != 2 or self.mute:
             return
         body = self._sdo(mail[8 : 6 + length])
-        head = struct.pack("<HHBBH", len(body) + 2, 0, 0, 3 | kind & 0x70, 3 << 12)
+        service = 2 if body[0] == 0x80 else 3  # an abort is a request, too
+        head = struct.pack("<HHBBH", len(body) + 2, 0, 0, 3 | kind & 0x70, service << 12)
         self.answers.append(head + body)
         self.memory[SM + 8 + 5] = 8
 
@@ -258,7 +252,13 @@ class Slave:
             data = struct.pack("<" + letter, value)
             return struct.pack("<BHB", 0x43 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
         known = (index, sub) in self.objects or is_mapping
-        if command >> 5 == 1 and not complete and known and index != self.refused and not (is_mapping and self.fixed):
+        if (
+            command >> 5 == 1
+            and not complete
+            and known
+            and index != self.refused
+            and not (is_mapping and self.fixed)
+        ):
             size = 4 - (command >> 2 & 3) if command & 2 else struct.unpack_from("<I", request, 4)[0]
             data = request[4 : 4 + size] if command & 2 else request[8 : 8 + size]
             value = int.from_bytes(data, "little")
@@ -283,8 +283,10 @@ def answer(frame: bytes, slaves: list[Slave]) -> bytes:
         for slave in slaves:
             if command in LOGICAL:
                 counter += slave.logical(address | place << 16, data, command in READS, command in WRITES)
-            elif command in BROADCAST or (command in AUTO and address == 0) or (
-                command in FIXED and address == slave.station()
+            elif (
+                command in BROADCAST
+                or (command in AUTO and address == 0)
+                or (command in FIXED and address == slave.station())
             ):
                 counter += _physical(slave, command, place, data)
             if command in (*AUTO, *BROADCAST):
@@ -308,118 +310,3 @@ def _physical(slave: Slave, command: int, place: int, data: bytearray) -> int:
         slave.write(place, sent)
         counter += 1 if command not in READS else 2
     return counter
-
-
-class Wire:
-    """What the tests may do to the slaves, inside their process: by name, over a pipe."""
-
-    def __init__(self, slaves: list[Slave]) -> None:
-        self.slaves, self.cut, self.lost, self.short = slaves, len(slaves), 0, 0
-        self.frames = 0
-
-    def serve(self, name: str, pipe: Any) -> None:
-        """Answer frames and the test's requests until the pipe is closed."""
-        with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERCAT)) as link:
-            link.bind((name, ETHERCAT))
-            pipe.send("ready")
-            while True:
-                for ready in select.select([link, pipe], [], [], 0.005)[0]:
-                    if ready is pipe:
-                        try:
-                            self._ask(pipe)
-                        except (EOFError, OSError):
-                            return
-                    else:
-                        self._frame(link)
-                for slave in self.slaves:
-                    slave.watch()
-
-    def _frame(self, link: socket.socket) -> None:
-        try:
-            frame = link.recv(2048)
-        except OSError:
-            return
-        self.frames += 1
-        there = list(itertools.takewhile(lambda s: s.present, self.slaves[: self.cut]))
-        for slave in there:
-            slave.watch()
-        if self.lost:
-            self.lost -= 1
-        elif there:
-            with contextlib.suppress(OSError):
-                link.send(answer(frame, there))
-
-    def _ask(self, pipe: Any) -> None:
-        position, key, arguments = pipe.recv()
-        target = self if position == 0 else self.slaves[position - 1]
-        found = getattr(target, key)
-        if callable(found):
-            found = found(*arguments)
-        elif arguments:
-            setattr(target, key, arguments[0])
-        pipe.send(found)
-
-
-class Cable:
-    """A pair of virtual cables: the master opens `name`, the slaves stand at the other end."""
-
-    _numbers = itertools.count()
-
-    def __init__(self, make: Callable[[], list[Slave]]) -> None:
-        number = next(self._numbers)
-        self.name, self.far = f"ec{os.getpid() % 10**6}m{number}", f"ec{os.getpid() % 10**6}s{number}"
-        ip("link", "add", self.name, "type", "veth", "peer", "name", self.far)
-        for end in (self.name, self.far):
-            with contextlib.suppress(OSError, subprocess.CalledProcessError):
-                ip("link", "set", end, "addrgenmode", "none")
-            ip("link", "set", end, "up")
-        context = multiprocessing.get_context("fork")
-        self._pipe, other = context.Pipe()
-        self._process = context.Process(target=_run, args=(make, self.far, other, self._pipe), daemon=True)
-        self._process.start()
-        other.close()
-        assert self._pipe.recv() == "ready"
-
-    def ask(self, position: int, key: str, *arguments: Any) -> Any:
-        """Read or write an attribute, or call a method, of slave `position` (0: the wire)."""
-        self._pipe.send((position, key, arguments))
-        return self._pipe.recv()
-
-    def plug(self) -> None:
-        ip("link", "set", self.far, "up")
-
-    def unplug(self) -> None:
-        ip("link", "set", self.far, "down")
-
-    def close(self) -> None:
-        self._pipe.close()
-        self._process.join(5)
-        ip("link", "del", self.name)
-
-
-def _run(make: Callable[[], list[Slave]], name: str, pipe: Any, other: Any) -> None:
-    other.close()
-    Wire(make()).serve(name, pipe)
-
-
-def ip(*arguments: str) -> None:
-    subprocess.run(["ip", *arguments], check=True, capture_output=True)
-
-
-def why_not() -> str:
-    """Return why no virtual cable can be had here, '' where it can."""
-    try:
-        socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERCAT)).close()
-        ip("link", "add", "ecprobe0", "type", "veth", "peer", "name", "ecprobe1")
-        ip("link", "del", "ecprobe0")
-    except PermissionError:
-        return "raw sockets need CAP_NET_RAW"
-    except (OSError, subprocess.CalledProcessError) as e:
-        return f"a virtual cable (ip link add ... type veth) needs CAP_NET_ADMIN: {e}"
-    return ""
-
-
-def terminals(values: list[int]) -> Iterator[bytes]:
-    """Bytes of a channel of an input terminal: status word, value."""
-    for value in values:
-        yield struct.pack("<Hh", 0, value)

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.buses import BUSES
-from thermoctl_hal.keys import REQUIRED, TABLES, Key
+from thermoctl_hal.key import REQUIRED, Key
+from thermoctl_hal.keys import TABLES
 from thermoctl_hal.read_profile import FORMAT, load_profile
 
 EXIT_OK, EXIT_INPUT = 0, 2
