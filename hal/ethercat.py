@@ -1,13 +1,13 @@
 """EtherCAT slaves: inputs of any slave, and CiA-402 drives over CANopen over EtherCAT.
 
 One frame a cycle carries the outputs of all slaves and returns with their inputs, see
-thermoctl_hal.ethercat_bus. A process of its own polls each device at the rate of its fastest channel. A device
-that has seen the newest cycle runs another; otherwise it uses the cycle of a neighbour. The command goes out
-with a cycle of its own, in the same poll.
+thermoctl_hal.ethercat_bus. A process of its own polls each device at the rate of its fastest channel. A
+device that has seen the newest cycle runs another; otherwise it uses the cycle of a neighbour. The command
+goes out with a cycle of its own, in the same poll.
 
-A drive stops by itself when no frame arrives for `watchdog_s`: its slave controller leaves the state OP, and the
-drive follows. Each set-up writes that time, see thermoctl_hal.ethercat_slave. A slave is lost and connected
-again when it is not in OP, or when the frames do not come back.
+A drive stops by itself when no frame arrives for `watchdog_s`: its slave controller leaves the state OP, and
+the drive follows. Each set-up writes that time, see thermoctl_hal.ethercat_slave. A slave is lost, and
+connected again, when it is not in OP or when the frames do not come back.
 """
 
 from __future__ import annotations

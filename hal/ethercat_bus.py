@@ -1,8 +1,8 @@
 """An EtherCAT adapter of this process: its master (pysoem), and the cycle that its devices share.
 
-A cycle sends the outputs of every slave in one frame, which comes back with their inputs. The working counter
-says whether every slave took part. `exchange` blocks until the frame is back. A lost frame costs up to 8 ms,
-whatever the timeout: the master's socket waits in steps of the kernel's clock. A process of its own therefore
+A cycle sends the outputs of every slave in one frame, which comes back with their inputs. Its working counter
+tells whether every slave took part. `exchange` blocks until the frame is back. A lost frame costs up to 8 ms,
+at any timeout: the master's socket waits in steps of the kernel's clock. A process of its own therefore
 runs the cycle, beside the loop.
 
     working counter as expected   every slave's inputs are new
@@ -10,8 +10,8 @@ runs the cycle, beside the loop.
                                   with every slave in OP the frame does not count
     LOST_FRAMES lost in a row     the link is lost
 
-A slave is brought to OP once, when the first device of the adapter connects: identity, objects, mapping, watchdog.
-`revive` brings one slave back while the others stay in the cycle.
+The first device that connects brings every slave to OP. A slave that is lost later comes back alone, while
+the others stay in the cycle.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class Drive(Slave):
 
     def __init__(self, watched: bool = True, product: int = 0x61500000) -> None:
         self.word, self.error, self.command, self.enabled_count, self.last_control = 0x40, 0, 0, 0, 0
-        self.position, self.obeys, self.moved = 5000, True, 0
+        self.position, self.current, self.moved = 5000, 0, 0
         default_rx: list[Entry] = [(0x6040, 0, 16), (0x607A, 0, 32)]
         super().__init__(
             "EPOS4",
@@ -101,7 +101,7 @@ class Drive(Slave):
         values = {
             (0x6041, 0): self.word,
             (0x603F, 0): self.error,
-            (0x30D1, 2): 2 * self.output(),
+            (0x30D1, 2): 2 * self.output() + self.current,
             (0x6064, 0): self.position,
         }
         data = b""

@@ -11,7 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import pytest
+
 from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, Unit, encode, words
+from tests.devices.ethercat import Slave
+from tests.devices.ethercat_cable import Cable, why_not
+from tests.devices.ethercat_devices import Drive, Terminal, coupler
 
 
 @dataclass
@@ -19,7 +24,7 @@ class Device:
     """An emulated device. expected: channel -> reading; `fault` breaks `bad`; send: what it sends by itself."""
 
     port: str
-    wire: Port
+    wire: Port | Cable
     expected: dict[str, float]
     fault: Callable[[], None]
     bad: str
@@ -243,6 +248,23 @@ def drive(
     return Device(f"slcan:{folder}/wire", wire, expected, lambda: broken.append(list(objects)[-1]), bad)
 
 
+def ethercat(
+    slaves: Callable[[], list[Slave]], expected: dict[str, float], fault: tuple[object, ...], bad: str
+) -> Device:
+    """Slaves at a virtual cable. fault: position, name and arguments, as of `Cable.ask`."""
+    if reason := why_not():
+        pytest.skip(reason)
+    wire = Cable(slaves)
+    return Device(wire.name, wire, expected, lambda: wire.ask(*fault), bad)
+
+
+def drawing(current: int) -> Drive:
+    """A drive that draws a current without being enabled, mA."""
+    drive = Drive()
+    drive.current = current
+    return drive
+
+
 STATE = {(0x6041, 0): ("H", 0x0250), (0x603F, 0): ("H", 0)}
 EIGHT = b"".join(b"%+08.2f" % (20.5 + k) for k in range(8))
 KELVIN = b",".join(b"%+.3f" % (293.15 + k) for k in range(8))
@@ -306,6 +328,12 @@ CASES: dict[str, Callable[[Path], Device]] = {
     ),
     "nanotec-c5-e": lambda d: drive(
         d, STATE | {(0x6077, 0): ("h", -250)}, {"state": 0x250, "fault": 0, "current": -0.25}, "current"
+    ),
+    "beckhoff-el3314": lambda d: ethercat(
+        lambda: [coupler(), Terminal()], {f"t{k}": 21.5 + k for k in range(4)}, (2, "open_wire", 3), "t3"
+    ),
+    "maxon-epos4-ethercat": lambda d: ethercat(
+        lambda: [drawing(-1500)], {"state": 0x40, "fault": 0, "current": -1.5}, (1, "current", 20000), "current"
     ),
     "copley-accelnet": lambda d: drive(
         d, STATE | {(0x2201, 0): ("h", 481), (0x221C, 0): ("h", -150)},
