@@ -21,7 +21,7 @@ from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
 from thermoctl_hal.binding import Binding
 from thermoctl_hal.device import Device
-from thermoctl_hal.drive import FAULT_RESET_S, MAX_STEP_S, drive_state, next_control_word, state_name
+from thermoctl_hal.drive import FAULT_RESET_S, MAX_STEP_S, drive_state, next_control_word
 from thermoctl_hal.ethercat_bus import EthercatBus, bus_of
 from thermoctl_hal.ethercat_slave import SlaveSetUp
 from thermoctl_hal.profile import Amplifier, typed
@@ -124,17 +124,6 @@ class EthercatDevice(Device):
         """Report that the poller has posted no reading and no problem yet."""
         return "its poller has posted nothing"
 
-    def explain(self, sample: Sample, role: int) -> str:
-        """Say also how a drive left 'operation enabled' by itself, until it is enabled anew."""
-        found = super().explain(sample, role)
-        if found or self._drive is None or self._drive.left_word < 0 or role != self.roles[self._state]:
-            return found
-        word = self._drive.left_word
-        return (
-            f"{self.name}: left 'operation enabled' without a command: {state_name(word)} (status word "
-            f"0x{word:04X}): check its stop, limit and enable inputs and its supply"
-        )
-
 
 class Cia402Steps:
     """The outputs of a drive: control word and command. The rules are those of thermoctl_hal.drive."""
@@ -155,7 +144,7 @@ class Cia402Steps:
 
     def restart(self) -> None:
         """Forget the state, after a new connection; the drive is not enabled again by itself."""
-        self._word, self.left_word, self._left_to = 0, -1, AMP_OFFLINE
+        self._word, self._left_to = 0, AMP_OFFLINE
         self._wanted = self._driving = self._left = False
         self._position, self._target, self._target_s, self._reset_s = 0.0, math.nan, 0.0, -math.inf
 
@@ -165,9 +154,9 @@ class Cia402Steps:
         if self._actual is not None:
             self._position = self._actual.value(inputs)
         if self._driving and not self._left and state != AMP_ENABLED:
-            self._left, self._left_to, self.left_word = True, state, word
+            self._left, self._left_to = True, state
         if self._wanted and state == AMP_ENABLED and not self._left:
-            self._driving, self.left_word = True, -1
+            self._driving = True
         return self._left_to if self._left and state != AMP_FAULT else state
 
     def outputs(self, drive: float, enable: bool, now_s: float) -> bytes:

@@ -171,14 +171,11 @@ class EthercatBus:
 
     def _coe(self, act: Callable[[], object]) -> None:
         """Run a set-up over the slaves' mailboxes. Raises HardwareError with the slave's reason."""
-        import pysoem
-
         try:
             act()
-        except pysoem.ConfigMapError as e:
-            raise HardwareError(f"{self.interface}: {'; '.join(map(_reason, e.error_list))}") from None
-        except (pysoem.SdoError, pysoem.MailboxError, pysoem.PacketError, pysoem.WkcError) as e:
-            raise HardwareError(f"{self.interface}: {_reason(e)}") from None
+        except Exception as e:  # the errors of pysoem have no common base
+            reasons = "; ".join(map(_reason, getattr(e, "error_list", [e])))
+            raise HardwareError(f"{self.interface}: {reasons}") from None
 
     def _request(self, position: int, state: int) -> None:
         slave = self.slave(position)
@@ -266,7 +263,7 @@ def _reason(error: Any) -> str:
             f"{where} refuses object 0x{error.index:04X}:{error.subindex}: abort 0x{error.abort_code:08X}, "
             f"{error.desc}: check the profile's objects and values against the manual"
         )
-    return f"{where} does not answer its mailbox ({error}): check its manual for CANopen over EtherCAT"
+    return f"{where} does not answer its mailbox ({error!r}): check its manual for CANopen over EtherCAT"
 
 
 _BUSES: WeakValueDictionary[str, EthercatBus] = WeakValueDictionary()
