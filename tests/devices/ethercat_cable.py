@@ -120,8 +120,9 @@ def why_not() -> str:
     """Return why no virtual cable can be had here, '' where it can."""
     try:
         socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERCAT)).close()
-        ip("link", "add", "ecprobe0", "type", "veth", "peer", "name", "ecprobe1")
-        ip("link", "del", "ecprobe0")
+        name = f"ecp{os.getpid() % 10**6}"
+        ip("link", "add", f"{name}a", "type", "veth", "peer", "name", f"{name}b")
+        ip("link", "del", f"{name}a")
     except PermissionError:
         return "raw sockets need CAP_NET_RAW"
     except (OSError, subprocess.CalledProcessError) as e:
