@@ -263,7 +263,9 @@ def ramps(said):
     t = np.arange(600.0)
     plant = loads(RAMPS.replace("power: {unit: W}", f"power: {{unit: W, {said}}}"))
     truth = loads(RAMPS.replace("power: {unit: W}", "power: {unit: W, between_samples: linear}"))
-    table = Table("ramps", "ramps.csv", t, {"power": 20 * np.abs((t / 60) % 2 - 1), "block_c": np.full(len(t), 20.0)})
+    table = Table(
+        "ramps", "ramps.csv", t, {"power": 20 * np.abs((t / 60) % 2 - 1), "block_c": np.full(len(t), 20.0)}
+    )
     model = compile_plant(truth)
     y = model.run(model.excitation(table)).y[:, 0] + 0.02 * np.random.default_rng(1).standard_normal(len(t))
     return plant, dataclasses.replace(table, columns=table.columns | {"block_c": y})

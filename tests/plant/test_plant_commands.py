@@ -1,5 +1,7 @@
 """linearise, show and the plant commands, from outside."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -42,6 +44,10 @@ def remembering(plant):
 def test_model_predicts_what_the_plant_does(plant, also):
     """An hour of power steps and drifting air: temperatures and growth by the model, against the plant's own simulation."""
     plant = also(plant)
+    steps = {
+        n: replace(plant.inputs[n], linear=False) for n in ("voltage", "current")
+    }  # here the power jumps
+    plant = replace(plant, inputs={**plant.inputs, **steps})
     model, n, step = linearise(plant, period_s=1.0, expansion_period_s=1.0), 3600, 1.0
     t = np.arange(n) * step
     current, air = 0.8 * ((t // 300) % 2), 22 + t / 1800
