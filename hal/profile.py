@@ -383,6 +383,18 @@ class Profile:
     amplifier: Amplifier | None
     file: str
     manual: str = ""
+    edition: str = ""
+    place: str = ""
+
+    @property
+    def source(self) -> str:
+        """Return manual, edition and place as one line; '' where no manual is named."""
+        return ", ".join(part for part in (self.manual, self.edition, self.place) if part)
+
+    @property
+    def is_cited(self) -> bool:
+        """Return whether manual, edition and place are all named."""
+        return bool(self.manual and self.edition and self.place)
 
 
 def typed(value: object, kind: type[T]) -> T:

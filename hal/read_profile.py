@@ -39,8 +39,11 @@ def load_profile(path: str | Path) -> Profile:
         rate = amplifier.command_hz
         stale = max(1.0, 3.0 / rate)
         channels[STATE] = Channel(STATE, "1", 1.0, 0.0, (0.0, 3.0), rate, stale, Assumed(), top.node.place)
+    cited = k["manual"], k["edition"], k["place"]
+    if any(cited[1:]) and not cited[0]:
+        raise top.get("channels").error("manual: the document of 'edition' and 'place' was expected")
     profile = Profile(
-        k["vendor"], k["model"], bus, channels, spec, read_line(top), amplifier, str(path), k["manual"]
+        k["vendor"], k["model"], bus, channels, spec, read_line(top), amplifier, str(path), *cited
     )
     top.end()
     return profile

@@ -340,4 +340,4 @@ CASES: dict[str, Callable[[Path], Device]] = {
         {"state": 0x250, "fault": 0, "current": -1.5, "supply": 48.1}, "current",
     ),
 }  # fmt: skip
-UNTRIED = {"mjbots-moteus": "CAN FD: in test_drives.py, because a Lawicel adapter has none"}
+UNTRIED = {"mjbots-moteus": "CAN FD: tried in test_drives.py, because a Lawicel adapter has none"}

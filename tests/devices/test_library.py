@@ -12,7 +12,7 @@ import pytest
 
 from tests.devices.library import CASES, UNTRIED
 from thermoctl import cli
-from thermoctl.devices.library import find
+from thermoctl.devices.library import cited, find
 from thermoctl.devices.new import new
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
@@ -20,13 +20,42 @@ from thermoctl_hal.backend import HardwareError
 from thermoctl_hal.probe import Probe, read_for
 from thermoctl_hal.read_profile import load_profile
 
+NOT_CITED = ("; written from memory, the manual was not at hand", "; its edition is not known")
 NAMES = sorted(p.stem for p in shipped("config/devices/library").glob("*.yaml"))
 
 
 def test_every_profile_has_an_emulator_and_a_source():
     assert len(NAMES) >= 25 and set(NAMES) == set(CASES) | set(UNTRIED)
     for name in NAMES:
-        assert len(load_profile(find(name)).manual) > 20, name
+        assert load_profile(find(name)).manual, name
+
+
+def test_a_profile_states_edition_and_place_of_its_manual_or_that_it_has_none():
+    for name in NAMES:
+        profile = load_profile(find(name))
+        assert profile.is_cited != profile.manual.endswith(NOT_CITED), name
+        assert bool(profile.edition) == bool(profile.place), name
+    assert len(cited()) >= 12 and set(cited()) <= set(NAMES)
+
+
+def test_an_edition_without_a_manual_is_refused(tmp_path):
+    path = tmp_path / "profile.yaml"
+    text = find("icpdas-m-7015").read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in text if not line.startswith("manual:")) + "edition: B2.8\n")
+    with pytest.raises(InputError, match="the document of 'edition' and 'place' was expected"):
+        load_profile(path)
+
+
+@pytest.mark.skipif(not os.environ.get("THERMOCTL_TABLE"), reason="prints rows of the table")
+def test_the_table_has_the_profiles_that_are_tried_elsewhere(capsys):
+    for name, where in UNTRIED.items():
+        with capsys.disabled():
+            print(_table_row(name, load_profile(find(name)), where, "", "", ""))
+
+
+def _table_row(name, profile, *rest):
+    source = (profile.manual, profile.edition or "none", profile.place or "none")
+    return "\n| " + " | ".join((name, profile.bus, *source, *rest)) + " |"
 
 
 def read(device, profile, wanted, limit_s=20.0):
@@ -85,8 +114,9 @@ def test_a_device_is_read_as_its_manual_says(tmp_path, name, capsys):
             with capsys.disabled():
                 value = ", ".join(f"{c} {v:g}" for c, v in list(device.expected.items())[:2])
                 more = f" and {len(device.expected) - 2} more" if len(device.expected) > 2 else ""
-                row = (name, profile.bus, profile.manual, value + more, f"{first_s:.2f}", f"{again_s:.2f}")
-                print("\n| " + " | ".join((*row, found[device.bad].problem.replace("|", "/"))) + " |")
+                times = f"{first_s:.2f}", f"{again_s:.2f}"
+                problem = found[device.bad].problem.replace("|", "/")
+                print(_table_row(name, profile, value + more, *times, problem))
     finally:
         device.wire.close()
 
@@ -115,7 +145,7 @@ def test_the_commands_show_search_and_probe(tmp_path, capsys):
 
 
 ANSWERS = {
-    "vendor": "ours", "model": "oven: left", "manual": "manual 1.2, page 7", "bus": "modbus", "unit": "degC",
+    "vendor": "ours", "model": "oven: left", "manual": "oven manual", "edition": "1.2", "place": "page 7", "bus": "modbus", "unit": "degC",
     "register": "12", "scale": "0.1", "rate_hz": "5", "stale_after_s": "1", "range": "[-20, 300]", "kind": "holding",
 }  # fmt: skip
 

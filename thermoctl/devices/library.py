@@ -21,6 +21,12 @@ def profiles() -> Iterator[tuple[str, Profile]]:
             yield path.stem, load_profile(path)
 
 
+def cited() -> list[str]:
+    """Return the names of the library's profiles that state manual, edition and place of their facts."""
+    folder = shipped(FOLDERS[0])
+    return sorted(p.stem for p in folder.glob("*.yaml") if load_profile(p).is_cited)
+
+
 def find(name: str) -> Path:
     """Return the file of a profile: a path, or the name of a shipped one. Raises InputError."""
     path = Path(name)
@@ -52,7 +58,7 @@ def search(words: list[str]) -> int:
     Searched are name, vendor, model, bus, manual and channels."""
     found = 0
     for name, p in profiles():
-        text = " ".join((name, p.vendor, p.model, p.bus, p.manual, *p.channels)).lower()
+        text = " ".join((name, p.vendor, p.model, p.bus, p.source, *p.channels)).lower()
         if all(w.lower() in text for w in words):
             print(_row(name, p))
             found += 1
@@ -65,7 +71,7 @@ def show(name: str) -> int:
     """Print a profile: its file, where its facts come from, its channels, and the text of the file."""
     path = find(name)
     profile = load_profile(path)
-    print(f"{profile.vendor} {profile.model}\nfile: {path}\nfrom: {profile.manual or 'not stated'}")
+    print(f"{profile.vendor} {profile.model}\nfile: {path}\nfrom: {profile.source or 'not stated'}")
     for c in profile.channels.values():
         low, high = c.range
         print(

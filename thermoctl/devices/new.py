@@ -12,7 +12,7 @@ from thermoctl_hal.keys import TABLES
 from thermoctl_hal.read_profile import FORMAT, load_profile
 
 EXIT_OK, EXIT_INPUT = 0, 2
-_TOP = ("vendor", "model", "manual")
+_TOP = ("vendor", "model", "manual", "edition", "place")
 
 
 def new(path: str, ask: Callable[[str], str] = input) -> int:
