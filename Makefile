@@ -261,7 +261,7 @@ devices: develop                   # every profile of the library against its em
 	@THERMOCTL_TABLE=1 $(BIN)/python -m pytest -q tests/devices/test_library.py > build/devices.log 2>&1 || { tail -30 build/devices.log; exit 1; }
 	@{ echo "<!-- Written by \`make devices\`. -->"; echo "# Devices"; echo; \
 		$(BIN)/python -c 'from thermoctl.devices.library import cited; print(len(cited()), end=" ")'; \
-		echo "profiles name a public manual with its edition and the place of their registers or frames; the others say that they are from memory."; echo; \
+		echo "profiles name a public manual with its edition and the place of their registers or frames; the others say what is missing."; echo; \
 		echo "Each profile of config/devices/library against a program that answers as the manual says (tests/devices/library.py), byte by byte"; \
 		echo "and with framing of its own. Read: all values within 0.2 %. Then the cable is pulled and plugged, and a fault injected."; echo; \
 		echo "| profile | bus | manual | edition | place | values | first reading, s | after the cable, s | fault shown |"; echo "|$$(printf ' --- |%.0s' 1 2 3 4 5 6 7 8 9)"; \

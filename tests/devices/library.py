@@ -84,6 +84,19 @@ def temperatures(folder: Path, kind: str) -> Device:
         return modbus(
             folder, {4: row(0, [2150] * 6)}, {f"t{k}": 21.5 for k in range(6)}, (4, 5, 0x8000), "t5"
         )
+    if kind == "pet-7015":
+        tables = {4: row(0, [-4321] * 7)}
+        return modbus(folder, tables, {f"t{k}": -43.21 for k in range(7)}, (4, 6, 32767), "t6", True)
+    if kind == "pet-7018z":
+        tables = {4: row(0, [215 + 10 * k for k in range(10)])}
+        return modbus(folder, tables, {f"t{k}": 21.5 + k for k in range(10)}, (4, 9, 32767), "t9", True)
+    if kind == "wb-m1w2":
+        tables = {4: {7: 344, 8: 0xFFF0}, 2: {16: 1, 17: 1}}
+        return modbus(folder, tables, {"t0": 21.5, "t1": -1.0}, (2, 17, 0), "t1")
+    if kind == "labjack":
+        values = {7000 + 2 * k: 293.15 + k for k in range(4)} | {60052: 301.5}
+        expected = {f"t{k}": 293.15 + k for k in range(4)} | {"device": 301.5}
+        return modbus(folder, {3: floats(values)}, expected, (3, 7002, 0xC61C), "t1", True)
     if kind == "status first":
         tables = {4: row(0, [0, 215, 0, -35])}
         return modbus(folder, tables, {"t0": 21.5, "t1": -3.5}, (4, 2, 0x41), "t1", True)
@@ -129,6 +142,8 @@ def meters(folder: Path, kind: str) -> Device:
     if kind == "em21":
         tables = {4: longs({0: 2305, 12: 1250})}
         return modbus(folder, tables, {"voltage_1": 230.5, "current_1": 1.25}, (4, 13, 0x7FFF), "current_1")
+    if kind == "wb-mao4":
+        return modbus(folder, {3: {0: 12000}, 2: {16: 0}}, {"i0": 12.0}, (2, 16, 1), "i0")
     if kind == "ai":
         tables = {4: row(0, [4000 + k for k in range(8)])}
         return modbus(folder, tables, {f"i{k}": 4 + k / 1000 for k in range(8)}, (4, 2, 60000), "i2")
@@ -266,18 +281,23 @@ def drawing(current: int) -> Drive:
 
 
 STATE = {(0x6041, 0): ("H", 0x0250), (0x603F, 0): ("H", 0)}
-EIGHT = b"".join(b"%+08.2f" % (20.5 + k) for k in range(8))
+EIGHT = b"".join(b"%+07.1f" % (20.5 + k) for k in range(8))
 KELVIN = b",".join(b"%+.3f" % (293.15 + k) for k in range(8))
 CASES: dict[str, Callable[[Path], Device]] = {
     "advantech-adam-6015": lambda d: temperatures(d, "adam-6015"),
     "advantech-adam-6018": lambda d: temperatures(d, "adam-6018"),
     "advantech-adam-4018-ascii": lambda d: line(
-        d, b"#0A\r", b">" + EIGHT + b"\r", b">" + EIGHT[:8] + b"+9999.99" + EIGHT[16:] + b"\r",
+        d, b"#0A\r", b">" + EIGHT + b"\r", b">" + EIGHT[:7] + b"+9999.9" + EIGHT[14:] + b"\r",
         {f"t{k}": 20.5 + k for k in range(8)}, "t1", 10,
     ),
     "icpdas-m-7018": lambda d: temperatures(d, "m-7018"),
     "icpdas-tm-th8": lambda d: temperatures(d, "tm-th8"),
     "icpdas-m-7015": lambda d: temperatures(d, "m-7015"),
+    "icpdas-pet-7015": lambda d: temperatures(d, "pet-7015"),
+    "icpdas-pet-7018z": lambda d: temperatures(d, "pet-7018z"),
+    "wirenboard-wb-m1w2": lambda d: temperatures(d, "wb-m1w2"),
+    "wirenboard-wb-mao4-20ma": lambda d: meters(d, "wb-mao4"),
+    "labjack-t7": lambda d: temperatures(d, "labjack"),
     "wago-750-461": lambda d: temperatures(d, "status first"),
     "beckhoff-bk9050-kl3312": lambda d: temperatures(d, "status first"),
     "seneca-z-4tc": lambda d: temperatures(d, "z-4tc"),
@@ -323,8 +343,7 @@ CASES: dict[str, Callable[[Path], Device]] = {
     ),
     "vesc-can": lambda d: can_device(d, vesc, expected={"current": 1.2, "supply": 48.2}, bad="supply", address=60),
     "maxon-epos4": lambda d: drive(
-        d, STATE | {(0x2200, 1): ("H", 241), (0x30D1, 2): ("i", -1500)},
-        {"state": 0x250, "fault": 0, "current": -1.5, "supply": 24.1}, "current",
+        d, STATE | {(0x30D1, 2): ("i", -1500)}, {"state": 0x250, "fault": 0, "current": -1.5}, "current",
     ),
     "nanotec-c5-e": lambda d: drive(
         d, STATE | {(0x6077, 0): ("h", -250)}, {"state": 0x250, "fault": 0, "current": -0.25}, "current"
