@@ -55,19 +55,15 @@ SWAPS: dict[type, list[type]] = {
 }
 
 _FLAG = "a flag: only ever looked at as zero or not"
-_NO_DRIVE = "v is 0 wherever enable is 0: control() and _arm() empty it; a second lock on the same door"
 WHY: dict[str, str] = {
     "axes.py:__init__: `0` + 1 in `self.sample = Sample(0)`": "the sample's arrays are replaced in the next lines",
     "law.py:_agree: `if self.coil_fresh: self._compare_order()` condition True in `if self.coil_fresh:`": "means and estimates move over seconds: looked at in every tick the same is found, up to 0.1 s earlier, at a cost",
-    "law.py:protect: `clip(self.v, -self.p.output_limit, self.p.output_limit) if s` condition True in "
-    "`self.drive = clip(self.v, -self.p.output_limit, self.p.output_limit) if self.enable > 0.0 `": _NO_DRIVE,
-    "law.py:protect: `self.enable > 0.0` Gt -> GtE in "
-    "`self.drive = clip(self.v, -self.p.output_limit, self.p.output_limit) if self.enable > 0.0 `": _NO_DRIVE,
     "law.py:_agree: `self.last[_CURRENT] if current else 0.0` condition True in "
     "`amperes = self.last[_CURRENT] if current else 0.0`": "amperes is looked at only where `current` holds",
     "law.py:_judge_readings: `1.0 + _K_ERROR` Add -> Sub in `self.verdict[c] = 1.0 + _K_ERROR`": "_K_ERROR is 0",
     "law.py:_judge_readings: `1.0 + _K_ERROR` Add -> Sub in `self.verdict[c] = 1.0 + _K_ERROR` (2)": "_K_ERROR is 0",
-    "law.py:_judge_readings: `1.0` + 1 in `self.verdict[c] = 1.0 + _K_ERROR`": "of a channel that no device has and nobody requires: its verdict is only looked at as zero or not",
+    "law.py:_judge_readings: `1.0 + _K_ERROR` Add -> Sub in `self.verdict[c] = 1.0 + _K_ERROR` (3)": "_K_ERROR is 0",
+    "law.py:_judge_readings: `self.age[c] > _RESISTANCE_LATE_S` Gt -> GtE in `if self.seen[c] == 0.0 or self.age[c] > _RESISTANCE_LATE_S:`": "an age is a sum of rounded ticks, which never is exactly the limit",
     "law.py:_judge_reading: `1.0` + 1 in `self.seen[c] = 1.0`": _FLAG,
     "law.py:_judge_readings: `1` + 1 in `self.hold = 1`": _FLAG,
     "law.py:_watch_amplifier: `1.0` + 1 in `self.driving = 1.0`": _FLAG,
