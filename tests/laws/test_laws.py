@@ -1,32 +1,41 @@
 """A concealed law is found, written and found again by name; where nothing is missing, none is claimed."""
 
 import json
+import os
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from tests.laws.prove import EQUAL, difference
+from tests.laws.real import law_of
 from tests.laws.rigs import LAWS, make
 from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.fit import fitted
-from thermoctl.diagnose.law import FEWEST_REFITS, REFITS, SIMPLER, affordable, find_law
+from thermoctl.diagnose.law import find_law
+from thermoctl.diagnose.law_misfit import odds_elsewhere
+from thermoctl.diagnose.law_propose import PROPOSALS
+from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable
 from thermoctl.diagnose.law_result import law_entry, law_section
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.rig import Rig
 from thermoctl.plant import load, save
+from thermoctl.proof.rigs import RIGS
 
+FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[3] / "shared/recordings"))
 ENTROPIC = next(law for law in LAWS if law.name == "entropic heat")
 
 
-def look(made):
+def look(made, reserve=slice(2, 3)):
     """The law that the plant's refit leaves, without the catalogue."""
     known = case(made.plant, made.tables[:2], {}, Budget(80))
     first = fitted(known, known.plant, (), known.null)
-    return known, find_law(known, first, limits(), made.tables[2:3])
+    return known, find_law(known, first, limits(), made.tables[reserve])
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +87,45 @@ def test_a_larger_plant_gets_fewer_refits_of_laws(found):
     _, known, law = found
     once = affordable(known, law.fitted)
     often = affordable(replace(known, tables=known.tables * 2000), law.fitted)
-    assert once == REFITS + SIMPLER and often == FEWEST_REFITS
+    assert once == PROPOSALS + SIMPLER and often == FEWEST_REFITS
+
+
+def test_without_a_reserve_the_end_of_each_recording_tests_the_law(found):
+    made, _, _ = found
+    _, law = look(made, slice(0))
+    assert law is not None
+    assert law.worth.names == ("run_1", "run_2")
+    assert difference(law.fitted.plant, made) < EQUAL
+    assert len(law.fitted.fit.residuals[0]) == 800  # refitted to all of the data
+
+
+def test_error_on_data_that_it_was_not_fitted_to_speaks_for_or_against_a_law(found):
+    _, known, law = found
+    numbers, value = limits(), law.worth
+    worse = replace(value, after={o: 2 * r for o, r in value.refit_only.items()})
+    assert odds_elsewhere(known, value, numbers) > 10
+    assert odds_elsewhere(known, worse, numbers) == pytest.approx(-np.log(4) / (2 * numbers.alike))
+    assert odds_elsewhere(known, replace(value, after={}), numbers) == -np.inf
 
 
 def test_no_law_is_claimed_where_nothing_is_missing():
     assert look(make(None, "stage", "small", "closed", 3))[1] is None
+
+
+@pytest.mark.parametrize(
+    ("rig", "forms", "shape"),
+    [
+        ("pendulum", {"friction": {"velocity"}, "power": {"velocity"}}, ("n2", 1.8, 2.2)),
+        ("battery", {"total_product": {"current"}}, None),
+        ("silverbox", {"power": {"position"}}, ("n1", 2.7, 3.3)),
+    ],
+)
+def test_laws_of_real_rigs_have_their_published_form(rig, forms, shape):
+    if not FOLDER.is_dir():
+        pytest.skip(f"{FOLDER}: no such folder; set THERMOCTL_RECORDINGS to the folder of the recordings")
+    _, law = law_of(FOLDER, next(r for r in RIGS if r.name == rig))
+    assert law is not None
+    assert {t.form.name: t.variables for t in law.proposal.terms} == forms
+    if shape:
+        name, low, high = shape
+        assert low < law_entry(law)["parameters"][name]["value"] < high

@@ -15,7 +15,7 @@ from thermoctl.diagnose.coordinates import Coordinates
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.noise import Grid, grid
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.rows import OUTLIER, reduced
+from thermoctl.diagnose.rows import OUTLIER, Reduced, reduced
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Noise, fit
@@ -110,7 +110,6 @@ def case(
     tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
     drives = [dataclasses.replace(model.excitation(t), rtol=rtol) for t in tables]
     coordinates = Coordinates(drives)
-    sensors = [fewer.sensor(o.noise) for o in plant.outputs.values()]
     rig = Structure(plant, drives, [t.columns for t in tables])
     return Case(
         plant,
@@ -119,10 +118,7 @@ def case(
         noise,
         null,
         coordinates,
-        tuple(
-            grid(coordinates, ks, noise[j].sigma, _swing(drives, j), sensors[j])
-            for j, ks in coordinates.by_output().items()
-        ),
+        _grids(coordinates, drives, plant, noise, fewer),
         budget,
         [
             *freed,
@@ -134,6 +130,35 @@ def case(
         off,
         rtol,
         memory,
+    )
+
+
+def with_tables(case: Case, tables: Sequence[Table]) -> Case:
+    """Return the case with parts of its recordings, the plant refitted to them; noise and accuracy stay.
+
+    Rows that are means already stay as they are."""
+    model = compile_plant(case.plant)
+    drives = [dataclasses.replace(model.excitation(t), rtol=case.rtol) for t in tables]
+    null = fit(model, drives, case.noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
+    coordinates = Coordinates(drives)
+    grids = _grids(coordinates, drives, case.plant, case.noise, Reduced(list(tables), case.block, 0, 0))
+    return dataclasses.replace(
+        case, tables=tuple(tables), null=null, coordinates=coordinates, grids=grids, block=1
+    )
+
+
+def _grids(
+    coordinates: Coordinates,
+    drives: Sequence[Excitation],
+    plant: Plant,
+    noise: Sequence[Noise],
+    rows: Reduced,
+) -> tuple[Grid, ...]:
+    """Return the frequencies of each measured output."""
+    sensors = [rows.sensor(o.noise) for o in plant.outputs.values()]
+    return tuple(
+        grid(coordinates, ks, noise[j].sigma, _swing(drives, j), sensors[j])
+        for j, ks in coordinates.by_output().items()
     )
 
 

@@ -50,18 +50,21 @@ def split(tables: Sequence[Table], held_out: Sequence[Table]) -> tuple[list[Tabl
     return list(tables[:-1]), list(tables[-1:])
 
 
-def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> Worth:
-    """Errors on the reserve; without one, on every other block, the plants refitted to the rest."""
+def worth(
+    case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table], known: Worth | None = None
+) -> Worth:
+    """Errors on the reserve; without one, on every other block, the plants refitted to the rest.
+
+    `known`: of another hypothesis, whose errors without the findings are the same."""
     if reserve:
         if case.block > 1:
             reserve = [means(case.null.model, t, case.block) for t in reserve]
-        return Worth(
-            _rms([_errors(case, case.plant, t) for t in reserve], null.fit.model),
-            _rms([_errors(case, null.plant, t) for t in reserve], null.fit.model),
-            _rms([_errors(case, best.plant, t) for t in reserve], null.fit.model),
-            True,
-            tuple(t.name for t in reserve),
-        )
+
+        def rms(plant: Plant) -> dict[str, float]:
+            return _rms([_errors(case, plant, t) for t in reserve], null.fit.model)
+
+        before, refit_only = (known.before, known.refit_only) if known else (rms(case.plant), rms(null.plant))
+        return Worth(before, refit_only, rms(best.plant), True, tuple(t.name for t in reserve))
     before = _rms([_errors(case, case.plant, t) for t in case.tables], null.fit.model)
     return Worth(before, _crossed(case, null), _crossed(case, best), False, ())
 

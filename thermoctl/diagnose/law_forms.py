@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -20,6 +20,8 @@ from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.shipped import shipped
+
+TOTAL = "total"  # a memory that keeps all: an integral
 
 Values = Mapping[str, np.ndarray | float]
 
@@ -46,6 +48,7 @@ class Form:
     sizes: tuple[str, ...]
     shapes: Mapping[str, Shape]
     memory: str | None
+    odd: bool  # reverses with its signal
 
 
 @cache
@@ -68,7 +71,15 @@ def library() -> tuple[Form, ...]:
             for k, s in p.get("shapes", {}).items()
         }
         out.append(
-            Form(key, text, p.get("of", "any"), tuple(p.get("sizes", ("A",))), shapes, p.get("memory"))
+            Form(
+                key,
+                text,
+                p.get("of", "any"),
+                tuple(p.get("sizes", ("A",))),
+                shapes,
+                p.get("memory"),
+                p.get("odd", False),
+            )
         )
     return tuple(out)
 
@@ -93,7 +104,9 @@ class Place:
 
 @dataclass(frozen=True)
 class Signal:
-    """A signal of the plant: an expression, its unit, its typical size."""
+    """A signal of the plant: an expression, its unit, its typical size.
+
+    `drives`: a difference or a velocity that drives the flow at its place, and reverses it."""
 
     label: str
     value: Expr
@@ -102,6 +115,8 @@ class Signal:
     centre: float = 0.0
     kelvin: float | None = None  # offset to kelvins; None: no absolute temperature
     position: bool = False
+    drives: bool = False
+    recorded: bool = False
 
 
 def places(rig: Structure) -> list[Place]:
@@ -125,10 +140,12 @@ def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal
         if unit in TEMPERATURE:
             out.append(Signal(n, name(n), "K", kelvin=273.15 - zero_of(unit)))
         else:
-            out.append(Signal(n, name(n), unit, position=n in positions))
+            own = n in place.nodes and n in rig.velocities and not place.source
+            out.append(Signal(n, name(n), unit, position=n in positions, drives=own, recorded=n in p.inputs))
 
     def difference(a: str, b: str) -> None:
-        out.append(Signal(f"{a} - {b}", ex.add(name(a), ex.neg(name(b))), _difference(p.nodes[a].unit)))
+        unit = _difference(p.nodes[a].unit)
+        out.append(Signal(f"{a} - {b}", ex.add(name(a), ex.neg(name(b))), unit, drives=True))
 
     for n in near:
         if rig.air and n in rig.temperatures:
@@ -158,9 +175,7 @@ def _sized(s: Signal, runs: Sequence[Values]) -> Signal | None:
     size = float(np.sqrt(np.mean((values - centre) ** 2)))
     if not np.isfinite(size) or float(np.ptp(values)) <= 1e-9 * max(size, 1e-300):
         return None
-    return Signal(
-        s.label, s.value, s.unit, float(f"{size:.3g}"), float(f"{centre:.4g}"), s.kelvin, s.position
-    )
+    return replace(s, size=float(f"{size:.3g}"), centre=float(f"{centre:.4g}"))
 
 
 @dataclass(frozen=True)
@@ -170,11 +185,17 @@ class Term:
     form: Form
     signals: tuple[Signal, ...]
     shapes: Mapping[str, float] = field(default_factory=dict)
+    duration: float = 1.0  # of the longest run, s
 
     @property
     def variables(self) -> frozenset[str]:
         """The signals that it depends on."""
         return frozenset(s.label for s in self.signals)
+
+    @property
+    def reverses(self) -> bool | None:
+        """Return whether the term reverses with what drives the flow; None where nothing demands it."""
+        return self.form.odd if len(self.signals) == 1 and self.signals[0].drives else None
 
     def expression(self, number: int) -> Expr:
         """Return the term with its parameters A, n, ... named A1, n1, ... and its signals filled in."""
@@ -206,13 +227,33 @@ class Term:
         """Return what drives the memory of the term."""
         return self.normal(self.signals[0], f"Z{number}")
 
+    @property
+    def integrates(self) -> bool:
+        """Return whether the memory is an integral."""
+        return self.form.memory == TOTAL
+
+    def filling(self, number: int) -> str:
+        """Return the rate of the memory: of first order, or of an integral."""
+        z = self.lagged(number)
+        if self.integrates:
+            return f"({z}) / {self.duration:.4g}"
+        return f"({z} - m{number}) / {self.form.memory}{number}"
+
+    def memory_text(self, number: int) -> str:
+        """Return the memory of the term in words."""
+        z = readable(self.lagged(number))
+        if self.integrates:
+            return f"the integral of {z} since the start, over {self.duration:.4g} s"
+        return f"{z}, delayed by a first-order lag of {self.form.memory}{number}"
+
     def values(self, run: Values, t: np.ndarray) -> np.ndarray:
         """Return the term (N, sizes) along a trajectory, for sizes of one."""
         known: dict[str, Any] = {**run, **{f"{k}1": v for k, v in self.shapes.items()}}
         known |= {k: s.size for k, s in self.scales(1).items()}
         if self.form.memory:
-            known["m1"] = _lag(
-                t, np.broadcast_to(ex.evaluate(self.lagged(1), known), t.shape), self.shapes[self.form.memory]
+            z = np.broadcast_to(np.asarray(ex.evaluate(self.lagged(1), known), float), t.shape)
+            known["m1"] = (
+                _total(t, z) / self.duration if self.integrates else _lag(t, z, self.shapes[self.form.memory])
             )
         e = self.expression(1)
         out = []
@@ -232,20 +273,25 @@ def _lag(t: np.ndarray, z: np.ndarray, tau: float) -> np.ndarray:
     return out
 
 
+def _total(t: np.ndarray, z: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0.0], np.cumsum(z[:-1] * np.diff(t))])
+
+
 def terms(found: Sequence[Signal], duration: float) -> Iterator[Term]:
     """Yield every form over these signals at each of its first values."""
     for form in library():
         if form.of == "none":
-            yield Term(form, ())
+            yield Term(form, (), {}, duration)
             continue
         for s in found:
-            if (form.of == "absolute" and s.kelvin is None) or (form.of == "position" and not s.position):
+            fits = {"absolute": s.kelvin is not None, "position": s.position, "input": s.recorded}
+            if not fits.get(form.of, True):
                 continue
             for w in found if form.of == "two" else (s,):
                 if form.of == "two" and (w is s or (form.name == "product" and w.label < s.label)):
                     continue
                 for shapes in _grid(form, duration):
-                    yield Term(form, (s, w) if form.of == "two" else (s,), shapes)
+                    yield Term(form, (s, w) if form.of == "two" else (s,), shapes, duration)
 
 
 def _grid(form: Form, duration: float) -> Iterator[dict[str, float]]:
@@ -269,7 +315,7 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
         ]
         parameters += [_parameter(q, s.unit, None, s.size) for q, s in term.scales(k).items()]
         if term.form.memory:
-            tau, lagged = f"{term.form.memory}{k}", term.lagged(k)
+            lagged = term.lagged(k)
             changes.append(
                 {
                     "node": {
@@ -280,7 +326,7 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
                     }
                 }
             )
-            changes.append({"flow": {"into": f"m{k}", "rate": f"({lagged} - m{k}) / {tau}"}})
+            changes.append({"flow": {"into": f"m{k}", "rate": term.filling(k)}})
     ends = {"into": "target", **({"from": "source"} if place.source else {})}
     changes.append({"flow": {**ends, "rate": str(rate)}})
     return Effect(

@@ -10,7 +10,9 @@ from typing import Any
 import yaml
 
 from thermoctl.diagnose.fit import Fitted
-from thermoctl.diagnose.law import Law, Proposal, equation
+from thermoctl.diagnose.law import Law
+from thermoctl.diagnose.law_propose import Proposal
+from thermoctl.diagnose.law_refit import equation, law_rate
 from thermoctl.diagnose.rig import zero_of
 from thermoctl.diagnose.words import law_sentence
 from thermoctl.plant import expression as ex
@@ -32,6 +34,8 @@ def law_entry(law: Law | None) -> dict[str, Any] | None:
         "expression": equation(law.rate, f),
         "into": place.target,
         "from": place.source,
+        "terms": _terms(p),
+        "memory": {f"m{k}": t.memory_text(k) for k, t in enumerate(p.terms, 1) if t.form.memory},
         "variables": sorted({s.label for t in p.terms for s in t.signals}),
         "parameters": _parameters(law),
         "probability": round(law.probability, 4),
@@ -42,6 +46,19 @@ def law_entry(law: Law | None) -> dict[str, Any] | None:
         "family": family(law),
         "effect": effect_file(law),
     }
+
+
+def _terms(p: Proposal) -> list[dict[str, Any]]:
+    """Return form and signals of each term, and the names of its parameters."""
+    return [
+        {
+            "form": t.form.name,
+            "variables": [s.label for s in t.signals],
+            "sizes": {q: f"{q}{k}" for q in t.form.sizes},
+            "shapes": {q: f"{q}{k}" for q in t.form.shapes},
+        }
+        for k, t in enumerate(p.terms, 1)
+    ]
 
 
 def _parameters(law: Law) -> dict[str, Any]:
@@ -76,9 +93,7 @@ def family(law: Law) -> list[str]:
 
 def described(p: Proposal, f: Fitted) -> str:
     """Return a law as an expression with its place."""
-    own = set(f.hypothesis.effects[-1].own.values())
-    rate = next(x.rate for x in reversed(list(f.plant.flows.values())) if ex.names(x.rate) & own)
-    return f"{equation(rate, f)} at {p.place.where}"
+    return f"{equation(law_rate(f), f)} at {p.place.where}"
 
 
 def law_section(law: Law | None) -> str:

@@ -8,6 +8,8 @@ from typing import Any
 
 Result = Mapping[str, Any]  # the content of diagnosis.json
 
+WHOLE = 0.99  # share of the misfit's energy, from which a law closes all but the noise
+
 NEXT = {
     "consistent": "Nothing has to be done. Effects that these inputs do not excite would not show: record wider steps to exclude them.",
     "explained": "Use the extended plant. Check it on a recording with another schedule before you trust it outside these ranges.",
@@ -104,8 +106,15 @@ def law_sentence(entry: Result | None) -> str:
     values = ", ".join(
         f"{n} = {p['value']:.4g} {p['unit'] or ''}".strip() for n, p in entry["parameters"].items()
     )
+    values += "".join(f"; {m} is {text}" for m, text in entry.get("memory", {}).items())
     at = f"from {entry['from']} into {entry['into']}" if entry["from"] else f"into {entry['into']}"
-    return f"A law for it: a flow {at} of {entry['expression']} with {values} (probability {chance(entry['probability'])})."
+    closes = f"It closes {100 * entry['share_closed']:.0f} % of the misfit's energy"
+    if entry["share_closed"] < WHOLE:
+        closes += "; a remainder stays"
+    return (
+        f"A law for it: a flow {at} of {entry['expression']} with {values} "
+        f"(probability {chance(entry['probability'])}). {closes}."
+    )
 
 
 def _worst(found: Result) -> str | None:

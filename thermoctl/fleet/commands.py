@@ -17,6 +17,7 @@ from rich.table import Table
 
 from thermoctl.fleet import live
 from thermoctl.fleet.health import Summary, summarise
+from thermoctl.fleet.laws import comparisons, side_by_side
 from thermoctl.fleet.recordings import find_recordings, rig_of
 from thermoctl.fleet.trend import RigHealth, judge
 from thermoctl.plant import load
@@ -109,6 +110,7 @@ class RigDiagnosis:
     seconds: float | None
     verdict: str | None
     findings: list[dict[str, Any]]
+    law: dict[str, Any] | None
 
 
 def diagnose_folders(args: argparse.Namespace) -> int:
@@ -126,6 +128,7 @@ def diagnose_folders(args: argparse.Namespace) -> int:
         print(json.dumps([asdict(d) for d in found], indent=1))
     elif not args.quiet:
         Console(soft_wrap=True).print(_diagnoses(found))
+        _print_laws(found)
         print(f"reports: {out}/RIG/report.html")
     return 0
 
@@ -152,7 +155,20 @@ def _diagnosis(job: Job, out: Path) -> RigDiagnosis:
         {k: f[k] for k in ("effect", "where", "probability")} for f in (result or {}).get("findings", [])
     ]
     verdict = result["verdict"] if result else None
-    return RigDiagnosis(job.name, list(job.recordings), run["error"], run.get("seconds"), verdict, findings)
+    law = ((result or {}).get("remainder") or {}).get("law")
+    return RigDiagnosis(
+        job.name, list(job.recordings), run["error"], run.get("seconds"), verdict, findings, law
+    )
+
+
+def _print_laws(found: Sequence[RigDiagnosis]) -> None:
+    """Print the laws of all rigs side by side, and what repeats in them."""
+    laws = {d.rig: d.law for d in found if d.law}
+    if laws:
+        console = Console(soft_wrap=True)
+        console.print(side_by_side(laws))
+        for line in comparisons(laws):
+            console.print(line, highlight=False, markup=False)
 
 
 def _diagnoses(found: Sequence[RigDiagnosis]) -> Table:

@@ -1,0 +1,277 @@
+"""Proposals of laws: sparse regression on the linearised plant.
+
+1. `law_smooth` tracks the recordings with unknown flows and linearises the plant about this trajectory.
+2. Each place and signal is scored with a free function of the signal (straight lines between quantiles).
+3. Where that score is high, the library's forms are tried: alone, in pairs, and in sums of three terms."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.law_forms import Place, Signal, Term, library, places, signals, terms
+from thermoctl.diagnose.law_smooth import Tracked, tracked
+from thermoctl.diagnose.roles import Structure
+from thermoctl.diagnose.shortlist import ALIKE
+from thermoctl.diagnose.unknown import located, reached
+from thermoctl.plant import expression as ex
+from thermoctl.plant.residuals import HUGE
+
+PIECES = 8  # of a free function of a signal
+TRACKED = 20  # nodes with an unknown flow, those that explain the residual best: 24 knots each
+NODES = 4  # of a plant, at which a free flow in time explains most
+SECOND = 10  # signals of a place that may be the second one of a form
+COMBINATIONS = 12  # places and signals whose forms are tried
+POOL = 60  # terms that a sum of terms is built from
+PAIRED = 600  # terms that are tried two at a time
+PAIRS, LIKELY = 8, 5000  # pairs from which sums grow; best pairs of values that they are looked for in
+PROPOSALS, SIMPLEST = 12, 4  # the best ones; of one term, each of another signal
+TERMS = 3
+CHUNK = 256  # terms whose responses are computed at a time
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Terms at a place, their sizes and the gain in log likelihood that the linearised plant promises."""
+
+    place: Place
+    terms: tuple[Term, ...]
+    sizes: tuple[float, ...]
+    promise: float
+    look: float  # log of the number of places, signals and forms that a term was chosen from
+    rare: float  # share of the terms that do not reverse with what drives the flow
+
+    @property
+    def cost(self) -> float:
+        """Return minus the log of its prior odds.
+
+        It is one of many laws; a second signal is chosen once more. A flow that a difference or a velocity
+        drives reverses with it: terms that do not share the odds `rare`."""
+        chosen = self.look * sum(max(len(t.signals), 1) for t in self.terms)
+        return chosen + float(np.log(2)) * self.shapes + sum(self._surprise(t) for t in self.terms)
+
+    def _surprise(self, t: Term) -> float:
+        """Return minus the log of a form's odds over equal odds of all forms."""
+        if t.reverses is None:
+            return 0.0
+        odd = sum(form.odd for form in library()) / len(library())
+        return float(np.log(odd / (1 - self.rare)) if t.reverses else np.log((1 - odd) / self.rare))
+
+    @property
+    def kind(self) -> tuple[Place, tuple[tuple[str, tuple[Signal, ...]], ...]]:
+        """Return place, forms and signals, without the values of shapes."""
+        return self.place, tuple(sorted(((t.form.name, t.signals) for t in self.terms), key=str))
+
+    @property
+    def shapes(self) -> int:
+        """Number of parameters beside the sizes."""
+        return sum(len(t.form.shapes) for t in self.terms)
+
+    @property
+    def score(self) -> float:
+        """Promised gain less the cost of the description."""
+        return self.promise - self.cost
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A term at a place: its gain in energy, and its responses (rows, sizes)."""
+
+    gain: float
+    place: Place
+    term: Term
+    columns: np.ndarray
+
+    @property
+    def kind(self) -> tuple[str, tuple[Signal, ...]]:
+        """Return the term without the values of its shapes."""
+        return self.term.form.name, self.term.signals
+
+
+def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal], Tracked]:
+    """Return the most promising laws, best first, and the linearised plant. Raises SimulationError.
+
+    `rare`: of `Proposal`."""
+    drives = case.drives(parent.rough.model)
+    rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
+    where = places(rig)
+    nodes = [p.target for p in where if p.source is None]
+    if len(nodes) > TRACKED:
+        nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
+    at = tracked(case, parent, nodes)
+    likely = sorted(at.explained, key=lambda n: -at.explained[n])[:NODES]
+    combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, at.runs)]
+    free = [(_free(at, p, s), p, s) for p, s in combos]
+    free.sort(key=lambda x: -x[0])
+    chosen = free[:COMBINATIONS]
+    pool: list[Found] = []
+    for place in dict.fromkeys(p for _, p, _ in chosen):
+        found = [s for _, p, s in chosen if p == place]
+        every = [s for _, p, s in free if p == place][:SECOND]
+        pool += _singles(at, place, found, every)
+    pool.sort(key=lambda f: -f.gain)
+    base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), rare
+    out = [_proposal(at, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
+    for place in dict.fromkeys(f.place for f in pool):
+        out += _sums(at, place, [f for f in pool if f.place == place], base)
+    out.sort(key=lambda p: -p.score)
+    return _distinct([*_simplest(out), *out])[:PROPOSALS], at
+
+
+def _free(at: Tracked, place: Place, s: Signal) -> float:
+    """Return the promised gain of a free function of a signal.
+
+    Each piece costs half a log of the rows."""
+    values = [along(s, run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+    knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
+    x = at.columns(place, [pieces(v, knots) for v in values])
+    return _promise(at, x)[0] - 0.5 * len(knots) * float(np.log(len(at.target)))
+
+
+def along(s: Signal, run: Mapping[str, np.ndarray | float], t: np.ndarray) -> np.ndarray:
+    """Return a signal along a trajectory."""
+    return np.broadcast_to(np.asarray(ex.evaluate(s.value, run), float), t.shape)
+
+
+def pieces(v: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """Return straight lines between the knots of a signal (N, knots): the columns of a free function."""
+    if len(knots) < 2:
+        return np.ones((len(v), 1))
+    return np.stack([np.interp(v, knots, row) for row in np.eye(len(knots))], axis=1)
+
+
+def _promise(at: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the gain in log likelihood of these columns at their best sizes, and the sizes."""
+    scale = np.linalg.norm(x, axis=0)
+    scale[scale == 0] = 1.0
+    c = np.linalg.lstsq(x / scale, at.target, rcond=1e-8)[0] / scale
+    return at.metric.log_likelihood(at.target - x @ c) - at.now, c
+
+
+def _singles(at: Tracked, place: Place, found: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
+    """Return every term at a place."""
+    tried = [t for t in terms(every, at.duration) if not t.signals or t.signals[0] in found]
+    still = at.columns(place, [np.ones((len(d.t), 1)) for d in at.metric.drives])
+    out = []
+    for k in range(0, len(tried), CHUNK):
+        part = tried[k : k + CHUNK]
+        flows = [
+            np.concatenate([t.values(run, d.t) for t in part], axis=1)
+            for run, d in zip(at.runs, at.metric.drives, strict=True)
+        ]
+        x = at.columns(place, flows)
+        column = 0
+        for t in part:
+            n = len(t.form.sizes)
+            own = x[:, column : column + n]
+            column += n
+            if np.all(np.abs(own) < HUGE) and np.any(own) and (not t.signals or not _alike(own, still)):
+                c = np.linalg.lstsq(own, at.target, rcond=1e-10)[0]
+                gain = float(at.target @ at.target - np.sum((at.target - own @ c) ** 2))
+                out.append(Found(gain, place, t, own))
+    return out
+
+
+def _alike(x: np.ndarray, y: np.ndarray) -> bool:
+    """Return whether single columns (rows, 1) point the same way."""
+    a, b = x / np.abs(x).max(), y / max(np.abs(y).max(), 1e-300)
+    return x.shape[1] == 1 and abs(float(a[:, 0] @ b[:, 0])) > ALIKE * float(
+        np.linalg.norm(a) * np.linalg.norm(b)
+    )
+
+
+def _varied(pool: Sequence[Found]) -> list[Found]:
+    """Return the best value of the shapes of each form over each signal at each place, at most POOL."""
+    best: dict[Any, Found] = {}
+    for f in pool:
+        best.setdefault((f.place, f.kind), f)
+    return list(best.values())[:POOL]
+
+
+def _proposal(
+    at: Tracked, place: Place, law: tuple[Term, ...], x: np.ndarray, base: tuple[float, float]
+) -> Proposal:
+    promise, c = _promise(at, x)
+    p = Proposal(place, law, tuple(map(float, c)), promise, *base)
+    dims = len(c) + p.shapes
+    return dataclasses.replace(p, promise=promise - 0.5 * dims * float(np.log(len(at.target))))
+
+
+def _sums(at: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, float]) -> list[Proposal]:
+    """Return sums of two and three terms at a place.
+
+    Each grows by what another term adds: from the best term, and from the best pairs. A pair may explain much
+    where each of its terms alone does not, because the plant's own parameters imitate it."""
+    starts = [([f.term], f.columns) for f in pool[:1]]
+    starts += [
+        ([a.term, b.term], np.concatenate([a.columns, b.columns], axis=1)) for a, b in _pairs(at, pool)
+    ]
+    out = []
+    for law, columns in starts:
+        if len(law) > 1:
+            out.append(_proposal(at, place, tuple(law), columns, base))
+        while len(law) < TERMS:
+            added = _added(at, law, columns, pool[:POOL])
+            if added is None:
+                break
+            law, columns = [*law, added.term], np.concatenate([columns, added.columns], axis=1)
+            out.append(_proposal(at, place, tuple(law), columns, base))
+    return out
+
+
+def _added(at: Tracked, law: Sequence[Term], columns: np.ndarray, pool: Sequence[Found]) -> Found | None:
+    """Return the term that explains most of what a sum of terms leaves."""
+    q, _ = np.linalg.qr(columns)
+    rest = at.target - q @ (q.T @ at.target)
+    best, most = None, 0.0
+    for f in pool:
+        own = f.columns - q @ (q.T @ f.columns)
+        if f.term in law or np.linalg.norm(own) < 1e-3 * np.linalg.norm(f.columns):
+            continue
+        c = np.linalg.lstsq(own, rest, rcond=1e-8)[0]
+        gain = float(rest @ rest - np.sum((rest - own @ c) ** 2))
+        if best is None or gain > most:
+            best, most = f, gain
+    return best
+
+
+def _pairs(at: Tracked, pool: Sequence[Found]) -> list[tuple[Found, Found]]:
+    """Return the pairs of terms that explain most together, one for each two forms and signals."""
+    single = [f for f in pool if f.columns.shape[1] == 1][:PAIRED]
+    if len(single) < len(("one", "other")):
+        return []
+    v = np.concatenate([f.columns for f in single], axis=1)
+    v = v / np.linalg.norm(v, axis=0)
+    g, c = v.T @ at.target, np.clip(v.T @ v, -ALIKE, ALIKE)
+    joint = (g[:, None] ** 2 + g[None] ** 2 - 2 * c * np.outer(g, g)) / (1 - c**2)
+    joint = np.triu(np.where(abs(c) < ALIKE, joint, 0.0), 1)
+    out: dict[Any, tuple[Found, Found]] = {}
+    for k in np.argsort(-joint, axis=None)[:LIKELY]:
+        a, b = (single[i] for i in np.unravel_index(k, joint.shape))
+        out.setdefault(frozenset((a.kind, b.kind)), (a, b))
+        if len(out) == PAIRS:
+            break
+    return list(out.values())
+
+
+def _simplest(found: Sequence[Proposal]) -> list[Proposal]:
+    """Return the best law of one term for each place and signal: the plant may follow a law but badly."""
+    best: dict[Any, Proposal] = {}
+    for p in found:
+        if len(p.terms) == len(p.terms[0].signals) == 1:
+            best.setdefault((p.place, p.terms[0].signals), p)
+    return list(best.values())[:SIMPLEST]
+
+
+def _distinct(found: Sequence[Proposal]) -> list[Proposal]:
+    """Return proposals whose forms, signals or places differ."""
+    out: dict[Any, Proposal] = {}
+    for p in found:
+        out.setdefault(p.kind, p)
+    return list(out.values())
