@@ -15,6 +15,8 @@ from thermoctl.plant.recordings import read_recordings
 
 LAW = [
     "expression",
+    "terms",
+    "memory",
     "variables",
     "parameters",
     "probability",

@@ -3,8 +3,8 @@
 1. `law_propose` proposes terms of the library at the places where a free function helps most.
 2. The best are refitted as a hypothesis like any other: same noise, remainder and evidence. The prior odds of
    a law fall with the number of places, signals and forms that it was chosen from.
-3. A law counts where it is no shape of the misfit that stays (`law_misfit`). Two things tell: how far it stands
-   out of that misfit, and how much error it removes from data that it was not fitted to."""
+3. A law counts where it is no shape of the misfit that stays (`law_misfit`). Two things tell: how far it
+   stands out of that misfit, and how much error it removes from data that it was not fitted to."""
 
 from __future__ import annotations
 
@@ -56,6 +56,11 @@ class Law:
     def placed(self) -> Placed:
         """The law among the effects of its hypothesis."""
         return self.fitted.hypothesis.effects[-1]
+
+    @property
+    def share(self) -> float:
+        """Its probability among the laws that fit about as well."""
+        return 1.0 - sum(share for _, _, share in self.rivals)
 
     @property
     def rate(self) -> ex.Expr:

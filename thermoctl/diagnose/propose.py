@@ -18,7 +18,7 @@ inputs' excursions are made smaller (SHARES)."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -26,9 +26,11 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.design import NONE, Excitation, Lever, Limits, family, levers
 from thermoctl.diagnose.experiment_file import FILES
 from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.law_result import described
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.plant.refit import Scale
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
@@ -54,6 +56,7 @@ IN_RANGE = (
 )
 WORTH_A_SENSOR = 0.1  # bits by which a further sensor must better the experiment
 
+Standing = tuple[Fitted, float, str]  # a fitted hypothesis, its probability, its name
 Prediction = tuple[np.ndarray, np.ndarray]  # readings (N, ny), and their uncertainty (N, ny, z)
 
 
@@ -81,7 +84,7 @@ class _Predictor:
         return (y, slopes) if np.all(np.isfinite(y)) and np.all(np.isfinite(slopes)) else None
 
 
-def _predictor(f: Fitted, weight: float) -> _Predictor:
+def _predictor(f: Fitted, weight: float, label: str) -> _Predictor:
     model = compile_plant(f.plant)
     found = f.fit
     covariance = np.linalg.pinv(found.hessian, hermitian=True)
@@ -101,8 +104,7 @@ def _predictor(f: Fitted, weight: float) -> _Predictor:
     P[np.diag_indices(nq)] = np.minimum(np.diag(P), 1.0)  # no parameter is more uncertain than its range
     values, vectors = np.linalg.eigh((P + P.T) / 2)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    label = " and ".join(f"{effect} at {where}" for effect, where in sorted(f.hypothesis.keys))
-    return _Predictor(label or "nothing missing", weight, model, root, slopes)
+    return _Predictor(label, weight, model, root, slopes)
 
 
 def distances(
@@ -160,12 +162,26 @@ def noise_of(case: Case, f: Fitted) -> np.ndarray:
     return np.array(out)
 
 
-def survivors(found: Diagnosis) -> list[tuple[Fitted, float]]:
-    """List the hypotheses with effects that are not ruled out, likeliest first, each with its probability."""
-    fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
-    likely = [(fits[keys], p) for keys, p in found.posterior.hypotheses.items() if keys]
+def survivors(found: Diagnosis) -> list[Standing]:
+    """List what is not ruled out, likeliest first: hypotheses with effects, or laws of the remainder.
+
+    Each has its probability and its name. The list is empty where nothing is undecided."""
+    if found.decision.verdict == "ambiguous":
+        fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
+        likely = [(fits[k], p, _effects(k)) for k, p in found.posterior.hypotheses.items() if k]
+    elif found.law:
+        likely = [
+            (f, share, described(p, f))
+            for p, f, share in ((found.law.proposal, found.law.fitted, found.law.share), *found.law.rivals)
+        ]
+    else:
+        return []
     likely.sort(key=lambda x: -x[1])
-    return [(f, p) for f, p in likely if p >= LIKELY * likely[0][1] and p > 0][:MOST]
+    return [x for x in likely if x[1] >= LIKELY * likely[0][1] and x[1] > 0][:MOST]
+
+
+def _effects(keys: Iterable[Key]) -> str:
+    return " and ".join(f"{effect} at {where}" for effect, where in sorted(keys))
 
 
 @dataclass(frozen=True)
@@ -187,9 +203,9 @@ class _Trial:
 class _Comparison:
     """The hypotheses of an undecided diagnosis, and what an experiment would tell between them."""
 
-    def __init__(self, case: Case, standing: Sequence[tuple[Fitted, float]], limits: Limits):
+    def __init__(self, case: Case, standing: Sequence[Standing], limits: Limits):
         self.case, self.limits = case, limits
-        self.predictors = [_predictor(f, p) for f, p in standing]
+        self.predictors = [_predictor(f, p, label) for f, p, label in standing]
         weights = np.array([b.weight for b in self.predictors])
         self.weights = weights / weights.sum()
         self.step = float(np.median(np.concatenate([np.diff(t.t) for t in case.tables])))
@@ -248,7 +264,8 @@ def propose(
 ) -> tuple[dict[str, Any], Excitation] | None:
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
 
-    None where the verdict is not `ambiguous`, one hypothesis stands alone, or nothing can be driven.
+    None where nothing is undecided or nothing can be driven. Undecided are the hypotheses of an `ambiguous`
+    verdict, else the laws of the remainder that fit about as well.
     `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
     case = found.case
     for n in limits:
@@ -258,7 +275,7 @@ def propose(
                 + ", ".join((*case.plant.inputs, *case.plant.outputs))
             )
     standing = survivors(found)
-    if found.decision.verdict != "ambiguous" or len(standing) < 2:
+    if len(standing) < 2:
         return None
     drive = levers(case.plant, case.tables, drivable, limits)
     if not drive:
