@@ -20,7 +20,7 @@ from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law import find_law
 from thermoctl.diagnose.law_forms import library
-from thermoctl.diagnose.law_misfit import odds_elsewhere
+from thermoctl.diagnose.law_misfit import misfit_odds
 from thermoctl.diagnose.law_propose import PROPOSALS
 from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable, refitted_law
 from thermoctl.diagnose.law_result import law_entry, law_section
@@ -105,10 +105,16 @@ def test_without_a_reserve_the_end_of_each_recording_tests_the_law(found):
 def test_error_on_data_that_it_was_not_fitted_to_speaks_for_or_against_a_law(found):
     _, known, law = found
     numbers, value = limits(), law.worth
+    parent = fitted(known, known.plant, (), known.null)
     worse = replace(value, after={o: 2 * r for o, r in value.refit_only.items()})
-    assert odds_elsewhere(known, value, numbers) > 10
-    assert odds_elsewhere(known, worse, numbers) == pytest.approx(-np.log(4) / (2 * numbers.alike))
-    assert odds_elsewhere(known, replace(value, after={}), numbers) == -np.inf
+    failed = replace(value, after={})
+
+    def odds(*test):
+        return misfit_odds(known, parent, law.fitted, law.proposal, numbers, *test)
+
+    assert odds(worse) - odds() == pytest.approx(-np.log(4) / (2 * numbers.alike), rel=1e-6)
+    assert odds(failed) == -np.inf
+    assert odds(worse, False) < 0 < odds(value, False)
 
 
 def test_an_experiment_separates_laws_that_fit_about_as_well(found):

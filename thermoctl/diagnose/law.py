@@ -18,7 +18,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, Placed
 from thermoctl.diagnose.held_out import Worth, worth
 from thermoctl.diagnose.law_curve import Curve, curve
-from thermoctl.diagnose.law_misfit import closed, fit_odds, held_back, odds_elsewhere
+from thermoctl.diagnose.law_misfit import closed, held_back, misfit_odds
 from thermoctl.diagnose.law_propose import Proposal, propose_laws
 from thermoctl.diagnose.law_refit import SIMPLER, affordable, at_bound, law_rate, refitted_law, simpler_law
 from thermoctl.diagnose.law_smooth import Tracked, flow_unit, tracked
@@ -82,30 +82,43 @@ def find_law(
     say("looking for a law of the remainder")
     try:
         if reserve:
-            return _chosen(case, parent, limits, reserve, say)
+            return _chosen(case, parent, limits, reserve, True, say)
         short, base, last = held_back(case, parent)
-        law = _chosen(short, base, limits, last, say)
+        law = _chosen(short, base, limits, last, False, say)
         return _refitted_to_all(case, parent, law) if law else None
     except (SimulationError, np.linalg.LinAlgError):
         return None
 
 
 def _chosen(
-    case: Case, parent: Fitted, limits: Limits, reserve: Sequence[Table], say: Callable[[str], None]
+    case: Case,
+    parent: Fitted,
+    limits: Limits,
+    reserve: Sequence[Table],
+    apart: bool,
+    say: Callable[[str], None],
 ) -> Law | None:
-    """Return the likeliest law of those refitted, if it is likely. Raises SimulationError."""
+    """Return the likeliest law of those refitted, if it is likely. Raises SimulationError.
+
+    `apart`: whether the reserve is other recordings."""
     proposals, at = propose_laws(case, parent, limits.rare)
     tried = _refits(case, parent, proposals, at, say)
     if not tried:
         return None
     gains = np.array([f.log_evidence - p.cost - parent.log_evidence for p, f in tried])
-    fits = np.array([fit_odds(case, parent, f, p, limits) for p, f in tried])
-    likely = np.argsort(-_both(gains / limits.temperature, fits), kind="stable")[:TESTED]
+    evidence = gains / limits.temperature
+    odds = _both(evidence, [misfit_odds(case, parent, f, p, limits) for p, f in tried])
+    likely = np.argsort(-odds, kind="stable")[:TESTED]
     values: list[Worth] = []
     for k in likely:
         values.append(worth(case, parent, tried[k][1], reserve, values[0] if values else None))
-    tests = np.array([odds_elsewhere(case, v, limits) for v in values])
-    odds = _both(gains[likely] / limits.temperature, fits[likely] + tests)
+    odds = _both(
+        evidence[likely],
+        [
+            misfit_odds(case, parent, tried[k][1], tried[k][0], limits, v, apart)
+            for k, v in zip(likely, values, strict=True)
+        ],
+    )
     best = int(np.argmax(odds))
     (p, f), value, gain = tried[likely[best]], values[best], float(gains[likely[best]])
     probability, shut = float(expit(odds[best])), closed(case, value)
@@ -120,9 +133,9 @@ def _chosen(
     return Law(p, f, gain, probability, value, shut, drawn, rivals, unit)
 
 
-def _both(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _both(one: np.ndarray, other: Sequence[float]) -> np.ndarray:
     """Return about the smaller of two log odds: those of two things that both have to hold."""
-    return -np.logaddexp(-one, -other)
+    return -np.logaddexp(-one, -np.array(other))
 
 
 def _refits(

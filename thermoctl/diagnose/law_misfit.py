@@ -5,9 +5,13 @@ another. So errors of the energy E have the likelihood
 
     integral of e^-n exp(-n E / (2 e^2)) de / e ~ E^(-n/2),   n = 1 / alike
 
-On data that it was not fitted to a law has no free parameter. There the odds that it describes the part that
-it claims are (E without it / E with it)^(n/2). They multiply the odds on the data of the fit. The prior
-odds bear the cost of the choice: a misfit has as many chances to look like a law as there are laws."""
+Another recording is another draw of the misfit. There a law that was fitted elsewhere has no free parameter.
+So the odds that it describes the part that it claims are (E without it / E with it)^(n/2). They multiply
+those on the data of the fit. The end of the same recording is no other draw, because slow errors go on. It
+only shows how much of the energy stays beside the law.
+
+The prior odds bear the cost of the choice. A misfit has as many chances to look like a law as there are
+laws."""
 
 from __future__ import annotations
 
@@ -28,6 +32,7 @@ from thermoctl.recording.table import Table
 
 CHOOSES = 2 / 3  # of each recording, where none is set aside; the rest tests the law
 CERTAIN = 1e9  # log odds that stand for certainty
+TINY = 1e-12  # least share of the energy that stays
 
 
 def held_back(case: Case, parent: Fitted) -> tuple[Case, Fitted, list[Table]]:
@@ -54,22 +59,37 @@ def _rows(t: Table, kept: np.ndarray) -> Table:
     return dataclasses.replace(t, t=t.t[kept], columns={k: v[kept] for k, v in t.columns.items()})
 
 
-def fit_odds(case: Case, parent: Fitted, law: Fitted, p: Proposal, limits: Limits) -> float:
-    """Return the log odds that a law is no shape of the misfit, from the data that it was fitted to."""
+def misfit_odds(
+    case: Case,
+    parent: Fitted,
+    law: Fitted,
+    p: Proposal,
+    limits: Limits,
+    test: Worth | None = None,
+    apart: bool = True,
+) -> float:
+    """Return the log odds that a law is no shape of the misfit.
+
+    `test`: errors on data that it was not fitted to; `apart`: whether these are other recordings."""
     searched = Searched((Weighed(law, 0.0), Weighed(parent, 0.0)), False)
     energy = energies(case, searched, limits)
     mine, rival = energy[law.hypothesis.keys], energy[parent.hypothesis.keys]
+    left, elsewhere = mine.misfit, 0.0
+    if test:
+        stays = _stays(case, test)
+        if apart:
+            elsewhere = -float(np.log(max(stays, TINY))) / (2 * limits.alike)
+        else:
+            left = max(left, rival.all * stays)
     dims = sum(len(t.form.sizes) + len(t.form.shapes) for t in p.terms)
-    sure = physics(rival.all - mine.all, mine.misfit, 1 - (1 - limits.alike) ** dims)
-    return min(float(logit(sure)), CERTAIN) - p.cost
+    sure = physics(rival.all - mine.all, left, 1 - (1 - limits.alike) ** dims)
+    return min(float(logit(sure)), CERTAIN) - p.cost + elsewhere
 
 
-def odds_elsewhere(case: Case, value: Worth, limits: Limits) -> float:
-    """Return the log odds from data that a law was not fitted to."""
-    before, after = _energies(case, value)
-    if not 0 < after < np.inf:
-        return -np.inf
-    return float(np.log(before / after)) / (2 * limits.alike)
+def _stays(case: Case, test: Worth) -> float:
+    """Return the share of the energy that stays with a law; infinite where the simulation failed."""
+    before, after = _energies(case, test)
+    return after / before if before > 0 else 1.0
 
 
 def closed(case: Case, value: Worth) -> float:

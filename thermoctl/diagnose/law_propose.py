@@ -27,7 +27,8 @@ PIECES = 8  # of a free function of a signal
 TRACKED = 20  # nodes with an unknown flow, those that explain the residual best: 24 knots each
 NODES = 4  # of a plant, at which a free flow in time explains most
 SECOND = 10  # signals of a place that may be the second one of a form
-COMBINATIONS = 12  # places and signals whose forms are tried
+RANKED, COMBINATIONS = 40, 12  # places and signals with the best free function; whose forms are tried
+SEEN = 1e-6  # of the strongest direction of a free function: weaker ones are rounding errors
 POOL = 60  # terms that a sum of terms is built from
 PAIRED = 600  # terms that are tried two at a time
 PAIRS, LIKELY = 8, 5000  # pairs from which sums grow; best pairs of values that they are looked for in
@@ -107,8 +108,7 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
     at = tracked(case, parent, nodes)
     likely = sorted(at.explained, key=lambda n: -at.explained[n])[:NODES]
     combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, at.runs)]
-    free = [(_free(at, p, s), p, s) for p, s in combos]
-    free.sort(key=lambda x: -x[0])
+    free = _ranked(at, combos)
     chosen = free[:COMBINATIONS]
     pool: list[Found] = []
     for place in dict.fromkeys(p for _, p, _ in chosen):
@@ -121,17 +121,33 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
     for place in dict.fromkeys(f.place for f in pool):
         out += _sums(at, place, [f for f in pool if f.place == place], base)
     out.sort(key=lambda p: -p.score)
-    return _distinct([*_simplest(out), *out])[:PROPOSALS], at
+    return _distinct([*out[:1], *_simplest(out), *out])[:PROPOSALS], at
 
 
-def _free(at: Tracked, place: Place, s: Signal) -> float:
-    """Return the promised gain of a free function of a signal.
+def _ranked(at: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
+    """Return the promised gain of a free function of a signal at a place, the best first.
 
-    Each piece costs half a log of the rows."""
-    values = [along(s, run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
-    knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
-    x = at.columns(place, [pieces(v, knots) for v in values])
-    return _promise(at, x)[0] - 0.5 * len(knots) * float(np.log(len(at.target)))
+    Each piece costs half a log of the rows. Only the RANKED with the largest gain in energy are returned: the
+    gain in likelihood takes longer."""
+    found = []
+    for place, s in combos:
+        values = [along(s, run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+        knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
+        x = at.columns(place, [pieces(v, knots) for v in values])
+        found.append((_energy(x, at.target), place, s, x))
+    found.sort(key=lambda f: -f[0])
+    out = [
+        (_promise(at, x)[0] - 0.5 * x.shape[1] * float(np.log(len(at.target))), place, s)
+        for _, place, s, x in found[:RANKED]
+    ]
+    return sorted(out, key=lambda f: -f[0])
+
+
+def _energy(x: np.ndarray, target: np.ndarray) -> float:
+    """Return the energy of the target that columns explain."""
+    scale = np.linalg.norm(x, axis=0)
+    u, w, _ = np.linalg.svd(x / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    return float(np.sum((u[:, w > SEEN * max(w[0], 1e-300)].T @ target) ** 2))
 
 
 def along(s: Signal, run: Mapping[str, np.ndarray | float], t: np.ndarray) -> np.ndarray:
