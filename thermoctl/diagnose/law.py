@@ -4,7 +4,8 @@
 2. The best are refitted as a hypothesis like any other: same noise, remainder and evidence. The prior odds of
    a law fall with the number of places, signals and forms that it was chosen from.
 3. A law counts where it is no shape of the misfit that stays (`law_misfit`). Two things tell: how far it
-   stands out of that misfit, and how much error it removes from data that it was not fitted to."""
+   stands out of that misfit, and how much error it removes from data that it was not fitted to.
+4. Of the laws that count, the evidence decides."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
 
-TESTED = 6  # likeliest laws, on data that they were not fitted to
+TESTED = 8  # likeliest laws, on data that they were not fitted to
 
 Tried = tuple[Proposal, Fitted]
 
@@ -98,7 +99,7 @@ def _chosen(
     apart: bool,
     say: Callable[[str], None],
 ) -> Law | None:
-    """Return the likeliest law of those refitted, if it is likely. Raises SimulationError.
+    """Return the law with the largest evidence of those that count. Raises SimulationError.
 
     `apart`: whether the reserve is other recordings."""
     proposals, at = propose_laws(case, parent, limits.rare)
@@ -119,18 +120,22 @@ def _chosen(
             for k, v in zip(likely, values, strict=True)
         ],
     )
-    best = int(np.argmax(odds))
-    (p, f), value, gain = tried[likely[best]], values[best], float(gains[likely[best]])
-    probability, shut = float(expit(odds[best])), closed(case, value)
-    if probability < limits.name or shut <= 0:
+    sure, shut = expit(odds), np.array([closed(case, v) for v in values])
+    counts = np.flatnonzero((sure >= limits.name) & (shut > 0))
+    if not len(counts):
         return None
+    share = softmax(evidence[likely[counts]])
+    order = counts[np.argsort(-share, kind="stable")]
+    best = int(order[0])
+    p, f = tried[likely[best]]
     rivals = tuple(
         (*tried[likely[k]], float(s))
-        for k, s in sorted(enumerate(softmax(odds)), key=lambda x: -x[1])
-        if k != best and s > 1 - limits.set
+        for k, s in zip(order[1:], np.sort(share)[::-1][1:], strict=True)
+        if s > 1 - limits.set
     )
     drawn, unit = curve(at, p, law_rate(f), f.plant), flow_unit(case.plant, p.place.target)
-    return Law(p, f, gain, probability, value, shut, drawn, rivals, unit)
+    gain, probability, share_closed = float(gains[likely[best]]), float(sure[best]), float(shut[best])
+    return Law(p, f, gain, probability, values[best], share_closed, drawn, rivals, unit)
 
 
 def _both(one: np.ndarray, other: Sequence[float]) -> np.ndarray:

@@ -32,7 +32,7 @@ SEEN = 1e-6  # of the strongest direction of a free function: weaker ones are ro
 POOL = 60  # terms that a sum of terms is built from
 PAIRED = 600  # terms that are tried two at a time
 PAIRS, LIKELY = 8, 5000  # pairs from which sums grow; best pairs of values that they are looked for in
-PROPOSALS, SIMPLEST = 12, 4  # the best ones; of one term, each of another signal
+PROPOSALS, SINGLE, SIGNALS = 14, 5, 4  # the best; of one term; of one term, each of another signal
 TERMS = 3
 CHUNK = 256  # terms whose responses are computed at a time
 
@@ -121,7 +121,7 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
     for place in dict.fromkeys(f.place for f in pool):
         out += _sums(at, place, [f for f in pool if f.place == place], base)
     out.sort(key=lambda p: -p.score)
-    return _distinct([*out[:1], *_simplest(out), *out])[:PROPOSALS], at
+    return _mixed(out), at
 
 
 def _ranked(at: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
@@ -276,13 +276,17 @@ def _pairs(at: Tracked, pool: Sequence[Found]) -> list[tuple[Found, Found]]:
     return list(out.values())
 
 
-def _simplest(found: Sequence[Proposal]) -> list[Proposal]:
-    """Return the best law of one term for each place and signal: the plant may follow a law but badly."""
-    best: dict[Any, Proposal] = {}
-    for p in found:
-        if len(p.terms) == len(p.terms[0].signals) == 1:
-            best.setdefault((p.place, p.terms[0].signals), p)
-    return list(best.values())[:SIMPLEST]
+def _mixed(found: Sequence[Proposal]) -> list[Proposal]:
+    """Return laws to refit: the best, the best of one term, one of each signal, then the rest by score.
+
+    Sums promise more than they hold, and the plant may follow a law but badly."""
+    single = [p for p in found if len(p.terms) == 1]
+    signal: dict[Any, Proposal] = {}
+    for p in single:
+        if len(p.terms[0].signals) == 1:
+            signal.setdefault((p.place, p.terms[0].signals), p)
+    chosen = [*found[:1], *single[:SINGLE], *list(signal.values())[:SIGNALS], *found]
+    return _distinct(chosen)[:PROPOSALS]
 
 
 def _distinct(found: Sequence[Proposal]) -> list[Proposal]:
