@@ -80,6 +80,7 @@ def undecided_between(known, searched, hypotheses, verdict="ambiguous"):
         searched=searched,
         posterior=SimpleNamespace(hypotheses=dict.fromkeys(hypotheses, share)),
         decision=SimpleNamespace(verdict=verdict),
+        law=None,
     )
 
 
