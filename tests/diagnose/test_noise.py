@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from scipy.special import logsumexp
 
 from thermoctl.diagnose import noise as module
-from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.coordinates import Coordinates, transform
 from thermoctl.diagnose.noise import Averaged, Grid, averaged, grid
 from thermoctl.plant.simulate import Excitation
 
@@ -22,7 +22,7 @@ def banded(e: np.ndarray) -> tuple[list[Grid], list[np.ndarray]]:
     n = len(e)
     d = Excitation("run", np.arange(n) * 1.0, np.zeros((n, 0)), e[:, None], {}, np.zeros(0, np.intc))
     c = Coordinates([d])
-    return [grid(c, [0], SIGMA, SWING)], c.powers([c.transform(c.channels[0], e)])
+    return [grid(c, [0], SIGMA, SWING)], c.powers([transform(c.channels[0], e)])
 
 
 def likelihood(e: np.ndarray) -> Averaged:

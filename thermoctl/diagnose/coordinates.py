@@ -92,6 +92,15 @@ def quick(n: int) -> int:
     return next(m for m in range(n, 0, -1) if rest(m) == 1) if n > SHORT else n
 
 
+def transform(c: Channel, e: np.ndarray) -> np.ndarray:
+    """(N, ...) values of a channel's output at all samples as its rows (rows, ...)."""
+    part = e if len(c.index) == len(e) else e[c.index]
+    if c.block > 1:
+        whole = len(part) // c.block * c.block
+        part = part[:whole].reshape(-1, c.block, *part.shape[1:]).sum(axis=1) / np.sqrt(c.block)
+    return dct(part, axis=0, norm="ortho")[: c.rows]
+
+
 class Coordinates:
     """The rows of all outputs in all recordings."""
 
@@ -105,13 +114,9 @@ class Coordinates:
         found = sorted({c.output for c in self.channels})
         return {j: tuple(k for k, c in enumerate(self.channels) if c.output == j) for j in found}
 
-    def transform(self, c: Channel, e: np.ndarray) -> np.ndarray:
-        """(N, ...) values of a channel's output at all samples as its rows (rows, ...)."""
-        part = e if len(c.index) == len(e) else e[c.index]
-        if c.block > 1:
-            whole = len(part) // c.block * c.block
-            part = part[:whole].reshape(-1, c.block, *part.shape[1:]).sum(axis=1) / np.sqrt(c.block)
-        return dct(part, axis=0, norm="ortho")[: c.rows]
+    def of_recording(self, r: int) -> list[Channel]:
+        """Return the channels of a recording."""
+        return [c for c in self.channels if c.recording == r]
 
     def transposed(self, c: Channel, rows: np.ndarray, samples: int) -> np.ndarray:
         """Return the transpose of `transform`: rows (rows, k) of a channel as values (samples, k)."""

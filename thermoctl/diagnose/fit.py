@@ -6,7 +6,7 @@
 
 z: parameters of plant and effects, 0..1 in their ranges, and initial states in their standard deviations.
 The scale is logarithmic where a range spans a factor of three. log p(D | z) is averaged over noise and
-remainder (noise.py). Gauss-Newton steps find its maximum; with the weights E[1/V] their gradient is exact.
+remainder (noise.py). Its maximum is found in posterior.py.
 """
 
 from __future__ import annotations
@@ -14,62 +14,30 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 
 import numpy as np
 
-from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
-from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.coordinates import transform
 from thermoctl.diagnose.memory import Past, PlacedBefore
 from thermoctl.diagnose.noise import Averaged, Grid, averaged
+from thermoctl.diagnose.posterior import Hypothesis, Placed, Posterior, bounded_step, gaussian
 from thermoctl.plant import refit
-from thermoctl.plant.cores import each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
-from thermoctl.plant.residuals import HUGE, Evaluation
-from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.plant.residuals import Evaluation
+from thermoctl.plant.simulate import SimulationError
 
 SIGNIFICANT = 2.0  # standard deviations
-BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
 UNIFORM = 12.0  # precision of a uniform prior over 0..1
 PERIODS = 15.0  # times the range that a refit gives a period that it could have had (logarithms)
 DECADES = 4.0  # width of the log-uniform prior of an effect's size
 WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
-ROUNDS = 15  # largest number of Gauss-Newton steps
-LENGTHS = 1.0, 0.3, 0.1  # shares of a Newton step that are tried, in this order
 SHARE = 0.01  # of an effect's size, from which the first step towards it is taken
-FAR = 8.0  # standard deviations that a start may be off
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
 MOST = 0.9  # of a curvature that not knowing the spectrum may take
-ENOUGH = 0.05  # gain in the log posterior, below which no further step is taken
 LOG_2PI = float(np.log(2 * np.pi))
-
-
-@dataclass(frozen=True)
-class Placed:
-    """An effect at a place, and the parameters that it adds to the plant."""
-
-    candidate: Candidate
-    own: Mapping[str, str]  # its parameter: the plant's name
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """Return (name of the effect, name of its place): the key of the placed effect."""
-        return self.candidate.key
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """The placed effects that are assumed to be missing. Every hypothesis holds a remainder besides."""
-
-    effects: tuple[Placed, ...] = ()
-
-    @property
-    def keys(self) -> frozenset[tuple[str, str]]:
-        """The (effect, where) of each."""
-        return frozenset(e.key for e in self.effects)
 
 
 @dataclass(frozen=True)
@@ -136,214 +104,6 @@ def _near_null(f: Fitted, e: Placed, p: EffectParameter) -> bool:
     """Return whether a parameter is within SIGNIFICANT sd of the value at which it changes nothing."""
     own = e.own[p.name]
     return abs(f.plant.parameters[own].value - p.null) < SIGNIFICANT * f.sd[own]
-
-
-class Posterior:
-    """The log posterior of one hypothesis' parameters, and its Gauss-Newton steps."""
-
-    def __init__(self, case: Case, plant: Plant, effects: Sequence[Placed]):
-        self.case, self.plant, self.effects = case, plant, effects
-        self.model = compile_plant(plant)
-        self.drives = case.drives(self.model)
-        for d in self.drives:
-            self.model.prepare(d)
-        self.problem = Problem(self.model, self.drives, case.noise)
-        self.amplitudes, self.mean, precision = _priors(case, self.problem, effects)
-        self.past = case.memory.of(frozenset(e.key for e in effects), plant)
-        place = {q: k for k, (q, r) in enumerate(self.problem.unknowns) if r is None}
-        self.shared = np.array([place[q] for q in self.past.unknowns], int)
-        self.mean[self.shared], precision[self.shared] = self.past.z, 0.0
-        self.precision = np.diag(precision)
-        self.precision[np.ix_(self.shared, self.shared)] = self.past.precision
-        beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
-        self.problem.priors = tuple(beliefs)
-        self.kept: tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]] | None = None
-
-    def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """(N, outputs, ...) of each recording as rows of each channel."""
-        c: Coordinates = self.case.coordinates
-        return [c.transform(k, e[k.recording][:, k.output]) for k in c.channels]
-
-    def likelihood(self, rows: Sequence[np.ndarray]) -> tuple[Averaged, list[np.ndarray]]:
-        """The averaged likelihood of residuals' rows, and their powers."""
-        powers = self.case.coordinates.powers(rows)
-        return averaged(self.case.grids, powers), powers
-
-    def errors(self, z: np.ndarray) -> list[np.ndarray]:
-        """Free-run errors. Raises SimulationError."""
-        values, dx0 = self.problem.unpack(z)
-        out = each(
-            lambda r: self.drives[r].y - self.model.run(self.drives[r], values[r], dx0[r]).y,
-            range(len(self.drives)),
-            self.problem.numbers,
-        )
-        self._check(out)
-        return out
-
-    def _check(self, errors: Sequence[np.ndarray]) -> None:
-        if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(errors, self.drives, strict=True)):
-            raise SimulationError("the simulation gives values that are not numbers")
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Between which the unknowns lie."""
-        n, m = self.problem.n_parameters, len(self.problem.unknowns)
-        return np.concatenate([np.zeros(n), np.full(m - n, -FAR)]), np.concatenate(
-            [np.ones(n), np.full(m - n, FAR)]
-        )
-
-    def prior(self, z: np.ndarray) -> float:
-        """Return the log prior of the unknowns `z`, without the Gaussians' normalisation.
-
-        It is the sum of the Gaussian priors and of the priors that the catalogue's entries state."""
-        values, _ = self.problem.unpack(z)
-        return (
-            -0.5 * float((z - self.mean) @ self.precision @ (z - self.mean))
-            - 0.5 * self.problem.prior_terms(values, False)[0]
-        )
-
-    def slopes(self, z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return each channel's unknowns (k,), and the slopes of its rows by them (rows, k).
-
-        The result is kept for the next call with the same z."""
-        if self.kept is None or not np.array_equal(self.kept[0], z):
-            self.errors_and_slopes(z)
-        assert self.kept is not None
-        return self.kept[1]
-
-    def errors_and_slopes(self, z: np.ndarray) -> list[np.ndarray]:
-        """Free-run errors; `slopes` are kept. One run costs less than two. Raises SimulationError."""
-        by_recording = {
-            r: list(channels)
-            for r, channels in groupby(self.case.coordinates.channels, lambda c: c.recording)
-        }
-
-        def part(r: int) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-            unknown, y, jac = self.problem.jacobian(z, r)
-            rows = [self.case.coordinates.transform(c, jac[:, c.output]) for c in by_recording.get(r, ())]
-            return self.drives[r].y - y, [(unknown, x) for x in rows]
-
-        parts = each(part, range(len(self.drives)), 2 * self.problem.numbers)
-        errors, found = [e for e, _ in parts], [x for _, rows in parts for x in rows]
-        self._check(errors)
-        self.kept = z.copy(), found
-        return errors
-
-    def slope(
-        self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient of the log posterior, and minus its second derivative."""
-        n = len(z)
-        gradient, matrix = np.zeros(n), np.zeros((n, n))
-        for c, (unknown, jac), weight, row in zip(
-            self.case.coordinates.channels, self.slopes(z), inverse, rows, strict=True
-        ):
-            w = np.sqrt(weight[c.band])
-            j = jac * w[:, None]
-            gradient[unknown] += j.T @ (w * row)
-            matrix[np.ix_(unknown, unknown)] += j.T @ j
-        values, _ = self.problem.unpack(z)
-        _, push, bend = self.problem.prior_terms(values, True)
-        return gradient - self.precision @ (z - self.mean) - push, matrix + self.precision + bend
-
-    def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
-        """Return E[1/V] J'J minus the curvature: the gradient's variance over the unknown V (Louis 1982)."""
-        out = np.zeros((len(z), len(z)))
-        jacobians = self.slopes(z)
-        for g, unsure in zip(self.case.grids, average.unsure, strict=True):
-            pull = np.zeros((len(unsure), len(z)))
-            at = 0
-            for k in g.channels:
-                c = self.case.coordinates.channels[k]
-                unknown, jac = jacobians[k]
-                node = g.node[at : at + len(c.count)]
-                at += len(c.count)
-                starts = np.cumsum(c.count) - c.count
-                by_band = np.add.reduceat(jac * rows[k][:, None], starts, axis=0)
-                np.add.at(pull, np.ix_(node, unknown), by_band)  # two bands may share a node
-            out += pull.T @ unsure @ pull
-        return out
-
-    def climb(
-        self, z: np.ndarray, goal: float
-    ) -> tuple[np.ndarray, Averaged, list[np.ndarray], np.ndarray, list[np.ndarray]]:
-        """Return z, likelihood, powers, H and errors at the maximum near z.
-
-        Stop early if `goal` is out of reach."""
-        low, high = self.bounds()
-        errors = self.errors_and_slopes(z)
-        rows = self.rows(errors)
-        now, powers = self.likelihood(rows)
-        gradient, matrix = self.slope(z, rows, now.inverse)
-        for left in range(ROUNDS, 0, -1):
-            base = now.log_likelihood + self.prior(z)
-            step, gained, here = _step(z, gradient, matrix, low, high), 0.0, self.kept
-            for length in LENGTHS:
-                trial = np.clip(z + length * step, low, high)
-                try:
-                    at_once = self.problem.few and length == LENGTHS[0]
-                    e = self.errors_and_slopes(trial) if at_once else self.errors(trial)
-                except SimulationError:
-                    continue
-                trial_rows = self.rows(e)
-                then, trial_powers = self.likelihood(trial_rows)
-                gained = then.log_likelihood + self.prior(trial) - base
-                if gained > 0:
-                    z, errors, rows, now, powers = trial, e, trial_rows, then, trial_powers
-                    gradient, matrix = self.slope(z, rows, now.inverse)
-                    break
-                self.kept = here
-            if gained < ENOUGH or now.log_likelihood + left * gained < goal:
-                break
-        return z, now, powers, matrix, errors
-
-
-def _step(
-    z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Return Newton's step inside the bounds; a coordinate that reaches its bound stays there."""
-    free = ~(((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0)))
-    step = np.zeros_like(z)
-    for _ in range(len(z)):
-        index = np.flatnonzero(free)
-        if not len(index):
-            break
-        rest = np.flatnonzero(~free)
-        right = gradient[index] - matrix[np.ix_(index, rest)] @ step[rest]
-        step[index] = np.linalg.solve(
-            matrix[np.ix_(index, index)] + 1e-9 * np.diag(np.diag(matrix)[index]), right
-        )
-        out = index[
-            (z[index] + step[index] < low[index] - 1e-12) | (z[index] + step[index] > high[index] + 1e-12)
-        ]
-        if not len(out):
-            break
-        step[out] = np.clip(z[out] + step[out], low[out], high[out]) - z[out]
-        free[out] = False
-    return step
-
-
-def _priors(
-    case: Case, problem: Problem, effects: Sequence[Placed]
-) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
-    """Which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian."""
-    mean, precision = problem.z_plant.copy(), np.ones(len(problem.unknowns))
-    own = {
-        e.own[p.name]: (e.candidate, p)
-        for e in effects
-        for p in e.candidate.effect.parameters
-        if p.name in e.own
-    }
-    sizes = {}
-    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
-        precision[k] = BELIEF**-2
-        if q in own:
-            c, p = own[q]
-            mean[k], precision[k] = 0.5, 1e-6 if c.effect.prior is not None else 1e-4
-            if p.amplitude:
-                sizes[k] = own[q]
-        elif q in case.plant.parameters:
-            mean[k] = problem.scales[q].z(case.plant.parameters[q].value)
-    return sizes, mean, precision
 
 
 def fitted(
@@ -426,7 +186,7 @@ def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np
         slope[k] = scale.slope(at[k])
         low[k], high[k] = (scale.low - at[k]) / slope[k], (scale.high - at[k]) / slope[k]
     zero = np.zeros(len(free))
-    step = _step(zero, now.gradient[free], now.matrix[np.ix_(free, free)], low[free], high[free])
+    step = bounded_step(zero, now.gradient[free], now.matrix[np.ix_(free, free)], low[free], high[free])
     out = z.copy()
     for k, change in zip(free, step, strict=True):
         if k < problem.n_parameters:
@@ -451,7 +211,7 @@ def _weighed(
     problem = posterior.problem
     values, dx0 = problem.unpack(z)
     own = np.ones(len(z), bool)
-    own[_gaussian(posterior)] = False
+    own[gaussian(posterior)] = False
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
     confined = _relieved(confined, posterior.relief(z, posterior.rows(errors), average))
     inverse = np.linalg.pinv(confined, hermitian=True)
@@ -576,10 +336,7 @@ def _rms(f: Fitted, g: Grid) -> float:
 
 def as_refitted(case: Case, f: Fitted) -> Fitted:
     """The hypothesis as an ordinary refit in white noise leaves it, for comparison."""
-    rows = [
-        case.coordinates.transform(c, f.rough.residuals[c.recording][:, c.output])
-        for c in case.coordinates.channels
-    ]
+    rows = [transform(c, f.rough.residuals[c.recording][:, c.output]) for c in case.coordinates.channels]
     powers = case.coordinates.powers(rows)
     average = averaged(case.grids, powers)
     return dataclasses.replace(f, plant=f.rough_plant, fit=f.rough, powers=tuple(powers), average=average)
@@ -588,7 +345,7 @@ def as_refitted(case: Case, f: Fitted) -> Fitted:
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
     """Return log p(z): Gaussians, uniform shapes, and the effects' sizes with standard deviations `sd`."""
     values, _ = posterior.problem.unpack(z)
-    normal = _gaussian(posterior)
+    normal = gaussian(posterior)
     out = posterior.prior(z) + 0.5 * float(
         np.linalg.slogdet(posterior.precision[np.ix_(normal, normal)] / (2 * np.pi))[1]
     )
@@ -609,18 +366,24 @@ def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
     )
 
 
-def _gaussian(posterior: Posterior) -> np.ndarray:
-    """The unknowns whose prior is a Gaussian (those of effects have their own until recordings were seen)."""
-    names = {n for e in posterior.effects for n in e.own.values()}
-    return np.array(
-        [k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names or k in posterior.shared],
-        int,
-    )
-
-
 def _size(p: EffectParameter, value: float, sd: float) -> float:
     """Return the log prior density of an effect's size: log-uniform over DECADES decades.
 
     Below its standard deviation the density is nearly constant."""
     one_sided = p.low >= p.null or p.high <= p.null
     return -float(np.log(np.log(10.0) * DECADES * (1 if one_sided else 2) * np.hypot(value - p.null, sd)))
+
+
+__all__ = [
+    "Fitted",
+    "Hypothesis",
+    "Placed",
+    "Posterior",
+    "as_refitted",
+    "evidence_at",
+    "fitted",
+    "levels",
+    "over_noise",
+    "placed_before",
+    "remembered",
+]

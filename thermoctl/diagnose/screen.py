@@ -37,6 +37,7 @@ EPSILON = 1e-4  # amplitude at which a direction is taken
 CHUNK = 96
 EXACT = 4_000  # columns, up to which all are simulated
 ONSETS = 24  # onset times of the grid over the recordings
+ABSENT = 1e-6  # share of a sensitivity, below which others imitate it
 NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
 
 
@@ -77,7 +78,8 @@ class Metric:
 
     - `weight` (rows,): factor of each row that whitens it
     - `residual` (rows,): the residual, without what the plant's own parameters absorb
-    - `basis` (rows, k): orthonormal; the directions that the plant's own parameters absorb"""
+    - `own`: of each recording, orthonormal (rows, k): the directions that its own unknowns absorb
+    - `basis` (rows, k): orthonormal; the directions that the other parameters absorb besides"""
 
     fit: Fit
     model: Model
@@ -85,6 +87,7 @@ class Metric:
     runs: list[Simulation]
     weight: np.ndarray
     residual: np.ndarray
+    own: list[np.ndarray]
     basis: np.ndarray
 
     def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
@@ -97,7 +100,21 @@ class Metric:
 
     def project(self, d: np.ndarray) -> np.ndarray:
         """Return directions (rows, k) without the part that the plant's own parameters absorb."""
+        d = without(self.own, d)
         return d - self.basis @ (self.basis.T @ d)
+
+
+def without(own: Sequence[np.ndarray], d: np.ndarray) -> np.ndarray:
+    """Return rows (rows, ...) of all recordings without what each one's orthonormal basis spans."""
+    parts = np.split(d, np.cumsum([len(q) for q in own])[:-1])
+    return np.concatenate([x - q @ (q.T @ x) for q, x in zip(own, parts, strict=True)])
+
+
+def span(columns: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis (rows, k) of columns; parts below ABSENT of their `size` are left out."""
+    there = size > 0
+    u, s, _ = np.linalg.svd(columns[:, there] / size[there], full_matrices=False)
+    return u[:, s > ABSENT]
 
 
 # ------------------------------------------------------------------------------------------------- first-order changes
@@ -470,9 +487,8 @@ def score(
     scale = np.where(useful, np.sqrt(np.maximum(np.diag(m), 1e-300)), 1.0)
     sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
     coefficient = np.zeros(len(g))
-    coefficient[useful] = (
-        np.linalg.pinv(sub, rcond=1e-8, hermitian=True) @ (g[useful] / scale[useful]) / scale[useful]
-    )
+    inverse = 1 / sub if len(sub) == 1 else np.linalg.pinv(sub, rcond=1e-8, hermitian=True)
+    coefficient[useful] = inverse @ (g[useful] / scale[useful]) / scale[useful]
     shape, _ = columns[0].item[2]
     gain = float(g @ coefficient)
     if len(g) == 1 and not _possible(c, columns[0], float(coefficient[0])):

@@ -9,11 +9,11 @@ import numpy as np
 
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.coordinates import Coordinates, transform
 from thermoctl.diagnose.fit import Fitted, as_refitted, over_noise
 from thermoctl.diagnose.noise import Averaged, averaged, grid
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Direction, Metric, screen
+from thermoctl.diagnose.screen import Direction, Metric, screen, span, without
 from thermoctl.diagnose.sketch import likeliest
 from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
@@ -38,29 +38,23 @@ class Plain:
             for ks, g in zip(measured, case.grids, strict=True)
         ]
         self.runs, residual = [], []
-        self.sensitivities = np.zeros(
-            (sum(c.rows for c in self.coordinates.channels), len(self.problem.unknowns))
-        )
-        at = 0
+        self.sensitivities: list[np.ndarray] = []  # of each recording (rows, k), to `unknowns`
         for r, d in enumerate(self.drives):
             run = self.model.run(d, self.fit.values[r], self.fit.dx0[r], sensitivities=True, states=False)
             assert run.dy is not None
             self.runs.append(Simulation(run.t, run.x, run.y))
             residual.append(self.rows(r, d.y - run.y))
-            used = np.flatnonzero(self.problem.columns[r] >= 0)
-            block = self.rows(r, run.dy[:, :, used])
-            self.sensitivities[at : at + len(block), self.problem.columns[r, used]] = block
-            at += len(block)
+            self.sensitivities.append(self.rows(r, run.dy[:, :, self.problem.columns[r] >= 0]))
         self.residual = np.concatenate(residual)
+
+    def unknowns(self, r: int) -> np.ndarray:
+        """Return the unknowns of recording r."""
+        return self.problem.columns[r, self.problem.columns[r] >= 0]
 
     def rows(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to the DCT rows of all its channels."""
         return np.concatenate(
-            [
-                self.coordinates.transform(c, e[:, c.output])
-                for c in self.coordinates.channels
-                if c.recording == r
-            ]
+            [transform(c, e[:, c.output]) for c in self.coordinates.channels if c.recording == r]
         )
 
 
@@ -75,13 +69,31 @@ class Rows(Metric):
         self.drives, self.runs = plain.drives, plain.runs
         self.weights = _weights(plain.case, average, plain.coordinates, remainder)
         self.weight = np.concatenate(self.weights)
-        free = [k for k, (q, _) in enumerate(plain.problem.unknowns) if q not in self.fit.at_bound]
-        basis = plain.sensitivities[:, free] * self.weight[:, None]
-        size = np.linalg.norm(basis, axis=0)
-        u, s, _ = np.linalg.svd(basis[:, size > 0] / size[size > 0], full_matrices=False)
-        self.basis = u[:, s > 1e-6 * s[0]] if len(s) else u
+        self._absorb()
         self.residual = self.project(plain.residual * self.weight)
         self.now = self.log_likelihood(self.residual)
+
+    def _absorb(self) -> None:
+        """Set the bases of what the free unknowns absorb.
+
+        Initial states act in their own recording only: their bases are small, however many recordings."""
+        unknowns = self.plain.problem.unknowns
+        free = np.array([q not in self.fit.at_bound for q, _ in unknowns], bool)
+        shared = np.flatnonzero(free & np.array([of is None for _, of in unknowns], bool))
+        place = {int(k): at for at, k in enumerate(shared)}
+        self.own, common = [], []
+        edges = np.cumsum([len(s) for s in self.plain.sensitivities])[:-1]
+        for r, weight in enumerate(np.split(self.weight, edges)):
+            rows, ks = self.plain.sensitivities[r] * weight[:, None], self.plain.unknowns(r)
+            mine = rows[:, [bool(free[k]) and unknowns[k][1] is not None for k in ks]]
+            self.own.append(span(mine, np.linalg.norm(mine, axis=0)))
+            part = np.zeros((len(rows), len(shared)))
+            for c, k in enumerate(ks):
+                if int(k) in place:
+                    part[:, place[int(k)]] = rows[:, c]
+            common.append(part)
+        joined = np.concatenate(common)
+        self.basis = span(without(self.own, joined), np.linalg.norm(joined, axis=0))
 
     def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""

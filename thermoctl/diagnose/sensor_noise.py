@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table as Printed
 from scipy.optimize import minimize
 
-from thermoctl.diagnose.coordinates import Channel, Coordinates
+from thermoctl.diagnose.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnose.noise import spectrum
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant, SensorNoise
@@ -63,7 +63,7 @@ def learnt(plant: Plant, tables: Sequence[Table]) -> Plant:
         if counts[j] < LEAST:
             continue
         channels = [coordinates.channels[k] for k in ks]
-        rows = [coordinates.transform(c, found.residuals[c.recording][:, j]) for c in channels]
+        rows = [transform(c, found.residuals[c.recording][:, j]) for c in channels]
         powers = [_Powers(c, np.bincount(c.band, x * x)) for c, x in zip(channels, rows, strict=True)]
         o = outputs[model.outputs[j]]
         step = (o.resolution or 0.0) ** 2 / 12  # the rounding's own variance is stated apart

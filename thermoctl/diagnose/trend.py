@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import SIGNIFICANT, Fitted, Placed, Posterior
+from thermoctl.diagnose.fit import SIGNIFICANT, Fitted
+from thermoctl.diagnose.posterior import Placed, Posterior
 from thermoctl.recording.dates import begun, line
 from thermoctl.yamlfile import InputError
 
@@ -123,19 +124,16 @@ def _sizes(posterior: Posterior, f: Fitted, parameter: str) -> list[tuple[float,
     problem, z = posterior.problem, f.fit.z
     index = posterior.model.parameters.index(parameter)
     errors = posterior.errors(z)
-    rows, slopes = posterior.rows(errors), posterior.slopes(z)
-    inverse = posterior.likelihood(rows)[0].inverse
+    rows = posterior.rows(errors)
+    sums = posterior.sums(z, rows, posterior.likelihood(rows)[0].inverse)
     initial = np.arange(len(z)) >= problem.n_parameters
     prior = np.where(np.outer(initial, initial), posterior.precision, 0.0)
     out = []
     for r in range(len(posterior.drives)):
         gradient, matrix = prior @ (posterior.mean - z), prior.copy()
-        for k, c in enumerate(posterior.case.coordinates.channels):
-            if c.recording == r:
-                unknown, jac = slopes[k]
-                w = np.sqrt(inverse[k][c.band])[:, None]
-                gradient[unknown] += (jac * w).T @ (w[:, 0] * rows[k])
-                matrix[np.ix_(unknown, unknown)] += (jac * w).T @ (jac * w)
+        unknowns = sums[r].unknowns
+        gradient[unknowns] += sums[r].gradient
+        matrix[np.ix_(unknowns, unknowns)] += sums[r].matrix
         mine = [k for k, (q, of) in enumerate(problem.unknowns) if q == parameter and of in (None, r)]
         starts = [k for k, (q, of) in enumerate(problem.unknowns) if initial[k] and of == r]
         value = float(f.fit.values[r, index])

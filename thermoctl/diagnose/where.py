@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import idct
 
-from thermoctl.diagnose.coordinates import Coordinates, band_edges
+from thermoctl.diagnose.coordinates import Coordinates, band_edges, transform
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation, Model
@@ -127,7 +127,7 @@ def responses(
                 continue
             white[k] = np.zeros((len(nodes), len(c.count)))
             if dy is not None:
-                rows = coordinates.transform(c, dy[:, c.output]) ** 2
+                rows = transform(c, dy[:, c.output]) ** 2
                 mean = np.stack([np.bincount(c.band, column) for column in rows.T]) / c.count
                 white[k] = mean.reshape(len(nodes), FORCES, -1).sum(axis=1)
     span = max(float(d.t[-1] - d.t[0]) for d in drives)

@@ -1,15 +1,16 @@
-"""Recordings side by side on all cores: a plant's machine code and numpy's loops run outside Python's lock.
+"""Recordings side by side, on all cores or on the workers of a cluster.
 
-Results come in the order of the recordings and are summed in this order, so that they do not depend on the
-number of cores."""
+A plant's machine code and numpy's loops run outside Python's lock. Results come in the order of the
+recordings and are summed in this order. So they do not depend on the number of cores or workers."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar
 
 LEAST = (
     200_000  # numbers that a run computes, about a millisecond: less is not worth the way to another thread
@@ -36,3 +37,31 @@ def each(f: Callable[[T], R], items: Sequence[T], numbers: int) -> list[R]:
     if len(items) < 2 or numbers < LEAST or _cores() == 1:
         return [f(x) for x in items]
     return list(_pool(os.getpid()).map(f, items))
+
+
+class Workers(Protocol):
+    """Other processes that compute for this one."""
+
+    def hold(self, thing: Any) -> Any:
+        """Return a handle of an object that workers keep, so that it is sent once."""
+
+    def each(self, f: Callable[..., R], held: Sequence[Any], arguments: Sequence[tuple[Any, ...]]) -> list[R]:
+        """Return f(object, *arguments) of each handle."""
+
+
+_elsewhere: list[Workers] = []
+
+
+@contextmanager
+def elsewhere(workers: Workers) -> Iterator[None]:
+    """Compute on these workers what is computed by recording."""
+    _elsewhere.append(workers)
+    try:
+        yield
+    finally:
+        _elsewhere.remove(workers)
+
+
+def workers() -> Workers | None:
+    """Return the workers to compute on; None: this process."""
+    return _elsewhere[-1] if _elsewhere else None

@@ -76,6 +76,9 @@ class Expr:
     def __str__(self) -> str:
         return _text(self, 0)
 
+    def __reduce__(self) -> tuple[Any, ...]:  # in another process, too, an expression is one object
+        return _remade, (self.op, self.args, self.value)
+
 
 _INTERNED: dict[tuple[str, tuple[int, ...], Any], Expr] = {}
 
@@ -90,6 +93,10 @@ def make(op: str, *args: Expr, value: Any = None) -> Expr:
             _INTERNED.update({("num", (), 0.0): ZERO, ("num", (), 1.0): ONE})
         found = _INTERNED[key] = Expr(op, args, value)
     return found
+
+
+def _remade(op: str, args: tuple[Expr, ...], value: Any) -> Expr:
+    return make(op, *args, value=value)
 
 
 def num(value: float) -> Expr:

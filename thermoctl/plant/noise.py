@@ -63,7 +63,8 @@ class _Restricted:
     def __init__(self, found: Fit, excitations: Sequence[Excitation]):
         self.found = found
         self.problem = Problem(found.model, excitations, found.noise)
-        self.slopes = [self.problem.jacobian(found.z, r) for r in range(len(excitations))]
+        values, dx0 = self.problem.unpack(found.z)
+        self.slopes = [self.problem.jacobian(r, values[r], dx0[r]) for r in range(len(excitations))]
         self.prior = np.diag(self.problem.prior())
         self.moments = [self.moments_of(j, n) for j, n in enumerate(found.noise)]
 

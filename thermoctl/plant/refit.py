@@ -285,9 +285,10 @@ def _acceleration(
     """Return half the geodesic acceleration, or zeros if it is not small beside the step.
 
     The cost's valleys are curved, and a straight step leaves them (Transtrum & Sethna 2012, arXiv:1201.5885).
+    It needs the sensitivities of all recordings: zeros where they are too many to be kept.
     """
     out = np.zeros_like(step)
-    if len(free):
+    if len(free) and problem.keeps:
         sub = matrix[np.ix_(free, free)]
         weight = np.diag(sub)
         curvature = problem.curvature(z, step, kept)[free]

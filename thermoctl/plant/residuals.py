@@ -13,15 +13,16 @@ do not determine at the plant's value.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.signal import lfilter
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.cores import each
+from thermoctl.plant.cores import each, workers
 from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
 from thermoctl.yamlfile import InputError
@@ -36,6 +37,11 @@ MIN_DIFFERENCED = 4  # fewest samples of a recording for second differences
 # once (integrator.h). There a trial step, which succeeds nine times of ten, runs with them at once.
 FEW_UNKNOWNS = 16
 LOG_RATIO = 3.0  # a range that spans this factor is fitted on a log scale
+# Sensitivities of all recordings, up to which they are kept from one pass to the next (160 MB). Of more, each
+# recording's are summed and forgotten, and a refit's steps are straight (refit.py).
+KEPT = 20_000_000
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -170,6 +176,9 @@ class Problem:
         self.rows = [[_rows(d, j, n) for j, n in enumerate(self.noise)] for d in excitations]
         # computed in a run without sensitivities; with them, at least as many again
         self.numbers = sum(len(d.t) for d in excitations) * len(model.states) * (len(model.unknowns) + 1)
+        slopes = sum(d.y.size for d in excitations) * len(model.unknowns)
+        self.keeps = slopes <= KEPT  # may sensitivities be kept?
+        self.held: list[Any] = []  # handles of `alone`, for workers
         self.samples = sum(len(e[0]) for entry in self.rows for e in entry)
         if self.samples == 0:
             raise InputError("no recording has a column that an output of the plant reads; nothing to fit")
@@ -216,6 +225,7 @@ class Problem:
         """Return the same problem with another noise of output j."""
         other = copy.copy(self)
         other.noise = (*self.noise[:j], n, *self.noise[j + 1 :])
+        other.held = []
         other.rows = [
             [_rows(d, j, n) if k == j else q for k, q in enumerate(rows)]
             for d, rows in zip(self.excitations, self.rows, strict=True)
@@ -237,6 +247,30 @@ class Problem:
                 else:
                     dx0[r, c - len(self.model.active)] = z[k] * self.sigma0[k - self.n_parameters]
         return values, dx0
+
+    def alone(self, r: int) -> Problem:
+        """Return the problem of one recording, with the same numbers of the unknowns; it has no priors."""
+        other = copy.copy(self)
+        other.excitations, other.rows = [self.excitations[r]], [self.rows[r]]
+        other.columns, other.priors = self.columns[r : r + 1], ()
+        other.buffers, other.kept_buffers, other.held = {}, {}, []
+        return other
+
+    def each(
+        self, f: Callable[..., R], z: np.ndarray, arguments: Sequence[tuple[Any, ...]], size: int
+    ) -> list[R]:
+        """Return f(problem, r, values, dx0, *arguments[r]) at z of each recording r, here or by workers.
+
+        `size`: cost in runs without sensitivities. A worker has the problem of a recording `alone`, r = 0."""
+        values, dx0 = self.unpack(z)
+        recordings = range(len(self.excitations))
+        far = workers() if len(recordings) > 1 else None
+        if far is None:
+            return each(
+                lambda r: f(self, r, values[r], dx0[r], *arguments[r]), recordings, size * self.numbers
+            )
+        self.held = self.held or [far.hold(self.alone(r)) for r in recordings]
+        return far.each(f, self.held, [(0, values[r], dx0[r], *arguments[r]) for r in recordings])
 
     def whiten(self, r: int, j: int, e: np.ndarray) -> np.ndarray:
         """Return whitened rows (M, ...) of output j's errors (N, ...); missing samples are dropped."""
@@ -282,45 +316,48 @@ class Problem:
             [np.full(self.n_parameters, PRIOR_WEIGHT**2), np.ones(len(self.unknowns) - self.n_parameters)]
         )
 
-    def jacobian(self, z: np.ndarray, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def jacobian(
+        self, r: int, values: np.ndarray, dx0: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return recording r's unknowns (k,), its outputs (N, ny) and their slopes (N, ny, k)."""
-        values, dx0 = self.unpack(z)
-        run = self.model.run(self.excitations[r], values[r], dx0[r], sensitivities=True, states=False)
-        used, k, slope = self._slopes(r, values[r])
+        run = self.model.run(self.excitations[r], values, dx0, sensitivities=True, states=False)
+        used, k, slope = self._slopes(r, values)
         assert run.dy is not None
         return k, run.y, run.dy[:, :, used] * slope
+
+    def errors(self, r: int, values: np.ndarray, dx0: np.ndarray) -> np.ndarray:
+        """Return recording r's free-run errors (N, ny), NaN where nothing was measured."""
+        return self.excitations[r].y - self.model.run(self.excitations[r], values, dx0).y
 
     def evaluate(self, z: np.ndarray, jacobian: bool, keep: list[Rows] | None = None) -> Evaluation:
         """Evaluate the cost, and with `jacobian` its derivatives. Raises SimulationError.
 
-        The rows that `curvature` needs are appended to `keep`. The next evaluation with derivatives
-        overwrites them, unless `self.keep` is called."""
-        values, dx0 = self.unpack(z)
+        The rows that `curvature` needs are appended to `keep`, if they may be kept (`keeps`). The next
+        evaluation with derivatives overwrites them, unless `self.keep` is called."""
         cost, gradient, matrix = 0.0, np.zeros(len(z)), np.zeros((len(z), len(z)))
+        keeping = self.keeps and keep is not None
+        known = (jacobian, keeping, self.huber)
         residuals = []
-        parts = each(
-            lambda r: self._part(r, values[r], dx0[r], jacobian),
-            range(len(self.excitations)),
-            self.numbers * (jacobian + 1),
-        )
-        for part in parts:
+        for r, part in enumerate(self.each(Problem._part, z, [known] * len(self.excitations), jacobian + 1)):
             cost += part.cost
             residuals.append(part.residual)
             if keep is not None:
-                keep.extend(part.rows)
+                keep += [dataclasses.replace(rows, recording=r) for rows in part.rows]
             if jacobian:
                 np.add.at(gradient, part.unknowns, part.gradient)
                 matrix[np.ix_(part.unknowns, part.unknowns)] += part.matrix
-        prior_cost, prior_gradient, prior_matrix = self.prior_terms(values, jacobian)
+        prior_cost, prior_gradient, prior_matrix = self.prior_terms(self.unpack(z)[0], jacobian)
         weight, distance = self.prior(), z - self.z_plant
         cost = cost + prior_cost + float(np.sum(weight * distance**2))
         gradient = gradient + prior_gradient - weight * distance
         return Evaluation(cost, gradient, matrix + prior_matrix + np.diag(weight), residuals)
 
-    def _part(self, r: int, values: np.ndarray, dx0: np.ndarray, jacobian: bool) -> _Part:
+    def _part(
+        self, r: int, values: np.ndarray, dx0: np.ndarray, jacobian: bool, keeping: bool, huber: np.ndarray
+    ) -> _Part:
         """Return what one recording adds to an evaluation. Raises SimulationError."""
-        d = self.excitations[r]
-        run = self.model.run(d, values, dx0, sensitivities=jacobian, buffers=self.buffers, states=False)
+        d, buffers = self.excitations[r], self.buffers if self.keeps else {}
+        run = self.model.run(d, values, dx0, sensitivities=jacobian, buffers=buffers, states=False)
         if not np.all(np.abs(run.y) < HUGE):
             raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
         e, cost, kept = d.y - run.y, 0.0, []
@@ -330,14 +367,15 @@ class Problem:
             if not len(self.rows[r][j][0]):
                 continue
             w = self.whiten(r, j, e[:, j])
-            size, limit = np.abs(w), self.huber[j]
+            size, limit = np.abs(w), huber[j]
             cost += float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
             if run.dy is None:
                 continue
             weight = np.where(size <= limit, 1.0, limit / np.maximum(size, limit))
             dy = run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used]
             rows = self._weighted(r, j, k, slope, w, weight, dy)
-            kept.append(rows)
+            if keeping:
+                kept.append(rows)
             gradient += rows.slope * (rows.jac.T @ (rows.weight * rows.w))
             matrix += _gram(rows.jac, rows.weight) * np.outer(rows.slope, rows.slope)
         return _Part(cost, k, gradient, matrix, e, kept)
@@ -367,15 +405,7 @@ class Problem:
         """Return J' d2w/dh2 of the whitened residuals w(z + h step), by one more simulation.
 
         Raises SimulationError."""
-        values, dx0 = self.unpack(z + PROBE * step)
-        errors = each(
-            lambda r: (
-                self.excitations[r].y
-                - self.model.run(self.excitations[r], values[r], dx0[r], buffers=self.buffers).y
-            ),
-            range(len(self.excitations)),
-            self.numbers,
-        )
+        errors = self.each(Problem.errors, z + PROBE * step, [()] * len(self.excitations), 1)
         out = np.zeros(len(z))
         for rows in kept:
             r, j = rows.recording, rows.output

@@ -7,6 +7,7 @@ import dataclasses
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -111,6 +112,9 @@ class Model:
         self.unknowns = (*self.active, *(f"{n} at the start" for n in self.uncertain))
         self._initial = [n.initial for n in plant.nodes.values()]
         self._slots = [self.states.index(n) for n in self.uncertain]
+
+    def __reduce__(self) -> tuple[Any, ...]:  # another process compiles the plant itself
+        return compile_plant, (self.plant, self.active)
 
     # ------------------------------------------------------------------------------------------------ inputs
 

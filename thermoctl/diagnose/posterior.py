@@ -1,0 +1,324 @@
+"""The log posterior of one hypothesis' parameters, and its maximum.
+
+    log p(z | D) = log p(D | z) + log p(z) + constant
+
+log p(D | z) is averaged over noise and remainder (noise.py). Gauss-Newton steps find the maximum; with the
+weights E[1/V] their gradient is exact. Gradient and curvature are sums over recordings: one recording at a
+time is simulated, and its sums are added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.diagnose.candidates import Candidate
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.catalogue import EffectParameter
+from thermoctl.diagnose.coordinates import Channel, transform
+from thermoctl.diagnose.noise import Averaged, averaged
+from thermoctl.plant.language import Plant
+from thermoctl.plant.residuals import HUGE, Problem
+from thermoctl.plant.simulate import SimulationError, compile_plant
+
+BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
+ROUNDS = 15  # largest number of Gauss-Newton steps
+LENGTHS = 1.0, 0.3, 0.1  # shares of a Newton step that are tried, in this order
+FAR = 8.0  # standard deviations that a start may be off
+ENOUGH = 0.05  # gain in the log posterior, below which no further step is taken
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An effect at a place, and the parameters that it adds to the plant."""
+
+    candidate: Candidate
+    own: Mapping[str, str]  # its parameter: the plant's name
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Return (name of the effect, name of its place): the key of the placed effect."""
+        return self.candidate.key
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """The placed effects that are assumed to be missing. Every hypothesis holds a remainder besides."""
+
+    effects: tuple[Placed, ...] = ()
+
+    @property
+    def keys(self) -> frozenset[tuple[str, str]]:
+        """The (effect, where) of each."""
+        return frozenset(e.key for e in self.effects)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """One recording's share of gradient and curvature of the log likelihood, by its unknowns (k,).
+
+    - `gradient` (k,), `matrix` (k, k): J' E[1/V] R and J' E[1/V] J
+    - `by_band`: of each channel J' R in each band (bands, k)"""
+
+    unknowns: np.ndarray
+    gradient: np.ndarray
+    matrix: np.ndarray
+    by_band: list[np.ndarray]
+
+
+def _slopes(
+    problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, channels: Sequence[Channel]
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Return a recording's free-run errors, its unknowns (k,) and its channels' slopes (rows, k)."""
+    unknowns, y, jac = problem.jacobian(r, values, dx0)
+    return problem.excitations[r].y - y, unknowns, [transform(c, jac[:, c.output]) for c in channels]
+
+
+def _sums(
+    channels: Sequence[Channel],
+    unknowns: np.ndarray,
+    slopes: Iterable[np.ndarray],
+    rows: Sequence[np.ndarray],
+    inverse: Sequence[np.ndarray],
+) -> Sums:
+    """Return a recording's sums from its channels' slopes, residuals' rows and weights of bands."""
+    k = len(unknowns)
+    gradient, matrix, by_band = np.zeros(k), np.zeros((k, k)), []
+    for c, jac, row, weight in zip(channels, slopes, rows, inverse, strict=True):
+        w = np.sqrt(weight[c.band])
+        j = jac * w[:, None]
+        gradient += j.T @ (w * row)
+        matrix += j.T @ j
+        starts = np.cumsum(c.count) - c.count
+        by_band.append(np.add.reduceat(jac * row[:, None], starts, axis=0))
+    return Sums(unknowns, gradient, matrix, by_band)
+
+
+def _simulated_sums(
+    problem: Problem,
+    r: int,
+    values: np.ndarray,
+    dx0: np.ndarray,
+    channels: Sequence[Channel],
+    rows: Sequence[np.ndarray],
+    inverse: Sequence[np.ndarray],
+) -> Sums:
+    """Return a recording's sums; its slopes are computed, and forgotten."""
+    unknowns, _, jac = problem.jacobian(r, values, dx0)
+    slopes = (transform(c, jac[:, c.output]) for c in channels)  # one at a time: a recording has megabytes
+    return _sums(channels, unknowns, slopes, rows, inverse)
+
+
+class Posterior:
+    """The log posterior of one hypothesis' parameters, and its Gauss-Newton steps."""
+
+    def __init__(self, case: Case, plant: Plant, effects: Sequence[Placed]):
+        self.case, self.plant, self.effects = case, plant, effects
+        self.model = compile_plant(plant)
+        self.drives = case.drives(self.model)
+        for d in self.drives:
+            self.model.prepare(d)
+        self.problem = Problem(self.model, self.drives, case.noise)
+        self.amplitudes, self.mean, precision = _priors(case, self.problem, effects)
+        self.past = case.memory.of(frozenset(e.key for e in effects), plant)
+        place = {q: k for k, (q, r) in enumerate(self.problem.unknowns) if r is None}
+        self.shared = np.array([place[q] for q in self.past.unknowns], int)
+        self.mean[self.shared], precision[self.shared] = self.past.z, 0.0
+        self.precision = np.diag(precision)
+        self.precision[np.ix_(self.shared, self.shared)] = self.past.precision
+        beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
+        self.problem.priors = tuple(beliefs)
+        coordinates = case.coordinates
+        self.channels = [coordinates.of_recording(r) for r in range(len(self.drives))]
+        # z, and each recording's unknowns and its channels' slopes (rows, k) there
+        self.kept: tuple[np.ndarray, list[tuple[np.ndarray, list[np.ndarray]]]] | None = None
+        self.newest: tuple[np.ndarray, Sequence[Sums]] | None = None
+
+    def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """(N, outputs, ...) of each recording as rows of each channel."""
+        return [transform(c, e[c.recording][:, c.output]) for c in self.case.coordinates.channels]
+
+    def likelihood(self, rows: Sequence[np.ndarray]) -> tuple[Averaged, list[np.ndarray]]:
+        """The averaged likelihood of residuals' rows, and their powers."""
+        powers = self.case.coordinates.powers(rows)
+        return averaged(self.case.grids, powers), powers
+
+    def errors(self, z: np.ndarray) -> list[np.ndarray]:
+        """Free-run errors. Raises SimulationError."""
+        return self._checked(self.problem.each(Problem.errors, z, [()] * len(self.drives), 1))
+
+    def _checked(self, errors: list[np.ndarray]) -> list[np.ndarray]:
+        if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(errors, self.drives, strict=True)):
+            raise SimulationError("the simulation gives values that are not numbers")
+        return errors
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Between which the unknowns lie."""
+        n, m = self.problem.n_parameters, len(self.problem.unknowns)
+        return np.concatenate([np.zeros(n), np.full(m - n, -FAR)]), np.concatenate(
+            [np.ones(n), np.full(m - n, FAR)]
+        )
+
+    def prior(self, z: np.ndarray) -> float:
+        """Return the log prior of the unknowns `z`, without the Gaussians' normalisation.
+
+        It is the sum of the Gaussian priors and of the priors that the catalogue's entries state."""
+        values, _ = self.problem.unpack(z)
+        return (
+            -0.5 * float((z - self.mean) @ self.precision @ (z - self.mean))
+            - 0.5 * self.problem.prior_terms(values, False)[0]
+        )
+
+    def errors_and_slopes(self, z: np.ndarray) -> list[np.ndarray]:
+        """Free-run errors; slopes are kept for `sums`, if they are not too many. Raises SimulationError.
+
+        One run costs less than two."""
+        if not self.problem.keeps:
+            return self.errors(z)
+        parts = self.problem.each(_slopes, z, [(c,) for c in self.channels], 2)
+        errors = self._checked([e for e, _, _ in parts])
+        self.kept = z.copy(), [(unknowns, slopes) for _, unknowns, slopes in parts]
+        return errors
+
+    def sums(
+        self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
+    ) -> Sequence[Sums]:
+        """Return what each recording adds to gradient and curvature.
+
+        `rows`, `inverse`: the residuals' rows at z and the weights of their bands, by channel."""
+        data, at = [], 0
+        for channels in self.channels:
+            end = at + len(channels)
+            data.append((rows[at:end], inverse[at:end]))
+            at = end
+        if not self.problem.keeps:
+            known = [(c, *d) for c, d in zip(self.channels, data, strict=True)]
+            return self.problem.each(_simulated_sums, z, known, 2)
+        if self.kept is None or not np.array_equal(self.kept[0], z):
+            self.errors_and_slopes(z)
+        assert self.kept is not None
+        return [_sums(c, *slopes, *d) for c, slopes, d in zip(self.channels, self.kept[1], data, strict=True)]
+
+    def slope(
+        self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient of the log posterior, and minus its second derivative."""
+        n = len(z)
+        gradient, matrix = np.zeros(n), np.zeros((n, n))
+        self.newest = z.copy(), self.sums(z, rows, inverse)
+        for s in self.newest[1]:
+            gradient[s.unknowns] += s.gradient
+            matrix[np.ix_(s.unknowns, s.unknowns)] += s.matrix
+        values, _ = self.problem.unpack(z)
+        _, push, bend = self.problem.prior_terms(values, True)
+        return gradient - self.precision @ (z - self.mean) - push, matrix + self.precision + bend
+
+    def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
+        """Return E[1/V] J'J minus the curvature: the gradient's variance over the unknown V (Louis 1982)."""
+        out = np.zeros((len(z), len(z)))
+        if self.newest is None or not np.array_equal(self.newest[0], z):
+            self.slope(z, rows, average.inverse)
+        assert self.newest is not None
+        by_band = [(s.unknowns, x) for s in self.newest[1] for x in s.by_band]
+        for g, unsure in zip(self.case.grids, average.unsure, strict=True):
+            pull = np.zeros((len(unsure), len(z)))
+            at = 0
+            for k in g.channels:
+                unknowns, x = by_band[k]
+                np.add.at(pull, np.ix_(g.node[at : at + len(x)], unknowns), x)  # two bands may share a node
+                at += len(x)
+            out += pull.T @ unsure @ pull
+        return out
+
+    def climb(
+        self, z: np.ndarray, goal: float
+    ) -> tuple[np.ndarray, Averaged, list[np.ndarray], np.ndarray, list[np.ndarray]]:
+        """Return z, likelihood, powers, H and errors at the maximum near z.
+
+        Stop early if `goal` is out of reach."""
+        low, high = self.bounds()
+        errors = self.errors_and_slopes(z)
+        rows = self.rows(errors)
+        now, powers = self.likelihood(rows)
+        gradient, matrix = self.slope(z, rows, now.inverse)
+        for left in range(ROUNDS, 0, -1):
+            base = now.log_likelihood + self.prior(z)
+            step, gained, here = bounded_step(z, gradient, matrix, low, high), 0.0, self.kept
+            for length in LENGTHS:
+                trial = np.clip(z + length * step, low, high)
+                try:
+                    at_once = self.problem.few and length == LENGTHS[0]
+                    e = self.errors_and_slopes(trial) if at_once else self.errors(trial)
+                except SimulationError:
+                    continue
+                trial_rows = self.rows(e)
+                then, trial_powers = self.likelihood(trial_rows)
+                gained = then.log_likelihood + self.prior(trial) - base
+                if gained > 0:
+                    z, errors, rows, now, powers = trial, e, trial_rows, then, trial_powers
+                    gradient, matrix = self.slope(z, rows, now.inverse)
+                    break
+                self.kept = here
+            if gained < ENOUGH or now.log_likelihood + left * gained < goal:
+                break
+        return z, now, powers, matrix, errors
+
+
+def bounded_step(
+    z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Return Newton's step inside the bounds; a coordinate that reaches its bound stays there."""
+    free = ~(((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0)))
+    step = np.zeros_like(z)
+    for _ in range(len(z)):
+        index = np.flatnonzero(free)
+        if not len(index):
+            break
+        rest = np.flatnonzero(~free)
+        right = gradient[index] - matrix[np.ix_(index, rest)] @ step[rest]
+        step[index] = np.linalg.solve(
+            matrix[np.ix_(index, index)] + 1e-9 * np.diag(np.diag(matrix)[index]), right
+        )
+        out = index[
+            (z[index] + step[index] < low[index] - 1e-12) | (z[index] + step[index] > high[index] + 1e-12)
+        ]
+        if not len(out):
+            break
+        step[out] = np.clip(z[out] + step[out], low[out], high[out]) - z[out]
+        free[out] = False
+    return step
+
+
+def _priors(
+    case: Case, problem: Problem, effects: Sequence[Placed]
+) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
+    """Which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian."""
+    mean, precision = problem.z_plant.copy(), np.ones(len(problem.unknowns))
+    own = {
+        e.own[p.name]: (e.candidate, p)
+        for e in effects
+        for p in e.candidate.effect.parameters
+        if p.name in e.own
+    }
+    sizes = {}
+    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
+        precision[k] = BELIEF**-2
+        if q in own:
+            c, p = own[q]
+            mean[k], precision[k] = 0.5, 1e-6 if c.effect.prior is not None else 1e-4
+            if p.amplitude:
+                sizes[k] = own[q]
+        elif q in case.plant.parameters:
+            mean[k] = problem.scales[q].z(case.plant.parameters[q].value)
+    return sizes, mean, precision
+
+
+def gaussian(posterior: Posterior) -> np.ndarray:
+    """The unknowns whose prior is a Gaussian (those of effects have their own until recordings were seen)."""
+    names = {n for e in posterior.effects for n in e.own.values()}
+    return np.array(
+        [k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names or k in posterior.shared],
+        int,
+    )
