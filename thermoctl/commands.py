@@ -627,7 +627,7 @@ _DIAGNOSIS = (
         _arg(
             "--scheduler",
             metavar="ADDRESS",
-            help="with folders: a Dask scheduler (tcp://...) that sees the same files",
+            help="a Dask scheduler (tcp://...): its workers compute by recording; with folders by rig, from the same files",
         ),
         _EFFECTS,
         _arg(

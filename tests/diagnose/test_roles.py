@@ -11,8 +11,8 @@ import yaml
 from tests.diagnose.changes import Rig, kelvin, milliwatt, names, order
 from thermoctl.diagnose.candidates import Candidate, candidates
 from thermoctl.diagnose.catalogue import catalogue
+from thermoctl.diagnose.overlay import Overlay, Trajectory
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Overlay, Trajectory
 from thermoctl.plant import from_plain, loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import compile_plant

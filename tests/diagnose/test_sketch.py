@@ -12,8 +12,9 @@ from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.fit import fitted
+from thermoctl.diagnose.overlay import Trajectory
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Trajectory, directions, groups_of, screen
+from thermoctl.diagnose.screen import directions, groups_of, screen
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 from thermoctl.diagnose.sketch import SKETCHES, likeliest, products
 from thermoctl.plant import load

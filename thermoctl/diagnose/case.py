@@ -14,6 +14,7 @@ from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.coordinates import Coordinates
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.noise import Grid, grid
+from thermoctl.diagnose.progress import Pace
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.rows import OUTLIER, Reduced, reduced
 from thermoctl.plant import expression as ex
@@ -26,14 +27,16 @@ from thermoctl.yamlfile import InputError
 LEAST = 40  # measured values of one output, below which nothing is decided
 ACCURATE = 1e-3  # local error of a simulation over noise / range of an output; at most LARGEST
 LARGEST = 1e-5
+LATER = 2.5  # refits after a later screening: mean of 26 diagnoses of real and shared rigs
 
 
 @dataclass
 class Budget:
     """Largest number of refits, and the number done. Counted, never timed: the same on every machine.
 
-    `planned`: number of refits after this step of the search; each step may plan more. `stopped`: does a
-    person want the result of what is done so far? `untried`: refits of promising hypotheses left out."""
+    `planned`: number of refits after this step of the search; each step may plan more. `later`: hypotheses
+    that the search may still extend; only the time left depends on it. `stopped`: does a person want the
+    result of what is done so far? `untried`: refits of promising hypotheses left out."""
 
     fits: int
     progress: Callable[[str], None] = lambda text: None
@@ -41,6 +44,8 @@ class Budget:
     fits_done: int = 0
     planned: int = 1
     untried: int = 0
+    later: int = 0
+    pace: Pace = field(default_factory=Pace)
 
     @property
     def spent(self) -> bool:
@@ -49,9 +54,23 @@ class Budget:
 
     def spend(self) -> None:
         """Count one refit, and report it."""
+        self.pace.enter("refit")
         self.fits_done += 1
         planned = min(max(self.planned, self.fits_done), self.fits)
-        self.progress(f"searching: refit {self.fits_done} of {planned} planned so far (at most {self.fits})")
+        left = self._left(planned - self.fits_done + 1, 0)
+        self.progress(
+            f"searching: refit {self.fits_done} of {planned} planned so far (at most {self.fits}){left}"
+        )
+
+    def screen(self) -> None:
+        """Report that a hypothesis is screened for effects."""
+        self.pace.enter("screening")
+        number = 1 + len(self.pace.spent.get("screening", ()))
+        self.progress(f"searching: screening {number}, after refit {self.fits_done}{self._left(LATER, 1)}")
+
+    def _left(self, refits: float, screenings: int) -> str:
+        planned = min(refits + LATER * self.later, self.fits - self.fits_done + 1)
+        return self.pace.told({"refit": planned, "screening": screenings + self.later})
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from thermoctl.diagnose.explain import explain
 from thermoctl.diagnose.law_result import save_effect
 from thermoctl.diagnose.resolve import resolve
 from thermoctl.diagnose.words import sentences, what_next
+from thermoctl.diagnose.workers import cluster
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.yamlfile import InputError, suggest
@@ -100,6 +101,7 @@ def diagnose(args: argparse.Namespace) -> int:
     if not args.recordings:
         raise InputError("no recording was given; one or more were expected, or --live")
 
+    run.writable(Path(args.out))
     plant = load(args.plant, args.map)
     given, found_before = checked(plant, args.recordings, args.time, args.columns)
     held_out, found_held = checked(plant, args.held_out or (), args.time, args.columns)
@@ -115,6 +117,7 @@ def diagnose(args: argparse.Namespace) -> int:
         with (
             contextlib.nullcontext() if args.quiet else StageReporter() as progress,
             on_interrupt() as stopped,
+            cluster(args.scheduler),
         ):
             return run.diagnose(
                 plant,

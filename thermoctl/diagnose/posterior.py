@@ -147,7 +147,7 @@ class Posterior:
 
     def errors(self, z: np.ndarray) -> list[np.ndarray]:
         """Free-run errors. Raises SimulationError."""
-        return self._checked(self.problem.each(Problem.errors, z, [()] * len(self.drives), 1))
+        return self._checked(self.problem.each(Problem.errors, self.problem.unpack(z), lambda r: (), 1))
 
     def _checked(self, errors: list[np.ndarray]) -> list[np.ndarray]:
         if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(errors, self.drives, strict=True)):
@@ -177,7 +177,7 @@ class Posterior:
         One run costs less than two."""
         if not self.problem.keeps:
             return self.errors(z)
-        parts = self.problem.each(_slopes, z, [(c,) for c in self.channels], 2)
+        parts = self.problem.each(_slopes, self.problem.unpack(z), lambda r: (self.channels[r],), 2)
         errors = self._checked([e for e, _, _ in parts])
         self.kept = z.copy(), [(unknowns, slopes) for _, unknowns, slopes in parts]
         return errors
@@ -194,8 +194,8 @@ class Posterior:
             data.append((rows[at:end], inverse[at:end]))
             at = end
         if not self.problem.keeps:
-            known = [(c, *d) for c, d in zip(self.channels, data, strict=True)]
-            return self.problem.each(_simulated_sums, z, known, 2)
+            point = self.problem.unpack(z)
+            return self.problem.each(_simulated_sums, point, lambda r: (self.channels[r], *data[r]), 2)
         if self.kept is None or not np.array_equal(self.kept[0], z):
             self.errors_and_slopes(z)
         assert self.kept is not None

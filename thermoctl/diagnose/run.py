@@ -65,7 +65,7 @@ def diagnose(
     Raises InputError for unusable inputs."""
     if not tables:
         raise InputError("no recording was given; one or more were expected")
-    started, folder = time.monotonic(), _writable(Path(out))
+    started, folder = time.monotonic(), writable(Path(out))
     named = _distinct([*tables, *held_out])
     chosen_on, reserve = named[: len(tables)], named[len(tables) :]
     before, sizes = memory.read(earlier, plant) if earlier else memory.Memory(), earlier_trends(earlier)
@@ -142,7 +142,7 @@ def diagnose_files(
     return diagnose(plant, read_recordings(plant, recordings), out, effects, read_recordings(plant, held_out))
 
 
-def _writable(folder: Path) -> Path:
+def writable(folder: Path) -> Path:
     """Return the folder of a result, if files can be written there; else InputError before the work."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: a file; a folder for the result was expected (--out)")

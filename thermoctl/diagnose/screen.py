@@ -25,19 +25,16 @@ from scipy.special import gammaincc
 
 from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.catalogue import EffectParameter
-from thermoctl.diagnose.rig import STRAIGHT, Rig
+from thermoctl.diagnose.metric import Metric, Pushed
+from thermoctl.diagnose.overlay import Overlay, Trajectory
+from thermoctl.diagnose.rig import Rig
 from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import expression as ex
-from thermoctl.plant.cores import each
-from thermoctl.plant.language import Node, Plant
-from thermoctl.plant.refit import Fit
-from thermoctl.plant.simulate import Excitation, Model, Simulation
 
 EPSILON = 1e-4  # amplitude at which a direction is taken
 CHUNK = 96
 EXACT = 4_000  # columns, up to which all are simulated
 ONSETS = 24  # onset times of the grid over the recordings
-ABSENT = 1e-6  # share of a sensitivity, below which others imitate it
 NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
 
 
@@ -71,190 +68,6 @@ def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
     return np.where(
         np.isfinite(value), value, -(gain - (dims - 2) * np.log(np.maximum(gain, 1.0))) / (2 * np.log(10))
     )
-
-
-class Metric:
-    """Whitened rows of a refitted hypothesis, as the screening needs them; a subclass fills them.
-
-    - `weight` (rows,): factor of each row that whitens it
-    - `residual` (rows,): the residual, without what the plant's own parameters absorb
-    - `own`: of each recording, orthonormal (rows, k): the directions that its own unknowns absorb
-    - `basis` (rows, k): orthonormal; the directions that the other parameters absorb besides"""
-
-    fit: Fit
-    model: Model
-    drives: list[Excitation]
-    runs: list[Simulation]
-    weight: np.ndarray
-    residual: np.ndarray
-    own: list[np.ndarray]
-    basis: np.ndarray
-
-    def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
-        """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
-        raise NotImplementedError
-
-    def spread(self, r: int, w: np.ndarray) -> np.ndarray:
-        """Return (N, outputs, k): the transpose of `unweighted`, of all rows (rows, k), for recording r."""
-        raise NotImplementedError
-
-    def project(self, d: np.ndarray) -> np.ndarray:
-        """Return directions (rows, k) without the part that the plant's own parameters absorb."""
-        d = without(self.own, d)
-        return d - self.basis @ (self.basis.T @ d)
-
-
-def without(own: Sequence[np.ndarray], d: np.ndarray) -> np.ndarray:
-    """Return rows (rows, ...) of all recordings without what each one's orthonormal basis spans."""
-    parts = np.split(d, np.cumsum([len(q) for q in own])[:-1])
-    return np.concatenate([x - q @ (q.T @ x) for q, x in zip(own, parts, strict=True)])
-
-
-def span(columns: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (rows, k) of columns; parts below ABSENT of their `size` are left out."""
-    there = size > 0
-    u, s, _ = np.linalg.svd(columns[:, there] / size[there], full_matrices=False)
-    return u[:, s > ABSENT]
-
-
-# ------------------------------------------------------------------------------------------------- first-order changes
-
-
-class Trajectory:
-    """The signals of one recording at the fit, for evaluating changed equations."""
-
-    def __init__(self, metric: Metric, rig: Rig, r: int):
-        d, run = metric.drives[r], metric.runs[r]
-        self.recording, self.drive, self.run = r, d, run
-        self.values: dict[str, np.ndarray | float] = {
-            **{c: _hold(rig.columns[r][c]) for c in rig.spare},
-            **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
-            **{i + STRAIGHT: u for i, u in zip(rig.plant.inputs, d.u.T, strict=False)},
-            **dict(zip(metric.model.parameters, map(float, metric.fit.values[r]), strict=True)),
-            **dict(zip(metric.model.states, run.x.T, strict=True)),
-            "t": d.t,
-            "pi": np.pi,
-        }
-        self.first = d.first
-        self.known: dict[int, np.ndarray] = {}
-        # inputs that hold, as they were until each sample
-        self.until = {
-            i: np.concatenate([u[:1], u[:-1]])
-            for i, u, linear in zip(rig.plant.inputs, d.u.T, d.linear, strict=False)
-            if not linear
-        }
-
-    def own(self, e: ex.Expr) -> np.ndarray:
-        """The value of an expression of the plant itself, computed once."""
-        if id(e) not in self.known:
-            self.known[id(e)] = self.value(e, {})
-        return self.known[id(e)]
-
-    def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
-        """The value of an expression along the trajectory."""
-        return np.broadcast_to(
-            np.asarray(ex.evaluate(e, {**self.values, **extra}), float), self.drive.t.shape
-        )
-
-
-def _hold(column: np.ndarray) -> np.ndarray:
-    good = np.isfinite(column)
-    index = np.maximum.accumulate(np.where(good, np.arange(len(column)), -1))
-    return column[np.where(index < 0, int(np.argmax(good)), index)]
-
-
-class Overlay:
-    """The changes of a plant by an extension: flows, storages, outputs, new nodes."""
-
-    def __init__(self, base: Plant, extended: Plant):
-        self.base, self.states = base, list(base.nodes)
-        self.new = [(n, _net(extended, k)) for k, n in extended.nodes.items() if k not in base.nodes]
-        self.flows = [
-            (f, old)
-            for f in extended.flows.values()
-            if (old := base.flows.get(f.name)) is None or old.rate is not f.rate
-        ]
-        self.storages = [
-            (n, extended.nodes[n.name].storage)
-            for n in base.nodes.values()
-            if extended.nodes[n.name].storage is not n.storage
-        ]
-        self.outputs = [
-            (j, o.value, extended.outputs[key].value)
-            for j, (key, o) in enumerate(base.outputs.items())
-            if extended.outputs[key].value is not o.value
-        ]
-
-    def changes(
-        self, values: Mapping[str, float], at: Trajectory
-    ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
-        """Return the changes along a trajectory: of slopes dx/dt by state, of outputs by output.
-
-        `values`: of the extension's parameters."""
-        base = self.base
-        extra: dict[str, np.ndarray | float] = {k: v for k, v in values.items()}
-        for n, net in self.new:
-            extra[n.name] = _new_node(n, net, extra, at)
-        touched: dict[str, list[tuple[np.ndarray, float]]] = {}
-        for f, old in self.flows:
-            delta = at.value(f.rate, extra) - (0.0 if old is None else at.own(old.rate))
-            for end, sign in ((f.source, -1.0), (f.target, 1.0)):
-                if end in base.nodes:
-                    touched.setdefault(end, []).append((delta, sign))  # type: ignore[arg-type]
-        slopes: dict[int, np.ndarray] = {}
-        for node, terms in touched.items():
-            total = sum(sign * delta for delta, sign in terms)
-            slopes[self.states.index(node)] = total / at.own(base.nodes[node].storage)
-        for n, storage in self.storages:
-            change = np.zeros(at.drive.t.shape)
-            for f in base.flows.values():
-                if n.name in (f.source, f.target):
-                    change += (1.0 if f.target == n.name else -1.0) * at.own(f.rate)
-            slopes[self.states.index(n.name)] = change / at.value(storage, extra) - change / at.value(
-                n.storage, extra
-            )
-        return slopes, {j: at.value(new, extra) - at.own(old) for j, old, new in self.outputs}
-
-
-def _net(plant: Plant, node: str) -> ex.Expr:
-    """Return what flows into a node, as one expression."""
-    net: ex.Expr = ex.ZERO
-    for f in plant.flows.values():
-        if f.target == node:
-            net = ex.add(net, f.rate)
-        if f.source == node:
-            net = ex.add(net, ex.neg(f.rate))
-    return net
-
-
-def _new_node(n: Node, net: ex.Expr, extra: Mapping[str, np.ndarray | float], at: Trajectory) -> np.ndarray:
-    """Integrate a new node alone along the trajectory: dn/dt = a - b n, a and b constant in a sample."""
-    node = n.name
-    first = {
-        **{k: float(np.asarray(v).flat[0]) for k, v in at.values.items()},
-        **{k: float(np.asarray(v).flat[0]) for k, v in extra.items()},
-    }
-    start = float(ex.evaluate(n.initial, first, lambda key: at.first[key]))
-    t = at.drive.t
-    storage = at.value(n.storage, extra)
-    b = -at.value(ex.derivative(net, node), {**extra, node: start}) / storage
-    a = at.value(net, {**extra, node: 0.0}) / storage
-    if not a.any() and not b.any():
-        return np.full(t.shape, start)
-    h = np.diff(t)
-    before = at.value(net, {**extra, **at.until, node: 0.0}) / storage if ex.names(net) & set(at.until) else a
-    mid_a, mid_b = 0.5 * (before[1:] + a[:-1]), np.maximum(0.5 * (b[1:] + b[:-1]), 0.0)
-    decay = np.exp(-mid_b * h)
-    gain = np.where(mid_b * h > 1e-9, -np.expm1(-mid_b * h) / np.maximum(mid_b, 1e-300), h) * mid_a
-    out = np.empty(len(t))
-    value = out[0] = start
-    for k, (c, g) in enumerate(zip(decay.tolist(), gain.tolist(), strict=True), 1):
-        value = value * c + g
-        out[k] = value
-    return out
-
-
-# ---------------------------------------------------------------------------------------------------------- screening
 
 
 @dataclass(frozen=True)
@@ -291,35 +104,31 @@ def directions(
     metric: Metric, at: Sequence[Trajectory], columns: Iterable[Column]
 ) -> Iterator[tuple[Sequence[Column], np.ndarray]]:
     """Yield rows (rows, k) of columns, not whitened, a chunk at a time."""
-    buffers: dict[str, np.ndarray] = {}
-    model, left = metric.model, iter(columns)
+    left = iter(columns)
     while part := list(itertools.islice(left, CHUNK)):
-        numbers = sum(len(d.t) for d in metric.drives) * len(model.states) * len(part)
-        yield part, np.concatenate(each(partial(_rows, metric, part, buffers), at, numbers))
+        yield part, metric.responses(partial(_pushed, part, at), len(part))
 
 
-def _rows(
-    metric: Metric, part: Sequence[Column], buffers: dict[str, np.ndarray], at: Trajectory
-) -> np.ndarray:
-    """Return the rows (rows, k) of columns in one recording, not whitened."""
-    d, r = at.drive, at.recording
+def _pushed(part: Sequence[Column], at: Sequence[Trajectory], r: int) -> Pushed:
+    """Return the first-order changes by columns in recording r."""
     forces: list[tuple[int, int]] = []
     values: list[np.ndarray] = []
-    outputs: list[dict[int, np.ndarray]] = []
+    changed: dict[tuple[int, int], np.ndarray] = {}
     for c, column in enumerate(part):
-        pushed, read = column.changes(at)
+        pushed, read = column.changes(at[r])
         forces += [(state, c) for state in pushed]
         values += pushed.values()
-        outputs.append(read)
-    if forces:
-        fit = (metric.fit.values[r], metric.fit.dx0[r])
-        dy = metric.model.respond(d, *fit, forces, np.stack(values, axis=1), len(part), buffers=buffers)
-    else:
-        dy = np.zeros((len(d.t), len(metric.model.outputs), len(part)))
-    for c, read in enumerate(outputs):
-        for j, delta in read.items():
-            dy[:, j, c] += delta
-    return metric.unweighted(r, dy)
+        changed |= {(j, c): delta for j, delta in read.items()}
+    return Pushed(forces, np.stack(values, axis=1) if values else np.zeros((0, 0)), changed)
+
+
+@dataclass(frozen=True)
+class Norms:
+    """A column that was simulated, the norm of its whitened rows, and that of their projection."""
+
+    column: Column
+    whole: float
+    left: float
 
 
 Select = Callable[[Sequence[Metric], Sequence[Trajectory], list["Group"]], list["Group"]]
@@ -331,16 +140,18 @@ def screen(
     found: Sequence[Candidate],
     edges: np.ndarray | None = None,
     select: Select = lambda metrics, at, groups: groups,
+    norms: list[Norms] | None = None,
 ) -> list[list[Direction]]:
     """Return every candidate's best direction, best first, in each of the metrics.
 
     The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid.
-    Of more than EXACT columns, `select` chooses the groups that are simulated (sketch.py)."""
+    Of more than EXACT columns, `select` chooses the groups that are simulated (sketch.py). `norms` receives
+    those of the first metric, if all columns are simulated."""
     first = metrics[0]
     at = [Trajectory(first, rig, r) for r in range(len(first.drives))]
     groups = [g for c in found for g in groups_of(c, first, edges)]
     if sum(len(g.sizes) for g in groups) > EXACT:
-        groups = select(metrics, at, groups)
+        groups, norms = select(metrics, at, groups), None
     best: list[dict[int, Direction]] = [{} for _ in metrics]
     pending: dict[tuple[Any, ...], list[Entry]] = {}
     columns = (column for g in groups for column in g.columns())
@@ -349,6 +160,9 @@ def screen(
             rows = plain * metric.weight[:, None]
             full = np.linalg.norm(rows, axis=0)
             rows = metric.project(rows)
+            if metric is first and norms is not None:
+                left = np.linalg.norm(rows, axis=0)
+                norms += [Norms(*n) for n in zip(part, map(float, full), map(float, left), strict=True)]
             for k, column in enumerate(part):
                 candidate, group, _, count = column.item
                 key = (id(metric), id(candidate), group)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.coordinates import Coordinates, transform
+from thermoctl.diagnose.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnose.fit import Fitted, as_refitted, over_noise
+from thermoctl.diagnose.metric import Metric, Pushed, span, without
 from thermoctl.diagnose.noise import Averaged, averaged, grid
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Direction, Metric, screen, span, without
+from thermoctl.diagnose.screen import Direction, Norms, screen
 from thermoctl.diagnose.sketch import likeliest
 from thermoctl.plant.refit import Problem
 from thermoctl.plant.simulate import Simulation
@@ -37,15 +39,12 @@ class Plain:
             grid(self.coordinates, ks, g.sigma, g.swing, g.sensor)
             for ks, g in zip(measured, case.grids, strict=True)
         ]
-        self.runs, residual = [], []
-        self.sensitivities: list[np.ndarray] = []  # of each recording (rows, k), to `unknowns`
-        for r, d in enumerate(self.drives):
-            run = self.model.run(d, self.fit.values[r], self.fit.dx0[r], sensitivities=True, states=False)
-            assert run.dy is not None
-            self.runs.append(Simulation(run.t, run.x, run.y))
-            residual.append(self.rows(r, d.y - run.y))
-            self.sensitivities.append(self.rows(r, run.dy[:, :, self.problem.columns[r] >= 0]))
-        self.residual = np.concatenate(residual)
+        self.channels = [self.coordinates.of_recording(r) for r in range(len(self.drives))]
+        self.point = self.fit.values, self.fit.dx0
+        found = self.problem.each(_sensitive, self.point, lambda r: (self.channels[r],), 2)
+        self.runs = [run for run, _, _ in found]
+        self.residual = np.concatenate([residual for _, residual, _ in found])
+        self.sensitivities = [rows for *_, rows in found]  # of each recording (rows, k), to `unknowns`
 
     def unknowns(self, r: int) -> np.ndarray:
         """Return the unknowns of recording r."""
@@ -53,9 +52,41 @@ class Plain:
 
     def rows(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to the DCT rows of all its channels."""
-        return np.concatenate(
-            [transform(c, e[:, c.output]) for c in self.coordinates.channels if c.recording == r]
-        )
+        return _rows(self.channels[r], e)
+
+
+def _rows(channels: Sequence[Channel], e: np.ndarray) -> np.ndarray:
+    return np.concatenate([transform(c, e[:, c.output]) for c in channels])
+
+
+def _sensitive(
+    problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, channels: Sequence[Channel]
+) -> tuple[Simulation, np.ndarray, np.ndarray]:
+    """Return a recording's run, and the rows of its residual and of its sensitivities."""
+    d = problem.excitations[r]
+    run = problem.model.run(d, values, dx0, sensitivities=True, states=False)
+    assert run.dy is not None
+    rows = _rows(channels, run.dy[:, :, problem.columns[r] >= 0])
+    return Simulation(run.t, run.x, run.y), _rows(channels, d.y - run.y), rows
+
+
+def _response(
+    problem: Problem,
+    r: int,
+    values: np.ndarray,
+    dx0: np.ndarray,
+    channels: Sequence[Channel],
+    pushed: Pushed,
+    count: int,
+) -> np.ndarray:
+    """Return the rows of a recording's responses (rows, count) to first-order changes."""
+    d, point = problem.excitations[r], (values, dx0)
+    dy = np.zeros((*d.y.shape, count))
+    if pushed.forces:
+        dy = problem.model.respond(d, *point, pushed.forces, pushed.q, count, buffers=problem.buffers)
+    for (j, c), delta in pushed.read.items():
+        dy[:, j, c] += delta
+    return _rows(channels, dy)
 
 
 class Rows(Metric):
@@ -98,6 +129,14 @@ class Rows(Metric):
     def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
         return self.plain.rows(r, e)
+
+    def responses(self, pushed: Callable[[int], Pushed], count: int) -> np.ndarray:
+        """Return the rows (rows, count), not whitened, of the responses in all recordings."""
+        plain = self.plain
+        size = 1 + count // (1 + len(self.model.unknowns))
+        return np.concatenate(
+            plain.problem.each(_response, plain.point, lambda r: (plain.channels[r], pushed(r), count), size)
+        )
 
     def spread(self, r: int, w: np.ndarray) -> np.ndarray:
         """Return (N, outputs, k): the transpose of `unweighted`, of all rows (rows, k), for recording r."""
@@ -151,7 +190,8 @@ class Screened:
 
     `energy`: the rows in the sensors' noise alone; `by_energy`: all directions by their gain there. Where the
     plant has a large error, a first-order step predicts log likelihood badly, and energy is the better
-    guide. Empty where the residual is about the noise."""
+    guide. Empty where the residual is about the noise. `norms`: of all columns, empty where not all were
+    simulated."""
 
     metric: Rows
     rig: Structure
@@ -159,6 +199,7 @@ class Screened:
     promises: list[float]
     energy: Rows | None
     by_energy: list[Direction]
+    norms: list[Norms]
 
 
 def screened(case: Case, fitted: Fitted, clean: float) -> Screened:
@@ -179,7 +220,9 @@ def screened(case: Case, fitted: Fitted, clean: float) -> Screened:
         for c in candidates(rig, case.catalogue)
         if c.key not in fitted.hypothesis.keys and not c.place.parts() & added
     ]
-    best, *rest = screen([metric, other] if other else [metric], rig, found, select=likeliest)
+    norms: list[Norms] = []
+    metrics = [metric, other] if other else [metric]
+    best, *rest = screen(metrics, rig, found, select=likeliest, norms=norms)
     promised = [(d, metric.promise(d)) for d in best[:PROMISED]]
     by_energy = rest[0] if rest else []
     if other:
@@ -191,7 +234,7 @@ def screened(case: Case, fitted: Fitted, clean: float) -> Screened:
             if p > known.get(d.candidate.key, 0.0)
         ]
     promised.sort(key=lambda x: -x[1])
-    return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised], other, by_energy)
+    return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised], other, by_energy, norms)
 
 
 def places(case: Case) -> dict[str, set[str]]:

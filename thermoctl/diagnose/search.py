@@ -20,7 +20,7 @@ from thermoctl.diagnose.mistakes import mistakes
 from thermoctl.diagnose.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnose.odds import odds
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Direction, sharpened
+from thermoctl.diagnose.screen import Direction, Norms, sharpened
 from thermoctl.diagnose.screening import Screened, places, screened
 from thermoctl.diagnose.shortlist import HALF, PAIR, shortlist, simpler
 from thermoctl.plant import refit
@@ -49,10 +49,13 @@ class Weighed:
 
 @dataclass(frozen=True)
 class Searched:
-    """All hypotheses tried, best first; whether the budget ended the search."""
+    """All hypotheses tried, best first; whether the budget ended the search.
+
+    `norms`: of all columns in the screening without effects; empty where there was none, or only of some."""
 
     tried: tuple[Weighed, ...]
     truncated: bool
+    norms: Sequence[Norms] = ()
 
 
 @dataclass
@@ -64,6 +67,7 @@ class Search:
     where: Mapping[str, set[str]]
     tried: dict[Keys, Weighed] = field(default_factory=dict)
     seen: set[Keys] = field(default_factory=set)
+    norms: list[Norms] = field(default_factory=list)  # of the screening without effects
 
     @property
     def best(self) -> Weighed:
@@ -85,7 +89,11 @@ class Search:
             self.case.budget.untried += 1
             return []
         self.seen.add(parent.fitted.hypothesis.keys)
-        found = extensions(self.case, parent, self.where, self.limits, self.tried)
+        self.case.budget.screen()
+        looked = screened(self.case, parent.fitted, self.limits.clean)
+        if not parent.fitted.hypothesis.effects:
+            self.norms = looked.norms
+        found = extensions(self.case, parent, looked, self.where, self.limits, self.tried)
         self.keep(found)
         return found
 
@@ -107,7 +115,7 @@ def search(case: Case, limits: Limits) -> Searched:
         s.extended(null)  # also where a rival fits better
     grow(s)
     swap(s)
-    return Searched(tuple(sorted(s.tried.values(), key=lambda w: -w.score)), case.budget.spent)
+    return Searched(tuple(sorted(s.tried.values(), key=lambda w: -w.score)), case.budget.spent, s.norms)
 
 
 def started(case: Case, limits: Limits) -> Search:
@@ -120,11 +128,13 @@ def started(case: Case, limits: Limits) -> Search:
 
 def grow(s: Search) -> None:
     """Extend the beam until none of its extensions is better."""
-    for _ in range(s.limits.effects):
+    for number in range(s.limits.effects):
         beam = leaders(list(s.tried.values()), s.limits)
         best = beam[0].score
         close = max(over_noise(s.case, beam[0].fitted, s.limits.clean)) <= s.limits.clean
-        for parent in beam:
+        rounds = s.limits.effects - number - 1
+        for k, parent in enumerate(beam):
+            s.case.budget.later = 0 if close else len(beam) - k - 1 + rounds * s.limits.beam
             if close and parent.score < best - BEATEN:
                 continue
             known = parent.fitted.hypothesis.keys in s.seen
@@ -244,7 +254,12 @@ def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
 
 
 def extensions(
-    case: Case, parent: Weighed, where: Mapping[str, set[str]], limits: Limits, tried: Mapping[Keys, Weighed]
+    case: Case,
+    parent: Weighed,
+    looked: Screened,
+    where: Mapping[str, set[str]],
+    limits: Limits,
+    tried: Mapping[Keys, Weighed],
 ) -> list[Weighed]:
     """Refit the parent with each direction, and with each pair of directions, of the shortlist."""
     out: list[Weighed] = []
@@ -252,7 +267,6 @@ def extensions(
     ahead = max(tried.values(), key=lambda w: w.score)
     # beside a hypothesis that leaves no more than noise only promises count
     promised = parent is not ahead and max(over_noise(case, ahead.fitted, limits.clean)) <= limits.clean
-    looked = screened(case, parent.fitted, limits.clean)
     queue = shortlist(looked, where, limits)
     for k, (added, gain) in enumerate(queue):
         case.budget.planned = case.budget.fits_done + len(queue) - k
@@ -265,6 +279,8 @@ def extensions(
             case.budget.untried += 1
             continue
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
+        if max(over_noise(case, leader, limits.clean)) <= limits.clean:
+            case.budget.later = min(case.budget.later, int(leader is not parent.fitted))
         fits = _followed(case, parent, looked, added, leader)
         found = [f for f in fits if not f.absent]
         if found:

@@ -23,7 +23,9 @@ import numpy as np
 from scipy.sparse import csc_matrix, identity
 from scipy.sparse.linalg import splu
 
-from thermoctl.diagnose.screen import Column, Direction, Group, Metric, Trajectory, score
+from thermoctl.diagnose.metric import Metric
+from thermoctl.diagnose.overlay import Trajectory
+from thermoctl.diagnose.screen import Column, Direction, Group, score
 from thermoctl.plant import expression as ex
 
 # None of these numbers chooses a hypothesis: directions that are kept are screened exactly.

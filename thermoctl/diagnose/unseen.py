@@ -8,7 +8,7 @@ own parameters absorb (screen.py). It depends on the plant, the inputs and the s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,9 +19,10 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.fit import Fitted
 from thermoctl.diagnose.noise import Averaged
+from thermoctl.diagnose.overlay import Trajectory
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import NEAR, Column, Trajectory, directions, groups_of, parameter_values
+from thermoctl.diagnose.screen import NEAR, Column, Norms, directions, groups_of, parameter_values
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 
 SEEN = 5.0  # standard errors of an effect's size, from which it would have been seen
@@ -59,7 +60,9 @@ class Visible:
 def not_seen(found: Diagnosis) -> list[dict[str, Any]]:
     """Return by effect and place the smallest size that would have been seen, in the parameter's unit."""
     null = next(w.fitted for w in found.searched.tried if not w.fitted.hypothesis.effects)
-    return [v.entry() for v in visible(found.case, null, found.null.average) if v.reason is None]
+    norms = [n for n in found.searched.norms if sized(n.column.item[0].effect)]
+    seen = _best(norms) if norms else visible(found.case, null, found.null.average)
+    return [v.entry() for v in seen if v.reason is None]
 
 
 def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
@@ -69,12 +72,9 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
     metric = Rows(Plain(case, null, ROWS), average, True)
     rig = Structure(null.rough_plant, metric.drives, [t.columns for t in case.tables])
     at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
-    best: dict[tuple[str, str], Visible] = {}
     found = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]
     columns = (column for c in found for g in groups_of(c, metric) for column in g.columns())
-    for v in _sizes(metric, at, columns):
-        _keep(best, v)
-    return [best[key] for key in sorted(best)]
+    return _best(_norms(metric, at, columns))
 
 
 def sized(effect: Effect) -> bool:
@@ -82,19 +82,24 @@ def sized(effect: Effect) -> bool:
     return any(p.amplitude for p in effect.parameters) or bool(SIZES & set(effect.shapes.values()))
 
 
-def _keep(best: dict[tuple[str, str], Visible], new: Visible) -> None:
-    old = best.get(new.candidate.key)
-    if old is None or (new.reason is not None, new.smallest) < (old.reason is not None, old.smallest):
-        best[new.candidate.key] = new
+def _best(norms: Iterable[Norms]) -> list[Visible]:
+    """Return the most visible size of each effect at each place."""
+    best: dict[tuple[str, str], Visible] = {}
+    for n in norms:
+        new = _visible(n.column, n.whole, n.left)
+        old = best.get(new.candidate.key)
+        if old is None or (new.reason is not None, new.smallest) < (old.reason is not None, old.smallest):
+            best[new.candidate.key] = new
+    return [best[key] for key in sorted(best)]
 
 
-def _sizes(metric: Rows, at: Sequence[Trajectory], columns: Iterable[Column]) -> Iterable[Visible]:
+def _norms(metric: Rows, at: Sequence[Trajectory], columns: Iterable[Column]) -> Iterator[Norms]:
     for part, plain in directions(metric, at, columns):
         rows = plain * metric.weight[:, None]
         full = np.linalg.norm(rows, axis=0)
         left = np.linalg.norm(metric.project(rows), axis=0)
         for column, whole, size in zip(part, full, left, strict=True):
-            yield _visible(column, float(whole), float(size))
+            yield Norms(column, float(whole), float(size))
 
 
 def _visible(column: Column, full: float, left: float) -> Visible:

@@ -6,7 +6,7 @@ recordings and are summed in this order. So they do not depend on the number of 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
@@ -45,7 +45,7 @@ class Workers(Protocol):
     def hold(self, thing: Any) -> Any:
         """Return a handle of an object that workers keep, so that it is sent once."""
 
-    def each(self, f: Callable[..., R], held: Sequence[Any], arguments: Sequence[tuple[Any, ...]]) -> list[R]:
+    def each(self, f: Callable[..., R], held: Sequence[Any], arguments: Iterable[tuple[Any, ...]]) -> list[R]:
         """Return f(object, *arguments) of each handle."""
 
 

@@ -227,10 +227,49 @@ static inline double table_slope_(double x, int k, const double *q) {
 """
 
 
+# Updates of a factorisation, up to which each is a statement of its own. A compiler needs 2 s for 2 700 of
+# them; a loop over a table takes as long as they do where a factorisation serves many right-hand sides.
+WRITTEN_OUT = 500
+
+_ELIMINATION = """for (const int *f = FACTORS, *end = f + sizeof FACTORS / sizeof *f; f < end;) {
+    const int p = *f++, below = *f++;
+    if (!(fabs(M[p]) > 1e-9)) return 0;
+    M[p] = 1 / M[p];
+    for (int i = 0; i < below; i++) {
+      const double m = M[*f] *= M[p];
+      for (const int *row = f + 2, *stop = f = f + 2 + 2 * f[1]; row < stop; row += 2) M[row[0]] -= m * M[row[1]];
+    }
+  }
+"""
+
+
 def ints(label: str, values: Iterable[int]) -> str:
     """Return a C array of integers; an empty one holds a 0, as C wants at least one."""
     values = list(values)
     return f"static const int {label}[] = {{{', '.join(map(str, values or [0]))}}};"
+
+
+Pivots = list[tuple[int, list[tuple[int, list[tuple[int, int]]]]]]
+
+
+def _factors(pivots: Pivots) -> tuple[str, str]:
+    """Write C that eliminates with each pivot (entry, rows below): a table of entries, and the statements.
+
+    A row below is (entry, updates (entry, entry of the pivot's row)). Few updates are written out."""
+    if sum(len(updates) for _, below in pivots for _, updates in below) <= WRITTEN_OUT:
+        text = ""
+        for p, below in pivots:
+            text += f"if (!(fabs(M[{p}]) > 1e-9)) return 0;\nM[{p}] = 1 / M[{p}];\n"
+            for m, updates in below:
+                text += f"M[{m}] *= M[{p}];\n"
+                text += "".join(f"M[{i}] -= M[{m}] * M[{j}];\n" for i, j in updates)
+        return "", text
+    numbers: list[int] = []
+    for p, below in pivots:
+        numbers += [p, len(below)]
+        for m, updates in below:
+            numbers += [m, len(updates), *(q for pair in updates for q in pair)]
+    return ints("FACTORS", numbers) + "\n", _ELIMINATION
 
 
 def sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, str, int]:
@@ -258,20 +297,13 @@ def sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, str, int]:
     put += [f"M[{index[i, i]}] = 1;\n" for i in range(n)]
     put += [f"M[{index[i, k]}] -= a * J[{q}];\n" for q, (i, k) in enumerate(pattern)]
     forward, backward = [], []
+    pivots: Pivots = []
     for k in order:
-        put.append(
-            f"if (!(fabs(M[{index[k, k]}]) > 1e-9)) return 0;\nM[{index[k, k]}] = 1 / M[{index[k, k]}];\n"
-        )
-        for i in sorted(columns[k], key=position.__getitem__):
-            if position[i] <= position[k]:
-                continue
-            put.append(f"M[{index[i, k]}] *= M[{index[k, k]}];\n")
-            put += [
-                f"M[{index[i, j]}] -= M[{index[i, k]}] * M[{index[k, j]}];\n"
-                for j in sorted(fill[k])
-                if position[j] > position[k]
-            ]
-            forward.append((i, k, index[i, k]))
+        below = [i for i in sorted(columns[k], key=position.__getitem__) if position[i] > position[k]]
+        right = [j for j in sorted(fill[k]) if position[j] > position[k]]
+        rows_below = [(index[i, k], [(index[i, j], index[k, j]) for j in right]) for i in below]
+        pivots.append((index[k, k], rows_below))
+        forward += [(i, k, index[i, k]) for i in below]
     for k in reversed(order):
         backward += [(k, j, index[k, j]) for j in sorted(fill[k]) if position[j] > position[k]]
         backward.append((k, -1, index[k, k]))
@@ -279,9 +311,11 @@ def sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, str, int]:
     single += "".join(
         f"r[{k}] *= M[{m}];\n" if j < 0 else f"r[{k}] -= M[{m}] * r[{j}];\n" for k, j, m in backward
     )
+    table, factors = _factors(pivots)
     lanes = f"static inline void solve_lanes_(const double *restrict M, lanes *restrict r) {{ (void)M; (void)r;\n{single}}}\n"
     return (
-        f"static int factor_(double a, const double *J, double *M) {{ (void)a; (void)J;\n{''.join(put)}return 1; }}\n"
+        f"{table}static int factor_(double a, const double *J, double *M) {{ (void)a; (void)J;\n{''.join(put)}"
+        f"{factors}return 1; }}\n"
         f"static void solve_(const double *M, double *r) {{ (void)M; (void)r;\n{single}}}\n",
         lanes,
         len(index),

@@ -257,20 +257,25 @@ class Problem:
         return other
 
     def each(
-        self, f: Callable[..., R], z: np.ndarray, arguments: Sequence[tuple[Any, ...]], size: int
+        self,
+        f: Callable[..., R],
+        point: tuple[np.ndarray, np.ndarray],
+        arguments: Callable[[int], tuple[Any, ...]],
+        size: int,
     ) -> list[R]:
-        """Return f(problem, r, values, dx0, *arguments[r]) at z of each recording r, here or by workers.
+        """Return f(problem, r, values[r], dx0[r], *arguments(r)) of each recording r, here or by workers.
 
-        `size`: cost in runs without sensitivities. A worker has the problem of a recording `alone`, r = 0."""
-        values, dx0 = self.unpack(z)
+        `point`: values and dx0. `size`: cost in runs without sensitivities. A worker has the problem of a
+        recording `alone`, r = 0."""
+        values, dx0 = point
         recordings = range(len(self.excitations))
         far = workers() if len(recordings) > 1 else None
         if far is None:
             return each(
-                lambda r: f(self, r, values[r], dx0[r], *arguments[r]), recordings, size * self.numbers
+                lambda r: f(self, r, values[r], dx0[r], *arguments(r)), recordings, size * self.numbers
             )
         self.held = self.held or [far.hold(self.alone(r)) for r in recordings]
-        return far.each(f, self.held, [(0, values[r], dx0[r], *arguments[r]) for r in recordings])
+        return far.each(f, self.held, ((0, values[r], dx0[r], *arguments(r)) for r in recordings))
 
     def whiten(self, r: int, j: int, e: np.ndarray) -> np.ndarray:
         """Return whitened rows (M, ...) of output j's errors (N, ...); missing samples are dropped."""
@@ -338,7 +343,7 @@ class Problem:
         keeping = self.keeps and keep is not None
         known = (jacobian, keeping, self.huber)
         residuals = []
-        for r, part in enumerate(self.each(Problem._part, z, [known] * len(self.excitations), jacobian + 1)):
+        for r, part in enumerate(self.each(Problem._part, self.unpack(z), lambda r: known, jacobian + 1)):
             cost += part.cost
             residuals.append(part.residual)
             if keep is not None:
@@ -405,7 +410,7 @@ class Problem:
         """Return J' d2w/dh2 of the whitened residuals w(z + h step), by one more simulation.
 
         Raises SimulationError."""
-        errors = self.each(Problem.errors, z + PROBE * step, [()] * len(self.excitations), 1)
+        errors = self.each(Problem.errors, self.unpack(z + PROBE * step), lambda r: (), 1)
         out = np.zeros(len(z))
         for rows in kept:
             r, j = rows.recording, rows.output

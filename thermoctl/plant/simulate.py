@@ -389,11 +389,11 @@ class Model:
         return bool(self.states) and not self.code.output_delays
 
     def _outputs(
-        self, excitation: Excitation, columns: int, buffers: dict[str, np.ndarray] | None
+        self, excitation: Excitation, columns: int, buffers: dict[str, np.ndarray] | None, key: str = ""
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return arrays for outputs (N, ny) and their sensitivities (N, ny, columns)."""
         n, ny = len(excitation.t), len(self.outputs)
-        return np.empty((n, ny)), _buffer(buffers, f"dy {id(excitation)}", (n, ny, columns))
+        return np.empty((n, ny)), _buffer(buffers, key or f"dy {id(excitation)}", (n, ny, columns))
 
     def respond(
         self,
@@ -409,7 +409,7 @@ class Model:
         """Return the outputs' first-order response (N, ny, columns) to additional forces on dx/dt.
 
         Entry e of `forces` is (state, column); its values, per second, are q[:, e] of q (N, entries).
-        `buffers`: as of `run`.
+        `buffers`: as of `run`; the next response in the same thread overwrites this one.
         """
         lib, n, nx = self.code.library, len(excitation.t), len(self.states)
         p = self.vector(parameters, excitation.name)
@@ -425,7 +425,7 @@ class Model:
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
         at_once = self._at_once
         dx = _buffer(buffers, _own("dx"), (1 if at_once else n, nx, columns))
-        y, dy = self._outputs(excitation, columns, buffers) if at_once else (None, None)
+        y, dy = self._outputs(excitation, columns, buffers, _own("dy")) if at_once else (None, None)
         atol = rtol * excitation.scale
         start = (n, excitation.t, u, excitation.linear, p, excitation.width, x0, s0)
         limits = (rtol, atol, MAX_STEPS, x, dx, info, ctypes.addressof(force), y, dy, 0)
