@@ -13,11 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from scipy.fft import dct, idct
 
+from thermoctl.plant.residuals import measured
 from thermoctl.plant.simulate import Excitation
 
 SINGLE = 6  # lowest rows that are bands of their own
@@ -54,29 +55,31 @@ def band_edges(rows: int) -> np.ndarray:
     return np.array(edges)
 
 
+@lru_cache(maxsize=256)
+def _bands(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the edges of the bands, the rows in each, and the band of each row: channels share them."""
+    edges = band_edges(rows)
+    count = np.diff(edges)
+    band = np.repeat(np.arange(len(count)), count)
+    for shared in (edges, count, band):
+        shared.flags.writeable = False
+    return edges, count, band
+
+
 def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel | None:
     """Output j of recording r; at most about `most` rows (the lowest). None where too little was measured."""
-    index = np.flatnonzero(np.isfinite(d.y[:, j]))
+    index = measured(d.y[:, j])
     if len(index) < FEWEST:
         return None
-    index = index[: quick(len(index))]
+    if quick(len(index)) < len(index):
+        index = index[: quick(len(index))]
     block = max(1, len(index) // (2 * most)) if most else 1
     n = len(index) // block
     rows = min(n, most or n)
-    edges = band_edges(rows)
-    count = np.diff(edges)
+    edges, count, band = _bands(rows)
     middle = 0.5 * (edges[:-1] + edges[1:] - 1)
     span = float(d.t[index[-1]] - d.t[index[0]]) * n * block / max(len(index) - 1, 1)
-    return Channel(
-        r,
-        j,
-        index,
-        block,
-        np.repeat(np.arange(len(count)), count),
-        count,
-        np.maximum(middle, 0.5) / (2 * span),
-        span / (n * block),
-    )
+    return Channel(r, j, index, block, band, count, np.maximum(middle, 0.5) / (2 * span), span / (n * block))
 
 
 @cache

@@ -8,7 +8,7 @@ from dataclasses import replace
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.decide import Facts, decide, weigh
-from thermoctl.diagnose.fit import as_refitted
+from thermoctl.diagnose.fit import as_refitted, with_residuals
 from thermoctl.diagnose.held_out import split, worth
 from thermoctl.diagnose.law import find_law
 from thermoctl.diagnose.law_smooth import missing_flow
@@ -52,10 +52,14 @@ def diagnose(
     scores = {w.fitted.hypothesis.keys: w.score for w in searched.tried}
     posterior = weigh({keys: scores[keys] for keys in physics}, physics, numbers)
     fits = {w.fitted.hypothesis.keys: w.fitted for w in searched.tried}
-    null = as_refitted(known, fits[frozenset()])
+    null = with_residuals(known, as_refitted(known, fits[frozenset()]))
     likeliest = next(iter(posterior.hypotheses))
     stand = standouts(physics[likeliest])  # the other effects are part of the remainder
-    best = fits.get(stand, fits[likeliest]) if posterior.something >= numbers.name else null
+    best = (
+        with_residuals(known, fits.get(stand, fits[likeliest]))
+        if posterior.something >= numbers.name
+        else null
+    )
     reach = reached(known)
     after, before = left(known, best, reach, numbers.clean), left(known, null, reach, numbers.clean)
     say("measuring what the findings are worth")
@@ -86,7 +90,8 @@ def diagnose(
         and not stopped()
         and max(found.remainder.over_noise.values()) > numbers.clean
     ):
-        found = replace(found, law=find_law(known, found.final, numbers, reserve, say))
+        law = find_law(known, found.final, numbers, reserve, say)
+        found = replace(found, law=law and replace(law, fitted=with_residuals(known, law.fitted)))
     return found
 
 

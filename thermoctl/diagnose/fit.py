@@ -19,7 +19,6 @@ import numpy as np
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
-from thermoctl.diagnose.coordinates import transform
 from thermoctl.diagnose.memory import Past, PlacedBefore
 from thermoctl.diagnose.noise import Averaged, Grid, averaged
 from thermoctl.diagnose.posterior import Hypothesis, Placed, Posterior, bounded_step, gaussian
@@ -55,6 +54,7 @@ class Fitted:
     sd: Mapping[str, float]  # of the effects' parameters
     rough_plant: Plant
     rough: Fit  # refit in white noise, whose free run is closest to the data: extensions start there
+    rough_powers: tuple[np.ndarray, ...]
     curvature: np.ndarray  # H
     past: Past  # of earlier recordings
 
@@ -244,6 +244,9 @@ def _weighed(
         problem.priors,
     )
     plant = refit.updated(posterior.plant, found, posterior.drives)
+    rough_powers = case.coordinates.powers(posterior.rows(rough.residuals))
+    if not problem.keeps:
+        found, rough = (dataclasses.replace(x, residuals=[]) for x in (found, rough))
     return Fitted(
         Hypothesis(tuple(posterior.effects)),
         plant,
@@ -256,6 +259,7 @@ def _weighed(
         names,
         refit.updated(posterior.plant, rough, posterior.drives),
         rough,
+        tuple(rough_powers),
         confined,
         posterior.past,
     )
@@ -336,10 +340,20 @@ def _rms(f: Fitted, g: Grid) -> float:
 
 def as_refitted(case: Case, f: Fitted) -> Fitted:
     """The hypothesis as an ordinary refit in white noise leaves it, for comparison."""
-    rows = [transform(c, f.rough.residuals[c.recording][:, c.output]) for c in case.coordinates.channels]
-    powers = case.coordinates.powers(rows)
-    average = averaged(case.grids, powers)
-    return dataclasses.replace(f, plant=f.rough_plant, fit=f.rough, powers=tuple(powers), average=average)
+    average = averaged(case.grids, f.rough_powers)
+    return dataclasses.replace(f, plant=f.rough_plant, fit=f.rough, powers=f.rough_powers, average=average)
+
+
+def with_residuals(case: Case, f: Fitted) -> Fitted:
+    """Return the fitted hypothesis with its residuals; those of long recordings were not kept."""
+    if f.fit.residuals:
+        return f
+    drives, found = case.drives(f.fit.model), f.fit
+    errors = [
+        d.y - found.model.run(d, values, dx0).y
+        for d, values, dx0 in zip(drives, found.values, found.dx0, strict=True)
+    ]
+    return dataclasses.replace(f, fit=dataclasses.replace(found, residuals=errors))
 
 
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
@@ -386,4 +400,5 @@ __all__ = [
     "over_noise",
     "placed_before",
     "remembered",
+    "with_residuals",
 ]

@@ -21,6 +21,7 @@ from thermoctl.report.page import figure, page, table, unit
 
 POINTS = 1500  # of a curve; more would only make the page heavy
 SHOWN = 6  # outputs that are drawn, worst first
+DRAWN = 6  # recordings of an output that are drawn: those with the largest error
 WIDE = 1.96  # standard deviations to either side of a 95 % interval
 MOVED, MOVED_SHARE = 4.0, 0.25  # change of a parameter by a finding that is worth a sentence: sd, share of it
 _COLOURS = {"measured": "#1b1f24", "refit": "#c7621b", "with": "#0b6bcb"}
@@ -152,10 +153,13 @@ def _curves(found: Diagnosis) -> str:
     for o in worst:
         j = case.null.model.outputs.index(o)
         refit, after = _errors(found.null, o), _errors(found.final, o)
+        size = [np.nanmean(e**2) if np.isfinite(e).any() else 0.0 for e in refit]
+        drawn = sorted(sorted(range(len(drives)), key=lambda r: -size[r])[:DRAWN])
         fig = Figure(figsize=(9, 3.8), layout="constrained")
-        axes = fig.subplots(2, len(drives), sharex="col", sharey="row", squeeze=False, height_ratios=(3, 2))
-        for k, d in enumerate(drives):
-            t, y, e0, e1 = _thin(d.t, d.y[:, j], refit[k], after[k])
+        axes = fig.subplots(2, len(drawn), sharex="col", sharey="row", squeeze=False, height_ratios=(3, 2))
+        for k, r in enumerate(drawn):
+            d = drives[r]
+            t, y, e0, e1 = _thin(d.t, d.y[:, j], refit[r], after[r])
             top, low = axes[0, k], axes[1, k]
             top.plot(t, y, ".", ms=2.5, color=_COLOURS["measured"], label="measured")
             top.plot(t, y - e0, color=_COLOURS["refit"], lw=1.2, label="refitted only")
@@ -171,7 +175,12 @@ def _curves(found: Diagnosis) -> str:
         axes[1, 0].set_ylabel(f"error ({_error_unit(its)})" if its else "error", fontsize=8)
         handles = axes[0, 0].get_legend_handles_labels()
         fig.legend(*handles, loc="outside upper right", ncols=3, fontsize=8, frameon=False)
-        body += figure(fig, f"{o}: simulation on the recorded inputs alone, and its error below.")
+        of = (
+            ""
+            if len(drawn) == len(drives)
+            else f" The {DRAWN} of {len(drives)} recordings with the largest error."
+        )
+        body += figure(fig, f"{o}: simulation on the recorded inputs alone, and its error below.{of}")
     if len(over) > len(worst):
         body += _p(
             f"The {len(worst)} outputs with the largest misfit of {len(over)} are drawn; the table has all."

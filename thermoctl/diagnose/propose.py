@@ -29,7 +29,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.design import NONE, Excitation, Lever, Limits, family, levers
 from thermoctl.diagnose.experiment_file import FILES
-from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.fit import Fitted, with_residuals
 from thermoctl.diagnose.law_result import described
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.plant.refit import Scale
@@ -209,7 +209,7 @@ class _Comparison:
         weights = np.array([b.weight for b in self.predictors])
         self.weights = weights / weights.sum()
         self.step = float(np.median(np.concatenate([np.diff(t.t) for t in case.tables])))
-        self.sigma = noise_of(case, standing[0][0])
+        self.sigma = noise_of(case, with_residuals(case, standing[0][0]))
         self.outputs = list(case.null.model.outputs)
         self.seen = [j for j, _ in enumerate(self.outputs) if len(_recorded(case, j))]
         self.points = min(POINTS, max(READINGS // len(self.outputs), FEWEST_POINTS))

@@ -108,7 +108,7 @@ def _block(model: Model, d: Excitation) -> int:
     most = n // FEWEST
     for j in range(d.y.shape[1]):
         most = min(most, int(len(d.t) / (HALF_BAND * _content(d.y[:, j]) + 1)))
-    sizes = sorted({int(most * 0.8**k) // 2 * 2 - 1 for k in range(40)}, reverse=True)
+    sizes = sorted({(int(most * 0.8**k) - 1) // 2 * 2 + 1 for k in range(40)}, reverse=True)
     may = (b for b in sizes if b > 1 and all(_may_average(d, j, b) for j in range(len(model.inputs))))
     return next(may, 1)
 

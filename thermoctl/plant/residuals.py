@@ -16,6 +16,7 @@ import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -105,12 +106,28 @@ def default_noise(plant: Plant, excitations: Sequence[Excitation] = ()) -> tuple
     return tuple(out)
 
 
+def measured(y: np.ndarray) -> np.ndarray:
+    """Return the indices of the measured samples of an output (N,)."""
+    index = np.flatnonzero(np.isfinite(y))
+    return _all(len(y)) if len(index) == len(y) else index
+
+
+@lru_cache(maxsize=64)
+def _all(n: int) -> np.ndarray:
+    """Return 0..n-1, the same read-only array each time: outputs of long recordings share it."""
+    index = np.arange(n)
+    index.flags.writeable = False
+    return index
+
+
 def _rows(d: Excitation, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return output j's measured samples, each one's correlation with its predecessor, and sigma."""
+    index = measured(d.y[:, j])
+    if n.phi <= 0:  # one number each, not one a sample
+        return index, np.broadcast_to(0.0, max(len(index) - 1, 0)), np.broadcast_to(n.sigma, len(index))
     dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
-    index = np.flatnonzero(np.isfinite(d.y[:, j]))
     gaps = np.diff(d.t[index]) / dt if len(index) > 1 else np.zeros(0)
-    phi = n.phi ** np.clip(gaps, 0.0, 1e4) if n.phi > 0 else np.zeros(len(gaps))
+    phi = n.phi ** np.clip(gaps, 0.0, 1e4)
     scale = np.full(len(index), n.sigma)
     if len(index):
         scale[1:] = n.sigma * np.sqrt(np.maximum(1 - phi**2, 1e-9))
