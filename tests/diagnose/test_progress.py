@@ -13,6 +13,7 @@ from tests.plants import ONE_BLOCK
 from thermoctl import shipped
 from thermoctl.diagnose.case import Budget
 from thermoctl.diagnose.commands import on_interrupt
+from thermoctl.diagnose.progress import Pace
 from thermoctl.diagnose.run import diagnose
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
@@ -29,6 +30,33 @@ def test_a_refit_is_reported_of_those_planned():
         budget.planned = planned
         budget.spend()
     assert [text.split("refit ")[1].split(" planned")[0] for text in said] == ["1 of 1", "2 of 3", "3 of 5"]
+
+
+# Seconds at which refits (r) and screenings (s) began, with refits planned by then: a network of 120 bodies, whose
+# third refit left no more than noise, under a profiler; the end of the search, and of the diagnosis.
+NETWORK = "r17/1 s21 r110/17 r123/17 r136/17 r145/17 r153/17 r163/17 r173/17 r186/17 r195/17 r212/17 r223/17 r233/17 "
+NETWORK += "r244/17 r259/17 r270/17 s294"
+END_S = 396.0
+
+
+def test_time_left_is_within_a_factor_of_two_from_the_second_minute_on():
+    """The plan of the search as it was then: one more screening, of the best hypothesis, which is the last."""
+    now, said = [0.0], list[tuple[float, str]]()
+    budget = Budget(80, lambda text: said.append((now[0], text)), pace=Pace(lambda: now[0]))
+    for number, event in enumerate(NETWORK.split()):
+        seconds, _, planned = event[1:].partition("/")
+        now[0] = float(seconds)
+        budget.later = 0 if number == 0 or event == "s294" else 1
+        if event[0] == "s":
+            budget.screen()
+        else:
+            budget.planned = int(planned)
+            budget.spend()
+    told = [(t, text.rpartition("about ")[2].split()) for t, text in said if "about" in text]
+    assert len(told) == len(NETWORK.split()) - 2  # none before the first screening is done
+    for t, (number, unit, _) in told:
+        left = float(number) * (60 if unit == "min" else 1)
+        assert 0.5 < left / (END_S - t) < 2, (t, left)
 
 
 @pytest.mark.parametrize("inside", ["", "result"])

@@ -1,0 +1,52 @@
+"""Sums over recordings: the same as with all recordings' sensitivities side by side."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.diagnose.test_workers import rig
+from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.fit import as_refitted, fitted, with_residuals
+from thermoctl.diagnose.posterior import Posterior
+from thermoctl.diagnose.screening import ROWS, Plain, Rows
+from thermoctl.plant import residuals
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory):
+    plant, tables = rig(tmp_path_factory.mktemp("rig"), recordings=3)
+    return case(plant, tables, {}, Budget(9))
+
+
+def test_the_directions_of_all_parameters_and_initial_states_are_projected_out(known):
+    """Against one orthonormal basis of the whole matrix, with a column for each initial state."""
+    null = fitted(known, known.plant, (), known.null)
+    plain = Plain(known, null, ROWS)
+    metric = Rows(plain, as_refitted(known, null).average, True)
+    whole, at = np.zeros((len(metric.weight), len(plain.problem.unknowns))), 0
+    for r, rows in enumerate(plain.sensitivities):
+        whole[at : at + len(rows), plain.unknowns(r)] = rows
+        at += len(rows)
+    free = [q not in metric.fit.at_bound for q, _ in plain.problem.unknowns]
+    q, _ = np.linalg.qr(whole[:, free] * metric.weight[:, None])
+    d = np.random.default_rng(1).standard_normal((len(metric.weight), 4))
+    assert np.allclose(metric.project(d), d - q @ (q.T @ d), atol=1e-9)
+    assert [b.shape[1] for b in metric.own] == [1, 1, 1] and metric.basis.shape[1] == sum(free) - 3
+
+
+def test_sensitivities_that_are_not_kept_give_the_same_sums_and_result(known, monkeypatch):
+    kept = fitted(known, known.plant, (), known.null)
+    posterior = Posterior(known, known.plant, ())
+    z = kept.fit.z
+    rows = posterior.rows(posterior.errors_and_slopes(z))
+    inverse = posterior.likelihood(rows)[0].inverse
+    gradient, matrix = posterior.slope(z, rows, inverse)
+    monkeypatch.setattr(residuals, "KEPT", 0)
+    other = Posterior(known, known.plant, ())
+    for a, b in zip(other.slope(z, rows, inverse), (gradient, matrix), strict=True):
+        assert np.array_equal(a, b)
+    forgot = fitted(known, known.plant, (), known.null)
+    assert forgot.fit.residuals == [] and forgot.log_evidence == pytest.approx(kept.log_evidence, abs=0.02)
+    again = with_residuals(known, forgot)
+    assert np.nanstd(again.fit.residuals[0]) == pytest.approx(np.nanstd(kept.fit.residuals[0]), rel=1e-3)
