@@ -343,7 +343,7 @@ class Problem:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return recording r's unknowns (k,), its outputs (N, ny) and their slopes (N, ny, k)."""
         run = self.model.run(self.excitations[r], values, dx0, sensitivities=True, states=False)
-        used, k, slope = self._slopes(r, values)
+        used, k, slope = self.slopes(r, values)
         assert run.dy is not None
         return k, run.y, run.dy[:, :, used] * slope
 
@@ -383,7 +383,7 @@ class Problem:
         if not np.all(np.abs(run.y) < HUGE):
             raise SimulationError(f"{d.name}: the simulation gives values that are not numbers")
         e, cost, kept = d.y - run.y, 0.0, []
-        used, k, slope = self._slopes(r, values)
+        used, k, slope = self.slopes(r, values)
         gradient, matrix = np.zeros(len(k)), np.zeros((len(k), len(k)))
         for j in range(len(self.noise)):
             if not len(self.rows[r][j][0]):
@@ -436,7 +436,7 @@ class Problem:
             np.add.at(out, rows.unknowns, rows.slope * (rows.jac.T @ (rows.weight * second)))
         return out * (2 / PROBE)
 
-    def _slopes(self, r: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def slopes(self, r: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the indices of recording r's sensitivities to unknowns, the unknowns' numbers, and dq/dz."""
         used = np.flatnonzero(self.columns[r] >= 0)
         active = self.model.active
