@@ -9,6 +9,7 @@ from tests.diagnose.test_workers import rig
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import as_refitted, fitted, with_residuals
 from thermoctl.diagnose.posterior import Posterior
+from thermoctl.diagnose.run import diagnose
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 from thermoctl.plant import residuals
 
@@ -50,3 +51,18 @@ def test_sensitivities_that_are_not_kept_give_the_same_sums_and_result(known, mo
     assert forgot.fit.residuals == [] and forgot.log_evidence == pytest.approx(kept.log_evidence, abs=0.02)
     again = with_residuals(known, forgot)
     assert np.nanstd(again.fit.residuals[0]) == pytest.approx(np.nanstd(kept.fit.residuals[0]), rel=1e-3)
+
+
+def test_a_diagnosis_that_keeps_no_sensitivities_has_the_same_findings(tmp_path, monkeypatch):
+    plant, tables = rig(tmp_path, recordings=3)
+    kept = diagnose(plant, tables, tmp_path / "kept")
+    monkeypatch.setattr(residuals, "KEPT", 0)
+    forgot = diagnose(plant, tables, tmp_path / "forgot")
+    for a, b in zip(
+        kept["findings"] + kept["alternatives"], forgot["findings"] + forgot["alternatives"], strict=True
+    ):
+        assert (a["effect"], a["where"]) == (b["effect"], b["where"])
+        assert a["probability"] == pytest.approx(b["probability"], abs=0.02)
+    assert kept["verdict"] == forgot["verdict"] and kept["fit"]["after"] == pytest.approx(
+        forgot["fit"]["after"], rel=1e-3
+    )

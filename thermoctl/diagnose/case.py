@@ -34,8 +34,8 @@ LATER = 2.5  # refits after a later screening: mean of 26 diagnoses of real and 
 class Budget:
     """Largest number of refits, and the number done. Counted, never timed: the same on every machine.
 
-    `planned`: number of refits after this step of the search; each step may plan more. `later`: hypotheses
-    that the search may still extend; only the time left depends on it. `stopped`: does a person want the
+    `planned`: number of refits after this step of the search; each step may plan more. `later`: number of
+    hypotheses that the search is expected to extend besides; only the time left depends on it. `stopped`: does a person want the
     result of what is done so far? `untried`: refits of promising hypotheses left out."""
 
     fits: int
@@ -44,7 +44,7 @@ class Budget:
     fits_done: int = 0
     planned: int = 1
     untried: int = 0
-    later: int = 0
+    later: float = 0.0
     pace: Pace = field(default_factory=Pace)
 
     @property
@@ -68,7 +68,7 @@ class Budget:
         number = 1 + len(self.pace.spent.get("screening", ()))
         self.progress(f"searching: screening {number}, after refit {self.fits_done}{self._left(LATER, 1)}")
 
-    def _left(self, refits: float, screenings: int) -> str:
+    def _left(self, refits: float, screenings: float) -> str:
         planned = min(refits + LATER * self.later, self.fits - self.fits_done + 1)
         return self.pace.told({"refit": planned, "screening": screenings + self.later})
 

@@ -246,7 +246,7 @@ def _weighed(
     plant = refit.updated(posterior.plant, found, posterior.drives)
     rough_powers = case.coordinates.powers(posterior.rows(rough.residuals))
     if not problem.keeps:
-        found, rough = (dataclasses.replace(x, residuals=[]) for x in (found, rough))
+        found, rough = (dataclasses.replace(x, residuals=[], sizes=x.rms()) for x in (found, rough))
     return Fitted(
         Hypothesis(tuple(posterior.effects)),
         plant,

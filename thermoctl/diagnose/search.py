@@ -30,6 +30,8 @@ from thermoctl.yamlfile import InputError
 
 SURPLUS = 5.0  # nats over every other extension, from which one with an insignificant part is kept
 BEATEN = 10.0  # nats below the best: such a parent is not extended where the best leaves no more than noise
+# Share of such hypotheses near the best that are extended: if the best cannot be extended, the others are not.
+CLOSE = 0.5
 Keys = frozenset[Key]
 START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
@@ -134,7 +136,8 @@ def grow(s: Search) -> None:
         close = max(over_noise(s.case, beam[0].fitted, s.limits.clean)) <= s.limits.clean
         rounds = s.limits.effects - number - 1
         for k, parent in enumerate(beam):
-            s.case.budget.later = 0 if close else len(beam) - k - 1 + rounds * s.limits.beam
+            after = [w for w in beam[k + 1 :] if not close or w.score >= best - BEATEN]
+            s.case.budget.later = CLOSE * len(after) if close else len(after) + rounds * s.limits.beam
             if close and parent.score < best - BEATEN:
                 continue
             known = parent.fitted.hypothesis.keys in s.seen
@@ -280,7 +283,9 @@ def extensions(
             continue
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
         if max(over_noise(case, leader, limits.clean)) <= limits.clean:
-            case.budget.later = min(case.budget.later, int(leader is not parent.fitted))
+            scores = sorted((w.score for w in (*tried.values(), *out)), reverse=True)[: limits.beam]
+            near = sum(score >= scores[0] - BEATEN for score in scores)
+            case.budget.later = min(case.budget.later, CLOSE * near)
         fits = _followed(case, parent, looked, added, leader)
         found = [f for f in fits if not f.absent]
         if found:

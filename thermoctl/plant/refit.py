@@ -56,7 +56,8 @@ class Fit:
     - `unknowns`: (name, recording index or None) of each free parameter and initial state
     - `z`: their scaled values: a parameter's is 0..1 in its range, an initial state's in standard deviations
     - `hessian`: Gauss-Newton matrix, the inverse covariance of `z`; `prior_hessian`: the priors' share
-    - `residuals`: (N, outputs) by recording, NaN where missing"""
+    - `residuals`: (N, outputs) by recording, NaN where missing
+    - `sizes`: rms of each output's residuals, where these were not kept"""
 
     model: Model
     values: np.ndarray
@@ -72,6 +73,7 @@ class Fit:
     at_bound: dict[str, str] = field(default_factory=dict)
     priors: tuple[Prior, ...] = ()
     prior_hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    sizes: dict[str, float] = field(default_factory=dict)
 
     def parameters(self, recording: int = 0) -> dict[str, float]:
         """Return all parameter values of one recording."""
@@ -79,6 +81,8 @@ class Fit:
 
     def rms(self) -> dict[str, float]:
         """Return the root-mean-square residual of each output over all recordings."""
+        if not self.residuals:
+            return self.sizes
         stacked = np.concatenate(self.residuals)
         return {
             o: float(np.sqrt(np.nanmean(stacked[:, j] ** 2)))
