@@ -34,9 +34,10 @@ LATER = 2.5  # refits after a later screening: mean of 26 diagnoses of real and 
 class Budget:
     """Largest number of refits, and the number done. Counted, never timed: the same on every machine.
 
-    `planned`: number of refits after this step of the search; each step may plan more. `later`: number of
-    hypotheses that the search is expected to extend besides; only the time left depends on it. `stopped`: does a person want the
-    result of what is done so far? `untried`: refits of promising hypotheses left out."""
+    - `planned`: number of refits after this step of the search; each step may plan more
+    - `later`: number of hypotheses that the search may extend besides; only the time left depends on it
+    - `stopped`: does a person want the result of what is done so far?
+    - `untried`: refits of promising hypotheses left out"""
 
     fits: int
     progress: Callable[[str], None] = lambda text: None

@@ -30,7 +30,7 @@ from thermoctl.yamlfile import InputError
 
 SURPLUS = 5.0  # nats over every other extension, from which one with an insignificant part is kept
 BEATEN = 10.0  # nats below the best: such a parent is not extended where the best leaves no more than noise
-# Share of such hypotheses near the best that are extended: if the best cannot be extended, the others are not.
+# Share of hypotheses near the best that are extended. If the best cannot be extended, the others are not.
 CLOSE = 0.5
 Keys = frozenset[Key]
 START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
