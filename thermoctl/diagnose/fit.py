@@ -21,7 +21,9 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.memory import Past, PlacedBefore
 from thermoctl.diagnose.noise import Averaged, Grid, averaged
-from thermoctl.diagnose.posterior import Hypothesis, Placed, Posterior, bounded_step, gaussian
+from thermoctl.diagnose.posterior import Hypothesis, bounded_step, gaussian
+from thermoctl.diagnose.posterior import Placed as Placed
+from thermoctl.diagnose.posterior import Posterior as Posterior
 from thermoctl.plant import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, Problem
@@ -386,19 +388,3 @@ def _size(p: EffectParameter, value: float, sd: float) -> float:
     Below its standard deviation the density is nearly constant."""
     one_sided = p.low >= p.null or p.high <= p.null
     return -float(np.log(np.log(10.0) * DECADES * (1 if one_sided else 2) * np.hypot(value - p.null, sd)))
-
-
-__all__ = [
-    "Fitted",
-    "Hypothesis",
-    "Placed",
-    "Posterior",
-    "as_refitted",
-    "evidence_at",
-    "fitted",
-    "levels",
-    "over_noise",
-    "placed_before",
-    "remembered",
-    "with_residuals",
-]
