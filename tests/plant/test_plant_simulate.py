@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from tests.bench.scale import block_plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
@@ -197,3 +198,16 @@ def test_a_delay_within_a_delay_is_refused_also_where_an_effect_makes_it():
     nested = dataclasses.replace(plant, outputs={"v": dataclasses.replace(plant.outputs["v"], value=late)})
     with pytest.raises(InputError, match="within a delay"):
         compile_plant(nested)
+
+
+def test_a_factorisation_by_table_gives_the_same_bytes_as_one_written_out(monkeypatch):
+    """Plants of many linked bodies have too many updates for a statement each."""
+    plant = loads(block_plant(9, [(a, b) for a in range(1, 10) for b in range(a + 1, 10)]))
+    t = np.arange(0.0, 600.0, 10.0)
+    columns = {i.column: 20 + 5 * np.sin(t / 60 + k) for k, i in enumerate(plant.inputs.values())}
+    runs = []
+    for written_out in (0, 10_000):
+        monkeypatch.setattr("thermoctl.plant.equations.WRITTEN_OUT", written_out)
+        monkeypatch.setattr("thermoctl.plant.compile._LOADED", {})
+        runs.append(compile_plant(plant).simulate(Table("run", "run", t, columns), sensitivities=True))
+    assert np.array_equal(runs[0].y, runs[1].y) and np.array_equal(runs[0].dy, runs[1].dy)
