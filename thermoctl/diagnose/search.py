@@ -270,7 +270,7 @@ def extensions(
     ahead = max(tried.values(), key=lambda w: w.score)
     # beside a hypothesis that leaves no more than noise only promises count
     promised = parent is not ahead and max(over_noise(case, ahead.fitted, limits.clean)) <= limits.clean
-    queue = shortlist(looked, where, limits)
+    queue, planned = shortlist(looked, where, limits), case.budget.later
     for k, (added, gain) in enumerate(queue):
         case.budget.planned = case.budget.fits_done + len(queue) - k
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
@@ -282,10 +282,7 @@ def extensions(
             case.budget.untried += 1
             continue
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
-        if max(over_noise(case, leader, limits.clean)) <= limits.clean:
-            scores = sorted((w.score for w in (*tried.values(), *out)), reverse=True)[: limits.beam]
-            near = sum(score >= scores[0] - BEATEN for score in scores)
-            case.budget.later = min(case.budget.later, CLOSE * near)
+        case.budget.later = min(planned, _expected(case, [*tried.values(), *out], leader, limits))
         fits = _followed(case, parent, looked, added, leader)
         found = [f for f in fits if not f.absent]
         if found:
@@ -297,6 +294,16 @@ def extensions(
             queue += [((d,), gain) for d in simpler(added, looked) if d.candidate.key not in queued]
     simplest = max((w.score for w in (parent, *out)), default=parent.score)
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
+
+
+def _expected(case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Limits) -> float:
+    """Return how many hypotheses the search will probably extend besides; it is only told."""
+    if not any(w.fitted.hypothesis.effects for w in tried):
+        return CLOSE * limits.beam  # it may end with the next one, or extend every beam
+    if max(over_noise(case, leader, limits.clean)) > limits.clean:
+        return np.inf
+    scores = sorted((w.score for w in tried), reverse=True)[: limits.beam]
+    return CLOSE * sum(score >= scores[0] - BEATEN for score in scores)
 
 
 def _followed(
