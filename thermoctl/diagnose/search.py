@@ -297,7 +297,7 @@ def extensions(
 
 
 def _expected(case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Limits) -> float:
-    """Return how many hypotheses the search will probably extend besides; it is only told."""
+    """Return how many hypotheses the search will probably extend besides; it steers nothing."""
     if not any(w.fitted.hypothesis.effects for w in tried):
         return CLOSE * limits.beam  # it may end with the next one, or extend every beam
     if max(over_noise(case, leader, limits.clean)) > limits.clean:
