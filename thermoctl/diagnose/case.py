@@ -67,7 +67,9 @@ class Budget:
         """Report that a hypothesis is screened for effects."""
         self.pace.enter("screening")
         number = 1 + len(self.pace.spent.get("screening", ()))
-        self.progress(f"searching: screening {number}, after refit {self.fits_done}{self._left(LATER, 1)}")
+        self.progress(
+            f"searching: screening {number}, after refit {self.fits_done}{self._left(min(LATER, self.later), 1)}"
+        )
 
     def _left(self, refits: float, screenings: float) -> str:
         planned = min(refits + LATER * self.later, self.fits - self.fits_done + 1)
