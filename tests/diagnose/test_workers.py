@@ -10,6 +10,7 @@ import pytest
 
 from tests.plants import ONE_BLOCK
 from tests.proof.test_proof import a_dask_by_hand
+from thermoctl.diagnose import workers as dask_workers
 from thermoctl.diagnose.run import diagnose
 from thermoctl.diagnose.workers import cluster
 from thermoctl.plant import load
@@ -50,7 +51,7 @@ def test_the_problem_of_one_recording_computes_the_same_in_another_process(tmp_p
 
 
 def test_an_address_without_a_scheduler_is_refused(monkeypatch):
-    monkeypatch.setattr("thermoctl.diagnose.workers.CONNECT_S", 0.5)
+    monkeypatch.setattr(dask_workers, "CONNECT_S", 0.5)
     with pytest.raises(InputError, match="no Dask scheduler"), cluster("tcp://127.0.0.1:1"):
         pass
 

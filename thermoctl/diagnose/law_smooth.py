@@ -34,6 +34,7 @@ KNOTS = 240  # of a recording, shared among the nodes
 FEWEST_KNOTS = 24
 ABSORBED = 1e-3  # share of a flow's response, below which the plant's own parameters absorb it
 STEPS = 3  # Gauss-Newton steps of the tracking
+TOGETHER = 48  # responses that are simulated at a time
 
 
 @dataclass
@@ -75,17 +76,21 @@ def _responses(
 def _blocks(
     metric: Rows, runs: Sequence[dict[str, np.ndarray | float]], place: Place, flows: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
+    """Return the rows of each recording's responses; TOGETHER columns at a time, for memory."""
     blocks, model = [], metric.model
     for r, (d, q) in enumerate(zip(metric.drives, flows, strict=True)):
-        k = q.shape[1]
-        forces, values = [], []
-        for node, sign in zip(reversed(place.nodes), (1.0, -1.0), strict=False):
-            storage = np.asarray(ex.evaluate(model.plant.nodes[node].storage, runs[r]), float)
-            forces += [(model.states.index(node), j) for j in range(k)]
-            values.append(sign * np.nan_to_num(q) / np.broadcast_to(storage, d.t.shape)[:, None])
-        q = np.concatenate(values, axis=1)
-        dy = model.respond(d, metric.fit.values[r], metric.fit.dx0[r], forces, q, k)
-        blocks.append(metric.rows(r, dy))
+        parts = []
+        for part in np.split(q, range(TOGETHER, q.shape[1], TOGETHER), axis=1):
+            k = part.shape[1]
+            forces, values = [], []
+            for node, sign in zip(reversed(place.nodes), (1.0, -1.0), strict=False):
+                storage = np.asarray(ex.evaluate(model.plant.nodes[node].storage, runs[r]), float)
+                forces += [(model.states.index(node), j) for j in range(k)]
+                values.append(sign * np.nan_to_num(part) / np.broadcast_to(storage, d.t.shape)[:, None])
+            force = np.concatenate(values, axis=1)
+            dy = model.respond(d, metric.fit.values[r], metric.fit.dx0[r], forces, force, k)
+            parts.append(metric.rows(r, dy))
+        blocks.append(np.concatenate(parts, axis=1))
     return blocks
 
 
