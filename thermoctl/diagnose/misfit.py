@@ -78,8 +78,8 @@ def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozense
     """Return the energies of all hypotheses.
 
     Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there.
-    The noise is what the leading hypothesis learnt, and at least the stated one. Of the two refits of a
-    hypothesis the better one counts."""
+    The noise is what the leading hypothesis learnt: a stated one that is too large would hide the misfit.
+    Of the two refits of a hypothesis the better one counts."""
     noise = list(zip(searched.tried[0].fitted.average.sensor, rounded(case), strict=True))
     out = {}
     for w in searched.tried:
@@ -97,7 +97,7 @@ def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: 
         output = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(output, 0.0)
         count = float(g.count.sum()) + f.past.counts.get(output, 0.0)
-        square = power / (count * max(own, g.variance))
+        square = power / (count * own)
         energy += square
         misfit += max(square - (1.0 if p >= limits.name and not coarse else limits.clean**2), 0.0)
     return Energy(energy, misfit)
