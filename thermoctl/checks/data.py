@@ -36,7 +36,11 @@ def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Fi
             found += _copies(table, item.column, values, table.t[there])
             if item.name in model.plant.outputs:
                 found += _resampled(table, item.column, values)
-    return found + _between(model, table, excitation) + _dead(model, table, excitation)
+    try:
+        simulated = model.run(excitation).y
+    except SimulationError:
+        return found
+    return found + _between(model, table, excitation, simulated) + _dead(model, table, excitation, simulated)
 
 
 def _empty(table: Table, name: str, column: str) -> Finding:
@@ -80,7 +84,7 @@ def _gaps(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
     ]
 
 
-def _between(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
+def _between(model: Model, table: Table, excitation: Excitation, held: np.ndarray) -> list[Finding]:
     """Find inputs that change in most rows, of which the plant file does not say how they go on between them.
 
     Straight lines would move the readings. Half the energy of that, in the noise, is the most that they could
@@ -92,7 +96,7 @@ def _between(model: Model, table: Table, excitation: Excitation) -> list[Finding
     straight = {i.name: replace(i, linear=True) for i in loose}
     lines = compile_plant(replace(model.plant, inputs={**model.plant.inputs, **straight}))
     try:
-        moved = lines.run(lines.excitation(table)).y - model.run(excitation).y
+        moved = lines.run(lines.excitation(table)).y - held
     except SimulationError:
         return []
     moved = moved / [n.sigma for n in default_noise(model.plant, [excitation])]
@@ -104,8 +108,8 @@ def _between(model: Model, table: Table, excitation: Excitation) -> list[Finding
         Finding(
             "between",
             table.path,
-            f"{names}: changes in most rows and is held between them, as the plant file says nothing else; straight lines "
-            f"would move the readings by up to {np.abs(moved).max():.2g} times their noise",
+            f"no word on how an input goes on between rows, where it changes in most of them: {names}. It is held; straight "
+            f"lines would move the readings by up to {np.abs(moved).max():.2g} times their noise",
             "State between_samples in the plant file: linear for what is measured, hold for what a drive holds.",
             severe=False,
         )
@@ -177,18 +181,14 @@ def _copies(table: Table, column: str, values: np.ndarray, t: np.ndarray) -> lis
     return []
 
 
-def _dead(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
+def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -> list[Finding]:
     """Find readings that stand still while the plant moves, and inputs that never move."""
-    try:
-        run = model.run(excitation)
-    except SimulationError:
-        return []
     found = []
     explained = total = 0.0
     noises = default_noise(model.plant, [excitation])
     for j, (o, noise) in enumerate(zip(model.plant.outputs.values(), noises, strict=True)):
         there = np.isfinite(excitation.y[:, j])
-        y, simulated = excitation.y[there, j], run.y[there, j]
+        y, simulated = excitation.y[there, j], run[there, j]
         if len(y) < FEW or not np.isfinite(simulated).all():
             continue
         sd = float(np.hypot(o.noise_sd, (o.resolution or 0.0) / 12**0.5))

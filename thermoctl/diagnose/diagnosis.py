@@ -55,11 +55,9 @@ def diagnose(
     null = with_residuals(known, as_refitted(known, fits[frozenset()]))
     likeliest = next(iter(posterior.hypotheses))
     stand = standouts(physics[likeliest])  # the other effects are part of the remainder
-    best = (
-        with_residuals(known, fits.get(stand, fits[likeliest]))
-        if posterior.something >= numbers.name
-        else null
-    )
+    best = null
+    if posterior.something >= numbers.name:
+        best = with_residuals(known, fits.get(stand, fits[likeliest]))
     reach = reached(known)
     after, before = left(known, best, reach, numbers.clean), left(known, null, reach, numbers.clean)
     say("measuring what the findings are worth")
@@ -90,8 +88,7 @@ def diagnose(
         and not stopped()
         and max(found.remainder.over_noise.values()) > numbers.clean
     ):
-        law = find_law(known, found.final, numbers, reserve, say)
-        found = replace(found, law=law and replace(law, fitted=with_residuals(known, law.fitted)))
+        found = replace(found, law=find_law(known, found.final, numbers, reserve, say))
     return found
 
 

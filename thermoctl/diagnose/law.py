@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import expit, softmax
 
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted, Placed
+from thermoctl.diagnose.fit import Fitted, Placed, with_residuals
 from thermoctl.diagnose.held_out import Worth, worth
 from thermoctl.diagnose.law_curve import Curve, curve
 from thermoctl.diagnose.law_misfit import closed, held_back, misfit_odds
@@ -83,10 +83,12 @@ def find_law(
     say("looking for a law of the remainder")
     try:
         if reserve:
-            return _chosen(case, parent, limits, reserve, True, say)
-        short, base, last = held_back(case, parent)
-        law = _chosen(short, base, limits, last, False, say)
-        return _refitted_to_all(case, parent, law) if law else None
+            law = _chosen(case, parent, limits, reserve, True, say)
+        else:
+            short, base, last = held_back(case, parent)
+            first = _chosen(short, base, limits, last, False, say)
+            law = first and _refitted_to_all(case, parent, first)
+        return law and replace(law, fitted=with_residuals(case, law.fitted))
     except (SimulationError, np.linalg.LinAlgError):
         return None
 

@@ -260,7 +260,7 @@ def _added(at: Tracked, law: Sequence[Term], columns: np.ndarray, pool: Sequence
 def _pairs(at: Tracked, pool: Sequence[Found]) -> list[tuple[Found, Found]]:
     """Return the pairs of terms that explain most together, one for each two forms and signals."""
     single = [f for f in pool if f.columns.shape[1] == 1][:PAIRED]
-    if len(single) < len(("one", "other")):
+    if len(single) < 2:
         return []
     v = np.concatenate([f.columns for f in single], axis=1)
     v = v / np.linalg.norm(v, axis=0)

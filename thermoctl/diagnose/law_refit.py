@@ -34,10 +34,9 @@ def refitted_law(case: Case, parent: Fitted, p: Proposal, duration: float, leade
     rig = Structure(parent.rough_plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
     c = law_candidate(case, rig, p)
     values, ranges = _start(p, duration)
-    free = {q: v for q, v in ranges.items()}
-    plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, free)
-    own = {q: c.own(q) for q in free if c.own(q) in plant.parameters}
-    c = dataclasses.replace(c, effect=_bounded(c, free))
+    plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
+    own = {q: c.own(q) for q in ranges if c.own(q) in plant.parameters}
+    c = dataclasses.replace(c, effect=_bounded(c, ranges))
     try:
         return fitted(
             case, plant, (*parent.hypothesis.effects, Placed(c, own)), None, leader, parent.rough.cost
