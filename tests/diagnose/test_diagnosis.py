@@ -12,9 +12,11 @@ from tests.plants import FREE_CARRIAGE, SPRING_STAGE, TWO_BLOCKS
 from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.catalogue import catalogue
+from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnose.fit import Placed, fitted
 from thermoctl.diagnose.result import doubts
 from thermoctl.diagnose.rig import Rig
+from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import load, loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table
@@ -299,6 +301,28 @@ def test_hysteresis_of_no_width_is_dry_friction(tmp_path):
     assert not any("backlash" in e for h in r["hypotheses"] for e in h["effects"])
 
 
+@pytest.mark.parametrize(("least", "absent"), [(1e-5, True), (1e-6, False)])  # m, of X0
+def test_hysteresis_pressed_to_its_least_width_is_no_finding(least, absent):
+    """What comes before sliding lies below the least width that was asked for: the simpler entry says the same."""
+    rubbed = FREE_CARRIAGE.replace(
+        "travel:", "rub: {from: velocity, rate: 3.0 * tanh(velocity / 0.0005), unit: N}\n  travel:"
+    )
+    t, rng = np.arange(2000) * 0.002, np.random.default_rng(1)
+    force = np.interp(t, np.arange(0, 9, 0.4), rng.uniform(-8, 8, 23))
+    table = compile_plant(loads(rubbed)).measure(
+        Table("run", "run", t, {"force": force, "encoder": np.zeros(len(t))})
+    )
+    table.columns["encoder"] = table.columns["encoder"] + rng.normal(0, 5e-6, len(t))
+    known = catalogue((CATALOGUE,))
+    c = case(loads(FREE_CARRIAGE), [table], known, Budget(1))
+    rig = Structure(c.plant, c.drives(c.null.model), [t.columns for t in c.tables])
+    entry = next(x for x in candidates(rig, known) if x.key == ("backlash_hysteresis", "velocity"))
+    start = {"F": 3.0, "X0": 3 * least}
+    plant = entry.extend(start, {"F": (0.1, 30.0), "X0": (least, 0.1)})
+    f = fitted(c, plant, (Placed(entry, {p: entry.own(p) for p in start}),))
+    assert f.absent == absent == (f.fit.at_bound.get(entry.own("X0")) == "low")
+
+
 TANK = """
 format: thermoctl-plant/1
 title: A pumped tank
@@ -448,7 +472,6 @@ def test_every_entry_of_the_catalogue_reads_and_a_users_own_replaces_it(tmp_path
         "effect: mine\ntitle: T\nwhere: temperature_node\nsource: me\n"
         "change: [{flow: {from: T, rate: 'K * (T - air)**3'}}]\nparameters: {K: {low: 0}}\n"
     )
-    from thermoctl.diagnose.catalogue import CATALOGUE
 
     assert "mine" in catalogue((CATALOGUE, tmp_path))
 

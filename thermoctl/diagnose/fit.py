@@ -87,14 +87,16 @@ def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]
     """Return whether any, or all, amplitudes of the effect are within SIGNIFICANT sd of no effect.
 
     For an effect without an amplitude (lag, delay): whether a parameter is at its lower bound.
-    A period at its upper bound does not repeat in the recordings: that is no periodic effect."""
+    A period at its upper bound does not repeat in the recordings: that is no periodic effect.
+    A parameter too small to be seen, at whose zero the effect is a simpler one: it is that one."""
     sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
     if not set(e.own.values()) <= f.plant.parameters.keys():
         return True  # another effect took its place
     effect = e.candidate.effect
-    periods = (e.own[p.name] for p in effect.parameters if effect.shapes.get(p.shape or "") == "periods")
-    if any(f.fit.at_bound.get(n) == "high" for n in periods):
-        return True
+    for p in effect.parameters:
+        at = f.fit.at_bound.get(e.own.get(p.name, ""))
+        if at == "high" and effect.shapes.get(p.shape or "") == "periods" or at == "low" and p.at_zero:
+            return True
     if e.candidate.effect.prior is not None:
         return False
     if not sizes:
