@@ -88,7 +88,7 @@ def judged(plant: Path, result: Path, used: Limits) -> Judged:
             for keys, h in keyed.items()
         },
         counts,
-        {keys: Energy(h["energy"], h["misfit"]) for keys, h in keyed.items()},
+        {keys: Energy(*(tuple(h[n]) for n in ("energy", "misfit", "rows"))) for keys, h in keyed.items()},
         dims,
         (),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from thermoctl.diagnose.decide import Facts, decide, weigh
@@ -57,13 +59,13 @@ def test_a_likely_effect_that_may_be_a_misfit_is_no_certainty():
     assert found.something == pytest.approx(0.7)
 
 
+def one(square: float, misfit: float) -> Energy:
+    """Energies of a single output with so many rows that noise moves nothing."""
+    return Energy((square,), (misfit,), (1e15,))
+
+
 def test_a_second_effect_that_removes_less_than_stays_does_not_stand():
-    energy = {
-        NOTHING: Energy(100.0, 98.4),
-        ONE: Energy(10.0, 8.4),
-        OTHER: Energy(90.0, 88.4),
-        BOTH: Energy(9.5, 7.9),
-    }
+    energy = {NOTHING: one(100.0, 98.4), ONE: one(10.0, 8.4), OTHER: one(90.0, 88.4), BOTH: one(9.5, 7.9)}
     found = standing(energy, {A: 1, B: 1}, limits())
     assert set(found) == {NOTHING, ONE, BOTH}
     assert found[ONE][A] > 0.99
@@ -72,7 +74,7 @@ def test_a_second_effect_that_removes_less_than_stays_does_not_stand():
 
 
 def test_without_a_misfit_every_effect_stands():
-    energy = {NOTHING: Energy(1.02, 0.0), ONE: Energy(1.0, 0.0)}
+    energy = {NOTHING: one(1.02, 0.0), ONE: one(1.0, 0.0)}
     assert standing(energy, {A: 7}, limits())[ONE][A] == 1.0
 
 
@@ -82,6 +84,18 @@ def test_the_odds_of_physics_are_a_log_uniform_size_against_a_normal_one():
 
     r = 3.0  # sizes in standard deviations of the misfit, over four decades about it
     expected = loguniform(1e-2, 1e2).pdf(r) / norm.pdf(r)
-    p = physics(r**2 * 0.1 * 5.0, 5.0, 0.1)
+    p = physics(one(6.0 + r**2 * 0.1 * 5.0, 0.0), one(6.0, 5.0), 0.1)
     assert p / (1 - p) == pytest.approx(expected, rel=1e-9)
-    assert np.all(np.diff([physics(x, 1.0, 0.1) for x in np.linspace(0.2, 3.0, 30)]) > 0)
+    assert np.all(
+        np.diff([physics(one(2.0 + x, 0.0), one(2.0, 1.0), 0.1) for x in np.linspace(0.2, 3.0, 30)]) > 0
+    )
+
+
+def test_a_misfit_in_one_reading_hides_no_effect_in_another():
+    """A position's misfit of ten times its noise is nine; of a temperature's 20 000 rows an effect removes 0.5 %."""
+    beside = Energy((10.0, 1.0), (9.0, 0.0), (20_000.0, 20_000.0))
+    assert physics(dataclasses.replace(beside, squares=(10.0, 1.005)), beside, 0.1) > 0.99
+    assert physics(dataclasses.replace(beside, squares=(10.005, 1.0)), beside, 0.1) < 0.5
+    assert (
+        physics(dataclasses.replace(beside, squares=(10.0, 1.0001)), beside, 0.1) < 0.5
+    )  # two squares of noise

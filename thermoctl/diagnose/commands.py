@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
 import signal
 import sys
@@ -28,7 +29,9 @@ from thermoctl.diagnose.resolve import resolve
 from thermoctl.diagnose.words import sentences, what_next
 from thermoctl.diagnose.workers import cluster
 from thermoctl.plant import load
+from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import read_recordings
+from thermoctl.recording.table import Table as Recording
 from thermoctl.yamlfile import InputError, suggest
 
 QUIET_S = 5.0  # seconds between two lines on the same stage
@@ -114,36 +117,10 @@ def diagnose(args: argparse.Namespace) -> int:
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
         added = read_recordings(plant, recordings[len(given) :])  # of --resolve: written by thermoctl
-        with (
-            contextlib.nullcontext() if args.quiet else StageReporter() as progress,
-            on_interrupt() as stopped,
-            cluster(args.scheduler),
-        ):
-            return run.diagnose(
-                plant,
-                [*given, *added],
-                args.out,
-                [Path(e) for e in args.effects or ()],
-                held_out,
-                progress,
-                args.drive or (),
-                parsed_limits(args.limit or ()),
-                stopped,
-                Path(args.continued) if args.continued else None,
-            )
+        return _run(args, plant, [*given, *added], held_out)
 
     try:
-        if args.resolve:
-            found = resolve(
-                diagnosed,
-                args.recordings,
-                Path(args.out),
-                args.record,
-                args.rounds,
-                lambda text: print(text, file=sys.stderr, flush=True),
-            )
-        else:
-            found = diagnosed(args.recordings)
+        found = _resolved(args, diagnosed) if args.resolve else diagnosed(args.recordings)
     except KeyboardInterrupt:
         print(f"thermoctl: stopped; {args.out} holds nothing of this diagnosis", file=sys.stderr)
         raise
@@ -152,6 +129,37 @@ def diagnose(args: argparse.Namespace) -> int:
     elif not args.quiet:
         summary(found, args.out)
     return 0
+
+
+def _run(
+    args: argparse.Namespace, plant: Plant, tables: Sequence[Recording], held_out: Sequence[Recording]
+) -> dict[str, Any]:
+    """Diagnose with progress, Ctrl-C and the options of the command line."""
+    with (
+        contextlib.nullcontext() if args.quiet else StageReporter() as progress,
+        on_interrupt() as stopped,
+        cluster(args.scheduler),
+    ):
+        return run.diagnose(
+            plant,
+            tables,
+            args.out,
+            [Path(e) for e in args.effects or ()],
+            held_out,
+            progress,
+            args.drive or (),
+            parsed_limits(args.limit or ()),
+            stopped,
+            Path(args.continued) if args.continued else None,
+        )
+
+
+def _resolved(
+    args: argparse.Namespace, diagnosed: Callable[[Sequence[str]], dict[str, Any]]
+) -> dict[str, Any]:
+    """Diagnose, record what is proposed, and diagnose again (`--resolve`)."""
+    say = functools.partial(print, file=sys.stderr, flush=True)
+    return resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds, say)
 
 
 def _read(folder: Path) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.case import Budget, Case, case
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.decide import Facts, decide, weigh
 from thermoctl.diagnose.fit import as_refitted, with_residuals
@@ -16,7 +16,7 @@ from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.misfit import energies, standing, standouts
 from thermoctl.diagnose.result import Diagnosis
-from thermoctl.diagnose.search import search
+from thermoctl.diagnose.search import Searched, search
 from thermoctl.diagnose.threads import one_thread
 from thermoctl.diagnose.unknown import left, reached, remainder
 from thermoctl.plant.language import Plant
@@ -46,43 +46,10 @@ def diagnose(
     chosen_on, reserve = split(tables, held_out)
     known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped), memory)
     searched = search(known, numbers)
-    energy = energies(known, searched, numbers)
-    dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
-    physics = standing(energy, dims, numbers)
-    scores = {w.fitted.hypothesis.keys: w.score for w in searched.tried}
-    posterior = weigh({keys: scores[keys] for keys in physics}, physics, numbers)
-    fits = {w.fitted.hypothesis.keys: w.fitted for w in searched.tried}
-    null = with_residuals(known, as_refitted(known, fits[frozenset()]))
-    likeliest = next(iter(posterior.hypotheses))
-    stand = standouts(physics[likeliest])  # the other effects are part of the remainder
-    best = null
-    if posterior.something >= numbers.name:
-        best = with_residuals(known, fits.get(stand, fits[likeliest]))
-    reach = reached(known)
-    after, before = left(known, best, reach, numbers.clean), left(known, null, reach, numbers.clean)
     say("measuring what the findings are worth")
-    value = worth(known, null, best, reserve)
-    sure = not (stopped() and known.budget.untried)  # an untried hypothesis may be likelier
-    named = tuple(e.key for e in best.hypothesis.effects if sure and posterior.effects[e.key] >= numbers.name)
-    # data that took part in the choice cannot speak against it
-    ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects and value.reserved else 1.0
-    remains = remainder(known, fits[best.hypothesis.keys])
-    facts = Facts(posterior.something, named, max(after.over_noise.values()), ratio, remains)
-    found = Diagnosis(
-        known,
-        searched,
-        posterior,
-        best,
-        null,
-        after,
-        before,
-        value,
-        decide(posterior, facts, numbers),
-        energy,
-        physics,
-    )
-    if found.decision.verdict != "consistent" and before.node:
-        found = replace(found, missing_flow=missing_flow(known, null, before.node))
+    found = _decided(known, searched, numbers, reserve, stopped() and bool(known.budget.untried))
+    if found.decision.verdict != "consistent" and found.before.node:
+        found = replace(found, missing_flow=missing_flow(known, found.null, found.before.node))
     if (
         found.decision.verdict not in WITHOUT_REMAINDER
         and not stopped()
@@ -90,6 +57,36 @@ def diagnose(
     ):
         found = replace(found, law=find_law(known, found.final, numbers, reserve, say))
     return found
+
+
+def _decided(
+    known: Case, searched: Searched, numbers: Limits, reserve: Sequence[Table], unsure: bool
+) -> Diagnosis:
+    """Return what a search says: posterior, findings and their worth, remainder, verdict.
+
+    `unsure`: an untried hypothesis may be likelier, so that nothing is named."""
+    energy = energies(known, searched, numbers)
+    dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
+    physics = standing(energy, dims, numbers)
+    scores = {w.fitted.hypothesis.keys: w.score for w in searched.tried}
+    posterior = weigh({keys: scores[keys] for keys in physics}, physics, numbers)
+    fits = {w.fitted.hypothesis.keys: w.fitted for w in searched.tried}
+    best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
+    if posterior.something >= numbers.name:
+        likeliest = next(iter(posterior.hypotheses))
+        stand = standouts(physics[likeliest])  # the other effects are part of the remainder
+        best = with_residuals(known, fits.get(stand, fits[likeliest]))
+    reach = reached(known)
+    after, before = left(known, best, reach, numbers.clean), left(known, null, reach, numbers.clean)
+    value = worth(known, null, best, reserve)
+    keys = () if unsure else (e.key for e in best.hypothesis.effects)
+    named = tuple(key for key in keys if posterior.effects[key] >= numbers.name)
+    # data that took part in the choice cannot speak against it
+    ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects and value.reserved else 1.0
+    remains = remainder(known, fits[best.hypothesis.keys])
+    facts = Facts(posterior.something, named, max(after.over_noise.values()), ratio, remains)
+    decision = decide(posterior, facts, numbers)
+    return Diagnosis(known, searched, posterior, best, null, after, before, value, decision, energy, physics)
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:

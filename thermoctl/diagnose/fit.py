@@ -37,6 +37,7 @@ DECADES = 4.0  # width of the log-uniform prior of an effect's size
 WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
 SHARE = 0.01  # of an effect's size, from which the first step towards it is taken
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
+EDGE = 1e-6  # of a parameter's range, up to which it is at its end
 MOST = 0.9  # of a curvature that not knowing the spectrum may take
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -220,18 +221,8 @@ def _weighed(
     confined = _relieved(confined, posterior.relief(z, posterior.rows(errors), average))
     inverse = np.linalg.pinv(confined, hermitian=True)
     sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
-    names: dict[str, float] = {}
-    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
-        slope = problem.scales[q].slope(float(values[0, posterior.model.parameters.index(q)]))
-        if q not in case.plant.parameters:
-            names[q] = max(names.get(q, 0.0), float(sd[k] * slope))
-    log_prior = log_density(posterior, z, names)
+    names = _deviations(posterior, values, sd)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
-    at_bound = {
-        q: "low" if z[k] <= 1e-6 else "high"
-        for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters])
-        if z[k] <= 1e-6 or z[k] >= 1 - 1e-6
-    }
     found = Fit(
         posterior.model,
         values,
@@ -244,19 +235,18 @@ def _weighed(
         case.noise,
         0,
         problem.samples,
-        at_bound,
+        _at_bound(problem, z),
         problem.priors,
     )
-    plant = refit.updated(posterior.plant, found, posterior.drives)
     rough_powers = case.coordinates.powers(posterior.rows(rough.residuals))
     if not problem.keeps:
         found, rough = (dataclasses.replace(x, residuals=[], sizes=x.rms()) for x in (found, rough))
     return Fitted(
         Hypothesis(tuple(posterior.effects)),
-        plant,
+        refit.updated(posterior.plant, found, posterior.drives),
         found,
         average.log_likelihood,
-        float(log_prior),
+        log_density(posterior, z, names),
         volume,
         average,
         tuple(powers),
@@ -267,6 +257,25 @@ def _weighed(
         confined,
         posterior.past,
     )
+
+
+def _deviations(posterior: Posterior, values: np.ndarray, sd: np.ndarray) -> dict[str, float]:
+    """Return the standard deviations of the effects' parameters, in their units, from those of z."""
+    problem, out = posterior.problem, dict[str, float]()
+    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
+        if q not in posterior.case.plant.parameters:
+            slope = problem.scales[q].slope(float(values[0, posterior.model.parameters.index(q)]))
+            out[q] = max(out.get(q, 0.0), float(sd[k] * slope))
+    return out
+
+
+def _at_bound(problem: Problem, z: np.ndarray) -> dict[str, str]:
+    """Return "low" or "high" for each parameter at an end of its range."""
+    return {
+        q: "low" if z[k] <= EDGE else "high"
+        for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters])
+        if not EDGE < z[k] < 1 - EDGE
+    }
 
 
 def _relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:

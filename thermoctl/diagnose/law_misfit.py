@@ -74,15 +74,16 @@ def misfit_odds(
     searched = Searched((Weighed(law, 0.0), Weighed(parent, 0.0)), False)
     energy = energies(case, searched, limits)
     mine, rival = energy[law.hypothesis.keys], energy[parent.hypothesis.keys]
-    left, elsewhere = mine.misfit, 0.0
+    elsewhere = 0.0
     if test:
         stays = _stays(case, test)
         if apart:
             elsewhere = -float(np.log(max(stays, TINY))) / (2 * limits.alike)
         else:
-            left = max(left, rival.all * stays)
+            left = tuple(max(m, e * stays) for m, e in zip(mine.misfit, rival.squares, strict=True))
+            mine = dataclasses.replace(mine, misfit=left)
     dims = sum(len(t.form.sizes) + len(t.form.shapes) for t in p.terms)
-    sure = physics(rival.all - mine.all, left, 1 - (1 - limits.alike) ** dims)
+    sure = physics(rival, mine, 1 - (1 - limits.alike) ** dims)
     return min(float(logit(sure)), CERTAIN) - p.cost + elsewhere
 
 

@@ -2,13 +2,14 @@
 
 Every plant is also wrong in small ways, whose misfits have the shapes of effects. Their energy is what a
 hypothesis leaves. Along the direction of one effect such a misfit is normal: along each parameter of the
-effect lies the share `alike` of its energy. The size of a true effect is log-uniform.
-So with r, the effect's size in standard deviations of such a misfit,
+effect lies the share `alike` of its energy. The outputs' misfits are independent. So each output o tells the
+effect's size with an error of its own, from its misfit and from the noise of its n_o rows. The size of a true
+effect is log-uniform. With r, the effect's size in standard deviations of all outputs together,
 
-    r^2 = (energy that the effect removes) / (share (energy that stays)),   share = 1 - (1 - alike)^parameters
-    odds of physics = sqrt(2 pi) exp(r^2 / 2) / (r DECADES ln 10)
+    r^2 = sum_o (energy that the effect removes) / (share (energy that stays) + 1 / n_o)
+    share = 1 - (1 - alike)^parameters,   odds of physics = sqrt(2 pi) exp(r^2 / 2) / (r DECADES ln 10)
 
-Energies are mean squares of residuals over the sensors' noise, summed over outputs.
+Energies are mean squares of an output's residuals over its sensor's noise.
 """
 
 from __future__ import annotations
@@ -31,10 +32,16 @@ SURE = 200.0  # r^2 beyond which the probability is 1 in any case
 
 @dataclasses.dataclass(frozen=True)
 class Energy:
-    """Mean square of a hypothesis' residuals over the noise: `all`, and the part beyond the noise."""
+    """Of each output: mean square of residuals over the noise, the part beyond the noise, number of rows."""
 
-    all: float
-    misfit: float
+    squares: tuple[float, ...]
+    misfit: tuple[float, ...]
+    rows: tuple[float, ...]
+
+    @property
+    def all(self) -> float:
+        """Sum over outputs."""
+        return sum(self.squares)
 
 
 def standing(
@@ -50,8 +57,8 @@ def standing(
         mine, own = energy[home], {}
         for key in home:
             part = (e for keys, e in energy.items() if keys < home and key not in keys)
-            removed = min(part, key=lambda e: e.all).all - mine.all
-            own[key] = physics(removed, mine.misfit, 1 - (1 - limits.alike) ** dims[key])
+            without = min(part, key=lambda e: e.all)
+            own[key] = physics(without, mine, 1 - (1 - limits.alike) ** dims[key])
         stand = standouts(own)
         for key, p in found.get(stand, {}).items() if stand < home else ():
             own[key] = max(own[key], p)
@@ -64,11 +71,12 @@ def standouts(of: Mapping[Key, float]) -> frozenset[Key]:
     return frozenset(key for key, p in of.items() if p > MISFIT)
 
 
-def physics(removed: float, left: float, share: float) -> float:
-    """Return the probability that an effect is physics, from the energies that it removes and leaves."""
-    if left <= 0:
+def physics(without: Energy, beside: Energy, share: float) -> float:
+    """Return the probability that an effect is physics, from the energies without it and beside it."""
+    if not any(beside.misfit):
         return 1.0
-    square = min(max(removed, 0.0) / (share * left), SURE)
+    removed, left = np.subtract(without.squares, beside.squares), np.array(beside.misfit)
+    square = float(np.clip(np.sum(removed / (share * left + 1 / np.array(beside.rows))), 0.0, SURE))
     r = max(np.sqrt(square), 1.0)
     odds = np.sqrt(2 * np.pi) * np.exp(0.5 * square) / (r * DECADES * np.log(10.0))
     return float(odds / (1 + odds))
@@ -92,12 +100,12 @@ def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: 
     """Return the energies of a refit.
 
     `noise`: by output the noise's variance, and whether the reading is coarsely rounded."""
-    energy = misfit = 0.0
+    found = []
     for g, (own, coarse), p in zip(case.grids, noise, f.average.remainder, strict=True):
         output = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(output, 0.0)
-        count = float(g.count.sum()) + f.past.counts.get(output, 0.0)
-        square = power / (count * own)
-        energy += square
-        misfit += max(square - (1.0 if p >= limits.name and not coarse else limits.clean**2), 0.0)
-    return Energy(energy, misfit)
+        rows = float(g.count.sum()) + f.past.counts.get(output, 0.0)
+        square = power / (rows * own)
+        noisy = 1.0 if p >= limits.name and not coarse else limits.clean**2
+        found.append((square, max(square - noisy, 0.0), rows))
+    return Energy(*zip(*found, strict=True))

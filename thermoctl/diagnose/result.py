@@ -298,8 +298,9 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
                 "rms": w.fitted.fit.rms(),
                 "cost": w.fitted.rough.cost,
                 "at_bound": w.fitted.fit.at_bound,
-                "energy": d.energy[keys].all,
-                "misfit": d.energy[keys].misfit,
+                "energy": list(d.energy[keys].squares),
+                "misfit": list(d.energy[keys].misfit),
+                "rows": list(d.energy[keys].rows),
                 "dims": [len(e.own) for e in sorted(w.fitted.hypothesis.effects, key=lambda e: e.key)],
             }
         )

@@ -90,6 +90,12 @@ def diagnose(
         result["notes"].insert(0, STOPPED.format(found.case.budget.fits_done))
     result["not_seen"] = not_seen(found) if found.decision.verdict == "consistent" and not stopped() else []
     result["seconds"] = round(time.monotonic() - started, 1)
+    _write(folder, plant, found, result, proposed)
+    return result
+
+
+def _write(folder: Path, plant: Plant, found: Diagnosis, result: dict[str, Any], proposed: Any) -> None:
+    """Write all files of a result, or none."""
     with tempfile.TemporaryDirectory(dir=folder.parent) as part_name:
         part = Path(part_name)
         added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in found.shown)
@@ -104,7 +110,6 @@ def diagnose(
             (folder / stale).unlink(missing_ok=True)
         for name in ("plant.yaml", "report.html", "diagnosis.json", memory.FILE, *written):
             shutil.move(part / name, folder / name)
-    return result
 
 
 def _report(found: Diagnosis, result: dict[str, Any], path: Path) -> None:
