@@ -35,6 +35,8 @@ SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "motor": ("v",),
     "drive": ("u",),
     "sensor": ("y",),
+    "body_sensor": ("y",),
+    "passive_sensor": ("y",),
     "reading_in_air": ("y",),
     "position_sensor": ("y",),
     "displacement": ("y",),

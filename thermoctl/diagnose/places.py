@@ -155,6 +155,23 @@ def _sensors(rig: Rig, dimension: str | None = None) -> Iterator[Place]:
             yield Place(i.name, {"y": name(i.name)}, input=i.name)
 
 
+def _of_bodies(rig: Rig) -> Iterator[Place]:
+    yield from (p for p in _sensors(rig) if p.where != rig.air)
+
+
+def _passive(rig: Rig) -> Iterator[Place]:
+    """Sensors, without the inputs that drive: a late or clipped drive is the actuator's entry."""
+    driving = {p.input for p in driven(rig)}
+    yield from (p for p in _sensors(rig) if not p.input or p.input not in driving)
+
+
+def _in_moving_air(rig: Rig) -> Iterator[Place]:
+    if rig.air in rig.moving_inputs:
+        for p in (*_sensors(rig, "temperature"), *_displacements(rig)):
+            if p.where != rig.air:
+                yield p
+
+
 def _displacements(rig: Rig) -> Iterator[Place]:
     warm = set(rig.temperatures) | set(rig.heat_inputs)
     for o in rig.physics.outputs.values():
@@ -250,7 +267,9 @@ PLACES = {
     "motor": _motors,
     "drive": driven,
     "sensor": _sensors,
-    "reading_in_air": lambda rig: (*_sensors(rig, "temperature"), *_displacements(rig)),
+    "body_sensor": _of_bodies,
+    "passive_sensor": _passive,
+    "reading_in_air": _in_moving_air,
     "position_sensor": lambda rig: _sensors(rig, "length"),
     "displacement": _displacements,
     "member": _members,

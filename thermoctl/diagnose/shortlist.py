@@ -29,7 +29,7 @@ def relabels(c: Candidate) -> bool:
         return any(_free_member(c, side) for side in ("TA", "TB"))
     displaced = PLACES["displacement"](c.rig)
     return (
-        c.effect.where == "sensor"
+        c.effect.where != "displacement"
         and "tau" in c.effect.shapes
         and any(p.output == c.place.output for p in displaced)
     )
