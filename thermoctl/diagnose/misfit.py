@@ -2,11 +2,12 @@
 
 Every plant is also wrong in small ways, whose misfits have the shapes of effects. Their energy is what a
 hypothesis leaves. Along the direction of one effect such a misfit is normal: along each parameter of the
-effect lies the share `alike` of its energy. The outputs' misfits are independent. So each output o tells the
-effect's size with an error of its own, from its misfit and from the noise of its n_o rows. The size of a true
-effect is log-uniform. With r, the effect's size in standard deviations of all outputs together,
+effect lies the share `alike` of its energy. Readings share the causes of their misfits, so these are taken
+together. A reading o without a misfit tells the effect's size up to the noise of its n_o rows. The size of a
+true effect is log-uniform. With r, the effect's size in standard deviations of all readings together,
 
-    r^2 = sum_o (energy that the effect removes) / (share (energy that stays) + 1 / n_o)
+    r^2 = (energy that the effect removes) / (share (energy that stays))  of readings with a misfit
+          + sum_o n_o (energy that it removes)                            of readings without one
     share = 1 - (1 - alike)^parameters,   odds of physics = sqrt(2 pi) exp(r^2 / 2) / (r DECADES ln 10)
 
 Energies are mean squares of an output's residuals over its sensor's noise.
@@ -76,7 +77,9 @@ def physics(without: Energy, beside: Energy, share: float) -> float:
     if not any(beside.misfit):
         return 1.0
     removed, left = np.subtract(without.squares, beside.squares), np.array(beside.misfit)
-    square = float(np.clip(np.sum(removed / (share * left + 1 / np.array(beside.rows))), 0.0, SURE))
+    known = max(float(removed[left > 0].sum()), 0.0) / (share * float(left.sum()))
+    known += float(removed[left == 0] @ np.array(beside.rows)[left == 0])
+    square = float(np.clip(known, 0.0, SURE))
     r = max(np.sqrt(square), 1.0)
     odds = np.sqrt(2 * np.pi) * np.exp(0.5 * square) / (r * DECADES * np.log(10.0))
     return float(odds / (1 + odds))
