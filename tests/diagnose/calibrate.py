@@ -40,7 +40,7 @@ NUMBERS = {
     "missing": (0.02, 0.05, 0.1, 0.2, 0.35, 0.5),
     "rare": (0.01, 0.03, 0.1, 0.3),
     "temperature": (0.7, 1.0, 1.25, 1.5, 2.0, 3.0),
-    "alike": (0.05, 0.1, 0.2),
+    "alike": (0.05, 0.075, 0.1, 0.15),
 }
 LEAST = 1e-3  # of a probability: the largest loss of one effect is 7
 FLAT = 0.02  # of the score, about one name: less says nothing
