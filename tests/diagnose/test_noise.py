@@ -18,11 +18,11 @@ ROWS, SIGMA, SWING = 2000, 0.05, 5.0
 SHARE = 0.4  # of the noise's variance, that is not white
 
 
-def banded(e: np.ndarray) -> tuple[list[Grid], list[np.ndarray]]:
+def banded(e: np.ndarray, sigma: float = SIGMA, block: int = 1) -> tuple[list[Grid], list[np.ndarray]]:
     n = len(e)
     d = Excitation("run", np.arange(n) * 1.0, np.zeros((n, 0)), e[:, None], {}, np.zeros(0, np.intc))
     c = Coordinates([d])
-    return [grid(c, [0], SIGMA, SWING)], c.powers([transform(c.channels[0], e)])
+    return [grid(c, [0], sigma, SWING, block=block)], c.powers([transform(c.channels[0], e)])
 
 
 def likelihood(e: np.ndarray) -> Averaged:
@@ -141,3 +141,11 @@ def test_a_residual_of_zero_has_a_finite_likelihood():
 def test_noise_as_stated_is_no_remainder():
     for phi in (0.0, 0.7, 0.9):
         assert all(likelihood(coloured(seed, phi)).remainder[0] < 0.5 for seed in range(4)), phi
+
+
+def test_slow_noise_is_the_same_noise_in_means_of_rows():
+    """Means keep the first-order part whole, and it is larger than their white part: still no remainder."""
+    block = 5
+    means = coloured(4, 0.9, rows=block * ROWS).reshape(-1, block).mean(axis=1)
+    present = [averaged(*banded(means, SIGMA / np.sqrt(block), b)).remainder[0] for b in (block, 1)]
+    assert present[0] < 0.05 and present[1] > 0.5

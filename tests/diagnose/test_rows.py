@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +12,27 @@ from tests.plants import ONE_BLOCK
 from thermoctl.diagnose.rows import LONG, reduced
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import fit
+from thermoctl.plant.refit import Noise, fit
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 ROWS = 30_000
+SLOW = ONE_BLOCK.replace("value: 6, unit: J/K, range: [2, 14]", "value: 60, unit: J/K, range: [20, 180]")
+LAGGING = (  # a probe that follows the block
+    SLOW.replace(
+        "nodes:",
+        "  lag: {value: 20, unit: s, range: [4, 100]}\nnodes:\n  probe: {unit: degC, storage: lag, initial: air}",
+    )
+    .replace("outputs:", "  contact: {into: probe, rate: block - probe}\noutputs:")
+    .replace("value: block", "value: probe")
+)
 CHANGES = (3_001, 9_498, 17_777)  # s: when the heater changes
 
 
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Plant:
     path: Path = tmp_path_factory.mktemp("rows") / "plant.yaml"
-    path.write_text(
-        ONE_BLOCK.replace("value: 6, unit: J/K, range: [2, 14]", "value: 60, unit: J/K, range: [20, 180]")
-    )
+    path.write_text(SLOW)
     return load(path)
 
 
@@ -61,6 +69,44 @@ def test_held_inputs_change_at_their_exact_times(plant):
     assert tuple(table.t[changed]) == CHANGES
 
 
+def test_the_plant_as_it_came_may_be_wrong(plant):
+    """Its error has kinks where the heater changes; that of the refitted plant has none."""
+    table = record(plant, stepped())
+    wrong = dataclasses.replace(plant.parameters["C"], value=100.0)
+    came = dataclasses.replace(plant, parameters={**plant.parameters, "C": wrong})
+    assert reduced(came, [table]).block == reduced(plant, [table]).block > 5
+
+
+def test_blocks_end_where_an_input_jumps(plant):
+    """A linear input keeps both rows of a jump, and no mean has readings of before and after."""
+    straight = {n: dataclasses.replace(i, linear=True) for n, i in plant.inputs.items()}
+    linear = dataclasses.replace(plant, inputs=straight)
+    table = record(linear, stepped())
+    few = reduced(linear, [table])
+    (t,) = few.tables
+    heat = t.columns["heat"][np.searchsorted(t.t, [[c - 1, c] for c in CHANGES])]
+    assert np.array_equal(heat, table.columns["heat"][[[c - 1, c] for c in CHANGES]])
+    middles = t.t[np.isfinite(t.columns["temperature"])][1:]
+    assert all(np.abs(middles - (c - 0.5)).min() >= few.block / 2 for c in CHANGES)
+
+
+def test_a_fast_part_keeps_its_information(tmp_path):
+    """A probe's lag of a few rows decides after each change of the heater only."""
+    path = tmp_path / "plant.yaml"
+    path.write_text(LAGGING)
+    plant = load(path)
+    model, table = compile_plant(plant), record(plant, stepped())
+    few = reduced(plant, [table])
+    k = model.active.index("lag")
+
+    def deviation(t: Table, noise: tuple[Noise, ...] | None) -> float:
+        return float(np.sqrt(np.linalg.inv(fit(model, [model.excitation(t)], noise).hessian)[k, k]))
+
+    drives = [model.excitation(t) for t in few.tables]
+    assert few.block > 1
+    assert deviation(few.tables[0], few.noise(plant, drives)) < 1.05 * deviation(table, None)
+
+
 def test_lost_cells_and_an_outlier_leave_the_means_right(plant):
     whole = record(plant, stepped())
     lost = whole.columns["temperature"].copy()
@@ -74,7 +120,7 @@ def test_lost_cells_and_an_outlier_leave_the_means_right(plant):
     assert np.nanmax(np.abs(table.columns["temperature"] - truth)[late]) < 0.3
 
 
-@pytest.mark.parametrize("what", ["short", "fast output", "fast input"])
+@pytest.mark.parametrize("what", ["short", "fast output", "weak oscillation", "fast input"])
 def test_rows_that_are_needed_are_kept(plant, what):
     rows = LONG if what == "short" else ROWS
     heat = stepped(rows)
@@ -83,5 +129,7 @@ def test_rows_that_are_needed_are_kept(plant, what):
     table = record(plant, heat, rows)
     if what == "fast output":
         table.columns["temperature"] += 0.3 * np.sin(2.4 * table.t)
+    if what == "weak oscillation":  # a tenth of the noise: no band of rows shows it
+        table.columns["temperature"] += 0.01 * np.sqrt(2) * np.sin(2.4 * table.t)
     few = reduced(plant, [table])
     assert few.block == 1 and few.tables[0] is table

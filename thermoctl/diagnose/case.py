@@ -179,7 +179,7 @@ def _grids(
     """Return the frequencies of each measured output."""
     sensors = [rows.sensor(o.noise) for o in plant.outputs.values()]
     return tuple(
-        grid(coordinates, ks, noise[j].sigma, _swing(drives, j), sensors[j])
+        grid(coordinates, ks, noise[j].sigma, _swing(drives, j), sensors[j], rows.block)
         for j, ks in coordinates.by_output().items()
     )
 

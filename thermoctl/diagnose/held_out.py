@@ -58,7 +58,7 @@ def worth(
     `known`: of another hypothesis, whose errors without the findings are the same."""
     if reserve:
         if case.block > 1:
-            reserve = [means(case.null.model, t, case.block) for t in reserve]
+            reserve = [means(compile_plant(null.plant), t, case.block) for t in reserve]
 
         def rms(plant: Plant) -> dict[str, float]:
             return _rms([_errors(case, plant, t) for t in reserve], null.fit.model)

@@ -66,6 +66,7 @@ class Grid:
     channels: tuple[int, ...]  # positions in Coordinates.channels
     node: np.ndarray
     count: np.ndarray
+    block: int  # samples whose mean is one row of the recordings
     turn: np.ndarray  # angle in a sampling interval
     shape: np.ndarray  # the stated noise's spectrum, its mean over all rows 1
     slow: np.ndarray  # (starts, nodes) the same of noise with slow parts
@@ -94,11 +95,13 @@ def grid(
     sigma: float,
     swing: float,
     sensor: SensorNoise | None = None,
+    block: int = 1,
 ) -> Grid:
     """Return the frequencies of one output.
 
     `positions`: of its channels; `sigma`: its stated noise; `swing`: its rms about the mean. `sensor`: the
-    parts of the noise, where the plant file states them."""
+    parts of the noise, where the plant file states them. `block`: samples whose mean is one row. A mean of
+    samples has the spectrum of the samples, divided by their number: slow parts keep their size and time."""
     channels = [coordinates.channels[k] for k in positions]
     octave = np.concatenate([np.log2(c.frequency) for c in channels])
     cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)
@@ -116,13 +119,14 @@ def grid(
     log_rough = float(np.linalg.slogdet(rough)[1])
     frequency = np.exp2(octave.min()) * WIDTH**known
     interval = channels[0].interval
-    turn = 2 * np.pi * frequency * interval
+    turn = 2 * np.pi * frequency * interval / block
     shape = spectrum(sensor or SensorNoise(1.0), frequency, interval)
     slow = np.array([_slow(turn, x)[0] for x in STARTS])
     return Grid(
         tuple(positions),
         node,
         count,
+        block,
         turn,
         shape * count.sum() / (shape @ count),
         slow * count.sum() / (slow @ count)[:, None],

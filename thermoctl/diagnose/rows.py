@@ -1,21 +1,26 @@
-"""Fewer rows without loss: means over blocks, where neither outputs nor inputs hold anything faster.
+"""Fewer rows without loss: means over blocks of a recording, about the run of a refitted plant.
 
 A logger writes far more rows than a slow plant needs. Rows of a long recording are put together `block` at a
 time, one row at the middle of each block:
 
     y = yhat(middle) + mean over the block (y - yhat)
 
-yhat is the run of the plant as it came. It carries what is fast in the outputs. So only the plant's error has
-to be smooth over a block. White noise of standard deviation s becomes s / sqrt(block).
+yhat is the run of the plant, refitted to coarse means. It carries what is fast in the outputs. So only the
+plant's error has to be smooth over a block. White noise of standard deviation s becomes s / sqrt(block).
 
-A held input keeps the exact times of its changes: each change has a row of its own, without outputs. An input
-that changes too often for that is averaged from one row to the next. `block` is the largest number that
-passes two tests in every recording:
+Where an input jumps, a block ends and the next begins: no block mixes readings of before and after. The
+last rows before a jump, fewer than a block, give no value. A held input keeps the exact times of its changes:
+each has a row of its own, without outputs. An input that changes too often for that is averaged.
 
-- Every measured output is white above half of the new highest frequency. No band of DCT rows there has more
-  power than the highest half of all rows.
+`block` is the largest number that passes three tests in every recording:
+
+- The plant's error is white above half of the new highest frequency. No band of DCT rows there has more
+  power than the highest half of all rows, and no single row has: an oscillation is one (Fisher 1929).
 - Averaged inputs vary within a block by little: AVERAGED of their variance. So functions that are not linear
   in an input keep their mean.
+- The means keep the information on each parameter and initial state, and on a delay of each output. The
+  information is 1 / [(J'J + prior)^-1]_kk: all others are unknown too. A delay changes a reading by its
+  slope. That is as fast as any effect's change.
 """
 
 from __future__ import annotations
@@ -23,18 +28,21 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.fft import dct
+from scipy.special import chdtri
 
 from thermoctl.diagnose.coordinates import band_edges
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.recordings import in_plant_units
-from thermoctl.plant.refit import Noise, default_noise
+from thermoctl.plant.refit import Noise, Problem, default_noise, fit
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
-# None of these numbers chooses a hypothesis. They limit the loss to about 2 % of the information.
+# None of these numbers chooses a hypothesis.
+LOST = 0.05  # of the information on an unknown: as a recording that is so much shorter
 LONG = 12_000  # rows of all recordings, up to which a diagnosis takes seconds: all are kept
 FEWEST = 1_000  # rows that each recording keeps: forty bands, the highest with a tenth of them
 # At half of the new highest frequency the mean of a block keeps sinc(1/4)^2 = 81 % of the power.
@@ -42,6 +50,7 @@ FEWEST = 1_000  # rows that each recording keeps: forty bands, the highest with 
 HALF_BAND = 2.0  # the new highest frequency over that of the fastest content
 WHITE = 1.1  # times the power of the highest rows, up to which a band is white
 DEVIATIONS = 4.0  # of a band's power that are chance: wrong at one output in a thousand
+CHANCE = 1e-3  # that one of the rows of white noise is taken for an oscillation
 AVERAGED = 1e-3  # share of an input's variance that averaging may remove: the mean of its square is as exact
 OUTLIER = 6.0  # robust standard deviations from the median of its neighbours, beyond which a cell is dropped
 GAP = 1.5  # times the usual duration of a block, beyond which rows are missing in it: it gives no value
@@ -93,24 +102,69 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     kept = Reduced(list(tables), 1, before, before)
     if before <= LONG:
         return kept
-    model = compile_plant(plant, ())
+    model = compile_plant(plant)
     drives = [model.excitation(t) for t in tables]
-    block = min(_block(model, d) for d in drives)
+    coarse = min(next((b for b in _sizes(len(d.t) // FEWEST) if _allowed(d, b)), 1) for d in drives)
+    if coarse == 1:
+        return kept
+    rough = Reduced([means(model, t, coarse) for t in tables], coarse, before, 0)
+    rough_drives = [model.excitation(t) for t in rough.tables]
+    try:
+        found = fit(model, rough_drives, rough.noise(plant, drives), tolerance=1e-3, seconds=np.inf)
+        problem = Problem(model, drives, default_noise(plant, drives))
+        point = found.values, found.dx0
+        block = min(problem.each(_block, point, lambda r: (coarse,), 2))
+    except SimulationError:
+        return kept
     if block == 1:
         return kept
-    out = [means(model, t, block) for t in tables]
+    out = [means(model, t, block, *of_t) for t, *of_t in zip(tables, *point, strict=True)]
     return Reduced(out, block, before, sum(map(len, out)))
 
 
-def _block(model: Model, d: Excitation) -> int:
-    """Return the largest block that a recording allows. It is odd: so its middle is a row."""
-    n = len(d.t)
-    most = n // FEWEST
+def _block(problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, coarse: int) -> int:
+    """Return the largest block, at most `coarse`, that a recording allows."""
+    d = problem.excitations[r]
+    run = problem.model.run(d, values, dx0, sensitivities=True, states=False)
+    used, unknowns, slope = problem.slopes(r, values)
+    content = max(_content(e) for e in (d.y - run.y).T)
+    assert run.dy is not None
+    columns = np.concatenate(
+        [run.dy[:, :, used] * slope, np.gradient(run.y, d.t, axis=0)[:, :, None]], axis=2
+    )
+    columns /= np.array([n.sigma for n in problem.noise])[:, None]
+    columns[~np.isfinite(d.y)] = 0.0
+    prior = problem.prior()[unknowns]
+    whole = _information(columns, d, np.arange(len(d.t)), 1, prior)
+
+    def enough(b: int) -> bool:
+        return bool((_information(columns, d, _starts(d, b), b, prior) >= (1 - LOST) * whole).all())
+
+    sizes = _sizes(min(coarse, int(len(d.t) / (HALF_BAND * content + 1))))
+    return next((b for b in sizes if _allowed(d, b) and enough(b)), 1)
+
+
+def _sizes(most: int) -> list[int]:
+    """Return the blocks to try, the largest first. They are odd: so the middle is a row."""
+    return sorted({(int(most * 0.8**k) - 1) // 2 * 2 + 1 for k in range(40)} - {1, -1}, reverse=True)
+
+
+def _information(
+    columns: np.ndarray, d: Excitation, starts: np.ndarray, block: int, prior: np.ndarray
+) -> np.ndarray:
+    """Return the information on each of k unknowns, then on a delay of each output, in means of blocks.
+
+    `columns` (N, outputs, k + 1): whitened changes of the readings by the unknowns, and by the output's
+    delay, 0 where nothing was measured. `prior` (k,): of the unknowns."""
+    k, rows = len(prior), starts[:, None] + np.arange(block)
+    gram = np.diag(np.concatenate([prior, np.zeros(d.y.shape[1])]))
     for j in range(d.y.shape[1]):
-        most = min(most, int(len(d.t) / (HALF_BAND * _content(d.y[:, j]) + 1)))
-    sizes = sorted({(int(most * 0.8**k) - 1) // 2 * 2 + 1 for k in range(40)}, reverse=True)
-    may = (b for b in sizes if b > 1 and all(_may_average(d, j, b) for j in range(len(model.inputs))))
-    return next(may, 1)
+        count = np.isfinite(d.y[rows, j]).sum(axis=1)
+        mean = columns[rows, j].sum(axis=1) / np.sqrt(np.maximum(count, 1))[:, None]
+        at = np.ix_([*range(k), k + j], [*range(k), k + j])
+        gram[at] += mean.T @ mean
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    return size**2 / np.diag(np.linalg.pinv(gram / np.outer(size, size), hermitian=True))
 
 
 def _content(y: np.ndarray) -> int:
@@ -124,58 +178,92 @@ def _content(y: np.ndarray) -> int:
     edges = band_edges(len(power))
     count = np.diff(edges)
     mean = np.add.reduceat(power, edges[:-1]) / count
-    loud = np.flatnonzero(mean > floor * (WHITE + DEVIATIONS * np.sqrt(2 / count)))
-    return int(edges[loud[-1] + 1]) if len(loud) else 0
+    loud = edges[1:][mean > floor * (WHITE + DEVIATIONS * np.sqrt(2 / count))]
+    lines = np.flatnonzero(power > floor * chdtri(1, CHANCE / len(power))) + 1
+    return int(max(loud.max(initial=0), lines.max(initial=0)))
 
 
-def _may_average(d: Excitation, j: int, block: int) -> bool:
-    """Are the changes of an input few enough for rows of their own, or its variance within blocks small?"""
-    u = d.u[:, j]
-    if not d.linear[j] and _changes(u).size <= len(u) // block:
-        return True
-    whole = u[: len(u) // block * block].reshape(-1, block)
-    if d.linear[j]:  # a straight line within the block is kept
-        whole = whole - np.linspace(-0.5, 0.5, block) * (whole[:, -1:] - whole[:, :1])
-    return float(np.mean(np.var(whole, axis=1))) <= AVERAGED * float(np.var(u))
+def _allowed(d: Excitation, block: int) -> bool:
+    """Does a block leave half of the rows or more, and does each input keep its changes or its variance?"""
+    starts = _starts(d, block)
+    rows = starts[:, None] + np.arange(block)
+    if 2 * rows.size < len(d.t):
+        return False
+    for j, u in enumerate(d.u.T):
+        if len(_changes(d, j, block)):
+            continue
+        part = u[rows]
+        if d.linear[j]:  # a straight line within the block is kept
+            part = part - np.linspace(-0.5, 0.5, block) * (part[:, -1:] - part[:, :1])
+        if np.mean(np.var(part, axis=1)) > AVERAGED * np.var(u):
+            return False
+    return True
 
 
-def _changes(u: np.ndarray) -> np.ndarray:
-    return np.flatnonzero(u[1:] != u[:-1]) + 1
+def _changes(d: Excitation, j: int, block: int) -> np.ndarray:
+    """Return the rows at which a held input changes; none if they are more than the blocks."""
+    rows = np.flatnonzero(d.u[1:, j] != d.u[:-1, j]) + 1
+    return rows if not d.linear[j] and len(rows) <= len(d.t) // block else rows[:0]
 
 
-def means(model: Model, table: Table, block: int) -> Table:
-    """Return a recording with one row a block and one a change of a held input."""
+def _jumps(d: Excitation, block: int) -> np.ndarray:
+    """Return the rows at which a block ends because an input jumps.
+
+    Half a block of rows is lost at each. So the largest jumps, each in its input's standard deviations, are
+    taken, until LOST of the rows are lost."""
+    size = np.zeros(len(d.t) - 1)
+    for u in d.u.T:
+        step = np.abs(np.diff(u))
+        size = np.maximum(
+            size, np.where(step > OUTLIER * 1.4826 * np.median(step), step, 0.0) / (np.std(u) or 1.0)
+        )
+    size[: block - 1] = 0.0  # the first block is at the start
+    most = int(LOST * len(d.t) / (0.5 * block))
+    largest = np.argsort(-size, kind="stable")[:most]
+    return np.sort(largest[size[largest] > 0]) + 1
+
+
+def _starts(d: Excitation, block: int) -> np.ndarray:
+    """Return the first row of each block."""
+    ends = [0, *_jumps(d, block).tolist(), len(d.t)]
+    return np.concatenate([np.arange(a, z - block + 1, block) for a, z in pairwise(ends)])
+
+
+def means(
+    model: Model, table: Table, block: int, values: np.ndarray | None = None, dx0: np.ndarray | None = None
+) -> Table:
+    """Return a recording with one row a block, one a change of a held input, and two a jump of another.
+
+    `values`, `dx0`: parameters and shifts of initial states of the run that carries what is fast."""
     table = in_plant_units(model.plant, table)
     d = model.excitation(table)
-    n = len(d.t) // block * block
-    middle = np.arange(
-        block // 2, n, block
-    )  # an input that is averaged holds from one of these rows to the next
+    starts, jumps = _starts(d, block), _jumps(d, block)
+    middle = starts + block // 2  # an input that is averaged holds from one of these rows to the next
     inputs = list(model.plant.inputs.values())
-    seldom = [
-        j for j in range(len(inputs)) if not d.linear[j] and _changes(d.u[:, j]).size <= len(d.t) // block
-    ]
-    rows = np.unique(np.concatenate([[0], middle, *(_changes(d.u[:, j]) for j in seldom)]))
+    seldom = [_changes(d, j, block) for j in range(len(inputs))]
+    before = jumps - 1 if d.linear.any() else jumps
+    rows = np.unique(np.concatenate([[0], middle, jumps, before, *seldom]))
     columns = {name: _held_mean(c, rows) for name, c in table.columns.items()}
     for j, i in enumerate(inputs):
-        if j in seldom:
+        if len(seldom[j]):
             columns[i.column] = d.u[rows, j]
         elif d.linear[j]:
-            columns[i.column] = _centred(d.u[:, j], rows, block)
+            columns[i.column] = _centred(d.u[:, j], rows, block, jumps)
     try:
-        run = model.run(d).y
+        run = model.run(d, values, dx0).y
     except SimulationError:
         run = np.zeros_like(d.y)
     noise = default_noise(model.plant, [d])
-    span = np.ptp(d.t[:n].reshape(-1, block), axis=1)
+    span = d.t[starts + block - 1] - d.t[starts]
     whole = span <= GAP * np.median(span)
     place = middle.copy()
     place[0] = 0  # the plant starts at the first value of an output
     at = np.searchsorted(rows, place)
     for j, o in enumerate(model.plant.outputs.values()):
         if o.column in table.columns:
-            error = (d.y[:, j] - run[:, j])[:n].reshape(-1, block)
-            away = np.abs(error - np.nanmedian(error, axis=1, keepdims=True))
+            error = (d.y[:, j] - run[:, j])[starts[:, None] + np.arange(block)]
+            seen = np.isfinite(error).any(axis=1, keepdims=True)
+            away = np.abs(error - np.nanmedian(np.where(seen, error, 0.0), axis=1, keepdims=True))
             good = away <= OUTLIER * max(1.4826 * float(np.nanmedian(away)), noise[j].sigma)
             count = good.sum(axis=1)
             mean = np.where(good, error, 0.0).sum(axis=1) / np.maximum(count, 1)
@@ -192,8 +280,10 @@ def _held_mean(column: np.ndarray, rows: np.ndarray) -> np.ndarray:
         return np.add.reduceat(np.where(good, column, 0.0), rows) / count
 
 
-def _centred(u: np.ndarray, rows: np.ndarray, block: int) -> np.ndarray:
-    """Return the mean over a block about each row."""
+def _centred(u: np.ndarray, rows: np.ndarray, block: int, jumps: np.ndarray) -> np.ndarray:
+    """Return the mean over a block about each row, shorter at jumps and ends."""
     total = np.concatenate([[0.0], np.cumsum(u)])
-    reach = np.minimum(np.minimum(rows, len(u) - 1 - rows), block // 2)
+    ends = np.concatenate([[0], jumps, [len(u)]])
+    part = np.searchsorted(ends, rows, side="right")
+    reach = np.minimum(np.minimum(rows - ends[part - 1], ends[part] - 1 - rows), block // 2)
     return (total[rows + reach + 1] - total[rows - reach]) / (2 * reach + 1)
