@@ -15,6 +15,7 @@ has a heat source that the plant lacks. In a network, whose blocks are linked wi
 from __future__ import annotations
 
 import argparse
+import heapq
 import json
 import os
 import subprocess
@@ -28,20 +29,36 @@ import numpy as np
 
 from tests.plants import TWO_BLOCKS
 from thermoctl.plant import load
+from thermoctl.plant.recordings import read_recordings
+from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 BODY = """
-import json, resource, sys, time
+import json, os, resource, sys, time
 from thermoctl.diagnose.run import diagnose_files
+from thermoctl.plant import residuals
+calls, side_by_side = [], residuals.each
+def timed(f, items, numbers):  # on one core these run one after the other
+    calls.append([])
+    def one(x):
+        started = time.thread_time()
+        try:
+            return f(x)
+        finally:
+            calls[-1].append(round(time.thread_time() - started, 4))
+    return side_by_side(one, items, numbers)
+if len(os.sched_getaffinity(0)) == 1:
+    residuals.each = timed
 found = diagnose_files(sys.argv[1], sys.argv[3:], sys.argv[2])
 used = [resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
 print(json.dumps({"verdict": found["verdict"], "found": [f"{f['effect']} at {f['where']}" for f in found["findings"]],
     "probability": [round(f["probability"], 3) for f in found["findings"]],
-    "cpu_s": sum(u.ru_utime + u.ru_stime for u in used), "MiB": used[0].ru_maxrss / 1024, "notes": found["notes"]}))
+    "cpu_s": sum(u.ru_utime + u.ru_stime for u in used), "MiB": used[0].ru_maxrss / 1024, "notes": found["notes"], "tasks": calls}))
 """
 LIMIT_S = 1800
 WEAK = "{from: outer_stator, rate: 1e-10 * ((outer_stator + 273.15)**4 - (air + 273.15)**4), unit: W}"  # radiation
+SIGMAS = 2.0  # of `weak`: size of the effect in one recording, in standard deviations
 THINNED = 100  # rows of the long record for one of the short
 
 
@@ -105,7 +122,14 @@ def block_plant(n: int, links: Links | None = None) -> str:
 
 
 def recorded(
-    folder: Path, plant_text: str, flow: str, rows: int, interval: float, power: float, grid: int = 1
+    folder: Path,
+    plant_text: str,
+    flow: str,
+    rows: int,
+    interval: float,
+    power: float,
+    grid: int = 1,
+    seed: int = 0,
 ) -> None:
     """Write plant.yaml and run_1.csv, recorded on the plant with one flow more.
 
@@ -114,7 +138,7 @@ def recorded(
     (folder / "plant.yaml").write_text(plant_text)
     (folder / "truth.yaml").write_text(plant_text.replace("flows:\n", f"flows:\n  concealed: {flow}\n"))
     plant = load(folder / "truth.yaml")
-    t, rng = np.arange(rows) * interval, np.random.default_rng(5)
+    t, rng = np.arange(rows) * interval, np.random.default_rng(5 + seed)
     columns: dict[str, np.ndarray] = {}
     for i in plant.inputs.values():
         if i.name == "air":
@@ -122,7 +146,7 @@ def recorded(
         else:
             ends = np.sort(rng.integers(0, rows // grid, 60)) * grid * interval
             columns[i.column] = np.round(rng.uniform(0, power, 61), 2)[np.searchsorted(ends, t, side="right")]
-    table = compile_plant(plant).measure(Table("run_1", "run_1", t, columns), seed=7)
+    table = compile_plant(plant).measure(Table("run_1", "run_1", t, columns), seed=7 + seed)
     write(folder / "run_1.csv", table)
 
 
@@ -259,23 +283,83 @@ def recordings(numbers: list[int], workers: list[int]) -> None:
                 found = diagnosed(folder, [f"run_{k}.csv" for k in range(1, n + 1)], workers=w)
                 line(f"{n} recordings, {w} workers", found)
                 print(f"{'':28} {found.get('wall_s', float('nan')):.1f} s", flush=True)
+                if found.get("tasks"):
+                    simulate_workers(float(found["cpu_s"]), found["tasks"])  # type: ignore[arg-type]
+
+
+def makespan(tasks: Sequence[float], workers: int) -> float:
+    """Return the seconds that tasks take on workers, each taken in order by the first that is free."""
+    free = [0.0] * workers
+    for seconds in tasks:
+        heapq.heapreplace(free, free[0] + seconds)
+    return max(free)
+
+
+def simulate_workers(cpu_s: float, calls: Sequence[Sequence[float]]) -> None:
+    """Print the time on 1, 2, 4 and 16 workers: the part of one process, and the longest worker of each call.
+
+    Transfers between machines are left out."""
+    serial = cpu_s - sum(map(sum, calls))
+    print(
+        f"{'':28} {serial:.1f} s in one process, {sum(map(sum, calls)):.1f} s in {sum(map(len, calls))} tasks of a recording"
+    )
+    times = [serial + sum(makespan(c, w) for c in calls) for w in (1, 2, 4, 16)]
+    print(f"{'':28} 1, 2, 4, 16 workers: " + ", ".join(f"{t:.0f}" for t in times) + " s")
+
+
+def weak(numbers: list[int]) -> None:
+    """Print what is found of a missing link that one recording shows with SIGMAS standard deviations only."""
+    name = "missing_link at block_1-block_4"
+    with tempfile.TemporaryDirectory() as work:
+        folder, plant = Path(work), block_plant(4)
+        (folder / "plant.yaml").write_text(plant)
+        size = 0.0
+        for k in range(max(numbers) + 1):  # the first one, without the link, gives its standard deviation
+            flow = f"{{from: block_1, into: block_4, rate: {size} * (block_1 - block_4), unit: W}}"
+            recorded(folder / str(k), plant, flow, 1200, 10.0, 10.0, seed=k)
+            if k == 0:
+                size = SIGMAS * _deviation(folder / "0", flow)
+                print(f"a link of {size:.3g} W/K: {SIGMAS} standard deviations in one recording", flush=True)
+            else:
+                (folder / str(k) / "run_1.csv").rename(folder / f"run_{k}.csv")
+        for n in numbers:
+            found = diagnosed(folder, [f"run_{k}.csv" for k in range(1, n + 1)])
+            line(f"{n} recordings, {SIGMAS * np.sqrt(n):.1f} sd", found)
+            print(f"{'':28} {name}: {'named' if name in found.get('found', ()) else 'not named'}", flush=True)  # type: ignore[operator]
+
+
+def _deviation(folder: Path, flow: str) -> float:
+    """Return the standard deviation of the link's conductance, all parameters and initial states unknown."""
+    free = "  G_link: {value: 0.0, unit: W/K, range: [-0.1, 0.1]}\nnodes:"
+    text = (folder / "plant.yaml").read_text().replace("nodes:", free, 1)
+    (folder / "free.yaml").write_text(
+        text.replace("flows:\n", f"flows:\n  concealed: {flow}\n".replace("rate: 0.0", "rate: G_link"))
+    )
+    plant = load(folder / "free.yaml")
+    model = compile_plant(plant)
+    found = fit(model, [model.excitation(t) for t in read_recordings(plant, [folder / "run_1.csv"])])
+    k = found.unknowns.index(("G_link", None))
+    return float(0.2 * np.sqrt(np.linalg.inv(found.hessian)[k, k]))
 
 
 def main() -> int:
     """Run one of the benchmarks."""
     p = argparse.ArgumentParser(description=__doc__)
-    p.add_argument("what", choices=("rows", "bodies", "recordings"))
+    p.add_argument("what", choices=("rows", "bodies", "recordings", "weak"))
     p.add_argument("--rows", type=int, default=260_000)
     p.add_argument("--before", type=Path)
     p.add_argument("--bodies", type=int, nargs="*", default=[12, 30, 60, 120])
     p.add_argument("--shape", nargs="*", choices=("chain", "network"), default=["chain", "network"])
     p.add_argument("--recordings", type=int, nargs="*", default=[1, 6, 12])
+    p.add_argument("--weak", type=int, nargs="*", default=[1, 4, 16, 32])
     p.add_argument("--workers", type=int, nargs="*", default=[1, 2])
     a = p.parse_args()
     if a.what == "rows":
         rows(a.rows, a.before)
     elif a.what == "bodies":
         bodies(a.bodies, a.shape)
+    elif a.what == "weak":
+        weak(a.weak)
     else:
         recordings(a.recordings, a.workers)
     return 0

@@ -19,7 +19,7 @@ each has a row of its own, without outputs. An input that changes too often for 
 - Averaged inputs vary within a block by little: AVERAGED of their variance. So functions that are not linear
   in an input keep their mean.
 - The means keep the information on each parameter and initial state, and on a delay of each output. The
-  information is 1 / [(J'J + prior)^-1]_kk: all others are unknown too. A delay changes a reading by its
+  information is 1 / [(J'J + prior)^-1]_kk. So all others are unknown, too. A delay changes a reading by its
   slope. That is as fast as any effect's change.
 """
 
