@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from tests.diagnose.test_workers import rig
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import as_refitted, fitted, with_residuals
+from thermoctl.diagnose.law_smooth import _smoothed
 from thermoctl.diagnose.posterior import Posterior
 from thermoctl.diagnose.run import diagnose
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
@@ -66,3 +68,10 @@ def test_a_diagnosis_that_keeps_no_sensitivities_has_the_same_findings(tmp_path,
     assert kept["verdict"] == forgot["verdict"] and kept["fit"]["after"] == pytest.approx(
         forgot["fit"]["after"], rel=1e-3
     )
+
+
+def test_unknown_flows_of_each_recording_are_solved_alone_as_if_together():
+    rng = np.random.default_rng(2)
+    wide, targets = [rng.standard_normal((40, 6)) for _ in range(3)], list(rng.standard_normal((3, 40)))
+    together = _smoothed([block_diag(*wide)], [np.concatenate(targets)])
+    assert np.allclose(np.concatenate(_smoothed(wide, targets)), together[0])

@@ -101,8 +101,23 @@ def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
     return dataclasses.replace(plant, inputs={**plant.inputs, **inputs}, flows={**plant.flows, **flows})
 
 
-def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
-    """Track the recordings from a fitted hypothesis. Raises SimulationError."""
+@dataclass(frozen=True)
+class _Followed:
+    """The plant linearised about the trajectory that follows the recordings best.
+
+    - `misfit`: of each recording, whitened rows of y - y(u^) + D u^
+    - `wide`: of each recording, rows of the responses to each knot's flow (rows, nodes * knots)"""
+
+    metric: Rows
+    runs: list[dict[str, np.ndarray | float]]
+    misfit: list[np.ndarray]
+    wide: list[np.ndarray]
+
+
+def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
+    """Follow the recordings with unknown flows into nodes. Raises SimulationError.
+
+    The knots of one recording do not touch another one: each is solved alone."""
     if not nodes:
         raise SimulationError("the plant has no node that an unknown flow could enter")
     f = as_refitted(case, f)
@@ -115,7 +130,7 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
     hats = [_hats(t.t - t.t[0], knots) for t in case.tables]
     weights = [np.zeros((knots, len(nodes))) for _ in hats]
     sizes: list[float] = []
-    best: tuple[float, Rows, list[dict[str, np.ndarray | float]], np.ndarray, np.ndarray] | None = None
+    best: tuple[float, _Followed] | None = None
     for _ in range(STEPS + 1):
         tables = tuple(
             dataclasses.replace(
@@ -132,29 +147,32 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
             signals(model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
         ]
         sizes = sizes or [typical_flow(f.rough_plant, n, runs) or 1.0 for n in nodes]
-        residual = np.concatenate(
-            [metric.rows(r, np.nan_to_num(d.y - metric.runs[r].y)) for r, d in enumerate(metric.drives)]
-        )
-        wide = _wide(metric, runs, nodes, sizes, hats)
-        scaled = np.concatenate([(w / np.array(sizes)).T.ravel() for w in weights])
-        size = float(residual @ residual)
-        if best is None or size < best[0]:
-            best = size, metric, runs, residual + wide @ scaled, wide
-        else:
+        residual = [
+            metric.rows(r, np.nan_to_num(d.y - metric.runs[r].y)) for r, d in enumerate(metric.drives)
+        ]
+        size = sum(float(e @ e) for e in residual)
+        if best is not None and size >= best[0]:
             break
-        new = _smoothed(wide, residual + wide @ scaled)
-        parts = np.split(new, len(hats))
-        weights = [p.reshape(len(nodes), knots).T * np.array(sizes) for p in parts]
+        wide = _wide(metric, runs, nodes, sizes, hats)
+        scaled = [(w / np.array(sizes)).T.ravel() for w in weights]
+        misfit = [e + x @ w for e, x, w in zip(residual, wide, scaled, strict=True)]
+        best = size, _Followed(metric, runs, misfit, wide)
+        weights = [p.reshape(len(nodes), knots).T * np.array(sizes) for p in _smoothed(wide, misfit)]
     if best is None:
         raise SimulationError("the plant cannot be tracked")
-    _, metric, runs, whole, wide = best
-    target = metric.project(whole)
-    duration = max(float(d.t[-1]) for d in metric.drives)
-    columns = np.arange(wide.shape[1]).reshape(len(hats), len(nodes), knots)
+    return best[1]
+
+
+def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
+    """Track the recordings from a fitted hypothesis. Raises SimulationError."""
+    at = _followed(case, f, nodes)
+    target = at.metric.project(np.concatenate(at.misfit))
+    duration = max(float(d.t[-1]) for d in at.metric.drives)
+    of_nodes = zip(*(np.split(x, len(nodes), axis=1) for x in at.wide), strict=True)
     explained = {
-        n: _explained(metric.project(wide[:, columns[:, i].ravel()]), target) for i, n in enumerate(nodes)
+        n: _explained(at.metric.project(block_diag(*x)), target) for n, x in zip(nodes, of_nodes, strict=True)
     }
-    return Tracked(metric, target, runs, duration, explained)
+    return Tracked(at.metric, target, at.runs, duration, explained)
 
 
 def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
@@ -162,7 +180,7 @@ def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
 
     `f`: the fitted plant. None where it cannot be tracked."""
     try:
-        runs = tracked(case, f, [node]).runs
+        runs = _followed(case, f, [node]).runs
     except (SimulationError, np.linalg.LinAlgError):
         return None
     return float(np.sqrt(np.mean(np.concatenate([run[f"{LATENT}{node}"] for run in runs]) ** 2)))
@@ -191,22 +209,25 @@ def _wide(
     nodes: Sequence[str],
     sizes: Sequence[float],
     hats: Sequence[np.ndarray],
-) -> np.ndarray:
-    """(rows, recordings * nodes * knots) responses to each knot, in units of the typical flows."""
+) -> list[np.ndarray]:
+    """Return each recording's (rows, nodes * knots) responses to each knot, in units of the typical flows."""
     by_node = [
         _blocks(metric, runs, Place(n), [h * s for h in hats]) for n, s in zip(nodes, sizes, strict=True)
     ]
-    return block_diag(*(np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)))
+    return [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
 
 
-def _smoothed(wide: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the mean of the knots' flows, their prior size chosen by marginal likelihood."""
-    u, s, v = np.linalg.svd(wide, full_matrices=False)
-    along, rest = u.T @ target, float(target @ target)
-    best = (-np.inf, np.zeros(wide.shape[1]))
-    for share in SHARES:
-        variance = 1 + (share * s) ** 2
-        score = -0.5 * (float(np.log(variance).sum()) + rest - float(along**2 @ (1 - 1 / variance)))
-        if score > best[0]:
-            best = score, v.T @ (share**2 * s / variance * along)
-    return best[1]
+def _smoothed(wide: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the mean of each recording's flows, with the prior size of the largest marginal likelihood."""
+    parts = [np.linalg.svd(x, full_matrices=False) for x in wide]
+    along = [u.T @ e for (u, _, _), e in zip(parts, targets, strict=True)]
+
+    def score(share: float) -> float:
+        """Twice the log marginal likelihood, up to a constant."""
+        variances = [1 + (share * s) ** 2 for _, s, _ in parts]
+        return sum(float(a**2 @ (1 - 1 / v) - np.log(v).sum()) for a, v in zip(along, variances, strict=True))
+
+    best = max(SHARES, key=score)
+    return [
+        v.T @ (best**2 * s / (1 + (best * s) ** 2) * a) for (_, s, v), a in zip(parts, along, strict=True)
+    ]

@@ -15,12 +15,12 @@ each has a row of its own, without outputs. An input that changes too often for 
 `block` is the largest number that passes three tests in every recording:
 
 - The plant's error is white above half of the new highest frequency. No band of DCT rows there has more
-  power than the highest half of all rows, and no single row has: an oscillation is one (Fisher 1929).
+  power than the highest half of all rows. No single row has: an oscillation is one (Fisher 1929).
 - Averaged inputs vary within a block by little: AVERAGED of their variance. So functions that are not linear
   in an input keep their mean.
-- The means keep the information on each parameter and initial state, and on a delay of each output. The
-  information is 1 / [(J'J + prior)^-1]_kk. So all others are unknown, too. A delay changes a reading by its
-  slope. That is as fast as any effect's change.
+- The means keep the information on each parameter and initial state, and on a delay of each output. It
+  is 1 / diag([J'J + prior]^-1): all others are unknown, too. A delay changes a reading by its slope.
+  That is as fast as any effect's change.
 """
 
 from __future__ import annotations

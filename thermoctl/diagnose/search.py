@@ -137,7 +137,12 @@ def grow(s: Search) -> None:
         rounds = s.limits.effects - number - 1
         for k, parent in enumerate(beam):
             after = [w for w in beam[k + 1 :] if not close or w.score >= best - BEATEN]
-            s.case.budget.later = CLOSE * len(after) if close else len(after) + rounds * s.limits.beam
+            follows = (
+                s.limits.beam if len(s.tried) == 1 and rounds else 0
+            )  # beside the plant alone none is known
+            s.case.budget.later = (
+                CLOSE * (len(after) + follows) if close else len(after) + rounds * s.limits.beam
+            )
             if close and parent.score < best - BEATEN:
                 continue
             known = parent.fitted.hypothesis.keys in s.seen
@@ -282,7 +287,8 @@ def extensions(
             case.budget.untried += 1
             continue
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
-        case.budget.later = min(planned, _expected(case, [*tried.values(), *out], leader, limits))
+        expected = _expected(case, [*tried.values(), *out], leader, limits, 1 - k / len(queue))
+        case.budget.later = min(planned, expected)
         fits = _followed(case, parent, looked, added, leader)
         found = [f for f in fits if not f.absent]
         if found:
@@ -296,10 +302,12 @@ def extensions(
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
 
 
-def _expected(case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Limits) -> float:
-    """Return how many hypotheses the search will probably extend besides; it steers nothing."""
+def _expected(case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Limits, untried: float) -> float:
+    """Return how many hypotheses the search will probably extend besides; it steers nothing.
+
+    `untried`: share of the shortlist."""
     if not any(w.fitted.hypothesis.effects for w in tried):
-        return CLOSE * limits.beam  # it may end with the next one, or extend every beam
+        return CLOSE * limits.beam * untried  # it may end with the next one, or extend every beam
     if max(over_noise(case, leader, limits.clean)) > limits.clean:
         return np.inf
     scores = sorted((w.score for w in tried), reverse=True)[: limits.beam]
