@@ -114,7 +114,8 @@ bench-scale: develop               # cost of a diagnosis by rows; BEFORE=a check
 bench-bodies: develop              # cost of a diagnosis by bodies: chains and networks of 12 to 120; half an hour
 	$(BIN)/python -m tests.bench.scale bodies
 
-bench-recordings: develop          # cost of a diagnosis by recordings of 30 000 rows, on one and on two cores; half an hour
+bench-recordings: develop          # a weak effect by recordings; cost by recordings of 30 000 rows, by cores and workers; half an hour
+	$(BIN)/python -m tests.bench.scale weak
 	$(BIN)/python -m tests.bench.scale recordings
 
 .PHONY: prove-refit refit-recordings

@@ -10,6 +10,7 @@ from tests.diagnose.test_workers import rig
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import as_refitted, fitted, with_residuals
 from thermoctl.diagnose.law_smooth import _smoothed
+from thermoctl.diagnose.overlay import _filtered
 from thermoctl.diagnose.posterior import Posterior
 from thermoctl.diagnose.run import diagnose
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
@@ -75,3 +76,13 @@ def test_unknown_flows_of_each_recording_are_solved_alone_as_if_together():
     wide, targets = [rng.standard_normal((40, 6)) for _ in range(3)], list(rng.standard_normal((3, 40)))
     together = _smoothed([block_diag(*wide)], [np.concatenate(targets)])
     assert np.allclose(np.concatenate(_smoothed(wide, targets)), together[0])
+
+
+def test_steps_that_are_joined_in_pairs_give_the_same_lag_as_one_after_the_other():
+    rng = np.random.default_rng(5)
+    decay, gain = rng.uniform(0, 1, 1001), rng.standard_normal(1001)
+    value, expected = 2.0, []
+    for c, g in zip(decay, gain, strict=True):
+        value = value * c + g
+        expected.append(value)
+    assert np.allclose(_filtered(decay, gain, 2.0), expected, rtol=1e-12, atol=1e-12)

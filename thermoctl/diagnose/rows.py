@@ -42,7 +42,8 @@ from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile
 from thermoctl.recording.table import Table
 
 # None of these numbers chooses a hypothesis.
-LOST = 0.05  # of the information on an unknown: as a recording that is so much shorter
+WIDER = 1.05  # largest factor on an unknown's standard deviation
+LOST = 0.05  # largest share of the rows that are left out before jumps
 LONG = 12_000  # rows of all recordings, up to which a diagnosis takes seconds: all are kept
 FEWEST = 1_000  # rows that each recording keeps: forty bands, the highest with a tenth of them
 # At half of the new highest frequency the mean of a block keeps sinc(1/4)^2 = 81 % of the power.
@@ -138,7 +139,7 @@ def _block(problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, coarse
     whole = _information(columns, d, np.arange(len(d.t)), 1, prior)
 
     def enough(b: int) -> bool:
-        return bool((_information(columns, d, _starts(d, b), b, prior) >= (1 - LOST) * whole).all())
+        return bool((_information(columns, d, _starts(d, b), b, prior) >= whole / WIDER**2).all())
 
     sizes = _sizes(min(coarse, int(len(d.t) / (HALF_BAND * content + 1))))
     return next((b for b in sizes if _allowed(d, b) and enough(b)), 1)
