@@ -133,3 +133,12 @@ def test_rows_that_are_needed_are_kept(plant, what):
         table.columns["temperature"] += 0.01 * np.sqrt(2) * np.sin(2.4 * table.t)
     few = reduced(plant, [table])
     assert few.block == 1 and few.tables[0] is table
+
+
+def test_the_sensitivity_to_a_start_decays_to_zero(plant):
+    """Not to the smallest number of the processor, on which it would take a hundred cycles an operation."""
+    table = record(plant, stepped())
+    month = dataclasses.replace(table, t=100 * table.t)
+    run = compile_plant(plant).simulate(month, sensitivities=True)
+    assert run.dx is not None
+    assert run.dx[1, 0, -1] > 0.9 and run.dx[-1, 0, -1] == 0.0
