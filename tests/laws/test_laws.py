@@ -24,6 +24,7 @@ from thermoctl.diagnose.law_misfit import misfit_odds
 from thermoctl.diagnose.law_propose import PROPOSALS
 from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable, refitted_law
 from thermoctl.diagnose.law_result import law_entry, law_section
+from thermoctl.diagnose.law_smooth import tracked
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.propose import propose, survivors
 from thermoctl.diagnose.rig import Rig
@@ -133,6 +134,13 @@ def test_an_experiment_separates_laws_that_fit_about_as_well(found):
     assert entry["separates"][0]["hypothesis"].startswith("A1 * (current / Z1) / (abs(current / Z1) + s1)")
     undecided.law = law
     assert propose(undecided) is None
+
+
+def test_parameters_that_scale_together_absorb_no_flow():
+    made = make(next(law for law in LAWS if law.name == "thermostat"), "reactor", "small", "closed", 7)
+    known = case(made.plant, made.tables[:2], {}, Budget(80))
+    at = tracked(known, fitted(known, known.plant, (), known.null), ["broth", "substrate"])
+    assert at.explained["broth"] > 0.5 > at.explained["substrate"]
 
 
 def test_no_law_is_claimed_where_nothing_is_missing():

@@ -25,7 +25,7 @@ from thermoctl.diagnose.law_forms import Place
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 from thermoctl.diagnose.where import SHARES, signals, typical_flow
 from thermoctl.plant import expression as ex
-from thermoctl.plant.expression import name
+from thermoctl.plant.expression import name, num
 from thermoctl.plant.language import Flow, Input, Plant
 from thermoctl.plant.simulate import SimulationError, compile_plant
 
@@ -95,10 +95,23 @@ def _blocks(
 
 
 def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
-    """Return the plant with a recorded flow into each node."""
+    """Return the plant with a recorded flow into each node.
+
+    Its slope does not change with the storage's parameters. In a plant whose storages and rates may share one
+    factor, this factor would else absorb every flow."""
     inputs = {f"{LATENT}{n}": Input(f"{LATENT}{n}", None, f"{LATENT}{n}", True) for n in nodes}
-    flows = {k: Flow(k, name(k), None, k.removeprefix(LATENT)) for k in inputs}
+    rates = {k: ex.mul(name(k), _scaling(plant, k.removeprefix(LATENT))) for k in inputs}
+    flows = {k: Flow(k, rate, None, k.removeprefix(LATENT)) for k, rate in rates.items()}
     return dataclasses.replace(plant, inputs={**plant.inputs, **inputs}, flows={**plant.flows, **flows})
+
+
+def _scaling(plant: Plant, node: str) -> ex.Expr:
+    """Return a node's storage over its value at the plant's parameters."""
+    known, storage = plant.parameters, plant.nodes[node].storage
+    if not ex.names(storage) & known.keys():
+        return ex.ONE
+    now = ex.substitute(storage, lambda e: num(known[e.value].value) if e.value in known else None)
+    return ex.div(storage, now)
 
 
 def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
