@@ -13,7 +13,7 @@ import numpy as np
 from tests.plants import TWO_BLOCKS
 from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
-from thermoctl.plant.language import Flow, Plant
+from thermoctl.plant.language import Flow, Node, Plant
 from thermoctl.plant.refit import default_noise, fit
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -95,7 +95,9 @@ STEPS = 4  # of the search for the law's size
 
 @dataclass(frozen=True)
 class Truth:
-    """A concealed law: `rate` is the flow from `source` into `target` for a size of one."""
+    """A concealed law: `rate` is the flow from `source` into `target` for a size of one.
+
+    `switches`: rate of a hidden state `on` that the law may read."""
 
     name: str
     family: str
@@ -104,6 +106,7 @@ class Truth:
     target: str
     source: str | None = None
     drawn: bool = False
+    switches: str | None = None
 
 
 def _t(name: str, family: str, rate: str, variables: str, target: str, source: str | None = None) -> Truth:
@@ -159,6 +162,23 @@ LAWS = (
     _t("heat of Monod growth", "reactor", "substrate / (0.8 + substrate)", "substrate", "broth"),
     _t("thermostat", "reactor", "-(1 + tanh((broth - 34) / 0.3)) / 2", "broth", "broth"),
     _t("phase change", "reactor", "exp(-((broth - 33) / 2)**2) * (broth - jacket)", "broth jacket", "broth"),
+)
+
+
+def _relay(
+    name: str, family: str, rate: str, on: str, off: str, signal: str, target: str, variables: str
+) -> Truth:
+    """A law with a switch that goes on above `on` and off below `off`, within about a sample."""
+    lag = 0.02 if family == "stage" else 1
+    switches = f"(step({signal} - {on} + ({on} - {off}) * on) - on) / {lag}"
+    return dataclasses.replace(_t(name, family, rate, variables, target), switches=switches)
+
+
+RELAYS = (
+    _relay("fan with hysteresis", "heater", "-on * (one - air)", "46", "38", "one", "one", "one air"),
+    _relay("latching magnet", "stage", "on", "0.03", "-0.02", "position", "velocity", "position"),
+    _relay("bell siphon", "tanks", "-on", "1.7", "0.8", "lower", "lower", "lower"),
+    _relay("thermostat with hysteresis", "reactor", "-on", "31", "26", "broth", "broth", "broth"),
 )
 
 # what the search's library does not hold; x is the variable over its typical size
@@ -269,6 +289,8 @@ def make(law: Truth | None, family: str, size: str, world: str, seed: int) -> Ma
     goal = RATIOS[size]
     misfit = goal * rng.uniform(0.03, 0.4) if world == "open" else 0.0
     truth, ratio = base, 1.0
+    if law and law.switches:
+        base = _switching(base, law.switches)
     if law:
         truth, ratio = _sized(plant, base, runs, "hidden", ex.parse(law.rate), law.target, law.source, goal)
     real = truth
@@ -283,6 +305,15 @@ def make(law: Truth | None, family: str, size: str, world: str, seed: int) -> Ma
         real = dataclasses.replace(truth, flows={**truth.flows, "wander": small.flows["wander"]})
     model = compile_plant(real)
     return Made(plant, [model.measure(t, seed + k) for k, t in enumerate(runs)], truth, law, ratio)
+
+
+def _switching(plant: Plant, rate: str) -> Plant:
+    """The plant with a state `on` that no flow of it reads yet."""
+    node = Node("on", ex.ONE, ex.ZERO, "1", None)
+    flow = Flow("switching", ex.parse(rate), None, "on")
+    return dataclasses.replace(
+        plant, nodes={**plant.nodes, "on": node}, flows={**plant.flows, "switching": flow}
+    )
 
 
 def _sized(

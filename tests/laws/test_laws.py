@@ -12,24 +12,28 @@ import yaml
 
 from tests.laws.prove import EQUAL, difference
 from tests.laws.real import law_of
-from tests.laws.rigs import LAWS, make
+from tests.laws.rigs import LAWS, RELAYS, make
 from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law import find_law
-from thermoctl.diagnose.law_forms import library
+from thermoctl.diagnose.law_forms import Signal, Term, library
 from thermoctl.diagnose.law_misfit import misfit_odds
 from thermoctl.diagnose.law_propose import PROPOSALS
 from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable, refitted_law
-from thermoctl.diagnose.law_result import law_entry, law_section
+from thermoctl.diagnose.law_result import law_entry, law_section, save_effect
 from thermoctl.diagnose.law_smooth import tracked
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.propose import propose, survivors
 from thermoctl.diagnose.rig import Rig
+from thermoctl.plant import expression as ex
 from thermoctl.plant import load, save
+from thermoctl.plant.language import Flow, Input, Node, Plant
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.proof.rigs import RIGS
+from thermoctl.recording.table import Table
 
 FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[3] / "shared/recordings"))
 ENTROPIC = next(law for law in LAWS if law.name == "entropic heat")
@@ -125,7 +129,7 @@ def test_an_experiment_separates_laws_that_fit_about_as_well(found):
     forms = {f.name: f for f in library()}
     bent = replace(term, form=forms["saturation"], shapes={"s": 2.5})
     other = replace(law.proposal, terms=(bent,), sizes=(3.5 * law.proposal.sizes[0],))
-    rival = refitted_law(known, parent, other, float(made.tables[0].t[-1]), parent)
+    rival = refitted_law(known, parent, other, parent)
     both = replace(law, rivals=((other, rival, 0.4),))
     undecided = SimpleNamespace(case=known, decision=SimpleNamespace(verdict="unexplained"), law=both)
     assert [share for _, share, _ in survivors(undecided)] == pytest.approx([0.6, 0.4])
@@ -141,6 +145,58 @@ def test_parameters_that_scale_together_absorb_no_flow():
     known = case(made.plant, made.tables[:2], {}, Budget(80))
     at = tracked(known, fitted(known, known.plant, (), known.null), ["broth", "substrate"])
     assert at.explained["broth"] > 0.5 > at.explained["substrate"]
+
+
+def test_a_relay_in_the_plant_switches_where_the_one_of_the_regression_does():
+    t = np.arange(400.0)
+    z = np.sin(t / 30) + 0.3 * np.sin(t / 7)
+    form = next(f for f in library() if f.name == "relay")
+    signal = Signal("z", ex.name("z"), None)
+    table = Table("made", "", t, {"z": z})
+    for on, off in ((0.6, -0.4), (-0.5, 0.7)):
+        term = Term(form, (signal,), {"on": on, "off": off}, 400.0, 1.0)
+        rate = ex.substitute(
+            term.filling(1),
+            lambda e, known={"on1": on, "off1": off, "Z1": 1.0}: (
+                ex.num(known[e.value]) if e.value in known else None
+            ),
+        )
+        plant = Plant(
+            "relay",
+            {"z": Input("z", None, "z", True)},
+            {},
+            {"m1": Node("m1", ex.ONE, ex.num(0.5))},
+            {"switching": Flow("switching", rate, None, "m1")},
+            {},
+        )
+        m = compile_plant(plant).simulate(table).x[:, 0]
+        other = (m > 0.5) != (term.values({"z": z}, t)[:, 0] > 0.5)
+        assert np.sum(np.diff(m > 0.5)) > 3 and np.mean(other) < 0.05  # a switch takes some samples
+
+
+@pytest.fixture(scope="module")
+def switched():
+    made = make(next(law for law in RELAYS if law.family == "reactor"), "reactor", "small", "closed", 7)
+    return made, look(made)[1]
+
+
+def test_a_thermostat_with_hysteresis_is_a_law_with_two_thresholds(switched):
+    made, law = switched
+    (term,) = law.proposal.terms
+    values = {q: p["value"] for q, p in law_entry(law)["parameters"].items()}
+    signal = term.signals[0]
+    assert (term.form.name, signal.label) == ("relay", "broth")
+    on, off = (signal.centre + values["Z1"] * values[q] for q in ("on1", "off1"))
+    assert abs(on - 31) < 0.5 and abs(off - 26) < 0.5
+    assert difference(law.fitted.plant, made) < EQUAL
+
+
+def test_a_saved_relay_is_an_effect(switched, tmp_path):
+    made, law = switched
+    result = {"remainder": {"law": law_entry(law)}}
+    save_effect(result, "thermostat", tmp_path / "own")
+    save(made.plant, tmp_path / "plant.yaml")
+    assert main(["effects", "check", str(tmp_path / "own"), "--plant", str(tmp_path / "plant.yaml")]) == 0
 
 
 def test_no_law_is_claimed_where_nothing_is_missing():

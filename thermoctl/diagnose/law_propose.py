@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,17 @@ import numpy as np
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, as_refitted
-from thermoctl.diagnose.law_forms import Place, Signal, Term, library, places, signals, terms
+from thermoctl.diagnose.law_forms import (
+    Family,
+    Place,
+    Signal,
+    Term,
+    combined,
+    families,
+    library,
+    places,
+    signals,
+)
 from thermoctl.diagnose.law_smooth import Tracked, tracked
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.shortlist import ALIKE
@@ -34,7 +44,9 @@ PAIRED = 600  # terms that are tried two at a time
 PAIRS, LIKELY = 8, 5000  # pairs from which sums grow; best pairs of values that they are looked for in
 PROPOSALS, SINGLE, SIGNALS = 14, 5, 4  # the best; of one term; of one term, each of another signal
 TERMS = 3
+ZOOMS, FINE = 2, 9  # finer grids of the shapes of a term; values of each shape there
 CHUNK = 256  # terms whose responses are computed at a time
+KEPT = 20  # values of the shapes of a form over a signal, from which sums may grow
 
 
 @dataclass(frozen=True)
@@ -116,6 +128,7 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
         every = [s for _, p, s in free if p == place][:SECOND]
         pool += _singles(at, place, found, every)
     pool.sort(key=lambda f: -f.gain)
+    pool = sorted([*pool, *(_zoomed(at, f) for f in _varied(pool))], key=lambda f: -f.gain)
     base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), rare
     out = [_proposal(at, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
@@ -171,35 +184,67 @@ def _promise(at: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _singles(at: Tracked, place: Place, found: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
-    """Return every term at a place."""
-    tried = [t for t in terms(every, at.duration) if not t.signals or t.signals[0] in found]
+    """Return the terms at a place, the best KEPT of each form over each signal."""
     still = at.columns(place, [np.ones((len(d.t), 1)) for d in at.metric.drives])
     out = []
-    for k in range(0, len(tried), CHUNK):
-        part = tried[k : k + CHUNK]
+    for part in _chunks(families(found, every, at.duration, at.sample)):
         flows = [
-            np.concatenate([t.values(run, d.t) for t in part], axis=1)
+            np.concatenate([f.values(run, d.t) for f in part], axis=1)
             for run, d in zip(at.runs, at.metric.drives, strict=True)
         ]
         x = at.columns(place, flows)
-        column = 0
-        for t in part:
-            n = len(t.form.sizes)
-            own = x[:, column : column + n]
-            column += n
-            if np.all(np.abs(own) < HUGE) and np.any(own) and (not t.signals or not _alike(own, still)):
-                c = np.linalg.lstsq(own, at.target, rcond=1e-10)[0]
-                gain = float(at.target @ at.target - np.sum((at.target - own @ c) ** 2))
-                out.append(Found(gain, place, t, own))
+        ends = np.cumsum([f.count * len(f.form.sizes) for f in part])
+        for f, own in zip(part, np.split(x, ends[:-1], axis=1), strict=True):
+            out += _best(at, place, f, own, still if f.signals else np.zeros_like(still))
     return out
 
 
-def _alike(x: np.ndarray, y: np.ndarray) -> bool:
-    """Return whether single columns (rows, 1) point the same way."""
-    a, b = x / np.abs(x).max(), y / max(np.abs(y).max(), 1e-300)
-    return x.shape[1] == 1 and abs(float(a[:, 0] @ b[:, 0])) > ALIKE * float(
-        np.linalg.norm(a) * np.linalg.norm(b)
-    )
+def _chunks(found: Sequence[Family]) -> Iterator[list[Family]]:
+    """Yield families in groups of CHUNK terms and more."""
+    part: list[Family] = []
+    for f in found:
+        part.append(f)
+        if sum(q.count for q in part) >= CHUNK:
+            yield part
+            part = []
+    if part:
+        yield part
+
+
+def _best(at: Tracked, place: Place, f: Family, x: np.ndarray, still: np.ndarray) -> list[Found]:
+    """Return the terms of a family that explain most, without those that look like a constant."""
+    n = len(f.form.sizes)
+    with np.errstate(all="ignore"):
+        square = np.einsum("rk,rk->k", x, x)
+        gain = (at.target @ x) ** 2 / square
+        alike = np.abs(still[:, 0] @ x) > ALIKE * np.sqrt(square) * np.linalg.norm(still)
+    if n > 1:
+        gain = np.repeat([_energy(own, at.target) for own in np.split(x, f.count, axis=1)], n)
+    usable = (np.abs(x).max(axis=0) < HUGE) & (square > 0) & ((n > 1) | ~alike)
+    gain = np.where(usable, gain, -1.0)[::n]
+    order = [k for k in np.argsort(-gain, kind="stable")[:KEPT] if gain[k] >= 0]
+    return [Found(float(gain[k]), place, f.term(k), x[:, k * n : (k + 1) * n].copy()) for k in order]
+
+
+def _zoomed(at: Tracked, found: Found) -> Found:
+    """Return a term at better values of its shapes, between its neighbours on a grid that gets finer."""
+    t = found.term
+    grid = {q: np.unique(s.scaled(s.values, t.signals[0], t.duration)) for q, s in t.form.shapes.items()}
+    for _ in range(ZOOMS if grid else 0):
+        grid = {q: _between(v, found.term.shapes[q]) for q, v in grid.items()}
+        f = Family(t.form, t.signals, combined(grid), t.duration, t.sample)
+        x = at.columns(
+            found.place, [f.values(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+        )
+        best = _best(at, found.place, f, x, np.zeros((len(x), 1)))[:1]
+        found = max([found, *best], key=lambda b: b.gain)
+    return found
+
+
+def _between(values: np.ndarray, v: float) -> np.ndarray:
+    """Return FINE values between the neighbours of the value nearest to v."""
+    k = int(np.argmin(np.abs(values - v)))
+    return np.linspace(values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)], FINE)
 
 
 def _varied(pool: Sequence[Found]) -> list[Found]:

@@ -27,13 +27,13 @@ NUMBERS = 3e7  # that one run of each refit computes, with slopes: so that all r
 RANGE = 100.0  # times its first size that the size of a term may reach
 
 
-def refitted_law(case: Case, parent: Fitted, p: Proposal, duration: float, leader: Fitted) -> Fitted | None:
+def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fitted | None:
     """Refit the parent with a law from its proposed sizes; None where the plant cannot be simulated.
 
     The refit ends early if it stays far from `leader`, the likeliest one so far."""
     rig = Structure(parent.rough_plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
     c = law_candidate(case, rig, p)
-    values, ranges = _start(p, duration)
+    values, ranges = _start(p)
     plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
     own = {q: c.own(q) for q in ranges if c.own(q) in plant.parameters}
     c = dataclasses.replace(c, effect=_bounded(c, ranges))
@@ -62,7 +62,7 @@ def _bounded(c: Candidate, ranges: Mapping[str, tuple[float, float]]) -> Any:
     return dataclasses.replace(c.effect, parameters=new)
 
 
-def _start(p: Proposal, duration: float) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """Return the values that a refit starts from, and the ranges of what it moves."""
     values: dict[str, float] = {}
     ranges: dict[str, tuple[float, float]] = {}
@@ -74,9 +74,8 @@ def _start(p: Proposal, duration: float) -> tuple[dict[str, float], dict[str, tu
             reach = RANGE * max(abs(v), 1e-300)
             ranges[f"{q}{k}"] = (-reach, reach)
         for q, shape in t.form.shapes.items():
-            scale = duration if shape.of == "duration" else 1.0
-            values[f"{q}{k}"] = t.shapes[q]
-            ranges[f"{q}{k}"] = (shape.range[0] * scale, shape.range[1] * scale)
+            low, high = shape.scaled(shape.range, next(iter(t.signals), None), t.duration)
+            values[f"{q}{k}"], ranges[f"{q}{k}"] = t.shapes[q], (low, high)
     return values, ranges
 
 

@@ -160,7 +160,13 @@ def effect_file(law: Law) -> dict[str, Any]:
             entry["trial"] = "s" if sizes == 1 else f"s{sizes}"
         else:
             low, high = p.range or (p.value, p.value)
-            entry |= {"trial": repr(p.value), "null": p.value, "low": low, "high": high}
+            entry |= {
+                "unit": p.unit or "1",
+                "trial": repr(p.value),
+                "null": p.value,
+                "low": low,
+                "high": high,
+            }
         parameters[q.name] = entry
     changes = []
     for item in c.effect.changes[0]:
