@@ -6,6 +6,7 @@ search does not have), other parameters than the plant file, and in the open wor
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,7 +98,7 @@ STEPS = 4  # of the search for the law's size
 class Truth:
     """A concealed law: `rate` is the flow from `source` into `target` for a size of one.
 
-    `switches`: rate of a hidden state `on` that the law may read."""
+    `switches`: rate of a hidden state `on` that the law may read. `part`: "storage" where `rate` is a part of it."""
 
     name: str
     family: str
@@ -107,6 +108,7 @@ class Truth:
     source: str | None = None
     drawn: bool = False
     switches: str | None = None
+    part: str = "flow"
 
 
 def _t(name: str, family: str, rate: str, variables: str, target: str, source: str | None = None) -> Truth:
@@ -179,6 +181,16 @@ RELAYS = (
     _relay("latching magnet", "stage", "on", "0.03", "-0.02", "position", "velocity", "position"),
     _relay("bell siphon", "tanks", "-on", "1.7", "0.8", "lower", "lower", "lower"),
     _relay("thermostat with hysteresis", "reactor", "-on", "31", "26", "broth", "broth", "broth"),
+)
+
+STORAGES = (
+    dataclasses.replace(
+        _t("melting in the block", "heater", "exp(-((one - 41) / 3)**2)", "one", "one"), part="storage"
+    ),
+    dataclasses.replace(
+        _t("melting in the broth", "reactor", "1 / (1 + ((broth - 29) / 1.5)**2)", "broth", "broth"),
+        part="storage",
+    ),
 )
 
 # what the search's library does not hold; x is the variable over its typical size
@@ -292,7 +304,8 @@ def make(law: Truth | None, family: str, size: str, world: str, seed: int) -> Ma
     if law and law.switches:
         base = _switching(base, law.switches)
     if law:
-        truth, ratio = _sized(plant, base, runs, "hidden", ex.parse(law.rate), law.target, law.source, goal)
+        size = 0.3 * _reference(base, runs, law)
+        truth, ratio = _sized(plant, runs, lambda q: with_law(base, law, q), size, goal)
     real = truth
     if misfit > 0.3:
         node = list(plant.nodes)[0] if family != "reactor" else str(rng.choice(list(plant.nodes)))
@@ -301,8 +314,11 @@ def make(law: Truth | None, family: str, size: str, world: str, seed: int) -> Ma
             f"{rng.uniform(0.3, 1):.3g} * sin(2 * pi * t / {span * rng.uniform(0.15, 0.9):.4g} + {rng.uniform(0, 6):.3g})"
             for _ in range(3)
         )
-        small, _ = _sized(plant, base, runs, "wander", ex.parse(waves), node, None, misfit)
-        real = dataclasses.replace(truth, flows={**truth.flows, "wander": small.flows["wander"]})
+        wander = Truth("wander", family, waves, frozenset(), node)
+        size = 0.3 * _reference(base, runs, wander)
+        small, _ = _sized(plant, runs, lambda q: with_law(base, wander, q), size, misfit)
+        flow = dataclasses.replace(small.flows["hidden"], name="wander")
+        real = dataclasses.replace(truth, flows={**truth.flows, "wander": flow})
     model = compile_plant(real)
     return Made(plant, [model.measure(t, seed + k) for k, t in enumerate(runs)], truth, law, ratio)
 
@@ -316,29 +332,32 @@ def _switching(plant: Plant, rate: str) -> Plant:
     )
 
 
+def with_law(base: Plant, law: Truth, size: float) -> Plant:
+    """The plant with a law of a size."""
+    rate = ex.mul(ex.num(float(f"{size:.4g}")), ex.parse(law.rate))
+    if law.part == "storage":
+        node = base.nodes[law.target]
+        larger = dataclasses.replace(node, storage=ex.add(node.storage, rate))
+        return dataclasses.replace(base, nodes={**base.nodes, law.target: larger})
+    flow = Flow("hidden", rate, law.source, law.target)
+    return dataclasses.replace(base, flows={**base.flows, "hidden": flow})
+
+
+def _reference(base: Plant, runs: list[Table], law: Truth) -> float:
+    """The size with which a law is as large as the flows, or the storage, at its place."""
+    shape = np.mean([_rms(base, t, ex.parse(law.rate)) for t in runs[:3]])
+    if law.part == "storage":
+        return float(_rms(base, runs[0], base.nodes[law.target].storage) / max(shape, 1e-12))
+    return float(np.mean([_typical(base, t, law.target) for t in runs[:3]]) / max(shape, 1e-12))
+
+
 def _sized(
-    plant: Plant,
-    base: Plant,
-    runs: list[Table],
-    label: str,
-    rate: ex.Expr,
-    target: str,
-    source: str | None,
-    goal: float,
+    plant: Plant, runs: list[Table], made: Callable[[float], Plant], size: float, goal: float
 ) -> tuple[Plant, float]:
-    """The plant with a flow of such a size that a refit of the plant file leaves `goal` times the noise."""
-    reference = np.mean([_typical(base, t, target) for t in runs[:3]])
-    shape = np.mean([_rms(base, t, rate) for t in runs[:3]])
-    size, found = 0.3 * reference / max(shape, 1e-12), base
+    """The plant made with such a size that a refit of the plant file leaves `goal` times the noise."""
     ratio = np.nan
     for _ in range(STEPS):
-        found = dataclasses.replace(
-            base,
-            flows={
-                **base.flows,
-                label: Flow(label, ex.mul(ex.num(float(f"{size:.4g}")), rate), source, target),
-            },
-        )
+        found = made(size)
         try:
             ratio = _left(plant, found, runs[:3])
         except Exception:  # an unstable truth: smaller

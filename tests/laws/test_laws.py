@@ -12,14 +12,14 @@ import yaml
 
 from tests.laws.prove import EQUAL, difference
 from tests.laws.real import law_of
-from tests.laws.rigs import LAWS, RELAYS, make
+from tests.laws.rigs import LAWS, RELAYS, STORAGES, make
 from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law import find_law
-from thermoctl.diagnose.law_forms import Signal, Term, library
+from thermoctl.diagnose.law_forms import Place, Signal, Term, library
 from thermoctl.diagnose.law_misfit import misfit_odds
 from thermoctl.diagnose.law_propose import PROPOSALS
 from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable, refitted_law
@@ -28,6 +28,7 @@ from thermoctl.diagnose.law_smooth import tracked
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.propose import propose, survivors
 from thermoctl.diagnose.rig import Rig
+from thermoctl.diagnose.words import law_sentence
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Flow, Input, Node, Plant
@@ -195,6 +196,33 @@ def test_a_saved_relay_is_an_effect(switched, tmp_path):
     made, law = switched
     result = {"remainder": {"law": law_entry(law)}}
     save_effect(result, "thermostat", tmp_path / "own")
+    save(made.plant, tmp_path / "plant.yaml")
+    assert main(["effects", "check", str(tmp_path / "own"), "--plant", str(tmp_path / "plant.yaml")]) == 0
+
+
+def test_a_larger_storage_is_no_law_where_the_plant_has_a_parameter_for_it():
+    made = make(ENTROPIC, "reactor", "middle", "closed", 7)
+    known = case(made.plant, made.tables[:2], {}, Budget(80))
+    at = tracked(known, fitted(known, known.plant, (), known.null), ["broth", "substrate"])
+    flows = [np.ones((len(d.t), 1)) for d in at.metric.drives]
+    assert abs(_cosine(at, Place("broth", None, "storage"), flows)) < 0.05
+    assert abs(_cosine(at, Place("broth"), [np.asarray(run["current"])[:, None] for run in at.runs])) > 0.95
+
+
+def _cosine(at, place, flows):
+    x = at.columns(place, flows)[:, 0]
+    return float(x @ at.target) / max(float(np.linalg.norm(x) * np.linalg.norm(at.target)), 1e-300)
+
+
+def test_latent_heat_is_a_law_in_the_storage(tmp_path):
+    law = next(law for law in STORAGES if law.family == "heater")
+    made = make(law, "heater", "middle", "closed", 7)
+    _, found = look(made)
+    entry = law_entry(found)
+    assert (entry["part"], entry["into"]) == ("storage", "one")
+    assert difference(found.fitted.plant, made) < EQUAL
+    assert law_sentence(entry).startswith("A law for it: a storage of one, C_1 + ")
+    save_effect({"remainder": {"law": entry}}, "melting", tmp_path / "own")
     save(made.plant, tmp_path / "plant.yaml")
     assert main(["effects", "check", str(tmp_path / "own"), "--plant", str(tmp_path / "plant.yaml")]) == 0
 

@@ -22,7 +22,7 @@ from thermoctl.diagnose.law_curve import Curve, curve
 from thermoctl.diagnose.law_misfit import closed, held_back, misfit_odds
 from thermoctl.diagnose.law_propose import Proposal, propose_laws
 from thermoctl.diagnose.law_refit import SIMPLER, affordable, at_bound, law_rate, refitted_law, simpler_law
-from thermoctl.diagnose.law_smooth import flow_unit, tracked
+from thermoctl.diagnose.law_smooth import law_unit, tracked
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.shortlist import HALF
 from thermoctl.plant import expression as ex
@@ -65,7 +65,7 @@ class Law:
 
     @property
     def rate(self) -> ex.Expr:
-        """Return the law's flow."""
+        """Return the law's flow, or the storage with it."""
         return law_rate(self.fitted)
 
 
@@ -135,7 +135,7 @@ def _chosen(
         for k, s in zip(order[1:], np.sort(share)[::-1][1:], strict=True)
         if s > 1 - limits.set
     )
-    drawn, unit = curve(at, p, law_rate(f), f.plant), flow_unit(case.plant, p.place.target)
+    drawn, unit = curve(at, p, law_rate(f), f.plant), law_unit(case.plant, p.place)
     gain, probability, share_closed = float(gains[likely[best]]), float(sure[best]), float(shut[best])
     return Law(p, f, gain, probability, values[best], share_closed, drawn, rivals, unit)
 

@@ -29,9 +29,9 @@ class Curve:
 def curve(at: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
     """Return the flow at the law's place as a free function of its first signal, and the law there.
 
-    None for a law with a memory. The free function is the law plus a fit of its residual."""
+    None for a law with a memory, or in a storage. The free function is the law plus a fit of its residual."""
     found = [s for t in p.terms for s in t.signals]
-    if not found or any(t.form.memory for t in p.terms):
+    if not found or p.place.part != "flow" or any(t.form.memory for t in p.terms):
         return None
     s = found[0]
     known = {q: v.value for q, v in plant.parameters.items()}

@@ -96,14 +96,20 @@ def library() -> tuple[Form, ...]:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a law acts: a node (`source` None: from outside), or two nodes that exchange the flow."""
+    """Where a law acts.
+
+    - flow: into the node `target` from outside, or from the node `source`
+    - storage: of the node `target`"""
 
     target: str
     source: str | None = None
+    part: str = "flow"
 
     @property
     def where(self) -> str:
         """Its name in a result."""
+        if self.part != "flow":
+            return f"{self.part} of {self.target}"
         return f"{self.source}-{self.target}" if self.source else self.target
 
     @property
@@ -132,14 +138,17 @@ class Signal:
 
 
 def places(rig: Structure) -> list[Place]:
-    """Return every node that stores something, and every pair of nodes that exchange a flow."""
+    """Return the flow into every node that stores something, and between nodes that exchange one; storages.
+
+    A storage of 1 is a definition: dn/dt is the sum of the flows."""
     positions = set(rig.pairs.values())
     flows = rig.physics.flows.values()
     nodes = [
         n for n in rig.physics.nodes if n not in positions and any(n in (f.source, f.target) for f in flows)
     ]
     pairs = {(f.source, f.target) for f in flows if f.source in nodes and f.target in nodes}
-    return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs))]
+    stored = [Place(n, None, "storage") for n in nodes if rig.physics.nodes[n].storage is not ex.ONE]
+    return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs)), *stored]
 
 
 def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal]:
@@ -152,12 +161,13 @@ def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal
         if unit in TEMPERATURE:
             out.append(Signal(n, name(n), "K", kelvin=273.15 - zero_of(unit)))
         else:
-            own = n in place.nodes and n in rig.velocities and not place.source
+            own = n in place.nodes and n in rig.velocities and not place.source and place.part == "flow"
             out.append(Signal(n, name(n), unit, position=n in positions, drives=own, recorded=n in p.inputs))
 
     def difference(a: str, b: str) -> None:
         unit = _difference(p.nodes[a].unit)
-        out.append(Signal(f"{a} - {b}", ex.add(name(a), ex.neg(name(b))), unit, drives=True))
+        drives = place.part == "flow"
+        out.append(Signal(f"{a} - {b}", ex.add(name(a), ex.neg(name(b))), unit, drives=drives))
 
     for n in near:
         if rig.air and n in rig.temperatures:
@@ -356,8 +366,11 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
             node = {"name": f"m{k}", "storage": 1, "initial": memory.start}
             changes.append({"node": {**node, "initial_sigma": memory.start_sigma}})
             changes.append({"flow": {"into": f"m{k}", "rate": str(term.filling(k))}})
-    ends = {"into": "target", **({"from": "source"} if place.source else {})}
-    changes.append({"flow": {**ends, "rate": str(rate)}})
+    if place.part == "storage":
+        changes.append({"storage": str(ex.add(name("storage"), rate))})
+    else:
+        ends = {"into": "target", **({"from": "source"} if place.source else {})}
+        changes.append({"flow": {**ends, "rate": str(rate)}})
     return Effect(
         "law",
         "A law that the recordings propose",

@@ -114,7 +114,7 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
     drives = case.drives(parent.rough.model)
     rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
     where = places(rig)
-    nodes = [p.target for p in where if p.source is None]
+    nodes = [p.target for p in where if p == Place(p.target)]
     if len(nodes) > TRACKED:
         nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
     at = tracked(case, parent, nodes)

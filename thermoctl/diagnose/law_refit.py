@@ -15,7 +15,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, Placed, fitted
 from thermoctl.diagnose.law_forms import law_effect, readable
 from thermoctl.diagnose.law_propose import PROPOSALS, Proposal
-from thermoctl.diagnose.law_smooth import flow_unit
+from thermoctl.diagnose.law_smooth import law_unit
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulate import SimulationError
@@ -47,7 +47,7 @@ def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fit
 
 def law_candidate(case: Case, rig: Structure, p: Proposal) -> Candidate:
     """Return a law as an effect at its place."""
-    effect = law_effect(p.terms, p.place, flow_unit(case.plant, p.place.target))
+    effect = law_effect(p.terms, p.place, law_unit(case.plant, p.place))
     ends = {"target": p.place.target, **({"source": p.place.source} if p.place.source else {})}
     return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig)
 
@@ -108,8 +108,11 @@ def affordable(case: Case, parent: Fitted) -> int:
 
 
 def law_rate(f: Fitted) -> ex.Expr:
-    """Return the flow of the law that a hypothesis holds as its last effect."""
-    own = set(f.hypothesis.effects[-1].own.values())
+    """Return the flow, or the storage, of the law that a hypothesis holds as its last effect."""
+    law = f.hypothesis.effects[-1]
+    own, nodes = set(law.own.values()), law.candidate.place.nodes
+    if "storage" in law.candidate.effect.changes[0][-1]:
+        return f.plant.nodes[nodes["target"]].storage
     return next(x.rate for x in reversed(list(f.plant.flows.values())) if ex.names(x.rate) & own)
 
 

@@ -23,6 +23,7 @@ from scipy.sparse import csr_matrix
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, as_refitted
 from thermoctl.diagnose.law_forms import Place
+from thermoctl.diagnose.rig import TEMPERATURE
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 from thermoctl.diagnose.where import SHARES, signals, typical_flow
 from thermoctl.plant import expression as ex
@@ -65,8 +66,10 @@ class Tracked:
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
         """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording.
 
-        Sums of the responses to RESOLVED hat functions. A flow that the plant's own parameters absorb gives
-        zeros."""
+        Sums of the responses to RESOLVED hat functions. A storage that is larger by q takes up the flow
+        q dx/dt. A flow that the plant's own parameters absorb gives zeros."""
+        if place.part == "storage":
+            flows = [-q * s[:, None] for q, s in zip(flows, self._slopes(place.target), strict=True)]
         nodes = zip(reversed(place.nodes), (1.0, -1.0), strict=False)
         signed = [[sign * block for block in self._unit(n)] for n, sign in nodes]
         with np.errstate(all="ignore"):
@@ -79,6 +82,16 @@ class Tracked:
     @cached_property
     def _hats(self) -> list[csr_matrix]:
         return [_hats(d.t, min(RESOLVED, len(d.t))) for d in self.metric.drives]
+
+    def _slopes(self, node: str) -> list[np.ndarray]:
+        """Return the rate of a node (N,) by recording, without the unknown flow.
+
+        With it a larger storage, less the plant's own parameter of it, would be the unknown flow."""
+        out, storage = [], self.metric.model.plant.nodes[node].storage
+        for run, d in zip(self.runs, self.metric.drives, strict=True):
+            unknown = run.get(f"{LATENT}{node}", 0.0) / np.asarray(ex.evaluate(storage, run), float)
+            out.append(np.gradient(np.asarray(run[node], float), d.t) - unknown)
+        return out
 
     def _unit(self, node: str) -> list[np.ndarray]:
         """Return the rows of each recording's responses to hat functions of flow into a node."""
@@ -197,6 +210,14 @@ def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
 def flow_unit(plant: Plant, node: str) -> str | None:
     """Return the unit of the flows at a node, None where none is stated."""
     return next((f.unit for f in plant.flows.values() if node in (f.source, f.target) and f.unit), None)
+
+
+def law_unit(plant: Plant, place: Place) -> str | None:
+    """Return the unit of a law at a place, None where the plant states none."""
+    flow, own = flow_unit(plant, place.target), plant.nodes[place.target].unit
+    if place.part == "flow" or not flow or not own:
+        return flow if place.part == "flow" else None
+    return f"({flow}) * s / ({'K' if own in TEMPERATURE else own})"
 
 
 def _explained(x: np.ndarray, target: np.ndarray) -> float:
