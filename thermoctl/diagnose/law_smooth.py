@@ -70,11 +70,11 @@ class Tracked:
         q dx/dt. A flow that the plant's own parameters absorb gives zeros."""
         if place.part == "storage":
             flows = [-q * s[:, None] for q, s in zip(flows, self._slopes(place.target), strict=True)]
-        nodes = zip(reversed(place.nodes), (1.0, -1.0), strict=False)
-        signed = [[sign * block for block in self._unit(n)] for n, sign in nodes]
+        units = [self._unit(n) for n in reversed(place.nodes)]
         with np.errstate(all="ignore"):
             fine = [_fitted_hats(h, q) for h, q in zip(self._hats, flows, strict=True)]
-            whole = np.concatenate([sum(b) @ c for *b, c in zip(*signed, fine, strict=True)])
+            into, *out = [np.concatenate([b @ c for b, c in zip(u, fine, strict=True)]) for u in units]
+            whole = into - out[0] if out else into
             rest = self.metric.project(whole)
         absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
         return np.where(absorbed, 0.0, rest)
