@@ -13,13 +13,14 @@ import yaml
 from tests.laws.prove import EQUAL, difference
 from tests.laws.real import law_of
 from tests.laws.rigs import LAWS, RELAYS, STORAGES, make
+from tests.plants import TWO_BLOCKS
 from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law import find_law
-from thermoctl.diagnose.law_forms import Place, Signal, Term, library
+from thermoctl.diagnose.law_forms import Place, Signal, Term, library, signals
 from thermoctl.diagnose.law_misfit import misfit_odds
 from thermoctl.diagnose.law_propose import PROPOSALS
 from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable, refitted_law
@@ -28,9 +29,10 @@ from thermoctl.diagnose.law_smooth import tracked
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.propose import propose, survivors
 from thermoctl.diagnose.rig import Rig
+from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.words import law_sentence
 from thermoctl.plant import expression as ex
-from thermoctl.plant import load, save
+from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Flow, Input, Node, Plant
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.proof.rigs import RIGS
@@ -225,6 +227,28 @@ def test_latent_heat_is_a_law_in_the_storage(tmp_path):
     save_effect({"remainder": {"law": entry}}, "melting", tmp_path / "own")
     save(made.plant, tmp_path / "plant.yaml")
     assert main(["effects", "check", str(tmp_path / "own"), "--plant", str(tmp_path / "plant.yaml")]) == 0
+
+
+def test_the_time_of_day_is_a_signal_where_each_hour_was_visited():
+    plant = loads(TWO_BLOCKS.replace("inputs:\n", "inputs:\n  clock: {unit: h, role: time_of_day}\n"))
+    sun = Flow("sun", ex.parse("0.3 * sin(2 * pi * (clock - 8) / 24)"), None, "one")
+    truth = compile_plant(replace(plant, flows={**plant.flows, "sun": sun}))
+    rng, t = np.random.default_rng(1), np.arange(900) * 100.0
+    tables = []
+    for k in range(3):
+        heat = np.repeat(rng.permutation([0, 2.5, 0.8, 0, 1.6, 3]), 150)
+        columns = {"heat": heat, "air_temperature": np.full(900, 21.0), "clock": (6 * k + t / 3600) % 24}
+        tables.append(truth.measure(Table(f"run_{k}", "", t, columns), k))
+    _, law = look(SimpleNamespace(plant=plant, tables=tables))
+    assert [(t.form.name, t.variables) for t in law.proposal.terms] == [("daily", {"clock"})]
+    rig = Structure(plant, [truth.excitation(t) for t in tables], [t.columns for t in tables])
+    assert not any(s.daily for s in signals(rig, Place("one"), [_named(tables[0], 800)]))
+    assert any(s.daily for s in signals(rig, Place("one"), [_named(tables[0], 900)]))
+
+
+def _named(table, count):
+    rows = {k: v[:count] for k, v in table.columns.items()}
+    return {"one": np.arange(count), "two": np.arange(count), "air": np.arange(count), **rows}
 
 
 def test_no_law_is_claimed_where_nothing_is_missing():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoctl.diagnose.law_forms import Signal
-from thermoctl.diagnose.law_propose import PIECES, Proposal, along, pieces
+from thermoctl.diagnose.law_propose import PIECES, Proposal, pieces
 from thermoctl.diagnose.law_smooth import Tracked
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
@@ -35,7 +35,7 @@ def curve(at: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None
         return None
     s = found[0]
     known = {q: v.value for q, v in plant.parameters.items()}
-    values = [along(s, run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+    values = [s.along(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
     flows = [
         np.broadcast_to(np.asarray(ex.evaluate(rate, {**run, **known}), float), d.t.shape)
         for run, d in zip(at.runs, at.metric.drives, strict=True)

@@ -21,6 +21,7 @@ from thermoctl.diagnose.rig import TEMPERATURE, zero_of
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
+from thermoctl.plant.units import conversion, dimension
 from thermoctl.shipped import shipped
 
 QUANTILES = 21  # of a signal: each 5 %
@@ -123,7 +124,8 @@ class Signal:
     """A signal of the plant: an expression, its unit, its typical size.
 
     `visited`: its evenly spaced quantiles from the smallest to the largest value, over its size.
-    `drives`: a difference or a velocity that drives the flow at its place, and reverses it."""
+    `drives`: a difference or a velocity that drives the flow at its place, and reverses it. `daily`: the time
+    of day, with a day as its size."""
 
     label: str
     value: Expr
@@ -135,6 +137,12 @@ class Signal:
     position: bool = False
     drives: bool = False
     recorded: bool = False
+    daily: bool = False
+
+    def along(self, run: Values, t: np.ndarray) -> np.ndarray:
+        """Return its values (N,) along a trajectory."""
+        values = np.broadcast_to(np.asarray(ex.evaluate(self.value, run), float), t.shape)
+        return values % self.size if self.daily else values
 
 
 def places(rig: Structure) -> list[Place]:
@@ -181,10 +189,21 @@ def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal
             linked = any({n, place.target} == {f.source, f.target} for f in p.flows.values())
             if linked and not place.source and p.nodes[n].unit == p.nodes[place.target].unit:
                 difference(place.target, n)
-    for i in sorted(rig.moving_inputs):
+    clocks = {i for i, q in p.inputs.items() if q.role == "time_of_day"}
+    for i in sorted(rig.moving_inputs - clocks):
         if i != rig.air and not i.endswith("_start"):
             absolute(i, p.inputs[i].unit)
-    return [s for s in (_sized(s, runs) for s in out) if s is not None]
+    sized = [_sized(s, runs) for s in out] + [_daily(i, p.inputs[i].unit, runs) for i in sorted(clocks)]
+    return [s for s in sized if s is not None]
+
+
+def _daily(clock: str, unit: str | None, runs: Sequence[Values]) -> Signal | None:
+    """Return the time of day as a signal; None where the runs do not visit each of its hours."""
+    if unit is None or dimension(unit) != dimension("s"):
+        return None
+    day = conversion("day", unit)[0]
+    hours = np.floor(24 * np.concatenate([np.atleast_1d(run[clock]) for run in runs]) / day) % 24
+    return Signal(clock, name(clock), unit, day, daily=True) if len(np.unique(hours)) == 24 else None
 
 
 def _difference(unit: str | None) -> str | None:
@@ -299,7 +318,7 @@ class Family:
         """Return the terms (N, count * sizes) along a trajectory, for sizes of one."""
         known: dict[str, Any] = {**self.shapes, "pi": np.pi}
         for symbol, s in zip("zw", self.signals, strict=False):
-            value = np.broadcast_to(np.asarray(ex.evaluate(s.value, run), float), t.shape)
+            value = s.along(run, t)
             known[symbol] = ((value - s.centre) / s.size)[:, None]
             if symbol == "z" and s.kelvin is not None:
                 known["T"] = (value + s.kelvin)[:, None]
@@ -324,7 +343,7 @@ def families(
             continue
         for z in found:
             fits = {"absolute": z.kelvin is not None, "position": z.position, "input": z.recorded}
-            if fits.get(form.of, True):
+            if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
                 shapes = _grid(form, z, duration)
                 out += [Family(form, pair, shapes, duration, sample) for pair in _pairs(form, z, every)]
     return out
@@ -334,7 +353,7 @@ def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal,
     """Return the signals of a form whose first one is z."""
     if form.of not in ("two", "driven"):
         return [(z,)]
-    second = [w for w in every if w != z and (w.drives or form.of == "two")]
+    second = [w for w in every if w != z and not w.daily and (w.drives or form.of == "two")]
     return [(z, w) for w in second if form.name != "product" or z.label < w.label]
 
 

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +30,6 @@ from thermoctl.diagnose.law_smooth import Tracked, tracked
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.shortlist import ALIKE
 from thermoctl.diagnose.unknown import located, reached
-from thermoctl.plant import expression as ex
 from thermoctl.plant.residuals import HUGE
 
 PIECES = 8  # of a free function of a signal
@@ -144,7 +143,7 @@ def _ranked(at: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[f
     gain in likelihood takes longer."""
     found = []
     for place, s in combos:
-        values = [along(s, run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+        values = [s.along(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
         knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
         x = at.columns(place, [pieces(v, knots) for v in values])
         found.append((_energy(x, at.target), place, s, x))
@@ -161,11 +160,6 @@ def _energy(x: np.ndarray, target: np.ndarray) -> float:
     scale = np.linalg.norm(x, axis=0)
     u, w, _ = np.linalg.svd(x / np.where(scale > 0, scale, 1.0), full_matrices=False)
     return float(np.sum((u[:, w > SEEN * max(w[0], 1e-300)].T @ target) ** 2))
-
-
-def along(s: Signal, run: Mapping[str, np.ndarray | float], t: np.ndarray) -> np.ndarray:
-    """Return a signal along a trajectory."""
-    return np.broadcast_to(np.asarray(ex.evaluate(s.value, run), float), t.shape)
 
 
 def pieces(v: np.ndarray, knots: np.ndarray) -> np.ndarray:
