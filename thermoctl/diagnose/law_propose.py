@@ -40,7 +40,8 @@ RANKED, COMBINATIONS = 40, 12  # places and signals with the best free function;
 SEEN = 1e-6  # of the strongest direction of a free function: weaker ones are rounding errors
 POOL = 60  # terms that a sum of terms is built from
 PAIRED = 600  # terms that are tried two at a time
-PAIRS, LIKELY = 8, 5000  # pairs from which sums grow; best pairs of values that they are looked for in
+PAIRS, LIKELY = 24, 50_000  # pairs that explain most energy; best pairs of values that they are looked for in
+GROWN = 8  # pairs of the best score, from which sums of three grow
 PROPOSALS, SINGLE, SIGNALS = 14, 5, 4  # the best; of one term; of one term, each of another signal
 TERMS = 3
 ZOOMS, FINE = 2, 9  # finer grids of the shapes of a term; values of each shape there
@@ -262,21 +263,25 @@ def _sums(at: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, f
     """Return sums of two and three terms at a place.
 
     Each grows by what another term adds: from the best term, and from the best pairs. A pair may explain much
-    where each of its terms alone does not, because the plant's own parameters imitate it."""
-    starts = [([f.term], f.columns) for f in pool[:1]]
-    starts += [
-        ([a.term, b.term], np.concatenate([a.columns, b.columns], axis=1)) for a, b in _pairs(at, pool)
-    ]
-    out = []
+    where each of its terms alone does not, because the plant's own parameters imitate it. Terms that do not
+    reverse with what drives the flow are rare: the best pairs without them are tried, too."""
+    likely = [f for f in pool if f.term.reverses is not False]
+    found = _pairs(at, pool) + (_pairs(at, likely) if len(likely) < len(pool) else [])
+    pairs = []
+    for a, b in found:
+        x = np.concatenate([a.columns, b.columns], axis=1)
+        pairs.append((_proposal(at, place, (a.term, b.term), x, base), x))
+    pairs.sort(key=lambda p: -p[0].score)
+    starts: list[tuple[tuple[Term, ...], np.ndarray]] = [((f.term,), f.columns) for f in pool[:1]]
+    starts += [(p.terms, x) for p, x in pairs[:GROWN]]
+    out = [p for p, _ in pairs]
     for law, columns in starts:
-        if len(law) > 1:
-            out.append(_proposal(at, place, tuple(law), columns, base))
         while len(law) < TERMS:
             added = _added(at, law, columns, pool[:POOL])
             if added is None:
                 break
-            law, columns = [*law, added.term], np.concatenate([columns, added.columns], axis=1)
-            out.append(_proposal(at, place, tuple(law), columns, base))
+            law, columns = (*law, added.term), np.concatenate([columns, added.columns], axis=1)
+            out.append(_proposal(at, place, law, columns, base))
     return out
 
 
