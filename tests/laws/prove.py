@@ -171,11 +171,11 @@ def difference(plant: Plant, made: Made) -> float:
         return total / np.asarray(ex.evaluate(p.nodes[made.law.target].storage, known), float)
 
     with np.errstate(all="ignore"):
-        delta, own = net(plant) - net(made.truth), net(_without(made.truth)) - net(made.truth)
+        delta, own = net(plant) - net(made.truth), net(without(made.truth)) - net(made.truth)
     return float(np.sqrt(np.mean(delta**2) / np.mean(own**2)))
 
 
-def _without(truth: Plant) -> Plant:
+def without(truth: Plant) -> Plant:
     """The truth's plant without its law."""
     flows = {k: f for k, f in truth.flows.items() if k != "hidden"}
     nodes = {
