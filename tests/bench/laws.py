@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.laws.prove import AMBIENT, EQUAL, PART, cases, judge
+from tests.laws.prove import AMBIENT, EQUAL, PART, cases, judge, without
 from tests.laws.rigs import Made, make
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import Fitted, as_refitted, fitted
@@ -122,11 +122,11 @@ def judged(made: Made, first: Fitted, found: list, x: np.ndarray, predict: Predi
         "pi": np.pi,
     }
 
-    def net(plant, only=None):
+    def net(plant):
         known = {**run, **{k: v.value for k, v in plant.parameters.items()}}
         total = np.zeros(len(d.t))
         for f in plant.flows.values():
-            if made.law.target in (f.source, f.target) and only in (None, f.name):
+            if made.law.target in (f.source, f.target):
                 total = total + (1 if f.target == made.law.target else -1) * np.asarray(
                     ex.evaluate(f.rate, known), float
                 )
@@ -143,9 +143,10 @@ def judged(made: Made, first: Fitted, found: list, x: np.ndarray, predict: Predi
         )
     )
     delta = net(first.plant) + predict(_values(found, run)) / storage - net(made.truth)
+    own = net(without(made.truth)) - net(made.truth)
     return {
         "variable": used - AMBIENT == set(made.law.variables) - AMBIENT,
-        "difference": float(np.sqrt(np.mean(delta**2) / np.mean(net(made.truth, "hidden") ** 2))),
+        "difference": float(np.sqrt(np.mean(delta**2) / np.mean(own**2))),
     }
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.laws.rigs import LAWS, RATIOS, Made, Truth, drawn, make
+from tests.laws.rigs import LAWS, RATIOS, RELAYS, STORAGES, Made, Truth, drawn, make
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
@@ -27,9 +27,10 @@ from thermoctl.diagnose.law import Law, find_law
 from thermoctl.diagnose.law_refit import law_rate
 from thermoctl.diagnose.limits import limits
 from thermoctl.plant import expression as ex
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Input, Parameter, Plant
 from thermoctl.plant.refit import default_noise, fit, updated
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
 
 DRAWN, NONE = 16, 40  # laws from the grammar; cases without a law
 EQUAL = 0.15  # rms difference of the net flow over the law's own rms, up to which a law is equivalent
@@ -42,7 +43,7 @@ def cases() -> list[tuple[str, Truth | None, str, str, str, int]]:
     """(name, law, family, size, world, seed): every law once for each world, the sizes in turn; then none."""
     out: list[tuple[str, Truth | None, str, str, str, int]] = []
     for w, world in enumerate(("closed", "open")):
-        for k, law in enumerate((*LAWS, *drawn(DRAWN, SEED))):
+        for k, law in enumerate((*LAWS, *drawn(DRAWN, SEED), *RELAYS, *STORAGES)):
             size = list(RATIOS)[(k + w) % len(RATIOS)]
             out.append(
                 (
@@ -93,7 +94,9 @@ def judge(made: Made, full: bool) -> dict[str, Any]:
     closed = [1 - x / max(e[0], 1e-9) for x in e[1:]]
     out |= {"closed": closed[0], "oracle": closed[1], "difference": difference(plant, made)}
     if law:
-        out["place"] = {*law.proposal.place.nodes} == {made.law.target, made.law.source} - {None}
+        place = law.proposal.place
+        nodes = {made.law.target, made.law.source} - {None}
+        out["place"] = ({*place.nodes}, place.part) == (nodes, made.law.part)
         out["variables"] = sorted(_variables(law, made))
         out["variable"] = set(out["variables"]) == made.law.variables - AMBIENT
     return out
@@ -101,16 +104,24 @@ def judge(made: Made, full: bool) -> dict[str, Any]:
 
 def _with_range(truth: Plant) -> Plant:
     """The truth's plant, whose law's size a refit may move."""
-    hidden = truth.flows["hidden"]
-    from thermoctl.plant.language import Parameter
-
     size = Parameter("size_of_law", 1.0, None, (0.2, 5.0))
-    rate = ex.mul(ex.name("size_of_law"), hidden.rate)
-    return replace(
-        truth,
-        parameters={**truth.parameters, "size_of_law": size},
-        flows={**truth.flows, "hidden": replace(hidden, rate=rate)},
+    known = {**truth.parameters, "size_of_law": size}
+    flows = {
+        k: replace(f, rate=ex.mul(ex.name("size_of_law"), f.rate)) if k == "hidden" else f
+        for k, f in truth.flows.items()
+    }
+    nodes = {k: replace(n, storage=_scaled(n.storage)) for k, n in truth.nodes.items()}
+    used = set().union(
+        *(ex.names(e) for e in (*(f.rate for f in flows.values()), *(n.storage for n in nodes.values())))
     )
+    return replace(truth, parameters={k: p for k, p in known.items() if k in used}, flows=flows, nodes=nodes)
+
+
+def _scaled(storage: ex.Expr) -> ex.Expr:
+    """A storage whose law, its second part, has a size that a refit may move."""
+    if storage.op != "+":
+        return storage
+    return ex.add(storage.args[0], ex.mul(ex.name("size_of_law"), storage.args[1]))
 
 
 def _refit(made: Made, plant: Plant) -> Plant:
@@ -147,22 +158,42 @@ def difference(plant: Plant, made: Made) -> float:
         "t": d.t,
         "pi": np.pi,
     }
-    if plant.nodes.keys() - trajectory.keys():
-        return float("nan")  # a law with a memory of its own
+    trajectory |= _memories(plant, trajectory, d.t)
 
-    def net(p: Plant, only: str | None = None) -> np.ndarray:
+    def net(p: Plant) -> np.ndarray:
         known = {**trajectory, **{k: v.value for k, v in p.parameters.items()}}
         total = np.zeros(len(d.t))
         for f in p.flows.values():
-            if made.law.target in (f.source, f.target) and only in (None, f.name):
+            if made.law.target in (f.source, f.target):
                 total = total + (1 if f.target == made.law.target else -1) * np.asarray(
                     ex.evaluate(f.rate, known), float
                 )
         return total / np.asarray(ex.evaluate(p.nodes[made.law.target].storage, known), float)
 
     with np.errstate(all="ignore"):
-        delta = net(plant) - net(made.truth)
-    return float(np.sqrt(np.mean(delta**2) / np.mean(net(made.truth, "hidden") ** 2)))
+        delta, own = net(plant) - net(made.truth), net(without(made.truth)) - net(made.truth)
+    return float(np.sqrt(np.mean(delta**2) / np.mean(own**2)))
+
+
+def without(truth: Plant) -> Plant:
+    """The truth's plant without its law."""
+    flows = {k: f for k, f in truth.flows.items() if k != "hidden"}
+    nodes = {
+        k: replace(n, storage=n.storage.args[0]) if n.storage.op == "+" else n for k, n in truth.nodes.items()
+    }
+    return replace(truth, flows=flows, nodes=nodes)
+
+
+def _memories(plant: Plant, trajectory: dict[str, Any], t: np.ndarray) -> dict[str, np.ndarray]:
+    """The states of a law's own along a trajectory of the others."""
+    own = {k: n for k, n in plant.nodes.items() if k not in trajectory}
+    if not own:
+        return {}
+    others = {k: Input(k, None, k, True) for k in trajectory if k not in ("t", "pi")}
+    flows = {k: f for k, f in plant.flows.items() if f.target in own}
+    model = compile_plant(replace(plant, inputs=others, nodes=own, flows=flows, outputs={}))
+    columns = {k: np.asarray(trajectory[k], float) for k in others}
+    return dict(zip(own, model.run(model.excitation(Table("truth", "", t, columns))).x.T, strict=True))
 
 
 def _variables(law: Law, made: Made) -> set[str]:

@@ -6,6 +6,7 @@ search does not have), other parameters than the plant file, and in the open wor
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from tests.plants import TWO_BLOCKS
 from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
-from thermoctl.plant.language import Flow, Plant
+from thermoctl.plant.language import Flow, Node, Plant
 from thermoctl.plant.refit import default_noise, fit
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -95,7 +96,9 @@ STEPS = 4  # of the search for the law's size
 
 @dataclass(frozen=True)
 class Truth:
-    """A concealed law: `rate` is the flow from `source` into `target` for a size of one."""
+    """A concealed law: `rate` is the flow from `source` into `target` for a size of one.
+
+    `switches`: rate of a hidden state `on` that the law may read. `part`: "storage" where `rate` is a part of it."""
 
     name: str
     family: str
@@ -104,6 +107,8 @@ class Truth:
     target: str
     source: str | None = None
     drawn: bool = False
+    switches: str | None = None
+    part: str = "flow"
 
 
 def _t(name: str, family: str, rate: str, variables: str, target: str, source: str | None = None) -> Truth:
@@ -159,6 +164,33 @@ LAWS = (
     _t("heat of Monod growth", "reactor", "substrate / (0.8 + substrate)", "substrate", "broth"),
     _t("thermostat", "reactor", "-(1 + tanh((broth - 34) / 0.3)) / 2", "broth", "broth"),
     _t("phase change", "reactor", "exp(-((broth - 33) / 2)**2) * (broth - jacket)", "broth jacket", "broth"),
+)
+
+
+def _relay(
+    name: str, family: str, rate: str, on: str, off: str, signal: str, target: str, variables: str
+) -> Truth:
+    """A law with a switch that goes on above `on` and off below `off`, within about a sample."""
+    lag = 0.02 if family == "stage" else 1
+    switches = f"(step({signal} - {on} + ({on} - {off}) * on) - on) / {lag}"
+    return dataclasses.replace(_t(name, family, rate, variables, target), switches=switches)
+
+
+RELAYS = (
+    _relay("fan with hysteresis", "heater", "-on * (one - air)", "46", "38", "one", "one", "one air"),
+    _relay("latching magnet", "stage", "on", "0.03", "-0.02", "position", "velocity", "position"),
+    _relay("bell siphon", "tanks", "-on", "1.7", "0.8", "lower", "lower", "lower"),
+    _relay("thermostat with hysteresis", "reactor", "-on", "31", "26", "broth", "broth", "broth"),
+)
+
+STORAGES = (
+    dataclasses.replace(
+        _t("melting in the block", "heater", "exp(-((one - 41) / 3)**2)", "one", "one"), part="storage"
+    ),
+    dataclasses.replace(
+        _t("melting in the broth", "reactor", "1 / (1 + ((broth - 29) / 1.5)**2)", "broth", "broth"),
+        part="storage",
+    ),
 )
 
 # what the search's library does not hold; x is the variable over its typical size
@@ -269,8 +301,11 @@ def make(law: Truth | None, family: str, size: str, world: str, seed: int) -> Ma
     goal = RATIOS[size]
     misfit = goal * rng.uniform(0.03, 0.4) if world == "open" else 0.0
     truth, ratio = base, 1.0
+    if law and law.switches:
+        base = _switching(base, law.switches)
     if law:
-        truth, ratio = _sized(plant, base, runs, "hidden", ex.parse(law.rate), law.target, law.source, goal)
+        size = 0.3 * _reference(base, runs, law)
+        truth, ratio = _sized(plant, runs, lambda q: with_law(base, law, q), size, goal)
     real = truth
     if misfit > 0.3:
         node = list(plant.nodes)[0] if family != "reactor" else str(rng.choice(list(plant.nodes)))
@@ -279,35 +314,50 @@ def make(law: Truth | None, family: str, size: str, world: str, seed: int) -> Ma
             f"{rng.uniform(0.3, 1):.3g} * sin(2 * pi * t / {span * rng.uniform(0.15, 0.9):.4g} + {rng.uniform(0, 6):.3g})"
             for _ in range(3)
         )
-        small, _ = _sized(plant, base, runs, "wander", ex.parse(waves), node, None, misfit)
-        real = dataclasses.replace(truth, flows={**truth.flows, "wander": small.flows["wander"]})
+        wander = Truth("wander", family, waves, frozenset(), node)
+        size = 0.3 * _reference(base, runs, wander)
+        small, _ = _sized(plant, runs, lambda q: with_law(base, wander, q), size, misfit)
+        flow = dataclasses.replace(small.flows["hidden"], name="wander")
+        real = dataclasses.replace(truth, flows={**truth.flows, "wander": flow})
     model = compile_plant(real)
     return Made(plant, [model.measure(t, seed + k) for k, t in enumerate(runs)], truth, law, ratio)
 
 
+def _switching(plant: Plant, rate: str) -> Plant:
+    """The plant with a state `on` that no flow of it reads yet."""
+    node = Node("on", ex.ONE, ex.ZERO, "1", None)
+    flow = Flow("switching", ex.parse(rate), None, "on")
+    return dataclasses.replace(
+        plant, nodes={**plant.nodes, "on": node}, flows={**plant.flows, "switching": flow}
+    )
+
+
+def with_law(base: Plant, law: Truth, size: float) -> Plant:
+    """The plant with a law of a size."""
+    rate = ex.mul(ex.num(float(f"{size:.4g}")), ex.parse(law.rate))
+    if law.part == "storage":
+        node = base.nodes[law.target]
+        larger = dataclasses.replace(node, storage=ex.add(node.storage, rate))
+        return dataclasses.replace(base, nodes={**base.nodes, law.target: larger})
+    flow = Flow("hidden", rate, law.source, law.target)
+    return dataclasses.replace(base, flows={**base.flows, "hidden": flow})
+
+
+def _reference(base: Plant, runs: list[Table], law: Truth) -> float:
+    """The size with which a law is as large as the flows, or the storage, at its place."""
+    shape = np.mean([_rms(base, t, ex.parse(law.rate)) for t in runs[:3]])
+    if law.part == "storage":
+        return float(_rms(base, runs[0], base.nodes[law.target].storage) / max(shape, 1e-12))
+    return float(np.mean([_typical(base, t, law.target) for t in runs[:3]]) / max(shape, 1e-12))
+
+
 def _sized(
-    plant: Plant,
-    base: Plant,
-    runs: list[Table],
-    label: str,
-    rate: ex.Expr,
-    target: str,
-    source: str | None,
-    goal: float,
+    plant: Plant, runs: list[Table], made: Callable[[float], Plant], size: float, goal: float
 ) -> tuple[Plant, float]:
-    """The plant with a flow of such a size that a refit of the plant file leaves `goal` times the noise."""
-    reference = np.mean([_typical(base, t, target) for t in runs[:3]])
-    shape = np.mean([_rms(base, t, rate) for t in runs[:3]])
-    size, found = 0.3 * reference / max(shape, 1e-12), base
+    """The plant made with such a size that a refit of the plant file leaves `goal` times the noise."""
     ratio = np.nan
     for _ in range(STEPS):
-        found = dataclasses.replace(
-            base,
-            flows={
-                **base.flows,
-                label: Flow(label, ex.mul(ex.num(float(f"{size:.4g}")), rate), source, target),
-            },
-        )
+        found = made(size)
         try:
             ratio = _left(plant, found, runs[:3])
         except Exception:  # an unstable truth: smaller

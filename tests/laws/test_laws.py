@@ -12,23 +12,31 @@ import yaml
 
 from tests.laws.prove import EQUAL, difference
 from tests.laws.real import law_of
-from tests.laws.rigs import LAWS, make
+from tests.laws.rigs import LAWS, RELAYS, STORAGES, make
+from tests.plants import TWO_BLOCKS
 from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law import find_law
-from thermoctl.diagnose.law_forms import library
+from thermoctl.diagnose.law_forms import Place, Signal, Term, library, signals
 from thermoctl.diagnose.law_misfit import misfit_odds
 from thermoctl.diagnose.law_propose import PROPOSALS
 from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable, refitted_law
-from thermoctl.diagnose.law_result import law_entry, law_section
+from thermoctl.diagnose.law_result import law_entry, law_section, save_effect
+from thermoctl.diagnose.law_smooth import tracked
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.propose import propose, survivors
 from thermoctl.diagnose.rig import Rig
-from thermoctl.plant import load, save
+from thermoctl.diagnose.roles import Structure
+from thermoctl.diagnose.words import law_sentence
+from thermoctl.plant import expression as ex
+from thermoctl.plant import load, loads, save
+from thermoctl.plant.language import Flow, Input, Node, Plant
+from thermoctl.plant.simulate import compile_plant
 from thermoctl.proof.rigs import RIGS
+from thermoctl.recording.table import Table
 
 FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[3] / "shared/recordings"))
 ENTROPIC = next(law for law in LAWS if law.name == "entropic heat")
@@ -124,7 +132,7 @@ def test_an_experiment_separates_laws_that_fit_about_as_well(found):
     forms = {f.name: f for f in library()}
     bent = replace(term, form=forms["saturation"], shapes={"s": 2.5})
     other = replace(law.proposal, terms=(bent,), sizes=(3.5 * law.proposal.sizes[0],))
-    rival = refitted_law(known, parent, other, float(made.tables[0].t[-1]), parent)
+    rival = refitted_law(known, parent, other, parent)
     both = replace(law, rivals=((other, rival, 0.4),))
     undecided = SimpleNamespace(case=known, decision=SimpleNamespace(verdict="unexplained"), law=both)
     assert [share for _, share, _ in survivors(undecided)] == pytest.approx([0.6, 0.4])
@@ -133,6 +141,114 @@ def test_an_experiment_separates_laws_that_fit_about_as_well(found):
     assert entry["separates"][0]["hypothesis"].startswith("A1 * (current / Z1) / (abs(current / Z1) + s1)")
     undecided.law = law
     assert propose(undecided) is None
+
+
+def test_parameters_that_scale_together_absorb_no_flow():
+    made = make(next(law for law in LAWS if law.name == "thermostat"), "reactor", "small", "closed", 7)
+    known = case(made.plant, made.tables[:2], {}, Budget(80))
+    at = tracked(known, fitted(known, known.plant, (), known.null), ["broth", "substrate"])
+    assert at.explained["broth"] > 0.5 > at.explained["substrate"]
+
+
+def test_a_relay_in_the_plant_switches_where_the_one_of_the_regression_does():
+    t = np.arange(400.0)
+    z = np.sin(t / 30) + 0.3 * np.sin(t / 7)
+    form = next(f for f in library() if f.name == "relay")
+    signal = Signal("z", ex.name("z"), None)
+    table = Table("made", "", t, {"z": z})
+    for on, off in ((0.6, -0.4), (-0.5, 0.7)):
+        term = Term(form, (signal,), {"on": on, "off": off}, 400.0, 1.0)
+        rate = ex.substitute(
+            term.filling(1),
+            lambda e, known={"on1": on, "off1": off, "Z1": 1.0}: (
+                ex.num(known[e.value]) if e.value in known else None
+            ),
+        )
+        plant = Plant(
+            "relay",
+            {"z": Input("z", None, "z", True)},
+            {},
+            {"m1": Node("m1", ex.ONE, ex.num(0.5))},
+            {"switching": Flow("switching", rate, None, "m1")},
+            {},
+        )
+        m = compile_plant(plant).simulate(table).x[:, 0]
+        other = (m > 0.5) != (term.values({"z": z}, t)[:, 0] > 0.5)
+        assert np.sum(np.diff(m > 0.5)) > 3 and np.mean(other) < 0.05  # a switch takes some samples
+
+
+@pytest.fixture(scope="module")
+def switched():
+    made = make(next(law for law in RELAYS if law.family == "reactor"), "reactor", "small", "closed", 7)
+    return made, look(made)[1]
+
+
+def test_a_thermostat_with_hysteresis_is_a_law_with_two_thresholds(switched):
+    made, law = switched
+    (term,) = law.proposal.terms
+    values = {q: p["value"] for q, p in law_entry(law)["parameters"].items()}
+    signal = term.signals[0]
+    assert (term.form.name, signal.label) == ("relay", "broth")
+    on, off = (signal.centre + values["Z1"] * values[q] for q in ("on1", "off1"))
+    assert abs(on - 31) < 0.5 and abs(off - 26) < 0.5
+    assert difference(law.fitted.plant, made) < EQUAL
+
+
+def test_a_saved_relay_is_an_effect(switched, tmp_path):
+    made, law = switched
+    result = {"remainder": {"law": law_entry(law)}}
+    save_effect(result, "thermostat", tmp_path / "own")
+    save(made.plant, tmp_path / "plant.yaml")
+    assert main(["effects", "check", str(tmp_path / "own"), "--plant", str(tmp_path / "plant.yaml")]) == 0
+
+
+def test_a_larger_storage_is_no_law_where_the_plant_has_a_parameter_for_it():
+    made = make(ENTROPIC, "reactor", "middle", "closed", 7)
+    known = case(made.plant, made.tables[:2], {}, Budget(80))
+    at = tracked(known, fitted(known, known.plant, (), known.null), ["broth", "substrate"])
+    flows = [np.ones((len(d.t), 1)) for d in at.metric.drives]
+    assert abs(_cosine(at, Place("broth", None, "storage"), flows)) < 0.05
+    assert abs(_cosine(at, Place("broth"), [np.asarray(run["current"])[:, None] for run in at.runs])) > 0.95
+
+
+def _cosine(at, place, flows):
+    x = at.columns(place, flows)[:, 0]
+    return float(x @ at.target) / max(float(np.linalg.norm(x) * np.linalg.norm(at.target)), 1e-300)
+
+
+def test_latent_heat_is_a_law_in_the_storage(tmp_path):
+    law = next(law for law in STORAGES if law.family == "heater")
+    made = make(law, "heater", "middle", "closed", 7)
+    _, found = look(made)
+    entry = law_entry(found)
+    assert (entry["part"], entry["into"]) == ("storage", "one")
+    assert difference(found.fitted.plant, made) < EQUAL
+    assert law_sentence(entry).startswith("A law for it: a storage of one, C_1 + ")
+    save_effect({"remainder": {"law": entry}}, "melting", tmp_path / "own")
+    save(made.plant, tmp_path / "plant.yaml")
+    assert main(["effects", "check", str(tmp_path / "own"), "--plant", str(tmp_path / "plant.yaml")]) == 0
+
+
+def test_the_time_of_day_is_a_signal_where_each_hour_was_visited():
+    plant = loads(TWO_BLOCKS.replace("inputs:\n", "inputs:\n  clock: {unit: h, role: time_of_day}\n"))
+    sun = Flow("sun", ex.parse("0.3 * sin(2 * pi * (clock - 8) / 24)"), None, "one")
+    truth = compile_plant(replace(plant, flows={**plant.flows, "sun": sun}))
+    rng, t = np.random.default_rng(1), np.arange(900) * 100.0
+    tables = []
+    for k in range(3):
+        heat = np.repeat(rng.permutation([0, 2.5, 0.8, 0, 1.6, 3]), 150)
+        columns = {"heat": heat, "air_temperature": np.full(900, 21.0), "clock": (6 * k + t / 3600) % 24}
+        tables.append(truth.measure(Table(f"run_{k}", "", t, columns), k))
+    _, law = look(SimpleNamespace(plant=plant, tables=tables))
+    assert [(t.form.name, t.variables) for t in law.proposal.terms] == [("daily", {"clock"})]
+    rig = Structure(plant, [truth.excitation(t) for t in tables], [t.columns for t in tables])
+    assert not any(s.daily for s in signals(rig, Place("one"), [_named(tables[0], 800)]))
+    assert any(s.daily for s in signals(rig, Place("one"), [_named(tables[0], 900)]))
+
+
+def _named(table, count):
+    rows = {k: v[:count] for k, v in table.columns.items()}
+    return {"one": np.arange(count), "two": np.arange(count), "air": np.arange(count), **rows}
 
 
 def test_no_law_is_claimed_where_nothing_is_missing():

@@ -210,7 +210,7 @@ class Builder:
         }
 
     def _storage(self, form: str) -> None:
-        n = self.base.nodes[self.c.place.nodes["T"]]
+        n = self.base.nodes[next(iter(self.c.place.nodes.values()))]
         self.symbols["storage"] = n.storage
         self.nodes[n.name] = dataclasses.replace(n, storage=self.expression(form))
 

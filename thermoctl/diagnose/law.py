@@ -22,7 +22,7 @@ from thermoctl.diagnose.law_curve import Curve, curve
 from thermoctl.diagnose.law_misfit import closed, held_back, misfit_odds
 from thermoctl.diagnose.law_propose import Proposal, propose_laws
 from thermoctl.diagnose.law_refit import SIMPLER, affordable, at_bound, law_rate, refitted_law, simpler_law
-from thermoctl.diagnose.law_smooth import Tracked, flow_unit, tracked
+from thermoctl.diagnose.law_smooth import law_unit, tracked
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.shortlist import HALF
 from thermoctl.plant import expression as ex
@@ -65,7 +65,7 @@ class Law:
 
     @property
     def rate(self) -> ex.Expr:
-        """Return the law's flow."""
+        """Return the law's flow, or the storage with it."""
         return law_rate(self.fitted)
 
 
@@ -105,7 +105,7 @@ def _chosen(
 
     `apart`: whether the reserve is other recordings."""
     proposals, at = propose_laws(case, parent, limits.rare)
-    tried = _refits(case, parent, proposals, at, say)
+    tried = _refits(case, parent, proposals, say)
     if not tried:
         return None
     gains = np.array([f.log_evidence - p.cost - parent.log_evidence for p, f in tried])
@@ -135,7 +135,7 @@ def _chosen(
         for k, s in zip(order[1:], np.sort(share)[::-1][1:], strict=True)
         if s > 1 - limits.set
     )
-    drawn, unit = curve(at, p, law_rate(f), f.plant), flow_unit(case.plant, p.place.target)
+    drawn, unit = curve(at, p, law_rate(f), f.plant), law_unit(case.plant, p.place)
     gain, probability, share_closed = float(gains[likely[best]]), float(sure[best]), float(shut[best])
     return Law(p, f, gain, probability, values[best], share_closed, drawn, rivals, unit)
 
@@ -146,7 +146,7 @@ def _both(one: np.ndarray, other: Sequence[float]) -> np.ndarray:
 
 
 def _refits(
-    case: Case, parent: Fitted, proposals: Sequence[Proposal], at: Tracked, say: Callable[[str], None]
+    case: Case, parent: Fitted, proposals: Sequence[Proposal], say: Callable[[str], None]
 ) -> list[Tried]:
     """Refit the proposals, and sums without their least significant term, while more may gain than so far.
 
@@ -159,7 +159,7 @@ def _refits(
             continue
         left -= 1
         say(f"looking for a law of the remainder: refit {k + 1}")
-        f = refitted_law(case, parent, p, at.duration, leader)
+        f = refitted_law(case, parent, p, leader)
         if f is None:
             continue
         more_evidence = f.log_evidence - parent.log_evidence
@@ -178,7 +178,7 @@ def _refits(
 def _refitted_to_all(case: Case, parent: Fitted, law: Law) -> Law | None:
     """Return the law at its parameters from all of the data; None where it is not significant there."""
     at = tracked(case, parent, [law.proposal.place.target])
-    f = refitted_law(case, parent, law.proposal, at.duration, parent)
+    f = refitted_law(case, parent, law.proposal, parent)
     if f is None or f.absent or at_bound(f):
         return None
     gain = f.log_evidence - law.proposal.cost - parent.log_evidence

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoctl.diagnose.law_forms import Signal
-from thermoctl.diagnose.law_propose import PIECES, Proposal, along, pieces
+from thermoctl.diagnose.law_propose import PIECES, Proposal, pieces
 from thermoctl.diagnose.law_smooth import Tracked
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
@@ -29,13 +29,13 @@ class Curve:
 def curve(at: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
     """Return the flow at the law's place as a free function of its first signal, and the law there.
 
-    None for a law with a memory. The free function is the law plus a fit of its residual."""
+    None for a law with a memory, or in a storage. The free function is the law plus a fit of its residual."""
     found = [s for t in p.terms for s in t.signals]
-    if not found or any(t.form.memory for t in p.terms):
+    if not found or p.place.part != "flow" or any(t.form.memory for t in p.terms):
         return None
     s = found[0]
     known = {q: v.value for q, v in plant.parameters.items()}
-    values = [along(s, run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+    values = [s.along(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
     flows = [
         np.broadcast_to(np.asarray(ex.evaluate(rate, {**run, **known}), float), d.t.shape)
         for run, d in zip(at.runs, at.metric.drives, strict=True)

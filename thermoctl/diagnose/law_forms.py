@@ -5,8 +5,9 @@ with the signal's unit. So the size A of a term has the unit of the flow."""
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
@@ -15,13 +16,15 @@ import numpy as np
 
 from thermoctl import yamlfile
 from thermoctl.diagnose.catalogue import Effect, EffectParameter
+from thermoctl.diagnose.law_memory import MEMORIES
 from thermoctl.diagnose.rig import TEMPERATURE, zero_of
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
+from thermoctl.plant.units import conversion, dimension
 from thermoctl.shipped import shipped
 
-TOTAL = "total"  # a memory that keeps all: an integral
+QUANTILES = 21  # of a signal: each 5 %
 
 Values = Mapping[str, np.ndarray | float]
 
@@ -30,12 +33,20 @@ Values = Mapping[str, np.ndarray | float]
 class Shape:
     """A parameter of a form beside its size: values to try first, range, unit.
 
-    `of` 'duration': the values are shares of the longest run."""
+    `of` 'duration': the values are shares of the longest run; 'visited': quantiles of the signal."""
 
     values: tuple[float, ...]
     range: tuple[float, float]
     unit: str | None = None
     of: str | None = None
+
+    def scaled(self, values: Sequence[float], s: Signal | None, duration: float) -> tuple[float, ...]:
+        """Return values, or bounds, as the form counts them."""
+        if self.of == "duration":
+            return tuple(v * duration for v in values)
+        if self.of == "visited" and s:
+            return tuple(np.interp(values, np.linspace(0, 1, len(s.visited)), s.visited).tolist())
+        return tuple(values)
 
 
 @dataclass(frozen=True)
@@ -86,14 +97,20 @@ def library() -> tuple[Form, ...]:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a law acts: a node (`source` None: from outside), or two nodes that exchange the flow."""
+    """Where a law acts.
+
+    - flow: into the node `target` from outside, or from the node `source`
+    - storage: of the node `target`"""
 
     target: str
     source: str | None = None
+    part: str = "flow"
 
     @property
     def where(self) -> str:
         """Its name in a result."""
+        if self.part != "flow":
+            return f"{self.part} of {self.target}"
         return f"{self.source}-{self.target}" if self.source else self.target
 
     @property
@@ -106,28 +123,40 @@ class Place:
 class Signal:
     """A signal of the plant: an expression, its unit, its typical size.
 
-    `drives`: a difference or a velocity that drives the flow at its place, and reverses it."""
+    `visited`: its evenly spaced quantiles from the smallest to the largest value, over its size.
+    `drives`: a difference or a velocity that drives the flow at its place, and reverses it. `daily`: the time
+    of day, with a day as its size."""
 
     label: str
     value: Expr
     unit: str | None
     size: float = 1.0
     centre: float = 0.0
+    visited: tuple[float, ...] = (-1.0, 1.0)
     kelvin: float | None = None  # offset to kelvins; None: no absolute temperature
     position: bool = False
     drives: bool = False
     recorded: bool = False
+    daily: bool = False
+
+    def along(self, run: Values, t: np.ndarray) -> np.ndarray:
+        """Return its values (N,) along a trajectory."""
+        values = np.broadcast_to(np.asarray(ex.evaluate(self.value, run), float), t.shape)
+        return values % self.size if self.daily else values
 
 
 def places(rig: Structure) -> list[Place]:
-    """Return every node that stores something, and every pair of nodes that exchange a flow."""
+    """Return the flow into every node that stores something, and between nodes that exchange one; storages.
+
+    A storage of 1 is a definition: dn/dt is the sum of the flows."""
     positions = set(rig.pairs.values())
     flows = rig.physics.flows.values()
     nodes = [
         n for n in rig.physics.nodes if n not in positions and any(n in (f.source, f.target) for f in flows)
     ]
     pairs = {(f.source, f.target) for f in flows if f.source in nodes and f.target in nodes}
-    return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs))]
+    stored = [Place(n, None, "storage") for n in nodes if rig.physics.nodes[n].storage is not ex.ONE]
+    return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs)), *stored]
 
 
 def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal]:
@@ -140,12 +169,13 @@ def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal
         if unit in TEMPERATURE:
             out.append(Signal(n, name(n), "K", kelvin=273.15 - zero_of(unit)))
         else:
-            own = n in place.nodes and n in rig.velocities and not place.source
+            own = n in place.nodes and n in rig.velocities and not place.source and place.part == "flow"
             out.append(Signal(n, name(n), unit, position=n in positions, drives=own, recorded=n in p.inputs))
 
     def difference(a: str, b: str) -> None:
         unit = _difference(p.nodes[a].unit)
-        out.append(Signal(f"{a} - {b}", ex.add(name(a), ex.neg(name(b))), unit, drives=True))
+        drives = place.part == "flow"
+        out.append(Signal(f"{a} - {b}", ex.add(name(a), ex.neg(name(b))), unit, drives=drives))
 
     for n in near:
         if rig.air and n in rig.temperatures:
@@ -159,10 +189,21 @@ def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal
             linked = any({n, place.target} == {f.source, f.target} for f in p.flows.values())
             if linked and not place.source and p.nodes[n].unit == p.nodes[place.target].unit:
                 difference(place.target, n)
-    for i in sorted(rig.moving_inputs):
+    clocks = {i for i, q in p.inputs.items() if q.role == "time_of_day"}
+    for i in sorted(rig.moving_inputs - clocks):
         if i != rig.air and not i.endswith("_start"):
             absolute(i, p.inputs[i].unit)
-    return [s for s in (_sized(s, runs) for s in out) if s is not None]
+    sized = [_sized(s, runs) for s in out] + [_daily(i, p.inputs[i].unit, runs) for i in sorted(clocks)]
+    return [s for s in sized if s is not None]
+
+
+def _daily(clock: str, unit: str | None, runs: Sequence[Values]) -> Signal | None:
+    """Return the time of day as a signal; None where the runs do not visit each of its hours."""
+    if unit is None or dimension(unit) != dimension("s"):
+        return None
+    day = conversion("day", unit)[0]
+    hours = np.floor(24 * np.concatenate([np.atleast_1d(run[clock]) for run in runs]) / day) % 24
+    return Signal(clock, name(clock), unit, day, daily=True) if len(np.unique(hours)) == 24 else None
 
 
 def _difference(unit: str | None) -> str | None:
@@ -175,7 +216,9 @@ def _sized(s: Signal, runs: Sequence[Values]) -> Signal | None:
     size = float(np.sqrt(np.mean((values - centre) ** 2)))
     if not np.isfinite(size) or float(np.ptp(values)) <= 1e-9 * max(size, 1e-300):
         return None
-    return replace(s, size=float(f"{size:.3g}"), centre=float(f"{centre:.4g}"))
+    size, centre = float(f"{size:.3g}"), float(f"{centre:.4g}")
+    visited = (np.quantile(values, np.linspace(0, 1, QUANTILES)) - centre) / size
+    return replace(s, size=size, centre=centre, visited=tuple(visited.tolist()))
 
 
 @dataclass(frozen=True)
@@ -186,6 +229,7 @@ class Term:
     signals: tuple[Signal, ...]
     shapes: Mapping[str, float] = field(default_factory=dict)
     duration: float = 1.0  # of the longest run, s
+    sample: float = 1.0  # interval between samples, s
 
     @property
     def variables(self) -> frozenset[str]:
@@ -227,79 +271,101 @@ class Term:
         """Return what drives the memory of the term."""
         return self.normal(self.signals[0], f"Z{number}")
 
-    @property
-    def integrates(self) -> bool:
-        """Return whether the memory is an integral."""
-        return self.form.memory == TOTAL
-
-    def filling(self, number: int) -> str:
-        """Return the rate of the memory: of first order, or of an integral."""
-        z = self.lagged(number)
-        if self.integrates:
-            return f"({z}) / {self.duration:.4g}"
-        return f"({z} - m{number}) / {self.form.memory}{number}"
+    def filling(self, number: int) -> Expr:
+        """Return the rate of the memory."""
+        known = {k: name(f"{k}{number}") for k in ("m", *self.form.shapes)}
+        known |= {"z": self.lagged(number), **{k: num(float(f"{v:.4g}")) for k, v in self.clock.items()}}
+        text = ex.parse(MEMORIES[self.form.memory or ""].rate)
+        return ex.substitute(text, lambda e: known.get(str(e.value)) if e.op == "name" else None)
 
     def memory_text(self, number: int) -> str:
         """Return the memory of the term in words."""
-        z = readable(self.lagged(number))
-        if self.integrates:
-            return f"the integral of {z} since the start, over {self.duration:.4g} s"
-        return f"{z}, delayed by a first-order lag of {self.form.memory}{number}"
+        known = {k: f"{k}{number}" for k in self.form.shapes} | {k: f"{v:.4g}" for k, v in self.clock.items()}
+        return MEMORIES[self.form.memory or ""].words.format(z=readable(self.lagged(number)), **known)
+
+    @property
+    def clock(self) -> dict[str, float]:
+        """Return the times that a memory may count in, s."""
+        return {"duration": self.duration, "sample": self.sample}
 
     def values(self, run: Values, t: np.ndarray) -> np.ndarray:
         """Return the term (N, sizes) along a trajectory, for sizes of one."""
-        known: dict[str, Any] = {**run, **{f"{k}1": v for k, v in self.shapes.items()}}
-        known |= {k: s.size for k, s in self.scales(1).items()}
+        shapes = {q: np.array([v]) for q, v in self.shapes.items()}
+        return Family(self.form, self.signals, shapes, self.duration, self.sample).values(run, t)
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """A form over signals, at k values of each of its shapes (k,)."""
+
+    form: Form
+    signals: tuple[Signal, ...]
+    shapes: Mapping[str, np.ndarray]
+    duration: float
+    sample: float
+
+    @property
+    def count(self) -> int:
+        """Number of terms."""
+        return len(next(iter(self.shapes.values()), (0,)))
+
+    def term(self, k: int) -> Term:
+        """Return the term with the k-th values."""
+        shapes = {q: float(v[k]) for q, v in self.shapes.items()}
+        return Term(self.form, self.signals, shapes, self.duration, self.sample)
+
+    def values(self, run: Values, t: np.ndarray) -> np.ndarray:
+        """Return the terms (N, count * sizes) along a trajectory, for sizes of one."""
+        known: dict[str, Any] = {**self.shapes, "pi": np.pi}
+        for symbol, s in zip("zw", self.signals, strict=False):
+            value = s.along(run, t)
+            known[symbol] = ((value - s.centre) / s.size)[:, None]
+            if symbol == "z" and s.kelvin is not None:
+                known["T"] = (value + s.kelvin)[:, None]
         if self.form.memory:
-            z = np.broadcast_to(np.asarray(ex.evaluate(self.lagged(1), known), float), t.shape)
-            known["m1"] = (
-                _total(t, z) / self.duration if self.integrates else _lag(t, z, self.shapes[self.form.memory])
-            )
-        e = self.expression(1)
-        out = []
-        for q in self.form.sizes:
-            one = {f"{o}1": float(o == q) for o in self.form.sizes}
+            known["m"] = MEMORIES[self.form.memory].along(t, known["z"][:, 0], self.shapes, self.duration)
+        out = np.empty((len(t), self.count, len(self.form.sizes)))
+        for k, q in enumerate(self.form.sizes):
+            one = {o: float(o == q) for o in self.form.sizes}
             with np.errstate(all="ignore"):
-                out.append(np.broadcast_to(np.asarray(ex.evaluate(e, {**known, **one}), float), t.shape))
-        return np.stack(out, axis=1)
+                out[:, :, k] = ex.evaluate(self.form.text, {**known, **one})
+        return out.reshape(len(t), -1)
 
 
-def _lag(t: np.ndarray, z: np.ndarray, tau: float) -> np.ndarray:
-    out = np.empty(len(t))
-    value = out[0] = z[0]
-    for k, a in enumerate(np.exp(-np.diff(t) / tau).tolist(), 1):
-        value = a * value + (1 - a) * z[k - 1]
-        out[k] = value
+def families(
+    found: Sequence[Signal], every: Sequence[Signal], duration: float, sample: float
+) -> list[Family]:
+    """Return every form at its first values over the signals found. `every`: possible second signals."""
+    out = []
+    for form in library():
+        if form.of == "none":
+            out.append(Family(form, (), {}, duration, sample))
+            continue
+        for z in found:
+            fits = {"absolute": z.kelvin is not None, "position": z.position, "input": z.recorded}
+            if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
+                shapes = _grid(form, z, duration)
+                out += [Family(form, pair, shapes, duration, sample) for pair in _pairs(form, z, every)]
     return out
 
 
-def _total(t: np.ndarray, z: np.ndarray) -> np.ndarray:
-    return np.concatenate([[0.0], np.cumsum(z[:-1] * np.diff(t))])
+def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal, ...]]:
+    """Return the signals of a form whose first one is z."""
+    if form.of not in ("two", "driven"):
+        return [(z,)]
+    second = [w for w in every if w != z and not w.daily and (w.drives or form.of == "two")]
+    return [(z, w) for w in second if form.name != "product" or z.label < w.label]
 
 
-def terms(found: Sequence[Signal], duration: float) -> Iterator[Term]:
-    """Yield every form over these signals at each of its first values."""
-    for form in library():
-        if form.of == "none":
-            yield Term(form, (), {}, duration)
-            continue
-        for s in found:
-            fits = {"absolute": s.kelvin is not None, "position": s.position, "input": s.recorded}
-            if not fits.get(form.of, True):
-                continue
-            for w in found if form.of == "two" else (s,):
-                if form.of == "two" and (w is s or (form.name == "product" and w.label < s.label)):
-                    continue
-                for shapes in _grid(form, duration):
-                    yield Term(form, (s, w) if form.of == "two" else (s,), shapes, duration)
+def _grid(form: Form, z: Signal, duration: float) -> dict[str, np.ndarray]:
+    """Return all combinations of the first values of the shapes."""
+    return combined({q: s.scaled(s.values, z, duration) for q, s in form.shapes.items()})
 
 
-def _grid(form: Form, duration: float) -> Iterator[dict[str, float]]:
-    if not form.shapes:
-        yield {}
-    for key, shape in form.shapes.items():  # one shape each
-        for v in shape.values:
-            yield {key: v * (duration if shape.of == "duration" else 1.0)}
+def combined(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np.ndarray]:
+    """Return all combinations of values, for each name (k,); two equal thresholds are none."""
+    chosen = [v for v in itertools.product(*values.values()) if len(v) == len(set(v))]
+    return dict(zip(values, np.array(chosen).T, strict=False))
 
 
 def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
@@ -315,20 +381,15 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
         ]
         parameters += [_parameter(q, s.unit, None, s.size) for q, s in term.scales(k).items()]
         if term.form.memory:
-            lagged = term.lagged(k)
-            changes.append(
-                {
-                    "node": {
-                        "name": f"m{k}",
-                        "storage": 1,
-                        "initial": str(_at_start(lagged)),
-                        "initial_sigma": 0.1,
-                    }
-                }
-            )
-            changes.append({"flow": {"into": f"m{k}", "rate": term.filling(k)}})
-    ends = {"into": "target", **({"from": "source"} if place.source else {})}
-    changes.append({"flow": {**ends, "rate": str(rate)}})
+            memory = MEMORIES[term.form.memory]
+            node = {"name": f"m{k}", "storage": 1, "initial": memory.start}
+            changes.append({"node": {**node, "initial_sigma": memory.start_sigma}})
+            changes.append({"flow": {"into": f"m{k}", "rate": str(term.filling(k))}})
+    if place.part == "storage":
+        changes.append({"storage": str(ex.add(name("storage"), rate))})
+    else:
+        ends = {"into": "target", **({"from": "source"} if place.source else {})}
+        changes.append({"flow": {**ends, "rate": str(rate)}})
     return Effect(
         "law",
         "A law that the recordings propose",
@@ -342,10 +403,6 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
         (),
         "",
     )
-
-
-def _at_start(e: Expr) -> Expr:
-    return ex.ZERO if ex.names(e) else e
 
 
 def _parameter(label: str, unit: str | None, trial: Expr | None, null: float) -> EffectParameter:

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,12 +15,21 @@ import numpy as np
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, as_refitted
-from thermoctl.diagnose.law_forms import Place, Signal, Term, library, places, signals, terms
+from thermoctl.diagnose.law_forms import (
+    Family,
+    Place,
+    Signal,
+    Term,
+    combined,
+    families,
+    library,
+    places,
+    signals,
+)
 from thermoctl.diagnose.law_smooth import Tracked, tracked
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.shortlist import ALIKE
 from thermoctl.diagnose.unknown import located, reached
-from thermoctl.plant import expression as ex
 from thermoctl.plant.residuals import HUGE
 
 PIECES = 8  # of a free function of a signal
@@ -31,10 +40,13 @@ RANKED, COMBINATIONS = 40, 12  # places and signals with the best free function;
 SEEN = 1e-6  # of the strongest direction of a free function: weaker ones are rounding errors
 POOL = 60  # terms that a sum of terms is built from
 PAIRED = 600  # terms that are tried two at a time
-PAIRS, LIKELY = 8, 5000  # pairs from which sums grow; best pairs of values that they are looked for in
+PAIRS, LIKELY = 24, 50_000  # pairs that explain most energy; best pairs of values that they are looked for in
+GROWN = 8  # pairs of the best score, from which sums of three grow
 PROPOSALS, SINGLE, SIGNALS = 14, 5, 4  # the best; of one term; of one term, each of another signal
 TERMS = 3
+ZOOMS, FINE = 2, 9  # finer grids of the shapes of a term; values of each shape there
 CHUNK = 256  # terms whose responses are computed at a time
+KEPT = 20  # values of the shapes of a form over a signal, from which sums may grow
 
 
 @dataclass(frozen=True)
@@ -102,7 +114,7 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
     drives = case.drives(parent.rough.model)
     rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
     where = places(rig)
-    nodes = [p.target for p in where if p.source is None]
+    nodes = [p.target for p in where if p == Place(p.target)]
     if len(nodes) > TRACKED:
         nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
     at = tracked(case, parent, nodes)
@@ -116,6 +128,7 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
         every = [s for _, p, s in free if p == place][:SECOND]
         pool += _singles(at, place, found, every)
     pool.sort(key=lambda f: -f.gain)
+    pool = sorted([*pool, *(_zoomed(at, f) for f in _varied(pool))], key=lambda f: -f.gain)
     base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), rare
     out = [_proposal(at, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
@@ -131,7 +144,7 @@ def _ranked(at: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[f
     gain in likelihood takes longer."""
     found = []
     for place, s in combos:
-        values = [along(s, run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+        values = [s.along(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
         knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
         x = at.columns(place, [pieces(v, knots) for v in values])
         found.append((_energy(x, at.target), place, s, x))
@@ -150,11 +163,6 @@ def _energy(x: np.ndarray, target: np.ndarray) -> float:
     return float(np.sum((u[:, w > SEEN * max(w[0], 1e-300)].T @ target) ** 2))
 
 
-def along(s: Signal, run: Mapping[str, np.ndarray | float], t: np.ndarray) -> np.ndarray:
-    """Return a signal along a trajectory."""
-    return np.broadcast_to(np.asarray(ex.evaluate(s.value, run), float), t.shape)
-
-
 def pieces(v: np.ndarray, knots: np.ndarray) -> np.ndarray:
     """Return straight lines between the knots of a signal (N, knots): the columns of a free function."""
     if len(knots) < 2:
@@ -171,35 +179,67 @@ def _promise(at: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _singles(at: Tracked, place: Place, found: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
-    """Return every term at a place."""
-    tried = [t for t in terms(every, at.duration) if not t.signals or t.signals[0] in found]
+    """Return the terms at a place, the best KEPT of each form over each signal."""
     still = at.columns(place, [np.ones((len(d.t), 1)) for d in at.metric.drives])
     out = []
-    for k in range(0, len(tried), CHUNK):
-        part = tried[k : k + CHUNK]
+    for part in _chunks(families(found, every, at.duration, at.sample)):
         flows = [
-            np.concatenate([t.values(run, d.t) for t in part], axis=1)
+            np.concatenate([f.values(run, d.t) for f in part], axis=1)
             for run, d in zip(at.runs, at.metric.drives, strict=True)
         ]
         x = at.columns(place, flows)
-        column = 0
-        for t in part:
-            n = len(t.form.sizes)
-            own = x[:, column : column + n]
-            column += n
-            if np.all(np.abs(own) < HUGE) and np.any(own) and (not t.signals or not _alike(own, still)):
-                c = np.linalg.lstsq(own, at.target, rcond=1e-10)[0]
-                gain = float(at.target @ at.target - np.sum((at.target - own @ c) ** 2))
-                out.append(Found(gain, place, t, own))
+        ends = np.cumsum([f.count * len(f.form.sizes) for f in part])
+        for f, own in zip(part, np.split(x, ends[:-1], axis=1), strict=True):
+            out += _best(at, place, f, own, still if f.signals else np.zeros_like(still))
     return out
 
 
-def _alike(x: np.ndarray, y: np.ndarray) -> bool:
-    """Return whether single columns (rows, 1) point the same way."""
-    a, b = x / np.abs(x).max(), y / max(np.abs(y).max(), 1e-300)
-    return x.shape[1] == 1 and abs(float(a[:, 0] @ b[:, 0])) > ALIKE * float(
-        np.linalg.norm(a) * np.linalg.norm(b)
-    )
+def _chunks(found: Sequence[Family]) -> Iterator[list[Family]]:
+    """Yield families in groups of CHUNK terms and more."""
+    part: list[Family] = []
+    for f in found:
+        part.append(f)
+        if sum(q.count for q in part) >= CHUNK:
+            yield part
+            part = []
+    if part:
+        yield part
+
+
+def _best(at: Tracked, place: Place, f: Family, x: np.ndarray, still: np.ndarray) -> list[Found]:
+    """Return the terms of a family that explain most, without those that look like a constant."""
+    n = len(f.form.sizes)
+    with np.errstate(all="ignore"):
+        square = np.einsum("rk,rk->k", x, x)
+        gain = (at.target @ x) ** 2 / square
+        alike = np.abs(still[:, 0] @ x) > ALIKE * np.sqrt(square) * np.linalg.norm(still)
+    if n > 1:
+        gain = np.repeat([_energy(own, at.target) for own in np.split(x, f.count, axis=1)], n)
+    usable = (np.abs(x).max(axis=0) < HUGE) & (square > 0) & ((n > 1) | ~alike)
+    gain = np.where(usable, gain, -1.0)[::n]
+    order = [k for k in np.argsort(-gain, kind="stable")[:KEPT] if gain[k] >= 0]
+    return [Found(float(gain[k]), place, f.term(k), x[:, k * n : (k + 1) * n].copy()) for k in order]
+
+
+def _zoomed(at: Tracked, found: Found) -> Found:
+    """Return a term at better values of its shapes, between its neighbours on a grid that gets finer."""
+    t = found.term
+    grid = {q: np.unique(s.scaled(s.values, t.signals[0], t.duration)) for q, s in t.form.shapes.items()}
+    for _ in range(ZOOMS if grid else 0):
+        grid = {q: _between(v, found.term.shapes[q]) for q, v in grid.items()}
+        f = Family(t.form, t.signals, combined(grid), t.duration, t.sample)
+        x = at.columns(
+            found.place, [f.values(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+        )
+        best = _best(at, found.place, f, x, np.zeros((len(x), 1)))[:1]
+        found = max([found, *best], key=lambda b: b.gain)
+    return found
+
+
+def _between(values: np.ndarray, v: float) -> np.ndarray:
+    """Return FINE values between the neighbours of the value nearest to v."""
+    k = int(np.argmin(np.abs(values - v)))
+    return np.linspace(values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)], FINE)
 
 
 def _varied(pool: Sequence[Found]) -> list[Found]:
@@ -223,21 +263,25 @@ def _sums(at: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, f
     """Return sums of two and three terms at a place.
 
     Each grows by what another term adds: from the best term, and from the best pairs. A pair may explain much
-    where each of its terms alone does not, because the plant's own parameters imitate it."""
-    starts = [([f.term], f.columns) for f in pool[:1]]
-    starts += [
-        ([a.term, b.term], np.concatenate([a.columns, b.columns], axis=1)) for a, b in _pairs(at, pool)
-    ]
-    out = []
+    where each of its terms alone does not, because the plant's own parameters imitate it. Terms that do not
+    reverse with what drives the flow are rare: the best pairs without them are tried, too."""
+    likely = [f for f in pool if f.term.reverses is not False]
+    found = _pairs(at, pool) + (_pairs(at, likely) if len(likely) < len(pool) else [])
+    pairs = []
+    for a, b in found:
+        x = np.concatenate([a.columns, b.columns], axis=1)
+        pairs.append((_proposal(at, place, (a.term, b.term), x, base), x))
+    pairs.sort(key=lambda p: -p[0].score)
+    starts: list[tuple[tuple[Term, ...], np.ndarray]] = [((f.term,), f.columns) for f in pool[:1]]
+    starts += [(p.terms, x) for p, x in pairs[:GROWN]]
+    out = [p for p, _ in pairs]
     for law, columns in starts:
-        if len(law) > 1:
-            out.append(_proposal(at, place, tuple(law), columns, base))
         while len(law) < TERMS:
             added = _added(at, law, columns, pool[:POOL])
             if added is None:
                 break
-            law, columns = [*law, added.term], np.concatenate([columns, added.columns], axis=1)
-            out.append(_proposal(at, place, tuple(law), columns, base))
+            law, columns = (*law, added.term), np.concatenate([columns, added.columns], axis=1)
+            out.append(_proposal(at, place, law, columns, base))
     return out
 
 

@@ -15,7 +15,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, Placed, fitted
 from thermoctl.diagnose.law_forms import law_effect, readable
 from thermoctl.diagnose.law_propose import PROPOSALS, Proposal
-from thermoctl.diagnose.law_smooth import flow_unit
+from thermoctl.diagnose.law_smooth import law_unit
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulate import SimulationError
@@ -27,13 +27,13 @@ NUMBERS = 3e7  # that one run of each refit computes, with slopes: so that all r
 RANGE = 100.0  # times its first size that the size of a term may reach
 
 
-def refitted_law(case: Case, parent: Fitted, p: Proposal, duration: float, leader: Fitted) -> Fitted | None:
+def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fitted | None:
     """Refit the parent with a law from its proposed sizes; None where the plant cannot be simulated.
 
     The refit ends early if it stays far from `leader`, the likeliest one so far."""
     rig = Structure(parent.rough_plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
     c = law_candidate(case, rig, p)
-    values, ranges = _start(p, duration)
+    values, ranges = _start(p)
     plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
     own = {q: c.own(q) for q in ranges if c.own(q) in plant.parameters}
     c = dataclasses.replace(c, effect=_bounded(c, ranges))
@@ -47,7 +47,7 @@ def refitted_law(case: Case, parent: Fitted, p: Proposal, duration: float, leade
 
 def law_candidate(case: Case, rig: Structure, p: Proposal) -> Candidate:
     """Return a law as an effect at its place."""
-    effect = law_effect(p.terms, p.place, flow_unit(case.plant, p.place.target))
+    effect = law_effect(p.terms, p.place, law_unit(case.plant, p.place))
     ends = {"target": p.place.target, **({"source": p.place.source} if p.place.source else {})}
     return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig)
 
@@ -62,7 +62,7 @@ def _bounded(c: Candidate, ranges: Mapping[str, tuple[float, float]]) -> Any:
     return dataclasses.replace(c.effect, parameters=new)
 
 
-def _start(p: Proposal, duration: float) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """Return the values that a refit starts from, and the ranges of what it moves."""
     values: dict[str, float] = {}
     ranges: dict[str, tuple[float, float]] = {}
@@ -74,9 +74,8 @@ def _start(p: Proposal, duration: float) -> tuple[dict[str, float], dict[str, tu
             reach = RANGE * max(abs(v), 1e-300)
             ranges[f"{q}{k}"] = (-reach, reach)
         for q, shape in t.form.shapes.items():
-            scale = duration if shape.of == "duration" else 1.0
-            values[f"{q}{k}"] = t.shapes[q]
-            ranges[f"{q}{k}"] = (shape.range[0] * scale, shape.range[1] * scale)
+            low, high = shape.scaled(shape.range, next(iter(t.signals), None), t.duration)
+            values[f"{q}{k}"], ranges[f"{q}{k}"] = t.shapes[q], (low, high)
     return values, ranges
 
 
@@ -109,8 +108,11 @@ def affordable(case: Case, parent: Fitted) -> int:
 
 
 def law_rate(f: Fitted) -> ex.Expr:
-    """Return the flow of the law that a hypothesis holds as its last effect."""
-    own = set(f.hypothesis.effects[-1].own.values())
+    """Return the flow, or the storage, of the law that a hypothesis holds as its last effect."""
+    law = f.hypothesis.effects[-1]
+    own, nodes = set(law.own.values()), law.candidate.place.nodes
+    if "storage" in law.candidate.effect.changes[0][-1]:
+        return f.plant.nodes[nodes["target"]].storage
     return next(x.rate for x in reversed(list(f.plant.flows.values())) if ex.names(x.rate) & own)
 
 

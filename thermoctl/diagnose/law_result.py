@@ -32,6 +32,7 @@ def law_entry(law: Law | None) -> dict[str, Any] | None:
     f, p, place = law.fitted, law.proposal, law.proposal.place
     return {
         "expression": equation(law.rate, f),
+        "part": place.part,
         "into": place.target,
         "from": place.source,
         "terms": _terms(p),
@@ -160,19 +161,15 @@ def effect_file(law: Law) -> dict[str, Any]:
             entry["trial"] = "s" if sizes == 1 else f"s{sizes}"
         else:
             low, high = p.range or (p.value, p.value)
-            entry |= {"trial": repr(p.value), "null": p.value, "low": low, "high": high}
+            entry |= {
+                "unit": p.unit or "1",
+                "trial": repr(p.value),
+                "null": p.value,
+                "low": low,
+                "high": high,
+            }
         parameters[q.name] = entry
-    changes = []
-    for item in c.effect.changes[0]:
-        ((kind, what),) = item.items()
-        told = {
-            k: (v if k not in ("rate", "initial") else str(ex.substitute(ex.parse(v), swap)))
-            for k, v in what.items()
-        }
-        for end, label in (("into", "target"), ("from", "source")):
-            if told.get(end) == label:
-                told[end] = _ends(where)[label]
-        changes.append({kind: told})
+    changes = [_general(item, swap, _ends(where)) for item in c.effect.changes[0]]
     variables = ", ".join(sorted({s.label for t in law.proposal.terms for s in t.signals}))
     read = _names(changes)
     needs = ["x"] if where == "velocity_node" and "x" in read else []
@@ -190,8 +187,21 @@ def effect_file(law: Law) -> dict[str, Any]:
     }
 
 
+def _general(change: Mapping[str, Any], swap: Any, ends: Mapping[str, str]) -> dict[str, Any]:
+    """Return a change of an effect with the symbols of an effect file."""
+
+    def told(text: str) -> str:
+        return str(ex.substitute(ex.parse(text), swap))
+
+    ((kind, what),) = change.items()
+    if isinstance(what, str):
+        return {kind: told(what)}
+    out = {k: told(v) if k in ("rate", "initial") else v for k, v in what.items()}
+    return {kind: {k: ends.get(v, v) if k in ("into", "from") else v for k, v in out.items()}}
+
+
 def _names(changes: Sequence[Mapping[str, Any]]) -> set[str]:
-    rates = [what["rate"] for c in changes for kind, what in c.items() if kind == "flow"]
+    rates = [what if isinstance(what, str) else what.get("rate", "0") for c in changes for what in c.values()]
     return set().union(*(ex.names(ex.parse(r)) for r in rates))
 
 

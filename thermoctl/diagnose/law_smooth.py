@@ -13,19 +13,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solveh_banded
+from scipy.sparse import csr_matrix
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, as_refitted
 from thermoctl.diagnose.law_forms import Place
+from thermoctl.diagnose.rig import TEMPERATURE
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 from thermoctl.diagnose.where import SHARES, signals, typical_flow
 from thermoctl.plant import expression as ex
-from thermoctl.plant.expression import name
+from thermoctl.plant.expression import name, num
 from thermoctl.plant.language import Flow, Input, Plant
 from thermoctl.plant.simulate import SimulationError, compile_plant
 
@@ -35,6 +37,7 @@ FEWEST_KNOTS = 24
 ABSORBED = 1e-3  # share of a flow's response, below which the plant's own parameters absorb it
 STEPS = 3  # Gauss-Newton steps of the tracking
 TOGETHER = 48  # responses that are simulated at a time
+RESOLVED = 400  # hat functions of a flow; 90 % of responses in a stage and in tanks err by less than 0.7 %
 
 
 @dataclass
@@ -44,13 +47,16 @@ class Tracked:
     - `metric`: whitened rows there, the plant's own parameters projected out
     - `target` (rows,): the misfit that a law has to explain
     - `runs`: every signal of each recording, along the trajectory
+    - `duration`, `sample`: of the longest run, and between samples, s
     - `explained`: share of the target that a free flow in time into each node explains"""
 
     metric: Rows
     target: np.ndarray
     runs: list[dict[str, np.ndarray | float]]
     duration: float
+    sample: float
     explained: dict[str, float]
+    _units: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     @cached_property
     def now(self) -> float:
@@ -60,45 +66,77 @@ class Tracked:
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
         """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording.
 
-        A flow that the plant's own parameters absorb gives zeros."""
-        whole = _responses(self.metric, self.runs, place, flows)
-        rest = self.metric.project(whole)
+        Sums of the responses to RESOLVED hat functions. A storage that is larger by q takes up the flow
+        q dx/dt. A flow that the plant's own parameters absorb gives zeros."""
+        if place.part == "storage":
+            flows = [-q * s[:, None] for q, s in zip(flows, self._slopes(place.target), strict=True)]
+        units = [self._unit(n) for n in reversed(place.nodes)]
+        with np.errstate(all="ignore"):
+            fine = [_fitted_hats(h, q) for h, q in zip(self._hats, flows, strict=True)]
+            into, *out = [np.concatenate([b @ c for b, c in zip(u, fine, strict=True)]) for u in units]
+            whole = into - out[0] if out else into
+            rest = self.metric.project(whole)
         absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
         return np.where(absorbed, 0.0, rest)
 
+    @cached_property
+    def _hats(self) -> list[csr_matrix]:
+        return [_hats(d.t, min(RESOLVED, len(d.t))) for d in self.metric.drives]
 
-def _responses(
-    metric: Rows, runs: Sequence[dict[str, np.ndarray | float]], place: Place, flows: Sequence[np.ndarray]
-) -> np.ndarray:
-    return np.concatenate(_blocks(metric, runs, place, flows))
+    def _slopes(self, node: str) -> list[np.ndarray]:
+        """Return the rate of a node (N,) by recording, without the unknown flow.
+
+        With it a larger storage, less the plant's own parameter of it, would be the unknown flow."""
+        out, storage = [], self.metric.model.plant.nodes[node].storage
+        for run, d in zip(self.runs, self.metric.drives, strict=True):
+            unknown = run.get(f"{LATENT}{node}", 0.0) / np.asarray(ex.evaluate(storage, run), float)
+            out.append(np.gradient(np.asarray(run[node], float), d.t) - unknown)
+        return out
+
+    def _unit(self, node: str) -> list[np.ndarray]:
+        """Return the rows of each recording's responses to hat functions of flow into a node."""
+        if node not in self._units:
+            hats = [h.toarray() for h in self._hats]
+            self._units[node] = _blocks(self.metric, self.runs, node, hats)
+        return self._units[node]
 
 
 def _blocks(
-    metric: Rows, runs: Sequence[dict[str, np.ndarray | float]], place: Place, flows: Sequence[np.ndarray]
+    metric: Rows, runs: Sequence[dict[str, np.ndarray | float]], node: str, flows: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """Return the rows of each recording's responses; TOGETHER columns at a time, for memory."""
+    """Return the rows of each recording's responses to flows into a node; TOGETHER at a time, for memory."""
     blocks, model = [], metric.model
     for r, (d, q) in enumerate(zip(metric.drives, flows, strict=True)):
         parts = []
-        for part in np.split(q, range(TOGETHER, q.shape[1], TOGETHER), axis=1):
+        storage = np.asarray(ex.evaluate(model.plant.nodes[node].storage, runs[r]), float)
+        force = q / np.broadcast_to(storage, d.t.shape)[:, None]
+        for part in np.split(force, range(TOGETHER, q.shape[1], TOGETHER), axis=1):
             k = part.shape[1]
-            forces, values = [], []
-            for node, sign in zip(reversed(place.nodes), (1.0, -1.0), strict=False):
-                storage = np.asarray(ex.evaluate(model.plant.nodes[node].storage, runs[r]), float)
-                forces += [(model.states.index(node), j) for j in range(k)]
-                values.append(sign * np.nan_to_num(part) / np.broadcast_to(storage, d.t.shape)[:, None])
-            force = np.concatenate(values, axis=1)
-            dy = model.respond(d, metric.fit.values[r], metric.fit.dx0[r], forces, force, k)
+            entries = [(model.states.index(node), j) for j in range(k)]
+            dy = model.respond(d, metric.fit.values[r], metric.fit.dx0[r], entries, part, k)
             parts.append(metric.rows(r, dy))
         blocks.append(np.concatenate(parts, axis=1))
     return blocks
 
 
 def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
-    """Return the plant with a recorded flow into each node."""
+    """Return the plant with a recorded flow into each node.
+
+    Its slope does not change with the storage's parameters. In a plant whose storages and rates may share one
+    factor, this factor would else absorb every flow."""
     inputs = {f"{LATENT}{n}": Input(f"{LATENT}{n}", None, f"{LATENT}{n}", True) for n in nodes}
-    flows = {k: Flow(k, name(k), None, k.removeprefix(LATENT)) for k in inputs}
+    rates = {k: ex.mul(name(k), _scaling(plant, k.removeprefix(LATENT))) for k in inputs}
+    flows = {k: Flow(k, rate, None, k.removeprefix(LATENT)) for k, rate in rates.items()}
     return dataclasses.replace(plant, inputs={**plant.inputs, **inputs}, flows={**plant.flows, **flows})
+
+
+def _scaling(plant: Plant, node: str) -> ex.Expr:
+    """Return a node's storage over its value at the plant's parameters."""
+    known, storage = plant.parameters, plant.nodes[node].storage
+    if not ex.names(storage) & known.keys():
+        return ex.ONE
+    now = ex.substitute(storage, lambda e: num(known[e.value].value) if e.value in known else None)
+    return ex.div(storage, now)
 
 
 @dataclass(frozen=True)
@@ -168,11 +206,12 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
     at = _followed(case, f, nodes)
     target = at.metric.project(np.concatenate(at.misfit))
     duration = max(float(d.t[-1]) for d in at.metric.drives)
+    sample = max(float(np.median(np.diff(d.t))) for d in at.metric.drives)
     of_nodes = zip(*(np.split(x, len(nodes), axis=1) for x in at.wide), strict=True)
     explained = {
         n: _explained(at.metric.project(block_diag(*x)), target) for n, x in zip(nodes, of_nodes, strict=True)
     }
-    return Tracked(at.metric, target, at.runs, duration, explained)
+    return Tracked(at.metric, target, at.runs, duration, sample, explained)
 
 
 def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
@@ -191,16 +230,34 @@ def flow_unit(plant: Plant, node: str) -> str | None:
     return next((f.unit for f in plant.flows.values() if node in (f.source, f.target) and f.unit), None)
 
 
+def law_unit(plant: Plant, place: Place) -> str | None:
+    """Return the unit of a law at a place, None where the plant states none."""
+    flow, own = flow_unit(plant, place.target), plant.nodes[place.target].unit
+    if place.part == "flow" or not flow or not own:
+        return flow if place.part == "flow" else None
+    return f"({flow}) * s / ({'K' if own in TEMPERATURE else own})"
+
+
 def _explained(x: np.ndarray, target: np.ndarray) -> float:
     u, s, _ = np.linalg.svd(x, full_matrices=False)
     along = u[:, s > ABSORBED * s[0]].T @ target
     return float(along @ along) / max(float(target @ target), 1e-300)
 
 
-def _hats(t: np.ndarray, knots: int) -> np.ndarray:
+def _hats(t: np.ndarray, knots: int) -> csr_matrix:
     """(N, knots) straight lines between evenly spaced knots."""
-    at = np.linspace(t[0], t[-1], knots)
-    return np.stack([np.interp(t, at, row) for row in np.eye(knots)], axis=1)
+    at, n = np.linspace(t[0], t[-1], knots), np.arange(len(t))
+    k = np.clip(np.searchsorted(at, t, side="right") - 1, 0, knots - 2)
+    part = (t - at[k]) / (at[k + 1] - at[k])
+    entries = np.concatenate([n, n]), np.concatenate([k, k + 1])
+    return csr_matrix((np.concatenate([1 - part, part]), entries), shape=(len(t), knots))
+
+
+def _fitted_hats(hats: csr_matrix, flows: np.ndarray) -> np.ndarray:
+    """Return the weights (knots, k) of hat functions (N, knots) that fit flows (N, k) by least squares."""
+    square = (hats.T @ hats).tocsr()
+    bands = np.stack([np.concatenate([[0.0], square.diagonal(1)]), square.diagonal()])
+    return solveh_banded(bands, hats.T @ np.nan_to_num(flows), check_finite=False)
 
 
 def _wide(
@@ -208,11 +265,11 @@ def _wide(
     runs: Sequence[dict[str, np.ndarray | float]],
     nodes: Sequence[str],
     sizes: Sequence[float],
-    hats: Sequence[np.ndarray],
+    hats: Sequence[csr_matrix],
 ) -> list[np.ndarray]:
     """Return each recording's (rows, nodes * knots) responses to each knot, in units of the typical flows."""
     by_node = [
-        _blocks(metric, runs, Place(n), [h * s for h in hats]) for n, s in zip(nodes, sizes, strict=True)
+        _blocks(metric, runs, n, [s * h.toarray() for h in hats]) for n, s in zip(nodes, sizes, strict=True)
     ]
     return [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
 

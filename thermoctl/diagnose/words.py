@@ -108,11 +108,12 @@ def law_sentence(entry: Result | None) -> str:
     )
     values += "".join(f"; {m} is {text}" for m, text in entry.get("memory", {}).items())
     at = f"from {entry['from']} into {entry['into']}" if entry["from"] else f"into {entry['into']}"
+    acts = f"a flow {at}" if entry.get("part", "flow") == "flow" else f"a {entry['part']} of {entry['into']}"
     closes = f"It closes {100 * entry['share_closed']:.0f} % of the misfit's energy"
     if entry["share_closed"] < WHOLE:
         closes += "; a remainder stays"
     return (
-        f"A law for it: a flow {at} of {entry['expression']} with {values} "
+        f"A law for it: {acts}, {entry['expression']}, with {values} "
         f"(probability {chance(entry['probability'])}). {closes}."
     )
 

@@ -1,0 +1,77 @@
+"""Memories of a signal z, for laws that depend on its history: nodes of the plant, and values for regression.
+
+- lag: follows z with the time constant tau.
+- total: the integral of z since the start, over the longest run.
+- relay: 1 beyond the threshold `on`, 0 beyond the threshold `off`, between them as before. A thermostat, a
+  siphon. `on` is the upper threshold or the lower one.
+
+The relay is the non-ideal relay of Visintin, Differential Models of Hysteresis (1994), section I.2. As a node
+it is a trigger with positive feedback (Schmitt, J. Sci. Instrum. 15 (1938) 24):
+
+    dm/dt = ((1 + tanh(6 s + 10 (m - 1/2))) / 2 - m) / sample
+    s = (z - (on + off) / 2) / (on - off)
+
+Its two stable states end where ds/dm = 0, at s = 0.505 and -0.505. It switches within a few samples: a
+faster one would look the same. It starts in the middle, and falls to the side where s is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+Shapes = Mapping[str, np.ndarray]
+Along = Callable[[np.ndarray, np.ndarray, Shapes, float], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """A memory m of a signal z.
+
+    - `rate`: dm/dt, of z, m, the form's shapes, `duration` (of the longest run) and `sample`, s
+    - `start`, `start_sigma`: m at the first sample, and its standard deviation
+    - `words`: a description of m
+    - `along`: m (N, k) along t (N,) and z (N,), for k values of each shape and a duration"""
+
+    rate: str
+    start: str
+    start_sigma: float | None
+    words: str
+    along: Along
+
+
+def _lag(t: np.ndarray, z: np.ndarray, shapes: Shapes, duration: float) -> np.ndarray:
+    out = np.empty((len(t), len(shapes["tau"])))
+    out[0] = z[0]
+    for k, a in enumerate(np.exp(-np.diff(t)[:, None] / shapes["tau"]), 1):
+        out[k] = a * out[k - 1] + (1 - a) * z[k - 1]
+    return out
+
+
+def _total(t: np.ndarray, z: np.ndarray, shapes: Shapes, duration: float) -> np.ndarray:
+    return np.concatenate([[0.0], np.cumsum(z[:-1] * np.diff(t))])[:, None] / duration
+
+
+def _relay(t: np.ndarray, z: np.ndarray, shapes: Shapes, duration: float) -> np.ndarray:
+    on, off = shapes["on"], shapes["off"]
+    s = (z[:, None] - 0.5 * (on + off)) / (on - off)
+    outside = np.abs(s) >= 0.5
+    outside[0] = True
+    last = np.maximum.accumulate(np.where(outside, np.arange(len(s))[:, None], 0))
+    return np.take_along_axis(s >= 0, last, axis=0).astype(float)
+
+
+MEMORIES = {
+    "lag": Memory("(z - m) / tau", "0", 0.1, "{z}, delayed by a first-order lag of {tau}", _lag),
+    "total": Memory(
+        "z / duration", "0", 0.1, "the integral of {z} since the start, over {duration} s", _total
+    ),
+    "relay": Memory(
+        "((1 + tanh(6 * (z - 0.5 * (on + off)) / (on - off) + 10 * (m - 0.5))) / 2 - m) / sample",
+        "0.5",
+        None,
+        "1 after {z} passed {on}, 0 after it passed {off}",
+        _relay,
+    ),
+}
