@@ -90,13 +90,8 @@ def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozense
 
     Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there.
     The noise is what the leading hypothesis learnt: a stated one that is too large would hide the misfit.
-    A reading that rests on the steps of its rounding shows too little noise: there the stated one counts.
     Of the two refits of a hypothesis the better one counts."""
-    learnt = searched.tried[0].fitted.average.sensor
-    noise = [
-        (max(own, g.variance) if coarse else own, coarse)
-        for g, own, coarse in zip(case.grids, learnt, rounded(case), strict=True)
-    ]
+    noise = list(zip(searched.tried[0].fitted.average.sensor, rounded(case), strict=True))
     out = {}
     for w in searched.tried:
         both = [_energy(case, f, noise, limits) for f in (w.fitted, as_refitted(case, w.fitted))]
