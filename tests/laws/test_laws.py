@@ -23,7 +23,7 @@ from thermoctl.diagnose.law import find_law
 from thermoctl.diagnose.law_forms import Place, Signal, Term, library, signals
 from thermoctl.diagnose.law_misfit import misfit_odds
 from thermoctl.diagnose.law_propose import PROPOSALS
-from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable, refitted_law
+from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
 from thermoctl.diagnose.law_result import law_entry, law_section, save_effect
 from thermoctl.diagnose.law_smooth import tracked
 from thermoctl.diagnose.limits import limits
@@ -141,6 +141,16 @@ def test_an_experiment_separates_laws_that_fit_about_as_well(found):
     assert entry["separates"][0]["hypothesis"].startswith("A1 * (current / Z1) / (abs(current / Z1) + s1)")
     undecided.law = law
     assert propose(undecided) is None
+
+
+@pytest.mark.parametrize("part", ["flow", "storage"])
+def test_a_law_may_sit_at_a_body_that_a_finding_brought(found, part):
+    made, known, law = found
+    broth = made.plant.nodes["broth"]
+    plant = replace(made.plant, nodes={**made.plant.nodes, "shell": replace(broth, name="shell")})
+    rig = Structure(plant, known.drives(known.null.model), [t.columns for t in known.tables])
+    c = law_candidate(rig, replace(law.proposal, place=Place("shell", None, part)))
+    assert c.place.nodes == {"target": "shell"} and "shell" not in known.plant.nodes
 
 
 def test_parameters_that_scale_together_absorb_no_flow():

@@ -135,7 +135,7 @@ def _chosen(
         for k, s in zip(order[1:], np.sort(share)[::-1][1:], strict=True)
         if s > 1 - limits.set
     )
-    drawn, unit = curve(at, p, law_rate(f), f.plant), law_unit(case.plant, p.place)
+    drawn, unit = curve(at, p, law_rate(f), f.plant), law_unit(f.plant, p.place)
     gain, probability, share_closed = float(gains[likely[best]]), float(sure[best]), float(shut[best])
     return Law(p, f, gain, probability, values[best], share_closed, drawn, rivals, unit)
 

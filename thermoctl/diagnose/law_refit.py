@@ -32,7 +32,7 @@ def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fit
 
     The refit ends early if it stays far from `leader`, the likeliest one so far."""
     rig = Structure(parent.rough_plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
-    c = law_candidate(case, rig, p)
+    c = law_candidate(rig, p)
     values, ranges = _start(p)
     plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
     own = {q: c.own(q) for q in ranges if c.own(q) in plant.parameters}
@@ -45,9 +45,9 @@ def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fit
         return None
 
 
-def law_candidate(case: Case, rig: Structure, p: Proposal) -> Candidate:
+def law_candidate(rig: Structure, p: Proposal) -> Candidate:
     """Return a law as an effect at its place."""
-    effect = law_effect(p.terms, p.place, law_unit(case.plant, p.place))
+    effect = law_effect(p.terms, p.place, law_unit(rig.plant, p.place))
     ends = {"target": p.place.target, **({"source": p.place.source} if p.place.source else {})}
     return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig)
 
