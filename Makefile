@@ -110,6 +110,10 @@ bench: develop                     # speed of plants beside scipy and CasADi
 bench-scale: develop               # cost of a diagnosis by rows; BEFORE=a checkout of an older version, beside it; minutes
 	$(BIN)/python -m tests.bench.scale rows $(if $(BEFORE),--before $(BEFORE))
 
+.PHONY: bench-parts
+bench-parts: develop               # where the time of a diagnosis goes, by parts; CASES= folders with plant.yaml and run_*.csv
+	$(BIN)/python -m tests.bench.parts $(CASES)
+
 .PHONY: bench-bodies bench-recordings
 bench-bodies: develop              # cost of a diagnosis by bodies: chains and networks of 12 to 120; half an hour
 	$(BIN)/python -m tests.bench.scale bodies

@@ -15,6 +15,7 @@ from thermoctl.plant.recordings import read_recordings
 
 LAW = [
     "expression",
+    "part",
     "terms",
     "memory",
     "variables",
