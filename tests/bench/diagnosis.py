@@ -44,8 +44,8 @@ from thermoctl.diagnose.screen import Direction, sharpened
 from thermoctl.diagnose.screening import screened
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
+from thermoctl.plant.estimate import report
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.refit import report
 from thermoctl.plant.simulate import Excitation, SimulationError
 from thermoctl.proof import jobs as proof_jobs
 from thermoctl.proof import score as scoring

@@ -8,8 +8,9 @@ from tests.plants import FREE_CARRIAGE, ONE_BLOCK
 from thermoctl.diagnose.observer import drifts, held, linear
 from thermoctl.diagnose.rig import Rig
 from thermoctl.plant import loads
-from thermoctl.plant.refit import default_noise, fit
+from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 
 RUBBED = FREE_CARRIAGE.replace(

@@ -12,8 +12,9 @@ from tests.plants import ONE_BLOCK
 from thermoctl.diagnose.rows import LONG, reduced
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Noise, fit
+from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.whitening import Noise
 from thermoctl.recording.table import Table
 
 ROWS = 30_000

@@ -14,8 +14,9 @@ from thermoctl.diagnose import workers as dask_workers
 from thermoctl.diagnose.run import diagnose
 from thermoctl.diagnose.workers import cluster
 from thermoctl.plant import load
-from thermoctl.plant.residuals import Problem, default_noise
+from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -27,9 +27,11 @@ from thermoctl.diagnose.law import Law, find_law
 from thermoctl.diagnose.law_refit import law_rate
 from thermoctl.diagnose.limits import limits
 from thermoctl.plant import expression as ex
+from thermoctl.plant.estimate import updated
 from thermoctl.plant.language import Input, Parameter, Plant
-from thermoctl.plant.refit import default_noise, fit, updated
+from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 
 DRAWN, NONE = 16, 40  # laws from the grammar; cases without a law

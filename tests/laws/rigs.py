@@ -15,8 +15,9 @@ from tests.plants import TWO_BLOCKS
 from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
 from thermoctl.plant.language import Flow, Node, Plant
-from thermoctl.plant.refit import default_noise, fit
+from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 
 STAGE = """\

@@ -17,8 +17,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 from thermoctl.plant import load, loads
+from thermoctl.plant.estimate import report
 from thermoctl.plant.noise import coloured
-from thermoctl.plant.refit import Scale, fit, report
+from thermoctl.plant.refit import fit
+from thermoctl.plant.residuals import Scale
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
 

@@ -7,8 +7,10 @@ from scipy.signal import lfilter
 from thermoctl.cli import main
 from thermoctl.plant import expression as ex
 from thermoctl.plant import extended, loads
+from thermoctl.plant.estimate import report
 from thermoctl.plant.noise import coloured, innovations
-from thermoctl.plant.refit import Prior, Problem, fit, report
+from thermoctl.plant.refit import fit
+from thermoctl.plant.residuals import Prior, Problem
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from thermoctl.plant import load
-from thermoctl.plant.refit import fit, updated
+from thermoctl.plant.estimate import updated
+from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table
 

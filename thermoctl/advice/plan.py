@@ -29,8 +29,9 @@ from thermoctl.diagnose.fit import UNIFORM, as_refitted, fitted
 from thermoctl.diagnose.unseen import NOT_EXCITED, Visible, sized, visible
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import in_plant_units
-from thermoctl.plant.refit import Problem, default_noise
+from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
+from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from thermoctl.api.plants import Plant
 from thermoctl.api.plots import profile_curve, residual_panels
-from thermoctl.plant.refit import Estimate, Fit, fit, report, updated
+from thermoctl.plant.estimate import Estimate, report, updated
+from thermoctl.plant.refit import Fit, fit
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.report.page import figure, table
 from thermoctl.yamlfile import InputError, suggest

@@ -14,8 +14,8 @@ from thermoctl.checks.finding import Finding
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Input
-from thermoctl.plant.residuals import default_noise
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
+from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 
 ALARM = 1e-6  # false alarms a column and recording

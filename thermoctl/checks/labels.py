@@ -27,9 +27,9 @@ from thermoctl.checks.finding import Finding
 from thermoctl.checks.model import NYQUIST, rates_of
 from thermoctl.plant.language import Input, Output, Plant
 from thermoctl.plant.refit import fit
-from thermoctl.plant.residuals import default_noise
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.plant.units import conversion, dimension
+from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 
 RARITY = 1000.0  # prior odds against a wrong label

@@ -13,8 +13,8 @@ from thermoctl.checks.finding import Finding
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fmu import opened
-from thermoctl.plant.residuals import default_noise
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
+from thermoctl.plant.whitening import default_noise
 
 GROWTH = 1.0  # e-folds over the recording from which an unstable plant cannot follow it
 NYQUIST = np.pi  # sampling interval over time constant from which a mode lies beyond the Nyquist frequency

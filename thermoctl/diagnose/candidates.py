@@ -15,7 +15,7 @@ from thermoctl.diagnose.rig import Rig
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Prior
+from thermoctl.plant.residuals import Prior
 
 
 class Candidate(Placement):

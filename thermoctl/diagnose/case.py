@@ -19,8 +19,9 @@ from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.rows import OUTLIER, Reduced, reduced
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit, Noise, fit
+from thermoctl.plant.refit import Fit, fit
 from thermoctl.plant.simulate import RTOL, Excitation, Model, compile_plant
+from thermoctl.plant.whitening import Noise
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -25,9 +25,10 @@ from thermoctl.diagnose.posterior import Hypothesis, bounded_step, gaussian
 from thermoctl.diagnose.posterior import Placed as Placed
 from thermoctl.diagnose.posterior import Posterior as Posterior
 from thermoctl.plant import refit
+from thermoctl.plant.estimate import updated
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit, Problem
-from thermoctl.plant.residuals import Evaluation
+from thermoctl.plant.refit import Fit
+from thermoctl.plant.residuals import Evaluation, Problem
 from thermoctl.plant.simulate import SimulationError
 
 SIGNIFICANT = 2.0  # standard deviations
@@ -243,7 +244,7 @@ def _weighed(
         found, rough = (dataclasses.replace(x, residuals=[], sizes=x.rms()) for x in (found, rough))
     return Fitted(
         Hypothesis(tuple(posterior.effects)),
-        refit.updated(posterior.plant, found, posterior.drives),
+        updated(posterior.plant, found, posterior.drives),
         found,
         average.log_likelihood,
         log_density(posterior, z, names),
@@ -251,7 +252,7 @@ def _weighed(
         average,
         tuple(powers),
         names,
-        refit.updated(posterior.plant, rough, posterior.drives),
+        updated(posterior.plant, rough, posterior.drives),
         rough,
         tuple(rough_powers),
         confined,

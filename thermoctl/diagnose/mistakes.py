@@ -20,7 +20,7 @@ from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.fit import Fitted, Placed, Posterior, fitted
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Problem
+from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.shipped import shipped
 

@@ -20,8 +20,9 @@ from thermoctl.diagnose.where import signals
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
 from thermoctl.plant.language import Flow, Input, Plant
-from thermoctl.plant.refit import Fit, Noise
+from thermoctl.plant.refit import Fit
 from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.whitening import Noise
 
 LASTING = 20.0  # samples for which a missing flow holds: turns its variance into an intensity
 RESTING = 1e-3  # of the fastest state's slope: least slope of another, so that no state is without noise

@@ -15,7 +15,8 @@ from thermoctl.diagnose.fit import Fitted, Placed
 from thermoctl.diagnose.law_result import law_section
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.words import chance, name, sentences, what_next
-from thermoctl.plant.refit import Estimate, Fit, report
+from thermoctl.plant.estimate import Estimate, report
+from thermoctl.plant.refit import Fit
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, page, table, unit
 

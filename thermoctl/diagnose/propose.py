@@ -32,7 +32,7 @@ from thermoctl.diagnose.experiment_file import FILES
 from thermoctl.diagnose.fit import Fitted, with_residuals
 from thermoctl.diagnose.law_result import described
 from thermoctl.diagnose.result import Diagnosis
-from thermoctl.plant.refit import Scale
+from thermoctl.plant.residuals import Scale
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError

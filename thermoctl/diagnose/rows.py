@@ -37,8 +37,10 @@ from scipy.special import chdtri
 from thermoctl.diagnose.coordinates import band_edges
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.recordings import in_plant_units
-from thermoctl.plant.refit import Noise, Problem, default_noise, fit
+from thermoctl.plant.refit import fit
+from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
+from thermoctl.plant.whitening import Noise, default_noise
 from thermoctl.recording.table import Table
 
 # None of these numbers chooses a hypothesis.

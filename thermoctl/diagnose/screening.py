@@ -17,7 +17,7 @@ from thermoctl.diagnose.noise import Averaged, averaged, grid
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Norms, screen
 from thermoctl.diagnose.sketch import likeliest
-from thermoctl.plant.refit import Problem
+from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import Simulation
 
 ROWS = 6_000  # largest number of DCT rows, all outputs and recordings together

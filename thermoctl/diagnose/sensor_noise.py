@@ -27,8 +27,9 @@ from thermoctl.diagnose.noise import spectrum
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.refit import default_noise, fit
+from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -17,7 +17,8 @@ from thermoctl.control import recorded_faults
 from thermoctl.control.arming import ARMED
 from thermoctl.fleet.recordings import local, rig_of
 from thermoctl.plant import load
-from thermoctl.plant.refit import Fit, fit, report
+from thermoctl.plant.estimate import report
+from thermoctl.plant.refit import Fit, fit
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table

@@ -15,9 +15,10 @@ from rich.table import Table as Grid
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant import expression as ex
 from thermoctl.plant import show as drawing
+from thermoctl.plant.estimate import Estimate, report, updated
 from thermoctl.plant.noise import coloured
 from thermoctl.plant.recordings import as_recorded, read_recordings
-from thermoctl.plant.refit import Estimate, fit, report, updated
+from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.logger import parsed_columns

@@ -21,8 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from thermoctl.plant.refit import Fit, Noise, Problem
+from thermoctl.plant.refit import Fit
+from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.whitening import Noise
 
 CLIP = 6.0  # residuals are clipped to this many robust standard deviations
 # limits of the correlation of neighbouring samples; below the first: white noise
@@ -76,12 +78,12 @@ class _Restricted:
             e = self.found.residuals[r][:, j]
             spread = 1.4826 * np.nanmedian(np.abs(e)) if np.isfinite(e).any() else 1.0
             e = np.clip(e, -CLIP * spread, CLIP * spread) if spread > 0 else e
-            w, jac = own.whiten(r, j, e), own.whiten(r, j, dy[:, j])
+            w, jac = own.whitening[r][j].whiten(e), own.whitening[r][j].whiten(dy[:, j])
             gram[np.ix_(columns, columns)] += jac.T @ jac
             gradient[columns] += jac.T @ w
             square += float(w @ w)
             log_size += 2 * (
-                float(np.log(own.rows[r][j][2]).sum())
+                float(np.log(own.whitening[r][j].scale).sum())
                 if len(candidate.ar) == 1
                 else len(w) * np.log(candidate.sigma)
             )
@@ -104,7 +106,7 @@ class _Restricted:
 
     def samples(self, j: int) -> int:
         """Return the number of measured samples of channel j."""
-        return sum(len(rows[j][0]) for rows in self.problem.rows)
+        return sum(len(outputs[j].index) for outputs in self.problem.whitening)
 
     def _score(self, j: int, phi: float) -> tuple[float, Noise]:
         """Return -2 log restricted likelihood of channel j at a correlation phi, and its noise.

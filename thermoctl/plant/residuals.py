@@ -16,16 +16,15 @@ import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from scipy.signal import lfilter
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.cores import each, workers
-from thermoctl.plant.language import Parameter, Plant
+from thermoctl.plant.language import Parameter
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
+from thermoctl.plant.whitening import Noise, Whitening
 from thermoctl.yamlfile import InputError
 
 HUGE = 1e100  # outputs from here on count as infinite: the sums of their squares would be
@@ -33,7 +32,6 @@ HUBER = 4.0  # residuals beyond this many standard deviations count linearly
 PRIOR_WEIGHT = 0.02  # moving a parameter over its whole range costs as much as one residual of 0.02 sigma
 PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
 DOWNDATE_SHARE = 0.25  # up to this share of down-weighted rows, their excess is subtracted from J'J
-MIN_DIFFERENCED = 4  # fewest samples of a recording for second differences
 # Unknowns up to which a run with sensitivities costs less than ten without: eight go through the processor at
 # once (integrator.h). There a trial step, which succeeds nine times of ten, runs with them at once.
 FEW_UNKNOWNS = 16
@@ -43,18 +41,6 @@ LOG_RATIO = 3.0  # a range that spans this factor is fitted on a log scale
 KEPT = 20_000_000
 
 R = TypeVar("R")
-
-
-@dataclass(frozen=True)
-class Noise:
-    """One channel's noise: standard deviation, and correlation `phi` over one sampling interval.
-
-    With a whitening filter ar(z)/ma(z), `sigma` is the standard deviation of the innovations."""
-
-    sigma: float
-    phi: float = 0.0
-    ar: tuple[float, ...] = (1.0,)
-    ma: tuple[float, ...] = (1.0,)
 
 
 @dataclass(frozen=True)
@@ -87,51 +73,6 @@ class Scale:
     def slope(self, value: float) -> float:
         """Return d value / d z."""
         return float(value * self.span if self.log else self.span)
-
-
-def default_noise(plant: Plant, excitations: Sequence[Excitation] = ()) -> tuple[Noise, ...]:
-    """Return the noise of the plant file, else the white part of the second differences."""
-    out = []
-    for j, o in enumerate(plant.outputs.values()):
-        sigma = np.hypot(o.noise_sd, (o.resolution or 0.0) / np.sqrt(12))
-        if sigma <= 0:
-            parts = [d.y[np.isfinite(d.y[:, j]), j] for d in excitations]
-            second = np.concatenate(
-                [np.diff(y, 2) for y in parts if len(y) >= MIN_DIFFERENCED] or [np.zeros(1)]
-            )
-            sigma = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6)
-            spread = max((float(np.ptp(y)) for y in parts if len(y)), default=1.0)
-            sigma = max(sigma, 1e-4 * spread, 1e-12)
-        out.append(Noise(float(sigma)))
-    return tuple(out)
-
-
-def measured(y: np.ndarray) -> np.ndarray:
-    """Return the indices of the measured samples of an output (N,)."""
-    index = np.flatnonzero(np.isfinite(y))
-    return _all(len(y)) if len(index) == len(y) else index
-
-
-@lru_cache(maxsize=64)
-def _all(n: int) -> np.ndarray:
-    """Return 0..n-1, the same read-only array each time: outputs of long recordings share it."""
-    index = np.arange(n)
-    index.flags.writeable = False
-    return index
-
-
-def _rows(d: Excitation, j: int, n: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return output j's measured samples, each one's correlation with its predecessor, and sigma."""
-    index = measured(d.y[:, j])
-    if n.phi <= 0:  # one number each, not one a sample
-        return index, np.broadcast_to(0.0, max(len(index) - 1, 0)), np.broadcast_to(n.sigma, len(index))
-    dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
-    gaps = np.diff(d.t[index]) / dt if len(index) > 1 else np.zeros(0)
-    phi = n.phi ** np.clip(gaps, 0.0, 1e4)
-    scale = np.full(len(index), n.sigma)
-    if len(index):
-        scale[1:] = n.sigma * np.sqrt(np.maximum(1 - phi**2, 1e-9))
-    return index, phi, scale
 
 
 @dataclass(frozen=True)
@@ -190,13 +131,13 @@ class Problem:
         self.buffers: dict[str, np.ndarray] = {}
         self.kept_buffers: dict[str, np.ndarray] = {}
         self.huber = np.full(len(self.noise), HUBER)
-        self.rows = [[_rows(d, j, n) for j, n in enumerate(self.noise)] for d in excitations]
+        self.whitening = [[Whitening.of(d, j, n) for j, n in enumerate(self.noise)] for d in excitations]
         # computed in a run without sensitivities; with them, at least as many again
         self.numbers = sum(len(d.t) for d in excitations) * len(model.states) * (len(model.unknowns) + 1)
         slopes = sum(d.y.size for d in excitations) * len(model.unknowns)
         self.keeps = slopes <= KEPT  # may sensitivities be kept?
         self.held: list[Any] = []  # handles of `alone`, for workers
-        self.samples = sum(len(e[0]) for entry in self.rows for e in entry)
+        self.samples = sum(len(w.index) for outputs in self.whitening for w in outputs)
         if self.samples == 0:
             raise InputError("no recording has a column that an output of the plant reads; nothing to fit")
 
@@ -243,9 +184,9 @@ class Problem:
         other = copy.copy(self)
         other.noise = (*self.noise[:j], n, *self.noise[j + 1 :])
         other.held = []
-        other.rows = [
-            [_rows(d, j, n) if k == j else q for k, q in enumerate(rows)]
-            for d, rows in zip(self.excitations, self.rows, strict=True)
+        other.whitening = [
+            [Whitening.of(d, j, n) if k == j else w for k, w in enumerate(outputs)]
+            for d, outputs in zip(self.excitations, self.whitening, strict=True)
         ]
         return other
 
@@ -268,7 +209,7 @@ class Problem:
     def alone(self, r: int) -> Problem:
         """Return the problem of one recording, with the same numbers of the unknowns; it has no priors."""
         other = copy.copy(self)
-        other.excitations, other.rows = [self.excitations[r]], [self.rows[r]]
+        other.excitations, other.whitening = [self.excitations[r]], [self.whitening[r]]
         other.columns, other.priors = self.columns[r : r + 1], ()
         other.buffers, other.kept_buffers, other.held = {}, {}, []
         return other
@@ -294,18 +235,6 @@ class Problem:
         self.held = self.held or [far.hold(self.alone(r)) for r in recordings]
         return far.each(f, self.held, ((0, values[r], dx0[r], *arguments(r)) for r in recordings))
 
-    def whiten(self, r: int, j: int, e: np.ndarray) -> np.ndarray:
-        """Return whitened rows (M, ...) of output j's errors (N, ...); missing samples are dropped."""
-        index, phi, scale = self.rows[r][j]
-        part = e if len(index) == len(e) else e[index]
-        shape = (-1, *([1] * (part.ndim - 1)))
-        noise = self.noise[j]
-        if len(noise.ar) > 1 and len(index) > 1:
-            return lfilter(noise.ar, noise.ma, part, axis=0) / noise.sigma
-        if len(index) > 1 and phi.any():
-            part = np.concatenate([part[:1], part[1:] - phi.reshape(shape) * part[:-1]])
-        return part / scale.reshape(shape)
-
     def set_outlier_limits(self, residuals: Sequence[np.ndarray]) -> bool:
         """Set Huber's limit of each output from its residuals; True if one changed by more than a half.
 
@@ -314,7 +243,7 @@ class Problem:
         """
         new = np.full(len(self.noise), HUBER)
         for j in range(len(self.noise)):
-            w = np.concatenate([self.whiten(r, j, e[:, j]) for r, e in enumerate(residuals)])
+            w = np.concatenate([self.whitening[r][j].whiten(e[:, j]) for r, e in enumerate(residuals)])
             if len(w):
                 middle, high = np.quantile(np.abs(w), [0.5, 0.98])
                 new[j] = max(HUBER * max(1.0, 1.4826 * float(middle)), float(high))
@@ -385,10 +314,10 @@ class Problem:
         e, cost, kept = d.y - run.y, 0.0, []
         used, k, slope = self.slopes(r, values)
         gradient, matrix = np.zeros(len(k)), np.zeros((len(k), len(k)))
-        for j in range(len(self.noise)):
-            if not len(self.rows[r][j][0]):
+        for j, whitening in enumerate(self.whitening[r]):
+            if not len(whitening.index):
                 continue
-            w = self.whiten(r, j, e[:, j])
+            w = whitening.whiten(e[:, j])
             size, limit = np.abs(w), huber[j]
             cost += float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
             if run.dy is None:
@@ -431,7 +360,8 @@ class Problem:
         out = np.zeros(len(z))
         for rows in kept:
             r, j = rows.recording, rows.output
-            moved = self._spread(r, j, self.whiten(r, j, errors[r][:, j]), len(rows.w))
+            whitening = self.whitening[r][j]
+            moved = whitening.spread(whitening.whiten(errors[r][:, j]), len(rows.w))
             second = (moved - rows.w) / PROBE + rows.jac @ (rows.slope * step[rows.unknowns])
             np.add.at(out, rows.unknowns, rows.slope * (rows.jac.T @ (rows.weight * second)))
         return out * (2 / PROBE)
@@ -463,21 +393,10 @@ class Problem:
         White noise of one standard deviation only scales the sensitivities: they are not copied, and a
         missing sample gets weight 0.
         """
-        index, phi, _ = self.rows[r][j]
-        noise, n = self.noise[j], len(jac)
-        if len(noise.ar) > 1 or phi.any() or len(index) < (1 - DOWNDATE_SHARE) * n:
-            return Rows(r, j, k, slope, self.whiten(r, j, jac), w, weight)
-        return Rows(
-            r, j, k, slope / noise.sigma, jac, self._spread(r, j, w, n), self._spread(r, j, weight, n)
-        )
-
-    def _spread(self, r: int, j: int, w: np.ndarray, n: int) -> np.ndarray:
-        """Spread values (M,) of output j's measured samples over `n` rows, 0 for a missing sample."""
-        if len(w) == n:
-            return w
-        out = np.zeros(n)
-        out[self.rows[r][j][0]] = w
-        return out
+        own, n = self.whitening[r][j], len(jac)
+        if not own.white or len(own.index) < (1 - DOWNDATE_SHARE) * n:
+            return Rows(r, j, k, slope, own.whiten(jac), w, weight)
+        return Rows(r, j, k, slope / own.noise.sigma, jac, own.spread(w, n), own.spread(weight, n))
 
 
 def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:
