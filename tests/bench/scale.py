@@ -10,8 +10,8 @@ one row in a hundred. Every diagnosis is a process of its own: CPU time (with th
 --before FOLDER: a checkout of an older version; it works on the same records, with a limit of 30 minutes.
 `bodies`: blocks of which every third one is measured and every sixth one heated. In a chain a middle one, not heated,
 has a heat source that the plant lacks. In a network, whose blocks are linked with near ones as in a CAD model, a link is missing.
-`recordings`: the actuator of twelve bodies, 30 000 rows a recording, with weak radiation. On one core each task of a
-recording is timed, and the time on more workers is computed from these.
+`recordings`: the actuator of twelve bodies, 30 000 rows a recording, with a missing link of two standard deviations in
+one of them. On one core each task of a recording is timed, and the time on more workers is computed from these.
 `weak`: four blocks, with a missing link of two standard deviations in one recording of 1 200 rows.
 """
 
@@ -60,8 +60,10 @@ print(json.dumps({"verdict": found["verdict"], "found": [f"{f['effect']} at {f['
     "cpu_s": sum(u.ru_utime + u.ru_stime for u in used), "MiB": used[0].ru_maxrss / 1024, "notes": found["notes"], "tasks": calls}))
 """
 LIMIT_S = 1800
-WEAK = "{from: outer_stator, rate: 1e-10 * ((outer_stator + 273.15)**4 - (air + 273.15)**4), unit: W}"  # radiation
-SIGMAS = 2.0  # of `weak`: size of the effect in one recording, in standard deviations
+SIGMAS = 2.0  # of `weak` and `recordings`: size of the effect in one recording, in standard deviations
+CONVERTER = (
+    0.01  # K, of `recordings`: in steps of 0.25 K a reading that hardly moves has errors that last for hours
+)
 THINNED = 100  # rows of the long record for one of the short
 
 
@@ -263,15 +265,17 @@ def bodies(numbers: list[int], shapes: list[str]) -> None:
 
 def recordings(numbers: list[int], workers: list[int]) -> None:
     """Print time, memory and result against the number of recordings of a 12-body actuator, and of workers."""
-    source = Path(__file__).parents[2] / "config/plants/actuator_thermal.yaml"
+    source = (Path(__file__).parents[2] / "config/plants/actuator_thermal.yaml").read_text()
+    source = source.replace("resolution: 0.25", f"resolution: {CONVERTER}")
+    name, t = "missing_link at outer_stator-bracket_1", np.arange(30_000.0)
     with tempfile.TemporaryDirectory() as work:
-        folder = Path(work)
-        (folder / "plant.yaml").write_text(source.read_text())
-        (folder / "truth.yaml").write_text(
-            source.read_text().replace("flows:\n", f"flows:\n  concealed: {WEAK}\n")
-        )
-        truth, t = compile_plant(load(folder / "truth.yaml")), np.arange(30_000.0)
-        for k in range(1, max(numbers) + 1):
+        folder, size = Path(work), 0.0
+        (folder / "plant.yaml").write_text(source)
+        for k in range(max(numbers) + 1):  # the first one, without the link, gives its standard deviation
+            flow = (
+                f"{{from: outer_stator, into: bracket_1, rate: {size} * (outer_stator - bracket_1), unit: W}}"
+            )
+            (folder / "truth.yaml").write_text(source.replace("flows:\n", f"flows:\n  concealed: {flow}\n"))
             rng = np.random.default_rng(k)
             ends = np.sort(rng.choice(np.arange(600, 30_000, 60), 20, replace=False))
             current = np.round(rng.uniform(0, 2, 21), 2)[np.searchsorted(ends, t, side="right")]
@@ -280,12 +284,20 @@ def recordings(numbers: list[int], workers: list[int]) -> None:
                 "voltage_v": 4 * current,
                 "air_c": 22 + 0.2 * np.sin(t / 4000 + k),
             }
+            truth = compile_plant(load(folder / "truth.yaml"))
             write(folder / f"run_{k}.csv", truth.measure(Table(f"run_{k}", f"run_{k}", t, inputs), seed=k))
+            if k == 0:
+                size = SIGMAS * _deviation(folder, flow, "run_0.csv")
+                print(f"a link of {size:.3g} W/K: {SIGMAS} standard deviations in one recording", flush=True)
         for n in numbers:
             for w in workers if n == max(numbers) else workers[-1:]:
                 found = diagnosed(folder, [f"run_{k}.csv" for k in range(1, n + 1)], workers=w)
                 line(f"{n} recordings, {w} workers", found)
-                print(f"{'':28} {found.get('wall_s', float('nan')):.1f} s", flush=True)
+                named = "named" if name in found.get("found", ()) else "not named"  # type: ignore[operator]
+                print(
+                    f"{'':28} {found.get('wall_s', float('nan')):.1f} s; {SIGMAS * np.sqrt(n):.1f} sd: {named}",
+                    flush=True,
+                )
                 if found.get("tasks"):
                     simulate_workers(float(found["cpu_s"]), found["tasks"])  # type: ignore[arg-type]
 
@@ -331,7 +343,7 @@ def weak(numbers: list[int]) -> None:
             print(f"{'':28} {name}: {'named' if name in found.get('found', ()) else 'not named'}", flush=True)  # type: ignore[operator]
 
 
-def _deviation(folder: Path, flow: str) -> float:
+def _deviation(folder: Path, flow: str, recording: str = "run_1.csv") -> float:
     """Return the standard deviation of the link's conductance, all parameters and initial states unknown."""
     free = "  G_link: {value: 0.0, unit: W/K, range: [-0.1, 0.1]}\nnodes:"
     text = (folder / "plant.yaml").read_text().replace("nodes:", free, 1)
@@ -340,7 +352,7 @@ def _deviation(folder: Path, flow: str) -> float:
     )
     plant = load(folder / "free.yaml")
     model = compile_plant(plant)
-    found = fit(model, [model.excitation(t) for t in read_recordings(plant, [folder / "run_1.csv"])])
+    found = fit(model, [model.excitation(t) for t in read_recordings(plant, [folder / recording])])
     k = found.unknowns.index(("G_link", None))
     return float(0.2 * np.sqrt(np.linalg.inv(found.hessian)[k, k]))
 

@@ -285,7 +285,7 @@ def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment
     alone = json.loads(capsys.readouterr().out)
     names = {f["effect"] for f in alone["findings"]} | {a["effect"] for a in alone["alternatives"]}
     assert alone["verdict"] == "ambiguous" and {"radiation", "temperature_dependent_conductance"} <= names
-    assert alone["next_experiment"] and "Next experiment" in (tmp_path / "out/report.html").read_text()
+    assert alone["next_experiment"] and "proposed experiment" in (tmp_path / "out/report.html").read_text()
     assert yaml.safe_load((tmp_path / "out/next_experiment.yaml").read_text())["experiments"]
     assert main([*common, "--resolve", "--rig", str(tmp_path / "truth.yaml")]) == 0
     told = json.loads((tmp_path / "out/diagnosis.json").read_text())
