@@ -1,4 +1,4 @@
-"""Result of a refit for each parameter: value, standard error, state. And the plant with the fitted values."""
+"""The result of a refit for each parameter (value, standard error, state) and the plant with these values."""
 
 from __future__ import annotations
 
