@@ -8,8 +8,8 @@ import pytest
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
 from thermoctl.diagnose.limits import limits
+from thermoctl.diagnose.report.words import NEXT
 from thermoctl.diagnose.result import contract
-from thermoctl.diagnose.words import NEXT
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 

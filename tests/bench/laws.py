@@ -2,7 +2,7 @@
 
     python tests/bench/laws.py [--number N] [--out FILE]
 
-Every method is given the true place. The peers fit the smoothed flow there (`law_smooth.tracked` with that node alone) over the
+Every method is given the true place. The peers fit the smoothed flow there (`smooth.tracked` with that node alone) over the
 signals of the place:
 
 thermoctl   `find_law`, which has to find the place itself
@@ -26,8 +26,8 @@ from tests.laws.prove import AMBIENT, EQUAL, PART, cases, judge, without
 from tests.laws.rigs import Made, make
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import Fitted, as_refitted, fitted
-from thermoctl.diagnose.law_forms import Place, signals
-from thermoctl.diagnose.law_smooth import LATENT, tracked
+from thermoctl.diagnose.law.forms import Place, signals
+from thermoctl.diagnose.law.smooth import LATENT, tracked
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex

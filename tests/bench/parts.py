@@ -40,7 +40,7 @@ PARTS = (
     ("diagnose/overlay.py", "", "screening"),
     ("diagnose/metric.py", "", "screening"),
     ("diagnose/shortlist.py", "", "screening"),
-    ("diagnose/page.py", "", "report"),
+    ("diagnose/report/page.py", "", "report"),
     ("plant/residuals.py", "", "refit"),
     ("plant/refit.py", "", "refit"),
     ("diagnose/search.py", "", "search"),

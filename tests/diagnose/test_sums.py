@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from tests.diagnose.test_workers import rig
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import as_refitted, fitted, with_residuals
-from thermoctl.diagnose.law_smooth import _smoothed
+from thermoctl.diagnose.law.smooth import _smoothed
 from thermoctl.diagnose.overlay import _filtered
 from thermoctl.diagnose.posterior import Posterior
 from thermoctl.diagnose.run import diagnose

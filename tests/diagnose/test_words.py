@@ -7,8 +7,8 @@ import json
 import pytest
 
 from thermoctl.cli import main
-from thermoctl.diagnose.explain import explain
-from thermoctl.diagnose.words import sentences, words
+from thermoctl.diagnose.report.explain import explain
+from thermoctl.diagnose.report.words import sentences, words
 
 LAG = {
     "effect": "sensor_lag",

@@ -23,8 +23,8 @@ from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
 from thermoctl.diagnose.fit import fitted
-from thermoctl.diagnose.law import Law, find_law
-from thermoctl.diagnose.law_refit import law_rate
+from thermoctl.diagnose.law.find import Law, find_law
+from thermoctl.diagnose.law.refit import law_rate
 from thermoctl.diagnose.limits import limits
 from thermoctl.plant import expression as ex
 from thermoctl.plant.estimate import updated

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import fitted
-from thermoctl.diagnose.law import Law, find_law
-from thermoctl.diagnose.law_result import law_entry
+from thermoctl.diagnose.law.find import Law, find_law
+from thermoctl.diagnose.law.result import law_entry
 from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.words import law_sentence
+from thermoctl.diagnose.report.words import law_sentence
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.proof.rigs import RIGS, Rig

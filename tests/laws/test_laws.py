@@ -18,19 +18,19 @@ from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
+from thermoctl.diagnose.experiment.propose import propose, survivors
 from thermoctl.diagnose.fit import fitted
-from thermoctl.diagnose.law import find_law
-from thermoctl.diagnose.law_forms import Place, Signal, Term, library, signals
-from thermoctl.diagnose.law_misfit import misfit_odds
-from thermoctl.diagnose.law_propose import PROPOSALS
-from thermoctl.diagnose.law_refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
-from thermoctl.diagnose.law_result import law_entry, law_section, save_effect
-from thermoctl.diagnose.law_smooth import tracked
+from thermoctl.diagnose.law.find import find_law
+from thermoctl.diagnose.law.forms import Place, Signal, Term, library, signals
+from thermoctl.diagnose.law.misfit import misfit_odds
+from thermoctl.diagnose.law.propose import PROPOSALS
+from thermoctl.diagnose.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
+from thermoctl.diagnose.law.result import law_entry, law_section, save_effect
+from thermoctl.diagnose.law.smooth import tracked
 from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.propose import propose, survivors
+from thermoctl.diagnose.report.words import law_sentence
 from thermoctl.diagnose.rig import Rig
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.words import law_sentence
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Flow, Input, Node, Plant

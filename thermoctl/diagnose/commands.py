@@ -22,11 +22,11 @@ from rich.table import Table
 from thermoctl.checks.commands import checked, report
 from thermoctl.diagnose import run
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.experiment_file import peaks
-from thermoctl.diagnose.explain import explain
-from thermoctl.diagnose.law_result import save_effect
-from thermoctl.diagnose.resolve import resolve
-from thermoctl.diagnose.words import sentences, what_next
+from thermoctl.diagnose.experiment.file import peaks
+from thermoctl.diagnose.experiment.resolve import resolve
+from thermoctl.diagnose.law.result import save_effect
+from thermoctl.diagnose.report.explain import explain
+from thermoctl.diagnose.report.words import sentences, what_next
 from thermoctl.diagnose.workers import cluster
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant

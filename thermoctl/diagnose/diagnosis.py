@@ -10,8 +10,8 @@ from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.decide import Facts, decide, weigh
 from thermoctl.diagnose.fit import as_refitted, with_residuals
 from thermoctl.diagnose.held_out import split, worth
-from thermoctl.diagnose.law import find_law
-from thermoctl.diagnose.law_smooth import missing_flow
+from thermoctl.diagnose.law.find import find_law
+from thermoctl.diagnose.law.smooth import missing_flow
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.misfit import energies, standing, standouts

@@ -12,9 +12,9 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.decide import Decision, Key, Posterior
 from thermoctl.diagnose.fit import Fitted, Placed
 from thermoctl.diagnose.held_out import Worth
-from thermoctl.diagnose.law import Law
-from thermoctl.diagnose.law_result import law_entry
-from thermoctl.diagnose.law_smooth import flow_unit
+from thermoctl.diagnose.law.find import Law
+from thermoctl.diagnose.law.result import law_entry
+from thermoctl.diagnose.law.smooth import flow_unit
 from thermoctl.diagnose.misfit import Energy, standouts
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import Left

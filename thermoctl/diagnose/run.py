@@ -13,18 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.diagnose import diagnosis as engine
-from thermoctl.diagnose import experiment_file, memory
+from thermoctl.diagnose import memory
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.design import NONE, Limits
+from thermoctl.diagnose.experiment import file as experiment_file
+from thermoctl.diagnose.experiment.design import NONE, Limits
+from thermoctl.diagnose.experiment.propose import propose
 from thermoctl.diagnose.fit import remembered
 from thermoctl.diagnose.limits import limits as numbers
-from thermoctl.diagnose.page import write_report
-from thermoctl.diagnose.propose import propose
+from thermoctl.diagnose.report.page import write_report
+from thermoctl.diagnose.report.trend import earlier_trends, told, trends
+from thermoctl.diagnose.report.unseen import not_seen
+from thermoctl.diagnose.report.words import words
 from thermoctl.diagnose.result import Diagnosis, contract
 from thermoctl.diagnose.threads import one_thread
-from thermoctl.diagnose.trend import earlier_trends, told, trends
-from thermoctl.diagnose.unseen import not_seen
-from thermoctl.diagnose.words import words
 from thermoctl.extras import lacking
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.diagnose.law_forms import Signal
-from thermoctl.diagnose.law_propose import PIECES, Proposal, pieces
-from thermoctl.diagnose.law_smooth import Tracked
+from thermoctl.diagnose.law.forms import Signal
+from thermoctl.diagnose.law.propose import PIECES, Proposal, pieces
+from thermoctl.diagnose.law.smooth import Tracked
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 

@@ -27,10 +27,10 @@ import numpy as np
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.decide import Key
-from thermoctl.diagnose.design import NONE, Excitation, Lever, Limits, family, levers
-from thermoctl.diagnose.experiment_file import FILES
+from thermoctl.diagnose.experiment.design import NONE, Excitation, Lever, Limits, family, levers
+from thermoctl.diagnose.experiment.file import FILES
 from thermoctl.diagnose.fit import Fitted, with_residuals
-from thermoctl.diagnose.law_result import described
+from thermoctl.diagnose.law.result import described
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.plant.residuals import Scale
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant

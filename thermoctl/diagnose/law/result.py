@@ -10,11 +10,11 @@ from typing import Any
 import yaml
 
 from thermoctl.diagnose.fit import Fitted
-from thermoctl.diagnose.law import Law
-from thermoctl.diagnose.law_propose import Proposal
-from thermoctl.diagnose.law_refit import equation, law_rate
+from thermoctl.diagnose.law.find import Law
+from thermoctl.diagnose.law.propose import Proposal
+from thermoctl.diagnose.law.refit import equation, law_rate
+from thermoctl.diagnose.report.words import law_sentence
 from thermoctl.diagnose.rig import zero_of
-from thermoctl.diagnose.words import law_sentence
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from thermoctl.diagnose.experiment_file import FILES
+from thermoctl.diagnose.experiment.file import FILES
 
 ROUNDS = 3
 

@@ -24,7 +24,7 @@ from scipy.special import logit
 from thermoctl.diagnose.case import Case, with_tables
 from thermoctl.diagnose.fit import Fitted, fitted
 from thermoctl.diagnose.held_out import Worth
-from thermoctl.diagnose.law_propose import Proposal
+from thermoctl.diagnose.law.propose import Proposal
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.misfit import energies, physics
 from thermoctl.diagnose.search import Searched, Weighed

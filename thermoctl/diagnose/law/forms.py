@@ -16,7 +16,7 @@ import numpy as np
 
 from thermoctl import yamlfile
 from thermoctl.diagnose.catalogue import Effect, EffectParameter
-from thermoctl.diagnose.law_memory import MEMORIES
+from thermoctl.diagnose.law.memory import MEMORIES
 from thermoctl.diagnose.rig import TEMPERATURE, zero_of
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex

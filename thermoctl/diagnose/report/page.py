@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.experiment_file import peaks
+from thermoctl.diagnose.experiment.file import peaks
 from thermoctl.diagnose.fit import Fitted, Placed
-from thermoctl.diagnose.law_result import law_section
+from thermoctl.diagnose.law.result import law_section
+from thermoctl.diagnose.report.words import chance, name, sentences, what_next
 from thermoctl.diagnose.result import Diagnosis
-from thermoctl.diagnose.words import chance, name, sentences, what_next
 from thermoctl.plant.estimate import Estimate, report
 from thermoctl.plant.refit import Fit
 from thermoctl.plant.show import drawing

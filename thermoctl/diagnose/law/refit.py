@@ -13,9 +13,9 @@ from thermoctl.diagnose import places as catalogue_places
 from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, Placed, fitted
-from thermoctl.diagnose.law_forms import law_effect, readable
-from thermoctl.diagnose.law_propose import PROPOSALS, Proposal
-from thermoctl.diagnose.law_smooth import law_unit
+from thermoctl.diagnose.law.forms import law_effect, readable
+from thermoctl.diagnose.law.propose import PROPOSALS, Proposal
+from thermoctl.diagnose.law.smooth import law_unit
 from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulate import SimulationError

@@ -1,9 +1,9 @@
 """The law of a remainder: proposed by sparse regression, refitted in the whole plant, weighed by evidence.
 
-1. `law_propose` proposes terms of the library at the places where a free function helps most.
+1. `propose` proposes terms of the library at the places where a free function helps most.
 2. The best are refitted as a hypothesis like any other: same noise, remainder and evidence. The prior odds of
    a law fall with the number of places, signals and forms that it was chosen from.
-3. A law counts where it is no shape of the misfit that stays (`law_misfit`). Two things tell: how far it
+3. A law counts where it is no shape of the misfit that stays (`misfit`). Two things tell: how far it
    stands out of that misfit, and how much error it removes from data that it was not fitted to.
 4. Of the laws that count, the evidence decides."""
 
@@ -18,11 +18,11 @@ from scipy.special import expit, softmax
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, Placed, with_residuals
 from thermoctl.diagnose.held_out import Worth, worth
-from thermoctl.diagnose.law_curve import Curve, curve
-from thermoctl.diagnose.law_misfit import closed, held_back, misfit_odds
-from thermoctl.diagnose.law_propose import Proposal, propose_laws
-from thermoctl.diagnose.law_refit import SIMPLER, affordable, at_bound, law_rate, refitted_law, simpler_law
-from thermoctl.diagnose.law_smooth import law_unit, tracked
+from thermoctl.diagnose.law.curve import Curve, curve
+from thermoctl.diagnose.law.misfit import closed, held_back, misfit_odds
+from thermoctl.diagnose.law.propose import Proposal, propose_laws
+from thermoctl.diagnose.law.refit import SIMPLER, affordable, at_bound, law_rate, refitted_law, simpler_law
+from thermoctl.diagnose.law.smooth import law_unit, tracked
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.shortlist import HALF
 from thermoctl.plant import expression as ex

@@ -1,6 +1,6 @@
 """Proposals of laws: sparse regression on the linearised plant.
 
-1. `law_smooth` tracks the recordings with unknown flows and linearises the plant about this trajectory.
+1. `smooth` tracks the recordings with unknown flows and linearises the plant about this trajectory.
 2. Each place and signal is scored with a free function of the signal (straight lines between quantiles).
 3. Where that score is high, the library's forms are tried: alone, in pairs, and in sums of three terms."""
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, as_refitted
-from thermoctl.diagnose.law_forms import (
+from thermoctl.diagnose.law.forms import (
     Family,
     Place,
     Signal,
@@ -26,7 +26,7 @@ from thermoctl.diagnose.law_forms import (
     places,
     signals,
 )
-from thermoctl.diagnose.law_smooth import Tracked, tracked
+from thermoctl.diagnose.law.smooth import Tracked, tracked
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.shortlist import ALIKE
 from thermoctl.diagnose.unknown import located, reached

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from thermoctl.diagnose.words import what_next
+from thermoctl.diagnose.report.words import what_next
 
 SHOWN, LOST = 4, 3  # hypotheses; effects that were tried and lost
 

@@ -1,0 +1,1 @@
+"""The experiment that separates hypotheses which fit about as well."""

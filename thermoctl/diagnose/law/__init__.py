@@ -1,0 +1,1 @@
+"""An unknown law of the remainder: proposed, refitted, weighed and written."""

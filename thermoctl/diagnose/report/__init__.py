@@ -1,0 +1,1 @@
+"""The result of a diagnosis in words, tables and figures."""
