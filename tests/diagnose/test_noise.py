@@ -18,11 +18,13 @@ ROWS, SIGMA, SWING = 2000, 0.05, 5.0
 SHARE = 0.4  # of the noise's variance, that is not white
 
 
-def banded(e: np.ndarray, sigma: float = SIGMA, block: int = 1) -> tuple[list[Grid], list[np.ndarray]]:
+def banded(
+    e: np.ndarray, sigma: float = SIGMA, block: int = 1, change: float = 0.0
+) -> tuple[list[Grid], list[np.ndarray]]:
     n = len(e)
     d = Excitation("run", np.arange(n) * 1.0, np.zeros((n, 0)), e[:, None], {}, np.zeros(0, np.intc))
     c = Coordinates([d])
-    return [grid(c, [0], sigma, SWING, block=block)], c.powers([transform(c.channels[0], e)])
+    return [grid(c, [0], sigma, SWING, change, block=block)], c.powers([transform(c.channels[0], e)])
 
 
 def likelihood(e: np.ndarray) -> Averaged:
@@ -105,6 +107,49 @@ def test_slow_noise_is_averaged_over_its_size_time_and_flicker(phi):
     log_p = log_p - 0.5 * (level / g.known) ** 2 - np.log(np.sqrt(2 * np.pi) * g.known)
     whole = logsumexp(log_p) + np.log(0.01 / 30**3)
     assert module._laplace(module._Noise(g, power, True)).log_p == pytest.approx(whole, abs=0.5)
+
+
+@pytest.mark.parametrize("kind", ["noise", "slow noise", "remainder"])
+@pytest.mark.parametrize("change", [0.0, 20 * SIGMA])
+def test_slopes_and_curvatures_of_the_log_densities_are_those_of_differences(kind, change):
+    (g,), powers = banded(coloured(5, 0.7, 3.0), change=change)
+    power = np.bincount(g.node, powers[0])
+    first = 1 + (change > 0)
+    assert len(g.scales) == first
+    if kind == "remainder":
+        precision = np.diag(np.r_[g.scales**-2.0, np.zeros(len(g.count))])
+        precision[first:, first:] = g.rough
+        density = module._Remainder(g, power, precision)
+    else:
+        density = module._Noise(g, power, kind == "slow noise")
+    x = density.start() + 0.3 * np.random.default_rng(1).standard_normal(len(density.start()))
+    at, step = density.at(x), 1e-5 * np.eye(len(x))
+    slope = [(density.at(x - d).log_density - density.at(x + d).log_density) / 2e-5 for d in step]
+    curvature = [(density.at(x + d).uphill - density.at(x - d).uphill) / 2e-5 for d in step]
+    ratio = [(np.log(density.at(x + d).variance) - np.log(density.at(x - d).variance)) / 2e-5 for d in step]
+    np.testing.assert_allclose(at.uphill, slope, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(at.curvature, curvature, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(at.slope, np.transpose(ratio), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.02])
+def test_uncertain_times_of_a_fast_reading_are_noise_and_no_misfit(late):
+    """A sine of 100 noises: 2 % of a sampling interval is four times the noise where the reading is fastest."""
+    rng, t = np.random.default_rng(9), np.arange(ROWS)
+    slope = 200 * SIGMA * np.cos(0.2 * t)
+    e = SIGMA * rng.standard_normal(ROWS) + late * slope * rng.standard_normal(ROWS)
+    change = float(np.sqrt(np.mean(slope**2)))
+    (g,), powers = banded(e, change=change)
+    assert module.floor(g, powers, 5) == pytest.approx(SIGMA**2 + (late * change) ** 2, rel=0.2)
+    assert averaged([g], powers).remainder[0] < 0.5
+    (still,), powers = banded(e)
+    assert module.floor(still, powers, 5) <= still.most * SIGMA**2  # nothing moves: only the sensor errs
+
+
+def test_a_misfit_that_falls_with_frequency_is_no_noise():
+    e = coloured(3, 0.0) + 30 * effect(1.0, 0.0)
+    (g,), powers = banded(e, change=20 * SIGMA)
+    assert module.floor(g, powers, 5) < 1.5 * SIGMA**2
 
 
 @pytest.mark.parametrize("phi", [0.3, 0.5, 0.7, 0.84, 0.9])

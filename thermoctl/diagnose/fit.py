@@ -20,7 +20,7 @@ import numpy as np
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.memory import Past, PlacedBefore
-from thermoctl.diagnose.noise import Averaged, Grid, averaged
+from thermoctl.diagnose.noise import Averaged, Grid, averaged, floor
 from thermoctl.diagnose.posterior import Hypothesis, bounded_step, gaussian
 from thermoctl.diagnose.posterior import Placed as Placed
 from thermoctl.diagnose.posterior import Posterior as Posterior
@@ -328,17 +328,12 @@ def placed_before(effects: Sequence[Placed], plant: Plant) -> tuple[PlacedBefore
 def levels(case: Case, f: Fitted, clean: float) -> list[float]:
     """Return the standard deviation of each output's noise: the stated one, or more if that explains all.
 
-    A stated noise may be wrong by one standard deviation of its prior. So variance that is present at all
-    frequencies counts as noise up to there. The residual must then be within `clean` times this noise."""
+    A stated noise and the recorded times may be wrong by one standard deviation of their priors. So variance
+    that is present at all frequencies counts as noise up to there. The residual must then be within `clean`
+    times this noise."""
     out = []
     for g in case.grids:
-        lowest, at = np.inf, 0
-        for k in g.channels:
-            inverse = f.average.inverse[k]
-            stated = g.variance * g.shape[g.node[at : at + len(inverse)]]
-            lowest = min(lowest, float(np.min(1 / (inverse * stated))))
-            at += len(inverse)
-        level = g.sigma * float(np.sqrt(np.clip(lowest, 1.0, np.exp(g.known))))
+        level = float(np.sqrt(max(floor(g, f.powers, len(f.fit.unknowns)), g.variance)))
         out.append(level if _rms(f, g) <= clean * level else g.sigma)
     return out
 

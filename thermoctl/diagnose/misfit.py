@@ -24,6 +24,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.fit import DECADES, Fitted, as_refitted
 from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.noise import floor
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import rounded
 
@@ -90,8 +91,14 @@ def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozense
 
     Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there.
     The noise is what the leading hypothesis learnt: a stated one that is too large would hide the misfit.
+    Where uncertain times may add to it, power that is there at all frequencies is noise, too.
     Of the two refits of a hypothesis the better one counts."""
-    noise = list(zip(searched.tried[0].fitted.average.sensor, rounded(case), strict=True))
+    leader = searched.tried[0].fitted
+    own = [
+        max(learnt, floor(g, leader.powers, len(leader.fit.unknowns))) if g.clock else learnt
+        for g, learnt in zip(case.grids, leader.average.sensor, strict=True)
+    ]
+    noise = list(zip(own, rounded(case), strict=True))
     out = {}
     for w in searched.tried:
         both = [_energy(case, f, noise, limits) for f in (w.fitted, as_refitted(case, w.fitted))]

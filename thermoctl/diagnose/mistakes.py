@@ -19,6 +19,7 @@ from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.fit import Fitted, Placed, Posterior, fitted
 from thermoctl.diagnose.roles import Structure
+from thermoctl.plant.cores import LEAST, each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import SimulationError, compile_plant
@@ -42,17 +43,17 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
             if c.effect.where != "sensor" or c.place.output in case.off:
                 starts.setdefault(c.key, []).append(_start(case, c))
     best = sorted((min(s, key=lambda x: x[0]) for s in starts.values()), key=lambda x: x[0])
-    found = []
-    for _, plant, placed in best[:most]:
-        if case.budget.spent:
-            break
+
+    def refitted(start: tuple[float, Plant, Placed]) -> Fitted | None:
+        _, plant, placed = start
         try:
-            f = fitted(case, plant, (placed,), parent=null.rough.cost)
+            return None if case.budget.stopped() else fitted(case, plant, (placed,), parent=null.rough.cost)
         except (SimulationError, np.linalg.LinAlgError):
-            continue
-        if not f.absent:
-            found.append(f)
-    return found
+            return None
+
+    tried = best[: max(min(most, case.budget.fits - case.budget.fits_done), 0)]
+    found = each(refitted, tried, LEAST * len(tried))
+    return [f for f in found if f is not None and not f.absent]
 
 
 def _start(case: Case, c: Candidate) -> tuple[float, Plant, Placed]:

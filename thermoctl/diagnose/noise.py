@@ -3,9 +3,11 @@
 In band b of an output, with n rows and power P = sum R^2, a row has this variance (coordinates.py).
 Bands of an output's recordings at the same frequency count as one.
 
-    V_b = c^2 s^2 + q exp(u_b),   log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
+    V_b = c^2 s^2 + j^2 w^2 + q exp(u_b),   log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
 
-s is the noise that the plant file states, c its error, log-normal. Where slow parts are stated, s^2 follows
+s is the noise that the plant file states, c its error, log-normal. j is the error of the recorded times in
+sampling intervals, log-normal, and w the output's change in an interval: where it is fast, an uncertain time
+is an uncertain reading. Like the sensor's noise it is the same at all frequencies. Where slow parts are stated, s^2 follows
 their spectrum. q exp(u_b) is the remainder and every slow error of the sensor. u is a random walk over log
 frequency: smooth, and its size is learnt at each frequency. So an error of the plant at one frequency says
 little about another. But a plant with a large error is not exact at any frequency. So at least the share
@@ -15,7 +17,7 @@ the remainder's share of the output's swing has a half-normal prior of width SMA
     log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
 
 Without a remainder the noise has the stated spectrum. Where no slow parts are stated, it has with even odds a
-first-order and a 1/f part, whose sizes and time are log-uniform. These, c and u are integrated by Laplace's
+first-order and a 1/f part, whose sizes and time are log-uniform. These, c, j and u are integrated by Laplace's
 method.
 """
 
@@ -29,11 +31,18 @@ import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.special import logsumexp, ndtr, ndtri
+from scipy.stats import chi2
 
 from thermoctl.diagnose.coordinates import WIDTH, Coordinates
 from thermoctl.plant.language import SensorNoise
 
 STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times
+# The error of recorded times in sampling intervals: median, and prior sd of log j^2, which is a factor of ten in j.
+# A clock in hardware has 1e-4 or less, a program that polls a device on a busy machine 1e-1.
+CLOCK, CLOCK_SD = 3e-3, 2 * np.log(10.0)
+# Of the noise's variance, from which an error of the times, two sd above the median, is looked for
+SEEN = 0.1
+RARE = 0.05  # chance of a power as small as that of an octave, below which it contradicts a noise
 ABSENT = 0.5  # prior of no remainder at an output
 WHITE = 0.5  # prior of no slow part in a noise whose parts nobody stated
 SMALL = 0.02  # of an output's swing: width of the prior of the remainder's rms
@@ -75,6 +84,7 @@ class Grid:
     log_rough: float  # its log determinant
     log_small: float  # log of the half-normal's mean over the random walk
     sigma: float  # s above: standard deviation of the stated noise, in the output's unit
+    change: float  # w above, the output's change in a sampling interval, in its unit
     swing: float  # rms of the output about its mean
     sensor: SensorNoise | None  # the parts of the stated noise
 
@@ -82,6 +92,22 @@ class Grid:
     def variance(self) -> float:
         """Variance of the stated noise, s^2."""
         return self.sigma**2
+
+    @property
+    def clock(self) -> float:
+        """Variance of the median error of the times, over the stated noise's; 0 where it would not be seen."""
+        ratio = (CLOCK * self.change / self.sigma) ** 2
+        return ratio if ratio * np.exp(2 * CLOCK_SD) > SEEN else 0.0
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Prior sd of log c^2 and, where it is looked for, of log j^2."""
+        return np.array([self.known, CLOCK_SD] if self.clock else [self.known])
+
+    @property
+    def most(self) -> float:
+        """Variance over the stated noise's, one prior sd above the median."""
+        return float(np.exp(self.known) + self.clock * np.exp(CLOCK_SD))
 
     @property
     def small(self) -> float:
@@ -94,14 +120,16 @@ def grid(
     positions: Sequence[int],
     sigma: float,
     swing: float,
+    change: float = 0.0,
     sensor: SensorNoise | None = None,
     block: int = 1,
 ) -> Grid:
     """Return the frequencies of one output.
 
-    `positions`: of its channels; `sigma`: its stated noise; `swing`: its rms about the mean. `sensor`: the
-    parts of the noise, where the plant file states them. `block`: samples whose mean is one row. A mean of
-    samples has the spectrum of the samples, divided by their number: slow parts keep their size and time."""
+    `positions`: of its channels; `sigma`: its stated noise; `swing`: its rms about the mean; `change`: its
+    rms change in a sampling interval, over the root of `block`. `sensor`: the parts of the noise, where the
+    plant file states them. `block`: samples whose mean is one row. A mean of samples has the spectrum of the
+    samples, divided by their number: slow parts keep their size and time."""
     channels = [coordinates.channels[k] for k in positions]
     octave = np.concatenate([np.log2(c.frequency) for c in channels])
     cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)
@@ -135,9 +163,23 @@ def grid(
         log_rough,
         log_small,
         sigma,
+        change,
         swing,
         sensor,
     )
+
+
+def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
+    """Return the largest variance of a noise that the power of no octave contradicts, up to `Grid.most`.
+
+    Errors of a plant fall with frequency. Power that is there at all frequencies is noise. `absorbed`: number
+    of unknowns of a refit, which may have absorbed that many rows, all of them in one octave."""
+    power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels])) / (g.variance * g.shape)
+    octave = np.cumsum(np.append(0.0, np.diff(np.log2(g.turn)))).astype(int)
+    rows = np.bincount(octave, g.count) - absorbed
+    told = rows > 0
+    allowed = np.bincount(octave, power)[told] / chi2.ppf(RARE, rows[told])
+    return g.variance * float(min(allowed.min(initial=g.most), g.most))
 
 
 def spectrum(sensor: SensorNoise, frequency: np.ndarray, interval: float) -> np.ndarray:
@@ -210,7 +252,7 @@ def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
         power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels]))
         power = np.maximum(power, LEAST * g.variance * g.count)
         noises = [_Noise(g, power, slow) for slow in ([False] if g.sensor else [False, True])]
-        some = _Remainder(g, power, block_diag(g.known**-2, g.rough))
+        some = _Remainder(g, power, block_diag(np.diag(g.scales**-2.0), g.rough))
         found = [*(_laplace(c) for c in noises), _laplace(some)]
         odds = ABSENT * np.array([1.0] if g.sensor else [WHITE, 1 - WHITE])
         scores = np.log(np.append(odds, 1 - ABSENT)) + [f.log_p for f in found]
@@ -247,8 +289,8 @@ class _At:
 class _Noise:
     """The log density of an output's residual without a remainder, and its derivatives.
 
-    x holds log c^2. With `slow` parts that nobody stated it holds their sizes and time, too: the standard
-    normal values of the same probability."""
+    x holds log c^2 and, where it may be seen, log j^2 over its median. With `slow` parts that nobody stated
+    it holds their sizes and time, too: the standard normal values of the same probability."""
 
     grid: Grid
     power: np.ndarray
@@ -257,46 +299,56 @@ class _Noise:
     @property
     def log_prior(self) -> float:
         """Log of the prior's normalisation, without 2 pi."""
-        return -float(np.log(self.grid.known))
+        return -float(np.log(self.grid.scales).sum())
 
     def start(self) -> np.ndarray:
-        """Return the likeliest x of some."""
+        """Return the likeliest x of some, the times without an error."""
         g, n = self.grid, self.grid.count.sum()
-        if not self.slow:
-            return np.log([(self.power / g.shape).sum() / n / g.variance])
-        level = np.log((self.power / g.slow).sum(axis=1) / n / g.variance)
-        score = -0.5 * (n * level + (level / g.known) ** 2 + np.log(g.slow) @ g.count)
+        shapes = g.slow if self.slow else g.shape[None]
+        level = np.log((self.power / shapes).sum(axis=1) / n / g.variance)
+        score = -0.5 * (n * level + (level / g.known) ** 2 + np.log(shapes) @ g.count)
         k = int(np.argmax(score))
-        return np.append(level[k], STARTS[k])
+        other = STARTS[k] if self.slow else np.zeros(0)
+        return np.concatenate([[level[k]], np.zeros(len(g.scales) - 1), other])
 
     def at(self, x: np.ndarray) -> _At:
         """Return the log density, V and their derivatives at x."""
-        g = self.grid
-        precision = np.append(g.known**-2, np.ones(len(x) - 1))
-        v, slope, bend = (
-            g.variance * np.exp(x[0]) * g.shape,
-            np.ones((len(x), len(g.count))),
-            np.zeros((0, 0)),
-        )
+        g, first = self.grid, len(self.grid.scales)
+        precision = np.append(g.scales**-2.0, np.ones(len(x) - first))
+        shape, change, second = g.shape, np.zeros((0, len(g.count))), np.zeros((0, 0, len(g.count)))
         if self.slow:
-            shape, change, second = _slow(g.turn, x[1:])
-            total = g.count @ shape
-            share, whole = change / shape, change @ g.count / total
-            slope[1:] = share - whole[:, None]
-            v = v * shape * (g.count.sum() / total)
-            excess = g.count - self.power / v
-            bend = second @ (excess / shape) - (share * excess) @ share.T
-            bend -= excess.sum() * (second @ g.count / total - np.outer(whole, whole))
+            shape, change, second = _slow(g.turn, x[first:])
+            mean = g.count / g.count.sum()
+            whole = shape @ mean
+            shape, change, second = shape / whole, change / whole, second / whole
+            drift, bend = change @ mean, second @ mean  # the mean over all rows stays 1
+            crossed = change[:, None] * drift[None, :, None]
+            second = second - crossed - crossed.transpose(1, 0, 2) - shape * bend[..., None]
+            second += 2 * shape * np.outer(drift, drift)[..., None]
+            change = change - shape * drift[:, None]
+        noise = g.variance * np.exp(x[0])
+        parts = [noise * shape]
+        if first > 1:
+            parts.append(np.full(len(shape), g.variance * g.clock * np.exp(x[1])))
+        v = np.sum(parts, axis=0)
+        slope = np.concatenate([parts, noise * change]) / v
+        bends = np.zeros((len(x), *slope.shape))
+        for k, part in enumerate(parts):
+            bends[k, k] = part / v
+        bends[0, first:] = bends[first:, 0] = noise * change / v
+        bends[first:, first:] = noise * second / v
         p = self.power / v
-        curvature = 0.5 * (slope * p) @ slope.T + np.diag(precision)
-        curvature[1:, 1:] += 0.5 * bend
+        pull = 0.5 * (g.count - p)
+        curvature = (slope * (p - 0.5 * g.count)) @ slope.T + bends @ pull + np.diag(precision)
         density = -0.5 * float(g.count @ np.log(v) + p.sum() + precision @ x**2)
-        return _At(x, density, v, slope.T, 0.5 * slope @ (g.count - p) + precision * x, curvature)
+        return _At(x, density, v, slope.T, slope @ pull + precision * x, curvature)
 
 
 @dataclass(frozen=True)
 class _Remainder:
-    """The log density of an output's residual and of x = (log c^2, u), and its derivatives."""
+    """The log density of an output's residual and of x, and its derivatives.
+
+    x holds log c^2 and, where it may be seen, log j^2 over its median, then u."""
 
     grid: Grid
     power: np.ndarray
@@ -305,23 +357,28 @@ class _Remainder:
     @property
     def log_prior(self) -> float:
         """Log of the prior's normalisation, without 2 pi."""
-        return -float(np.log(self.grid.known)) + 0.5 * self.grid.log_rough - self.grid.log_small
+        g = self.grid
+        return -float(np.log(g.scales).sum()) + 0.5 * g.log_rough - g.log_small
 
     def at(self, x: np.ndarray) -> _At:
         """Return the log density, V and their derivatives at x.
 
         The curvature is exact: the expected one (Fisher) misleads where a residual spans many decades."""
-        g = self.grid
-        noise, free = g.variance * g.shape * np.exp(x[0]), np.exp(x[1:])
+        g, first = self.grid, len(self.grid.scales)
+        noise, free = g.variance * g.shape * np.exp(x[0]), np.exp(x[first:])
+        timing = g.variance * g.clock * np.exp(x[first - 1])
         part = g.count * free / g.count.sum()
         v = noise + g.small * (free + FLOOR * part.sum())
-        slope = np.tile(g.small * FLOOR * np.concatenate([[0.0], part]), (len(free), 1))
+        slope = np.tile(g.small * FLOOR * np.concatenate([np.zeros(first), part]), (len(free), 1))
         slope[:, 0] = noise
-        slope[:, 1:] += np.diag(g.small * free)
+        if first > 1:
+            v = v + timing
+            slope[:, 1] = timing
+        slope[:, first:] += np.diag(g.small * free)
         slope /= v[:, None]
         p, prior = self.power / v, self.precision @ x
         density = -0.5 * float(g.count @ np.log(v) + p.sum() + part.sum() + x @ prior)
-        pull = 0.5 * (slope.T @ (g.count - p) + np.concatenate([[0.0], part]))
+        pull = 0.5 * (slope.T @ (g.count - p) + np.concatenate([np.zeros(first), part]))
         curvature = (slope.T * (p - 0.5 * g.count)) @ slope + self.precision + np.diag(pull)
         return _At(x, density, v, slope, pull + prior, curvature)
 
@@ -329,7 +386,8 @@ class _Remainder:
         """Return an x near the maximum."""
         g = self.grid
         seen = self.power / g.count / g.small
-        return np.concatenate([[0.0], np.log(np.minimum(seen, np.sqrt(seen * g.count.sum())))])
+        none = np.zeros(len(g.scales))
+        return np.concatenate([none, np.log(np.minimum(seen, np.sqrt(seen * g.count.sum())))])
 
 
 @dataclass(frozen=True)
@@ -361,4 +419,5 @@ def _laplace(d: _Noise | _Remainder) -> _Found:
     score = at.log_density - 0.5 * float(g.count.sum()) * LOG_2PI + d.log_prior
     score -= float(np.log(np.diag(factor)).sum())
     moves = solve_triangular(factor, (at.slope / at.variance[:, None]).T, lower=True)
-    return _Found(score, float(g.variance * np.exp(at.x[0])), at.variance, moves.T @ moves)
+    timing = g.clock * np.exp(at.x[len(g.scales) - 1])
+    return _Found(score, float(g.variance * (np.exp(at.x[0]) + timing)), at.variance, moves.T @ moves)

@@ -30,6 +30,7 @@ from thermoctl.diagnose.overlay import Overlay, Trajectory
 from thermoctl.diagnose.rig import Rig
 from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import expression as ex
+from thermoctl.plant.cores import ABREAST, LEAST, each
 
 EPSILON = 1e-4  # amplitude at which a direction is taken
 CHUNK = 96
@@ -105,8 +106,9 @@ def directions(
 ) -> Iterator[tuple[Sequence[Column], np.ndarray]]:
     """Yield rows (rows, k) of columns, not whitened, a chunk at a time."""
     left = iter(columns)
-    while part := list(itertools.islice(left, CHUNK)):
-        yield part, metric.responses(partial(_pushed, part, at), len(part))
+    while parts := [p for _ in range(ABREAST) if (p := list(itertools.islice(left, CHUNK)))]:
+        rows = each(lambda p: metric.responses(partial(_pushed, p, at), len(p)), parts, LEAST * len(parts))
+        yield from zip(parts, rows, strict=True)
 
 
 def _pushed(part: Sequence[Column], at: Sequence[Trajectory], r: int) -> Pushed:

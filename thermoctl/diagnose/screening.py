@@ -36,7 +36,7 @@ class Plain:
         self.coordinates = Coordinates(self.drives, max(most // len(case.coordinates.channels), 32))
         measured = self.coordinates.by_output().values()
         self.grids = [
-            grid(self.coordinates, ks, g.sigma, g.swing, g.sensor, g.block)
+            grid(self.coordinates, ks, g.sigma, g.swing, g.change, g.sensor, g.block)
             for ks, g in zip(measured, case.grids, strict=True)
         ]
         self.channels = [self.coordinates.of_recording(r) for r in range(len(self.drives))]

@@ -24,6 +24,7 @@ from thermoctl.diagnose.screen import Direction, Norms, sharpened
 from thermoctl.diagnose.screening import Screened, places, screened
 from thermoctl.diagnose.shortlist import HALF, PAIR, shortlist, simpler
 from thermoctl.plant import refit
+from thermoctl.plant.cores import LEAST, batches, each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.yamlfile import InputError
@@ -33,6 +34,7 @@ BEATEN = 10.0  # nats below the best: such a parent is not extended where the be
 # Share of hypotheses near the best that are extended. If the best cannot be extended, the others are not.
 CLOSE = 0.5
 Keys = frozenset[Key]
+Extension = tuple[tuple[Direction, ...], float]  # directions to add, and their promised gain
 START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
 
@@ -164,8 +166,11 @@ def swap(s: Search) -> None:
             if s.case.budget.spent or frozenset(o.key for o in rest) in s.seen:
                 continue
             parent = s.tried.get(frozenset(o.key for o in rest)) or rebuilt(s, rest, best.fitted, best.fitted)
-            if parent:
-                s.extended(parent)
+            if parent is None:
+                continue
+            if not parent.fitted.doubtful:
+                s.keep([parent])
+            s.extended(parent)
         if s.best is best:
             return
 
@@ -276,28 +281,32 @@ def extensions(
     # beside a hypothesis that leaves no more than noise only promises count
     promised = parent is not ahead and max(over_noise(case, ahead.fitted, limits.clean)) <= limits.clean
     queue, planned = shortlist(looked, where, limits), case.budget.later
-    for k, (added, gain) in enumerate(queue):
-        case.budget.planned = case.budget.fits_done + len(queue) - k
+
+    def wanted(item: Extension) -> bool:
+        """Return whether an extension is new and may win, and a refit is left."""
+        added, gain = item
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
         if keys in tried or len(keys) > limits.effects:
-            continue
+            return False
         if parent.score + HALF * gain < ahead.score or promised and np.isinf(gain):
-            continue
-        if case.budget.spent:
-            case.budget.untried += 1
-            continue
+            return False
+        case.budget.untried += case.budget.spent
+        return not case.budget.spent
+
+    for batch, left in batches(queue, wanted):
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
-        expected = _expected(case, [*tried.values(), *out], leader, limits, 1 - k / len(queue))
-        case.budget.later = min(planned, expected)
-        fits = _followed(case, parent, looked, added, leader)
-        found = [f for f in fits if not f.absent]
-        if found:
-            best = max(found, key=lambda f: f.log_evidence)
-            w = Weighed(best, odds(best.hypothesis.effects, where, limits))
-            (doubtful if best.doubtful else out).append(w)
-        if any(f.absent or f.doubtful for f in fits):
-            queued = {d.candidate.key for ds, _ in queue for d in ds}
-            queue += [((d,), gain) for d in simpler(added, looked) if d.candidate.key not in queued]
+        untried = (left + len(batch)) / len(queue)
+        case.budget.later = min(planned, _expected(case, [*tried.values(), *out], leader, limits, untried))
+        case.budget.planned = case.budget.fits_done + left + len(batch)
+        for (added, gain), fits in zip(batch, _abreast(case, parent, looked, batch, leader), strict=True):
+            found = [f for f in fits if not f.absent]
+            if found:
+                best = max(found, key=lambda f: f.log_evidence)
+                w = Weighed(best, odds(best.hypothesis.effects, where, limits))
+                (doubtful if best.doubtful else out).append(w)
+            if any(f.absent or f.doubtful for f in fits):
+                queued = {d.candidate.key for ds, _ in queue for d in ds}
+                queue += [((d,), gain) for d in simpler(added, looked) if d.candidate.key not in queued]
     simplest = max((w.score for w in (parent, *out)), default=parent.score)
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
 
@@ -314,13 +323,20 @@ def _expected(case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Limi
     return CLOSE * sum(score >= scores[0] - BEATEN for score in scores)
 
 
+def _abreast(
+    case: Case, parent: Weighed, looked: Screened, batch: Sequence[Extension], leader: Fitted
+) -> list[list[Fitted]]:
+    """Return the refits of each of some extensions, which run side by side."""
+    starts = [tuple(sharpened(looked.metric, looked.rig, d) for d in added) for added, _ in batch]
+    return each(lambda first: _followed(case, parent, looked, first, leader), starts, len(batch) * LEAST)
+
+
 def _followed(
-    case: Case, parent: Weighed, looked: Screened, added: Sequence[Direction], leader: Fitted
+    case: Case, parent: Weighed, looked: Screened, first: Sequence[Direction], leader: Fitted
 ) -> list[Fitted]:
     """Refit the parent with the directions from several starting points, which depend on their shapes.
 
     If every refit fits worse than the parent, start again from a weaker effect."""
-    first = tuple(sharpened(looked.metric, looked.rig, d) for d in added)
     stuck = tuple(sticking(d) or d for d in first)
     found = [_refitted(case, parent, first, looked, leader)]
     if stuck != first and max(d.gain for d in first) > looked.directions[0].gain / PAIR:

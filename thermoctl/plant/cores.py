@@ -1,11 +1,12 @@
-"""Recordings side by side, on all cores or on the workers of a cluster.
+"""Recordings or refits side by side, on all cores; recordings also on the workers of a cluster.
 
 A plant's machine code and numpy's loops run outside Python's lock. Results come in the order of the
-recordings and are summed in this order. So they do not depend on the number of cores or workers."""
+items and are summed in this order. So they do not depend on the number of cores or workers."""
 
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,15 +16,25 @@ from typing import Any, Protocol, TypeVar
 LEAST = (
     200_000  # numbers that a run computes, about a millisecond: less is not worth the way to another thread
 )
+# Refits, or chunks of directions, that run side by side. A refit ends early if it falls behind those before:
+# with a number that follows the cores the result would follow them, too.
+ABREAST = 2
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+_here = threading.local()
 
 
 @cache
 def _pool(process: int) -> ThreadPoolExecutor:
     """Return the threads of this process; a forked one has none of its parent's."""
-    return ThreadPoolExecutor(_cores(), thread_name_prefix=f"recordings-{process}")
+    return ThreadPoolExecutor(_cores(), thread_name_prefix=f"recordings-{process}", initializer=_entered)
+
+
+def _entered() -> None:
+    """Mark this thread: if it waited for others of its pool, none might be left to compute."""
+    _here.inside = True
 
 
 def _cores() -> int:
@@ -33,10 +44,22 @@ def _cores() -> int:
 def each(f: Callable[[T], R], items: Sequence[T], numbers: int) -> list[R]:
     """Return f of each item, side by side if `numbers`, the count that all of them compute, is large.
 
-    f must not call `each`. The first item's exception is raised."""
-    if len(items) < 2 or numbers < LEAST or _cores() == 1:
+    Inside f a call of `each` takes one item after the other. The first item's exception is raised."""
+    if len(items) < 2 or numbers < LEAST or _cores() == 1 or getattr(_here, "inside", False):
         return [f(x) for x in items]
     return list(_pool(os.getpid()).map(f, items))
+
+
+def batches(queue: list[T], wanted: Callable[[T], bool]) -> Iterator[tuple[list[T], int]]:
+    """Yield the wanted items of a queue that may grow, ABREAST at a time, and the number left after them."""
+    at = 0
+    while at < len(queue):
+        batch: list[T] = []
+        while at < len(queue) and len(batch) < ABREAST:
+            batch += [queue[at]] if wanted(queue[at]) else []
+            at += 1
+        if batch:
+            yield batch, len(queue) - at
 
 
 class Workers(Protocol):

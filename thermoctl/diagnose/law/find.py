@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import expit, softmax
@@ -26,6 +27,7 @@ from thermoctl.diagnose.law.smooth import law_unit, tracked
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.shortlist import HALF
 from thermoctl.plant import expression as ex
+from thermoctl.plant.cores import LEAST, batches, each
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
 
@@ -112,9 +114,9 @@ def _chosen(
     evidence = gains / limits.temperature
     odds = _both(evidence, [misfit_odds(case, parent, f, p, limits) for p, f in tried])
     likely = np.argsort(-odds, kind="stable")[:TESTED]
-    values: list[Worth] = []
-    for k in likely:
-        values.append(worth(case, parent, tried[k][1], reserve, values[0] if values else None))
+    first = worth(case, parent, tried[likely[0]][1], reserve)
+    others = [tried[k][1] for k in likely[1:]]
+    values = [first, *each(lambda f: worth(case, parent, f, reserve, first), others, LEAST * len(others))]
     odds = _both(
         evidence[likely],
         [
@@ -154,24 +156,30 @@ def _refits(
     tried: list[Tried] = []
     queue, more = list(proposals), SIMPLER
     gain, ratio, leader, left = 0.0, 1.0, parent, affordable(case, parent)
-    for k, p in enumerate(queue):
+
+    def wanted(p: Proposal) -> bool:
+        nonlocal left
         if not left or case.budget.stopped() or p.cost + gain > HALF * ratio * p.promise:
-            continue
+            return False
         left -= 1
-        say(f"looking for a law of the remainder: refit {k + 1}")
-        f = refitted_law(case, parent, p, leader)
-        if f is None:
-            continue
-        more_evidence = f.log_evidence - parent.log_evidence
-        gain, ratio = max(gain, more_evidence - p.cost), max(ratio, more_evidence / max(p.promise, 1.0))
-        leader = max(leader, f, key=lambda x: x.log_likelihood)
-        if not f.absent and not at_bound(f):
-            tried.append((p, f))
-        if len(p.terms) > 1 and more and (f.doubtful or at_bound(f)):
-            simpler = simpler_law(p, f)
-            if simpler.kind not in {q.kind for q in queue}:
-                queue.append(simpler)
-                more -= 1
+        return True
+
+    for batch, rest in batches(queue, wanted):
+        say(f"looking for a law of the remainder: refit {len(queue) - rest} of {len(queue)} at most")
+        fits = each(partial(refitted_law, case, parent, leader=leader), batch, LEAST * len(batch))
+        for p, f in zip(batch, fits, strict=True):
+            if f is None:
+                continue
+            more_evidence = f.log_evidence - parent.log_evidence
+            gain, ratio = max(gain, more_evidence - p.cost), max(ratio, more_evidence / max(p.promise, 1.0))
+            leader = max(leader, f, key=lambda x: x.log_likelihood)
+            if not f.absent and not at_bound(f):
+                tried.append((p, f))
+            if len(p.terms) > 1 and more and (f.doubtful or at_bound(f)):
+                simpler = simpler_law(p, f)
+                if simpler.kind not in {q.kind for q in queue}:
+                    queue.append(simpler)
+                    more -= 1
     return tried
 
 
