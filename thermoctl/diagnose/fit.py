@@ -20,7 +20,7 @@ import numpy as np
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.memory import Past, PlacedBefore
-from thermoctl.diagnose.noise import Averaged, Grid, averaged, floor
+from thermoctl.diagnose.noise import Averaged, averaged
 from thermoctl.diagnose.posterior import Hypothesis, bounded_step, gaussian
 from thermoctl.diagnose.posterior import Placed as Placed
 from thermoctl.diagnose.posterior import Posterior as Posterior
@@ -323,28 +323,6 @@ def placed_before(effects: Sequence[Placed], plant: Plant) -> tuple[PlacedBefore
         )
         for e in effects
     )
-
-
-def levels(case: Case, f: Fitted, clean: float) -> list[float]:
-    """Return the standard deviation of each output's noise: the stated one, or more if that explains all.
-
-    A stated noise and the recorded times may be wrong by one standard deviation of their priors. So variance
-    that is present at all frequencies counts as noise up to there. The residual must then be within `clean`
-    times this noise."""
-    out = []
-    for g in case.grids:
-        level = float(np.sqrt(max(floor(g, f.powers, len(f.fit.unknowns)), g.variance)))
-        out.append(level if _rms(f, g) <= clean * level else g.sigma)
-    return out
-
-
-def over_noise(case: Case, f: Fitted, clean: float) -> list[float]:
-    """Return the rms of each output's residuals over its noise (`levels`)."""
-    return [_rms(f, g) / level for g, level in zip(case.grids, levels(case, f, clean), strict=True)]
-
-
-def _rms(f: Fitted, g: Grid) -> float:
-    return float(np.sqrt(sum(f.powers[k].sum() for k in g.channels) / g.count.sum()))
 
 
 def as_refitted(case: Case, f: Fitted) -> Fitted:

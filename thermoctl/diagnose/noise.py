@@ -3,22 +3,23 @@
 In band b of an output, with n rows and power P = sum R^2, a row has this variance (coordinates.py).
 Bands of an output's recordings at the same frequency count as one.
 
-    V_b = c^2 s^2 + j^2 w^2 + q exp(u_b),   log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
+    V_b = c^2 s^2 + j^2 w^2 + q exp(u_b)
+    log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
 
-s is the noise that the plant file states, c its error, log-normal. j is the error of the recorded times in
-sampling intervals, log-normal, and w the output's change in an interval: where it is fast, an uncertain time
-is an uncertain reading. Like the sensor's noise it is the same at all frequencies. Where slow parts are stated, s^2 follows
-their spectrum. q exp(u_b) is the remainder and every slow error of the sensor. u is a random walk over log
-frequency: smooth, and its size is learnt at each frequency. So an error of the plant at one frequency says
-little about another. But a plant with a large error is not exact at any frequency. So at least the share
-FLOOR of the remainder's energy lies evenly over all of them. Errors that nobody will name are small. So
-the remainder's share of the output's swing has a half-normal prior of width SMALL, and q = (SMALL swing)^2.
+s is the noise that the plant file states, c its error, log-normal. Recorded times may be off by j sampling
+intervals, log-normal. A reading that changes by w in an interval is then off by j w, at all frequencies as
+its noise is. Where slow parts are stated, s^2 follows their spectrum. q exp(u_b) is the remainder and every
+slow error of the sensor. u is a random walk over log frequency: smooth, and its size is learnt at each
+frequency. So an error of the plant at one frequency says little about another. But a plant with a large
+error is not exact at any frequency. So at least the share FLOOR of the remainder's energy lies evenly over
+all of them. Errors that nobody will name are small. So the remainder's share of the output's swing has a
+half-normal prior of width SMALL, and q = (SMALL swing)^2.
 
     log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
 
 Without a remainder the noise has the stated spectrum. Where no slow parts are stated, it has with even odds a
-first-order and a 1/f part, whose sizes and time are log-uniform. These, c, j and u are integrated by Laplace's
-method.
+first-order and a 1/f part, whose sizes and time are log-uniform. These, c, j and u are integrated by
+Laplace's method.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from thermoctl.diagnose.coordinates import WIDTH, Coordinates
 from thermoctl.plant.language import SensorNoise
 
 STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times
-# The error of recorded times in sampling intervals: median, and prior sd of log j^2, which is a factor of ten in j.
+# The error of recorded times in sampling intervals: median, and prior sd of log j^2 (a factor of ten in j).
 # A clock in hardware has 1e-4 or less, a program that polls a device on a busy machine 1e-1.
 CLOCK, CLOCK_SD = 3e-3, 2 * np.log(10.0)
 # Of the noise's variance, from which an error of the times, two sd above the median, is looked for
@@ -95,7 +96,7 @@ class Grid:
 
     @property
     def clock(self) -> float:
-        """Variance of the median error of the times, over the stated noise's; 0 where it would not be seen."""
+        """Variance by the times' median error, over the stated noise's; 0 where it would not be seen."""
         ratio = (CLOCK * self.change / self.sigma) ** 2
         return ratio if ratio * np.exp(2 * CLOCK_SD) > SEEN else 0.0
 
@@ -126,7 +127,7 @@ def grid(
 ) -> Grid:
     """Return the frequencies of one output.
 
-    `positions`: of its channels; `sigma`: its stated noise; `swing`: its rms about the mean; `change`: its
+    `positions`: of its channels; `sigma`: its stated noise; `swing`: its rms about the mean. `change`: its
     rms change in a sampling interval, over the root of `block`. `sensor`: the parts of the noise, where the
     plant file states them. `block`: samples whose mean is one row. A mean of samples has the spectrum of the
     samples, divided by their number: slow parts keep their size and time."""

@@ -11,7 +11,8 @@ import numpy as np
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.coordinates import Channel, Coordinates, transform
-from thermoctl.diagnose.fit import Fitted, as_refitted, over_noise
+from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.levels import over_noise
 from thermoctl.diagnose.metric import Metric, Pushed, span, without
 from thermoctl.diagnose.noise import Averaged, averaged, grid
 from thermoctl.diagnose.roles import Structure

@@ -13,7 +13,8 @@ from thermoctl.diagnose.case import Budget, Case
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.extend import extend, sticking, weaker
-from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, over_noise, placed_before
+from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, placed_before
+from thermoctl.diagnose.levels import over_noise
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, PlacedBefore
 from thermoctl.diagnose.mistakes import mistakes

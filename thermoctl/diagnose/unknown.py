@@ -8,7 +8,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted, levels, over_noise
+from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.levels import levels, over_noise
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.where import Responses, responses, signals
 
