@@ -11,6 +11,7 @@ from scipy.special import logsumexp
 
 from thermoctl.diagnose import noise as module
 from thermoctl.diagnose.coordinates import Coordinates, transform
+from thermoctl.diagnose.levels import floor
 from thermoctl.diagnose.noise import Averaged, Grid, averaged, grid
 from thermoctl.plant.simulate import Excitation
 
@@ -140,16 +141,16 @@ def test_uncertain_times_of_a_fast_reading_are_noise_and_no_misfit(late):
     e = SIGMA * rng.standard_normal(ROWS) + late * slope * rng.standard_normal(ROWS)
     change = float(np.sqrt(np.mean(slope**2)))
     (g,), powers = banded(e, change=change)
-    assert module.floor(g, powers, 5) == pytest.approx(SIGMA**2 + (late * change) ** 2, rel=0.2)
+    assert floor(g, powers, 5) == pytest.approx(SIGMA**2 + (late * change) ** 2, rel=0.2)
     assert averaged([g], powers).remainder[0] < 0.5
     (still,), powers = banded(e)
-    assert module.floor(still, powers, 5) <= still.most * SIGMA**2  # nothing moves: only the sensor errs
+    assert floor(still, powers, 5) <= still.most * SIGMA**2  # nothing moves: only the sensor errs
 
 
 def test_a_misfit_that_falls_with_frequency_is_no_noise():
     e = coloured(3, 0.0) + 30 * effect(1.0, 0.0)
     (g,), powers = banded(e, change=20 * SIGMA)
-    assert module.floor(g, powers, 5) < 1.5 * SIGMA**2
+    assert floor(g, powers, 5) < 1.5 * SIGMA**2
 
 
 @pytest.mark.parametrize("phi", [0.3, 0.5, 0.7, 0.84, 0.9])

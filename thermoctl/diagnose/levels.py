@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from scipy.stats import chi2
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted
-from thermoctl.diagnose.noise import Grid, floor
+from thermoctl.diagnose.noise import Grid
+
+RARE = 0.05  # chance of a power as small as that of an octave, below which it contradicts a noise
+
+
+def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
+    """Return the largest variance of a noise that the power of no octave contradicts, up to `Grid.most`.
+
+    Errors of a plant fall with frequency. Power that is there at all frequencies is noise. `absorbed`: number
+    of unknowns of a refit, which may have absorbed that many rows, all of them in one octave."""
+    power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels])) / (g.variance * g.shape)
+    octave = np.cumsum(np.append(0.0, np.diff(np.log2(g.turn)))).astype(int)
+    rows = np.bincount(octave, g.count) - absorbed
+    told = rows > 0
+    allowed = np.bincount(octave, power)[told] / chi2.ppf(RARE, rows[told])
+    return g.variance * float(min(allowed.min(initial=g.most), g.most))
 
 
 def levels(case: Case, f: Fitted, clean: float) -> list[float]:

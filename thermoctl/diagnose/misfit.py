@@ -23,8 +23,8 @@ import numpy as np
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.fit import DECADES, Fitted, as_refitted
+from thermoctl.diagnose.levels import floor
 from thermoctl.diagnose.limits import Limits
-from thermoctl.diagnose.noise import floor
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import rounded
 

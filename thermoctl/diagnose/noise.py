@@ -26,15 +26,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotrs
-from scipy.special import logsumexp, ndtr, ndtri
-from scipy.stats import chi2
+from scipy.special import logsumexp
 
 from thermoctl.diagnose.coordinates import WIDTH, Coordinates
+from thermoctl.diagnose.spectra import STARTS, slow, spectrum
 from thermoctl.plant.language import SensorNoise
 
 STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times
@@ -43,7 +42,6 @@ STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off 
 CLOCK, CLOCK_SD = 3e-3, 2 * np.log(10.0)
 # Of the noise's variance, from which an error of the times, two sd above the median, is looked for
 SEEN = 0.1
-RARE = 0.05  # chance of a power as small as that of an octave, below which it contradicts a noise
 ABSENT = 0.5  # prior of no remainder at an output
 WHITE = 0.5  # prior of no slow part in a noise whose parts nobody stated
 SMALL = 0.02  # of an output's swing: width of the prior of the remainder's rms
@@ -56,13 +54,6 @@ STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the predicte
 LONGEST = 10.0  # step in a logarithm that is tried
 DAMPED = 0.01  # first damping of a step, as a share of the curvature
 LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm
-# Slow parts of a noise that nobody stated: least and largest size and time of a first-order part, and size
-# of a 1/f part. Sizes are standard deviations (of the 1/f part over a decade), as shares of the white part's.
-# The time is in sampling intervals. Slower or larger errors belong to the remainder: as noise they would
-# imitate physics.
-SLOW = np.log([[0.1, 1.0], [0.5, 15.0], [0.01, 0.1]])
-# Sizes and times, as `_slow` takes them, that share their prior equally: a search starts at the likeliest.
-STARTS = np.array([*product(*(ndtri((np.arange(n) + 0.5) / n) for n in (3, 5, 3)))])
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -150,7 +141,7 @@ def grid(
     interval = channels[0].interval
     turn = 2 * np.pi * frequency * interval / block
     shape = spectrum(sensor or SensorNoise(1.0), frequency, interval)
-    slow = np.array([_slow(turn, x)[0] for x in STARTS])
+    slow = np.array([slow(turn, x)[0] for x in STARTS])
     return Grid(
         tuple(positions),
         node,
@@ -168,65 +159,6 @@ def grid(
         swing,
         sensor,
     )
-
-
-def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
-    """Return the largest variance of a noise that the power of no octave contradicts, up to `Grid.most`.
-
-    Errors of a plant fall with frequency. Power that is there at all frequencies is noise. `absorbed`: number
-    of unknowns of a refit, which may have absorbed that many rows, all of them in one octave."""
-    power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels])) / (g.variance * g.shape)
-    octave = np.cumsum(np.append(0.0, np.diff(np.log2(g.turn)))).astype(int)
-    rows = np.bincount(octave, g.count) - absorbed
-    told = rows > 0
-    allowed = np.bincount(octave, power)[told] / chi2.ppf(RARE, rows[told])
-    return g.variance * float(min(allowed.min(initial=g.most), g.most))
-
-
-def spectrum(sensor: SensorNoise, frequency: np.ndarray, interval: float) -> np.ndarray:
-    """Return the variance of a DCT row at each frequency: of the white, the first-order and the 1/f part.
-
-    The first-order part has the spectrum of its samples, `interval` apart (an AR(1) process). A 1/f part with
-    the standard deviation `flicker` over a decade has the density flicker^2 / (ln 10 f)."""
-    out = np.full(len(frequency), sensor.white**2)
-    if sensor.drift is not None and sensor.time is not None:
-        out += sensor.drift**2 * _first_order(sensor.time / interval, 2 * np.pi * frequency * interval)
-    if sensor.flicker is not None:
-        out += sensor.flicker**2 * _flicker(2 * np.pi * frequency * interval)
-    return out
-
-
-def _first_order(time: float, turn: np.ndarray) -> np.ndarray:
-    phi = np.exp(-1 / time)
-    return (1 - phi**2) / (1 - 2 * phi * np.cos(turn) + phi**2)
-
-
-def _flicker(turn: np.ndarray) -> np.ndarray:
-    return np.pi / (np.log(10.0) * turn)
-
-
-def _slow(turn: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the spectrum (nodes,) of a noise whose white part is 1, and its two derivatives by x.
-
-    x: standard normal values, as probable as the first-order part's size and time, and the other's size.
-    The derivatives are (3, nodes) and (3, 3, nodes)."""
-    apart = SLOW[:, 1] - SLOW[:, 0]
-    size, time, flicker = np.exp(SLOW[:, 0] + apart * ndtr(x))
-    steps = apart * np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)  # d log of each by x
-    first, other = size**2 * _first_order(time, turn), flicker**2 * _flicker(turn)
-    phi = np.exp(-1 / time)
-    below = 1 - 2 * phi * np.cos(turn) + phi**2
-    near, far = (np.cos(turn) - phi) / below, phi / (1 - phi**2)
-    by_time = 2 * phi / time * (near - far)  # d log first / d log time
-    bend = (1 / time - 1) * by_time
-    bend += 2 * (phi / time) ** 2 * (2 * near**2 - 1 / below - (1 + phi**2) / (1 - phi**2) ** 2)
-    change = np.array([2 * first * steps[0], by_time * first * steps[1], 2 * other * steps[2]])
-    second = np.zeros((3, 3, len(turn)))
-    second[0, 0] = change[0] * (2 * steps[0] - x[0])
-    second[0, 1] = second[1, 0] = change[1] * 2 * steps[0]
-    second[1, 1] = change[1] * (by_time * steps[1] - x[1]) + first * bend * steps[1] ** 2
-    second[2, 2] = change[2] * (2 * steps[2] - x[2])
-    return 1 + first + other, change, second
 
 
 @dataclass(frozen=True)
@@ -318,7 +250,7 @@ class _Noise:
         precision = np.append(g.scales**-2.0, np.ones(len(x) - first))
         shape, change, second = g.shape, np.zeros((0, len(g.count))), np.zeros((0, 0, len(g.count)))
         if self.slow:
-            shape, change, second = _slow(g.turn, x[first:])
+            shape, change, second = slow(g.turn, x[first:])
             mean = g.count / g.count.sum()
             whole = shape @ mean
             shape, change, second = shape / whole, change / whole, second / whole

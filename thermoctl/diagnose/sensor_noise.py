@@ -23,7 +23,7 @@ from rich.table import Table as Printed
 from scipy.optimize import minimize
 
 from thermoctl.diagnose.coordinates import Channel, Coordinates, transform
-from thermoctl.diagnose.noise import spectrum
+from thermoctl.diagnose.spectra import spectrum
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.recordings import read_recordings

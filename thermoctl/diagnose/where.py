@@ -17,6 +17,7 @@ import numpy as np
 from scipy.fft import idct
 
 from thermoctl.diagnose.coordinates import Coordinates, band_edges, transform
+from thermoctl.diagnose.spectra import first_order
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation, Model
@@ -24,12 +25,6 @@ from thermoctl.plant.simulate import Excitation, Model
 SHARES = 10.0 ** np.arange(-3.5, 1.1, 0.5)  # values of eta: rms of a force over the typical flow
 CORNERS = 3  # tau, from a fortieth to a quarter of the longest recording
 FORCES = 2  # a node; each holds every second band, so that neighbours' responses do not mix
-
-
-def first_order(frequency: np.ndarray, interval: float, tau: float) -> np.ndarray:
-    """Return the row variances, by frequency, of a sampled first-order process of unit variance."""
-    rho = np.exp(-interval / tau)
-    return (1 - rho**2) / (1 - 2 * rho * np.cos(2 * np.pi * frequency * interval) + rho**2)
 
 
 @dataclass(frozen=True)
@@ -53,7 +48,8 @@ class Responses:
 
     def _channel(self, coordinates: Coordinates, k: int, node: int) -> np.ndarray:
         c = coordinates.channels[k]
-        slow = [first_order(c.frequency, self.intervals[c.recording], tau) for tau in self.corner]
+        interval = self.intervals[c.recording]
+        slow = [first_order(tau / interval, 2 * np.pi * c.frequency * interval) for tau in self.corner]
         return self.share[:, None] ** 2 * self.white[k][node] * np.array(slow)
 
 

@@ -1,0 +1,69 @@
+"""Spectra of a sensor's noise: the variance of a DCT row at each frequency.
+
+`turn` is the angle in a sampling interval, 2 pi f dt.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from thermoctl.plant.language import SensorNoise
+
+# Slow parts of a noise that nobody stated: least and largest size and time of a first-order part, and size
+# of a 1/f part. Sizes are standard deviations (of the 1/f part over a decade), as shares of the white part's.
+# The time is in sampling intervals. Slower or larger errors belong to the remainder: as noise they would
+# imitate physics.
+SLOW = np.log([[0.1, 1.0], [0.5, 15.0], [0.01, 0.1]])
+# Sizes and times, as `_slow` takes them, that share their prior equally: a search starts at the likeliest.
+STARTS = np.array([*product(*(ndtri((np.arange(n) + 0.5) / n) for n in (3, 5, 3)))])
+
+
+def spectrum(sensor: SensorNoise, frequency: np.ndarray, interval: float) -> np.ndarray:
+    """Return the variance of a DCT row at each frequency: of the white, the first-order and the 1/f part.
+
+    The first-order part has the spectrum of its samples, `interval` apart (an AR(1) process). A 1/f part with
+    the standard deviation `flicker` over a decade has the density flicker^2 / (ln 10 f)."""
+    out = np.full(len(frequency), sensor.white**2)
+    if sensor.drift is not None and sensor.time is not None:
+        out += sensor.drift**2 * first_order(sensor.time / interval, 2 * np.pi * frequency * interval)
+    if sensor.flicker is not None:
+        out += sensor.flicker**2 * flicker_part(2 * np.pi * frequency * interval)
+    return out
+
+
+def first_order(time: float | np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Return the row variances of a sampled first-order process of unit variance; `time` in samples."""
+    phi = np.exp(-1 / time)
+    return (1 - phi**2) / (1 - 2 * phi * np.cos(turn) + phi**2)
+
+
+def flicker_part(turn: np.ndarray) -> np.ndarray:
+    """Return the row variances of 1/f noise whose standard deviation over a decade is 1."""
+    return np.pi / (np.log(10.0) * turn)
+
+
+def slow(turn: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the spectrum (nodes,) of a noise whose white part is 1, and its two derivatives by x.
+
+    x: standard normal values, as probable as the first-order part's size and time, and the other's size.
+    The derivatives are (3, nodes) and (3, 3, nodes)."""
+    apart = SLOW[:, 1] - SLOW[:, 0]
+    size, time, flicker = np.exp(SLOW[:, 0] + apart * ndtr(x))
+    steps = apart * np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)  # d log of each by x
+    first, other = size**2 * first_order(time, turn), flicker**2 * flicker_part(turn)
+    phi = np.exp(-1 / time)
+    below = 1 - 2 * phi * np.cos(turn) + phi**2
+    near, far = (np.cos(turn) - phi) / below, phi / (1 - phi**2)
+    by_time = 2 * phi / time * (near - far)  # d log first / d log time
+    bend = (1 / time - 1) * by_time
+    bend += 2 * (phi / time) ** 2 * (2 * near**2 - 1 / below - (1 + phi**2) / (1 - phi**2) ** 2)
+    change = np.array([2 * first * steps[0], by_time * first * steps[1], 2 * other * steps[2]])
+    second = np.zeros((3, 3, len(turn)))
+    second[0, 0] = change[0] * (2 * steps[0] - x[0])
+    second[0, 1] = second[1, 0] = change[1] * 2 * steps[0]
+    second[1, 1] = change[1] * (by_time * steps[1] - x[1]) + first * bend * steps[1] ** 2
+    second[2, 2] = change[2] * (2 * steps[2] - x[2])
+    return 1 + first + other, change, second
