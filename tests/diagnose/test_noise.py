@@ -13,6 +13,7 @@ from thermoctl.diagnose import noise as module
 from thermoctl.diagnose.coordinates import Coordinates, transform
 from thermoctl.diagnose.levels import floor
 from thermoctl.diagnose.noise import Averaged, Grid, averaged, grid
+from thermoctl.diagnose.spectra import SLOW
 from thermoctl.plant.simulate import Excitation
 
 ROWS, SIGMA, SWING = 2000, 0.05, 5.0
@@ -88,7 +89,7 @@ def test_slow_noise_is_averaged_over_its_size_time_and_flicker(phi):
     (g,), (power,) = banded(coloured(1, phi))
     power = np.bincount(g.node, power)
     middle = (np.arange(30) + 0.5) / 30
-    size, time, flicker = (np.exp(a + (b - a) * middle) for a, b in module.SLOW)
+    size, time, flicker = (np.exp(a + (b - a) * middle) for a, b in SLOW)
     r = np.exp(-1 / time)[:, None]
     first = (1 - r**2) / (1 - 2 * r * np.cos(g.turn) + r**2)
     shape = (

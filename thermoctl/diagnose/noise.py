@@ -33,7 +33,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.special import logsumexp
 
 from thermoctl.diagnose.coordinates import WIDTH, Coordinates
-from thermoctl.diagnose.spectra import STARTS, slow, spectrum
+from thermoctl.diagnose.spectra import STARTS, slow_parts, spectrum
 from thermoctl.plant.language import SensorNoise
 
 STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times
@@ -141,7 +141,7 @@ def grid(
     interval = channels[0].interval
     turn = 2 * np.pi * frequency * interval / block
     shape = spectrum(sensor or SensorNoise(1.0), frequency, interval)
-    slow = np.array([slow(turn, x)[0] for x in STARTS])
+    slow = np.array([slow_parts(turn, x)[0] for x in STARTS])
     return Grid(
         tuple(positions),
         node,
@@ -250,7 +250,7 @@ class _Noise:
         precision = np.append(g.scales**-2.0, np.ones(len(x) - first))
         shape, change, second = g.shape, np.zeros((0, len(g.count))), np.zeros((0, 0, len(g.count)))
         if self.slow:
-            shape, change, second = slow(g.turn, x[first:])
+            shape, change, second = slow_parts(g.turn, x[first:])
             mean = g.count / g.count.sum()
             whole = shape @ mean
             shape, change, second = shape / whole, change / whole, second / whole

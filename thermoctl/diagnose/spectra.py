@@ -17,7 +17,7 @@ from thermoctl.plant.language import SensorNoise
 # The time is in sampling intervals. Slower or larger errors belong to the remainder: as noise they would
 # imitate physics.
 SLOW = np.log([[0.1, 1.0], [0.5, 15.0], [0.01, 0.1]])
-# Sizes and times, as `_slow` takes them, that share their prior equally: a search starts at the likeliest.
+# Sizes and times, as `slow_parts` takes them, of equal prior probability: a search starts at the likeliest.
 STARTS = np.array([*product(*(ndtri((np.arange(n) + 0.5) / n) for n in (3, 5, 3)))])
 
 
@@ -45,7 +45,7 @@ def flicker_part(turn: np.ndarray) -> np.ndarray:
     return np.pi / (np.log(10.0) * turn)
 
 
-def slow(turn: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def slow_parts(turn: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the spectrum (nodes,) of a noise whose white part is 1, and its two derivatives by x.
 
     x: standard normal values, as probable as the first-order part's size and time, and the other's size.
