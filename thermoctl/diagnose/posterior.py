@@ -72,8 +72,11 @@ def _slopes(
     problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, channels: Sequence[Channel]
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Return a recording's free-run errors, its unknowns (k,) and its channels' slopes (rows, k)."""
-    unknowns, y, jac = problem.jacobian(r, values, dx0)
-    return problem.excitations[r].y - y, unknowns, [transform(c, jac[:, c.output]) for c in channels]
+    d, buffers = problem.excitations[r], problem.buffers
+    run = problem.model.run(d, values, dx0, sensitivities=True, buffers=buffers, states=False)
+    used, unknowns, slope = problem.slopes(r, values)
+    assert run.dy is not None
+    return d.y - run.y, unknowns, [transform(c, run.dy[:, c.output, used]) * slope for c in channels]
 
 
 def _sums(
