@@ -145,7 +145,7 @@ def test_uncertain_times_of_a_fast_reading_are_noise_and_no_misfit(late):
     assert floor(g, powers, 5) == pytest.approx(SIGMA**2 + (late * change) ** 2, rel=0.2)
     assert averaged([g], powers).remainder[0] < 0.5
     (still,), powers = banded(e)
-    assert floor(still, powers, 5) <= still.most * SIGMA**2  # nothing moves: only the sensor errs
+    assert floor(still, powers, 5) <= still.most  # nothing moves: only the sensor errs
 
 
 def test_a_misfit_that_falls_with_frequency_is_no_noise():

@@ -91,13 +91,12 @@ def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozense
 
     Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there.
     The noise is what the leading hypothesis learnt: a stated one that is too large would hide the misfit.
-    Where uncertain times may add to it, power that is there at all frequencies is noise, too.
+    Power beyond the stated noise at all frequencies is noise, too, as far as uncertain times may add it.
     Of the two refits of a hypothesis the better one counts."""
     leader = searched.tried[0].fitted
-    own = [
-        max(learnt, floor(g, leader.powers, len(leader.fit.unknowns))) if g.clock else learnt
-        for g, learnt in zip(case.grids, leader.average.sensor, strict=True)
-    ]
+    beyond = [floor(g, leader.powers, len(leader.fit.unknowns)) - g.variance for g in case.grids]
+    timing = [float(np.clip(v, 0.0, g.timing)) for v, g in zip(beyond, case.grids, strict=True)]
+    own = np.add(leader.average.sensor, timing)
     noise = list(zip(own, rounded(case), strict=True))
     out = {}
     for w in searched.tried:

@@ -97,9 +97,14 @@ class Grid:
         return np.array([self.known, CLOCK_SD] if self.clock else [self.known])
 
     @property
+    def timing(self) -> float:
+        """Variance by an error of the times that is one prior sd above the median."""
+        return float(self.variance * self.clock * np.exp(CLOCK_SD))
+
+    @property
     def most(self) -> float:
-        """Variance over the stated noise's, one prior sd above the median."""
-        return float(np.exp(self.known) + self.clock * np.exp(CLOCK_SD))
+        """Variance of the noise, its parts one prior sd above their medians."""
+        return self.variance * float(np.exp(self.known)) + self.timing
 
     @property
     def small(self) -> float:
