@@ -27,6 +27,27 @@ def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
     return float(min(allowed.min(initial=g.most), g.most))
 
 
+def timing(case: Case, f: Fitted) -> list[float]:
+    """Return each output's variance beyond its stated noise at all frequencies, as far as uncertain times may
+    add it."""
+    beyond = [floor(g, f.powers, len(f.fit.unknowns)) - g.variance for g in case.grids]
+    return [float(np.clip(v, 0.0, g.timing)) for v, g in zip(beyond, case.grids, strict=True)]
+
+
+def late(case: Case, f: Fitted) -> list[str]:
+    """Return sentences about outputs that uncertain times make more wrong than the stated noise."""
+    out = []
+    for g, v in zip(case.grids, timing(case, f), strict=True):
+        if v > g.variance:
+            name = f.fit.model.outputs[case.coordinates.channels[g.channels[0]].output]
+            unit = case.plant.outputs[name].unit or ""
+            out.append(
+                f"{name} errs by {np.sqrt(v):.2g} {unit} beside its noise, at all frequencies: recorded times that are off by "
+                f"{100 * np.sqrt(v) / g.change:.2g} % of a sampling interval would do that"
+            )
+    return out
+
+
 def levels(case: Case, f: Fitted, clean: float) -> list[float]:
     """Return the standard deviation of each output's noise: the stated one, or more if that explains all.
 

@@ -23,7 +23,7 @@ import numpy as np
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.fit import DECADES, Fitted, as_refitted
-from thermoctl.diagnose.levels import floor
+from thermoctl.diagnose.levels import timing
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import rounded
@@ -94,9 +94,7 @@ def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozense
     Power beyond the stated noise at all frequencies is noise, too, as far as uncertain times may add it.
     Of the two refits of a hypothesis the better one counts."""
     leader = searched.tried[0].fitted
-    beyond = [floor(g, leader.powers, len(leader.fit.unknowns)) - g.variance for g in case.grids]
-    timing = [float(np.clip(v, 0.0, g.timing)) for v, g in zip(beyond, case.grids, strict=True)]
-    own = np.add(leader.average.sensor, timing)
+    own = np.add(leader.average.sensor, timing(case, leader))
     noise = list(zip(own, rounded(case), strict=True))
     out = {}
     for w in searched.tried:
