@@ -1,0 +1,65 @@
+"""Refits that run side by side: the result is that of one core, and a queue may grow while it is worked off."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import numpy as np
+
+from tests.plants import ONE_BLOCK
+from thermoctl.diagnose.run import diagnose
+from thermoctl.plant import cores, load
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
+
+
+def test_one_core_and_two_write_the_same_bytes(tmp_path, monkeypatch):
+    path, t = tmp_path / "plant.yaml", np.arange(400.0)
+    lost = "{from: block, rate: 3e-9 * ((block + 273.15)**4 - (air + 273.15)**4), unit: W}"
+    path.write_text(ONE_BLOCK.replace("flows:\n", f"flows:\n  concealed: {lost}\n"))
+    heat = 12.0 * np.random.default_rng(4).integers(0, 2, 8)[(t // 50).astype(int)]
+    inputs = {"heat": heat, "air": 20 + 0 * t}
+    table = compile_plant(load(path)).measure(Table("run", "run", t, inputs), seed=1)
+    path.write_text(ONE_BLOCK)
+    written, threads = [], []
+    for n in (1, 2):
+        monkeypatch.setattr(cores, "_cores", lambda n=n: n)
+        cores._pool.cache_clear()
+        seen = set[int]()
+        side_by_side = cores.each
+
+        def each(f, items, numbers, seen=seen, side_by_side=side_by_side):
+            return side_by_side(lambda x: (seen.add(threading.get_ident()), f(x))[1], items, numbers)
+
+        with monkeypatch.context() as patch:
+            patch.setattr("thermoctl.diagnose.search.each", each)
+            diagnose(load(path), [table], tmp_path / f"out{n}")
+        threads.append(len(seen))
+        found = json.loads((tmp_path / f"out{n}" / "diagnosis.json").read_text())
+        found.pop("seconds")
+        written.append((found, (tmp_path / f"out{n}" / "plant.yaml").read_bytes()))
+    cores._pool.cache_clear()
+    assert threads[0] == 1 < threads[1]  # a single item stays in the thread that asks
+    assert len(written[0][0]["hypotheses"]) > 3
+    assert written[0] == written[1]
+
+
+def test_batches_take_what_is_wanted_from_a_queue_that_grows():
+    queue, taken = [1, 2, 3, 4, 5], []
+    for batch, left in cores.batches(queue, lambda x: x % 2 == 1):
+        taken.append((batch, left))
+        if batch[0] == 1:
+            queue.append(7)
+    assert taken == [([1, 3], 2), ([5, 7], 0)]
+
+
+def test_items_that_are_split_again_are_taken_one_after_the_other(monkeypatch):
+    """More items than threads, each of which waits for others: without the rule none would ever end."""
+    monkeypatch.setattr(cores, "_cores", lambda: 2)
+    cores._pool.cache_clear()
+    found = cores.each(
+        lambda x: sum(cores.each(lambda y: x * y, range(4), cores.LEAST)), range(8), cores.LEAST
+    )
+    cores._pool.cache_clear()
+    assert found == [6 * x for x in range(8)]
