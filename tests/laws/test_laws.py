@@ -21,7 +21,7 @@ from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.experiment.propose import propose, survivors
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law.find import find_law
-from thermoctl.diagnose.law.forms import Place, Signal, Term, library, signals
+from thermoctl.diagnose.law.forms import Place, Signal, Term, families, library, signals
 from thermoctl.diagnose.law.misfit import misfit_odds
 from thermoctl.diagnose.law.propose import PROPOSALS
 from thermoctl.diagnose.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
@@ -158,6 +158,16 @@ def test_parameters_that_scale_together_absorb_no_flow():
     known = case(made.plant, made.tables[:2], {}, Budget(80))
     at = tracked(known, fitted(known, known.plant, (), known.null), ["broth", "substrate"])
     assert at.explained["broth"] > 0.5 > at.explained["substrate"]
+
+
+@pytest.mark.parametrize(("visited", "relays"), [((1.0, 1.0, 1.0), 0), ((0.0, 0.5, 1.0), 1)])
+def test_a_signal_of_one_value_has_no_thresholds(visited, relays):
+    """Nine tenths of a recording at one value: all pairs of thresholds were equal, and the search crashed."""
+    signal = Signal("z", ex.name("z"), None, visited=visited)
+    found = families([signal], [signal], 100.0, 1.0)
+    t = np.arange(100.0)
+    assert sum(f.form.name == "relay" for f in found) == relays
+    assert all(f.values({"z": np.sin(t)}, t).shape == (100, f.count * len(f.form.sizes)) for f in found)
 
 
 def test_a_relay_in_the_plant_switches_where_the_one_of_the_regression_does():

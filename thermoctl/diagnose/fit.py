@@ -21,6 +21,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.memory import Past, PlacedBefore
 from thermoctl.diagnose.noise import Averaged, averaged
+from thermoctl.diagnose.onsets import moved
 from thermoctl.diagnose.posterior import Hypothesis, bounded_step, gaussian
 from thermoctl.diagnose.posterior import Placed as Placed
 from thermoctl.diagnose.posterior import Posterior as Posterior
@@ -38,6 +39,7 @@ DECADES = 4.0  # width of the log-uniform prior of an effect's size
 WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
 SHARE = 0.01  # of an effect's size, from which the first step towards it is taken
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
+MOVES = 2  # refits after the times of jumps were moved
 EDGE = 1e-6  # of a parameter's range, up to which it is at its end
 MOST = 0.9  # of a curvature that not knowing the spectrum may take
 LOG_2PI = float(np.log(2 * np.pi))
@@ -124,6 +126,21 @@ def fitted(
 
     The refit ends early if it stays far from `best`, the best hypothesis so far. `parent`: the cost before
     the last effect was added."""
+    found = _refitted(case, plant, effects, start, best, parent)
+    for _ in range(MOVES):
+        behind = best is not None and found.log_likelihood < best.log_likelihood - HOPELESS
+        later = None if behind else moved(case, found.rough_plant, effects, found.rough)
+        again = later and _refitted(case, later, effects, None, best, parent)
+        if not again or again.log_evidence <= found.log_evidence:
+            break
+        found = again
+    return found
+
+
+def _refitted(
+    case: Case, plant: Plant, effects: Sequence[Placed], start: Fit | None, best: Fitted | None, parent: float
+) -> Fitted:
+    """Refit a plant from one starting point; the arguments are those of `fitted`."""
     case.budget.spend()
     posterior = Posterior(case, plant, effects)
     if start is None:

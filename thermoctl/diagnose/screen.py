@@ -26,6 +26,7 @@ from scipy.special import gammaincc
 from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.metric import Metric, Pushed
+from thermoctl.diagnose.onsets import ONSETS
 from thermoctl.diagnose.overlay import Overlay, Trajectory
 from thermoctl.diagnose.rig import Rig
 from thermoctl.diagnose.shapes import shape_grid
@@ -35,7 +36,6 @@ from thermoctl.plant.cores import ABREAST, LEAST, each
 EPSILON = 1e-4  # amplitude at which a direction is taken
 CHUNK = 96
 EXACT = 4_000  # columns, up to which all are simulated
-ONSETS = 24  # onset times of the grid over the recordings
 NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
 
 

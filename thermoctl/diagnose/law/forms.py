@@ -346,7 +346,7 @@ def families(
             if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
                 shapes = _grid(form, z, duration)
                 out += [Family(form, pair, shapes, duration, sample) for pair in _pairs(form, z, every)]
-    return out
+    return [f for f in out if f.count]  # a signal of one value has no two thresholds
 
 
 def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal, ...]]:
@@ -364,8 +364,10 @@ def _grid(form: Form, z: Signal, duration: float) -> dict[str, np.ndarray]:
 
 def combined(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np.ndarray]:
     """Return all combinations of values, for each name (k,); two equal thresholds are none."""
+    if not values:
+        return {}
     chosen = [v for v in itertools.product(*values.values()) if len(v) == len(set(v))]
-    return dict(zip(values, np.array(chosen).T, strict=False))
+    return dict(zip(values, np.reshape(chosen, (-1, len(values))).T, strict=True))
 
 
 def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:

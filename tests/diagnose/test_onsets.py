@@ -1,0 +1,58 @@
+"""The time of a jump in a refit, and what a wrong one would leave to other names."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.plants import ONE_BLOCK
+from thermoctl.diagnose.candidates import candidates
+from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnose.fit import Placed, fitted
+from thermoctl.diagnose.onsets import moved
+from thermoctl.diagnose.roles import Structure
+from thermoctl.plant import load
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
+
+TRUE, N = 231.0, 400  # s; samples, one a second
+
+
+@pytest.fixture
+def known(tmp_path):
+    """A block whose reading jumps by 1.5 K at 231 s."""
+    path, t = tmp_path / "plant.yaml", np.arange(float(N))
+    path.write_text(ONE_BLOCK)
+    heat = 12.0 * np.random.default_rng(4).integers(0, 2, 8)[(t // 50).astype(int)]
+    table = compile_plant(load(path)).measure(
+        Table("run", "run", t, {"heat": heat, "air": 20 + 0 * t}), seed=1
+    )
+    (reading,) = load(path).outputs.values()
+    columns = {**table.columns, reading.column: table.columns[reading.column] + 1.5 * (t >= TRUE)}
+    return case(load(path), [dataclasses.replace(table, columns=columns)], {}, Budget(20))
+
+
+def placed(known, at):
+    """The plant with an offset step at a time, and the effect."""
+    rig = Structure(known.plant, known.drives(known.null.model), [t.columns for t in known.tables])
+    entry = catalogue((CATALOGUE,))["sensor_offset_step"]
+    c = next(iter(candidates(rig, {entry.name: entry})))
+    plant = c.extend({"A": 0.5, "T0": at}, {"A": (-10.0, 10.0), "T0": (0.0, N - 1.0)})
+    return plant, Placed(c, {p: c.own(p) for p in ("A", "T0")})
+
+
+@pytest.mark.parametrize("off", [-40.0, -7.0, 0.0, 6.0, 60.0])
+def test_a_refit_finds_the_sample_of_a_jump(known, off):
+    plant, effect = placed(known, TRUE + off)
+    f = fitted(known, plant, (effect,))
+    assert f.plant.parameters[effect.own["T0"]].value == pytest.approx(TRUE - 0.5, abs=0.6)
+    assert f.plant.parameters[effect.own["A"]].value == pytest.approx(1.5, abs=0.1)
+
+
+def test_a_jump_that_is_in_place_stays(known):
+    plant, effect = placed(known, TRUE - 0.5)
+    f = fitted(known, plant, (effect,))
+    assert moved(known, f.rough_plant, (effect,), f.rough) is None
