@@ -136,6 +136,19 @@ def test_rows_that_are_needed_are_kept(plant, what):
     assert few.block == 1 and few.tables[0] is table
 
 
+@pytest.mark.parametrize("every", [4, 60])
+def test_the_readings_of_a_slow_sensor_are_kept(tmp_path, every):
+    """A block with one reading in five had no value: position readings of an actuator were lost altogether."""
+    path = tmp_path / "plant.yaml"
+    slow = "  growth: {value: 2 * (block - 20), unit: um, noise: 0.05}\n"
+    path.write_text(SLOW + slow)
+    table = record(load(path), stepped())
+    table.columns["growth"][np.arange(ROWS) % every > 0] = np.nan
+    few = reduced(load(path), [table])
+    kept = np.isfinite(few.tables[0].columns["growth"]).sum() * min(few.block, every)
+    assert kept > 0.9 * ROWS / every
+
+
 def test_the_sensitivity_to_a_start_decays_to_zero(plant):
     """Not to the smallest number of the processor, on which it would take a hundred cycles an operation."""
     table = record(plant, stepped())

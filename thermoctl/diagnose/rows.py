@@ -164,10 +164,15 @@ def _information(
     for j in range(d.y.shape[1]):
         count = np.isfinite(d.y[rows, j]).sum(axis=1)
         mean = columns[rows, j].sum(axis=1) / np.sqrt(np.maximum(count, 1))[:, None]
+        mean[2 * count <= block] = 0.0  # as in `means`: such a block gives no value
         at = np.ix_([*range(k), k + j], [*range(k), k + j])
         gram[at] += mean.T @ mean
-    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    return size**2 / np.diag(np.linalg.pinv(gram / np.outer(size, size), hermitian=True))
+    seen = np.flatnonzero(np.diag(gram) > 0)
+    size = np.sqrt(np.diag(gram)[seen])
+    out = np.zeros(len(gram))
+    scaled = gram[np.ix_(seen, seen)] / np.outer(size, size)
+    out[seen] = size**2 / np.diag(np.linalg.pinv(scaled, hermitian=True))
+    return out
 
 
 def _content(y: np.ndarray) -> int:
