@@ -126,6 +126,7 @@ def fitted(
 
     The refit ends early if it stays far from `best`, the best hypothesis so far. `parent`: the cost before
     the last effect was added."""
+    case.budget.spend()
     found = _refitted(case, plant, effects, start, best, parent)
     for _ in range(MOVES):
         behind = best is not None and found.log_likelihood < best.log_likelihood - HOPELESS
@@ -141,7 +142,6 @@ def _refitted(
     case: Case, plant: Plant, effects: Sequence[Placed], start: Fit | None, best: Fitted | None, parent: float
 ) -> Fitted:
     """Refit a plant from one starting point; the arguments are those of `fitted`."""
-    case.budget.spend()
     posterior = Posterior(case, plant, effects)
     if start is None:
         start = refit.fit(

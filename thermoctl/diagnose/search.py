@@ -158,13 +158,14 @@ def grow(s: Search) -> None:
 def swap(s: Search) -> None:
     """Leave out each effect of the best hypothesis in turn, and extend the rest, until none replaces it.
 
-    So each effect meets its rivals beside the same others, whichever way the beam took."""
+    So each effect meets its rivals beside the same others, whichever way the beam took. The rest itself is
+    refitted without regard to the budget: misfit.py compares the effect with it."""
     while True:
         best = s.best
         effects = best.fitted.hypothesis.effects
         for e in effects if len(effects) > 1 else ():
             rest = tuple(o for o in effects if o is not e)
-            if s.case.budget.spent or frozenset(o.key for o in rest) in s.seen:
+            if s.case.budget.stopped() or frozenset(o.key for o in rest) in s.seen:
                 continue
             parent = s.tried.get(frozenset(o.key for o in rest)) or rebuilt(s, rest, best.fitted, best.fitted)
             if parent is None:
