@@ -8,6 +8,7 @@ import threading
 import numpy as np
 
 from tests.plants import ONE_BLOCK
+from thermoctl.diagnose import search
 from thermoctl.diagnose.run import diagnose
 from thermoctl.plant import cores, load
 from thermoctl.plant.simulate import compile_plant
@@ -33,7 +34,7 @@ def test_one_core_and_two_write_the_same_bytes(tmp_path, monkeypatch):
             return side_by_side(lambda x: (seen.add(threading.get_ident()), f(x))[1], items, numbers)
 
         with monkeypatch.context() as patch:
-            patch.setattr("thermoctl.diagnose.search.each", each)
+            patch.setattr(search, "each", each)
             diagnose(load(path), [table], tmp_path / f"out{n}")
         threads.append(len(seen))
         found = json.loads((tmp_path / f"out{n}" / "diagnosis.json").read_text())

@@ -172,8 +172,11 @@ def difference(plant: Plant, made: Made) -> float:
                 )
         return total / np.asarray(ex.evaluate(p.nodes[made.law.target].storage, known), float)
 
-    with np.errstate(all="ignore"):
-        delta, own = net(plant) - net(made.truth), net(without(made.truth)) - net(made.truth)
+    try:
+        with np.errstate(all="ignore"):
+            delta, own = net(plant) - net(made.truth), net(without(made.truth)) - net(made.truth)
+    except KeyError:  # an effect that is named beside the law adds a state, which the truth lacks
+        return float("inf")
     return float(np.sqrt(np.mean(delta**2) / np.mean(own**2)))
 
 

@@ -113,7 +113,7 @@ def _simulated_sums(
     used, unknowns, slope = problem.slopes(r, values)
     assert run.dy is not None
     dy = run.dy  # of one channel at a time copies are made: a recording has megabytes
-    slopes = (transform(c, dy[:, c.output, used] * slope) for c in channels)
+    slopes = (transform(c, dy[:, c.output, used]) * slope for c in channels)
     return _sums(channels, unknowns, slopes, rows, inverse)
 
 
