@@ -287,5 +287,5 @@ def test_what_a_session_recorded_replays_to_the_bit(config, capsys):
         out = capsys.readouterr().out
         assert "bit for bit" in out and "rig simulated, run 2" in out
         ticks += int(out.split(": ")[1].split()[0])
-    assert ticks > 1000  # seen on the disk of one; a busy machine replays fewer than were seen of both
+    assert ticks > 2000  # what was seen on the disk of the last two
     assert main(["replay", str(config)]) == 2 and "rig.yaml" in capsys.readouterr().err
