@@ -24,7 +24,7 @@ from tests.diagnose.metamorphic import diagnosed, difference, drawn
     [
         (("tanks", 1, "one", "open"), [["sensor_delay", "level_lower"]], [together(order, clock, names)]),
         (("drive", 1, "one", "open"), [["copper_resistance", "joule"]], [together(kelvin, milliwatt)]),
-        (("drive", 0, "none", "open"), [], [together(rows_lost, cells_lost), columns_added]),
+        (("heater", 2, "none", "closed"), [], [together(rows_lost, cells_lost), columns_added]),
     ],
     ids=["order, clock and names", "units", "losses and unrelated columns"],
 )

@@ -34,24 +34,16 @@ def timing(case: Case, f: Fitted) -> list[float]:
     return [float(np.clip(v, 0.0, g.timing)) for v, g in zip(beyond, case.grids, strict=True)]
 
 
-def louder(case: Case, f: Fitted) -> list[str]:
-    """Return sentences about outputs whose noise has more than twice the energy of the stated one."""
+def late(case: Case, f: Fitted) -> list[str]:
+    """Return sentences about outputs that uncertain times make more wrong than the stated noise."""
     out = []
-    for g, late in zip(case.grids, timing(case, f), strict=True):
-        v = floor(g, f.powers, len(f.fit.unknowns)) - g.variance
-        if v <= g.variance:
-            continue
-        name = f.fit.model.outputs[case.coordinates.channels[g.channels[0]].output]
-        unit = case.plant.outputs[name].unit or ""
-        if late >= v:
+    for g, v in zip(case.grids, timing(case, f), strict=True):
+        if v > g.variance:
+            name = f.fit.model.outputs[case.coordinates.channels[g.channels[0]].output]
+            unit = case.plant.outputs[name].unit or ""
             out.append(
                 f"{name} errs by {np.sqrt(v):.2g} {unit} beside its noise, at all frequencies: recorded times that are off by "
                 f"{100 * np.sqrt(v) / g.change:.2g} % of a sampling interval would do that"
-            )
-        else:
-            out.append(
-                f"the noise of {name} is {np.sqrt(v + g.variance):.2g} {unit}, {np.sqrt(v / g.variance + 1):.1f} times the "
-                "stated one: state what `thermoctl noise` learns from a quiet recording"
             )
     return out
 
@@ -59,12 +51,19 @@ def louder(case: Case, f: Fitted) -> list[str]:
 def levels(case: Case, f: Fitted, clean: float) -> list[float]:
     """Return the standard deviation of each output's noise: the stated one, or more if that explains all.
 
-    A stated noise may be wrong by two standard deviations of its prior, the recorded times by one. So
-    variance that is present at all frequencies counts as noise up to there. The residual must then be within
-    `clean` times this noise."""
+    A stated noise and the recorded times may be wrong by one standard deviation of their priors. So variance
+    that is present at all frequencies counts as noise up to there. The residual must then be within `clean`
+    times this noise."""
     out = []
-    for g in case.grids:
-        level = float(np.sqrt(max(floor(g, f.powers, len(f.fit.unknowns)), g.variance)))
+    for g, late in zip(case.grids, timing(case, f), strict=True):
+        lowest, at = np.inf, 0
+        for k in g.channels:
+            inverse = f.average.inverse[k]
+            stated = g.variance * g.shape[g.node[at : at + len(inverse)]]
+            lowest = min(lowest, float(np.min(1 / (inverse * stated))))
+            at += len(inverse)
+        own = g.variance * float(np.clip(lowest, 1.0, np.exp(g.known)))
+        level = float(np.sqrt(max(own, g.variance + late)))
         out.append(level if _rms(f, g) <= clean * level else g.sigma)
     return out
 

@@ -103,8 +103,8 @@ class Grid:
 
     @property
     def most(self) -> float:
-        """Variance of the loudest noise that is still taken for one: two prior sd above the stated one."""
-        return self.variance * float(np.exp(2 * self.known)) + self.timing
+        """Variance of the noise, its parts one prior sd above their medians."""
+        return self.variance * float(np.exp(self.known)) + self.timing
 
     @property
     def small(self) -> float:

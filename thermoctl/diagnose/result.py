@@ -15,7 +15,7 @@ from thermoctl.diagnose.held_out import Worth
 from thermoctl.diagnose.law.find import Law
 from thermoctl.diagnose.law.result import law_entry
 from thermoctl.diagnose.law.smooth import flow_unit
-from thermoctl.diagnose.levels import louder
+from thermoctl.diagnose.levels import late
 from thermoctl.diagnose.misfit import Energy, standouts
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import Left
@@ -143,7 +143,7 @@ def _notes(d: Diagnosis) -> list[str]:
     return [
         *d.case.notes,
         *doubts(d.case, d.final.fit, d.before.noise),
-        *louder(d.case, d.final),
+        *late(d.case, d.final),
         *(
             f"{effect} at {where} is in the extended plant, but is not sure enough to be a finding "
             f"(probability {d.posterior.effects.get((effect, where), 0.0):.2f})"
