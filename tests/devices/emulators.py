@@ -115,9 +115,13 @@ class Port:
                 return
             try:
                 data = os.read(fd, 4096)
+            except BlockingIOError:  # the number was of the wire before this one, and was waited for still
+                return
             except OSError:
-                data = b"" if self.path is None else b"?"
-            if not data and self.path is None:
+                data = b""
+            if not data:
+                if self.path is not None:
+                    return
                 self.fds.remove(fd)
                 self._connections.pop(fd).close()
                 return
