@@ -137,6 +137,11 @@ class _Demo:
         return ask(self.settings.socket.path, {"command": command, **more})
 
     def run(self, seconds: float | None) -> int:
+        """Arm, move and show the rig for `seconds`, or until q is pressed; return the exit status.
+
+        1: a fault in the last status (warnings do not count), or the child has ended. 3: the child was not
+        READY within START_S. Raises InputError when arming is refused or the child has lost its lock.
+        """
         if not self._ready():
             sys.stderr.write(self.child.said())
             return 3
