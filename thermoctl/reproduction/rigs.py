@@ -112,6 +112,7 @@ class _Day:
 
     @property
     def changed_from(self) -> int:
+        """Return the first row, at 1 s a row, of the changed plant; unused where `calibrated_s` is None."""
         return int(self.calibrated_s or 0)
 
 
