@@ -189,7 +189,7 @@ def start_errors(model: Model, excitation: Excitation) -> dict[str, tuple[float,
     if not model.states:
         return {}
     try:
-        run = model.run(excitation, sensitivities=True)
+        run = model.run(excitation.part(0, 2), sensitivities=True)
     except SimulationError:
         return {}
     assert run.dy is not None

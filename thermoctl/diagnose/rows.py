@@ -26,7 +26,8 @@ each has a row of its own, without outputs. An input that changes too often for 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -35,6 +36,7 @@ from scipy.fft import dct
 from scipy.special import chdtri
 
 from thermoctl.diagnose.coordinates import band_edges
+from thermoctl.plant.cores import each_of
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.refit import fit
@@ -106,45 +108,52 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     if before <= LONG:
         return kept
     model = compile_plant(plant)
-    drives = [model.excitation(t) for t in tables]
-    coarse = min(next((b for b in _sizes(len(d.t) // FEWEST) if _allowed(d, b)), 1) for d in drives)
+    coarse = min(
+        next((b for b in _sizes(len(t) // FEWEST) if _allowed(model.excitation(t), b)), 1) for t in tables
+    )
     if coarse == 1:
         return kept
     rough = Reduced([means(model, t, coarse) for t in tables], coarse, before, 0)
-    rough_drives = [model.excitation(t) for t in rough.tables]
+    drives = [model.excitation(t) for t in rough.tables]
+    noise = rough.noise(plant, drives)
     try:
-        found = fit(model, rough_drives, rough.noise(plant, drives), tolerance=1e-3, seconds=np.inf)
-        problem = Problem(model, drives, default_noise(plant, drives))
-        point = found.values, found.dx0
-        block = min(problem.each(_block, point, lambda r: (coarse,), 2))
+        found = fit(model, drives, noise, tolerance=1e-3, seconds=np.inf)
+        point = list(zip(found.values, found.dx0, [coarse] * len(tables), strict=True))
+        numbers = before * len(model.states) * len(model.unknowns)
+        block = min(each_of(_block, [(model, t) for t in tables], point, numbers))
     except SimulationError:
         return kept
     if block == 1:
         return kept
-    out = [means(model, t, block, *of_t) for t, *of_t in zip(tables, *point, strict=True)]
+    out = [means(model, t, block, *at[:2]) for t, at in zip(tables, point, strict=True)]
     return Reduced(out, block, before, sum(map(len, out)))
 
 
-def _block(problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, coarse: int) -> int:
+def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse: int) -> int:
     """Return the largest block, at most `coarse`, that a recording allows."""
-    d = problem.excitations[r]
-    run = problem.model.run(d, values, dx0, sensitivities=True, states=False)
-    used, unknowns, slope = problem.slopes(r, values)
-    content = max(_content(e) for e in (d.y - run.y).T)
-    assert run.dy is not None
-    columns = np.concatenate(
-        [run.dy[:, :, used] * slope, np.gradient(run.y, d.t, axis=0)[:, :, None]], axis=2
-    )
-    columns /= np.array([n.sigma for n in problem.noise])[:, None]
-    columns[~np.isfinite(d.y)] = 0.0
+    model, d = of[0], of[0].excitation(of[1])
+    problem = Problem(model, [d], default_noise(model.plant, [d]))
+    run = model.run(d, values, dx0, sensitivities=True, states=False)
+    used, unknowns, slope = problem.slopes(0, values)
     prior = problem.prior()[unknowns]
+    content = max(_content(e) for e in (d.y - run.y).T)
+
+    def columns(j: int) -> np.ndarray:
+        """Whitened changes (N, k + 1) of an output's readings by the unknowns, then by its delay."""
+        assert run.dy is not None
+        by = np.column_stack([run.dy[:, j, used] * slope, np.gradient(run.y[:, j], d.t)])
+        return np.where(np.isfinite(d.y[:, j, None]), by / problem.noise[j].sigma, 0.0)
+
     whole = _information(columns, d, np.arange(len(d.t)), 1, prior)
 
     def enough(b: int) -> bool:
+        if not _allowed(d, b):
+            return False
         return bool((_information(columns, d, _starts(d, b), b, prior) >= whole / WIDER**2).all())
 
     sizes = _sizes(min(coarse, int(len(d.t) / (HALF_BAND * content + 1))))
-    return next((b for b in sizes if _allowed(d, b) and enough(b)), 1)
+    at = bisect_left(sizes, True, key=enough)  # the larger a block, the more it loses
+    return sizes[at] if at < len(sizes) else 1
 
 
 def _sizes(most: int) -> list[int]:
@@ -153,17 +162,17 @@ def _sizes(most: int) -> list[int]:
 
 
 def _information(
-    columns: np.ndarray, d: Excitation, starts: np.ndarray, block: int, prior: np.ndarray
+    columns: Callable[[int], np.ndarray], d: Excitation, starts: np.ndarray, block: int, prior: np.ndarray
 ) -> np.ndarray:
     """Return the information on each of k unknowns, then on a delay of each output, in means of blocks.
 
-    `columns` (N, outputs, k + 1): whitened changes of the readings by the unknowns, and by the output's
-    delay, 0 where nothing was measured. `prior` (k,): of the unknowns."""
+    `columns` of an output (N, k + 1): whitened changes of its readings by the unknowns, and by its delay, 0
+    where nothing was measured. `prior` (k,): of the unknowns."""
     k, rows = len(prior), starts[:, None] + np.arange(block)
     gram = np.diag(np.concatenate([prior, np.zeros(d.y.shape[1])]))
     for j in range(d.y.shape[1]):
         count = np.isfinite(d.y[rows, j]).sum(axis=1)
-        mean = columns[rows, j].sum(axis=1) / np.sqrt(np.maximum(count, 1))[:, None]
+        mean = columns(j)[rows].sum(axis=1) / np.sqrt(np.maximum(count, 1))[:, None]
         mean[2 * count <= block] = 0.0  # as in `means`: such a block gives no value
         at = np.ix_([*range(k), k + j], [*range(k), k + j])
         gram[at] += mean.T @ mean

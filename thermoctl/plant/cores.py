@@ -88,3 +88,13 @@ def elsewhere(workers: Workers) -> Iterator[None]:
 def workers() -> Workers | None:
     """Return the workers to compute on; None: this process."""
     return _elsewhere[-1] if _elsewhere else None
+
+
+def each_of(
+    f: Callable[..., R], things: Sequence[Any], arguments: Sequence[tuple[Any, ...]], numbers: int
+) -> list[R]:
+    """Return f(thing, *arguments) of each thing, here side by side (`each`) or by workers."""
+    far = workers() if len(things) > 1 else None
+    if far is not None:
+        return far.each(f, [far.hold(x) for x in things], arguments)
+    return each(lambda k: f(things[k], *arguments[k]), range(len(things)), numbers)
