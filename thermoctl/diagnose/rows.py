@@ -54,8 +54,7 @@ FEWEST = 1_000  # rows that each recording keeps: forty bands, the highest with 
 # Faster content has at most WHITE - 1 = 10 % of the noise's power: 2 % of the highest band are lost.
 HALF_BAND = 2.0  # the new highest frequency over that of the fastest content
 WHITE = 1.1  # times the power of the highest rows, up to which a band is white
-DEVIATIONS = 4.0  # of a band's power that are chance: wrong at one output in a thousand
-CHANCE = 1e-3  # that one of the rows of white noise is taken for an oscillation
+CHANCE = 1e-3  # that white noise of any output in any recording fails one of the two tests
 AVERAGED = 1e-3  # share of an input's variance that averaging may remove: the mean of its square is as exact
 OUTLIER = 6.0  # robust standard deviations from the median of its neighbours, beyond which a cell is dropped
 GAP = 1.5  # times the usual duration of a block, beyond which rows are missing in it: it gives no value
@@ -118,7 +117,8 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     noise = rough.noise(plant, drives)
     try:
         found = fit(model, drives, noise, tolerance=1e-3, seconds=np.inf)
-        point = list(zip(found.values, found.dx0, [coarse] * len(tables), strict=True))
+        chance = CHANCE / (len(tables) * len(model.outputs))
+        point = [(*at, coarse, chance) for at in zip(found.values, found.dx0, strict=True)]
         numbers = before * len(model.states) * len(model.unknowns)
         block = min(each_of(_block, [(model, t) for t in tables], point, numbers))
     except SimulationError:
@@ -129,14 +129,16 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     return Reduced(out, block, before, sum(map(len, out)))
 
 
-def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse: int) -> int:
-    """Return the largest block, at most `coarse`, that a recording allows."""
+def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse: int, chance: float) -> int:
+    """Return the largest block, at most `coarse`, that a recording allows.
+
+    `chance`: that an output's white noise fails a test."""
     model, d = of[0], of[0].excitation(of[1])
     problem = Problem(model, [d], default_noise(model.plant, [d]))
     run = model.run(d, values, dx0, sensitivities=True, states=False)
     used, unknowns, slope = problem.slopes(0, values)
     prior = problem.prior()[unknowns]
-    content = max(_content(e) for e in (d.y - run.y).T)
+    content = max(_content(e, chance) for e in (d.y - run.y).T)
 
     def columns(j: int) -> np.ndarray:
         """Whitened changes (N, k + 1) of an output's readings by the unknowns, then by its delay."""
@@ -184,8 +186,8 @@ def _information(
     return out
 
 
-def _content(y: np.ndarray) -> int:
-    """Return the DCT row above which a signal is white."""
+def _content(y: np.ndarray, chance: float) -> int:
+    """Return the DCT row above which a signal is white. `chance`: that white noise fails a test."""
     y = y[np.isfinite(y)]
     if len(y) < FEWEST or not np.ptp(y):
         return 0
@@ -195,8 +197,8 @@ def _content(y: np.ndarray) -> int:
     edges = band_edges(len(power))
     count = np.diff(edges)
     mean = np.add.reduceat(power, edges[:-1]) / count
-    loud = edges[1:][mean > floor * (WHITE + DEVIATIONS * np.sqrt(2 / count))]
-    lines = np.flatnonzero(power > floor * chdtri(1, CHANCE / len(power))) + 1
+    loud = edges[1:][mean > floor * (WHITE - 1 + chdtri(count, chance / len(count)) / count)]
+    lines = np.flatnonzero(power > floor * chdtri(1, chance / len(power))) + 1
     return int(max(loud.max(initial=0), lines.max(initial=0)))
 
 
