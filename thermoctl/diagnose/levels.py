@@ -19,7 +19,7 @@ def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
 
     Errors of a plant fall with frequency. Power that is there at all frequencies is noise. `absorbed`: number
     of unknowns of a refit, which may have absorbed that many rows, all of them in one octave."""
-    power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels])) / g.shape
+    power = g.power(powers) / g.shape
     octave = np.cumsum(np.append(0.0, np.diff(np.log2(g.turn)))).astype(int)
     rows = np.bincount(octave, g.count) - absorbed
     told = rows > 0

@@ -1,4 +1,8 @@
-"""Whitened rows of a refitted hypothesis, and the directions that its own parameters absorb."""
+"""Whitened rows of a refitted hypothesis, and what its own unknowns absorb of them.
+
+Unknowns with a Gaussian prior of covariance P and sensitivities J add J P J' to the rows' covariance. With
+J sqrt(P) = U s W' the covariance's inverse root takes 1 - 1 / sqrt(1 + s^2) off each direction of U: all of
+what the data determine well, little of what the prior holds."""
 
 from __future__ import annotations
 
@@ -9,8 +13,6 @@ import numpy as np
 
 from thermoctl.plant.refit import Fit
 from thermoctl.plant.simulate import Excitation, Model, Simulation
-
-ABSENT = 1e-6  # share of a sensitivity, below which others imitate it
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,9 @@ class Metric:
     """Whitened rows of a refitted hypothesis, as the screening needs them; a subclass fills them.
 
     - `weight` (rows,): factor of each row that whitens it
-    - `residual` (rows,): the residual, without what the plant's own parameters absorb
-    - `own`: of each recording, orthonormal (rows, k): the directions that its own unknowns absorb
-    - `basis` (rows, k): orthonormal; the directions that the other parameters absorb besides"""
+    - `residual` (rows,): of the plant's own unknowns at their priors' means, without what these absorb
+    - `own`: what the own unknowns of each recording absorb
+    - `shared`: what the other parameters absorb besides"""
 
     fit: Fit
     model: Model
@@ -38,8 +40,8 @@ class Metric:
     runs: list[Simulation]
     weight: np.ndarray
     residual: np.ndarray
-    own: list[np.ndarray]
-    basis: np.ndarray
+    own: list[Absorbed]
+    shared: Absorbed
 
     def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
@@ -56,19 +58,33 @@ class Metric:
         raise NotImplementedError
 
     def project(self, d: np.ndarray) -> np.ndarray:
-        """Return directions (rows, k) without the part that the plant's own parameters absorb."""
-        d = without(self.own, d)
-        return d - self.basis @ (self.basis.T @ d)
+        """Return directions (rows, ...) without the part that the plant's own unknowns absorb."""
+        return self.shared.without(without(self.own, d))
+
+    def pulled(self, w: np.ndarray) -> np.ndarray:
+        """Return rows (rows, ...) whose products with directions are those of w with projected ones."""
+        return without(self.own, self.shared.without(w))
 
 
-def without(own: Sequence[np.ndarray], d: np.ndarray) -> np.ndarray:
-    """Return rows (rows, ...) of all recordings without what each one's orthonormal basis spans."""
-    parts = np.split(d, np.cumsum([len(q) for q in own])[:-1])
-    return np.concatenate([x - q @ (q.T @ x) for q, x in zip(own, parts, strict=True)])
+@dataclass(frozen=True)
+class Absorbed:
+    """Orthonormal directions (rows, k), and the share (k,) of each that unknowns absorb."""
+
+    directions: np.ndarray
+    share: np.ndarray
+
+    @classmethod
+    def by(cls, columns: np.ndarray) -> Absorbed:
+        """Return what unknowns absorb; `columns` (rows, k): changes by independent prior deviations."""
+        u, s, _ = np.linalg.svd(columns, full_matrices=False)
+        return cls(u, 1 - 1 / np.sqrt(1 + s**2))
+
+    def without(self, x: np.ndarray) -> np.ndarray:
+        """Return rows (rows, ...) less the absorbed share of each direction."""
+        return x - (self.directions * self.share) @ (self.directions.T @ x)
 
 
-def span(columns: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (rows, k) of columns; parts below ABSENT of their `size` are left out."""
-    there = size > 0
-    u, s, _ = np.linalg.svd(columns[:, there] / size[there], full_matrices=False)
-    return u[:, s > ABSENT]
+def without(own: Sequence[Absorbed], d: np.ndarray) -> np.ndarray:
+    """Return rows (rows, ...) of all recordings without what each one's unknowns absorb."""
+    parts = np.split(d, np.cumsum([len(q.directions) for q in own])[:-1])
+    return np.concatenate([q.without(x) for q, x in zip(own, parts, strict=True)])

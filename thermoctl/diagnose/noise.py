@@ -24,7 +24,7 @@ Laplace's method.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +53,7 @@ WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a wh
 STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the predicted gain that ends it
 LONGEST = 10.0  # step in a logarithm that is tried
 DAMPED = 0.01  # first damping of a step, as a share of the curvature
+LITTLE = 1.0  # nats of one output, up to which a predicted rise is taken to first order: rms error 0.02
 LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -79,6 +80,10 @@ class Grid:
     change: float  # w above, the output's change in a sampling interval, in its unit
     swing: float  # rms of the output about its mean
     sensor: SensorNoise | None  # the parts of the stated noise
+
+    def power(self, powers: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the power at each frequency (nodes,) from the bands' of all channels of all outputs."""
+        return np.bincount(self.node, np.concatenate([powers[k] for k in self.channels]))
 
     @property
     def variance(self) -> float:
@@ -182,33 +187,76 @@ class Averaged:
     unsure: list[np.ndarray]
 
 
+@dataclass(frozen=True)
+class _Output:
+    """The same of one output; `inverse` (nodes,): E[1/V] at each of its frequencies.
+
+    `at`: x at the maximum of each density."""
+
+    log_likelihood: float
+    inverse: np.ndarray
+    sensor: float
+    remainder: float
+    unsure: np.ndarray
+    at: tuple[np.ndarray, ...]
+
+
 def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
     """Average the likelihood of banded `powers` (one a channel) over noise and remainder."""
+    found = [_output(g, g.power(powers)) for g in grids]
     inverse: list[np.ndarray] = [np.zeros(0)] * sum(len(g.channels) for g in grids)
-    total, sensor, present, unsure = 0.0, [], [], []
-    for g in grids:
-        power = np.bincount(g.node, np.concatenate([powers[k] for k in g.channels]))
-        power = np.maximum(power, LEAST * g.variance * g.count)
-        noises = [_Noise(g, power, slow) for slow in ([False] if g.sensor else [False, True])]
-        some = _Remainder(g, power, block_diag(np.diag(g.scales**-2.0), g.rough))
-        found = [*(_laplace(c) for c in noises), _laplace(some)]
-        odds = ABSENT * np.array([1.0] if g.sensor else [WHITE, 1 - WHITE])
-        scores = np.log(np.append(odds, 1 - ABSENT)) + [f.log_p for f in found]
-        whole = float(logsumexp(scores))
-        weight = np.exp(scores - whole)
-        each = np.array([1 / f.variance for f in found])
-        mean = weight @ each
-        at = 0
-        for k in g.channels:
-            inverse[k] = mean[g.node[at : at + len(powers[k])]]
-            at += len(powers[k])
-        total += whole
-        sensor.append(float(weight @ [f.sensor for f in found]))
-        present.append(float(weight[-1]))
-        apart = each - mean
-        within = sum(w * f.unsure for w, f in zip(weight, found, strict=True))
-        unsure.append(within + (apart.T * weight) @ apart)
-    return Averaged(total, inverse, sensor, present, unsure)
+    for g, f in zip(grids, found, strict=True):
+        parts = np.split(f.inverse[g.node], np.cumsum([len(powers[k]) for k in g.channels])[:-1])
+        for k, part in zip(g.channels, parts, strict=True):
+            inverse[k] = part
+    return Averaged(
+        sum(f.log_likelihood for f in found),
+        inverse,
+        [f.sensor for f in found],
+        [f.remainder for f in found],
+        [f.unsure for f in found],
+    )
+
+
+def rise(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Callable[[Sequence[np.ndarray]], float]:
+    """Return a function: by how much the log likelihood of other powers is above that of these.
+
+    d log p / dP = -E[1/V] / 2. Where that makes less than LITTLE, the output is not averaged again. Else the
+    maxima are looked for from the known ones."""
+    known = [(g, p := g.power(powers), _output(g, p)) for g in grids]
+
+    def above(others: Sequence[np.ndarray]) -> float:
+        total = 0.0
+        for g, p, f in known:
+            other = g.power(others)
+            first = -0.5 * f.inverse * (other - p)
+            little = np.abs(first).sum() < LITTLE
+            total += (
+                float(first.sum()) if little else _output(g, other, f.at).log_likelihood - f.log_likelihood
+            )
+        return total
+
+    return above
+
+
+def _output(g: Grid, power: np.ndarray, near: Sequence[np.ndarray | None] = (None,) * 3) -> _Output:
+    """Average the likelihood of an output's power at each frequency (nodes,). `near`: x to start from."""
+    power = np.maximum(power, LEAST * g.variance * g.count)
+    densities: list[_Noise | _Remainder]
+    densities = [_Noise(g, power, slow) for slow in ([False] if g.sensor else [False, True])]
+    densities.append(_Remainder(g, power, block_diag(np.diag(g.scales**-2.0), g.rough)))
+    found = [_laplace(d, x) for d, x in zip(densities, near, strict=False)]
+    odds = ABSENT * np.array([1.0] if g.sensor else [WHITE, 1 - WHITE])
+    scores = np.log(np.append(odds, 1 - ABSENT)) + [f.log_p for f in found]
+    whole = float(logsumexp(scores))
+    weight = np.exp(scores - whole)
+    each = np.array([1 / f.variance for f in found])
+    mean = weight @ each
+    apart = each - mean
+    within = sum(w * f.unsure for w, f in zip(weight, found, strict=True))
+    sensor = float(weight @ [f.sensor for f in found])
+    unsure = within + (apart.T * weight) @ apart
+    return _Output(whole, mean, sensor, float(weight[-1]), unsure, tuple(f.x for f in found))
 
 
 @dataclass(frozen=True)
@@ -330,17 +378,18 @@ class _Remainder:
 
 @dataclass(frozen=True)
 class _Found:
-    """One case: log p(R), the noise's variance, V at each frequency, and the covariance of 1/V."""
+    """One case: x at the maximum, log p(R), the noise's variance, V at each frequency, and the covariance of 1/V."""
 
+    x: np.ndarray
     log_p: float
     sensor: float
     variance: np.ndarray
     unsure: np.ndarray
 
 
-def _laplace(d: _Noise | _Remainder) -> _Found:
-    """Integrate a density about its maximum, which Newton's method with damping finds."""
-    g, at = d.grid, d.at(d.start())
+def _laplace(d: _Noise | _Remainder, near: np.ndarray | None = None) -> _Found:
+    """Integrate a density about its maximum, which Newton's method with damping finds from x `near`."""
+    g, at = d.grid, d.at(d.start() if near is None else near)
     damping = 0.0
     for _ in range(STEPS):
         h = at.curvature
@@ -358,4 +407,4 @@ def _laplace(d: _Noise | _Remainder) -> _Found:
     score -= float(np.log(np.diag(factor)).sum())
     moves = solve_triangular(factor, (at.slope / at.variance[:, None]).T, lower=True)
     timing = g.clock * np.exp(at.x[len(g.scales) - 1])
-    return _Found(score, float(g.variance * (np.exp(at.x[0]) + timing)), at.variance, moves.T @ moves)
+    return _Found(at.x, score, float(g.variance * (np.exp(at.x[0]) + timing)), at.variance, moves.T @ moves)

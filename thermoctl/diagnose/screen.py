@@ -1,8 +1,9 @@
 """Score test of every effect at every place: how much of the residual it could explain, without a refit.
 
-    r: whitened residual of the refit,  Q: orthonormal basis of what the plant's parameters absorb
-    d: first-order change of the outputs by an effect, whitened;  d' = d - Q Q^T d
-    gain = (d'^T r)^2 / (d'^T d')
+    r: whitened residual of the refit, its unknowns moved back to their priors' means
+    d: first-order change of the outputs by an effect, whitened
+    r', d': the same without what the plant's unknowns absorb (metric.py)
+    gain = (d'^T r')^2 / (d'^T d')
 
 The gain is chi-square with one degree of freedom (k for k amplitudes) where nothing is missing.
 d comes from the effect laid over the plant. Its change of dx/dt along the fitted trajectory drives the

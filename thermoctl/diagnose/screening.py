@@ -13,8 +13,9 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnose.fit import Fitted, as_refitted
 from thermoctl.diagnose.levels import over_noise
-from thermoctl.diagnose.metric import Metric, Pushed, span, without
-from thermoctl.diagnose.noise import Averaged, averaged, grid
+from thermoctl.diagnose.metric import Absorbed, Metric, Pushed, without
+from thermoctl.diagnose.noise import Averaged, grid, rise
+from thermoctl.diagnose.posterior import priors
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Norms, screen
 from thermoctl.diagnose.sketch import likeliest
@@ -22,11 +23,14 @@ from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import Simulation
 
 ROWS = 6_000  # largest number of DCT rows, all outputs and recordings together
+FREE = 1e-8  # factor on the precision of a prior that does not count
 PROMISED = 30  # directions whose gain in log likelihood is predicted
 
 
 class Plain:
-    """DCT rows of a refitted hypothesis, not whitened: of its residual and of its sensitivities."""
+    """DCT rows of a refitted hypothesis, not whitened: of its residual and of its sensitivities.
+
+    Sensitivities are to z (residuals.py). `mean`, `precision`: of the prior of z."""
 
     def __init__(self, case: Case, fitted: Fitted, most: int):
         self.case, self.fit, self.model = case, fitted.rough, fitted.rough.model
@@ -42,6 +46,7 @@ class Plain:
         ]
         self.channels = [self.coordinates.of_recording(r) for r in range(len(self.drives))]
         self.point = self.fit.values, self.fit.dx0
+        _, self.mean, self.precision, *_ = priors(case, self.problem, fitted.hypothesis.effects)
         found = self.problem.each(_sensitive, self.point, lambda r: (self.channels[r],), 2)
         self.runs = [run for run, _, _ in found]
         self.residual = np.concatenate([residual for _, residual, _ in found])
@@ -67,7 +72,8 @@ def _sensitive(
     d = problem.excitations[r]
     run = problem.model.run(d, values, dx0, sensitivities=True, states=False)
     assert run.dy is not None
-    rows = _rows(channels, run.dy[:, :, problem.columns[r] >= 0])
+    used, _, slope = problem.slopes(r, values)
+    rows = _rows(channels, run.dy[:, :, used]) * slope
     return Simulation(run.t, run.x, run.y), _rows(channels, d.y - run.y), rows
 
 
@@ -94,38 +100,42 @@ class Rows(Metric):
     """Whitened rows of a refitted hypothesis: DCT rows divided by the rms of their noise.
 
     `average`: spectra of the refit's residuals. `remainder`: does the remainder count as noise, too? If so,
-    errors at low frequencies have little weight."""
+    errors at low frequencies have little weight. Without it the unknowns are free, as in a refit that brings
+    the run closest to the data: a plant that is far off may need values that its priors do not expect."""
 
     def __init__(self, plain: Plain, average: Averaged, remainder: bool):
         self.plain, self.fit, self.model = plain, plain.fit, plain.model
         self.drives, self.runs = plain.drives, plain.runs
         self.weights = _weights(plain.case, average, plain.coordinates, remainder)
         self.weight = np.concatenate(self.weights)
-        self._absorb()
-        self.residual = self.project(plain.residual * self.weight)
-        self.now = self.log_likelihood(self.residual)
+        moved = self._absorb(plain.precision if remainder else FREE * plain.precision)
+        self.residual = self.project((plain.residual + moved) * self.weight)
+        self.above = self.rise(self.residual)
 
-    def _absorb(self) -> None:
-        """Set the bases of what the free unknowns absorb.
+    def _absorb(self, precision: np.ndarray) -> np.ndarray:
+        """Set what the unknowns absorb; return how far they moved the outputs, not whitened (rows,).
 
-        Initial states act in their own recording only: their bases are small, however many recordings."""
-        unknowns = self.plain.problem.unknowns
+        `precision` (k, k): of their prior. Those at an end of their range absorb nothing. Initial states act in
+        their own recording only: their directions are few, however many recordings."""
+        unknowns, plain = self.plain.problem.unknowns, self.plain
         free = np.array([q not in self.fit.at_bound for q, _ in unknowns], bool)
-        shared = np.flatnonzero(free & np.array([of is None for _, of in unknowns], bool))
-        place = {int(k): at for at, k in enumerate(shared)}
-        self.own, common = [], []
-        edges = np.cumsum([len(s) for s in self.plain.sensitivities])[:-1]
+        of_one = np.array([of is not None for _, of in unknowns], bool)
+        shared = np.flatnonzero(free & ~of_one)
+        sd = 1 / np.sqrt(np.where(of_one, np.diag(precision), 1.0))
+        offset = np.where(free, self.fit.z - plain.mean, 0.0)
+        self.own, common, moved = [], [], []
+        edges = np.cumsum([len(s) for s in plain.sensitivities])[:-1]
         for r, weight in enumerate(np.split(self.weight, edges)):
-            rows, ks = self.plain.sensitivities[r] * weight[:, None], self.plain.unknowns(r)
-            mine = rows[:, [bool(free[k]) and unknowns[k][1] is not None for k in ks]]
-            self.own.append(span(mine, np.linalg.norm(mine, axis=0)))
-            part = np.zeros((len(rows), len(shared)))
-            for c, k in enumerate(ks):
-                if int(k) in place:
-                    part[:, place[int(k)]] = rows[:, c]
-            common.append(part)
-        joined = np.concatenate(common)
-        self.basis = span(without(self.own, joined), np.linalg.norm(joined, axis=0))
+            rows, ks = plain.sensitivities[r] * weight[:, None], plain.unknowns(r)
+            moved.append(plain.sensitivities[r] @ offset[ks])
+            mine = free[ks] & of_one[ks]
+            self.own.append(Absorbed.by(rows[:, mine] * sd[ks[mine]]))
+            place = np.full(len(unknowns), -1)
+            place[ks] = np.arange(len(ks))
+            common.append(np.where(place[shared] >= 0, rows[:, place[shared]], 0.0))
+        root = np.linalg.inv(np.linalg.cholesky(precision[np.ix_(shared, shared)])).T
+        self.shared = Absorbed.by(without(self.own, np.concatenate(common)) @ root)
+        return np.concatenate(moved)
 
     def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
@@ -156,18 +166,24 @@ class Rows(Metric):
         x = self.unweighted(r, e)
         return x * weight.reshape(-1, *([1] * (x.ndim - 1)))
 
-    def log_likelihood(self, rows: np.ndarray) -> float:
-        """Of whitened rows (all recordings, one after the other), noise and remainder averaged."""
+    def rise(self, rows: np.ndarray) -> Callable[[np.ndarray], float]:
+        """Return a function: by how much the log likelihood of other rows is above that of these.
+
+        Rows are whitened, of all recordings; noise and remainder are averaged."""
+        above = rise(self.plain.grids, self._powers(rows))
+        return lambda others: above(self._powers(others))
+
+    def _powers(self, rows: np.ndarray) -> list[np.ndarray]:
         edges = np.cumsum([len(w) for w in self.weights])[:-1]
         plain = [x / w for x, w in zip(np.split(rows, edges), self.weights, strict=True)]
-        return averaged(self.plain.grids, self.plain.coordinates.powers(plain)).log_likelihood
+        return self.plain.coordinates.powers(plain)
 
     def promise(self, d: Direction) -> float:
         """Return the predicted gain in log likelihood of a first-order step along the direction."""
         if d.vector is None or d.gain <= 0:
             return 0.0
         v = d.vector.astype(float)
-        return self.log_likelihood(self.residual - v * (v @ self.residual)) - self.now
+        return self.above(self.residual - v * (v @ self.residual))
 
 
 def _weights(case: Case, average: Averaged, coordinates: Coordinates, remainder: bool) -> list[np.ndarray]:

@@ -12,6 +12,7 @@ from thermoctl.plant.expression import Expr, name
 from thermoctl.plant.simulate import Simulation
 
 REPEATED = 2.0  # periods over the span: fewer do not repeat
+BEYOND = 1 / 3, 2 / 3  # shares of the way from the last quantile to the extreme
 SLOW_TURNS, FINE_TURNS = 60.0, 4000  # each is looked at up to the first, the strongest up to the second
 
 
@@ -131,4 +132,7 @@ def _levels(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid
         z, quantiles = np.abs(z), [0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98]
     if kind == "end_levels" and candidate.variant == 1:
         quantiles = [1 - q for q in quantiles]
-    return [{"level": float(v)} for v in np.unique(np.quantile(z, quantiles))]
+    end = float(np.quantile(z, round(quantiles[-1])))
+    levels = np.quantile(z, quantiles)
+    beyond = levels[-1] + np.array(BEYOND) * (end - levels[-1])  # a start or a pulse may be all that is there
+    return [{"level": float(v)} for v in np.unique([*levels, *beyond])]

@@ -1,17 +1,17 @@
 """The likeliest of many thousand directions, without a simulation of each.
 
-    gain = (d' r)^2 / |P d|^2,    d = W B y(q)
+    gain = ((P d)' r)^2 / |P d|^2,    d = W B y(q)
 
 - y(q): first-order response of the outputs to an effect's forces q (screen.py)
 - B: samples to DCT rows; W: the weights that whiten them; r: residual
-- P: projection that removes the part that the plant's own parameters absorb
+- P: takes off the part that the plant's own unknowns absorb
 
 The product of d with a row vector w is an inner product with the forces:
 
     w' d = sum_n q_n' l_n,    -dl/dt = J' l + B' W w
 
 l is a run of the adjoint plant, backwards, for each w. One run gives the numerators of all directions.
-SKETCHES more give the norms: with random signs s_k, the mean of (s_k' P d)^2 is |P d|^2. Its relative
+SKETCHES more give the norms: with random signs s_k, the mean of ((P' s_k)' d)^2 is |P d|^2. Its relative
 standard deviation is sqrt(2 / SKETCHES). Links between all pairs of N bodies then cost products, and no
 simulation."""
 
@@ -72,8 +72,8 @@ def products(
 def _vectors(metric: Metric) -> np.ndarray:
     """Return the residual and the sketches (rows, 1 + SKETCHES), with the weights that whiten a row."""
     signs = np.random.default_rng(23).choice([-1.0, 1.0], (len(metric.weight), SKETCHES))
-    whole = np.concatenate([metric.residual[:, None], metric.project(signs) / np.sqrt(SKETCHES)], axis=1)
-    return whole * metric.weight[:, None]
+    whole = np.concatenate([metric.residual[:, None], signs / np.sqrt(SKETCHES)], axis=1)
+    return metric.pulled(whole) * metric.weight[:, None]
 
 
 def _scored(columns: Sequence[Column], products: np.ndarray) -> Direction | None:

@@ -175,7 +175,7 @@ def _promise(at: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
     scale = np.linalg.norm(x, axis=0)
     scale[scale == 0] = 1.0
     c = np.linalg.lstsq(x / scale, at.target, rcond=1e-8)[0] / scale
-    return at.metric.log_likelihood(at.target - x @ c) - at.now, c
+    return at.above(at.target - x @ c), c
 
 
 def _singles(at: Tracked, place: Place, found: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:

@@ -12,7 +12,7 @@ likelihood."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -59,9 +59,9 @@ class Tracked:
     _units: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     @cached_property
-    def now(self) -> float:
-        """Log likelihood of the target without a law."""
-        return self.metric.log_likelihood(self.target)
+    def above(self) -> Callable[[np.ndarray], float]:
+        """By how much the log likelihood of other rows is above that of the target."""
+        return self.metric.rise(self.target)
 
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
         """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording.
