@@ -11,9 +11,9 @@ from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import as_refitted, fitted, with_residuals
 from thermoctl.diagnose.law.smooth import _smoothed
 from thermoctl.diagnose.overlay import _filtered
-from thermoctl.diagnose.posterior import BELIEF, Posterior
+from thermoctl.diagnose.posterior import Posterior
 from thermoctl.diagnose.run import diagnose
-from thermoctl.diagnose.screening import ROWS, Plain, Rows
+from thermoctl.diagnose.screening import FREE, ROWS, Plain, Rows
 from thermoctl.plant import residuals
 
 
@@ -23,7 +23,7 @@ def known(tmp_path_factory):
     return case(plant, tables, {}, Budget(9))
 
 
-def test_the_metric_is_that_of_noise_and_all_unknowns_within_their_priors(known):
+def test_the_metric_is_that_of_noise_free_parameters_and_starts_within_their_priors(known):
     """Against the covariance of all rows: the noise's and the one that all unknowns add, side by side."""
     null = fitted(known, known.plant, (), known.null)
     plain = Plain(known, null, ROWS)
@@ -33,13 +33,13 @@ def test_the_metric_is_that_of_noise_and_all_unknowns_within_their_priors(known)
         whole[at : at + len(rows), plain.unknowns(r)] = rows
         at += len(rows)
     free = [q not in metric.fit.at_bound for q, _ in plain.problem.unknowns]
-    precision = np.where(np.arange(len(free)) < plain.problem.n_parameters, BELIEF**-2, 1.0)
+    starts = np.arange(len(free)) >= plain.problem.n_parameters
     whole *= metric.weight[:, None]
-    j = (whole / np.sqrt(precision))[:, free]
+    j = (whole * np.where(starts, 1.0, FREE))[:, free]
     inverse = np.linalg.inv(np.eye(len(j)) + j @ j.T)
     d = np.random.default_rng(1).standard_normal((len(metric.weight), 4))
     assert np.allclose(metric.project(d).T @ metric.project(d), d.T @ inverse @ d, rtol=1e-6)
-    at_priors = plain.residual * metric.weight + (whole * free) @ (metric.fit.z - metric.plain.mean)
+    at_priors = plain.residual * metric.weight + whole @ (starts * metric.fit.z)
     assert np.allclose(metric.project(d).T @ metric.residual, d.T @ inverse @ at_priors, rtol=1e-6)
     assert np.allclose(metric.pulled(metric.residual) @ d, d.T @ inverse @ at_priors, rtol=1e-6)
 

@@ -30,7 +30,7 @@ class Metric:
     """Whitened rows of a refitted hypothesis, as the screening needs them; a subclass fills them.
 
     - `weight` (rows,): factor of each row that whitens it
-    - `residual` (rows,): of the plant's own unknowns at their priors' means, without what these absorb
+    - `residual` (rows,): with starts at their priors' means, without what the plant's own unknowns absorb
     - `own`: what the own unknowns of each recording absorb
     - `shared`: what the other parameters absorb besides"""
 

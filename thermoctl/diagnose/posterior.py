@@ -18,7 +18,6 @@ from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.coordinates import Channel, transform
-from thermoctl.diagnose.memory import Past
 from thermoctl.diagnose.noise import Averaged, averaged
 from thermoctl.plant.language import Plant
 from thermoctl.plant.residuals import HUGE, Problem
@@ -128,9 +127,13 @@ class Posterior:
         for d in self.drives:
             self.model.prepare(d)
         self.problem = Problem(self.model, self.drives, case.noise)
-        self.amplitudes, self.mean, self.precision, self.past, self.shared = priors(
-            case, self.problem, effects
-        )
+        self.amplitudes, self.mean, precision = _priors(case, self.problem, effects)
+        self.past = case.memory.of(frozenset(e.key for e in effects), plant)
+        place = {q: k for k, (q, r) in enumerate(self.problem.unknowns) if r is None}
+        self.shared = np.array([place[q] for q in self.past.unknowns], int)
+        self.mean[self.shared], precision[self.shared] = self.past.z, 0.0
+        self.precision = np.diag(precision)
+        self.precision[np.ix_(self.shared, self.shared)] = self.past.precision
         beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
         self.problem.priors = tuple(beliefs)
         coordinates = case.coordinates
@@ -294,12 +297,10 @@ def bounded_step(
     return step
 
 
-def priors(
+def _priors(
     case: Case, problem: Problem, effects: Sequence[Placed]
-) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray, Past, np.ndarray]:
-    """Return which unknowns are sizes of effects, and the prior of all unknowns as a Gaussian.
-
-    The prior is its mean (k,) and precision (k, k), what earlier recordings say, and the unknowns of these."""
+) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
+    """Which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian."""
     mean, precision = problem.z_plant.copy(), np.ones(len(problem.unknowns))
     own = {
         e.own[p.name]: (e.candidate, p)
@@ -317,13 +318,7 @@ def priors(
                 sizes[k] = own[q]
         elif q in case.plant.parameters:
             mean[k] = problem.scales[q].z(case.plant.parameters[q].value)
-    past = case.memory.of(frozenset(e.key for e in effects), problem.model.plant)
-    place = {q: k for k, (q, r) in enumerate(problem.unknowns) if r is None}
-    shared = np.array([place[q] for q in past.unknowns], int)
-    mean[shared], precision[shared] = past.z, 0.0
-    matrix = np.diag(precision)
-    matrix[np.ix_(shared, shared)] = past.precision
-    return sizes, mean, matrix, past, shared
+    return sizes, mean, precision
 
 
 def gaussian(posterior: Posterior) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Score test of every effect at every place: how much of the residual it could explain, without a refit.
 
-    r: whitened residual of the refit, its unknowns moved back to their priors' means
+    r: whitened residual of the refit, the starts moved back to their priors' means
     d: first-order change of the outputs by an effect, whitened
     r', d': the same without what the plant's unknowns absorb (metric.py)
     gain = (d'^T r')^2 / (d'^T d')

@@ -15,7 +15,6 @@ from thermoctl.diagnose.fit import Fitted, as_refitted
 from thermoctl.diagnose.levels import over_noise
 from thermoctl.diagnose.metric import Absorbed, Metric, Pushed, without
 from thermoctl.diagnose.noise import Averaged, grid, rise
-from thermoctl.diagnose.posterior import priors
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Direction, Norms, screen
 from thermoctl.diagnose.sketch import likeliest
@@ -23,14 +22,12 @@ from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import Simulation
 
 ROWS = 6_000  # largest number of DCT rows, all outputs and recordings together
-FREE = 1e-8  # factor on the precision of a prior that does not count
+FREE = 1e4  # prior standard deviation of an unknown whose prior does not count
 PROMISED = 30  # directions whose gain in log likelihood is predicted
 
 
 class Plain:
-    """DCT rows of a refitted hypothesis, not whitened: of its residual and of its sensitivities.
-
-    Sensitivities are to z (residuals.py). `mean`, `precision`: of the prior of z."""
+    """DCT rows of a refitted hypothesis, not whitened: of its residual and of its sensitivities to z."""
 
     def __init__(self, case: Case, fitted: Fitted, most: int):
         self.case, self.fit, self.model = case, fitted.rough, fitted.rough.model
@@ -46,7 +43,6 @@ class Plain:
         ]
         self.channels = [self.coordinates.of_recording(r) for r in range(len(self.drives))]
         self.point = self.fit.values, self.fit.dx0
-        _, self.mean, self.precision, *_ = priors(case, self.problem, fitted.hypothesis.effects)
         found = self.problem.each(_sensitive, self.point, lambda r: (self.channels[r],), 2)
         self.runs = [run for run, _, _ in found]
         self.residual = np.concatenate([residual for _, residual, _ in found])
@@ -100,42 +96,42 @@ class Rows(Metric):
     """Whitened rows of a refitted hypothesis: DCT rows divided by the rms of their noise.
 
     `average`: spectra of the refit's residuals. `remainder`: does the remainder count as noise, too? If so,
-    errors at low frequencies have little weight. Without it the unknowns are free, as in a refit that brings
-    the run closest to the data: a plant that is far off may need values that its priors do not expect."""
+    errors at low frequencies have little weight. Without it the starts are free, as in a refit that brings
+    the run closest to the data."""
 
     def __init__(self, plain: Plain, average: Averaged, remainder: bool):
         self.plain, self.fit, self.model = plain, plain.fit, plain.model
         self.drives, self.runs = plain.drives, plain.runs
         self.weights = _weights(plain.case, average, plain.coordinates, remainder)
         self.weight = np.concatenate(self.weights)
-        moved = self._absorb(plain.precision if remainder else FREE * plain.precision)
-        self.residual = self.project((plain.residual + moved) * self.weight)
+        self.residual = self.project((plain.residual + self._absorb(remainder)) * self.weight)
         self.above = self.rise(self.residual)
 
-    def _absorb(self, precision: np.ndarray) -> np.ndarray:
-        """Set what the unknowns absorb; return how far they moved the outputs, not whitened (rows,).
+    def _absorb(self, held: bool) -> np.ndarray:
+        """Set what the unknowns absorb; return how far the starts moved the outputs, not whitened (rows,).
 
-        `precision` (k, k): of their prior. Those at an end of their range absorb nothing. Initial states act in
-        their own recording only: their directions are few, however many recordings."""
+        Are starts `held` by their priors? Parameters are free. Those at an end of their range absorb nothing.
+        Starts act in their own recording only: their directions are few, however many recordings."""
         unknowns, plain = self.plain.problem.unknowns, self.plain
         free = np.array([q not in self.fit.at_bound for q, _ in unknowns], bool)
         of_one = np.array([of is not None for _, of in unknowns], bool)
         shared = np.flatnonzero(free & ~of_one)
-        sd = 1 / np.sqrt(np.where(of_one, np.diag(precision), 1.0))
-        offset = np.where(free, self.fit.z - plain.mean, 0.0)
-        self.own, common, moved = [], [], []
+        sd, moved = np.full(len(unknowns), FREE), np.zeros(len(unknowns))
+        if held:  # in z their priors are standard normal
+            starts = slice(plain.problem.n_parameters, None)
+            sd[starts], moved[starts] = 1.0, self.fit.z[starts]
+        self.own, common, out = [], [], []
         edges = np.cumsum([len(s) for s in plain.sensitivities])[:-1]
         for r, weight in enumerate(np.split(self.weight, edges)):
             rows, ks = plain.sensitivities[r] * weight[:, None], plain.unknowns(r)
-            moved.append(plain.sensitivities[r] @ offset[ks])
+            out.append(plain.sensitivities[r] @ moved[ks])
             mine = free[ks] & of_one[ks]
             self.own.append(Absorbed.by(rows[:, mine] * sd[ks[mine]]))
             place = np.full(len(unknowns), -1)
             place[ks] = np.arange(len(ks))
             common.append(np.where(place[shared] >= 0, rows[:, place[shared]], 0.0))
-        root = np.linalg.inv(np.linalg.cholesky(precision[np.ix_(shared, shared)])).T
-        self.shared = Absorbed.by(without(self.own, np.concatenate(common)) @ root)
-        return np.concatenate(moved)
+        self.shared = Absorbed.by(without(self.own, np.concatenate(common)) * FREE)
+        return np.concatenate(out)
 
     def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
