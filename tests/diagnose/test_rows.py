@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.plants import ONE_BLOCK
-from thermoctl.diagnose.rows import LONG, reduced
+from thermoctl.diagnose.rows import CHANCE, LONG, _content, reduced
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import fit
@@ -156,3 +156,12 @@ def test_the_sensitivity_to_a_start_decays_to_zero(plant):
     run = compile_plant(plant).simulate(month, sensitivities=True)
     assert run.dx is not None
     assert run.dx[1, 0, -1] > 0.9 and run.dx[-1, 0, -1] == 0.0
+
+
+def test_white_noise_of_a_thousand_outputs_needs_no_row(plant):
+    """In many recordings one output in a thousand was taken for fast, and all rows were kept."""
+    rng, count = np.random.default_rng(11), 1000
+    noise = rng.standard_normal((count, 2000))
+    assert max(_content(y, CHANCE / count) for y in noise) < 50  # the line between its ends is slow
+    wave = 0.3 * np.sin(2 * np.pi * np.arange(2000) / 5)  # 0.2 per sample: row 800
+    assert 795 < _content(noise[0] + wave, CHANCE / count) < 900
