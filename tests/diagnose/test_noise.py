@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 from thermoctl.diagnose import noise as module
 from thermoctl.diagnose.coordinates import Coordinates, transform
 from thermoctl.diagnose.levels import floor
-from thermoctl.diagnose.noise import Averaged, Grid, averaged, grid
+from thermoctl.diagnose.noise import Averaged, Grid, averaged, grid, rise
 from thermoctl.diagnose.spectra import SLOW
 from thermoctl.plant.simulate import Excitation
 
@@ -196,3 +196,14 @@ def test_slow_noise_is_the_same_noise_in_means_of_rows():
     means = coloured(4, 0.9, rows=block * ROWS).reshape(-1, block).mean(axis=1)
     present = [averaged(*banded(means, SIGMA / np.sqrt(block), b)).remainder[0] for b in (block, 1)]
     assert present[0] < 0.05 and present[1] > 0.5
+
+
+@pytest.mark.parametrize("sigmas", [1.0, 7.0, 70.0, 7000.0])
+def test_a_predicted_rise_is_the_difference_of_two_likelihoods(sigmas):
+    """For a small effect to first order, for a huge one, whose residual falls by decades, from a new start."""
+    clean = coloured(3, 0.6)
+    g, before = banded(clean + effect(sigmas, 0.6))
+    after = banded(clean)[1]
+    whole = averaged(g, after).log_likelihood - averaged(g, before).log_likelihood
+    assert rise(g, before)(after) == pytest.approx(whole, abs=0.1)
+    assert rise(g, after)(before) == pytest.approx(-whole, abs=0.1)

@@ -53,7 +53,8 @@ WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a wh
 STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the predicted gain that ends it
 LONGEST = 10.0  # step in a logarithm that is tried
 DAMPED = 0.01  # first damping of a step, as a share of the curvature
-LITTLE = 1.0  # nats of one output, up to which a predicted rise is taken to first order: rms error 0.02
+# Nats of one output: up to the first a predicted rise is taken to first order (rms error 0.02).
+LITTLE, NEAR = 1.0, 5.0
 LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -221,8 +222,8 @@ def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
 def rise(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Callable[[Sequence[np.ndarray]], float]:
     """Return a function: by how much the log likelihood of other powers is above that of these.
 
-    d log p / dP = -E[1/V] / 2. Where that makes less than LITTLE, the output is not averaged again. Else the
-    maxima are looked for from the known ones."""
+    d log p / dP = -E[1/V] / 2. Where that makes less than LITTLE, the output is not averaged again; less than
+    NEAR, the maxima are looked for from the known ones."""
     known = [(g, p := g.power(powers), _output(g, p)) for g in grids]
 
     def above(others: Sequence[np.ndarray]) -> float:
@@ -230,22 +231,24 @@ def rise(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Callable[[Seque
         for g, p, f in known:
             other = g.power(others)
             first = -0.5 * f.inverse * (other - p)
-            little = np.abs(first).sum() < LITTLE
-            total += (
-                float(first.sum()) if little else _output(g, other, f.at).log_likelihood - f.log_likelihood
-            )
+            size = float(np.abs(first).sum())
+            if size < LITTLE:
+                total += float(first.sum())
+            else:
+                total += _output(g, other, f.at if size < NEAR else None).log_likelihood - f.log_likelihood
         return total
 
     return above
 
 
-def _output(g: Grid, power: np.ndarray, near: Sequence[np.ndarray | None] = (None,) * 3) -> _Output:
+def _output(g: Grid, power: np.ndarray, near: Sequence[np.ndarray] | None = None) -> _Output:
     """Average the likelihood of an output's power at each frequency (nodes,). `near`: x to start from."""
     power = np.maximum(power, LEAST * g.variance * g.count)
     densities: list[_Noise | _Remainder]
     densities = [_Noise(g, power, slow) for slow in ([False] if g.sensor else [False, True])]
     densities.append(_Remainder(g, power, block_diag(np.diag(g.scales**-2.0), g.rough)))
-    found = [_laplace(d, x) for d, x in zip(densities, near, strict=False)]
+    starts: list[np.ndarray | None] = [*near] if near else [None] * len(densities)
+    found = [_laplace(d, x) for d, x in zip(densities, starts, strict=True)]
     odds = ABSENT * np.array([1.0] if g.sensor else [WHITE, 1 - WHITE])
     scores = np.log(np.append(odds, 1 - ABSENT)) + [f.log_p for f in found]
     whole = float(logsumexp(scores))
