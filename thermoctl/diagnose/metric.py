@@ -1,8 +1,8 @@
-"""Whitened rows of a refitted hypothesis, and what its own unknowns absorb of them.
+"""Whitened rows of a refitted hypothesis, and the part of them that its own unknowns absorb.
 
-Unknowns with a Gaussian prior of covariance P and sensitivities J add J P J' to the rows' covariance. With
-J sqrt(P) = U s W' the covariance's inverse root takes 1 - 1 / sqrt(1 + s^2) off each direction of U: all of
-what the data determine well, little of what the prior holds."""
+Unknowns with a Gaussian prior of covariance P and sensitivities J add J P J' to the rows' covariance. Let
+J sqrt(P) be U s W'. The covariance's inverse root takes 1 - 1 / sqrt(1 + s^2) off each direction of U. That
+is nearly all where the data determine the unknowns, and little where the prior does."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Metric:
 
     - `weight` (rows,): factor of each row that whitens it
     - `residual` (rows,): with starts at their priors' means, without what the plant's own unknowns absorb
-    - `own`: what the own unknowns of each recording absorb
-    - `shared`: what the other parameters absorb besides"""
+    - `own`: the directions that the own unknowns of each recording absorb
+    - `shared`: those that the other parameters absorb besides"""
 
     fit: Fit
     model: Model
@@ -75,7 +75,9 @@ class Absorbed:
 
     @classmethod
     def by(cls, columns: np.ndarray) -> Absorbed:
-        """Return what unknowns absorb; `columns` (rows, k): changes by independent prior deviations."""
+        """Return the directions that unknowns absorb.
+
+        `columns` (rows, k): changes by independent prior deviations."""
         u, s, _ = np.linalg.svd(columns, full_matrices=False)
         return cls(u, 1 - 1 / np.sqrt(1 + s**2))
 

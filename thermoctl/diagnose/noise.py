@@ -381,7 +381,7 @@ class _Remainder:
 
 @dataclass(frozen=True)
 class _Found:
-    """One case: x at the maximum, log p(R), the noise's variance, V at each frequency, and the covariance of 1/V."""
+    """One case: x at the maximum, log p(R), the noise's variance, V at each frequency, covariance of 1/V."""
 
     x: np.ndarray
     log_p: float
