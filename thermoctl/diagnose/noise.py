@@ -53,7 +53,8 @@ WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a wh
 STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the predicted gain that ends it
 LONGEST = 10.0  # step in a logarithm that is tried
 DAMPED = 0.01  # first damping of a step, as a share of the curvature
-# Nats of one output: up to the first a predicted rise is taken to first order (rms error 0.02).
+# Nats of one output: up to LITTLE a predicted rise is taken to first order (rms error 0.02). Up to NEAR the
+# known maxima are the start.
 LITTLE, NEAR = 1.0, 5.0
 LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm
 LOG_2PI = float(np.log(2 * np.pi))
