@@ -116,3 +116,21 @@ outputs:
   voltage: {value: R * current + L * current_rate + K_e * velocity, unit: V, noise: 0.01}
   coil_temperature: {value: coil, unit: degC, noise: 0.1}
 """
+
+TANK = """\
+format: thermoctl-plant/1
+title: A pumped tank
+inputs:
+  pump: {unit: V}
+  level_start: {unit: V}
+parameters:
+  k_pump: {value: 0.05, unit: 1/s, range: [0.02, 0.12]}
+  k_out: {value: 0.06, unit: V**0.5/s, range: [0.02, 0.2]}
+nodes:
+  tank: {unit: V, storage: 1, initial: level_start, initial_sigma: 0.05}
+flows:
+  pumped: {into: tank, rate: k_pump * pump, unit: V/s}
+  outflow: {from: tank, rate: "k_out * sqrt(max(tank, 0))", unit: V/s}
+outputs:
+  level: {value: tank, unit: V, noise: 0.02}
+"""

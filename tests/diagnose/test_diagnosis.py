@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete, dlsim, lsim
 
-from tests.plants import FREE_CARRIAGE, SPRING_STAGE, TWO_BLOCKS
+from tests.plants import FREE_CARRIAGE, SPRING_STAGE, TANK, TWO_BLOCKS
 from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
@@ -321,25 +321,6 @@ def test_hysteresis_pressed_to_its_least_width_is_no_finding(least, absent):
     plant = entry.extend(start, {"F": (0.1, 30.0), "X0": (least, 0.1)})
     f = fitted(c, plant, (Placed(entry, {p: entry.own(p) for p in start}),))
     assert f.absent == absent == (f.fit.at_bound.get(entry.own("X0")) == "low")
-
-
-TANK = """
-format: thermoctl-plant/1
-title: A pumped tank
-inputs:
-  pump: {unit: V}
-  level_start: {unit: V}
-parameters:
-  k_pump: {value: 0.05, unit: 1/s, range: [0.02, 0.12]}
-  k_out: {value: 0.06, unit: V**0.5/s, range: [0.02, 0.2]}
-nodes:
-  tank: {unit: V, storage: 1, initial: level_start, initial_sigma: 0.05}
-flows:
-  pumped: {into: tank, rate: k_pump * pump, unit: V/s}
-  outflow: {from: tank, rate: "k_out * sqrt(max(tank, 0))", unit: V/s}
-outputs:
-  level: {value: tank, unit: V, noise: 0.02}
-"""
 
 
 def test_a_pump_that_is_clipped_is_the_actuators_entry(tmp_path):

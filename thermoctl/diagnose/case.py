@@ -134,7 +134,11 @@ def case(
     for d in drives:
         d.rtol = rtol
     null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
-    tables, dropped = _without_outliers(tables, plant, null.residuals, noise)
+    as_stated = [
+        d.y - model.run(d, values, np.zeros_like(dx0)).y
+        for d, values, dx0 in zip(drives, null.values, null.dx0, strict=True)
+    ]
+    tables, dropped = _without_outliers(tables, plant, null.residuals, as_stated, noise)
     drives = [dataclasses.replace(model.excitation(t), rtol=rtol) for t in tables]
     coordinates = Coordinates(drives)
     rig = Structure(plant, drives, [t.columns for t in tables])
@@ -236,11 +240,18 @@ def _swing(drives: Sequence[Excitation], j: int) -> float:
 
 
 def _without_outliers(
-    tables: Sequence[Table], plant: Plant, residuals: Sequence[np.ndarray], noise: Sequence[Noise]
+    tables: Sequence[Table],
+    plant: Plant,
+    residuals: Sequence[np.ndarray],
+    as_stated: Sequence[np.ndarray],
+    noise: Sequence[Noise],
 ) -> tuple[list[Table], int]:
-    """The recordings without cells whose residual lies far from its neighbours', and how many those are."""
+    """The recordings without cells whose residual lies far from its neighbours', and how many those are.
+
+    `as_stated`: residuals with the stated starts. What these predict is no outlier: a refit that moved a start
+    may have left its first readings far behind."""
     out, dropped = [], 0
-    for t, e in zip(tables, residuals, strict=True):
+    for t, e, stated in zip(tables, residuals, as_stated, strict=True):
         columns = dict(t.columns)
         for j, o in enumerate(plant.outputs.values()):
             index = np.flatnonzero(np.isfinite(e[:, j]))
@@ -248,7 +259,7 @@ def _without_outliers(
                 continue
             away = e[index, j] - median_filter(e[index, j], 5)
             limit = OUTLIER * max(1.4826 * float(np.median(np.abs(away))), noise[j].sigma)
-            odd = index[np.abs(away) > limit]
+            odd = index[(np.abs(away) > limit) & (np.abs(stated[index, j]) > limit)]
             if len(odd) and len(odd) < 0.02 * len(index):
                 columns[o.column] = columns[o.column].copy()
                 columns[o.column][odd] = np.nan
