@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.plants import TANK
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
@@ -13,7 +14,6 @@ from thermoctl.diagnose.search import started
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
-from tests.plants import TANK
 
 SPILL = 'flows:\n  spill: {from: tank, rate: "0.6 * max(tank - 2.75, 0)", unit: V/s}\n'
 

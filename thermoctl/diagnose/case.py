@@ -248,8 +248,8 @@ def _without_outliers(
 ) -> tuple[list[Table], int]:
     """The recordings without cells whose residual lies far from its neighbours', and how many those are.
 
-    `as_stated`: residuals with the stated starts. What these predict is no outlier: a refit that moved a start
-    may have left its first readings far behind."""
+    `as_stated`: residuals with the stated starts. A reading that these predict is no outlier: a refit that
+    moved a start may have left it far behind."""
     out, dropped = [], 0
     for t, e, stated in zip(tables, residuals, as_stated, strict=True):
         columns = dict(t.columns)
