@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -103,8 +105,24 @@ class Case:
     memory: Memory = NOTHING  # of earlier recordings
 
     def drives(self, model: Model) -> list[Excitation]:
-        """The recordings as a model reads them."""
+        """The recordings as a model reads them. Models that read the same columns share their values."""
+        if _readings(model) == _readings(self.null.model):
+            return [dataclasses.replace(d) for d in self._read]
+        return self._excitations(model)
+
+    @cached_property
+    def _read(self) -> list[Excitation]:
+        return self._excitations(self.null.model)
+
+    def _excitations(self, model: Model) -> list[Excitation]:
         return [dataclasses.replace(model.excitation(t), rtol=self.rtol) for t in self.tables]
+
+
+def _readings(model: Model) -> list[Any]:
+    """Return all that decides how a model reads a recording; a delayed input has a column of its own."""
+    plant = model.plant
+    outputs = [(o.name, o.column, o.unit, o.conversion) for o in plant.outputs.values()]
+    return [*plant.inputs.values(), *model.code.inputs, *outputs]
 
 
 def case(
@@ -248,8 +266,8 @@ def _without_outliers(
 ) -> tuple[list[Table], int]:
     """The recordings without cells whose residual lies far from its neighbours', and how many those are.
 
-    `as_stated`: residuals with the stated starts. A reading that these predict is no outlier: a refit that
-    moved a start may have left it far behind."""
+    `as_stated`: residuals with the stated starts. The first readings, up to which these predict all, are no
+    outliers: a refit that moved a start may have left them far behind."""
     out, dropped = [], 0
     for t, e, stated in zip(tables, residuals, as_stated, strict=True):
         columns = dict(t.columns)
@@ -259,7 +277,8 @@ def _without_outliers(
                 continue
             away = e[index, j] - median_filter(e[index, j], 5)
             limit = OUTLIER * max(1.4826 * float(np.median(np.abs(away))), noise[j].sigma)
-            odd = index[(np.abs(away) > limit) & (np.abs(stated[index, j]) > limit)]
+            predicted = np.logical_and.accumulate(np.abs(stated[index, j]) <= limit)
+            odd = index[(np.abs(away) > limit) & ~predicted]
             if len(odd) and len(odd) < 0.02 * len(index):
                 columns[o.column] = columns[o.column].copy()
                 columns[o.column][odd] = np.nan

@@ -61,7 +61,7 @@ class Fitted:
     rough_plant: Plant
     rough: Fit  # refit in white noise, whose free run is closest to the data: extensions start there
     rough_powers: tuple[np.ndarray, ...]
-    curvature: np.ndarray  # H
+    curvature: np.ndarray  # H of the unknowns that all recordings share, the others eliminated
     past: Past  # of earlier recordings
 
     @property
@@ -235,6 +235,7 @@ def _weighed(
     values, dx0 = problem.unpack(z)
     own = np.ones(len(z), bool)
     own[gaussian(posterior)] = False
+    own[posterior.believed] = False
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
     confined = _relieved(confined, posterior.relief(z, posterior.rows(errors), average))
     inverse = np.linalg.pinv(confined, hermitian=True)
@@ -248,13 +249,17 @@ def _weighed(
         -2 * average.log_likelihood,
         problem.unknowns,
         z,
-        matrix,
+        _kept(matrix, range(problem.n_parameters)),
         errors,
         case.noise,
         0,
         problem.samples,
         _at_bound(problem, z),
         problem.priors,
+    )
+    # with hundreds of recordings the starts' part fills the memory
+    rough = dataclasses.replace(
+        rough, hessian=_kept(rough.hessian, range(problem.n_parameters)), prior_hessian=np.zeros((0, 0))
     )
     rough_powers = case.coordinates.powers(posterior.rows(rough.residuals))
     if not problem.keeps:
@@ -272,9 +277,17 @@ def _weighed(
         updated(posterior.plant, rough, posterior.drives),
         rough,
         tuple(rough_powers),
-        confined,
+        _kept(confined, [k for k, (_, r) in enumerate(problem.unknowns) if r is None]),
         posterior.past,
     )
+
+
+def _kept(h: np.ndarray, some: Sequence[int]) -> np.ndarray:
+    """Return the curvature of some unknowns; the others are eliminated."""
+    kept = np.array(some, int)
+    others = np.setdiff1d(np.arange(len(h)), kept)
+    inner = np.linalg.pinv(h[np.ix_(others, others)], hermitian=True)
+    return np.asarray(h[np.ix_(kept, kept)] - h[np.ix_(kept, others)] @ inner @ h[np.ix_(others, kept)])
 
 
 def _deviations(posterior: Posterior, values: np.ndarray, sd: np.ndarray) -> dict[str, float]:
@@ -308,13 +321,9 @@ def _relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
 
 
 def remembered(case: Case, f: Fitted) -> Past:
-    """Return what all recordings so far say of a hypothesis. Own initial states are eliminated."""
-    unknowns, h = f.fit.unknowns, f.curvature
+    """Return what all recordings so far say of a hypothesis."""
+    unknowns = f.fit.unknowns
     shared = np.array([k for k, (_, r) in enumerate(unknowns) if r is None], int)
-    own = np.array([k for k, (_, r) in enumerate(unknowns) if r is not None], int)
-    absorbed = (
-        h[np.ix_(shared, own)] @ np.linalg.pinv(h[np.ix_(own, own)], hermitian=True) @ h[np.ix_(own, shared)]
-    )
     names = tuple(unknowns[k][0] for k in shared)
     at = [(case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids]
     return Past(
@@ -322,7 +331,7 @@ def remembered(case: Case, f: Fitted) -> Past:
         names,
         tuple(f.plant.parameters[q].range or (0.0, 0.0) for q in names),
         f.fit.z[shared],
-        h[np.ix_(shared, shared)] - absorbed,
+        f.curvature,
         f.log_evidence,
         {o: f.past.squares.get(o, 0.0) + sum(float(f.powers[k].sum()) for k in g.channels) for o, g in at},
         {o: f.past.counts.get(o, 0.0) + float(g.count.sum()) for o, g in at},
@@ -361,15 +370,17 @@ def with_residuals(case: Case, f: Fitted) -> Fitted:
 
 
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
-    """Return log p(z): Gaussians, uniform shapes, and the effects' sizes with standard deviations `sd`."""
+    """Return log p(z): Gaussians, uniform shapes, and the effects' sizes with standard deviations `sd`.
+
+    The catalogue's own priors are Gaussians, too: their curvature is the precision."""
     values, _ = posterior.problem.unpack(z)
-    normal = gaussian(posterior)
-    out = posterior.prior(z) + 0.5 * float(
-        np.linalg.slogdet(posterior.precision[np.ix_(normal, normal)] / (2 * np.pi))[1]
-    )
-    for k, (c, p) in posterior.amplitudes.items():
+    stated = posterior.problem.prior_terms(values, True)[2]
+    out = posterior.prior(z)
+    for precision, ks in ((posterior.precision, gaussian(posterior)), (stated, posterior.believed)):
+        out += 0.5 * float(np.linalg.slogdet(precision[np.ix_(ks, ks)] / (2 * np.pi))[1])
+    for k, (_, p) in posterior.amplitudes.items():
         q = posterior.problem.unknowns[k][0]
-        if c.effect.prior is None and k not in posterior.shared:
+        if k not in posterior.shared:
             value = float(values[0, posterior.model.parameters.index(q)])
             out += _size(p, value, sd[q]) + np.log(posterior.problem.scales[q].slope(value))
     new = [e for e in posterior.effects if e.key not in posterior.past.keys]

@@ -19,6 +19,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.coordinates import Channel, transform
 from thermoctl.diagnose.noise import Averaged, averaged
+from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.residuals import HUGE, Problem
 from thermoctl.plant.simulate import SimulationError, compile_plant
@@ -136,6 +137,9 @@ class Posterior:
         self.precision[np.ix_(self.shared, self.shared)] = self.past.precision
         beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
         self.problem.priors = tuple(beliefs)
+        # the unknowns (k,) that the catalogue gives a prior of their own
+        stated = self.problem.prior_terms(self.problem.unpack(self.problem.z_plant)[0], True)[2]
+        self.believed = np.setdiff1d(np.flatnonzero(stated.any(axis=0)), self.shared)
         coordinates = case.coordinates
         self.channels = [coordinates.of_recording(r) for r in range(len(self.drives))]
         # z, and each recording's unknowns and its channels' slopes (rows, k) there
@@ -313,8 +317,9 @@ def _priors(
         precision[k] = BELIEF**-2
         if q in own:
             c, p = own[q]
-            mean[k], precision[k] = 0.5, 1e-6 if c.effect.prior is not None else 1e-4
-            if p.amplitude:
+            told = c.effect.prior is not None and p.name in ex.names(c.effect.prior)
+            mean[k], precision[k] = 0.5, 1e-6 if told else 1e-4
+            if p.amplitude and not told:
                 sizes[k] = own[q]
         elif q in case.plant.parameters:
             mean[k] = problem.scales[q].z(case.plant.parameters[q].value)

@@ -22,6 +22,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.special import gammaincc
 
 from thermoctl.diagnose.candidates import Candidate
@@ -37,6 +38,7 @@ from thermoctl.plant.cores import ABREAST, LEAST, each
 EPSILON = 1e-4  # amplitude at which a direction is taken
 CHUNK = 96
 EXACT = 4_000  # columns, up to which all are simulated
+DECADES = 3.0  # up and down from one unit: where quotients of amplitudes are looked for
 NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
 
 
@@ -305,9 +307,13 @@ def score(
     sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
     coefficient = np.zeros(len(g))
     inverse = 1 / sub if len(sub) == 1 else np.linalg.pinv(sub, rcond=1e-8, hermitian=True)
-    coefficient[useful] = inverse @ (g[useful] / scale[useful]) / scale[useful]
+    inverse = inverse / np.outer(scale[useful], scale[useful])
+    coefficient[useful] = inverse @ g[useful]
     shape, _ = columns[0].item[2]
-    gain = float(g @ coefficient)
+    if c.effect.prior is not None:
+        told = [q for q, u in zip(columns, useful, strict=True) if u]
+        coefficient[useful] = _plausible(c, told, coefficient[useful], inverse)
+    gain = float(2 * g @ coefficient - coefficient @ m @ coefficient)
     if len(g) == 1 and not _possible(c, columns[0], float(coefficient[0])):
         gain = 0.0
     shape, s = _sizes(c, columns, shape, coefficient)
@@ -317,6 +323,35 @@ def score(
         s,
         lambda: rows @ coefficient,
     )
+
+
+def _plausible(
+    c: Candidate, columns: Sequence[Column], coefficient: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Return coefficients whose amplitudes are likely by the catalogue's prior, and fit as well as may be.
+
+    The other amplitudes are products with the first. Where the plant absorbs that one alone, the data leave
+    its size and its sign open, and only the prior of the others tells it."""
+    shape, _ = columns[0].item[2]
+    dims = np.array([q.item[2][1] for q in columns])  # (columns, amplitudes)
+    step = covariance @ dims[:, 0]
+    size, variance = float(dims[:, 0] @ coefficient), float(dims[:, 0] @ step)
+    typical, prior = float(np.abs(dims.T @ coefficient)[1:].max(initial=0.0)), c.effect.prior
+    if variance <= 0 or typical <= 0 or prior is None:
+        return coefficient
+    known = {"first_air": c.rig.first_air(c.rig.drives[0]), "duration": c.rig.duration}
+
+    def at(log_size: float) -> np.ndarray:
+        return np.asarray(coefficient + step * (np.exp(log_size) - size) / variance)
+
+    def surprise(log_size: float) -> float:
+        sizes = dims.T @ at(log_size)
+        values = {**parameter_values(c, shape, list(sizes)), **known}
+        unlikely = float(ex.evaluate(prior, values)) + 2 * (len(sizes) - 1) * log_size
+        return float((np.exp(log_size) - size) ** 2 / variance + unlikely)
+
+    reach = np.log(typical) + np.log(10.0) * np.array([-DECADES, DECADES])
+    return at(float(minimize_scalar(surprise, bounds=tuple(reach), method="bounded").x))
 
 
 def _possible(c: Candidate, column: Column, coefficient: float) -> bool:

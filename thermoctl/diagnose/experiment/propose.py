@@ -86,9 +86,8 @@ class _Predictor:
 
 def _predictor(f: Fitted, weight: float, label: str) -> _Predictor:
     model = compile_plant(f.plant)
-    found = f.fit
-    covariance = np.linalg.pinv(found.hessian, hermitian=True)
-    place = {q: k for k, (q, r) in enumerate(found.unknowns) if r is None}
+    covariance = np.linalg.pinv(f.curvature, hermitian=True)
+    place = {q: k for k, q in enumerate(q for q, r in f.fit.unknowns if r is None)}
     nq = len(model.unknowns)
     P, slopes = np.eye(nq), np.zeros(nq)
     for c, q in enumerate(model.unknowns):
