@@ -21,6 +21,9 @@ def weighed(scores):
 def test_a_small_remainder_that_is_certain_is_not_nothing():
     found = weighed({NOTHING: 0.0, ONE: -9.0})
     assert decide(found, Facts(found.something, (), 1.04, 1.0, 0.99), limits()).verdict == "unexplained"
+    found = weighed({NOTHING: 0.0, ONE: 40.0})
+    beside = decide(found, Facts(found.something, (A,), 1.04, 0.3, 0.99), limits())
+    assert (beside.verdict, beside.named) == ("partly_explained", (A,))
 
 
 @pytest.mark.parametrize(

@@ -75,20 +75,21 @@ def weigh(
     return Posterior(hypotheses, effects, something)
 
 
+def _only_noise(f: Facts, limits: Limits) -> bool:
+    """Is the residual about as large as the noise, and no remainder in it certain?"""
+    return f.over_noise <= limits.clean and f.remains < limits.name
+
+
 ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
     (
         "nothing is supported and the residual is the sensors' noise",
-        lambda f, q: f.something < q.name and f.over_noise <= q.clean and f.remains < q.name,
+        lambda f, q: f.something < q.name and _only_noise(f, q),
         "consistent",
     ),
     ("nothing is supported and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
     ("the findings predict held-out data worse than a refit alone", lambda f, q: f.worth > 1, "unexplained"),
     ("something is supported, but no effect for sure", lambda f, q: not f.named, "ambiguous"),
-    (
-        "findings are supported and the residual is the sensors' noise",
-        lambda f, q: f.over_noise <= q.clean,
-        "explained",
-    ),
+    ("findings are supported and the residual is the sensors' noise", _only_noise, "explained"),
     ("findings are supported and a remainder stays beside them", lambda f, q: True, "partly_explained"),
 )
 
