@@ -27,19 +27,19 @@ def test_a_small_remainder_that_is_certain_is_not_nothing():
 
 
 @pytest.mark.parametrize(
-    ("scores", "named", "over_noise", "worth", "verdict"),
+    ("scores", "named", "over_noise", "worse", "verdict"),
     [
-        ({NOTHING: 0.0, ONE: -9.0}, (), 1.0, 1.0, "consistent"),
-        ({NOTHING: 0.0, ONE: -9.0}, (), 3.0, 1.0, "unexplained"),
-        ({NOTHING: 0.0, ONE: 40.0}, (A,), 1.0, 1.5, "unexplained"),
-        ({NOTHING: 0.0, ONE: 40.0, OTHER: 39.5}, (), 1.0, 0.3, "ambiguous"),
-        ({NOTHING: 0.0, ONE: 40.0}, (A,), 1.0, 0.3, "explained"),
-        ({NOTHING: 0.0, ONE: 40.0}, (A,), 3.0, 0.3, "partly_explained"),
+        ({NOTHING: 0.0, ONE: -9.0}, (), 1.0, 0.0, "consistent"),
+        ({NOTHING: 0.0, ONE: -9.0}, (), 3.0, 0.0, "unexplained"),
+        ({NOTHING: 0.0, ONE: 40.0}, (A,), 1.0, 0.95, "unexplained"),
+        ({NOTHING: 0.0, ONE: 40.0, OTHER: 39.5}, (), 1.0, 0.0, "ambiguous"),
+        ({NOTHING: 0.0, ONE: 40.0}, (A,), 1.0, 0.6, "explained"),
+        ({NOTHING: 0.0, ONE: 40.0}, (A,), 3.0, 0.0, "partly_explained"),
     ],
 )
-def test_each_row_gives_its_verdict(scores, named, over_noise, worth, verdict):
+def test_each_row_gives_its_verdict(scores, named, over_noise, worse, verdict):
     posterior = weighed(scores)
-    found = decide(posterior, Facts(posterior.something, named, over_noise, worth), limits())
+    found = decide(posterior, Facts(posterior.something, named, over_noise, 1.0, 0.0, worse), limits())
     assert found.verdict == verdict
     assert (found.named == named) == (verdict in ("explained", "partly_explained") or not named)
 

@@ -32,13 +32,14 @@ class Facts:
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
     - `remains`: the largest probability of a remainder at an output
-    - `worth`: held-out error, divided by that of a refit alone"""
+    - `worth`: held-out error, divided by that of a refit alone; `worse`: probability that it is larger"""
 
     something: float
     named: tuple[Key, ...]
     over_noise: float
     worth: float
     remains: float = 0.0
+    worse: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,11 @@ ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
         "consistent",
     ),
     ("nothing is supported and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
-    ("the findings predict held-out data worse than a refit alone", lambda f, q: f.worth > 1, "unexplained"),
+    (
+        "the findings predict held-out data worse than a refit alone",
+        lambda f, q: f.worse >= q.name,
+        "unexplained",
+    ),
     ("something is supported, but no effect for sure", lambda f, q: not f.named, "ambiguous"),
     ("findings are supported and the residual is the sensors' noise", _only_noise, "explained"),
     ("findings are supported and a remainder stays beside them", lambda f, q: True, "partly_explained"),
@@ -101,6 +106,7 @@ def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
         "something": facts.something,
         "over_noise": facts.over_noise,
         "worth": facts.worth,
+        "worse": facts.worse,
         "remains": facts.remains,
         **{f"{e} at {w}": posterior.effects[e, w] for e, w in facts.named},
     }

@@ -82,9 +82,10 @@ def _decided(
     keys = () if unsure else (e.key for e in best.hypothesis.effects)
     named = tuple(key for key in keys if posterior.effects[key] >= numbers.name)
     # data that took part in the choice cannot speak against it
-    ratio = _ratio(value.after, value.refit_only) if best.hypothesis.effects and value.reserved else 1.0
+    told = bool(best.hypothesis.effects) and value.reserved
+    ratio, worse = (_ratio(value.after, value.refit_only), value.worse) if told else (1.0, 0.0)
     remains = remainder(known, fits[best.hypothesis.keys])
-    facts = Facts(posterior.something, named, max(after.over_noise.values()), ratio, remains)
+    facts = Facts(posterior.something, named, max(after.over_noise.values()), ratio, remains, worse)
     decision = decide(posterior, facts, numbers)
     return Diagnosis(known, searched, posterior, best, null, after, before, value, decision, energy, physics)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted
@@ -17,20 +18,23 @@ from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 ENOUGH = 3  # recordings, from which the last one is set aside
-BLOCKS = 16  # of recordings that are too few: fitted to every other one, checked on the rest
+BLOCKS = 16  # of a recording. Where recordings are too few, every other one is fitted and the rest checked
 
 
 @dataclass(frozen=True)
 class Worth:
     """Root-mean-square errors per output of the original plant, refitted, and with the findings.
 
-    `reserved`: on recordings set aside; otherwise cross-validated, on data that took part in the choice."""
+    `reserved`: on recordings set aside; otherwise cross-validated, on data that took part in the choice.
+    `worse`: probability that the findings predict the recordings set aside worse than a refit alone; 0
+    without such recordings."""
 
     before: dict[str, float]
     refit_only: dict[str, float]
     after: dict[str, float]
     reserved: bool
     names: tuple[str, ...]
+    worse: float = 0.0
 
     @property
     def share_closed(self) -> float | None:
@@ -60,13 +64,33 @@ def worth(
         if case.block > 1:
             reserve = [means(compile_plant(null.plant), t, case.block) for t in reserve]
 
-        def rms(plant: Plant) -> dict[str, float]:
-            return _rms([_errors(case, plant, t) for t in reserve], null.fit.model)
-
-        before, refit_only = (known.before, known.refit_only) if known else (rms(case.plant), rms(null.plant))
-        return Worth(before, refit_only, rms(best.plant), True, tuple(t.name for t in reserve))
+        names, model = tuple(t.name for t in reserve), null.fit.model
+        after = [_errors(case, best.plant, t) for t in reserve]
+        if known:
+            return dataclasses.replace(known, after=_rms(after, model))
+        came, alone = ([_errors(case, plant, t) for t in reserve] for plant in (case.plant, null.plant))
+        sizes = [_rms(errors, model) for errors in (came, alone, after)]
+        return Worth(sizes[0], sizes[1], sizes[2], True, names, worse(alone, after))
     before = _rms([_errors(case, case.plant, t) for t in case.tables], null.fit.model)
     return Worth(before, _crossed(case, null), _crossed(case, best), False, ())
+
+
+def worse(alone: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
+    """Return the probability that errors `after` are larger than those `alone`, as a mean over all time.
+
+    Differences of squares, each in its output's mean square, are summed over blocks: errors are not
+    independent from row to row (Diebold & Mariano 1995). The blocks' mean has Student's t distribution."""
+    size = np.nanmean(np.concatenate(alone) ** 2, axis=0)
+    seen = size > 0
+    blocks = [
+        float(np.nansum((a[part][:, seen] ** 2 - b[part][:, seen] ** 2) / size[seen]))
+        for b, a in zip(alone, after, strict=True)
+        for part in np.array_split(np.arange(len(a)), BLOCKS)
+    ]
+    if not all(np.isfinite(a[np.isfinite(b)]).all() for b, a in zip(alone, after, strict=True)):
+        return 1.0  # a simulation failed
+    spread = float(np.std(blocks, ddof=1)) / np.sqrt(len(blocks))
+    return float(student.cdf(np.mean(blocks) / spread, len(blocks) - 1)) if spread > 0 else 0.0
 
 
 def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:

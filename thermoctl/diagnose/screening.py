@@ -105,7 +105,7 @@ class Rows(Metric):
         self.weights = _weights(plain.case, average, plain.coordinates, remainder)
         self.weight = np.concatenate(self.weights)
         self.residual = self.project((plain.residual + self._absorb(remainder)) * self.weight)
-        self.above = self.rise(self.residual)
+        self.above = rise(plain.grids, self._powers(self.residual))
 
     def _absorb(self, held: bool) -> np.ndarray:
         """Set what the unknowns absorb; return how far the starts moved the outputs, not whitened (rows,).
@@ -179,7 +179,7 @@ class Rows(Metric):
         if d.vector is None or d.gain <= 0:
             return 0.0
         v = d.vector.astype(float)
-        return self.above(self.residual - v * (v @ self.residual))
+        return self.above(self._powers(self.residual - v * (v @ self.residual)))
 
 
 def _weights(case: Case, average: Averaged, coordinates: Coordinates, remainder: bool) -> list[np.ndarray]:
