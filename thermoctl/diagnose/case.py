@@ -21,6 +21,7 @@ from thermoctl.diagnose.progress import Pace
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.rows import OUTLIER, Reduced, reduced
 from thermoctl.plant import expression as ex
+from thermoctl.plant.cores import give_back
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit, fit
 from thermoctl.plant.simulate import RTOL, Excitation, Model, compile_plant
@@ -61,6 +62,7 @@ class Budget:
 
     def spend(self) -> None:
         """Count one refit, and report it."""
+        give_back()
         with self.lock:
             self.pace.enter("refit")
             self.fits_done += 1
@@ -72,6 +74,7 @@ class Budget:
 
     def screen(self) -> None:
         """Report that a hypothesis is screened for effects."""
+        give_back()
         self.pace.enter("screening")
         number = 1 + len(self.pace.spent.get("screening", ()))
         self.progress(

@@ -5,6 +5,7 @@ items and are summed in this order. So they do not depend on the number of cores
 
 from __future__ import annotations
 
+import ctypes
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -60,6 +61,15 @@ def batches(queue: list[T], wanted: Callable[[T], bool]) -> Iterator[tuple[list[
             at += 1
         if batch:
             yield batch, len(queue) - at
+
+
+def give_back() -> None:
+    """Give freed memory back to the system, where the C library can (glibc).
+
+    Each thread has a heap of its own, which it keeps at its largest size otherwise."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim:
+        trim(0)
 
 
 class Workers(Protocol):

@@ -96,18 +96,23 @@ class Tracked:
     def _unit(self, node: str) -> list[np.ndarray]:
         """Return the rows of each recording's responses to hat functions of flow into a node."""
         if node not in self._units:
-            hats = [h.toarray() for h in self._hats]
-            self._units[node] = _blocks(self.metric, self.runs, node, hats)
+            self._units[node] = _blocks(self.metric, self.runs, node, self._hats, 1.0)
         return self._units[node]
 
 
 def _blocks(
-    metric: Rows, runs: Sequence[dict[str, np.ndarray | float]], node: str, flows: Sequence[np.ndarray]
+    metric: Rows,
+    runs: Sequence[dict[str, np.ndarray | float]],
+    node: str,
+    hats: Sequence[csr_matrix],
+    size: float,
 ) -> list[np.ndarray]:
-    """Return the rows of each recording's responses to flows into a node; TOGETHER at a time, for memory."""
+    """Return the rows of each recording's responses to flows into a node: hats times `size`.
+
+    TOGETHER at a time, for memory."""
     blocks, model = [], metric.model
-    for r, (d, q) in enumerate(zip(metric.drives, flows, strict=True)):
-        parts = []
+    for r, (d, hat) in enumerate(zip(metric.drives, hats, strict=True)):
+        parts, q = [], size * hat.toarray()
         storage = np.asarray(ex.evaluate(model.plant.nodes[node].storage, runs[r]), float)
         force = q / np.broadcast_to(storage, d.t.shape)[:, None]
         for part in np.split(force, range(TOGETHER, q.shape[1], TOGETHER), axis=1):
@@ -268,9 +273,7 @@ def _wide(
     hats: Sequence[csr_matrix],
 ) -> list[np.ndarray]:
     """Return each recording's (rows, nodes * knots) responses to each knot, in units of the typical flows."""
-    by_node = [
-        _blocks(metric, runs, n, [s * h.toarray() for h in hats]) for n, s in zip(nodes, sizes, strict=True)
-    ]
+    by_node = [_blocks(metric, runs, n, hats, s) for n, s in zip(nodes, sizes, strict=True)]
     return [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
 
 
