@@ -1,0 +1,40 @@
+"""An ambient that nobody recorded: the data tell conductance times temperature, only the prior tells the two apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.plants import TWO_BLOCKS
+from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.catalogue import catalogue
+from thermoctl.diagnose.limits import limits
+from thermoctl.diagnose.screening import screened
+from thermoctl.diagnose.search import _followed, started
+from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
+
+WALL = 'flows:\n  wall: {from: one, rate: "0.004 * (one - 21 - 3 * sin(t / 900))", unit: W}\n'
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_its_refit_starts_where_it_gains_what_the_screening_promised(seed):
+    """The loss absorbs the conductance: its sign was open, and a refit from a negative one stayed at none."""
+    t, rng = np.arange(1500) * 4.0, np.random.default_rng(seed)
+    heat = np.repeat(rng.uniform(0.0, 3.0, 15), 100)
+    table = Table("run", "run", t, {"heat": heat, "air_temperature": np.full(1500, 21.0)})
+    truth = loads(TWO_BLOCKS.replace("flows:\n", WALL))
+    table = compile_plant(truth).measure(table, seed=seed)
+    known = case(loads(TWO_BLOCKS), [table], catalogue(), Budget(80))
+    null = started(known, limits()).best
+    looked = screened(known, null.fitted, limits().clean)
+    key = ("second_ambient", "one")
+    promise, found = next(
+        (p, d) for d, p in zip(looked.directions, looked.promises, strict=True) if d.candidate.key == key
+    )
+    assert found.start["G"] > 0
+    assert all(abs(found.start[f"B{k}"] - 21.0) < 30 for k in range(5))
+    refits = _followed(known, null, looked, (found,), null.fitted)
+    gained = max(f.log_likelihood for f in refits) - null.fitted.log_likelihood
+    assert gained > 0.7 * promise > 5.0
