@@ -30,7 +30,6 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose import screen
 from thermoctl.diagnose.candidates import Candidate, candidates
 from thermoctl.diagnose.case import Budget, Case, case
 from thermoctl.diagnose.catalogue import catalogue
@@ -38,9 +37,11 @@ from thermoctl.diagnose.extend import extend
 from thermoctl.diagnose.fit import Fitted, Placed, as_refitted, fitted
 from thermoctl.diagnose.held_out import worth
 from thermoctl.diagnose.limits import limits
+from thermoctl.diagnose.overlay import Trajectory
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.run import diagnose_files
-from thermoctl.diagnose.screen import Direction, sharpened
+from thermoctl.diagnose.score import Direction, parameter_values
+from thermoctl.diagnose.screen import groups_of, sharpened
 from thermoctl.diagnose.screening import screened
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
@@ -159,12 +160,13 @@ def sindy(job: proof_jobs.Job) -> dict[str, Any]:
     known: list[dict[str, np.ndarray]] = []  # per recording: the derivatives of the states that are measured
     at = []
     for r in range(len(drives)):
-        trajectory = screen.Trajectory(metric, rig, r)
+        trajectory = Trajectory(metric, rig, r)
         rates = _measured(base.plant, model, trajectory)
         known.append(rates)
         at.append(trajectory)
     library = [c for c in candidates(rig, known_case.catalogue) if c.place.output is None]
-    columns = [column for c in library for column in screen._columns(c, metric, at)]
+    columns = [column for c in library for g in groups_of(c, metric) for column in g.columns()]
+    forces = [[column.changes(a)[0] for a in at] for column in columns]  # by state, of each recording
     chosen: dict[tuple[str, str], tuple[float, Candidate, dict[str, float]]] = {}
     for i, state in enumerate(model.states):
         if not all(state in rates for rates in known):
@@ -174,16 +176,17 @@ def sindy(job: proof_jobs.Job) -> dict[str, Any]:
             rates[state] - np.broadcast_to(np.asarray(ex.evaluate(slope, a.values), float), a.drive.t.shape)
             for rates, a in zip(known, at, strict=True)
         ]
-        usable = [c for c in columns if all(i in f and np.isfinite(f[i]).all() for f in c.forces)]
-        for column, coefficient, share in _sparse(target, [[f[i] for f in c.forces] for c in usable], usable):
+        usable = [k for k, parts in enumerate(forces) if all(i in f for f in parts)]
+        features = [[f[i] for f in forces[k]] for k in usable]
+        for column, coefficient, share in _sparse(target, features, [columns[k] for k in usable]):
             c, _, (shape, dim), _ = column.item
-            start = screen.parameter_values(c, shape, [coefficient * v for v in dim])
+            start = parameter_values(c, shape, [coefficient * v for v in dim])
             if c.key not in chosen or share > chosen[c.key][0]:
                 chosen[c.key] = (share, c, {**shape, "": 0.0, **{f"={k}": v for k, v in start.items()}})
     current = base
     for _, c, kept in sorted(chosen.values(), key=lambda item: -item[0])[:MOST]:
         start = {k[1:]: v for k, v in kept.items() if k.startswith("=")}
-        direction = screen.Direction(
+        direction = Direction(
             dataclasses.replace(c, rig=Structure(current.plant, drives, rig.columns)),
             {k: v for k, v in kept.items() if k and not k.startswith("=")},
             0.0,
@@ -194,7 +197,7 @@ def sindy(job: proof_jobs.Job) -> dict[str, Any]:
     return told(known_case, base, current)
 
 
-def _measured(plant: Any, model: Any, at: screen.Trajectory) -> dict[str, np.ndarray]:
+def _measured(plant: Any, model: Any, at: Trajectory) -> dict[str, np.ndarray]:
     """Derivatives (N,) of the states with a sensor (an output that is a multiple of one state) and of speeds whose position
     has one; puts the smoothed measurements into the trajectory's values in place of the simulated ones."""
     from pysindy import SmoothedFiniteDifference

@@ -13,7 +13,7 @@ from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.extend import extend
 from thermoctl.diagnose.fit import Placed, Posterior, evidence_at, fitted, log_density
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Direction
+from thermoctl.diagnose.score import Direction
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

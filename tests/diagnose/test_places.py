@@ -10,7 +10,7 @@ from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.extend import ranges_of
 from thermoctl.diagnose.rig import Rig
-from thermoctl.diagnose.screen import Direction
+from thermoctl.diagnose.score import Direction
 from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import loads
 from thermoctl.plant.language import Plant

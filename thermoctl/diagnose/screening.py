@@ -16,7 +16,8 @@ from thermoctl.diagnose.levels import over_noise
 from thermoctl.diagnose.metric import Absorbed, Metric, Pushed, without
 from thermoctl.diagnose.noise import Averaged, grid, rise
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Direction, Norms, screen
+from thermoctl.diagnose.score import Direction
+from thermoctl.diagnose.screen import Norms, screen
 from thermoctl.diagnose.sketch import likeliest
 from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import Simulation

@@ -21,7 +21,8 @@ from thermoctl.diagnose.mistakes import mistakes
 from thermoctl.diagnose.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnose.odds import odds
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Direction, Norms, sharpened
+from thermoctl.diagnose.score import Direction
+from thermoctl.diagnose.screen import Norms, sharpened
 from thermoctl.diagnose.screening import Screened, places, screened
 from thermoctl.diagnose.shortlist import HALF, PAIR, shortlist, simpler
 from thermoctl.plant import refit

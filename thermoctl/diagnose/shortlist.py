@@ -13,7 +13,7 @@ from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.metric import Metric
 from thermoctl.diagnose.odds import EVENTS, odds
 from thermoctl.diagnose.places import PLACES
-from thermoctl.diagnose.screen import Direction
+from thermoctl.diagnose.score import Direction
 from thermoctl.diagnose.screening import Screened
 from thermoctl.plant import expression as ex
 

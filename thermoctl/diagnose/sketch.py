@@ -25,7 +25,8 @@ from scipy.sparse.linalg import splu
 
 from thermoctl.diagnose.metric import Metric
 from thermoctl.diagnose.overlay import Trajectory
-from thermoctl.diagnose.screen import Column, Direction, Group, score
+from thermoctl.diagnose.score import Column, Direction, score
+from thermoctl.diagnose.screen import Group
 from thermoctl.plant import expression as ex
 
 # None of these numbers chooses a hypothesis: directions that are kept are screened exactly.

@@ -22,7 +22,8 @@ from thermoctl.diagnose.noise import Averaged
 from thermoctl.diagnose.overlay import Trajectory
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import NEAR, Column, Norms, directions, groups_of, parameter_values
+from thermoctl.diagnose.score import NEAR, Column, parameter_values
+from thermoctl.diagnose.screen import Norms, directions, groups_of
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 
 SEEN = 5.0  # standard errors of an effect's size, from which it would have been seen
