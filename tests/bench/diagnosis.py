@@ -35,12 +35,12 @@ from thermoctl.diagnose.case import Budget, Case, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.extend import extend
 from thermoctl.diagnose.fit import Fitted, Placed, as_refitted, fitted
+from thermoctl.diagnose.gains import Direction, parameter_values
 from thermoctl.diagnose.held_out import worth
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.overlay import Trajectory
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.run import diagnose_files
-from thermoctl.diagnose.score import Direction, parameter_values
 from thermoctl.diagnose.screen import groups_of, sharpened
 from thermoctl.diagnose.screening import screened
 from thermoctl.plant import expression as ex

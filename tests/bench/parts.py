@@ -37,7 +37,7 @@ PARTS = (
     ("diagnose/fit.py", "", "evidence"),
     ("diagnose/screen.py", "", "screening"),
     ("diagnose/screening.py", "", "screening"),
-    ("diagnose/score.py", "", "screening"),
+    ("diagnose/gains.py", "", "screening"),
     ("diagnose/overlay.py", "", "screening"),
     ("diagnose/metric.py", "", "screening"),
     ("diagnose/shortlist.py", "", "screening"),

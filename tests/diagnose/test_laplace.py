@@ -12,8 +12,8 @@ from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.extend import extend
 from thermoctl.diagnose.fit import Placed, Posterior, evidence_at, fitted, log_density
+from thermoctl.diagnose.gains import Direction
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.score import Direction
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

@@ -9,8 +9,8 @@ from tests.plants import FREE_CARRIAGE
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.extend import ranges_of
+from thermoctl.diagnose.gains import Direction
 from thermoctl.diagnose.rig import Rig
-from thermoctl.diagnose.score import Direction
 from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import loads
 from thermoctl.plant.language import Plant

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from thermoctl.diagnose.score import Direction
+from thermoctl.diagnose.gains import Direction
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation
 

@@ -51,7 +51,7 @@ class Fitted:
 
     hypothesis: Hypothesis
     plant: Plant
-    fit: Fit
+    fit: Fit  # its Hessian is that of the parameters, with the starts eliminated
     log_likelihood: float
     log_prior: float
     volume: float  # k/2 log 2 pi - 1/2 log |H|

@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose.candidates import Candidate
+from thermoctl.diagnose.gains import Column, Direction, parameter_values, score
 from thermoctl.diagnose.metric import Metric, Pushed
 from thermoctl.diagnose.onsets import ONSETS
 from thermoctl.diagnose.overlay import Overlay, Trajectory
 from thermoctl.diagnose.rig import Rig
-from thermoctl.diagnose.score import Column, Direction, parameter_values, score
 from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant.cores import ABREAST, LEAST, each
 

@@ -12,11 +12,11 @@ from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.gains import Direction
 from thermoctl.diagnose.levels import over_noise
 from thermoctl.diagnose.metric import Absorbed, Metric, Pushed, without
 from thermoctl.diagnose.noise import Averaged, grid, rise
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.score import Direction
 from thermoctl.diagnose.screen import Norms, screen
 from thermoctl.diagnose.sketch import likeliest
 from thermoctl.plant.residuals import Problem

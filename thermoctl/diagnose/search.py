@@ -14,6 +14,7 @@ from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.extend import extend, sticking, weaker
 from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, placed_before
+from thermoctl.diagnose.gains import Direction
 from thermoctl.diagnose.levels import over_noise
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, PlacedBefore
@@ -21,7 +22,6 @@ from thermoctl.diagnose.mistakes import mistakes
 from thermoctl.diagnose.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnose.odds import odds
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.score import Direction
 from thermoctl.diagnose.screen import Norms, sharpened
 from thermoctl.diagnose.screening import Screened, places, screened
 from thermoctl.diagnose.shortlist import HALF, PAIR, shortlist, simpler

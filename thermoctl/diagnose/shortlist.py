@@ -9,11 +9,11 @@ import numpy as np
 
 from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.fit import Placed
+from thermoctl.diagnose.gains import Direction
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.metric import Metric
 from thermoctl.diagnose.odds import EVENTS, odds
 from thermoctl.diagnose.places import PLACES
-from thermoctl.diagnose.score import Direction
 from thermoctl.diagnose.screening import Screened
 from thermoctl.plant import expression as ex
 

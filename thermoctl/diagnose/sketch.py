@@ -23,9 +23,9 @@ import numpy as np
 from scipy.sparse import csc_matrix, identity
 from scipy.sparse.linalg import splu
 
+from thermoctl.diagnose.gains import Column, Direction, score
 from thermoctl.diagnose.metric import Metric
 from thermoctl.diagnose.overlay import Trajectory
-from thermoctl.diagnose.score import Column, Direction, score
 from thermoctl.diagnose.screen import Group
 from thermoctl.plant import expression as ex
 

@@ -18,11 +18,11 @@ from thermoctl.diagnose.candidates import Candidate, candidates
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.gains import NEAR, Column, parameter_values
 from thermoctl.diagnose.noise import Averaged
 from thermoctl.diagnose.overlay import Trajectory
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.score import NEAR, Column, parameter_values
 from thermoctl.diagnose.screen import Norms, directions, groups_of
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 
