@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -42,3 +44,13 @@ def test_a_simulation_that_fails_is_worse_and_a_cell_that_is_missing_is_not():
     cells = [np.where(np.arange(2000)[:, None] % 7 == 0, np.nan, e) for e in noise]
     assert worse([e + pattern for e in cells], cells) < 0.1
     assert worse(noise, [np.full_like(noise[0], np.nan), noise[1]]) == 1.0
+
+
+def test_an_output_that_no_recording_measured_says_nothing():
+    noise, pattern = errors(3)
+    unseen = [np.column_stack([e, np.full(len(e), np.nan)]) for e in noise]
+    after = [np.column_stack([e + pattern, np.full(len(e), np.nan)]) for e in noise]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert worse(unseen, after) == worse(noise, [e + pattern for e in noise])
+        assert worse(unseen, unseen) == 0.0

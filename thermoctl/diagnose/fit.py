@@ -233,9 +233,8 @@ def _weighed(
     """Laplace's evidence at the maximum."""
     problem = posterior.problem
     values, dx0 = problem.unpack(z)
-    own = np.ones(len(z), bool)
-    own[gaussian(posterior)] = False
-    own[posterior.believed] = False
+    own, parameters = np.ones(len(z), bool), np.arange(len(z)) < problem.n_parameters
+    own[np.concatenate([gaussian(posterior), posterior.believed])] = False
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
     confined = _relieved(confined, posterior.relief(z, posterior.rows(errors), average))
     inverse = np.linalg.pinv(confined, hermitian=True)
@@ -249,7 +248,7 @@ def _weighed(
         -2 * average.log_likelihood,
         problem.unknowns,
         z,
-        _kept(matrix, range(problem.n_parameters)),
+        _kept(matrix, parameters),
         errors,
         case.noise,
         0,
@@ -259,7 +258,7 @@ def _weighed(
     )
     # with hundreds of recordings the starts' part fills the memory
     rough = dataclasses.replace(
-        rough, hessian=_kept(rough.hessian, range(problem.n_parameters)), prior_hessian=np.zeros((0, 0))
+        rough, hessian=_kept(rough.hessian, parameters), prior_hessian=np.zeros((0, 0))
     )
     rough_powers = case.coordinates.powers(posterior.rows(rough.residuals))
     if not problem.keeps:
@@ -277,17 +276,16 @@ def _weighed(
         updated(posterior.plant, rough, posterior.drives),
         rough,
         tuple(rough_powers),
-        _kept(confined, [k for k, (_, r) in enumerate(problem.unknowns) if r is None]),
+        _kept(confined, np.array([r is None for _, r in problem.unknowns], bool)),
         posterior.past,
     )
 
 
-def _kept(h: np.ndarray, some: Sequence[int]) -> np.ndarray:
-    """Return the curvature of some unknowns; the others are eliminated."""
-    kept = np.array(some, int)
-    others = np.setdiff1d(np.arange(len(h)), kept)
-    inner = np.linalg.pinv(h[np.ix_(others, others)], hermitian=True)
-    return np.asarray(h[np.ix_(kept, kept)] - h[np.ix_(kept, others)] @ inner @ h[np.ix_(others, kept)])
+def _kept(h: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Return the curvature of the unknowns `kept` (k,), a mask; the others are eliminated."""
+    cross = h[np.ix_(~kept, kept)]
+    absorbed = cross.T @ np.linalg.pinv(h[np.ix_(~kept, ~kept)], hermitian=True) @ cross
+    return np.asarray(h[np.ix_(kept, kept)] - absorbed)
 
 
 def _deviations(posterior: Posterior, values: np.ndarray, sd: np.ndarray) -> dict[str, float]:
@@ -322,9 +320,8 @@ def _relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
 
 def remembered(case: Case, f: Fitted) -> Past:
     """Return what all recordings so far say of a hypothesis."""
-    unknowns = f.fit.unknowns
-    shared = np.array([k for k, (_, r) in enumerate(unknowns) if r is None], int)
-    names = tuple(unknowns[k][0] for k in shared)
+    shared = np.array([r is None for _, r in f.fit.unknowns], bool)
+    names = tuple(q for q, r in f.fit.unknowns if r is None)
     at = [(case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids]
     return Past(
         placed_before(f.hypothesis.effects, f.plant),

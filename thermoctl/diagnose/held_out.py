@@ -78,19 +78,19 @@ def worth(
 def worse(alone: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
     """Return the probability that errors `after` are larger than those `alone`, as a mean over all time.
 
-    Differences of squares, each in its output's mean square, are summed over blocks: errors are not
+    Differences of squares, each over its output's sum of squares, are summed over blocks: errors are not
     independent from row to row (Diebold & Mariano 1995). The blocks' mean has Student's t distribution."""
-    size = np.nanmean(np.concatenate(alone) ** 2, axis=0)
+    if not all(np.isfinite(a[np.isfinite(b)]).all() for b, a in zip(alone, after, strict=True)):
+        return 1.0  # a simulation failed
+    size = np.nansum(np.concatenate(alone) ** 2, axis=0)
     seen = size > 0
     blocks = [
         float(np.nansum((a[part][:, seen] ** 2 - b[part][:, seen] ** 2) / size[seen]))
         for b, a in zip(alone, after, strict=True)
         for part in np.array_split(np.arange(len(a)), BLOCKS)
     ]
-    if not all(np.isfinite(a[np.isfinite(b)]).all() for b, a in zip(alone, after, strict=True)):
-        return 1.0  # a simulation failed
-    spread = float(np.std(blocks, ddof=1)) / np.sqrt(len(blocks))
-    return float(student.cdf(np.mean(blocks) / spread, len(blocks) - 1)) if spread > 0 else 0.0
+    mean, spread = float(np.mean(blocks)), float(np.std(blocks, ddof=1)) / np.sqrt(len(blocks))
+    return float(student.cdf(mean / spread, len(blocks) - 1)) if spread > 0 else float(mean > 0)
 
 
 def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:
