@@ -33,7 +33,7 @@ from tests.concealed.thermal import Variant
 SHARE = (0.03, 0.5)  # of the effect's signal; ../shared/design/one_evidence.md, the proof in an open world
 ALONE = (1.5, 15.0)  # sigmas left by the misfits where nothing is concealed
 TOP = 8.0  # times its typical size that a misfit may have; beyond, it would be the rig's main physics
-STEPS = 4  # times the common size is chosen again, since misfits are not linear in it
+STEPS = 8  # times the common size is chosen again, since misfits are not linear in it
 DRIVES = ("drive", "pump", "current")  # a rig's driving input where its heat is not given ready-made
 
 
@@ -182,14 +182,15 @@ def open_world(
     chosen = [every[i] for i in rng.permutation(len(every))[: rng.integers(1, 4)]]
     low, high = SHARE if signal else ALONE
     target = float(np.exp(rng.uniform(np.log(low), np.log(high)))) * (signal or 1.0)
-    size = 1.0
+    size = then = 1.0
     for _ in range(STEPS):
+        size = then
         world = readings(scene, effects, chosen, size)
         delta = [(a - b)[None] for a, b in zip(world, runs, strict=True)]
         left = float(snr(bench.judge.left_over(bench.judge.whiten(delta)))[0])
         if 0.8 < left / target < 1.25 or (left < target and size >= TOP):
             break
-        size = float(np.clip(size * np.clip(target / max(left, 1e-6), 0.1, 10.0), 1e-3, TOP))
+        then = min(size * min(target / max(left, 1e-6), 10.0), TOP)
     factor = {o: float(np.exp(rng.uniform(-np.log(2), np.log(2)))) for o in scene.outputs}
     wrong_noise = bool(rng.random() < 0.3)
     plant = scene.plant
