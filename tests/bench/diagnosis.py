@@ -132,7 +132,7 @@ def bic(job: proof_jobs.Job) -> dict[str, Any]:
     known, base = prepared(job)
     current = base
     for _ in range(MOST):
-        looked = screened(known, current, limits().clean)
+        looked = screened(known, current, limits())
         first: dict[tuple[str, str], Direction] = {}
         for d in sorted(looked.directions, key=lambda d: d.log_p):
             first.setdefault(d.candidate.key, sharpened(looked.metric, looked.rig, d))
@@ -155,7 +155,7 @@ def bic(job: proof_jobs.Job) -> dict[str, Any]:
 def sindy(job: proof_jobs.Job) -> dict[str, Any]:
     """Sparse regression of what the measured states' derivatives have beyond the plant's slopes."""
     known_case, base = prepared(job)
-    looked = screened(known_case, base, limits().clean)
+    looked = screened(known_case, base, limits())
     model, drives, rig, metric = base.fit.model, looked.metric.drives, looked.rig, looked.metric
     known: list[dict[str, np.ndarray]] = []  # per recording: the derivatives of the states that are measured
     at = []

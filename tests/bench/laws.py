@@ -26,7 +26,7 @@ from tests.laws.prove import AMBIENT, EQUAL, PART, cases, judge, without
 from tests.laws.rigs import Made, make
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import Fitted, as_refitted, fitted
-from thermoctl.diagnose.law.forms import Place, signals
+from thermoctl.diagnose.law.signals import Place, signals
 from thermoctl.diagnose.law.smooth import LATENT, tracked
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.roles import Structure

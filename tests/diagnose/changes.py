@@ -13,6 +13,7 @@ import numpy as np
 LOST = 0.02  # of cells, or of rows
 SEED = 23
 KERNEL = np.array([0.25, 0.5, 0.25])  # passes half at a quarter of the sampling rate, nothing at half
+PLAIN = np.array([0.0, 1.0, 0.0])  # no filter: readings as they are
 JUMP = 0.02  # of a held input's range
 EPOCH = 1_763_870_400.0  # a unix time
 SECTIONS = ("inputs", "parameters", "nodes", "flows", "outputs")
@@ -210,14 +211,14 @@ def columns_added(rig: Rig) -> Rig:
     return _map(rig, change)
 
 
-def thinned(rig: Rig) -> Rig:
+def thinned(rig: Rig, kernel: np.ndarray = KERNEL) -> Rig:
     """Keep every second row, after a low-pass filter that neither delays nor passes half the sampling rate.
 
     A held input is its mean until the next kept row; readings beside its jumps would mix both, and are left out."""
     held = [n for n, linear in rig.inputs().items() if not linear]
 
     def change(c: Columns) -> Columns:
-        smooth = {n: v if n == "t" else _smooth(v) for n, v in c.items()}
+        smooth = {n: v if n == "t" else _smooth(v, kernel) for n, v in c.items()}
         jump = np.zeros(len(c["t"]) + 3, bool)
         for n in held:
             jump[2:-2] |= np.abs(np.diff(c[n])) > JUMP * np.ptp(c[n])
@@ -230,9 +231,9 @@ def thinned(rig: Rig) -> Rig:
     return _map(rig, change)
 
 
-def _smooth(v: np.ndarray) -> np.ndarray:
+def _smooth(v: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     """A signal (N,) after the filter; its ends as they were, since a recording's start is stated."""
-    return np.concatenate([v[:1], np.convolve(v, KERNEL, "valid"), v[-1:]])
+    return np.concatenate([v[:1], np.convolve(v, kernel, "valid"), v[-1:]])
 
 
 def noise_stated(factor: float) -> Callable[[Rig], Rig]:

@@ -22,12 +22,12 @@ import numpy as np
 import yaml
 
 from tests.concealed.generate import NotVisible, make_case
-from tests.diagnose.changes import CHANGES, KERNEL, SEED, Change, Rig, noise_stated, thinned
+from tests.diagnose.changes import CHANGES, PLAIN, SEED, Change, Rig, thinned
 from thermoctl.diagnose.run import diagnose_files
 
 CLOSE = 0.02  # probabilities that differ by less are the same (issue 23)
 EITHER_WAY = ("missing_link", "bending")  # their two places may be named in either order
-TIMES = {  # that the recordings of a family are thinned by two at first
+TIMES = {  # that every second row of a family's recordings is left out at first
     "tanks": 1,
     "heater": 3,
     "drive": 3,
@@ -57,9 +57,7 @@ def drawn(family: str, number: int, kind: str, world: str) -> tuple[Rig, dict[st
     plain = yaml.safe_load(yaml.safe_dump(json.loads(json.dumps(plant, default=float))))
     rig = Rig(plain, {f"run_{k + 1}": dict(run) for k, run in enumerate(runs)})
     for _ in range(TIMES[family]):
-        rig = noise_stated(float(np.linalg.norm(KERNEL)))(thinned(rig))
-        for o in rig.plant["outputs"].values():
-            o.pop("resolution", None)
+        rig = thinned(rig, PLAIN)
     return rig, answer
 
 

@@ -1,4 +1,4 @@
-"""Spelling, order, clock, units and lost cells do not change a diagnosis: three small cases of the generator."""
+"""Spelling, order, clock, units, losses, thinning and stated noise do not change a diagnosis: three small cases of the generator."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from tests.diagnose.changes import (
     noise_stated,
     order,
     rows_lost,
+    thinned,
     together,
 )
 from tests.diagnose.metamorphic import diagnosed, difference, drawn
@@ -24,9 +25,13 @@ from tests.diagnose.metamorphic import diagnosed, difference, drawn
     [
         (("tanks", 1, "one", "open"), [["sensor_delay", "level_lower"]], [together(order, clock, names)]),
         (("drive", 1, "one", "open"), [["copper_resistance", "joule"]], [together(kelvin, milliwatt)]),
-        (("heater", 2, "none", "closed"), [], [together(rows_lost, cells_lost), columns_added]),
+        (
+            ("heater", 2, "none", "closed"),
+            [],
+            [together(rows_lost, cells_lost), columns_added, thinned, noise_stated(0.5), noise_stated(2.0)],
+        ),
     ],
-    ids=["order, clock and names", "units", "losses and unrelated columns"],
+    ids=["order, clock and names", "units", "losses, unrelated columns, thinning and the stated noise"],
 )
 def test_a_change_of_form_does_not_change_the_diagnosis(case, effects, changes, tmp_path):
     rig, answer = drawn(*case)

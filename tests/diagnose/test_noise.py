@@ -11,8 +11,9 @@ from scipy.special import logsumexp
 
 from thermoctl.diagnose import noise as module
 from thermoctl.diagnose.coordinates import Coordinates, transform
+from thermoctl.diagnose.grids import Grid, grid
 from thermoctl.diagnose.levels import floor
-from thermoctl.diagnose.noise import Averaged, Grid, averaged, grid, rise
+from thermoctl.diagnose.noise import Averaged, averaged, rise
 from thermoctl.diagnose.spectra import SLOW
 from thermoctl.plant.simulate import Excitation
 

@@ -21,11 +21,12 @@ from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.experiment.propose import propose, survivors
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law.find import find_law
-from thermoctl.diagnose.law.forms import Place, Signal, Term, families, library, signals
+from thermoctl.diagnose.law.forms import Term, families, library
 from thermoctl.diagnose.law.misfit import misfit_odds
 from thermoctl.diagnose.law.propose import PROPOSALS
 from thermoctl.diagnose.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
 from thermoctl.diagnose.law.result import law_entry, law_section, save_effect
+from thermoctl.diagnose.law.signals import Place, Signal, signals
 from thermoctl.diagnose.law.smooth import tracked
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.report.words import law_sentence

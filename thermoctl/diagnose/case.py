@@ -15,8 +15,8 @@ from scipy.ndimage import median_filter
 from thermoctl.checks.model import SIGMAS, start_errors
 from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.grids import Grid, grid
 from thermoctl.diagnose.memory import NOTHING, Memory
-from thermoctl.diagnose.noise import Grid, grid
 from thermoctl.diagnose.progress import Pace
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.rows import OUTLIER, Reduced, reduced

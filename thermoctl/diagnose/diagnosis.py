@@ -12,13 +12,14 @@ from thermoctl.diagnose.fit import as_refitted, with_residuals
 from thermoctl.diagnose.held_out import split, worth
 from thermoctl.diagnose.law.find import find_law
 from thermoctl.diagnose.law.smooth import missing_flow
+from thermoctl.diagnose.levels import remainder
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.misfit import energies, standing, standouts
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.search import Searched, search
 from thermoctl.diagnose.threads import one_thread
-from thermoctl.diagnose.unknown import left, reached, remainder
+from thermoctl.diagnose.unknown import left, reached
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 
@@ -77,7 +78,7 @@ def _decided(
         stand = standouts(physics[likeliest])  # the other effects are part of the remainder
         best = with_residuals(known, fits.get(stand, fits[likeliest]))
     reach = reached(known)
-    after, before = left(known, best, reach, numbers.clean), left(known, null, reach, numbers.clean)
+    after, before = left(known, best, reach), left(known, null, reach)
     value = worth(known, null, best, reserve)
     keys = () if unsure else (e.key for e in best.hypothesis.effects)
     named = tuple(key for key in keys if posterior.effects[key] >= numbers.name)

@@ -9,8 +9,10 @@ from scipy.stats import chi2
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted
-from thermoctl.diagnose.noise import Grid
+from thermoctl.diagnose.grids import Grid
+from thermoctl.diagnose.limits import Limits
 
+PRESENT = 0.5  # probability of a remainder, from which an output's residual holds one
 RARE = 0.05  # chance of a power as small as that of an octave, below which it contradicts a noise
 
 
@@ -48,29 +50,49 @@ def late(case: Case, f: Fitted) -> list[str]:
     return out
 
 
-def levels(case: Case, f: Fitted, clean: float) -> list[float]:
-    """Return the standard deviation of each output's noise: the stated one, or more if that explains all.
+def rounded(case: Case) -> list[bool]:
+    """Return for each output whether its reading rests on the steps of its rounding.
 
-    A stated noise and the recorded times may be wrong by one standard deviation of their priors. So variance
-    that is present at all frequencies counts as noise up to there. The residual must then be within `clean`
-    times this noise."""
+    Such a reading errs with the signal: a remainder there proves nothing."""
+    drives, outputs = case.drives(case.null.model), list(case.plant.outputs.values())
     out = []
-    for g, late in zip(case.grids, timing(case, f), strict=True):
-        lowest, at = np.inf, 0
-        for k in g.channels:
-            inverse = f.average.inverse[k]
-            stated = g.variance * g.shape[g.node[at : at + len(inverse)]]
-            lowest = min(lowest, float(np.min(1 / (inverse * stated))))
-            at += len(inverse)
-        own = g.variance * float(np.clip(lowest, 1.0, np.exp(g.known)))
-        level = float(np.sqrt(max(own, g.variance + late)))
-        out.append(level if _rms(f, g) <= clean * level else g.sigma)
+    for g in case.grids:
+        j = case.coordinates.channels[g.channels[0]].output
+        step = outputs[j].resolution or 0.0
+        moves = [np.abs(np.diff(d.y[np.isfinite(d.y[:, j]), j])) for d in drives]
+        out.append(bool(step > g.sigma and np.median(np.concatenate(moves)) <= step))
     return out
 
 
-def over_noise(case: Case, f: Fitted, clean: float) -> list[float]:
+def remainder(case: Case, f: Fitted) -> float:
+    """Return the largest probability of a remainder at an output whose remainder proves something."""
+    known = zip(f.average.remainder, rounded(case), strict=True)
+    return max((p for p, coarse in known if not coarse), default=0.0)
+
+
+def levels(case: Case, f: Fitted) -> list[float]:
+    """Return the standard deviation of each output's noise: learnt, where the residual holds no remainder.
+
+    A stated noise may be wrong by two standard deviations of its prior either way. Beside a remainder the
+    stated noise counts, and what uncertain times add to it."""
+    out = []
+    for g, late, sensor, p in zip(
+        case.grids, timing(case, f), f.average.sensor, f.average.remainder, strict=True
+    ):
+        wrong = np.exp(2 * g.known)
+        learnt = float(np.clip(sensor, g.variance / wrong, max(g.variance * wrong, g.variance + late)))
+        out.append(float(np.sqrt(learnt if p < PRESENT else g.variance + late)))
+    return out
+
+
+def over_noise(case: Case, f: Fitted) -> list[float]:
     """Return the rms of each output's residuals over its noise (`levels`)."""
-    return [_rms(f, g) / level for g, level in zip(case.grids, levels(case, f, clean), strict=True)]
+    return [_rms(f, g) / level for g, level in zip(case.grids, levels(case, f), strict=True)]
+
+
+def only_noise(case: Case, f: Fitted, limits: Limits) -> bool:
+    """Is the residual about as large as the noise, and no remainder in it certain?"""
+    return max(over_noise(case, f)) <= limits.clean and remainder(case, f) < limits.name
 
 
 def _rms(f: Fitted, g: Grid) -> float:

@@ -23,10 +23,9 @@ import numpy as np
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.fit import DECADES, Fitted, as_refitted
-from thermoctl.diagnose.levels import timing
+from thermoctl.diagnose.levels import rounded, timing
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.search import Searched
-from thermoctl.diagnose.unknown import rounded
 
 MISFIT = 0.5  # probability of being physics, below which an effect is rather a misfit
 SURE = 200.0  # r^2 beyond which the probability is 1 in any case

@@ -13,9 +13,11 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnose.fit import Fitted, as_refitted
 from thermoctl.diagnose.gains import Direction
-from thermoctl.diagnose.levels import over_noise
+from thermoctl.diagnose.grids import grid
+from thermoctl.diagnose.levels import only_noise
+from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.metric import Absorbed, Metric, Pushed, without
-from thermoctl.diagnose.noise import Averaged, grid, rise
+from thermoctl.diagnose.noise import Averaged, rise
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Norms, screen
 from thermoctl.diagnose.sketch import likeliest
@@ -216,15 +218,14 @@ class Screened:
     norms: list[Norms]
 
 
-def screened(case: Case, fitted: Fitted, clean: float) -> Screened:
+def screened(case: Case, fitted: Fitted, limits: Limits) -> Screened:
     """Screen the catalogue at the places of the original plant; a part that an effect added is no place.
 
-    Where the residual is more than `clean` times the noise, in the noise alone, too: there by energy."""
+    Where the residual is more than noise, in the noise alone, too: there by energy."""
     refitted = as_refitted(case, fitted)
     plain = Plain(case, fitted, ROWS)
     metric = Rows(plain, refitted.average, True)
-    large = max(over_noise(case, refitted, clean)) > clean
-    other = Rows(plain, refitted.average, False) if large else None
+    other = None if only_noise(case, refitted, limits) else Rows(plain, refitted.average, False)
     rig = Structure(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()

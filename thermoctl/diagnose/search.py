@@ -15,7 +15,7 @@ from thermoctl.diagnose.decide import Key
 from thermoctl.diagnose.extend import extend, sticking, weaker
 from thermoctl.diagnose.fit import WHITE, Fitted, Placed, as_refitted, fitted, placed_before
 from thermoctl.diagnose.gains import Direction
-from thermoctl.diagnose.levels import over_noise
+from thermoctl.diagnose.levels import only_noise
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, PlacedBefore
 from thermoctl.diagnose.mistakes import mistakes
@@ -96,7 +96,7 @@ class Search:
             return []
         self.seen.add(parent.fitted.hypothesis.keys)
         self.case.budget.screen()
-        looked = screened(self.case, parent.fitted, self.limits.clean)
+        looked = screened(self.case, parent.fitted, self.limits)
         if not parent.fitted.hypothesis.effects:
             self.norms = looked.norms
         found = extensions(self.case, parent, looked, self.where, self.limits, self.tried)
@@ -137,7 +137,7 @@ def grow(s: Search) -> None:
     for number in range(s.limits.effects):
         beam = leaders(list(s.tried.values()), s.limits)
         best = beam[0].score
-        close = max(over_noise(s.case, beam[0].fitted, s.limits.clean)) <= s.limits.clean
+        close = only_noise(s.case, beam[0].fitted, s.limits)
         rounds = s.limits.effects - number - 1
         for k, parent in enumerate(beam):
             after = [w for w in beam[k + 1 :] if not close or w.score >= best - BEATEN]
@@ -222,7 +222,7 @@ def with_observer(s: Search) -> None:
     about = linear(case.null, drives)
     if about is None or not drifts(about, max(float(d.t[-1]) for d in drives)):
         return
-    if max(over_noise(case, as_refitted(case, s.best.fitted), s.limits.clean)) <= s.limits.clean:
+    if only_noise(case, as_refitted(case, s.best.fitted), s.limits):
         return
     for trust in TRUSTS:
         plant = held(case.plant, about, case.noise, float(np.median(np.diff(drives[0].t))), trust)
@@ -282,7 +282,7 @@ def extensions(
     doubtful: list[Weighed] = []
     ahead = max(tried.values(), key=lambda w: w.score)
     # beside a hypothesis that leaves no more than noise only promises count
-    promised = parent is not ahead and max(over_noise(case, ahead.fitted, limits.clean)) <= limits.clean
+    promised = parent is not ahead and only_noise(case, ahead.fitted, limits)
     queue, planned = shortlist(looked, where, limits), case.budget.later
 
     def wanted(item: Extension) -> bool:
@@ -320,7 +320,7 @@ def _expected(case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Limi
     `untried`: share of the shortlist."""
     if not any(w.fitted.hypothesis.effects for w in tried):
         return CLOSE * limits.beam * untried  # it may end with the next one, or extend every beam
-    if max(over_noise(case, leader, limits.clean)) > limits.clean:
+    if not only_noise(case, leader, limits):
         return np.inf
     scores = sorted((w.score for w in tried), reverse=True)[: limits.beam]
     return CLOSE * sum(score >= scores[0] - BEATEN for score in scores)

@@ -32,35 +32,15 @@ class Left:
     follows: tuple[str, ...]
 
 
-def left(case: Case, f: Fitted, reach: Responses, clean: float) -> Left:
+def left(case: Case, f: Fitted, reach: Responses) -> Left:
     """Measure and locate the residual of a fitted hypothesis."""
     names = [case.null.model.outputs[case.coordinates.channels[g.channels[0]].output] for g in case.grids]
-    over = dict(zip(names, over_noise(case, f, clean), strict=True))
-    noise = dict(zip(names, levels(case, f, clean), strict=True))
+    over = dict(zip(names, over_noise(case, f), strict=True))
+    noise = dict(zip(names, levels(case, f), strict=True))
     rms = {o: noise[o] * float(np.sqrt(max(ratio**2 - 1, 0.0))) for o, ratio in over.items()}
     worst = max(over, key=lambda o: over[o]) if over else ""
     follow = follows(case, f, worst) if over and over[worst] > 1 else ()
     return Left(rms, noise, over, next(iter(located(case, f, reach)), None), follow)
-
-
-def remainder(case: Case, f: Fitted) -> float:
-    """Return the largest probability of a remainder at an output whose remainder proves something."""
-    known = zip(f.average.remainder, rounded(case), strict=True)
-    return max((p for p, coarse in known if not coarse), default=0.0)
-
-
-def rounded(case: Case) -> list[bool]:
-    """Return for each output whether its reading rests on the steps of its rounding.
-
-    Such a reading errs with the signal: a remainder there proves nothing."""
-    drives, outputs = case.drives(case.null.model), list(case.plant.outputs.values())
-    out = []
-    for g in case.grids:
-        j = case.coordinates.channels[g.channels[0]].output
-        step = outputs[j].resolution or 0.0
-        moves = [np.abs(np.diff(d.y[np.isfinite(d.y[:, j]), j])) for d in drives]
-        out.append(bool(step > g.sigma and np.median(np.concatenate(moves)) <= step))
-    return out
 
 
 def reached(case: Case) -> Responses:

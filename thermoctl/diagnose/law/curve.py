@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.diagnose.law.forms import Signal
 from thermoctl.diagnose.law.propose import PIECES, Proposal, pieces
+from thermoctl.diagnose.law.signals import Signal
 from thermoctl.diagnose.law.smooth import Tracked
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant

@@ -15,17 +15,8 @@ import numpy as np
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, as_refitted
-from thermoctl.diagnose.law.forms import (
-    Family,
-    Place,
-    Signal,
-    Term,
-    combined,
-    families,
-    library,
-    places,
-    signals,
-)
+from thermoctl.diagnose.law.forms import Family, Term, combined, families, library
+from thermoctl.diagnose.law.signals import Place, Signal, places, signals
 from thermoctl.diagnose.law.smooth import Tracked, tracked
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.shortlist import ALIKE

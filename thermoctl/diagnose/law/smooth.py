@@ -22,7 +22,7 @@ from scipy.sparse import csr_matrix
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted, as_refitted
-from thermoctl.diagnose.law.forms import Place
+from thermoctl.diagnose.law.signals import Place
 from thermoctl.diagnose.rig import TEMPERATURE
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
 from thermoctl.diagnose.where import SHARES, signals, typical_flow
