@@ -11,6 +11,7 @@ from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.extend import ranges_of
 from thermoctl.diagnose.gains import Direction
 from thermoctl.diagnose.rig import Rig
+from thermoctl.diagnose.search import free_starts
 from thermoctl.diagnose.shapes import shape_grid
 from thermoctl.plant import loads
 from thermoctl.plant.language import Plant
@@ -86,3 +87,59 @@ def test_a_period_that_has_not_come_twice_is_not_offered():
     for shape in grid:
         direction = Direction(found, shape, 1.0, 2, {**start, "P": shape["period"]})
         assert ranges_of(direction, 8.0)["P"][1] <= 1.001 * travel / 2
+
+
+def jumping(motor, column: str) -> tuple[Plant, Table]:
+    plant, table = motor
+    columns = {**table.columns, column: table.columns[column] + 3.0 * (table.t > 1000)}
+    return plant, Table("run", "run", table.t, columns)
+
+
+@pytest.mark.parametrize("column", ["winding_c", "air"])
+def test_an_offset_step_is_no_larger_than_the_largest_jump_of_its_reading(motor, column):
+    """A step of 299 K at an extruder whose reading rose by 12 K within three samples had been named."""
+    plant, table = jumping(motor, column)
+    c = offered(plant, table, "sensor_offset_step")[column]
+    p = next(p for p in c.effect.parameters if p.name == "A")
+    low, high = c.bounds(p)
+    v = table.columns[column]
+    assert high == -low == max(np.abs(v[k:] - v[:-k]).max() for k in (1, 2, 3))
+    assert high > 3.0
+
+
+@pytest.mark.parametrize(
+    ("electronics", "values"),
+    [("sensor_offset_step", {"A": 3.0, "T0": 1000.0}), ("sensor_saturation", {"YMAX": 24.0})],
+)
+@pytest.mark.parametrize("slow", ["sensor_lag", "expansion_lag"])
+def test_a_slow_part_of_a_reading_comes_before_its_electronics_in_whichever_order_it_is_found(
+    motor, electronics, values, slow
+):
+    """A step that a lag smoothed had taken the shape of a heated probe's drift, with its full size."""
+    output = "error" if slow == "expansion_lag" else "winding_c"
+    plant, table = jumping(motor, output)
+    given = {electronics: values, slow: {"TAU": 60.0}}
+    readings = []
+    for order in ((slow, electronics), (electronics, slow), (slow,)):
+        extended = plant
+        for effect in order:
+            extended = offered(extended, table, effect)[output].extend(given[effect])
+        model = compile_plant(extended)
+        readings.append(model.run(model.excitation(table)).y[:, model.outputs.index(output)])
+    np.testing.assert_allclose(readings[0], readings[1], rtol=1e-9, atol=1e-9)
+    error = readings[0] - readings[2]
+    if electronics == "sensor_offset_step":
+        assert np.abs(error[3:] - error[:-3]).max() > 2.5  # a lag would leave 1.2
+
+
+def test_a_reading_of_the_start_is_no_body_whose_start_nobody_measured(motor):
+    """Ten times the spread let a member's growth trade with it: 18 sigmas of growth were called not significant."""
+    _, table = motor
+    plant = loads(MOTOR.replace("initial: air}", "initial: air, initial_sigma: 0.2}"))
+    extended = free_starts(plant, offered(plant, table, "missing_member")["winding"].extend({"A": 0.1}))
+    (memory,) = extended.nodes.keys() - plant.nodes.keys()
+    assert extended.nodes[memory].initial_sigma == pytest.approx(0.2)
+    hidden = offered(plant, table, "hidden_thermal_mass")["winding"].extend({"C": 30.0, "G": 1.0})
+    (body,) = hidden.nodes.keys() - plant.nodes.keys()
+    widened = free_starts(plant, hidden).nodes[body].initial_sigma
+    assert widened == pytest.approx(10 * hidden.nodes[body].initial_sigma)

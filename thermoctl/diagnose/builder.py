@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.catalogue import Effect
-from thermoctl.diagnose.places import Place, heats
+from thermoctl.diagnose.catalogue import Effect, EffectParameter
+from thermoctl.diagnose.places import ERRORS, Place, heats
 from thermoctl.diagnose.rig import STRAIGHT, TEMPERATURE, Rig, kind_of, zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
-from thermoctl.plant.language import Flow, Input, Node, Parameter, Plant
+from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
 
 _form = cache(ex.parse)  # the catalogue's forms are read once
 
@@ -36,6 +36,16 @@ class Placement:
         """The plant's name of one of the effect's parameters."""
         return f"{parameter}_{self.effect.name}_{re.sub(r'[^A-Za-z0-9_]', '_', self.place.where)}"
 
+    def bounds(self, p: EffectParameter) -> tuple[float, float]:
+        """Where physics lets a parameter be."""
+        origin = self.rig.first_air(self.rig.drives[0]) if p.origin == "first_air" else 0.0
+        unit = 1.0
+        if p.of == "jump":
+            physics, place = self.rig.physics, self.place
+            reading = physics.outputs.get(place.output or "") or physics.inputs[place.input or ""]
+            unit = self.rig.largest_jump(reading)
+        return origin + unit * p.low, origin + unit * p.high
+
 
 class Builder:
     """The plant's parts while a change of the catalogue is put into them."""
@@ -53,6 +63,11 @@ class Builder:
         if self.rig.air:
             self.symbols.setdefault("air", name(self.rig.air))
         place = c.place
+        o = self.base.outputs.get(place.output or "")
+        # Physics and slow sensors come before their electronics, in whichever order a search adds them.
+        self.inside = o.sensed if o and o.sensed and not self._of_electronics() else None
+        if self.inside and "y" in place.symbols:
+            self.symbols["y"] = self.inside
         y = place.symbols.get("y")
         for symbol in self.symbols.keys() & {"T", "TA", "TB", "air"}:
             self.symbols[symbol] = self._celsius(self.symbols[symbol])
@@ -68,7 +83,7 @@ class Builder:
             self.symbols[e.name] = name(own)
             value = values.get(e.name, e.null)
             per = value if isinstance(value, dict) else {}
-            low, high = ranges.get(e.name, (e.low, e.high))
+            low, high = ranges.get(e.name) or c.bounds(e)
             mean = float(np.mean(list(per.values()))) if per else float(value)
             limits = (low, high) if np.isfinite(low) and np.isfinite(high) and low < high else None
             if limits:
@@ -191,10 +206,20 @@ class Builder:
     def _value(self, form: str) -> None:
         self._put(self.expression(form))
 
+    def _of_electronics(self) -> bool:
+        """Is the effect an error of a reading that holds no memory?"""
+        changes = self.c.effect.changes[self.c.variant]
+        return self.c.effect.where in ERRORS and not any("node" in item for item in changes)
+
     def _put(self, new: Expr) -> None:
         p = self.c.place
         if p.output:
-            self.outputs[p.output] = dataclasses.replace(self.outputs[p.output], value=new)
+            o = self.outputs[p.output]
+            if self.inside:
+                self.outputs[p.output] = _changed(o, lambda e: new if e is self.inside else None)
+            else:
+                sensed = o.sensed or o.value if self._of_electronics() else None
+                self.outputs[p.output] = dataclasses.replace(o, value=new, sensed=sensed)
             return
 
         def change(e: Expr) -> Expr | None:
@@ -205,9 +230,7 @@ class Builder:
             k: dataclasses.replace(f, rate=ex.substitute(f.rate, change)) if k in self.base.flows else f
             for k, f in self.flows.items()
         }
-        self.outputs = {
-            k: dataclasses.replace(o, value=ex.substitute(o.value, change)) for k, o in self.outputs.items()
-        }
+        self.outputs = {k: _changed(o, change) for k, o in self.outputs.items()}
 
     def _storage(self, form: str) -> None:
         n = self.base.nodes[next(iter(self.c.place.nodes.values()))]
@@ -330,8 +353,13 @@ class Builder:
 
         p = self.c.place
         if p.output:
-            o = self.base.outputs[p.output]
-            self.outputs[p.output] = dataclasses.replace(o, value=ex.substitute(o.value, change))
+            self.outputs[p.output] = _changed(self.base.outputs[p.output], change)
         elif p.flow:
             f = self.base.flows[p.flow]
             self.flows[p.flow] = dataclasses.replace(f, rate=ex.substitute(f.rate, change))
+
+
+def _changed(o: Output, change: Callable[[Expr], Expr | None]) -> Output:
+    """Return an output whose value a substitution changes."""
+    sensed = ex.substitute(o.sensed, change) if o.sensed else None
+    return dataclasses.replace(o, value=ex.substitute(o.value, change), sensed=sensed)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from thermoctl.diagnose.builder import Builder, Placement
-from thermoctl.diagnose.catalogue import Effect, EffectParameter
+from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.places import PLACES, askable
 from thermoctl.diagnose.rig import Rig
 from thermoctl.plant import expression as ex
@@ -25,11 +25,6 @@ class Candidate(Placement):
     def key(self) -> tuple[str, str]:
         """Return (effect, where), as a result names it."""
         return self.effect.name, self.place.where
-
-    def bounds(self, p: EffectParameter) -> tuple[float, float]:
-        """Where physics lets a parameter be."""
-        origin = self.rig.first_air(self.rig.drives[0]) if p.origin == "first_air" else 0.0
-        return origin + p.low, origin + p.high
 
     @property
     def jumps(self) -> bool:

@@ -72,7 +72,8 @@ class EffectParameter:
     - `trial`: its value in screening, an expression of the amplitudes s, s2, s3 and of shapes
     - `shape`: the shape that it is
     - `null`: its value where the effect is absent
-    - `at_zero`: the simpler effect that this one is where the parameter is 0"""
+    - `at_zero`: the simpler effect that this one is where the parameter is 0
+    - `of`: 'jump': low and high count in the largest sudden change of what the sensor reads"""
 
     name: str
     unit: str | None
@@ -85,6 +86,7 @@ class EffectParameter:
     typical: float | None
     origin: str | None  # 'first_air': low and high are relative to the first ambient temperature
     at_zero: str | None = None
+    of: str | None = None
 
     @property
     def amplitude(self) -> bool:
@@ -199,6 +201,7 @@ def _parameter(name: str, node: yamlfile.Node) -> EffectParameter:
         p.get("typical"),
         p.get("origin"),
         p.get("at_zero"),
+        p.get("of"),
     )
 
 

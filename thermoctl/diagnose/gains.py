@@ -124,6 +124,8 @@ def score(
     if c.effect.prior is not None:
         told = [q for q, u in zip(columns, useful, strict=True) if u]
         coefficient[useful] = _plausible(c, told, coefficient[useful], inverse)
+    if len(g) == 1:
+        coefficient[0] = _within(c, columns[0], float(coefficient[0]))
     gain = float(2 * g @ coefficient - coefficient @ m @ coefficient)
     if len(g) == 1 and not _possible(c, columns[0], float(coefficient[0])):
         gain = 0.0
@@ -175,6 +177,20 @@ def _possible(c: Candidate, column: Column, coefficient: float) -> bool:
         # in proportion only from one lag of the grid to the next
         return 1 / NEAR < coefficient < NEAR
     return coefficient > 0
+
+
+def _within(c: Candidate, column: Column, coefficient: float) -> float:
+    """Return the coefficient of a direction that has only one, inside the bounds of its amplitude.
+
+    One of the wrong sign stays as it is: beside another effect the sign may turn (shortlist.pairs)."""
+    p = next((p for p in c.effect.parameters if p.amplitude), None)
+    if p is None:
+        return coefficient
+    shape, dim = column.item[2]
+    low, high = c.bounds(p)
+    at = parameter_values(c, shape, [coefficient * v for v in dim])[p.name]
+    beyond = float(np.clip(at, low, high)) - p.null
+    return coefficient * beyond / (at - p.null) if beyond * (at - p.null) > 0 else coefficient
 
 
 def _sizes(

@@ -38,7 +38,7 @@ from thermoctl.diagnose.spectra import STARTS, slow_parts
 ABSENT = 0.5  # prior of no remainder at an output
 WHITE = 0.5  # prior of no slow part in a noise whose parts nobody stated
 FLOOR = 0.1  # least share of the remainder's energy that is spread evenly over all frequencies
-STEPS, CLOSE = 100, 1e-4  # of Newton's method: largest number, and the predicted gain that ends it
+STEPS, CLOSE = 1000, 1e-4  # of Newton's method: largest number, and the predicted gain that ends it
 LONGEST = 10.0  # step in a logarithm that is tried
 DAMPED = 0.01  # first damping of a step, as a share of the curvature
 # Nats of one output: up to LITTLE a predicted rise is taken to first order (rms error 0.02). Up to NEAR the

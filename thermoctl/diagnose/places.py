@@ -255,6 +255,7 @@ def _fixed_flows(rig: Rig) -> Iterator[Place]:
             yield Place(f.name, {}, flow=f.name)
 
 
+ERRORS = ("sensor", "body_sensor", "passive_sensor", "position_sensor")  # places of errors of a reading
 PLACES = {
     "node": lambda rig: _nodes(rig, _storing(rig), "n"),
     "node_pair": _exchanging,

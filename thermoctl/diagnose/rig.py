@@ -66,6 +66,9 @@ SOUNDS = {"v": r"veloc|speed|^v$", "x": r"posit|stroke|travel|^x$", "i": r"curre
 MEANINGS = {"v": "velocity", "x": "position", "i": "current", "T": "temperature"}
 
 
+JUMP = 3  # samples within which a sudden change is over: a filter before the recording may smear it
+
+
 class Rig:
     """A plant and its recordings as the catalogue sees them: kinds of nodes, moving inputs, the air."""
 
@@ -73,6 +76,7 @@ class Rig:
         self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
     ):
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
+        self._jumps: dict[str, float] = {}  # by column
         p = dataclasses.replace(
             plant,
             inputs={
@@ -128,6 +132,14 @@ class Rig:
             and not re.search(r"start|initial", i, re.I)
         ]
         self.air = next(iter(named), None) or self._coolest()
+
+    def largest_jump(self, reading: Input | Output) -> float:
+        """Return the largest change of a reading within JUMP samples, over all recordings."""
+        if reading.column not in self._jumps:
+            readings = [c[reading.column][np.isfinite(c[reading.column])] for c in self.columns]
+            changes = [np.abs(v[k:] - v[:-k]) for v in readings for k in range(1, JUMP + 1)]
+            self._jumps[reading.column] = max((float(d.max(initial=0.0)) for d in changes), default=np.inf)
+        return self._jumps[reading.column]
 
     def kind(self, q: Input | Node | Output) -> str:
         """Return the kind of a quantity, from its role or else its unit; empty where neither has one."""

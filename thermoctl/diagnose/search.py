@@ -25,6 +25,7 @@ from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Norms, sharpened
 from thermoctl.diagnose.screening import Screened, places, screened
 from thermoctl.diagnose.shortlist import HALF, PAIR, shortlist, simpler
+from thermoctl.plant import expression as ex
 from thermoctl.plant import refit
 from thermoctl.plant.cores import LEAST, batches, each
 from thermoctl.plant.language import Plant
@@ -371,10 +372,13 @@ def _refitted(
 
 
 def free_starts(before: Plant, after: Plant) -> Plant:
-    """Widen the initial states of bodies that an effect added: nobody measured where they start."""
+    """Widen the initial states of bodies that an effect added: nobody measured where they start.
+
+    A node into which nothing flows is none: it holds a reading of the start."""
+    moving = {end for f in after.flows.values() if f.rate is not ex.ZERO for end in (f.source, f.target)}
     nodes = {
         n.name: n
-        if n.name in before.nodes or not n.initial_sigma
+        if n.name in before.nodes or n.name not in moving or not n.initial_sigma
         else dataclasses.replace(n, initial_sigma=START * n.initial_sigma)
         for n in after.nodes.values()
     }

@@ -125,7 +125,9 @@ class Flow:
 
 @dataclass(frozen=True)
 class Output:
-    """A sensor: `value` without error, `noise` its random error (a number: white), `resolution` its step."""
+    """A sensor: `value` without error, `noise` its random error (a number: white), `resolution` its step.
+
+    `sensed`: the part of `value` that its electronics read, where a diagnosis added an error of theirs."""
 
     name: str
     value: Expr
@@ -136,6 +138,7 @@ class Output:
     role: str | None = None
     conversion: Conversion | None = None
     at: str = _place()
+    sensed: Expr | None = None
 
     @property
     def noise_sd(self) -> float:
