@@ -297,7 +297,8 @@ def test_hysteresis_of_no_width_is_dry_friction(tmp_path):
     rows = np.column_stack([t, force, ran.columns["encoder"] + rng.normal(0, 5e-4, len(t))])
     np.savetxt(run, rows, delimiter=",", comments="", header="t,force,encoder")
     r = diagnosed([plant, run], tmp_path / "out")
-    assert [(f["effect"], f["probability"] > 0.99) for f in r["findings"]] == [("coulomb_friction", True)]
+    # friction that differs with direction, which contains it, is tried too and keeps some probability
+    assert [f["effect"] for f in r["findings"]] == ["coulomb_friction"] and r["verdict"] == "explained"
     assert not any("backlash" in e for h in r["hypotheses"] for e in h["effects"])
 
 

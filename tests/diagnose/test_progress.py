@@ -72,8 +72,8 @@ def test_the_first_extension_expects_a_beam_after_it(monkeypatch):
 
     null = SimpleNamespace(score=0.0, fitted=SimpleNamespace(hypothesis=SimpleNamespace(keys=frozenset())))
     monkeypatch.setattr(search, "leaders", lambda tried, limits: tried)
-    monkeypatch.setattr(search, "over_noise", lambda case, fitted, clean: [1.0])
-    limits = SimpleNamespace(effects=3, beam=4, clean=1.25)
+    monkeypatch.setattr(search, "only_noise", lambda case, fitted, limits: True)
+    limits = SimpleNamespace(effects=3, beam=4)
     search.grow(
         First(limits=limits, tried={1: null}, seen={}, case=SimpleNamespace(budget=Budget(9)), best=null)
     )

@@ -136,7 +136,8 @@ class Rig:
     def largest_jump(self, reading: Input | Output) -> float:
         """Return the largest change of a reading within JUMP samples, over all recordings."""
         if reading.column not in self._jumps:
-            readings = [c[reading.column][np.isfinite(c[reading.column])] for c in self.columns]
+            columns = [c[reading.column] for c in self.columns if reading.column in c]
+            readings = [v[np.isfinite(v)] for v in columns]
             changes = [np.abs(v[k:] - v[:-k]) for v in readings for k in range(1, JUMP + 1)]
             self._jumps[reading.column] = max((float(d.max(initial=0.0)) for d in changes), default=np.inf)
         return self._jumps[reading.column]
