@@ -169,6 +169,7 @@ def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, 
         p.optional_number(key)
     p.flag("per_recording", False)
     p.text("origin", "none", choices=("none", "first_air"))
+    p.text("of", "none", choices=("none", "jump"))
     p.text("at_zero", "")
     unit = p.text("unit")
     if not unit.startswith("unit_of") and not re.search(r"\bunit_of_\w+", unit):
