@@ -228,7 +228,13 @@ def effects() -> str:
     )
     for e in entries:
         rows = (
-            (f"`{p.name}`", p.unit or "", f"{p.low:g} to {p.high:g}" if _numbers(p.low, p.high) else "")
+            (
+                f"`{p.name}`",
+                p.unit or "",
+                f"{p.low:g} to {p.high:g}{' of the largest jump' if p.of == 'jump' else ''}"
+                if _numbers(p.low, p.high)
+                else "",
+            )
             for p in e.parameters
         )
         text += f"\n## {e.name}\n{e.title}.\n\n" + _table(("parameter", "unit", "bounds"), rows)
