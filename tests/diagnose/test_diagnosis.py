@@ -299,6 +299,7 @@ def test_hysteresis_of_no_width_is_dry_friction(tmp_path):
     r = diagnosed([plant, run], tmp_path / "out")
     # friction that differs with direction, which contains it, is tried too and keeps some probability
     assert [f["effect"] for f in r["findings"]] == ["coulomb_friction"] and r["verdict"] == "explained"
+    assert {a["effect"] for a in r["alternatives"]} <= {"directional_friction"}
     assert not any("backlash" in e for h in r["hypotheses"] for e in h["effects"])
 
 

@@ -43,8 +43,8 @@ class Grid:
     rough: np.ndarray  # (nodes, nodes) inverse covariance of u
     log_rough: float  # its log determinant
     log_small: float  # log of the half-normal's mean over the random walk
-    sigma: float  # s above: standard deviation of the stated noise, in the output's unit
-    change: float  # w above, the output's change in a sampling interval, in its unit
+    sigma: float  # s of noise.py: standard deviation of the stated noise, in the output's unit
+    change: float  # w of noise.py: the output's change in a sampling interval, in its unit
     swing: float  # rms of the output about its mean
     sensor: SensorNoise | None  # the parts of the stated noise
 
