@@ -238,6 +238,45 @@ def test_an_input_that_only_sets_the_start_is_no_drive():
     assert [str(f) for f in checks(plant, [table])] == []
 
 
+def swing(dry, seconds, step=1e-4):
+    """The pendulum released at 0.5 rad: time and angle (N,) under dry friction of `dry` N*m, read in steps (rad)."""
+    dt, angle, speed = 1e-3, 0.5, 0.0
+    angles = []
+    for _ in range(int(seconds / dt)):
+        angles.append(angle)
+        speed += (-0.6 * np.sin(angle) - 0.01 * speed) / 0.02 * dt
+        speed = np.sign(speed) * max(abs(speed) - dry / 0.02 * dt, 0.0)  # rest is held up to the friction
+        angle += speed * dt
+    t = np.arange(len(angles)) * dt
+    return t[::10], step * np.round(np.array(angles[::10]) / step)
+
+
+def released(dry, seconds):
+    text = PLANTS["pendulum"].replace(
+        "storage: 1, initial: 0", "storage: 1, initial: 0.5, initial_sigma: 0.02"
+    )
+    t, angle = swing(dry, seconds)
+    return loads(text), Table("swing", "swing.csv", t, {"torque": np.zeros(len(t)), "encoder": angle})
+
+
+def test_a_body_at_rest_by_dry_friction_is_no_hung_sensor():
+    """Found on a propeller's pendulum: it stood for seconds, and the plant without friction swung on."""
+    plant, table = released(dry=0.012, seconds=15.0)
+    y = table.columns["encoder"]
+    assert np.ptp(y[-500:]) == 0 and np.ptp(y[:200]) > 0.5
+    assert [f.kind for f in checks(plant, [table]) if f.severe] == []
+    hung = column("encoder", frozen(90, 150))(table)
+    assert [f.kind for f in checks(plant, [hung]) if f.severe] == ["stuck"]
+
+
+def test_a_free_swing_needs_no_input_that_moves():
+    """Found on a flexible link that rings after its release; a swing that nothing in the plant explains needs one."""
+    plant, table = released(dry=0.0, seconds=6.0)
+    assert [f.kind for f in checks(plant, [table]) if f.severe] == []
+    pushed = column("encoder", lambda v: v + 0.3 * np.sign(np.sin(table.t)))(table)
+    assert "still" in [f.kind for f in checks(plant, [pushed])]
+
+
 def test_two_recordings_share_a_finding():
     plant, one = rig(TWO, 1)
     _, two = rig(TWO, 1)

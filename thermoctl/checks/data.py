@@ -5,22 +5,26 @@ Of an input that changes in most rows the plant file should say how it goes on b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import gcd, log
 
 import numpy as np
 
 from thermoctl.checks.finding import Finding
-from thermoctl.plant import Plant
+from thermoctl.plant import Plant, refit
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Input
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
 
 ALARM = 1e-6  # false alarms a column and recording
 SIGMAS = 6.0
 FEW = 8  # samples of which nothing can be stated
+FREE = 12  # iterations of a refit in which the plant has to move without its inputs
+SLOWS = 0.25  # share of its mean step, below which the last ones of a body that comes to rest lie
 
 
 def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
@@ -184,14 +188,14 @@ def _copies(table: Table, column: str, values: np.ndarray, t: np.ndarray) -> lis
 def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -> list[Finding]:
     """Find readings that stand still while the plant moves, and inputs that never move."""
     found = []
-    explained = total = 0.0
     noises = default_noise(model.plant, [excitation])
+    sds = [float(np.hypot(o.noise_sd, (o.resolution or 0.0) / 12**0.5)) for o in model.plant.outputs.values()]
     for j, (o, noise) in enumerate(zip(model.plant.outputs.values(), noises, strict=True)):
         there = np.isfinite(excitation.y[:, j])
         y, simulated = excitation.y[there, j], run[there, j]
         if len(y) < FEW or not np.isfinite(simulated).all():
             continue
-        sd = float(np.hypot(o.noise_sd, (o.resolution or 0.0) / 12**0.5))
+        sd = sds[j]
         if np.ptp(y) == 0 and np.ptp(simulated) > SIGMAS * max(sd, 1e-3 * np.ptp(simulated)):
             found.append(
                 Finding(
@@ -203,12 +207,10 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
             )
             continue
         found += _stuck(table, o.column, y, simulated, table.t[there], max(sd, noise.sigma))
-        scale = max(sd, noise.sigma)
-        if np.ptp(y) > 2 * SIGMAS * scale:
-            total += float(np.var(y)) / scale**2
-            explained += (float(np.var(y)) - float(np.var(y - simulated))) / scale**2
+    scales = [max(sd, noise.sigma) for sd, noise in zip(sds, noises, strict=True)]
     driving = [i for i in driving_inputs(model.plant) if not _surroundings(i)]
-    if driving and total and explained < 0.5 * total and not any(moves(table, i.column) for i in driving):
+    dead = driving and not any(moves(table, i.column) for i in driving)
+    if dead and not _follows(excitation.y, run, scales) and not _by_itself(model, excitation, scales):
         names = ", ".join(f"'{i.column}'" for i in driving)
         found.append(
             Finding(
@@ -219,6 +221,30 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
             )
         )
     return found
+
+
+def _follows(y: np.ndarray, run: np.ndarray, scales: Sequence[float]) -> bool:
+    """Return whether a run (N, outputs) explains half of the variance of readings that move."""
+    explained = total = 0.0
+    for j, scale in enumerate(scales):
+        there = np.isfinite(y[:, j])
+        if (
+            there.sum() >= FEW
+            and np.isfinite(run[there, j]).all()
+            and np.ptp(y[there, j]) > 2 * SIGMAS * scale
+        ):
+            total += float(np.var(y[there, j])) / scale**2
+            explained += float(np.var(y[there, j]) - np.var(y[there, j] - run[there, j])) / scale**2
+    return explained >= 0.5 * total
+
+
+def _by_itself(model: Model, excitation: Excitation, scales: Sequence[float]) -> bool:
+    """Return whether the plant can move so without its inputs, as one that rings or cools after its start."""
+    try:
+        found = refit.fit(model, [excitation], iterations=FREE)
+    except (SimulationError, InputError):
+        return False
+    return _follows(excitation.y, excitation.y - found.residuals[0], scales)
 
 
 def driving_inputs(plant: Plant) -> list[Input]:
@@ -242,12 +268,19 @@ def _stuck(
 ) -> list[Finding]:
     """Find a run of one value, longer than chance has it, over which the plant moves.
 
-    At the end of the readings' range it is a sensor at its limit, which is physics."""
+    At the end of the readings' range it is a sensor at its limit, which is physics. So is a body at rest: it
+    comes to rest slowly, and leaves without a jump."""
     edges = np.flatnonzero(np.diff(y) != 0)
     begins, ends = np.concatenate([[0], edges + 1]), np.concatenate([edges, [len(y) - 1]])
     k = int(np.argmax(ends - begins))
     a, b = int(begins[k]), int(ends[k])
     length = b - a
+    steps = np.abs(np.diff(y))
+    if b == len(y) - 1:
+        before = y[max(a - 1 - length, 0) : a]
+        slows = np.mean(steps[max(a - FEW, 0) : a]) <= SLOWS * np.mean(steps[:a])
+        if slows or np.ptp(before) <= 2 * SIGMAS * sd:
+            return _stuck(table, column, y[:a], simulated[:a], t[:a], sd) if a > FEW else []
     rest = max(len(y) - 1 - length, 1)
     same = max((len(y) - 1 - len(edges) - length) / rest, 1 / (len(y) + 1))
     # Two readings of a body at rest agree with probability q / (2 sqrt(pi) sd), q the step of the readings.
@@ -256,6 +289,9 @@ def _stuck(
     if same > 0.5 or length < FEW or y[a] in (y.min(), y.max()):
         return []
     if length * -log(same) < log(len(y) / ALARM) or np.ptp(simulated[a : b + 1]) < 2 * SIGMAS * sd:
+        return []
+    others = np.concatenate([[0.0], steps[: max(a - 1, 0)], steps[b + 1 :]])
+    if b < len(y) - 1 and steps[b] <= max(2 * SIGMAS * sd, np.quantile(others, 0.99)):
         return []
     return [
         Finding(
