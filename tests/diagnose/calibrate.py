@@ -42,6 +42,7 @@ NUMBERS = {
     "temperature": (0.7, 1.0, 1.25, 1.5, 2.0, 3.0),
     "alike": (0.05, 0.075, 0.1, 0.15),
 }
+CONTAINS = {e.name: e.contains for e in catalogue((CATALOGUE,)).values() if e.contains}
 LEAST = 1e-3  # of a probability: the largest loss of one effect is 7
 FLAT = 0.02  # of the score, about one name: less says nothing
 FILE = Path("config/diagnosis.yaml")
@@ -128,7 +129,7 @@ def _truths(answer: Mapping[str, Any]) -> tuple[frozenset[Key], ...]:
 
 def posterior(case: Judged, numbers: Limits) -> Posterior:
     """Decide a case again with other numbers."""
-    physics = standing(case.energy, case.dims, numbers)
+    physics = standing(case.energy, case.dims, CONTAINS, numbers)
     own = np.log(numbers.missing / (1 - numbers.missing))
     scores = {
         keys: case.likelihood[keys]

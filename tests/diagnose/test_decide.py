@@ -69,16 +69,27 @@ def one(square: float, misfit: float) -> Energy:
 
 def test_a_second_effect_that_removes_less_than_stays_does_not_stand():
     energy = {NOTHING: one(100.0, 98.4), ONE: one(10.0, 8.4), OTHER: one(90.0, 88.4), BOTH: one(9.5, 7.9)}
-    found = standing(energy, {A: 1, B: 1}, limits())
+    found = standing(energy, {A: 1, B: 1}, {}, limits())
     assert set(found) == {NOTHING, ONE, BOTH}
     assert found[ONE][A] > 0.99
     # beside the first the second is part of the misfit, and takes nothing from it
     assert found[BOTH][A] == found[ONE][A] and found[BOTH][B] < 0.5
 
 
+def test_an_effect_is_the_simpler_one_that_it_contains_unless_it_stands_out_against_it():
+    a, b, c = ("backlash_hysteresis", "v"), ("coulomb_friction", "v"), ("creep", "v")
+    energy = {NOTHING: one(100.0, 98.4), frozenset({a}): one(9.5, 7.9), frozenset({b}): one(10.0, 8.4)}
+    energy[frozenset({a, c})] = one(9.2, 7.6)  # the second is part of the misfit, so the first stands alone
+    dims, contains = {a: 2, b: 2, c: 2}, {a[0]: b[0]}
+    assert set(standing(energy, dims, contains, limits())) == {NOTHING, frozenset({b})}
+    assert frozenset({a}) in standing(energy, dims, {}, limits())
+    energy[frozenset({a})] = one(2.0, 0.4)
+    assert frozenset({a}) in standing(energy, dims, contains, limits())
+
+
 def test_without_a_misfit_every_effect_stands():
     energy = {NOTHING: one(1.02, 0.0), ONE: one(1.0, 0.0)}
-    assert standing(energy, {A: 7}, limits())[ONE][A] == 1.0
+    assert standing(energy, {A: 7}, {}, limits())[ONE][A] == 1.0
 
 
 def test_the_odds_of_physics_are_a_log_uniform_size_against_a_normal_one():

@@ -143,7 +143,7 @@ def _structure(root: Node) -> tuple[str, str]:
 def _words(top: Section) -> None:
     for key in ("title", "source"):
         top.text(key)
-    for key in ("excited_by", "caution"):
+    for key in ("excited_by", "caution", "contains"):
         top.text(key, "")
     for node in top.list("mimics", required=False):
         if not isinstance(node.value, str):
@@ -170,7 +170,7 @@ def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, 
     p.flag("per_recording", False)
     p.text("origin", "none", choices=("none", "first_air"))
     p.text("of", "none", choices=("none", "jump"))
-    p.text("at_zero", "")
+    p.flag("at_zero", False)
     unit = p.text("unit")
     if not unit.startswith("unit_of") and not re.search(r"\bunit_of_\w+", unit):
         try:

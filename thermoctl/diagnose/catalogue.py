@@ -28,6 +28,7 @@ KEYS = (
     "shapes",
     "parameters",
     "dims",
+    "contains",
     "prior",
     "caution",
     "excited_by",
@@ -72,7 +73,7 @@ class EffectParameter:
     - `trial`: its value in screening, an expression of the amplitudes s, s2, s3 and of shapes
     - `shape`: the shape that it is
     - `null`: its value where the effect is absent
-    - `at_zero`: the simpler effect that this one is where the parameter is 0
+    - `at_zero`: where it is 0 the effect is the simpler one that it contains
     - `of`: 'jump': low and high count in the largest sudden change of what the sensor reads"""
 
     name: str
@@ -85,13 +86,17 @@ class EffectParameter:
     per_recording: bool
     typical: float | None
     origin: str | None  # 'first_air': low and high are relative to the first ambient temperature
-    at_zero: str | None = None
+    at_zero: bool = False
     of: str | None = None
 
     @property
     def amplitude(self) -> bool:
         """Does it scale with an amplitude of the screening?"""
         return _amplitudes(self.trial) > 0
+
+    def fades(self, shapes: Mapping[str, str]) -> bool:
+        """Is the effect absent where this parameter has its null value? `shapes`: those of its effect."""
+        return self.amplitude or shapes.get(self.shape or "") in ("small_levels", "lags", "delays")
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,7 @@ class Effect:
     source: str
     caution: str | None = None  # limits of a finding of it, in words
     prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
+    contains: str | None = None  # the simpler effect that it is for some values of its parameters
     reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
 
 
@@ -153,6 +159,7 @@ def _read(root: yamlfile.Node) -> Effect:
         plain("source"),
         plain("caution", None),
         _expression(top["prior"], top["prior"].value) if "prior" in top else None,
+        plain("contains", None),
         tuple(plain("reads")),
     )
 
@@ -200,7 +207,7 @@ def _parameter(name: str, node: yamlfile.Node) -> EffectParameter:
         bool(p.get("per_recording")),
         p.get("typical"),
         p.get("origin"),
-        p.get("at_zero"),
+        bool(p.get("at_zero")),
         p.get("of"),
     )
 

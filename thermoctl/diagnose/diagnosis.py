@@ -68,7 +68,7 @@ def _decided(
     `unsure`: an untried hypothesis may be likelier, so that nothing is named."""
     energy = energies(known, searched, numbers)
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
-    physics = standing(energy, dims, numbers)
+    physics = standing(energy, dims, known.contains, numbers)
     scores = {w.fitted.hypothesis.keys: w.score for w in searched.tried}
     posterior = weigh({keys: scores[keys] for keys in physics}, physics, numbers)
     fits = {w.fitted.hypothesis.keys: w.fitted for w in searched.tried}

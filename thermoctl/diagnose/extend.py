@@ -67,7 +67,7 @@ def weaker(direction: Direction, share: float = 0.1) -> Direction:
     """Return the direction with a start at a `share` of its size."""
     effect, start = direction.candidate.effect, dict(direction.start)
     for p in effect.parameters:
-        if p.amplitude or effect.shapes.get(p.shape or "") in ("small_levels", "lags", "delays"):
+        if p.fades(effect.shapes):
             start[p.name] = p.null + share * (start[p.name] - p.null)
     return dataclasses.replace(direction, start=start)
 

@@ -120,12 +120,12 @@ def fitted(
     effects: Sequence[Placed],
     start: Fit | None = None,
     best: Fitted | None = None,
-    parent: float = np.inf,
+    parent: Fitted | None = None,
 ) -> Fitted:
     """Refit a plant that holds these effects and compute its log evidence. Raises SimulationError.
 
-    The refit ends early if it stays far from `best`, the best hypothesis so far. `parent`: the cost before
-    the last effect was added."""
+    The refit ends early if it stays far from `best`, the best hypothesis so far. `parent`: the hypothesis
+    before the last effect was added."""
     case.budget.spend()
     found = _refitted(case, plant, effects, start, best, parent)
     for _ in range(MOVES):
@@ -139,16 +139,23 @@ def fitted(
 
 
 def _refitted(
-    case: Case, plant: Plant, effects: Sequence[Placed], start: Fit | None, best: Fitted | None, parent: float
+    case: Case,
+    plant: Plant,
+    effects: Sequence[Placed],
+    start: Fit | None,
+    best: Fitted | None,
+    parent: Fitted | None,
 ) -> Fitted:
-    """Refit a plant from one starting point; the arguments are those of `fitted`."""
+    """Refit a plant from one starting point; the arguments are those of `fitted`.
+
+    A refit that ends below its parent, which it contains, starts again beside the parent."""
     posterior = Posterior(case, plant, effects)
     if start is None:
         start = refit.fit(
             posterior.model,
             posterior.drives,
             case.noise,
-            start=_led(posterior, parent),
+            start=_led(posterior, parent.rough.cost if parent else np.inf),
             iterations=WHITE,
             tolerance=ROUGH,
             goal=best.rough.cost if best else np.inf,
@@ -158,8 +165,33 @@ def _refitted(
     goal = best.log_likelihood - HOPELESS if best else -np.inf
     z = start.z.copy()
     z[posterior.shared] = posterior.past.z
-    z, average, powers, matrix, errors = posterior.climb(z, goal)
-    return _weighed(case, posterior, z, average, powers, matrix, errors, start)
+    top = posterior.climb(z, goal)
+    if parent and top[1].log_likelihood < parent.log_likelihood:
+        try:
+            other = posterior.climb(_beside(posterior, parent), goal)
+        except SimulationError:
+            other = top
+        top = max(top, other, key=lambda t: t[1].log_likelihood + posterior.prior(t[0]))
+    return _weighed(case, posterior, *top, start)
+
+
+def _beside(posterior: Posterior, parent: Fitted) -> np.ndarray:
+    """Return the unknowns at the parent's maximum, with a small share of each effect that it has not."""
+    problem, plant = posterior.problem, posterior.plant.parameters
+    small = {
+        e.own[p.name]: p.null + SHARE * (plant[e.own[p.name]].value - p.null)
+        for e in posterior.effects
+        if e.key not in parent.hypothesis.keys
+        for p in e.candidate.effect.parameters
+        if e.own.get(p.name) in plant and p.fades(e.candidate.effect.shapes)
+    }
+    z = problem.start(small)
+    place = {unknown: k for k, unknown in enumerate(problem.unknowns)}
+    for unknown, value in zip(parent.fit.unknowns, parent.fit.z, strict=True):
+        if unknown in place:
+            z[place[unknown]] = value
+    z[posterior.shared] = posterior.past.z
+    return z
 
 
 def _led(posterior: Posterior, parent: float) -> np.ndarray:

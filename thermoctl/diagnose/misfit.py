@@ -46,14 +46,19 @@ class Energy:
 
 
 def standing(
-    energy: Mapping[frozenset[Key], Energy], dims: Mapping[Key, int], limits: Limits
+    energy: Mapping[frozenset[Key], Energy],
+    dims: Mapping[Key, int],
+    contains: Mapping[str, str],
+    limits: Limits,
 ) -> dict[frozenset[Key], dict[Key, float]]:
     """Return the hypotheses of which an effect stands out of the misfit: the probability of each.
 
     An effect has to stand out against the best tried hypothesis that holds part of the others. Effects that
-    do not are part of the misfit. The others then have to stand out beside them or without them.
-    `dims`: number of parameters of each effect."""
+    do not are part of the misfit. The others then have to stand out beside them or without them. An effect
+    that does not stand out against the simpler one that it contains is that one: no hypothesis holds it.
+    `dims`: number of parameters of each effect; `contains`: the simpler effect of some."""
     found: dict[frozenset[Key], dict[Key, float]] = {}
+    simpler = set()
     for home in sorted(energy, key=len):
         mine, own = energy[home], {}
         for key in home:
@@ -61,10 +66,31 @@ def standing(
             without = min(part, key=lambda e: e.all)
             own[key] = physics(without, mine, 1 - (1 - limits.alike) ** dims[key])
         stand = standouts(own)
+        if stand in simpler or any(_is_simpler(home, key, energy, dims, contains, limits) for key in home):
+            simpler.add(home)
+            continue
         for key, p in found.get(stand, {}).items() if stand < home else ():
             own[key] = max(own[key], p)
         found[home] = own
     return {home: own for home, own in found.items() if not home or standouts(own)}
+
+
+def _is_simpler(
+    home: frozenset[Key],
+    key: Key,
+    energy: Mapping[frozenset[Key], Energy],
+    dims: Mapping[Key, int],
+    contains: Mapping[str, str],
+    limits: Limits,
+) -> bool:
+    """Return whether an effect of a hypothesis is the simpler one that it contains, and a misfit."""
+    effect, where = key
+    simple = (contains.get(effect, ""), where)
+    other = energy.get(home - {key} | {simple})
+    if other is None or simple in home:
+        return False
+    more = max(dims[key] - dims[simple], 1)
+    return physics(other, energy[home], 1 - (1 - limits.alike) ** more) <= MISFIT
 
 
 def standouts(of: Mapping[Key, float]) -> frozenset[Key]:

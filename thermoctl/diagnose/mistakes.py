@@ -47,7 +47,7 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
     def refitted(start: tuple[float, Plant, Placed]) -> Fitted | None:
         _, plant, placed = start
         try:
-            return None if case.budget.stopped() else fitted(case, plant, (placed,), parent=null.rough.cost)
+            return None if case.budget.stopped() else fitted(case, plant, (placed,), parent=null)
         except (SimulationError, np.linalg.LinAlgError):
             return None
 

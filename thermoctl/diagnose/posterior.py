@@ -2,9 +2,9 @@
 
     log p(z | D) = log p(D | z) + log p(z) + constant
 
-log p(D | z) is averaged over noise and remainder (noise.py). Gauss-Newton steps find the maximum; with the
-weights E[1/V] their gradient is exact. Gradient and curvature are sums over recordings: one recording at a
-time is simulated, and its sums are added.
+log p(D | z) is averaged over noise and remainder (noise.py). Gauss-Newton steps with Levenberg's damping find
+the maximum; with the weights E[1/V] their gradient is exact. Gradient and curvature are sums over recordings:
+one recording at a time is simulated, and its sums are added.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from thermoctl.plant.simulate import SimulationError, compile_plant
 
 BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
 ROUNDS = 15  # largest number of Gauss-Newton steps
-LENGTHS = 1.0, 0.3, 0.1  # shares of a Newton step that are tried, in this order
+DAMPINGS = 0.0, 0.1, 1.0, 10.0, 100.0  # shares of the curvature added to it, tried in this order
 FAR = 8.0  # standard deviations that a start may be off
 ENOUGH = 0.05  # gain in the log posterior, below which no further step is taken
 
@@ -253,13 +253,15 @@ class Posterior:
         rows = self.rows(errors)
         now, powers = self.likelihood(rows)
         gradient, matrix = self.slope(z, rows, now.inverse)
+        first = 0
         for left in range(ROUNDS, 0, -1):
             base = now.log_likelihood + self.prior(z)
-            step, gained, here = bounded_step(z, gradient, matrix, low, high), 0.0, self.kept
-            for length in LENGTHS:
-                trial = np.clip(z + length * step, low, high)
+            gained, here = 0.0, self.kept
+            for k in range(first, len(DAMPINGS)):
+                damped = matrix + DAMPINGS[k] * np.diag(np.diag(matrix))
+                trial = np.clip(z + bounded_step(z, gradient, damped, low, high), low, high)
                 try:
-                    at_once = self.problem.few and length == LENGTHS[0]
+                    at_once = self.problem.few and k == first
                     e = self.errors_and_slopes(trial) if at_once else self.errors(trial)
                 except SimulationError:
                     continue
@@ -269,6 +271,7 @@ class Posterior:
                 if gained > 0:
                     z, errors, rows, now, powers = trial, e, trial_rows, then, trial_powers
                     gradient, matrix = self.slope(z, rows, now.inverse)
+                    first = max(k - 1, 0)
                     break
                 self.kept = here
             if gained < ENOUGH or now.log_likelihood + left * gained < goal:

@@ -366,7 +366,7 @@ def _refitted(
             if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
                 drives = case.drives(compile_plant(plant))
             effects = (*effects, Placed(d.candidate, own))
-        return fitted(case, free_starts(case.plant, plant), effects, None, leader, parent.fitted.rough.cost)
+        return fitted(case, free_starts(parent.fitted.plant, plant), effects, None, leader, parent.fitted)
     except (SimulationError, InputError, np.linalg.LinAlgError):
         return None
 

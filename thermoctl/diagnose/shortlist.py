@@ -49,9 +49,7 @@ def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
     def is_simpler(d: Direction, a: Direction) -> bool:
         new, old = d.candidate.effect, a.candidate.effect
         fewer = len(new.parameters) < len(old.parameters)
-        return d.candidate.place.where == a.candidate.place.where and (
-            fewer or any(p.at_zero == new.name for p in old.parameters)
-        )
+        return d.candidate.place.where == a.candidate.place.where and (fewer or new.name == old.contains)
 
     return [d for d in looked.directions if d.gain > 0 and any(is_simpler(d, a) for a in added)]
 

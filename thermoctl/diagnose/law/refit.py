@@ -38,9 +38,7 @@ def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fit
     own = {q: c.own(q) for q in ranges if c.own(q) in plant.parameters}
     c = dataclasses.replace(c, effect=_bounded(c, ranges))
     try:
-        return fitted(
-            case, plant, (*parent.hypothesis.effects, Placed(c, own)), None, leader, parent.rough.cost
-        )
+        return fitted(case, plant, (*parent.hypothesis.effects, Placed(c, own)), None, leader, parent)
     except (SimulationError, InputError, np.linalg.LinAlgError, ex.ExpressionError):
         return None
 
