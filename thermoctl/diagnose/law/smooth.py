@@ -76,7 +76,7 @@ class Tracked:
             into, *out = [np.concatenate([b @ c for b, c in zip(u, fine, strict=True)]) for u in units]
             whole = into - out[0] if out else into
             rest = self.metric.project(whole)
-        absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
+            absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
         return np.where(absorbed, 0.0, rest)
 
     @cached_property
