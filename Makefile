@@ -47,11 +47,11 @@ prove: develop                     # the full proof on concealed cases: made, se
 
 CALIBRATION ?= build/calibration
 calibrate-diagnosis: develop       # set the numbers of config/diagnosis.yaml from generated cases and THERMOCTL_RECORDINGS; hours; run again to continue
-	$(BIN)/python -m tests.concealed.generate --world open --answers inside --number 40 --seed 5004 --out $(CALIBRATION)/open_5004
-	$(BIN)/python -m tests.concealed.generate --world closed --answers inside --number 48 --seed 5003 --out $(CALIBRATION)/closed_5003
-	for world in open_5004 closed_5003; do $(BIN)/thermoctl prove $(CALIBRATION)/$$world --out $(CALIBRATION)/results/$$world || exit 1; done
+	$(BIN)/python -m tests.concealed.generate --world open --answers inside --number 32 --seed 11102 --out $(CALIBRATION)/open_11102
+	$(BIN)/python -m tests.concealed.generate --world closed --answers inside --number 32 --seed 11101 --out $(CALIBRATION)/closed_11101
+	for world in open_11102 closed_11101; do $(BIN)/thermoctl prove $(CALIBRATION)/$$world --out $(CALIBRATION)/results/$$world || exit 1; done
 	test -z "$$THERMOCTL_RECORDINGS" || $(BIN)/thermoctl prove --real --out $(CALIBRATION)/real
-	$(BIN)/python -m tests.diagnose.calibrate $(foreach w,open_5004 closed_5003,$(CALIBRATION)/$(w) $(CALIBRATION)/results/$(w)/cases) \
+	$(BIN)/python -m tests.diagnose.calibrate $(foreach w,open_11102 closed_11101,$(CALIBRATION)/$(w) $(CALIBRATION)/results/$(w)/cases) \
 		$${THERMOCTL_RECORDINGS:+--real "$$THERMOCTL_RECORDINGS" $(CALIBRATION)/real} --write
 
 lint: develop                      # ruff and mypy
