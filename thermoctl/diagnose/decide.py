@@ -32,6 +32,7 @@ class Facts:
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
     - `remains`: the largest probability of a remainder at an output
+    - `flow`: probability that a flow is missing which no output shows alone
     - `worth`: held-out error, divided by that of a refit alone; `worse`: probability that it is larger"""
 
     something: float
@@ -40,6 +41,7 @@ class Facts:
     worth: float
     remains: float = 0.0
     worse: float = 0.0
+    flow: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,8 @@ def weigh(
 
 
 def _only_noise(f: Facts, limits: Limits) -> bool:
-    """Is the residual about as large as the noise, and no remainder in it certain?"""
-    return f.over_noise <= limits.clean and f.remains < limits.name
+    """Is the residual about as large as the noise, and neither a remainder nor an unknown flow certain?"""
+    return f.over_noise <= limits.clean and max(f.remains, f.flow) < limits.name
 
 
 ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
@@ -108,6 +110,7 @@ def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
         "worth": facts.worth,
         "worse": facts.worse,
         "remains": facts.remains,
+        "flow": facts.flow,
         **{f"{e} at {w}": posterior.effects[e, w] for e, w in facts.named},
     }
     named = facts.named if verdict in ("explained", "partly_explained") else ()

@@ -20,6 +20,7 @@ from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.search import Searched, search
 from thermoctl.diagnose.threads import one_thread
 from thermoctl.diagnose.unknown import left, reached
+from thermoctl.diagnose.unknown_flow import MissingFlow, flow_missing
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 
@@ -86,9 +87,20 @@ def _decided(
     told = bool(best.hypothesis.effects) and value.reserved
     ratio, worse = (_ratio(value.after, value.refit_only), value.worse) if told else (1.0, 0.0)
     remains = remainder(known, fits[best.hypothesis.keys])
-    facts = Facts(posterior.something, named, max(after.over_noise.values()), ratio, remains, worse)
+    flow = MissingFlow()
+    if remains < numbers.name:
+        flow = flow_missing(known, fits[best.hypothesis.keys], reach.nodes, numbers)
+    sure = flow if flow.probability >= numbers.name else None
+    if sure:
+        after = replace(after, node=sure.node)
+        before = before if best.hypothesis.effects else after
+    facts = Facts(
+        posterior.something, named, max(after.over_noise.values()), ratio, remains, worse, flow.probability
+    )
     decision = decide(posterior, facts, numbers)
-    return Diagnosis(known, searched, posterior, best, null, after, before, value, decision, energy, physics)
+    return Diagnosis(
+        known, searched, posterior, best, null, after, before, value, decision, energy, physics, sure
+    )
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:

@@ -19,6 +19,7 @@ from thermoctl.diagnose.levels import late
 from thermoctl.diagnose.misfit import Energy, standouts
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import Left
+from thermoctl.diagnose.unknown_flow import MissingFlow
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit
@@ -44,6 +45,7 @@ class Diagnosis:
     - `energy`: of each hypothesis' residuals
     - `physics`: for hypotheses of which an effect stands out of the misfit that they leave: each effect's
       probability of being physics
+    - `flow`: a flow that `best` lacks for certain, which no output shows alone
     - `missing_flow`: rms of the flow into `before.node` that would close the misfit of `null`
     - `law`: a law for the remainder of the outcome"""
 
@@ -58,6 +60,7 @@ class Diagnosis:
     decision: Decision
     energy: Mapping[frozenset[Key], Energy]
     physics: Mapping[frozenset[Key], Mapping[Key, float]]
+    flow: MissingFlow | None
     missing_flow: float | None = None
     law: Law | None = None
 
@@ -144,6 +147,7 @@ def _notes(d: Diagnosis) -> list[str]:
         *d.case.notes,
         *doubts(d.case, d.final.fit, d.before.noise),
         *late(d.case, d.final),
+        *([d.flow.sentence()] if d.flow else []),
         *(
             f"{effect} at {where} is in the extended plant, but is not sure enough to be a finding "
             f"(probability {d.posterior.effects.get((effect, where), 0.0):.2f})"

@@ -17,7 +17,7 @@ from thermoctl.diagnose.grids import grid
 from thermoctl.diagnose.levels import only_noise
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.metric import Absorbed, Metric, Pushed, without
-from thermoctl.diagnose.noise import Averaged, rise
+from thermoctl.diagnose.noise import Averaged, averaged, rise
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Norms, screen
 from thermoctl.diagnose.sketch import likeliest
@@ -171,6 +171,14 @@ class Rows(Metric):
         Rows are whitened, of all recordings; noise and remainder are averaged."""
         above = rise(self.plain.grids, self._powers(rows))
         return lambda others: above(self._powers(others))
+
+    def weighed(self, rows: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the log likelihood of other rows, and how much more weight each has in their own noise.
+
+        Rows are whitened; noise and remainder are averaged."""
+        found = averaged(self.plain.grids, self._powers(rows))
+        channels = zip(self.plain.coordinates.channels, found.inverse, strict=True)
+        return found.log_likelihood, np.concatenate([np.sqrt(v)[c.band] for c, v in channels]) / self.weight
 
     def _powers(self, rows: np.ndarray) -> list[np.ndarray]:
         edges = np.cumsum([len(w) for w in self.weights])[:-1]

@@ -81,7 +81,7 @@ class Tracked:
 
     @cached_property
     def _hats(self) -> list[csr_matrix]:
-        return [_hats(d.t, min(RESOLVED, len(d.t))) for d in self.metric.drives]
+        return [hat_functions(d.t, min(RESOLVED, len(d.t))) for d in self.metric.drives]
 
     def _slopes(self, node: str) -> list[np.ndarray]:
         """Return the rate of a node (N,) by recording, without the unknown flow.
@@ -96,11 +96,11 @@ class Tracked:
     def _unit(self, node: str) -> list[np.ndarray]:
         """Return the rows of each recording's responses to hat functions of flow into a node."""
         if node not in self._units:
-            self._units[node] = _blocks(self.metric, self.runs, node, self._hats, 1.0)
+            self._units[node] = flow_rows(self.metric, self.runs, node, self._hats, 1.0)
         return self._units[node]
 
 
-def _blocks(
+def flow_rows(
     metric: Rows,
     runs: Sequence[dict[str, np.ndarray | float]],
     node: str,
@@ -170,7 +170,7 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
     rough = dataclasses.replace(f.rough, model=model, at_bound={})
     base = dataclasses.replace(f, rough=rough, rough_plant=plant)
     knots = max(FEWEST_KNOTS, KNOTS // max(len(nodes), 1))
-    hats = [_hats(t.t - t.t[0], knots) for t in case.tables]
+    hats = [hat_functions(t.t - t.t[0], knots) for t in case.tables]
     weights = [np.zeros((knots, len(nodes))) for _ in hats]
     sizes: list[float] = []
     best: tuple[float, _Followed] | None = None
@@ -249,7 +249,7 @@ def _explained(x: np.ndarray, target: np.ndarray) -> float:
     return float(along @ along) / max(float(target @ target), 1e-300)
 
 
-def _hats(t: np.ndarray, knots: int) -> csr_matrix:
+def hat_functions(t: np.ndarray, knots: int) -> csr_matrix:
     """(N, knots) straight lines between evenly spaced knots."""
     at, n = np.linspace(t[0], t[-1], knots), np.arange(len(t))
     k = np.clip(np.searchsorted(at, t, side="right") - 1, 0, knots - 2)
@@ -273,7 +273,7 @@ def _wide(
     hats: Sequence[csr_matrix],
 ) -> list[np.ndarray]:
     """Return each recording's (rows, nodes * knots) responses to each knot, in units of the typical flows."""
-    by_node = [_blocks(metric, runs, n, hats, s) for n, s in zip(nodes, sizes, strict=True)]
+    by_node = [flow_rows(metric, runs, n, hats, s) for n, s in zip(nodes, sizes, strict=True)]
     return [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
 
 

@@ -1,0 +1,102 @@
+"""Is a flow missing that no single reading shows?
+
+Each reading's noise may hide a slow error, but a flow into one node reaches several readings together. An
+unknown flow into a node is a hypothesis like any other: straight lines between KNOTS knots a recording, whose
+values are independent and normal, with the share eta of the node's typical flow as sd. Let X be its whitened
+responses without what the plant's own parameters absorb, U s V' = eta X, and r the residual. Then
+
+    log p(D | flow) / p(D | none) = log p(r - U s^2 / (1 + s^2) U'r) - log p(r)
+                                    - 1/2 sum (U'r)^2 s^2 / (1 + s^2)^2 - 1/2 sum log(1 + s^2)
+
+by Laplace's method, with noise and remainder averaged on both sides. eta is log-uniform over SHARES. Readings
+that rest on the steps of their rounding err with the signal, so they do not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import expit, logsumexp
+
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.law.smooth import flow_rows, hat_functions
+from thermoctl.diagnose.levels import rounded
+from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.screening import ROWS, Plain, Rows
+from thermoctl.diagnose.where import signals, typical_flow
+from thermoctl.plant.simulate import SimulationError
+
+KNOTS, FEWEST, TOGETHER = 24, 6, 240  # of a recording; least number; about so many in all recordings
+ROUNDS = 4  # of flow and noise in turn
+SHARES = 10.0 ** np.arange(-4.5, 0.6, 0.5)  # eta
+
+
+@dataclass(frozen=True)
+class MissingFlow:
+    """The probability that some unknown flow is missing, and the node that it would most likely enter."""
+
+    probability: float = 0.0
+    node: str | None = None
+
+    def sentence(self) -> str:
+        """Return it in words."""
+        return (
+            f"a flow into {self.node} is missing that no effect explains: readings that hide it one by one "
+            "show it together"
+        )
+
+
+def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Limits) -> MissingFlow:
+    """Return the probability that an unknown flow into one of the nodes is missing in a fitted hypothesis.
+
+    Its prior odds are those of a piece of physics, and of an unknown function of time."""
+    try:
+        gains = flow_gains(case, f, nodes)
+    except (SimulationError, np.linalg.LinAlgError):
+        return MissingFlow()
+    if not gains:
+        return MissingFlow()
+    odds = np.log(limits.missing / (1 - limits.missing)) + np.log(limits.rare) - np.log(len(gains))
+    p = float(expit((logsumexp(list(gains.values())) + odds) / limits.temperature))
+    return MissingFlow(p, max(gains, key=lambda n: gains[n]))
+
+
+def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
+    """Return the log Bayes factor of an unknown flow into each node. Raises SimulationError."""
+    metric = Rows(Plain(case, f, ROWS), as_refitted(case, f).average, True)
+    runs = [
+        signals(metric.model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
+    ]
+    knots = int(np.clip(TOGETHER // len(runs), FEWEST, KNOTS))
+    hats = [hat_functions(d.t, min(knots, len(d.t))) for d in metric.drives]
+    names = [case.coordinates.channels[g.channels[0]].output for g in case.grids]
+    coarse = {j for j, is_coarse in zip(names, rounded(case), strict=True) if is_coarse}
+    counts = np.concatenate(
+        [np.full(c.rows, c.output not in coarse) for c in metric.plain.coordinates.channels]
+    )
+    likelihood, weight = metric.weighed(metric.residual)
+    out = {}
+    for n in nodes:
+        size = typical_flow(metric.model.plant, n, runs)
+        if size == 0:
+            continue
+        x = metric.project(block_diag(*flow_rows(metric, runs, n, hats, size))) * counts[:, None]
+        scores = [_evidence(metric, x * share, weight) for share in SHARES]
+        out[n] = float(logsumexp(scores) - np.log(len(SHARES))) - likelihood
+    return out
+
+
+def _evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> float:
+    """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method.
+
+    `weight` (rows,): of the noise without them; what they explain changes it."""
+    for _ in range(ROUNDS):
+        inside = x * weight[:, None]
+        curvature = np.eye(x.shape[1]) + inside.T @ inside
+        w = np.linalg.solve(curvature, inside.T @ (metric.residual * weight))
+        likelihood, weight = metric.weighed(metric.residual - x @ w)
+    return likelihood - 0.5 * float(w @ w + np.linalg.slogdet(curvature)[1])
