@@ -32,7 +32,7 @@ from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.decide import Key, Posterior, weigh
 from thermoctl.diagnose.limits import Limits, limits
 from thermoctl.diagnose.misfit import Energy, standing
-from thermoctl.diagnose.odds import EVENTS
+from thermoctl.diagnose.odds import rare
 from thermoctl.plant import load
 from thermoctl.proof.rigs import RIGS, Rig
 
@@ -72,14 +72,8 @@ def judged(plant: Path, result: Path, used: Limits) -> Judged:
     found = json.loads((result / "diagnosis.json").read_text())["hypotheses"]
     keyed = {frozenset(_key(e) for e in h["effects"]): h for h in found}
 
-    def rare(key: Key) -> int:
-        effect = entries[key[0]]
-        event = any(kind in EVENTS for kind in effect.shapes.values())
-        event |= any(p.per_recording for p in effect.parameters)
-        return event + (key[1] in inputs and effect.where != "drive")
-
     dims = {k: n for h in found for k, n in zip(map(_key, sorted(h["effects"])), h["dims"], strict=True)}
-    counts = {keys: sum(map(rare, keys)) for keys in keyed}
+    counts = {keys: sum(rare(entries[e], where in inputs) for e, where in keys) for keys in keyed}
     missing = np.log(used.missing / (1 - used.missing))
     return Judged(
         result.name,

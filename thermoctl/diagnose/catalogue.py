@@ -119,6 +119,12 @@ class Effect:
     contains: str | None = None  # the simpler effect that it is for some values of its parameters
     reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
 
+    @property
+    def timed(self) -> bool:
+        """Does it depend on the time itself, or have values of its own in each recording?"""
+        named = re.search(r"\bt\b", str(self.changes))
+        return bool(named) or any(p.per_recording for p in self.parameters)
+
 
 def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
     """Return all entries of these folders; a later one replaces one of the same name. Raises InputError."""

@@ -269,8 +269,12 @@ def _weighed(
     own[np.concatenate([gaussian(posterior), posterior.believed])] = False
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
     confined = _relieved(confined, posterior.relief(z, posterior.rows(errors), average))
-    inverse = np.linalg.pinv(confined, hermitian=True)
-    sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    at_bound = _at_bound(problem, z)
+    # a parameter of the plant that is pressed to its bound does not give way to an effect
+    moves = np.array([q not in at_bound or q not in case.plant.parameters for q, _ in problem.unknowns])
+    sd = np.zeros(len(z))
+    inverse = np.linalg.pinv(confined[np.ix_(moves, moves)], hermitian=True)
+    sd[moves] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     names = _deviations(posterior, values, sd)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
     found = Fit(
@@ -285,7 +289,7 @@ def _weighed(
         case.noise,
         0,
         problem.samples,
-        _at_bound(problem, z),
+        at_bound,
         problem.priors,
     )
     # with hundreds of recordings the starts' part fills the memory

@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from thermoctl.diagnose.candidates import Candidate
+from thermoctl.diagnose.catalogue import Effect
 from thermoctl.diagnose.fit import Placed
 from thermoctl.diagnose.limits import Limits
-
-EVENTS = ("onsets", "windows")  # shapes that happen at one moment
 
 
 def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limits) -> float:
@@ -21,15 +19,14 @@ def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limit
     for e in effects:
         c = e.candidate
         share = len(where) * len(where.get(c.effect.name, {c.place.where}))
-        total += np.log(limits.missing / (1 - limits.missing) / share) + np.log(_class(c, limits))
+        total += np.log(limits.missing / (1 - limits.missing) / share) + rare(
+            c.effect, bool(c.place.input)
+        ) * np.log(limits.rare)
     return float(total)
 
 
-def _class(c: Candidate, limits: Limits) -> float:
-    """Odds of an entry's class against constant physics."""
-    event = any(kind in EVENTS for kind in c.effect.shapes.values()) or any(
-        p.per_recording for p in c.effect.parameters
-    )
-    return (limits.rare if event else 1.0) * (
-        limits.rare if c.place.input and c.effect.where != "drive" else 1.0
-    )
+def rare(effect: Effect, of_input: bool) -> int:
+    """Return how many times an effect is rare beside constant physics.
+
+    Once where it depends on the time itself, once where it is a fault of a recorded input."""
+    return effect.timed + (of_input and effect.where != "drive")

@@ -12,12 +12,13 @@ from thermoctl.diagnose.fit import Placed
 from thermoctl.diagnose.gains import Direction
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.metric import Metric
-from thermoctl.diagnose.odds import EVENTS, odds
+from thermoctl.diagnose.odds import odds
 from thermoctl.diagnose.places import PLACES
 from thermoctl.diagnose.screening import Screened
 from thermoctl.plant import expression as ex
 
 PAIR = 2
+EVENTS = ("onsets", "windows")  # shapes that happen at one moment
 HALF = 2.0  # times its first-order promise that a refit may gain
 PLACES_EACH = 3  # of one effect in a shortlist
 ALIKE = 0.999  # cosine of two directions, above which they are one

@@ -1,15 +1,16 @@
 """Is a flow missing that no single reading shows?
 
 Each reading's noise may hide a slow error, but a flow into one node reaches several readings together. An
-unknown flow into a node is a hypothesis like any other: straight lines between KNOTS knots a recording, whose
-values are independent and normal, with the share eta of the node's typical flow as sd. Let X be its whitened
-responses without what the plant's own parameters absorb, U s V' = eta X, and r the residual. Then
+unknown flow into a node is a hypothesis like any other. It is straight lines between KNOTS knots of each
+recording. Their values w are independent and normal, with the share eta of the node's typical flow as sd.
+X holds the responses to them, without the part that the plant's own parameters absorb. r is the residual. By
+Laplace's method, at the likeliest w,
 
-    log p(D | flow) / p(D | none) = log p(r - U s^2 / (1 + s^2) U'r) - log p(r)
-                                    - 1/2 sum (U'r)^2 s^2 / (1 + s^2)^2 - 1/2 sum log(1 + s^2)
+    log p(D | flow) = log p(r - X w) - 1/2 w'w - 1/2 log |1 + X' V^-1 X|.
 
-by Laplace's method, with noise and remainder averaged on both sides. eta is log-uniform over SHARES. Readings
-that rest on the steps of their rounding err with the signal, so they do not count.
+Noise and remainder are averaged as always. 1/V is their mean for r - X w, because part of the noise may be
+the flow. eta is log-uniform over SHARES. Readings that rest on the steps of their rounding err with the
+signal, so they do not count.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
 def _evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> float:
     """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method.
 
-    `weight` (rows,): of the noise without them; what they explain changes it."""
+    `weight` (rows,): of the noise without them; it rises where they explain part of that noise."""
     for _ in range(ROUNDS):
         inside = x * weight[:, None]
         curvature = np.eye(x.shape[1]) + inside.T @ inside
