@@ -87,7 +87,9 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
             continue
         x = metric.project(block_diag(*flow_rows(metric, runs, n, hats, size))) * counts[:, None]
         scores = [_evidence(metric, x * share, weight) for share in SHARES]
-        out[n] = float(logsumexp(scores) - np.log(len(SHARES))) - likelihood
+        gain = float(logsumexp(scores) - np.log(len(SHARES))) - likelihood
+        if np.isfinite(gain):
+            out[n] = gain
     return out
 
 
