@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnose.catalogue import CATALOGUE, catalogue, contained
 from thermoctl.diagnose.decide import Key, Posterior, weigh
 from thermoctl.diagnose.limits import Limits, limits
 from thermoctl.diagnose.misfit import Energy, standing
@@ -42,7 +42,7 @@ NUMBERS = {
     "temperature": (0.7, 1.0, 1.25, 1.5, 2.0, 3.0),
     "alike": (0.05, 0.075, 0.1, 0.15),
 }
-CONTAINS = {e.name: e.contains for e in catalogue((CATALOGUE,)).values() if e.contains}
+CONTAINS = contained(catalogue((CATALOGUE,)))
 LEAST = 1e-3  # of a probability: the largest loss of one effect is 7
 FLAT = 0.02  # of the score, about one name: less says nothing
 FILE = Path("config/diagnosis.yaml")

@@ -107,11 +107,6 @@ class Case:
     rtol: float = RTOL
     memory: Memory = NOTHING  # of earlier recordings
 
-    @cached_property
-    def contains(self) -> Mapping[str, str]:
-        """The simpler effect that some entries of the catalogue contain."""
-        return {e.name: e.contains for e in self.catalogue.values() if e.contains}
-
     def drives(self, model: Model) -> list[Excitation]:
         """The recordings as a model reads them. Models that read the same columns share their values."""
         if _readings(model) == _readings(self.null.model):

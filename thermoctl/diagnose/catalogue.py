@@ -139,6 +139,11 @@ def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
     return found
 
 
+def contained(entries: Mapping[str, Effect]) -> dict[str, str]:
+    """Return the simpler effect that some entries contain."""
+    return {e.name: e.contains for e in entries.values() if e.contains}
+
+
 def _read(root: yamlfile.Node) -> Effect:
     top = _checked(root)
 

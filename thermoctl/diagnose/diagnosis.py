@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from thermoctl.diagnose.case import Budget, Case, case
-from thermoctl.diagnose.catalogue import Effect
+from thermoctl.diagnose.catalogue import Effect, contained
 from thermoctl.diagnose.decide import Facts, decide, weigh
 from thermoctl.diagnose.fit import as_refitted, with_residuals
 from thermoctl.diagnose.held_out import split, worth
@@ -69,7 +69,7 @@ def _decided(
     `unsure`: an untried hypothesis may be likelier, so that nothing is named."""
     energy = energies(known, searched, numbers)
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
-    physics = standing(energy, dims, known.contains, numbers)
+    physics = standing(energy, dims, contained(known.catalogue), numbers)
     scores = {w.fitted.hypothesis.keys: w.score for w in searched.tried}
     posterior = weigh({keys: scores[keys] for keys in physics}, physics, numbers)
     fits = {w.fitted.hypothesis.keys: w.fitted for w in searched.tried}

@@ -19,6 +19,7 @@ import numpy as np
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import EffectParameter
+from thermoctl.diagnose.curvature import at_bound, deviations, kept, relieved
 from thermoctl.diagnose.memory import Past, PlacedBefore
 from thermoctl.diagnose.noise import Averaged, averaged
 from thermoctl.diagnose.onsets import moved
@@ -40,8 +41,6 @@ WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise t
 SHARE = 0.01  # of an effect's size, from which the first step towards it is taken
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
 MOVES = 2  # refits after the times of jumps were moved
-EDGE = 1e-6  # of a parameter's range, up to which it is at its end
-MOST = 0.9  # of a curvature that not knowing the spectrum may take
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -268,14 +267,9 @@ def _weighed(
     own, parameters = np.ones(len(z), bool), np.arange(len(z)) < problem.n_parameters
     own[np.concatenate([gaussian(posterior), posterior.believed])] = False
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
-    confined = _relieved(confined, posterior.relief(z, posterior.rows(errors), average))
-    at_bound = _at_bound(problem, z)
-    # a parameter of the plant that is pressed to its bound does not give way to an effect
-    moves = np.array([q not in at_bound or q not in case.plant.parameters for q, _ in problem.unknowns])
-    sd = np.zeros(len(z))
-    inverse = np.linalg.pinv(confined[np.ix_(moves, moves)], hermitian=True)
-    sd[moves] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
-    names = _deviations(posterior, values, sd)
+    confined = relieved(confined, posterior.relief(z, posterior.rows(errors), average))
+    bounds = at_bound(problem, z)
+    sd = deviations(posterior, values, confined, bounds)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
     found = Fit(
         posterior.model,
@@ -284,17 +278,17 @@ def _weighed(
         -2 * average.log_likelihood,
         problem.unknowns,
         z,
-        _kept(matrix, parameters),
+        kept(matrix, parameters),
         errors,
         case.noise,
         0,
         problem.samples,
-        at_bound,
+        bounds,
         problem.priors,
     )
     # with hundreds of recordings the starts' part fills the memory
     rough = dataclasses.replace(
-        rough, hessian=_kept(rough.hessian, parameters), prior_hessian=np.zeros((0, 0))
+        rough, hessian=kept(rough.hessian, parameters), prior_hessian=np.zeros((0, 0))
     )
     rough_powers = case.coordinates.powers(posterior.rows(rough.residuals))
     if not problem.keeps:
@@ -304,54 +298,17 @@ def _weighed(
         updated(posterior.plant, found, posterior.drives),
         found,
         average.log_likelihood,
-        log_density(posterior, z, names),
+        log_density(posterior, z, sd),
         volume,
         average,
         tuple(powers),
-        names,
+        sd,
         updated(posterior.plant, rough, posterior.drives),
         rough,
         tuple(rough_powers),
-        _kept(confined, np.array([r is None for _, r in problem.unknowns], bool)),
+        kept(confined, np.array([r is None for _, r in problem.unknowns], bool)),
         posterior.past,
     )
-
-
-def _kept(h: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Return the curvature of the unknowns `kept` (k,), a mask; the others are eliminated."""
-    cross = h[np.ix_(~kept, kept)]
-    absorbed = cross.T @ np.linalg.pinv(h[np.ix_(~kept, ~kept)], hermitian=True) @ cross
-    return np.asarray(h[np.ix_(kept, kept)] - absorbed)
-
-
-def _deviations(posterior: Posterior, values: np.ndarray, sd: np.ndarray) -> dict[str, float]:
-    """Return the standard deviations of the effects' parameters, in their units, from those of z."""
-    problem, out = posterior.problem, dict[str, float]()
-    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
-        if q not in posterior.case.plant.parameters:
-            slope = problem.scales[q].slope(float(values[0, posterior.model.parameters.index(q)]))
-            out[q] = max(out.get(q, 0.0), float(sd[k] * slope))
-    return out
-
-
-def _at_bound(problem: Problem, z: np.ndarray) -> dict[str, str]:
-    """Return "low" or "high" for each parameter at an end of its range."""
-    return {
-        q: "low" if z[k] <= EDGE else "high"
-        for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters])
-        if not EDGE < z[k] < 1 - EDGE
-    }
-
-
-def _relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
-    """matrix - relief, where no direction loses more than MOST of its curvature."""
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    w, q = np.linalg.eigh(matrix / np.outer(size, size))
-    root = q * np.sqrt(np.maximum(w, 1e-12))  # matrix = size root root' size
-    inner = np.linalg.solve(root, (relief / np.outer(size, size))) @ np.linalg.inv(root).T
-    share, p = np.linalg.eigh(0.5 * (inner + inner.T))
-    left = root @ (p * (1 - np.clip(share, 0.0, MOST))) @ p.T @ root.T
-    return left * np.outer(size, size)
 
 
 def remembered(case: Case, f: Fitted) -> Past:

@@ -19,9 +19,8 @@ def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limit
     for e in effects:
         c = e.candidate
         share = len(where) * len(where.get(c.effect.name, {c.place.where}))
-        total += np.log(limits.missing / (1 - limits.missing) / share) + rare(
-            c.effect, bool(c.place.input)
-        ) * np.log(limits.rare)
+        total += np.log(limits.missing / (1 - limits.missing) / share)
+        total += rare(c.effect, bool(c.place.input)) * np.log(limits.rare)
     return float(total)
 
 
