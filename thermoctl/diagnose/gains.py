@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.overlay import Overlay, Trajectory
 from thermoctl.plant import expression as ex
 
+PLACES_EACH = 3  # of one effect in a shortlist: else one with many places leaves no room for another
 DECADES = 3.0  # up and down from one unit: where quotients of amplitudes are looked for
 NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
 
@@ -37,6 +38,27 @@ class Direction:
     def log_p(self) -> float:
         """log10 of the chance of such a gain where nothing is missing."""
         return log_p(self.gain, self.dims) + self.elsewhere
+
+
+def once(directions: Iterable[Direction]) -> list[Direction]:
+    """Return the first direction of each candidate."""
+    first: dict[tuple[str, str], Direction] = {}
+    for d in directions:
+        first.setdefault(d.candidate.key, d)
+    return list(first.values())
+
+
+def foremost(directions: Iterable[Direction], places: int) -> list[Direction]:
+    """Return the directions at the first `places` places of each effect."""
+    seen: dict[str, set[str]] = {}
+    out = []
+    for d in directions:
+        effect, where = d.candidate.key
+        known = seen.setdefault(effect, set())
+        if where in known or len(known) < places:
+            known.add(where)
+            out.append(d)
+    return out
 
 
 def log_p(gain: float, dims: int) -> float:

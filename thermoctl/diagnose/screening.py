@@ -12,7 +12,7 @@ from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnose.fit import Fitted, as_refitted
-from thermoctl.diagnose.gains import Direction
+from thermoctl.diagnose.gains import PLACES_EACH, Direction, foremost
 from thermoctl.diagnose.grids import grid
 from thermoctl.diagnose.levels import only_noise
 from thermoctl.diagnose.limits import Limits
@@ -27,6 +27,7 @@ from thermoctl.plant.simulate import Simulation
 ROWS = 6_000  # largest number of DCT rows, all outputs and recordings together
 FREE = 1e4  # prior standard deviation of an unknown whose prior does not count
 PROMISED = 30  # directions whose gain in log likelihood is predicted
+ROOM = 2  # times PLACES_EACH places of one effect among them
 
 
 class Plain:
@@ -246,10 +247,10 @@ def screened(case: Case, fitted: Fitted, limits: Limits) -> Screened:
     norms: list[Norms] = []
     metrics = [metric, other] if other else [metric]
     best, *rest = screen(metrics, rig, found, select=likeliest, norms=norms)
-    promised = [(d, metric.promise(d)) for d in best[:PROMISED]]
+    promised = [(d, metric.promise(d)) for d in foremost(best, ROOM * PLACES_EACH)[:PROMISED]]
     by_energy = rest[0] if rest else []
     if other:
-        again = [(d, other.promise(d)) for d in by_energy[:PROMISED]]
+        again = [(d, other.promise(d)) for d in foremost(by_energy, ROOM * PLACES_EACH)[:PROMISED]]
         known = {d.candidate.key: promise for d, promise in promised}
         promised = [(d, p) for d, p in promised if p >= 0] + [
             (dataclasses.replace(d, vector=None), p)  # its vector is of another metric

@@ -9,7 +9,7 @@ import numpy as np
 
 from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.fit import Placed
-from thermoctl.diagnose.gains import Direction
+from thermoctl.diagnose.gains import PLACES_EACH, Direction, foremost, once
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.metric import Metric
 from thermoctl.diagnose.odds import odds
@@ -20,7 +20,6 @@ from thermoctl.plant import expression as ex
 PAIR = 2
 EVENTS = ("onsets", "windows")  # shapes that happen at one moment
 HALF = 2.0  # times its first-order promise that a refit may gain
-PLACES_EACH = 3  # of one effect in a shortlist
 ALIKE = 0.999  # cosine of two directions, above which they are one
 
 
@@ -67,12 +66,9 @@ def shortlist(
         if gain > 0 and d.gain > 0 and not relabels(d.candidate):
             paying.append((d, gain))
     paying.sort(key=lambda x: -x[1])
-    out: list[tuple[tuple[Direction, ...], float]] = []
-    for d, gain in paying:
-        alike = [o for (o,), _ in out if o.candidate.effect is d.candidate.effect]
-        if len(alike) < PLACES_EACH and d.candidate.key not in {o.candidate.key for o in alike}:
-            out.append(((d,), gain))
-    out = [(d, gain) for d, gain in out[: limits.shortlist] if HALF * gain > out[0][1]]
+    gains = {d.candidate.key: gain for d, gain in reversed(paying)}
+    best = foremost(once(d for d, _ in paying), PLACES_EACH)[: limits.shortlist]
+    out = [((d,), gain) for d in best if HALF * (gain := gains[d.candidate.key]) > paying[0][1]]
     known = {d.candidate.key for (d,), _ in out}
     out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in known]
     together = pairs([d for d, _ in paying], looked.metric, limits)
@@ -83,22 +79,20 @@ def shortlist(
 
 def largest(looked: Screened) -> list[Direction]:
     """Return the direction of each candidate whose gain in energy is at least half of the best one's."""
-    first: dict[tuple[str, str], Direction] = {}
-    for d in looked.by_energy:
-        if HALF * d.gain > looked.by_energy[0].gain and not relabels(d.candidate):
-            first.setdefault(d.candidate.key, dataclasses.replace(d, vector=None))
-    return list(first.values())
+    enough = [d for d in looked.by_energy if HALF * d.gain > looked.by_energy[0].gain]
+    best = foremost(once(d for d in enough if not relabels(d.candidate)), PLACES_EACH)
+    return [dataclasses.replace(d, vector=None) for d in best]
 
 
 def pairs(directions: Sequence[Direction], metric: Metric, limits: Limits) -> list[tuple[Direction, ...]]:
     """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
 
     The plant's own parameters may imitate each alone, but not both together."""
-    best: dict[tuple[str, str], Direction] = {}
-    for d in directions:
-        if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values()):
-            best.setdefault(d.candidate.key, d)
-    kept = list(best.values())
+    kept = once(
+        d
+        for d in directions
+        if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values())
+    )
     if len(kept) < PAIR:
         return []
     v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
