@@ -35,8 +35,8 @@ def bar():
     return "\n".join(lines) + "\n"
 
 
-def recording(seed, watts):
-    """Time and columns; `watts`: rms of a slow flow into block 5 that the plant lacks."""
+def recording(seed, watts, between):
+    """Time and columns; `watts`: rms of a slow flow into block 5, or from 4 to 5, that the plant lacks."""
     t = np.arange(0.0, 3000.0, 3.0)
     rng = np.random.default_rng(seed)
     heat = rng.permutation([0.0, 8.0, 3.0, 0.0, 6.0, 1.0])[(t // 500).astype(int)]
@@ -47,6 +47,7 @@ def recording(seed, watts):
         a[[k, k + 1], [k + 1, k]] += LINK
     into = np.zeros((BLOCKS, 2))
     into[0, 0] = into[5, 1] = 1.0
+    into[4, 1] = -float(between)
     system = (a / STORAGE, into / STORAGE, np.eye(BLOCKS), np.zeros((BLOCKS, 2)))
     _, x, _ = lsim(system, np.column_stack([heat, lacking]), t, interp=False)
     slow = lfilter([1], [1, -0.9], rng.standard_normal(x.shape), axis=0) * (1 - 0.9**2) ** 0.5
@@ -54,13 +55,15 @@ def recording(seed, watts):
     return np.column_stack([t, heat, y])
 
 
-def diagnosed(folder, watts, seeds):
+def diagnosed(folder, watts, seeds, between=False):
     header = "t,heat," + ",".join(f"t{k}" for k in range(BLOCKS))
     plant = folder / "plant.yaml"
     plant.write_text(bar())
     paths = [folder / f"run_{s}.csv" for s in seeds]
     for path, seed in zip(paths, seeds, strict=True):
-        np.savetxt(path, recording(seed, watts), delimiter=",", header=header, comments="", fmt="%.5f")
+        np.savetxt(
+            path, recording(seed, watts, between), delimiter=",", header=header, comments="", fmt="%.5f"
+        )
     assert (
         main(["diagnose", "--plant", str(plant), *map(str, paths), "--out", str(folder / "out"), "--quiet"])
         == 0
@@ -80,3 +83,10 @@ def test_a_flow_that_no_reading_shows_alone_is_found_at_its_node(tmp_path):
     assert r["decision"]["remains"] < 0.9 < r["decision"]["flow"]
     assert r["remainder"]["node"] == "b5"
     assert any("a flow into b5 is missing" in note for note in r["notes"])
+
+
+def test_a_flow_between_two_nodes_is_found_beside_their_link(tmp_path):
+    r = diagnosed(tmp_path, 0.2, (1, 2), between=True)
+    assert r["verdict"] == "unexplained" and not r["findings"]
+    assert r["remainder"]["node"] in {"b4", "b5"}
+    assert any("a flow along link4 is missing" in n for n in r["notes"])

@@ -1,10 +1,10 @@
 """Is a flow missing that no single reading shows?
 
 Each reading's noise may hide a slow error, but a flow into one node reaches several readings together. An
-unknown flow into a node is a hypothesis like any other. It is straight lines between KNOTS knots of each
-recording. Their values w are independent and normal, with the share eta of the node's typical flow as sd.
-X holds the responses to them, without the part that the plant's own parameters absorb. r is the residual. By
-Laplace's method, at the likeliest w,
+unknown flow into a node, or along a flow from node to node, is a hypothesis like any other. It is straight
+lines between KNOTS knots of each recording. Their values w are independent and normal, with the share eta
+of the typical flow there as sd. X holds the responses to them, without the part that the plant's own
+parameters absorb. r is the residual. By Laplace's method, at the likeliest w,
 
     log p(D | flow) = log p(r - X w) - 1/2 w'w - 1/2 log |1 + X' V^-1 X|.
 
@@ -15,7 +15,7 @@ signal, so they do not count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,31 +28,36 @@ from thermoctl.diagnose.law.smooth import flow_rows, hat_functions
 from thermoctl.diagnose.levels import rounded
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.screening import ROWS, Plain, Rows
-from thermoctl.diagnose.where import signals, typical_flow
+from thermoctl.diagnose.where import signals, typical_flow, typical_rate
+from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError
 
 KNOTS, FEWEST, TOGETHER = 24, 6, 240  # of a recording; least number; about so many in all recordings
-ROUNDS = 4  # of flow and noise in turn
+ROUNDS, SETTLED = 4, 0.1  # of flow and noise in turn, until the evidence changes by fewer nats
 SHARES = 10.0 ** np.arange(-4.5, 0.6, 0.5)  # eta
 
 
 @dataclass(frozen=True)
 class MissingFlow:
-    """The probability that some unknown flow is missing, and the node that it would most likely enter."""
+    """The probability that some unknown flow is missing, and the node that it would most likely enter.
+
+    `along`: the flow of the plant beside which it more likely goes, out of `node`."""
 
     probability: float = 0.0
     node: str | None = None
+    along: str | None = None
 
     def sentence(self) -> str:
         """Return it in words."""
+        where = f"along {self.along}" if self.along else f"into {self.node}"
         return (
-            f"a flow into {self.node} is missing that no effect explains: readings that hide it one by one "
+            f"a flow {where} is missing that no effect explains: readings that hide it one by one "
             "show it together"
         )
 
 
 def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Limits) -> MissingFlow:
-    """Return the probability that an unknown flow into one of the nodes is missing in a fitted hypothesis.
+    """Return the probability that an unknown flow into or between the nodes is missing in a fitted hypothesis.
 
     Its prior odds are those of a piece of physics, and of an unknown function of time."""
     try:
@@ -63,11 +68,15 @@ def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Limits) ->
         return MissingFlow()
     odds = np.log(limits.missing / (1 - limits.missing)) + np.log(limits.rare) - np.log(len(gains))
     p = float(expit((logsumexp(list(gains.values())) + odds) / limits.temperature))
-    return MissingFlow(p, max(gains, key=lambda n: gains[n]))
+    best = max(gains, key=lambda where: gains[where])
+    along = f.plant.flows.get(best)
+    return MissingFlow(p, along.source, best) if along else MissingFlow(p, best)
 
 
 def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
-    """Return the log Bayes factor of an unknown flow into each node. Raises SimulationError."""
+    """Return the log Bayes factor of an unknown flow into each node and along each flow between two of them.
+
+    Raises SimulationError."""
     metric = Rows(Plain(case, f, ROWS), as_refitted(case, f).average, True)
     runs = [
         signals(metric.model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
@@ -80,26 +89,45 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
         [np.full(c.rows, c.output not in coarse) for c in metric.plain.coordinates.channels]
     )
     likelihood, weight = metric.weighed(metric.residual)
+    responses = {n: block_diag(*flow_rows(metric, runs, n, hats, 1.0)) for n in nodes}
     out = {}
-    for n in nodes:
-        size = typical_flow(metric.model.plant, n, runs)
-        if size == 0:
-            continue
-        x = metric.project(block_diag(*flow_rows(metric, runs, n, hats, size))) * counts[:, None]
+    for where, response, size in _ways(metric.model.plant, responses, runs):
+        x = metric.project(size * response) * counts[:, None]
         scores = [_evidence(metric, x * share, weight) for share in SHARES]
         gain = float(logsumexp(scores) - np.log(len(SHARES))) - likelihood
         if np.isfinite(gain):
-            out[n] = gain
+            out[where] = gain
     return out
+
+
+def _ways(
+    plant: Plant, responses: Mapping[str, np.ndarray], runs: Sequence[Mapping[str, np.ndarray | float]]
+) -> Iterator[tuple[str, np.ndarray, float]]:
+    """Yield where a flow may be missing, its unit response and its typical size.
+
+    It comes from outside into a node, or it goes along a flow of the plant, from node to node."""
+    for n, response in responses.items():
+        size = typical_flow(plant, n, runs)
+        if size > 0:
+            yield n, response, size
+    for f in plant.flows.values():
+        if f.source in responses and f.target in responses:
+            size = typical_rate(f, runs)
+            if size > 0:
+                yield f.name, responses[f.target] - responses[f.source], size
 
 
 def _evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> float:
     """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method.
 
     `weight` (rows,): of the noise without them; it rises where they explain part of that noise."""
+    score = -np.inf
     for _ in range(ROUNDS):
         inside = x * weight[:, None]
         curvature = np.eye(x.shape[1]) + inside.T @ inside
         w = np.linalg.solve(curvature, inside.T @ (metric.residual * weight))
         likelihood, weight = metric.weighed(metric.residual - x @ w)
-    return likelihood - 0.5 * float(w @ w + np.linalg.slogdet(curvature)[1])
+        before, score = score, likelihood - 0.5 * float(w @ w + np.linalg.slogdet(curvature)[1])
+        if abs(score - before) < SETTLED:
+            break
+    return score

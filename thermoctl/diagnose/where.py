@@ -19,7 +19,7 @@ from scipy.fft import idct
 from thermoctl.diagnose.coordinates import Coordinates, band_edges, transform
 from thermoctl.diagnose.spectra import first_order
 from thermoctl.plant import expression as ex
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Flow, Plant
 from thermoctl.plant.simulate import Excitation, Model
 
 SHARES = 10.0 ** np.arange(-3.5, 1.1, 0.5)  # values of eta: rms of a force over the typical flow
@@ -57,13 +57,15 @@ def typical_flow(plant: Plant, node: str, values: Sequence[Mapping[str, np.ndarr
     """Return the geometric mean of the rms flows at a node, over all recordings.
 
     Not the largest: a large force that only stores and returns energy says little about a missing one."""
-    logs = []
-    for f in plant.flows.values():
-        if node in (f.source, f.target):
-            square = [float(np.mean(np.asarray(ex.evaluate(f.rate, v), float) ** 2)) for v in values]
-            if np.mean(square) > 0:
-                logs.append(0.5 * np.log(np.mean(square)))
+    rates = [typical_rate(f, values) for f in plant.flows.values() if node in (f.source, f.target)]
+    logs = [np.log(r) for r in rates if r > 0]
     return float(np.exp(np.mean(logs))) if logs else 0.0
+
+
+def typical_rate(f: Flow, values: Sequence[Mapping[str, np.ndarray | float]]) -> float:
+    """Return the rms of a flow over all recordings."""
+    square = [float(np.mean(np.asarray(ex.evaluate(f.rate, v), float) ** 2)) for v in values]
+    return float(np.sqrt(np.mean(square)))
 
 
 def signals(model: Model, d: Excitation, values: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
