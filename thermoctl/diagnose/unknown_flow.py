@@ -57,7 +57,7 @@ class MissingFlow:
 
 
 def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Limits) -> MissingFlow:
-    """Return the probability that an unknown flow into or between the nodes is missing in a fitted hypothesis.
+    """Return the probability that an unknown flow into or between nodes is missing in a fitted hypothesis.
 
     Its prior odds are those of a piece of physics, and of an unknown function of time."""
     try:
@@ -111,7 +111,7 @@ def _ways(
         if size > 0:
             yield n, response, size
     for f in plant.flows.values():
-        if f.source in responses and f.target in responses:
+        if f.source and f.target and {f.source, f.target} <= responses.keys():
             size = typical_rate(f, runs)
             if size > 0:
                 yield f.name, responses[f.target] - responses[f.source], size
