@@ -16,7 +16,7 @@ from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.overlay import Overlay, Trajectory
 from thermoctl.plant import expression as ex
 
-PLACES_EACH = 3  # of one effect in a shortlist: else one with many places leaves no room for another
+PLACES_EACH = 3  # of an effect in a shortlist: one with many places leaves room for others
 DECADES = 3.0  # up and down from one unit: where quotients of amplitudes are looked for
 NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
 

@@ -27,7 +27,7 @@ from thermoctl.plant.simulate import Simulation
 ROWS = 6_000  # largest number of DCT rows, all outputs and recordings together
 FREE = 1e4  # prior standard deviation of an unknown whose prior does not count
 PROMISED = 30  # directions whose gain in log likelihood is predicted
-ROOM = 2  # times PLACES_EACH places of one effect among them
+ROOM = 2  # times PLACES_EACH: places of one effect among them
 
 
 class Plain:

@@ -59,7 +59,8 @@ def shortlist(
 ) -> list[tuple[tuple[Direction, ...], float]]:
     """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
-    The best is first; at most PLACES_EACH of one effect. Those with the largest gain in energy follow."""
+    The best is first. Those with the largest gain in energy follow. Either list has at most
+    PLACES_EACH places of one effect."""
     paying = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
         gain = promise + odds((Placed(d.candidate, {}),), where, limits)
@@ -78,7 +79,7 @@ def shortlist(
 
 
 def largest(looked: Screened) -> list[Direction]:
-    """Return the direction of each candidate whose gain in energy is at least half of the best one's."""
+    """Return the foremost candidates whose gain in energy is at least half of the best one's."""
     enough = [d for d in looked.by_energy if HALF * d.gain > looked.by_energy[0].gain]
     best = foremost(once(d for d in enough if not relabels(d.candidate)), PLACES_EACH)
     return [dataclasses.replace(d, vector=None) for d in best]

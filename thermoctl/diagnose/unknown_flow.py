@@ -41,7 +41,7 @@ SHARES = 10.0 ** np.arange(-4.5, 0.6, 0.5)  # eta
 class MissingFlow:
     """The probability that some unknown flow is missing, and the node that it would most likely enter.
 
-    `along`: the flow of the plant beside which it more likely goes, out of `node`."""
+    `along`: the flow of the plant that it accompanies, out of `node`; None if it comes from outside."""
 
     probability: float = 0.0
     node: str | None = None
