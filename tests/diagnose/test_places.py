@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from tests.plants import FREE_CARRIAGE
 from thermoctl.diagnose.candidates import candidates
@@ -143,3 +144,56 @@ def test_a_reading_of_the_start_is_no_body_whose_start_nobody_measured(motor):
     (body,) = hidden.nodes.keys() - plant.nodes.keys()
     widened = free_starts(plant, hidden).nodes[body].initial_sigma
     assert widened == pytest.approx(10 * hidden.nodes[body].initial_sigma)
+
+
+TANK = """format: thermoctl-plant/1
+title: A tank that drains
+inputs: {inflow: {unit: m^3/s}}
+parameters: {k: {value: 1e-3, range: [1e-4, 1e-2]}}
+nodes: {level: {unit: m, storage: 0.1, initial: 0.3}}
+flows:
+  fill: {into: level, rate: inflow, unit: m^3/s}
+  outflow: {from: level, rate: "RATE", unit: m^3/s}
+outputs: {gauge: {value: level, unit: m, noise: 0.001}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("rate", "exponent"),
+    [
+        ("k * max(level - 0.02, 0)", 1.0),
+        ("k * level / 2", 1.0),
+        ("k * sqrt(max(level, 0))", 0.5),
+        ("k * max(level, 0)**1.5", 1.5),
+    ],
+)
+def test_an_outlet_has_the_exponent_of_its_file_until_another_is_found(rate, exponent):
+    t = np.arange(0.0, 200.0, 1.0)
+    plant = loads(TANK.replace("RATE", rate))
+    table = Table("run", "run", t, {"inflow": np.zeros(len(t)), "gauge": np.zeros(len(t))})
+    c = offered(plant, table, "orifice_exponent")["outflow"]
+    (n,) = c.effect.parameters
+    assert n.null == exponent
+
+    def level(p: Plant) -> np.ndarray:
+        model = compile_plant(p)
+        return model.run(model.excitation(table)).x[:, 0]
+
+    assert np.allclose(level(c.extend({})), level(plant), rtol=1e-6)
+
+    def fall(_: float, h: np.ndarray) -> np.ndarray:
+        head = h - 0.02 if "0.02" in rate else h
+        return -1e-3 * np.maximum(head, 0) ** 0.7 * (0.5 if "/ 2" in rate else 1) / 0.1
+
+    known = solve_ivp(fall, (0, t[-1]), [0.3], t_eval=t, rtol=1e-9, atol=1e-12).y[0]
+    assert np.allclose(level(c.extend({"N": 0.7})), known, rtol=1e-5, atol=1e-6)
+
+
+def test_only_a_level_has_an_outlet_and_only_of_its_own_head(motor):
+    assert offered(*motor, "orifice_exponent") == {}
+    t = np.arange(0.0, 200.0, 1.0)
+    drains = "  drain: {from: level, into: lower, rate: k * (level - lower)}"
+    two = TANK.replace("RATE", "k").replace("0.3}}", "0.3}, lower: {unit: m, storage: 1, initial: 0}}")
+    plant = loads(two.replace("outputs:", f"{drains}\noutputs:"))
+    table = Table("run", "run", t, {"inflow": np.zeros(len(t)), "gauge": np.zeros(len(t))})
+    assert offered(plant, table, "orifice_exponent") == {}

@@ -168,7 +168,7 @@ def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, 
     for key in ("null", "typical"):
         p.optional_number(key)
     p.flag("per_recording", False)
-    p.text("origin", "none", choices=("none", "first_air"))
+    p.text("origin", "none", choices=("none", "first_air", "exponent"))
     p.text("of", "none", choices=("none", "jump"))
     p.flag("at_zero", False)
     unit = p.text("unit")
@@ -186,7 +186,7 @@ def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, 
     if trial is None:
         return [] if shape is not None else ["s"]
     steps = {f"s{k}" for k in range(2, 10)} | {"s"}
-    _expression(trial, {*steps, *given, "first_air", *parameters}, f"trial of '{name}'")
+    _expression(trial, {*steps, *given, "first_air", "exponent", *parameters}, f"trial of '{name}'")
     return sorted(expression.names(expression.parse(trial.value)) & steps)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose.catalogue import Effect, EffectParameter
-from thermoctl.diagnose.places import ERRORS, Place, heats
+from thermoctl.diagnose.places import ERRORS, Place, heats, outlet
 from thermoctl.diagnose.rig import STRAIGHT, TEMPERATURE, Rig, kind_of, zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
@@ -326,21 +326,13 @@ class Builder:
             self.flows[f"spill_{a}_out"] = Flow(f"spill_{a}_out", over, a, None, unit)
 
     def _exponent(self, parameter: str) -> None:
-        n = name(self.c.own(parameter))
         f = self.base.flows[self.c.place.flow or ""]
-
-        def change(e: Expr) -> Expr | None:
-            if f.source not in ex.names(e):
-                return None
-            if e.op == "sqrt":
-                return ex.make("**", e.args[0], n)
-            return (
-                ex.make("**", e.args[0], n)
-                if e.op == "**" and e.args[1].op == "num" and e.args[1].value == 0.5
-                else None
-            )
-
-        self.flows[f.name] = dataclasses.replace(f, rate=ex.substitute(f.rate, change), unit=None)
+        found = outlet(self.rig, f)
+        assert found is not None  # the place is an outlet
+        part, head, _ = found
+        new = ex.make("**", head, name(self.c.own(parameter)))
+        rate = ex.substitute(f.rate, lambda e: new if e is part else None)
+        self.flows[f.name] = dataclasses.replace(f, rate=rate, unit=None)
 
     def _resistance(self, form: str) -> None:
         ohms = [q for q, p in self.base.parameters.items() if p.unit and re.search(r"ohm", p.unit, re.I)]

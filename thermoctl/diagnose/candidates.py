@@ -102,7 +102,9 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
                 choices = [{**c, need: name(s)} for c in choices for s in found if s != place.where]
             for variant in range(len(effect.changes)):
                 for k, choice in enumerate(choices):
-                    candidate = Candidate(effect, place, rig, variant, choice, f"{variant}{k}")
+                    candidate = Candidate(
+                        effect.at(place.exponent), place, rig, variant, choice, f"{variant}{k}"
+                    )
                     if not candidate.jumps and any("straight" in c for c in effect.changes[variant]):
                         continue  # it goes on straight lines in any case
                     out.append(candidate)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -85,7 +86,7 @@ class EffectParameter:
     shape: str | None
     per_recording: bool
     typical: float | None
-    origin: str | None  # 'first_air': low and high are relative to the first ambient temperature
+    origin: str | None  # 'first_air': bounds count from the first ambient; 'exponent': null is the outlet's
     at_zero: bool = False
     of: str | None = None
 
@@ -118,6 +119,20 @@ class Effect:
     prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
     contains: str | None = None  # the simpler effect that it is for some values of its parameters
     reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
+
+    def at(self, exponent: float | None) -> Effect:
+        """Return the entry at an outlet of this exponent, as the plant file has it."""
+        if exponent is None:
+            return self
+
+        def told(p: EffectParameter) -> EffectParameter:
+            if p.origin != "exponent" or p.trial is None:
+                return p
+            known = {"exponent": ex.num(exponent)}
+            trial = ex.substitute(p.trial, lambda e: known.get(str(e.value)) if e.op == "name" else None)
+            return dataclasses.replace(p, null=exponent, trial=trial)
+
+        return dataclasses.replace(self, parameters=tuple(map(told, self.parameters)))
 
     @property
     def timed(self) -> bool:

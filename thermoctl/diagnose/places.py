@@ -22,6 +22,7 @@ class Place:
     flow: str | None = None
     output: str | None = None
     input: str | None = None
+    exponent: float | None = None  # of an outlet, as the plant file has it
 
     def parts(self) -> set[str]:
         """The nodes and the flow that it names (not those that a reading is made of)."""
@@ -202,11 +203,30 @@ def _voltages(rig: Rig) -> Iterator[Place]:
             yield Place(n.name, {}, {"a": n.name})
 
 
+def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:
+    """Return the part of an outflow that follows its vessel's level, the head in it, and its exponent."""
+    node = rig.physics.nodes.get(f.source or "")
+    if node is None or node.name in (*rig.temperatures, *rig.velocities, *rig.position_of.values()):
+        return None
+    for e in ex.walk(f.rate):
+        if e.op == "sqrt" and node.name in ex.names(e):
+            return e, e.args[0], 0.5
+        if e.op == "**" and node.name in ex.names(e.args[0]) and e.args[1].op == "num":
+            return e, e.args[0], float(e.args[1].value or 0.0)
+    head = f.rate
+    while head.op in ("*", "/"):
+        factors = [a for a in head.args if node.name in ex.names(a)]
+        if len(factors) != 1 or (head.op == "/" and factors[0] is not head.args[0]):
+            return None
+        head = factors[0]
+    # Only a unit tells a level whose outlet is taken as laminar from any other state that decays.
+    if rig.kind(node) not in ("length", "volume") or ex.names(head) & rig.physics.nodes.keys() != {node.name}:
+        return None
+    return head, head if head.op == "max" else ex.make("max", head, ex.num(0.0)), 1.0
+
+
 def _sources(rig: Rig, node: str) -> bool:
-    return any(
-        f.source == node and any(e.op in ("sqrt", "**") and node in ex.names(e) for e in ex.walk(f.rate))
-        for f in rig.physics.flows.values()
-    )
+    return any(f.source == node and outlet(rig, f) for f in rig.physics.flows.values())
 
 
 def _levels(rig: Rig) -> Iterator[Place]:
@@ -218,12 +238,8 @@ def _levels(rig: Rig) -> Iterator[Place]:
 
 def _orifices(rig: Rig) -> Iterator[Place]:
     for f in rig.physics.flows.values():
-        if f.source and any(
-            e.op == "sqrt" or (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 0.5)
-            for e in ex.walk(f.rate)
-            if f.source in ex.names(e)
-        ):
-            yield Place(f.name, {}, flow=f.name)
+        if found := outlet(rig, f):
+            yield Place(f.name, flow=f.name, exponent=found[2])
 
 
 def _resistive(rig: Rig) -> Iterator[Place]:

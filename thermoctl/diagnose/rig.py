@@ -30,6 +30,7 @@ _KINDS = {
     "rotation": "1/s",
     "voltage": "V",
     "power": "W",
+    "volume": "m^3",
 }
 
 
