@@ -5,7 +5,7 @@ The first row of a table whose condition holds decides."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import logsumexp
@@ -13,15 +13,19 @@ from scipy.special import logsumexp
 from thermoctl.diagnose.limits import Limits
 
 Key = tuple[str, str]  # (effect, where)
+Laws = dict[tuple[frozenset[Key], Key], float]  # scores, by effects and that in whose place the law is
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Probability of each hypothesis tried (by its effects), of each effect, and of any effect."""
+    """Probability of each hypothesis tried (by its effects), of each effect, and of any effect.
+
+    `laws`: that an unknown law is there, by the effect in whose place it is"""
 
     hypotheses: Mapping[frozenset[Key], float]
     effects: Mapping[Key, float]
     something: float
+    laws: Mapping[Key, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ class Facts:
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
     - `remains`: the largest probability of a remainder at an output
-    - `flow`: probability that a flow is missing which no output shows alone
+    - `flow`: probability that a flow is missing which no output shows alone, or another law than an effect's
     - `worth`: held-out error, divided by that of a refit alone; `worse`: probability that it is larger"""
 
     something: float
@@ -59,23 +63,31 @@ def weigh(
     scores: Mapping[frozenset[Key], float],
     physics: Mapping[frozenset[Key], Mapping[Key, float]],
     limits: Limits,
+    laws: Laws | None = None,
 ) -> Posterior:
     """Return the posterior of hypotheses, the likeliest first, and of each effect.
 
     `scores`: log evidence plus log prior odds. They are divided by `limits.temperature` (diagnosis.yaml):
     a value above 1 makes the probabilities less extreme. `physics`: probability that each effect of a
-    hypothesis is physics and no unnamed misfit."""
-    order = sorted(scores, key=lambda keys: (-scores[keys], sorted(keys)))
-    values = np.array([scores[keys] for keys in order]) / limits.temperature
-    p = np.exp(values - logsumexp(values))
-    hypotheses = dict(zip(order, map(float, p), strict=True))
+    hypothesis is physics and no unnamed misfit. `laws`: scores of hypotheses with an unknown law beside them,
+    in the place of an effect (unknown_law.py)."""
+    laws = laws or {}
+    total = logsumexp(np.array([*scores.values(), *laws.values()]) / limits.temperature)
+    of = {keys: float(np.exp(score / limits.temperature - total)) for keys, score in scores.items()}
+    unknown: dict[Key, float] = {}
+    for (keys, at), score in laws.items():
+        p = float(np.exp(score / limits.temperature - total))
+        of[keys] += p
+        unknown[at] = unknown.get(at, 0.0) + p
+    order = sorted(of, key=lambda keys: (-of[keys], -scores[keys], sorted(keys)))
+    hypotheses = {keys: of[keys] for keys in order}
     effects: dict[Key, float] = {}
     something = 0.0
     for keys, q in hypotheses.items():
         something += q * max(physics[keys].values(), default=0.0)
         for key in keys:
             effects[key] = effects.get(key, 0.0) + q * physics[keys][key]
-    return Posterior(hypotheses, effects, something)
+    return Posterior(hypotheses, effects, something, unknown)
 
 
 def _only_noise(f: Facts, limits: Limits) -> bool:

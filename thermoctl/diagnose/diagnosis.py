@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from thermoctl.diagnose.case import Budget, Case, case
 from thermoctl.diagnose.catalogue import Effect, contained
-from thermoctl.diagnose.decide import Facts, decide, weigh
+from thermoctl.diagnose.decide import Facts, Laws, decide, weigh
 from thermoctl.diagnose.fit import as_refitted, with_residuals
 from thermoctl.diagnose.held_out import split, worth
 from thermoctl.diagnose.law.find import find_law
@@ -20,7 +20,8 @@ from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.search import Searched, search
 from thermoctl.diagnose.threads import one_thread
 from thermoctl.diagnose.unknown import left, reached
-from thermoctl.diagnose.unknown_flow import MissingFlow, flow_missing
+from thermoctl.diagnose.unknown_flow import flow_missing
+from thermoctl.diagnose.unknown_law import missing_law, unknown_laws
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 
@@ -70,9 +71,13 @@ def _decided(
     energy = energies(known, searched, numbers)
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
     physics = standing(energy, dims, contained(known.catalogue), numbers)
-    scores = {w.fitted.hypothesis.keys: w.score for w in searched.tried}
-    posterior = weigh({keys: scores[keys] for keys in physics}, physics, numbers)
-    fits = {w.fitted.hypothesis.keys: w.fitted for w in searched.tried}
+    tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
+    fits = {keys: w.fitted for keys, w in tried.items()}
+    scores = {keys: tried[keys].score for keys in physics}
+    posterior, laws = weigh(scores, physics, numbers), Laws()
+    if posterior.something >= numbers.name:
+        laws = unknown_laws(known, tried, next(iter(posterior.hypotheses)), physics, numbers)
+        posterior = weigh(scores, physics, numbers, laws)
     best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
     if posterior.something >= numbers.name:
         likeliest = next(iter(posterior.hypotheses))
@@ -87,19 +92,19 @@ def _decided(
     told = bool(best.hypothesis.effects) and value.reserved
     ratio, worse = (_ratio(value.after, value.refit_only), value.worse) if told else (1.0, 0.0)
     remains = remainder(known, fits[best.hypothesis.keys])
-    flow = MissingFlow()
-    if remains < numbers.name:
-        flow = flow_missing(known, fits[best.hypothesis.keys], reach.nodes, numbers)
-    sure = flow if flow.probability >= numbers.name else None
+    unknown = missing_law(posterior, searched.tried)
+    if remains < numbers.name and unknown.probability < numbers.name:
+        unknown = flow_missing(known, fits[best.hypothesis.keys], reach.nodes, numbers)
+    sure = unknown if unknown.probability >= numbers.name else None
     if sure:
-        after = replace(after, node=sure.node)
+        after = replace(after, node=sure.node or after.node)
         before = before if best.hypothesis.effects else after
     facts = Facts(
-        posterior.something, named, max(after.over_noise.values()), ratio, remains, worse, flow.probability
+        posterior.something, named, max(after.over_noise.values()), ratio, remains, worse, unknown.probability
     )
     decision = decide(posterior, facts, numbers)
     return Diagnosis(
-        known, searched, posterior, best, null, after, before, value, decision, energy, physics, sure
+        known, searched, posterior, best, null, after, before, value, decision, energy, physics, sure, laws
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.decide import Decision, Key, Posterior
+from thermoctl.diagnose.decide import Decision, Key, Laws, Posterior
 from thermoctl.diagnose.fit import Fitted, Placed
 from thermoctl.diagnose.held_out import Worth
 from thermoctl.diagnose.law.find import Law
@@ -19,7 +19,7 @@ from thermoctl.diagnose.levels import late
 from thermoctl.diagnose.misfit import Energy, standouts
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import Left
-from thermoctl.diagnose.unknown_flow import MissingFlow
+from thermoctl.diagnose.unknown_flow import Missing
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit
@@ -45,7 +45,8 @@ class Diagnosis:
     - `energy`: of each hypothesis' residuals
     - `physics`: for hypotheses of which an effect stands out of the misfit that they leave: each effect's
       probability of being physics
-    - `flow`: a flow that `best` lacks for certain, which no output shows alone
+    - `unknown`: something that `best` lacks for certain, though no output shows it alone
+    - `laws`: scores of hypotheses with an unknown law in the place of an effect
     - `missing_flow`: rms of the flow into `before.node` that would close the misfit of `null`
     - `law`: a law for the remainder of the outcome"""
 
@@ -60,7 +61,8 @@ class Diagnosis:
     decision: Decision
     energy: Mapping[frozenset[Key], Energy]
     physics: Mapping[frozenset[Key], Mapping[Key, float]]
-    flow: MissingFlow | None
+    unknown: Missing | None
+    laws: Laws
     missing_flow: float | None = None
     law: Law | None = None
 
@@ -147,7 +149,7 @@ def _notes(d: Diagnosis) -> list[str]:
         *d.case.notes,
         *doubts(d.case, d.final.fit, d.before.noise),
         *late(d.case, d.final),
-        *([d.flow.sentence()] if d.flow else []),
+        *([d.unknown.sentence] if d.unknown else []),
         *(
             f"{effect} at {where} is in the extended plant, but is not sure enough to be a finding "
             f"(probability {d.posterior.effects.get((effect, where), 0.0):.2f})"
@@ -299,6 +301,9 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
                 "log_evidence": w.fitted.log_evidence - null,
                 "log_prior_odds": w.log_odds,
                 "posterior": d.posterior.hypotheses.get(keys, 0.0),
+                "with_unknown_law": {
+                    f"{e} at {at}": s - w.score for (own, (e, at)), s in d.laws.items() if own == keys
+                },
                 "physics": None if physics is None else [physics[k] for k in sorted(keys)],
                 "remainder": max(w.fitted.average.remainder),
                 "rms": w.fitted.fit.rms(),

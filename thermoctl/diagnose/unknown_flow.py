@@ -38,39 +38,34 @@ SHARES = 10.0 ** np.arange(-4.5, 0.6, 0.5)  # eta
 
 
 @dataclass(frozen=True)
-class MissingFlow:
-    """The probability that some unknown flow is missing, and the node that it would most likely enter.
-
-    `along`: the flow of the plant that it accompanies, out of `node`; None if it comes from outside."""
+class Missing:
+    """The probability that something unknown is missing, the node where it most likely is, and a sentence."""
 
     probability: float = 0.0
     node: str | None = None
-    along: str | None = None
-
-    def sentence(self) -> str:
-        """Return it in words."""
-        where = f"along {self.along}" if self.along else f"into {self.node}"
-        return (
-            f"a flow {where} is missing that no effect explains: readings that hide it one by one "
-            "show it together"
-        )
+    sentence: str = ""
 
 
-def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Limits) -> MissingFlow:
+def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Limits) -> Missing:
     """Return the probability that an unknown flow into or between nodes is missing in a fitted hypothesis.
 
     Its prior odds are those of a piece of physics, and of an unknown function of time."""
     try:
         gains = flow_gains(case, f, nodes)
     except (SimulationError, np.linalg.LinAlgError):
-        return MissingFlow()
+        return Missing()
     if not gains:
-        return MissingFlow()
+        return Missing()
     odds = np.log(limits.missing / (1 - limits.missing)) + np.log(limits.rare) - np.log(len(gains))
     p = float(expit((logsumexp(list(gains.values())) + odds) / limits.temperature))
     best = max(gains, key=lambda where: gains[where])
     along = f.plant.flows.get(best)
-    return MissingFlow(p, along.source, best) if along else MissingFlow(p, best)
+    where = f"along {best}" if along else f"into {best}"
+    sentence = (
+        f"a flow {where} is missing that no effect explains: readings that hide it one by one "
+        "show it together"
+    )
+    return Missing(p, along.source if along else best, sentence)
 
 
 def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
@@ -93,7 +88,7 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
     out = {}
     for where, response, size in _ways(metric.model.plant, responses, runs):
         x = metric.project(size * response) * counts[:, None]
-        scores = [_evidence(metric, x * share, weight) for share in SHARES]
+        scores = [evidence(metric, x * share, weight) for share in SHARES]
         gain = float(logsumexp(scores) - np.log(len(SHARES))) - likelihood
         if np.isfinite(gain):
             out[where] = gain
@@ -117,7 +112,7 @@ def _ways(
                 yield f.name, responses[f.target] - responses[f.source], size
 
 
-def _evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> float:
+def evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> float:
     """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method.
 
     `weight` (rows,): of the noise without them; it rises where they explain part of that noise."""

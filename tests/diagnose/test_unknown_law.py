@@ -1,0 +1,81 @@
+"""Physics outside the catalogue has the signal of an effect, but not its form: scipy simulates a block that melts."""
+
+import json
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
+
+from thermoctl.cli import main
+
+PLANT = """format: thermoctl-plant/1
+title: A heated block on a base
+inputs: {heat: {unit: W}, air: {unit: degC}}
+parameters:
+  C: {value: 9, unit: J/K, range: [4, 30]}
+  D: {value: 18, unit: J/K, range: [8, 60]}
+  G: {value: 0.12, unit: W/K, range: [0.03, 0.4]}
+  H: {value: 0.09, unit: W/K, range: [0.03, 0.4]}
+nodes:
+  block: {unit: degC, storage: C, initial: 20, initial_sigma: 0.01}
+  base: {unit: degC, storage: D, initial: 20, initial_sigma: 0.01}
+flows:
+  power: {into: block, rate: heat, unit: W}
+  link: {from: block, into: base, rate: G * (block - base), unit: W}
+  loss: {from: base, rate: H * (base - air), unit: W}
+outputs:
+  t_block: {value: block, unit: degC, noise: 0.1}
+  t_base: {value: base, unit: degC, noise: 0.1}
+"""
+
+
+def melts(T):
+    return 10.0 * (1 + 0.35 * np.exp(-0.5 * ((T - 38) / 2.0) ** 2))
+
+
+def warms(T):
+    return 10.0 * (1 + 0.004 * (T - 20))
+
+
+def recording(seed, storage):
+    t = np.arange(0.0, 3000.0, 3.0)
+    rng = np.random.default_rng(seed)
+    levels = rng.permutation([0.0, 4.0, 1.5, 3.0, 0.5, 2.0])  # for 501 s each: they change at a sample
+
+    def slope(s, x):
+        heat, link = levels[min(int(s // 501), 5)], 0.1 * (x[0] - x[1])
+        return [(heat - link) / storage(x[0]), (link - 0.1 * (x[1] - 20)) / 20.0]
+
+    x = solve_ivp(slope, (0, t[-1]), [20.0, 20.0], t_eval=t, max_step=3.0, rtol=1e-8).y
+    slow = lfilter([1], [1, -0.9], rng.standard_normal(x.shape)) * (1 - 0.9**2) ** 0.5
+    y = x + 0.1 * (0.8 * rng.standard_normal(x.shape) + 0.6 * slow)
+    return np.column_stack([t, levels[(t // 501).astype(int)], np.full(len(t), 20.0), *y])
+
+
+def diagnosed(folder, storage):
+    (folder / "plant.yaml").write_text(PLANT)
+    paths = [str(folder / f"run_{seed}.csv") for seed in (1, 2)]
+    for path, seed in zip(paths, (1, 2), strict=True):
+        header = "t,heat,air,t_block,t_base"
+        np.savetxt(path, recording(seed, storage), delimiter=",", header=header, comments="", fmt="%.5f")
+    out = folder / "out"
+    arguments = ["diagnose", "--plant", str(folder / "plant.yaml"), *paths, "--out", str(out), "--quiet"]
+    assert main(arguments) == 0
+    return json.loads((out / "diagnosis.json").read_text())
+
+
+def test_a_block_that_melts_has_no_capacity_that_varies_evenly(tmp_path):
+    """The capacity of the catalogue rises on a line: it takes a part of the peak, and leaves the rest."""
+    r = diagnosed(tmp_path, melts)
+    assert not r["findings"] and r["verdict"] == "unexplained"
+    assert r["remainder"]["node"] == "block"
+    assert any("block depends on T" in note for note in r["notes"])
+
+
+def test_a_capacity_that_varies_evenly_keeps_its_name(tmp_path):
+    r = diagnosed(tmp_path, warms)
+    (found,) = r["findings"]
+    assert (found["effect"], found["where"]) == ("variable_heat_capacity", "block")
+    assert r["verdict"] == "explained" and r["decision"]["flow"] < 0.3
+    (named,) = [h for h in r["hypotheses"] if h["effects"] == ["variable_heat_capacity at block"]]
+    assert named["with_unknown_law"]["variable_heat_capacity at block"] < 0  # nats, beside its prior odds

@@ -1,0 +1,189 @@
+"""Is it the effect, or another law of the same signal at the same place?
+
+An effect states how a term depends on a signal s: a storage on its temperature, a friction on a velocity.
+Physics that nobody named may depend on s in any other way, and a single effect then takes part of it. So
+every hypothesis that holds some of the findings meets one more with an unknown law beside them,
+
+    term (1 + sum_k w_k h_k(s)),   w normal with sd eta,   eta log-uniform (unknown_flow.py)
+
+h_k: KNOTS straight lines over the range of s. A new flow or reading has its typical size as term. An effect
+whose form is right needs small w beside it, and large ones in its place: then the evidence keeps it. One
+that is as wrong as it is large gains nothing beside the law, and its own prior odds decide against it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from thermoctl.diagnose.builder import Builder
+from thermoctl.diagnose.candidates import Candidate, candidates
+from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.catalogue import Effect, EffectParameter
+from thermoctl.diagnose.decide import Key, Laws, Posterior
+from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.limits import Limits
+from thermoctl.diagnose.misfit import standouts
+from thermoctl.diagnose.odds import odds
+from thermoctl.diagnose.overlay import Trajectory
+from thermoctl.diagnose.roles import Structure
+from thermoctl.diagnose.screen import directions, groups_of
+from thermoctl.diagnose.screening import ROWS, Plain, Rows, places
+from thermoctl.diagnose.search import Keys, Weighed
+from thermoctl.diagnose.unknown_flow import SHARES, Missing, evidence
+from thermoctl.diagnose.where import typical_flow
+from thermoctl.plant import expression as ex
+from thermoctl.plant.simulate import SimulationError
+
+NAME = "unknown_law"
+KNOTS = 8  # of a law
+
+
+# The signal that the symbols of a form tell; the first that has all of them.
+SIGNALS = (
+    ("TA - TB", "TA", "TB"),
+    ("T - air", "T", "air"),
+    *((s, s) for s in ("T", "v", "x", "i", "u", "air", "y")),
+)
+WHOLE = {"rate": "rate", "storage": "storage", "resistance": "R"}  # terms that have a size of their own
+
+
+@dataclass(frozen=True)
+class Term:
+    """The term of the plant that an effect changes: kind of the change, ends of a flow, form and signal."""
+
+    kind: str
+    ends: Mapping[str, str]
+    signal: str
+
+
+def term_of(c: Candidate) -> Term | None:
+    """Return the term that an effect changes; None for an effect of time, of memory, or of no signal."""
+    *before, last = c.effect.changes[c.variant]
+    ((kind, what),) = last.items()
+    moving = any("flow" in item and str(item["flow"]["rate"]) != "0" for item in before)
+    moving |= kind == "flow" and bool(before)
+    if c.effect.timed or moving or kind not in ("flow", "rate", "value", "storage", "drive", "resistance"):
+        return None
+    form = ex.parse(str(what["rate"] if kind == "flow" else what))
+    if any(e.op == "delay" for e in ex.walk(form)):
+        return None
+    read = ex.names(form)
+    signal = next((text for text, *needed in SIGNALS if read.issuperset(needed)), None)
+    ends = {k: what[k] for k in ("from", "into") if k in what} if kind == "flow" else {}
+    return Term(kind, ends, signal) if signal else None
+
+
+def unknown_laws(
+    case: Case,
+    tried: Mapping[Keys, Weighed],
+    home: Keys,
+    physics: Mapping[Keys, Mapping[Key, float]],
+    limits: Limits,
+) -> Laws:
+    """Return the scores of hypotheses with an unknown law in the place of an effect that `home` would name.
+
+    Each hypothesis of `physics` meets it that holds no other effects than `home`. Its prior odds are those of
+    the effect, and `rare`: nobody knows it."""
+    out, where = Laws(), places(case)
+    stand = standouts(physics[home])
+    effects = [e for e in tried[home].fitted.hypothesis.effects if e.key in stand and term_of(e.candidate)]
+    for keys in sorted((k for k in physics if k <= home and effects), key=sorted):
+        try:
+            beside = Linearised(case, tried[keys].fitted)
+            for e in effects:
+                gain = beside.gain(e.candidate)
+                if gain is not None:
+                    own = odds((e,), where, limits) + np.log(limits.rare)
+                    out[keys, e.key] = float(tried[keys].score + gain + own)
+        except (SimulationError, np.linalg.LinAlgError):
+            continue
+    return out
+
+
+def missing_law(posterior: Posterior, tried: Sequence[Weighed]) -> Missing:
+    """Return the probability that an unknown law is there, and where it most likely is."""
+    if not posterior.laws:
+        return Missing()
+    at = max(posterior.laws, key=lambda key: posterior.laws[key])
+    c = next(e.candidate for w in tried for e in w.fitted.hypothesis.effects if e.key == at)
+    term, flow = term_of(c), c.rig.physics.flows.get(c.place.flow or "")
+    assert term is not None  # a law has one
+    ends = (*c.place.nodes.values(), *((flow.source, flow.target) if flow else ()))
+    return Missing(
+        sum(posterior.laws.values()),
+        next((n for n in ends if n), None),
+        f"something at {at[1]} depends on {term.signal} in a way that no effect explains",
+    )
+
+
+class Linearised:
+    """A fitted hypothesis, its whitened rows and its trajectories. Raises SimulationError."""
+
+    def __init__(self, case: Case, f: Fitted):
+        self.metric = Rows(Plain(case, f, ROWS), as_refitted(case, f).average, True)
+        self.rig = Structure(f.rough_plant, self.metric.drives, [t.columns for t in case.tables])
+        self.at = [Trajectory(self.metric, self.rig, r) for r in range(len(self.metric.drives))]
+        self.likelihood, self.weight = self.metric.weighed(self.metric.residual)
+
+    def gain(self, of: Candidate) -> float | None:
+        """Return the log Bayes factor of an unknown law in an effect's place; None if either is not there."""
+        term = term_of(of)
+        found = candidates(self.rig, {of.effect.name: of.effect})
+        c = next((c for c in found if (c.key, c.label) == (of.key, of.label)), None)
+        law = _law(c, term, self.at) if c and term else None
+        if not law:
+            return None
+        (group,) = groups_of(law, self.metric)
+        rows = [rows for _, rows in directions(self.metric, self.at, group.columns())]
+        x = self.metric.project(np.concatenate(rows, axis=1) * self.metric.weight[:, None])
+        scores = [evidence(self.metric, x * share, self.weight) for share in SHARES]
+        return float(logsumexp(scores) - np.log(len(SHARES))) - self.likelihood
+
+
+def _law(c: Candidate, term: Term, at: Sequence[Trajectory]) -> Candidate | None:
+    """Return an unknown law in the place of an effect, None where its signal does not move."""
+    build = Builder(c, {}, {})
+    signal = np.concatenate([a.value(build.expression(term.signal), {}) for a in at])
+    low, high = float(signal.min()), float(signal.max())
+    if not np.isfinite(high - low) or high <= low:
+        return None
+    width = (high - low) / (KNOTS - 1)
+    hats = " + ".join(
+        f"W{k} * max(1 - abs({term.signal} - ({low + k * width!r})) / {width!r}, 0)" for k in range(KNOTS)
+    )
+    if term.kind in WHOLE:
+        what: Any = f"{WHOLE[term.kind]} * (1 + {hats})"
+    else:
+        size = _size(c, term, build, at)
+        if size <= 0:
+            return None
+        old = {"value": "y + ", "drive": "u + "}.get(term.kind, "")
+        what = f"{old}{size!r} * ({hats})"
+    if term.kind == "flow":
+        what = {**term.ends, "rate": what}
+    parameters = tuple(
+        EffectParameter(
+            f"W{k}", "1", -np.inf, np.inf, 0.0, ex.name(f"s{k + 1}" if k else "s"), None, False, None, None
+        )
+        for k in range(KNOTS)
+    )
+    dims = tuple(map(tuple, np.eye(KNOTS).tolist()))
+    law = Effect(
+        NAME, "", c.effect.where, c.effect.needs, (({term.kind: what},),), {}, parameters, dims, "", (), ""
+    )
+    return dataclasses.replace(c, effect=law, variant=0)
+
+
+def _size(c: Candidate, term: Term, build: Builder, at: Sequence[Trajectory]) -> float:
+    """Return the typical size of a reading, a drive, or of the flows at the ends of a new one."""
+    if term.kind == "flow":
+        ends = [c.place.nodes[e] for e in term.ends.values() if e in c.place.nodes]
+        sizes = [typical_flow(c.rig.plant, n, [a.values for a in at]) for n in ends]
+        return float(np.exp(np.mean(np.log(sizes)))) if sizes and min(sizes) > 0 else 0.0
+    moved = np.concatenate([a.value(build.symbols["y" if term.kind == "value" else "u"], {}) for a in at])
+    return float(np.std(moved))
