@@ -52,8 +52,9 @@ FILE = Path("config/diagnosis.yaml")
 class Judged:
     """A case's hypotheses, and what the answer says is there.
 
-    `likelihood` and `share`: log evidence and log prior share of places; `rare`: number of rare classes; `truths`: the
-    accepted (effect, where) of each effect that is there; `tolerated`: further names that are not false."""
+    `likelihood` and `share`: log evidence and log prior share of places; `rare`: number of rare classes; `laws`: log odds that an
+    unknown law adds in the place of an effect, without `missing` and `rare`, and its rare classes; `truths`:
+    the accepted (effect, where) of each effect that is there; `tolerated`: further names that are not false."""
 
     name: str
     likelihood: Mapping[frozenset[Key], float]
@@ -61,6 +62,7 @@ class Judged:
     rare: Mapping[frozenset[Key], int]
     energy: Mapping[frozenset[Key], Energy]
     dims: Mapping[Key, int]
+    laws: Mapping[tuple[frozenset[Key], Key], tuple[float, int]]
     truths: tuple[frozenset[Key], ...]
     tolerated: frozenset[Key] = frozenset()
 
@@ -75,6 +77,11 @@ def judged(plant: Path, result: Path, used: Limits) -> Judged:
     dims = {k: n for h in found for k, n in zip(map(_key, sorted(h["effects"])), h["dims"], strict=True)}
     counts = {keys: sum(rare(entries[e], where in inputs) for e, where in keys) for keys in keyed}
     missing = np.log(used.missing / (1 - used.missing))
+    laws = {}
+    for keys, h in keyed.items():
+        for at, more in h["with_unknown_law"].items():
+            classes = 1 + rare(entries[_key(at)[0]], _key(at)[1] in inputs)
+            laws[keys, _key(at)] = more - missing - classes * np.log(used.rare), classes
     return Judged(
         result.name,
         {keys: h["log_evidence"] for keys, h in keyed.items()},
@@ -85,6 +92,7 @@ def judged(plant: Path, result: Path, used: Limits) -> Judged:
         counts,
         {keys: Energy(*(tuple(h[n]) for n in ("energy", "misfit", "rows"))) for keys, h in keyed.items()},
         dims,
+        laws,
         (),
     )
 
@@ -132,7 +140,12 @@ def posterior(case: Judged, numbers: Limits) -> Posterior:
         + case.rare[keys] * np.log(numbers.rare)
         for keys in physics
     }
-    return weigh(scores, physics, numbers)
+    laws = {
+        (keys, at): scores[keys] + more + own + classes * np.log(numbers.rare)
+        for (keys, at), (more, classes) in case.laws.items()
+        if keys in scores
+    }
+    return weigh(scores, physics, numbers, laws)
 
 
 def names(cases: Sequence[Judged], numbers: Limits) -> tuple[int, int]:
