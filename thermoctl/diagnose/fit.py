@@ -347,6 +347,11 @@ def as_refitted(case: Case, f: Fitted) -> Fitted:
     return dataclasses.replace(f, plant=f.rough_plant, fit=f.rough, powers=f.rough_powers, average=average)
 
 
+def as_weighed(f: Fitted) -> Fitted:
+    """The hypothesis with the fit of its evidence as starting point, too: one more term is weighed there."""
+    return dataclasses.replace(f, rough_plant=f.plant, rough=f.fit, rough_powers=f.powers)
+
+
 def with_residuals(case: Case, f: Fitted) -> Fitted:
     """Return the fitted hypothesis with its residuals; those of long recordings were not kept."""
     if f.fit.residuals:

@@ -23,7 +23,7 @@ from scipy.linalg import block_diag
 from scipy.special import expit, logsumexp
 
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.fit import Fitted, as_weighed
 from thermoctl.diagnose.law.smooth import flow_rows, hat_functions
 from thermoctl.diagnose.levels import rounded
 from thermoctl.diagnose.limits import Limits
@@ -72,7 +72,8 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
     """Return the log Bayes factor of an unknown flow into each node and along each flow between two of them.
 
     Raises SimulationError."""
-    metric = Rows(Plain(case, f, ROWS), as_refitted(case, f).average, True)
+    f = as_weighed(f)
+    metric = Rows(Plain(case, f, ROWS), f.average, True)
     runs = [
         signals(metric.model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
     ]

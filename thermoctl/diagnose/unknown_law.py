@@ -25,7 +25,7 @@ from thermoctl.diagnose.candidates import Candidate, candidates
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import Effect, EffectParameter
 from thermoctl.diagnose.decide import Key, Laws, Posterior
-from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.fit import Fitted, as_weighed
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.misfit import standouts
 from thermoctl.diagnose.odds import odds
@@ -125,7 +125,8 @@ class Linearised:
     """A fitted hypothesis, its whitened rows and its trajectories. Raises SimulationError."""
 
     def __init__(self, case: Case, f: Fitted):
-        self.metric = Rows(Plain(case, f, ROWS), as_refitted(case, f).average, True)
+        f = as_weighed(f)
+        self.metric = Rows(Plain(case, f, ROWS), f.average, True)
         self.rig = Structure(f.rough_plant, self.metric.drives, [t.columns for t in case.tables])
         self.at = [Trajectory(self.metric, self.rig, r) for r in range(len(self.metric.drives))]
         self.likelihood, self.weight = self.metric.weighed(self.metric.residual)
