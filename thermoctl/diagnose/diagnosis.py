@@ -76,7 +76,7 @@ def _decided(
     scores = {keys: tried[keys].score for keys in physics}
     posterior, laws = weigh(scores, physics, numbers), Laws()
     if posterior.something >= numbers.name:
-        laws = unknown_laws(known, tried, next(iter(posterior.hypotheses)), physics, numbers)
+        laws = unknown_laws(known, tried, posterior, physics, numbers)
         posterior = weigh(scores, physics, numbers, laws)
     best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
     if posterior.something >= numbers.name:

@@ -81,25 +81,33 @@ def term_of(c: Candidate) -> Term | None:
 def unknown_laws(
     case: Case,
     tried: Mapping[Keys, Weighed],
-    home: Keys,
+    posterior: Posterior,
     physics: Mapping[Keys, Mapping[Key, float]],
     limits: Limits,
 ) -> Laws:
-    """Return the scores of hypotheses with an unknown law in the place of an effect that `home` would name.
+    """Return the scores of hypotheses with an unknown law in the place of an effect.
 
-    Each hypothesis of `physics` meets it that holds no other effects than `home`. Its prior odds are those of
-    the effect, and `rare`: nobody knows it."""
-    out, where = Laws(), places(case)
-    stand = standouts(physics[home])
-    effects = [e for e in tried[home].fitted.hypothesis.effects if e.key in stand and term_of(e.candidate)]
-    for keys in sorted((k for k in physics if k <= home and effects), key=sorted):
+    All likely hypotheses meet it, and those of `physics` that hold a part of their effects. A law that only one
+    met would favour that one. Where more than `beam` are likely, only effects that would be named give a place.
+    The prior odds of a law are those of the effect, and `rare`: nobody knows it."""
+    total = np.cumsum([0.0, *posterior.hypotheses.values()])
+    likely = [keys for keys, p in zip(posterior.hypotheses, total, strict=False) if p < limits.set]
+    least = limits.name if len(likely) > limits.beam else 0.0
+    effects = {
+        e.key: e
+        for keys in likely
+        for e in tried[keys].fitted.hypothesis.effects
+        if e.key in standouts(physics[keys]) and posterior.effects[e.key] >= least and term_of(e.candidate)
+    }
+    out, where = Laws(), places(case) if effects else {}
+    for keys in sorted((k for k in physics if effects and any(k <= h for h in likely)), key=sorted):
         try:
             beside = Linearised(case, tried[keys].fitted)
-            for e in effects:
+            for key, e in effects.items():
                 gain = beside.gain(e.candidate)
                 if gain is not None:
                     own = odds((e,), where, limits) + np.log(limits.rare)
-                    out[keys, e.key] = float(tried[keys].score + gain + own)
+                    out[keys, key] = float(tried[keys].score + gain + own)
         except (SimulationError, np.linalg.LinAlgError):
             continue
     return out
