@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from thermoctl.diagnose.builder import Builder
-from thermoctl.diagnose.candidates import Candidate, candidates
+from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import Effect, EffectParameter
 from thermoctl.diagnose.decide import Key, Laws, Posterior
@@ -30,6 +30,7 @@ from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.misfit import standouts
 from thermoctl.diagnose.odds import odds
 from thermoctl.diagnose.overlay import Trajectory
+from thermoctl.diagnose.places import PLACES
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import directions, groups_of
 from thermoctl.diagnose.screening import ROWS, Plain, Rows, places
@@ -87,9 +88,9 @@ def unknown_laws(
 ) -> Laws:
     """Return the scores of hypotheses with an unknown law in the place of an effect.
 
-    All likely hypotheses meet it, and those of `physics` that hold a part of their effects. A law that only one
-    met would favour that one. Where more than `beam` are likely, only effects that would be named give a place.
-    The prior odds of a law are those of the effect, and `rare`: nobody knows it."""
+    All likely hypotheses meet it, and those of `physics` that hold a part of their effects. A law that only
+    one met would favour that one. Where more than `beam` are likely, only effects that would be named give a
+    place. The prior odds of a law are those of the effect, and `rare`: nobody knows it."""
     total = np.cumsum([0.0, *posterior.hypotheses.values()])
     likely = [keys for keys, p in zip(posterior.hypotheses, total, strict=False) if p < limits.set]
     least = limits.name if len(likely) > limits.beam else 0.0
@@ -142,9 +143,13 @@ class Linearised:
     def gain(self, of: Candidate) -> float | None:
         """Return the log Bayes factor of an unknown law in an effect's place; None if either is not there."""
         term = term_of(of)
-        found = candidates(self.rig, {of.effect.name: of.effect})
-        c = next((c for c in found if (c.key, c.label) == (of.key, of.label)), None)
-        law = _law(c, term, self.at) if c and term else None
+        same = (p for p in PLACES[of.effect.where](self.rig) if p.names == of.place.names)
+        place = next(same, None)
+        law = (
+            _law(dataclasses.replace(of, place=place, rig=self.rig), term, self.at)
+            if place and term
+            else None
+        )
         if not law:
             return None
         (group,) = groups_of(law, self.metric)
