@@ -13,7 +13,7 @@ from thermoctl.diagnose import noise as module
 from thermoctl.diagnose.coordinates import Coordinates, transform
 from thermoctl.diagnose.grids import Grid, grid
 from thermoctl.diagnose.levels import floor
-from thermoctl.diagnose.noise import Averaged, averaged, rise
+from thermoctl.diagnose.noise import Around, Averaged, averaged
 from thermoctl.diagnose.spectra import SLOW
 from thermoctl.plant.simulate import Excitation
 
@@ -206,5 +206,5 @@ def test_a_predicted_rise_is_the_difference_of_two_likelihoods(sigmas):
     g, before = banded(clean + effect(sigmas, 0.6))
     after = banded(clean)[1]
     whole = averaged(g, after).log_likelihood - averaged(g, before).log_likelihood
-    assert rise(g, before)(after) == pytest.approx(whole, abs=0.1)
-    assert rise(g, after)(before) == pytest.approx(-whole, abs=0.1)
+    assert Around(g, before).rise(after) == pytest.approx(whole, abs=0.1)
+    assert Around(g, after).rise(before) == pytest.approx(-whole, abs=0.1)

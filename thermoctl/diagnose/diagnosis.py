@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from thermoctl.diagnose.case import Budget, Case, case
 from thermoctl.diagnose.catalogue import Effect, contained
-from thermoctl.diagnose.decide import Facts, Laws, decide, weigh
+from thermoctl.diagnose.decide import Facts, decide
 from thermoctl.diagnose.fit import as_refitted, with_residuals
 from thermoctl.diagnose.held_out import split, worth
 from thermoctl.diagnose.law.find import find_law
@@ -21,7 +21,7 @@ from thermoctl.diagnose.search import Searched, search
 from thermoctl.diagnose.threads import one_thread
 from thermoctl.diagnose.unknown import left, reached
 from thermoctl.diagnose.unknown_flow import flow_missing
-from thermoctl.diagnose.unknown_law import missing_law, unknown_laws
+from thermoctl.diagnose.unknown_law import missing_law, weigh_laws
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 
@@ -73,11 +73,7 @@ def _decided(
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
     fits = {keys: w.fitted for keys, w in tried.items()}
-    scores = {keys: tried[keys].score for keys in physics}
-    posterior, laws = weigh(scores, physics, numbers), Laws()
-    if posterior.something >= numbers.name:
-        laws = unknown_laws(known, tried, posterior, physics, numbers)
-        posterior = weigh(scores, physics, numbers, laws)
+    posterior, laws = weigh_laws(known, tried, physics, numbers)
     best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
     if posterior.something >= numbers.name:
         likeliest = next(iter(posterior.hypotheses))

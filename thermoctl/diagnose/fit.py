@@ -391,8 +391,10 @@ def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
 
 
 def _size(p: EffectParameter, value: float, sd: float) -> float:
-    """Return the log prior density of an effect's size: log-uniform over DECADES decades.
+    """Return the log prior density of an effect's size: log-uniform over DECADES decades or its bounds.
 
     Below its standard deviation the density is nearly constant."""
+    low, high = sorted((abs(p.low - p.null), abs(p.high - p.null)))
     one_sided = p.low >= p.null or p.high <= p.null
-    return -float(np.log(np.log(10.0) * DECADES * (1 if one_sided else 2) * np.hypot(value - p.null, sd)))
+    decades = min(DECADES, np.log10(high / low)) if one_sided and 0 < low < high < np.inf else DECADES
+    return -float(np.log(np.log(10.0) * decades * (1 if one_sided else 2) * np.hypot(value - p.null, sd)))

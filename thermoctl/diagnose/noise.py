@@ -24,7 +24,7 @@ Laplace's method.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,40 +81,57 @@ class _Output:
 def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Averaged:
     """Average the likelihood of banded `powers` (one a channel) over noise and remainder."""
     found = [_output(g, g.power(powers)) for g in grids]
-    inverse: list[np.ndarray] = [np.zeros(0)] * sum(len(g.channels) for g in grids)
-    for g, f in zip(grids, found, strict=True):
-        parts = np.split(f.inverse[g.node], np.cumsum([len(powers[k]) for k in g.channels])[:-1])
-        for k, part in zip(g.channels, parts, strict=True):
-            inverse[k] = part
     return Averaged(
         sum(f.log_likelihood for f in found),
-        inverse,
+        _by_channel(grids, [f.inverse for f in found], powers),
         [f.sensor for f in found],
         [f.remainder for f in found],
         [f.unsure for f in found],
     )
 
 
-def rise(grids: Sequence[Grid], powers: Sequence[np.ndarray]) -> Callable[[Sequence[np.ndarray]], float]:
-    """Return a function: by how much the log likelihood of other powers is above that of these.
+def _by_channel(
+    grids: Sequence[Grid], inverse: Sequence[np.ndarray], powers: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Return E[1/V] in the bands of each channel, from its values at the frequencies of each output."""
+    out: list[np.ndarray] = [np.zeros(0)] * len(powers)
+    for g, of_output in zip(grids, inverse, strict=True):
+        parts = np.split(of_output[g.node], np.cumsum([len(powers[k]) for k in g.channels])[:-1])
+        for k, part in zip(g.channels, parts, strict=True):
+            out[k] = part
+    return out
+
+
+class Around:
+    """Other powers beside known ones: by how much their log likelihood is above, and their weights.
 
     d log p / dP = -E[1/V] / 2. Where that makes less than LITTLE, the output is not averaged again; less than
     NEAR, the maxima are looked for from the known ones."""
-    known = [(g, p := g.power(powers), _output(g, p)) for g in grids]
 
-    def above(others: Sequence[np.ndarray]) -> float:
-        total = 0.0
-        for g, p, f in known:
+    def __init__(self, grids: Sequence[Grid], powers: Sequence[np.ndarray]):
+        self.grids = grids
+        self.known = [(g, p := g.power(powers), _output(g, p)) for g in grids]
+
+    def rise(self, others: Sequence[np.ndarray]) -> float:
+        """Return by how much the log likelihood is above that of the known powers."""
+        return sum(rise for rise, _ in self._each(others))
+
+    def weighed(self, others: Sequence[np.ndarray]) -> tuple[float, list[np.ndarray]]:
+        """Return this, and E[1/V] in the bands of each channel."""
+        found = list(self._each(others))
+        return sum(rise for rise, _ in found), _by_channel(self.grids, [v for _, v in found], others)
+
+    def _each(self, others: Sequence[np.ndarray]) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield the rise of each output, and E[1/V] at its frequencies."""
+        for g, p, f in self.known:
             other = g.power(others)
             first = -0.5 * f.inverse * (other - p)
             size = float(np.abs(first).sum())
             if size < LITTLE:
-                total += float(first.sum())
+                yield float(first.sum()), f.inverse
             else:
-                total += _output(g, other, f.at if size < NEAR else None).log_likelihood - f.log_likelihood
-        return total
-
-    return above
+                again = _output(g, other, f.at if size < NEAR else None)
+                yield again.log_likelihood - f.log_likelihood, again.inverse
 
 
 def _output(g: Grid, power: np.ndarray, near: Sequence[np.ndarray] | None = None) -> _Output:

@@ -24,11 +24,6 @@ class Place:
     input: str | None = None
     exponent: float | None = None  # of an outlet, as the plant file has it
 
-    @property
-    def names(self) -> tuple[str | None, ...]:
-        """Its names, which stay where other effects change its expressions."""
-        return self.where, self.flow, self.output, self.input
-
     def parts(self) -> set[str]:
         """The nodes and the flow that it names (not those that a reading is made of)."""
         named = {str(e.value) for s, e in self.symbols.items() if s != "y" and e.op == "name"}

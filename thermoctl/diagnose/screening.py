@@ -17,7 +17,7 @@ from thermoctl.diagnose.grids import grid
 from thermoctl.diagnose.levels import only_noise
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.metric import Absorbed, Metric, Pushed, without
-from thermoctl.diagnose.noise import Averaged, averaged, rise
+from thermoctl.diagnose.noise import Around, Averaged
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import Norms, screen
 from thermoctl.diagnose.sketch import likeliest
@@ -109,7 +109,7 @@ class Rows(Metric):
         self.weights = _weights(plain.case, average, plain.coordinates, remainder)
         self.weight = np.concatenate(self.weights)
         self.residual = self.project((plain.residual + self._absorb(remainder)) * self.weight)
-        self.above = rise(plain.grids, self._powers(self.residual))
+        self.around = Around(plain.grids, self._powers(self.residual))
 
     def _absorb(self, held: bool) -> np.ndarray:
         """Set what the unknowns absorb; return how far the starts moved the outputs, not whitened (rows,).
@@ -170,16 +170,17 @@ class Rows(Metric):
         """Return a function: by how much the log likelihood of other rows is above that of these.
 
         Rows are whitened, of all recordings; noise and remainder are averaged."""
-        above = rise(self.plain.grids, self._powers(rows))
-        return lambda others: above(self._powers(others))
+        around = Around(self.plain.grids, self._powers(rows))
+        return lambda others: around.rise(self._powers(others))
 
     def weighed(self, rows: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the log likelihood of other rows, and how much more weight each has in their own noise.
+        """Return by how much the log likelihood of other rows is above the residual's, and their weights.
 
-        Rows are whitened; noise and remainder are averaged."""
-        found = averaged(self.plain.grids, self._powers(rows))
-        channels = zip(self.plain.coordinates.channels, found.inverse, strict=True)
-        return found.log_likelihood, np.concatenate([np.sqrt(v)[c.band] for c, v in channels]) / self.weight
+        Rows are whitened; noise and remainder are averaged. The weights are those in the noise of the other
+        rows, as a multiple of the metric's."""
+        above, inverse = self.around.weighed(self._powers(rows))
+        channels = zip(self.plain.coordinates.channels, inverse, strict=True)
+        return above, np.concatenate([np.sqrt(v)[c.band] for c, v in channels]) / self.weight
 
     def _powers(self, rows: np.ndarray) -> list[np.ndarray]:
         edges = np.cumsum([len(w) for w in self.weights])[:-1]
@@ -191,7 +192,7 @@ class Rows(Metric):
         if d.vector is None or d.gain <= 0:
             return 0.0
         v = d.vector.astype(float)
-        return self.above(self._powers(self.residual - v * (v @ self.residual)))
+        return self.around.rise(self._powers(self.residual - v * (v @ self.residual)))
 
 
 def _weights(case: Case, average: Averaged, coordinates: Coordinates, remainder: bool) -> list[np.ndarray]:

@@ -84,13 +84,13 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
     counts = np.concatenate(
         [np.full(c.rows, c.output not in coarse) for c in metric.plain.coordinates.channels]
     )
-    likelihood, weight = metric.weighed(metric.residual)
+    _, weight = metric.weighed(metric.residual)
     responses = {n: block_diag(*flow_rows(metric, runs, n, hats, 1.0)) for n in nodes}
     out = {}
     for where, response, size in _ways(metric.model.plant, responses, runs):
         x = metric.project(size * response) * counts[:, None]
-        scores = [evidence(metric, x * share, weight) for share in SHARES]
-        gain = float(logsumexp(scores) - np.log(len(SHARES))) - likelihood
+        scores = [evidence(metric, x * share, weight)[0] for share in SHARES]
+        gain = float(logsumexp(scores) - np.log(len(SHARES)))
         if np.isfinite(gain):
             out[where] = gain
     return out
@@ -113,11 +113,11 @@ def _ways(
                 yield f.name, responses[f.target] - responses[f.source], size
 
 
-def evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> float:
-    """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method.
+def evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method, and w.
 
     `weight` (rows,): of the noise without them; it rises where they explain part of that noise."""
-    score = -np.inf
+    score, w = -np.inf, np.zeros(x.shape[1])
     for _ in range(ROUNDS):
         inside = x * weight[:, None]
         curvature = np.eye(x.shape[1]) + inside.T @ inside
@@ -126,4 +126,4 @@ def evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> float:
         before, score = score, likelihood - 0.5 * float(w @ w + np.linalg.slogdet(curvature)[1])
         if abs(score - before) < SETTLED:
             break
-    return score
+    return score, w

@@ -24,13 +24,12 @@ from thermoctl.diagnose.builder import Builder
 from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.catalogue import Effect, EffectParameter
-from thermoctl.diagnose.decide import Key, Laws, Posterior
-from thermoctl.diagnose.fit import Fitted, as_weighed
+from thermoctl.diagnose.decide import Key, Laws, Posterior, weigh
+from thermoctl.diagnose.fit import Fitted, Placed, as_weighed, fitted
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.misfit import standouts
 from thermoctl.diagnose.odds import odds
 from thermoctl.diagnose.overlay import Trajectory
-from thermoctl.diagnose.places import PLACES
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import directions, groups_of
 from thermoctl.diagnose.screening import ROWS, Plain, Rows, places
@@ -39,9 +38,11 @@ from thermoctl.diagnose.unknown_flow import SHARES, Missing, evidence
 from thermoctl.diagnose.where import typical_flow
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulate import SimulationError
+from thermoctl.yamlfile import InputError
 
 NAME = "unknown_law"
 KNOTS = 8  # of a law
+REACH = 10.0  # standard deviations that w may be off in a refit
 
 
 # The signal that the symbols of a form tell; the first that has all of them.
@@ -79,16 +80,52 @@ def term_of(c: Candidate) -> Term | None:
     return Term(kind, ends, signal) if signal else None
 
 
-def unknown_laws(
+@dataclass(frozen=True)
+class UnknownLaw:
+    """A law beside a hypothesis: its log Bayes factor, and where a refit starts.
+
+    `start`: w; `sd`: the likeliest eta; `average`: log of the mean evidence over eta, less that of `sd`"""
+
+    candidate: Candidate
+    gain: float
+    start: np.ndarray
+    sd: float
+    average: float
+    refitted: bool = False
+
+
+def weigh_laws(
+    case: Case, tried: Mapping[Keys, Weighed], physics: Mapping[Keys, Mapping[Key, float]], limits: Limits
+) -> tuple[Posterior, Laws]:
+    """Return the posterior with unknown laws, and the scores of the hypotheses that hold one.
+
+    To first order a law may gain what it cannot: before one leads, it is refitted with the plant. At most as
+    many as directions of a screening are."""
+    scores = {keys: tried[keys].score for keys in physics}
+    posterior = now = weigh(scores, physics, limits)
+    if posterior.something < limits.name:
+        return posterior, Laws()
+    laws, odds_of = _found(case, tried, posterior, physics, limits)
+    for _ in range(limits.shortlist):
+        added = {k: float(scores[k[0]] + law.gain + odds_of[k[1]]) for k, law in laws.items()}
+        now = weigh(scores, physics, limits, added)
+        lead = max(added, key=lambda k: added[k], default=None)
+        if lead is None or laws[lead].refitted or added[lead] < max(scores.values()):
+            break
+        laws[lead] = _refitted(case, tried[lead[0]].fitted, laws[lead])
+    return now, added
+
+
+def _found(
     case: Case,
     tried: Mapping[Keys, Weighed],
     posterior: Posterior,
     physics: Mapping[Keys, Mapping[Key, float]],
     limits: Limits,
-) -> Laws:
-    """Return the scores of hypotheses with an unknown law in the place of an effect.
+) -> tuple[dict[tuple[Keys, Key], UnknownLaw], dict[Key, float]]:
+    """Return the laws in the places of effects, and their log prior odds by effect.
 
-    All likely hypotheses meet it, and those of `physics` that hold a part of their effects. A law that only
+    All likely hypotheses meet them, and those of `physics` that hold a part of their effects. A law that only
     one met would favour that one. Where more than `beam` are likely, only effects that would be named give a
     place. The prior odds of a law are those of the effect, and `rare`: nobody knows it."""
     total = np.cumsum([0.0, *posterior.hypotheses.values()])
@@ -100,18 +137,37 @@ def unknown_laws(
         for e in tried[keys].fitted.hypothesis.effects
         if e.key in standouts(physics[keys]) and posterior.effects[e.key] >= least and term_of(e.candidate)
     }
-    out, where = Laws(), places(case) if effects else {}
+    laws = {}
     for keys in sorted((k for k in physics if effects and any(k <= h for h in likely)), key=sorted):
         try:
             beside = Linearised(case, tried[keys].fitted)
             for key, e in effects.items():
-                gain = beside.gain(e.candidate)
-                if gain is not None:
-                    own = odds((e,), where, limits) + np.log(limits.rare)
-                    out[keys, key] = float(tried[keys].score + gain + own)
+                law = beside.law(e.candidate)
+                if law:
+                    laws[keys, key] = law
         except (SimulationError, np.linalg.LinAlgError):
             continue
-    return out
+    where = places(case) if laws else {}
+    return laws, {key: odds((e,), where, limits) + np.log(limits.rare) for key, e in effects.items()}
+
+
+def _refitted(case: Case, f: Fitted, law: UnknownLaw) -> UnknownLaw:
+    """Return a law with its gain after a refit of the whole plant; minus infinity where that fails."""
+    squares = " + ".join(f"W{k}**2" for k in range(KNOTS))
+    prior = ex.parse(f"({squares}) / {law.sd**2!r}")
+    c = dataclasses.replace(law.candidate, effect=dataclasses.replace(law.candidate.effect, prior=prior))
+    names = [p.name for p in c.effect.parameters]
+    reach = REACH * law.sd
+    try:
+        plant = c.extend(
+            {n: float(np.clip(v, -reach, reach)) for n, v in zip(names, law.start, strict=True)},
+            dict.fromkeys(names, (-REACH * law.sd, REACH * law.sd)),
+        )
+        placed = Placed(c, {n: c.own(n) for n in names if c.own(n) in plant.parameters})
+        found = fitted(case, plant, (*f.hypothesis.effects, placed), None, None, f)
+    except (SimulationError, InputError, np.linalg.LinAlgError):
+        return dataclasses.replace(law, gain=-np.inf, refitted=True)
+    return dataclasses.replace(law, gain=found.log_evidence - f.log_evidence + law.average, refitted=True)
 
 
 def missing_law(posterior: Posterior, tried: Sequence[Weighed]) -> Missing:
@@ -138,25 +194,25 @@ class Linearised:
         self.metric = Rows(Plain(case, f, ROWS), f.average, True)
         self.rig = Structure(f.rough_plant, self.metric.drives, [t.columns for t in case.tables])
         self.at = [Trajectory(self.metric, self.rig, r) for r in range(len(self.metric.drives))]
-        self.likelihood, self.weight = self.metric.weighed(self.metric.residual)
+        _, self.weight = self.metric.weighed(self.metric.residual)
 
-    def gain(self, of: Candidate) -> float | None:
-        """Return the log Bayes factor of an unknown law in an effect's place; None if either is not there."""
-        term = term_of(of)
-        same = (p for p in PLACES[of.effect.where](self.rig) if p.names == of.place.names)
-        place = next(same, None)
-        law = (
-            _law(dataclasses.replace(of, place=place, rig=self.rig), term, self.at)
-            if place and term
-            else None
-        )
+    def law(self, of: Candidate) -> UnknownLaw | None:
+        """Return an unknown law in an effect's place; None where it has no signal."""
+        term, place = term_of(of), of.place
+        if place.output:  # other effects may have changed the reading
+            now = self.rig.plant.outputs[place.output].value
+            place = dataclasses.replace(place, symbols={**place.symbols, "y": now})
+        law = term and _law(dataclasses.replace(of, place=place, rig=self.rig), term, self.at)
         if not law:
             return None
         (group,) = groups_of(law, self.metric)
         rows = [rows for _, rows in directions(self.metric, self.at, group.columns())]
         x = self.metric.project(np.concatenate(rows, axis=1) * self.metric.weight[:, None])
-        scores = [evidence(self.metric, x * share, self.weight) for share in SHARES]
-        return float(logsumexp(scores) - np.log(len(SHARES))) - self.likelihood
+        found = [evidence(self.metric, x * share, self.weight) for share in SHARES]
+        scores = np.array([score for score, _ in found])
+        k = int(np.argmax(scores))
+        gain = float(logsumexp(scores) - np.log(len(SHARES)))
+        return UnknownLaw(law, gain, SHARES[k] * found[k][1], float(SHARES[k]), gain - float(scores[k]))
 
 
 def _law(c: Candidate, term: Term, at: Sequence[Trajectory]) -> Candidate | None:
