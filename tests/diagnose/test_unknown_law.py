@@ -6,7 +6,11 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
+from tests.diagnose.test_places import TANK, offered
 from thermoctl.cli import main
+from thermoctl.diagnose.unknown_law import Term, term_of
+from thermoctl.plant import loads
+from thermoctl.recording.table import Table
 
 PLANT = """format: thermoctl-plant/1
 title: A heated block on a base
@@ -79,3 +83,15 @@ def test_a_capacity_that_varies_evenly_keeps_its_name(tmp_path):
     assert r["verdict"] == "explained" and r["decision"]["flow"] < 0.3
     (named,) = [h for h in r["hypotheses"] if h["effects"] == ["variable_heat_capacity at block"]]
     assert named["with_unknown_law"]["variable_heat_capacity at block"] < 0  # nats, beside its prior odds
+
+
+def test_an_outlet_has_a_law_of_its_level_and_a_memory_has_none():
+    plant = loads(TANK.replace("RATE", "k * sqrt(max(level, 0))"))
+    t = np.arange(0.0, 200.0, 1.0)
+    table = Table("run", "run", t, {"inflow": np.zeros(len(t)), "gauge": np.zeros(len(t))})
+    found = {
+        name: offered(plant, table, name) for name in ("orifice_exponent", "sensor_lag", "sensor_saturation")
+    }
+    assert term_of(found["orifice_exponent"]["outflow"]) == Term("rate", {}, "level")
+    assert term_of(found["sensor_lag"]["gauge"]) is None
+    assert term_of(found["sensor_saturation"]["gauge"]) == Term("value", {}, "y")

@@ -67,6 +67,8 @@ def term_of(c: Candidate) -> Term | None:
     """Return the term that an effect changes; None for an effect of time, of memory, or of no signal."""
     *before, last = c.effect.changes[c.variant]
     ((kind, what),) = last.items()
+    if kind == "exponent":
+        return Term("rate", {}, str(c.rig.physics.flows[c.place.flow or ""].source))
     moving = any("flow" in item and str(item["flow"]["rate"]) != "0" for item in before)
     moving |= kind == "flow" and bool(before)
     if c.effect.timed or moving or kind not in ("flow", "rate", "value", "storage", "drive", "resistance"):
