@@ -80,6 +80,8 @@ def judged(plant: Path, result: Path, used: Limits) -> Judged:
     laws = {}
     for keys, h in keyed.items():
         for at, more in h["with_unknown_law"].items():
+            if more is None:  # it could not be refitted
+                continue
             classes = 1 + rare(entries[_key(at)[0]], _key(at)[1] in inputs)
             laws[keys, _key(at)] = more - missing - classes * np.log(used.rare), classes
     return Judged(

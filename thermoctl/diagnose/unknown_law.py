@@ -44,7 +44,6 @@ NAME = "unknown_law"
 KNOTS = 8  # of a law
 REACH = 10.0  # standard deviations that w may be off in a refit
 
-
 # The signal that the symbols of a form tell; the first that has all of them.
 SIGNALS = (
     ("TA - TB", "TA", "TB"),
@@ -104,18 +103,21 @@ def weigh_laws(
     To first order a law may gain what it cannot: before one leads, it is refitted with the plant. At most as
     many as directions of a screening are."""
     scores = {keys: tried[keys].score for keys in physics}
-    posterior = now = weigh(scores, physics, limits)
+    posterior = weigh(scores, physics, limits)
     if posterior.something < limits.name:
         return posterior, Laws()
     laws, odds_of = _found(case, tried, posterior, physics, limits)
+
+    def score(at: tuple[Keys, Key]) -> float:
+        return float(scores[at[0]] + laws[at].gain + odds_of[at[1]])
+
     for _ in range(limits.shortlist):
-        added = {k: float(scores[k[0]] + law.gain + odds_of[k[1]]) for k, law in laws.items()}
-        now = weigh(scores, physics, limits, added)
-        lead = max(added, key=lambda k: added[k], default=None)
-        if lead is None or laws[lead].refitted or added[lead] < max(scores.values()):
+        lead = max(laws, key=score, default=None)
+        if lead is None or laws[lead].refitted or score(lead) < max(scores.values()):
             break
         laws[lead] = _refitted(case, tried[lead[0]].fitted, laws[lead])
-    return now, added
+    added = {at: score(at) for at in laws}
+    return weigh(scores, physics, limits, added), added
 
 
 def _found(
@@ -163,7 +165,7 @@ def _refitted(case: Case, f: Fitted, law: UnknownLaw) -> UnknownLaw:
     try:
         plant = c.extend(
             {n: float(np.clip(v, -reach, reach)) for n, v in zip(names, law.start, strict=True)},
-            dict.fromkeys(names, (-REACH * law.sd, REACH * law.sd)),
+            dict.fromkeys(names, (-reach, reach)),
         )
         placed = Placed(c, {n: c.own(n) for n in names if c.own(n) in plant.parameters})
         found = fitted(case, plant, (*f.hypothesis.effects, placed), None, None, f)
