@@ -189,6 +189,21 @@ def test_an_outlet_has_the_exponent_of_its_file_until_another_is_found(rate, exp
     assert np.allclose(level(c.extend({"N": 0.7})), known, rtol=1e-5, atol=1e-6)
 
 
+def test_a_vessel_may_overflow_beside_the_exponent_of_its_outlet():
+    """A level in volts: only the power of it in the outflow tells a vessel."""
+    t = np.arange(0.0, 200.0, 1.0)
+    text = (
+        TANK.replace("RATE", "k * sqrt(max(level, 0))")
+        .replace("m^3/s", "V/s")
+        .replace("unit: m,", "unit: V,")
+    )
+    plant = loads(text)
+    table = Table("run", "run", t, {"inflow": np.zeros(len(t)), "gauge": np.zeros(len(t))})
+    assert set(offered(plant, table, "overflow")) == {"level"}
+    found = offered(plant, table, "orifice_exponent")["outflow"]
+    assert set(offered(found.extend({"N": 0.6}), table, "overflow")) == {"level"}
+
+
 def test_only_a_level_has_an_outlet_and_only_of_its_own_head(motor):
     assert offered(*motor, "orifice_exponent") == {}
     t = np.arange(0.0, 200.0, 1.0)

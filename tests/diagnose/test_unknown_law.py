@@ -8,8 +8,10 @@ from scipy.signal import lfilter
 
 from tests.diagnose.test_places import TANK, offered
 from thermoctl.cli import main
+from thermoctl.diagnose import unknown_law
 from thermoctl.diagnose.unknown_law import Term, term_of
 from thermoctl.plant import loads
+from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
 
 PLANT = """format: thermoctl-plant/1
@@ -83,6 +85,15 @@ def test_a_capacity_that_varies_evenly_keeps_its_name(tmp_path):
     assert r["verdict"] == "explained" and r["decision"]["flow"] < 0.3
     (named,) = [h for h in r["hypotheses"] if h["effects"] == ["variable_heat_capacity at block"]]
     assert named["with_unknown_law"]["variable_heat_capacity at block"] < 0  # nats, beside its prior odds
+
+
+def test_a_plant_that_cannot_be_linearised_keeps_its_findings(tmp_path, monkeypatch):
+    def fails(case, f):
+        raise SimulationError("no trajectory")
+
+    monkeypatch.setattr(unknown_law, "Linearised", fails)
+    (found,) = diagnosed(tmp_path, warms)["findings"]
+    assert found["effect"] == "variable_heat_capacity"
 
 
 def test_an_outlet_has_a_law_of_its_level_and_a_memory_has_none():

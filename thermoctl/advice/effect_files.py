@@ -15,7 +15,7 @@ import numpy as np
 
 from thermoctl import yamlfile
 from thermoctl.diagnose.candidates import Candidate, candidates
-from thermoctl.diagnose.catalogue import CATALOGUE, _read
+from thermoctl.diagnose.catalogue import CATALOGUE, OWN, _read
 from thermoctl.diagnose.rig import Rig
 from thermoctl.plant import Plant, expression, load
 from thermoctl.plant.simulate import Excitation
@@ -64,8 +64,6 @@ SHAPES: Mapping[str, tuple[str, ...]] = {
     "distances": ("distance",),
 }
 """The kinds of shapes, and the names of the values that each gives to parameters and trials."""
-OWN = {"rate": "rate", "storage": "storage", "resistance": "R"}
-"""The symbol that stands, in a change of this kind, for the plant's own expression."""
 FORMS = ("rate", "value", "storage", "drive", "resistance")
 PARTS = {
     "flow": (("rate",), ("from", "into")),

@@ -52,6 +52,8 @@ SHAPES = (
     "creep_speeds",
     "distances",
 )
+OWN = {"rate": "rate", "storage": "storage", "resistance": "R"}
+"""The symbol that stands, in a change of this kind, for the plant's own expression."""
 CHANGES = (
     "flow",
     "rate",

@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from thermoctl.diagnose.limits import Limits
 
 Key = tuple[str, str]  # (effect, where)
-Laws = dict[tuple[frozenset[Key], Key], float]  # scores, by effects and that in whose place the law is
+Laws = dict[tuple[frozenset[Key], Key], float]  # scores, by effects and the one in whose place a law is
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Facts:
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
     - `remains`: the largest probability of a remainder at an output
-    - `flow`: probability that a flow is missing which no output shows alone, or another law than an effect's
+    - `flow`: probability that a flow is missing which no output shows alone, or that an unknown law is there
     - `worth`: held-out error, divided by that of a refit alone; `worse`: probability that it is larger"""
 
     something: float

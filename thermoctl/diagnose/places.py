@@ -208,11 +208,12 @@ def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:
     node = rig.physics.nodes.get(f.source or "")
     if node is None or node.name in (*rig.temperatures, *rig.velocities, *rig.position_of.values()):
         return None
+    known = {p.name: p.value for p in rig.physics.parameters.values()}
     for e in ex.walk(f.rate):
         if e.op == "sqrt" and node.name in ex.names(e):
             return e, e.args[0], 0.5
-        if e.op == "**" and node.name in ex.names(e.args[0]) and e.args[1].op == "num":
-            return e, e.args[0], float(e.args[1].value or 0.0)
+        if e.op == "**" and node.name in ex.names(e.args[0]) and ex.names(e.args[1]) <= known.keys():
+            return e, e.args[0], float(ex.evaluate(e.args[1], known))
     head = f.rate
     while head.op in ("*", "/"):
         factors = [a for a in head.args if node.name in ex.names(a)]

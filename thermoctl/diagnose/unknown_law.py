@@ -23,7 +23,7 @@ from scipy.special import logsumexp
 from thermoctl.diagnose.builder import Builder
 from thermoctl.diagnose.candidates import Candidate
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.catalogue import Effect, EffectParameter
+from thermoctl.diagnose.catalogue import OWN, Effect, EffectParameter
 from thermoctl.diagnose.decide import Key, Laws, Posterior, weigh
 from thermoctl.diagnose.fit import Fitted, Placed, as_weighed, fitted
 from thermoctl.diagnose.limits import Limits
@@ -50,7 +50,6 @@ SIGNALS = (
     ("T - air", "T", "air"),
     *((s, s) for s in ("T", "v", "x", "i", "u", "air", "y")),
 )
-WHOLE = {"rate": "rate", "storage": "storage", "resistance": "R"}  # terms that have a size of their own
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,7 @@ def _found(
                     laws[keys, key] = law
         except (SimulationError, np.linalg.LinAlgError):
             continue
-    where = places(case) if laws else {}
+    where = places(case) if effects else {}
     return laws, {key: odds((e,), where, limits) + np.log(limits.rare) for key, e in effects.items()}
 
 
@@ -230,8 +229,8 @@ def _law(c: Candidate, term: Term, at: Sequence[Trajectory]) -> Candidate | None
     hats = " + ".join(
         f"W{k} * max(1 - abs({term.signal} - ({low + k * width!r})) / {width!r}, 0)" for k in range(KNOTS)
     )
-    if term.kind in WHOLE:
-        what: Any = f"{WHOLE[term.kind]} * (1 + {hats})"
+    if term.kind in OWN:
+        what: Any = f"{OWN[term.kind]} * (1 + {hats})"
     else:
         size = _size(c, term, build, at)
         if size <= 0:
