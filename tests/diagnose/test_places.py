@@ -164,7 +164,7 @@ outputs: {gauge: {value: level, unit: m, noise: 0.001}}
         ("k * max(level - 0.02, 0)", 1.0),
         ("k * level / 2", 1.0),
         ("k * sqrt(max(level, 0))", 0.5),
-        ("k * max(level, 0)**1.5", 1.5),
+        ("k * max(level, 0)**0.8", 0.8),
     ],
 )
 def test_an_outlet_has_the_exponent_of_its_file_until_another_is_found(rate, exponent):
@@ -212,3 +212,5 @@ def test_only_a_level_has_an_outlet_and_only_of_its_own_head(motor):
     plant = loads(two.replace("outputs:", f"{drains}\noutputs:"))
     table = Table("run", "run", t, {"inflow": np.zeros(len(t)), "gauge": np.zeros(len(t))})
     assert offered(plant, table, "orifice_exponent") == {}
+    weir = loads(TANK.replace("RATE", "k * max(level, 0)**1.5"))  # no orifice
+    assert offered(weir, table, "orifice_exponent") == {}

@@ -89,7 +89,8 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
         if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
             continue
         for place in PLACES[effect.where](rig):
-            if not askable(rig, place):
+            here = effect.at(place.exponent)
+            if here is None or not askable(rig, place):
                 continue
             near = place.nodes.get("v")
             choices: list[dict[str, Expr]] = [{}]
@@ -102,9 +103,7 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
                 choices = [{**c, need: name(s)} for c in choices for s in found if s != place.where]
             for variant in range(len(effect.changes)):
                 for k, choice in enumerate(choices):
-                    candidate = Candidate(
-                        effect.at(place.exponent), place, rig, variant, choice, f"{variant}{k}"
-                    )
+                    candidate = Candidate(here, place, rig, variant, choice, f"{variant}{k}")
                     if not candidate.jumps and any("straight" in c for c in effect.changes[variant]):
                         continue  # it goes on straight lines in any case
                     out.append(candidate)

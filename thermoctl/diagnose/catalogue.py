@@ -122,10 +122,13 @@ class Effect:
     contains: str | None = None  # the simpler effect that it is for some values of its parameters
     reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
 
-    def at(self, exponent: float | None) -> Effect:
-        """Return the entry at an outlet of this exponent, as the plant file has it."""
-        if exponent is None:
+    def at(self, exponent: float | None) -> Effect | None:
+        """Return the entry at an outlet with this exponent in the plant file; None where it is beyond the bounds."""
+        own = [p for p in self.parameters if p.origin == "exponent"]
+        if exponent is None or not own:
             return self
+        if not all(p.low <= exponent <= p.high for p in own):
+            return None
 
         def told(p: EffectParameter) -> EffectParameter:
             if p.origin != "exponent" or p.trial is None:
