@@ -123,7 +123,7 @@ class Effect:
     reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
 
     def at(self, exponent: float | None) -> Effect | None:
-        """Return the entry at an outlet with this exponent in the plant file; None where it is beyond the bounds."""
+        """Return the entry at an outlet with this exponent in the plant file; None beyond its bounds."""
         own = [p for p in self.parameters if p.origin == "exponent"]
         if exponent is None or not own:
             return self
