@@ -347,6 +347,7 @@ def make_case(
         "colour": bench.colour,
         "band": told["band"],
         "snr": [round(float(s), 2) for s in told["snr"]],
+        "snr_learnt": round(told["learnt"], 2) if "learnt" in told else None,
         "onset": told["onset"],
         "also_right": [list(x) for x in told["aliases"]],
         "parameters": [{k: float(v) for k, v in published(e, p).items()} for e, _, p in effects],
@@ -447,6 +448,7 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
         told |= {
             "band": band,
             "snr": [seen],
+            "learnt": bench.judge.learnt(left),
             "alike": _alike(rivals, s),
             "onset": effects[0][2].get(s.onset) if s.onset else None,
             "aliases": [(s.effect, w) for w in s.aliases],
@@ -488,6 +490,7 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
     told |= {
         "band": "large",
         "snr": [snr(left), *(snr(a) for a in alone)],
+        "learnt": bench.judge.learnt(left),
         "onset": onset,
         "alike": [
             x

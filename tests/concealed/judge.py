@@ -12,21 +12,32 @@ is then measured by a refit that follows the curve and respects the ranges (`gen
 fifths of what the line says (a hidden thermal mass, 24.7 to 5.1 sigmas), or leave more, where a range is a wall.
 Bands: small 3-6, middle 6-15, large above 15. Two
 explanations are `nearly the same` when less than 3.5 of the true one's signal is left after the other, too, is fitted.
+
+A test that does not know the noise has to learn its spectrum S from the same record, and noise of another spectrum
+S' imitates a part of the signal R. With the likelihood of Whittle (1953), over all bins and with the best S' of the
+sensors' family in each channel, it is left with
+
+    SNR^2 = sum  log S'/S + (S + R^2) / S' - 1,      which is sum R^2 / S for S' = S.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.fft import dct
+from scipy.optimize import minimize
+
+from tests.concealed.sensors import Noise
 
 BANDS = {"small": (3.0, 6.0), "middle": (6.0, 15.0), "large": (15.0, 60.0)}
 TELL_APART = 3.5
+COLOURS = 0.3, 0.9, 0.99  # lag-one correlations from which the noise of a test that has to learn it starts
 
 
 class Judge:
     """Whitening and projection for one rig: `spectra[run][channel]` (N,) per-bin noise variances."""
 
     def __init__(self, spectra: list[np.ndarray]):
+        self.spectra = spectra
         self.scale = [1 / np.sqrt(s) for s in spectra]
 
     def whiten(self, runs: list[np.ndarray]) -> np.ndarray:
@@ -49,6 +60,36 @@ class Judge:
         c = d @ self.basis.T
         inner = np.linalg.solve(self.solve, c.T).T
         return np.concatenate([d - c @ self.basis, -inner], axis=1)
+
+    def learnt(self, left: np.ndarray) -> float:
+        """SNR of one left-over signal (M + np,) for a test that has to learn the noise of each channel."""
+        ends = np.cumsum([s.size for s in self.spectra])
+        *runs, ridge = np.split(left, ends)
+        parts = [r.reshape(s.shape) ** 2 for r, s in zip(runs, self.spectra, strict=True)]
+        channels = range(self.spectra[0].shape[1])
+        square = sum(_learnt([s[:, j] for s in self.spectra], [p[:, j] for p in parts]) for j in channels)
+        return float(np.sqrt(square + ridge @ ridge))
+
+
+def _learnt(spectra: list[np.ndarray], parts: list[np.ndarray]) -> float:
+    """SNR^2 of one channel: its spectrum in each run (N,), and the squares of the whitened signal there."""
+    size = float(np.mean(spectra[0]))
+    true, seen = (
+        np.concatenate(spectra),
+        np.concatenate([s * (1 + p) for s, p in zip(spectra, parts, strict=True)]),
+    )
+
+    def apart(x: np.ndarray) -> float:
+        white, ar, flicker = np.sqrt(size * np.exp(x[:3]))
+        noise = Noise(white, ar, x[3], flicker)
+        other = np.concatenate([noise.spectrum(len(s)) for s in spectra])
+        return float(np.sum(np.log(other / true) + seen / other - 1))
+
+    found = [
+        minimize(apart, [-0.5, -1.5, -4.0, rho], method="L-BFGS-B", bounds=[(-9, 6)] * 3 + [(0, 0.999)]).fun
+        for rho in COLOURS
+    ]
+    return max(0.0, min(float(np.sum(parts)), *found))
 
 
 def snr(left: np.ndarray) -> np.ndarray:

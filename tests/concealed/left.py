@@ -3,7 +3,8 @@
     python -m tests.concealed.left CASES ANSWERS RESULT       # RESULT: what `thermoctl prove --out` wrote
 
 In white noise  sigmas^2 = sum over outputs of n (rms^2 after the refit / rms^2 of the true noise - 1) + free parameters.
-Below it: how many of the small effects an ideal test finds that knows the noise, at 4.15 sigmas (a chance of 0.5 % over 150 looks).
+Below it: how many of the small effects an ideal test finds at 4.15 sigmas (a chance of 0.5 % over 150 looks), if it knows
+the noise, and if it has to learn the noise from the same record (`judge.py`).
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def main(argv: list[str]) -> int:
         if row["kind"] != "one":
             continue
         if row["band"] == "small":
-            small.append(answer["snr"][0])
+            small.append((answer["snr"][0], answer["snr_learnt"]))
         if answer["colour"] == "white" and answer["dirt"] != "outliers":
             fit = json.loads((result / "cases" / name / "diagnosis.json").read_text())["fit"]["refit_only"]
             told = "detected" if row["detected"] else "missed"
@@ -55,8 +56,13 @@ def main(argv: list[str]) -> int:
                 f"{name} {row['band']:6s} {told:8s} {answer['snr'][0]:6.1f} {left(cases / name, answer, fit):6.1f}"
             )
     if small:
+        known, learnt = norm.sf(THRESHOLD - np.array(small)).mean(axis=0)
+        found = sum(
+            row["detected"] for row in rows.values() if row["kind"] == "one" and row["band"] == "small"
+        )
         print(
-            f"an ideal test finds {np.mean(norm.sf(THRESHOLD - np.array(small))):.0%} of the {len(small)} small effects"
+            f"of the {len(small)} small effects an ideal test finds {known:.0%}, one that has to learn the noise {learnt:.0%}; "
+            f"found: {found}"
         )
     return 0
 

@@ -179,6 +179,38 @@ def test_size_is_what_a_refit_leaves_in_sigmas():
     assert beyond(left[2], left[1:2]) < 0.01
 
 
+def test_what_a_test_that_learns_the_noise_is_left_with_is_its_mean_likelihood_ratio():
+    """Against draws: the best noise with the signal and without it, each by Nelder and Mead's method."""
+    from scipy.optimize import minimize
+
+    rng, n, noise = np.random.default_rng(4), 300, sensors.Noise(white=0.8, ar=0.6, rho=0.8)
+    w, spectrum = np.pi * np.arange(n) / n, noise.spectrum(n)
+    judge = Judge([spectrum[:, None]])
+    course = judge.whiten(
+        [np.interp(np.arange(n), np.linspace(0, n, 6), [0, 1, 0.2, 0.9, 0.1, 1])[None, :, None]]
+    )[0]
+    course *= 8 / np.linalg.norm(course)
+
+    def least(power: np.ndarray) -> float:
+        def minus(x: np.ndarray) -> float:
+            white, ar, flicker = np.exp(np.clip(x[:3], -9, 6))
+            rho = 1 / (1 + np.exp(-x[3]))
+            s = white + ar * (1 - rho**2) / (1 - 2 * rho * np.cos(w) + rho**2)
+            s[1:] += flicker * n / np.arange(1, n) / (1 / np.arange(1, n)).sum()
+            return float(np.sum(np.log(s) + power / s))
+
+        starts = [[-0.5, -1.0, -4.0, 1.0], [-0.5, -1.0, -2.0, 3.0]]
+        return min(minimize(minus, x, method="Nelder-Mead", options={"maxiter": 1500}).fun for x in starts)
+
+    ratios = []
+    for _ in range(24):
+        z = rng.standard_normal(n)
+        ratios.append(least(spectrum * (z + course) ** 2) - least(spectrum * z**2))
+    told = judge.learnt(np.append(course, 0.0))
+    assert 3 < told < 5  # of 8 sigmas
+    assert told == pytest.approx(np.sqrt(np.mean(ratios)), abs=3 * np.std(ratios) / np.sqrt(24) / (2 * told))
+
+
 def test_noise_has_the_spectrum_that_it_tells():
     from scipy.fft import dct
 

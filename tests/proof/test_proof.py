@@ -219,7 +219,7 @@ def test_summary_of_a_hand_made_set():
         "radiation": 1,
     }
     assert s["by_effect"]["radiation"]["exact"] == 1
-    assert s["found_by_size"] == {"all": None, "white": None, "coloured": None}
+    assert s["found_by_size"] == dict.fromkeys(("all", "white", "coloured", "learnt"))
 
 
 def test_the_size_found_half_of_the_time_is_that_of_scipy_and_its_interval_holds_the_truth():

@@ -21,6 +21,7 @@ def page(content: Mapping[str, Any], rows: Sequence[Row]) -> str:
     """Write one self-contained HTML page of a scored set."""
 
     def brief(part: str) -> str:
+        """Return `content[part]` as an HTML table: a row a group, with the columns of the first group."""
         groups = content[part]
         return sheet.table(
             ["", *next(iter(groups.values()), {})], [[k, *b.values()] for k, b in groups.items()]

@@ -72,6 +72,7 @@ def real(
 
 def _job(folder: Path, rig: Rig) -> Job:
     def files(names: str) -> tuple[str, ...]:
+        """Return the paths of the rig's recordings; `names`: separated by spaces."""
         return tuple(str(folder / rig.folder / f"{n}{SUFFIX}") for n in names.split())
 
     return Job(rig.name, str(folder / rig.folder / rig.plant), files(rig.runs), held_out=files(rig.held_out))

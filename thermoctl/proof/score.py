@@ -37,6 +37,7 @@ class Row:
     kind: str
     band: str | None
     size: float | None  # part of the effect that a refit cannot absorb, in sigmas of an ideal single test
+    learnt: float | None  # the same for a test that has to learn the noise from the same record
     colour: str | None  # of the noise
     truth: list[Named]
     verdict: str
@@ -151,6 +152,7 @@ def score(
         kind=truth.kind,
         band=answer.get("band"),
         size=answer["snr"][0] if truth.kind == "one" and answer.get("snr") else None,
+        learnt=answer.get("snr_learnt") if truth.kind == "one" else None,
         colour=answer.get("colour"),
         truth=truth.effects,
         verdict=verdict,

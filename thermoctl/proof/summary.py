@@ -99,15 +99,18 @@ def _shares(rows: Sequence[Row]) -> dict[str, Share]:
 
 
 def _by_size(single: Sequence[Row]) -> dict[str, dict[str, float] | None]:
-    """Fit the size that is found half of the time, in all, in white and in coloured noise."""
-    sized = [r for r in single if r.size]
+    """Fit the size that is found half of the time, in all, in white and in coloured noise.
+
+    `learnt`: in all, in sigmas of a test that has to learn the noise."""
+    sized = [(r.size, r) for r in single if r.size]
     groups = {
         "all": sized,
-        "white": [r for r in sized if r.colour == "white"],
-        "coloured": [r for r in sized if r.colour not in (None, "white")],
+        "white": [(size, r) for size, r in sized if r.colour == "white"],
+        "coloured": [(size, r) for size, r in sized if r.colour not in (None, "white")],
+        "learnt": [(r.learnt, r) for r in single if r.learnt],
     }
     return {
-        name: found_by_size([r.size for r in group if r.size], [r.detected for r in group])
+        name: found_by_size([size for size, _ in group], [r.detected for _, r in group])
         for name, group in groups.items()
     }
 

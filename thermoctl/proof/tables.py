@@ -37,6 +37,7 @@ _NUMBERS = {
     "half_found_at_all": "found half of the time, sigmas of an ideal test",
     "half_found_at_white": "the same in white noise",
     "half_found_at_coloured": "the same in coloured noise",
+    "half_found_at_learnt": "the same in sigmas of an ideal test that has to learn the noise",
     "calibration_error": "calibration error of the probabilities",
     "gain_median": "held-out gain, share of the oracle's, median",
     "gain_worst_tenth": "held-out gain, worst tenth",
@@ -64,6 +65,7 @@ def lines(content: Mapping[str, Any]) -> Iterator[Line]:
     """Yield each measured figure with its interval, its number of cases and its goal."""
 
     def goal(key: str, percent: bool) -> tuple[str, bool | None]:
+        """Return the goal as text and whether it is reached; ('', None) where there is none."""
         g = content["goals"].get(key)
         if g is None:
             return "", None
