@@ -39,6 +39,7 @@ class SlaveSetUp:
         spec = self.spec
 
         def put(item: Object, letter: str, value: int) -> None:
+            """Write an integer to an object by SDO; `letter`: its format in struct, without byte order."""
             slave.sdo_write(item.number, item.sub, struct.pack("<" + letter, value))
 
         if spec.command is not None:

@@ -22,6 +22,7 @@ def serial_bytes(message: Message, command: float, address: int) -> bytes:
     if isinstance(message, TextMessage):
 
         def number(m: re.Match[bytes]) -> bytes:
+            """Return the command in the placeholder's format; the formats d, x and X round it."""
             value = round(command) if m[0].endswith(_WHOLE) else command
             return m[0].decode().format(command=value).encode()
 

@@ -89,6 +89,7 @@ def run_poller(devices: list[Device], board_name: str) -> None:
     parent = os.getppid()
 
     def watch_parent() -> None:
+        """Set `stop` within 0.5 s after the parent process has ended."""
         while not stop.wait(0.5):
             if os.getppid() != parent:
                 stop.set()

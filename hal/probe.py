@@ -190,6 +190,7 @@ def _frames(port: str, seconds: float) -> list[str]:
     seen: dict[int, tuple[int, bytes]] = {}
 
     def take() -> None:
+        """Count the received frames by identifier and keep the last data of each."""
         for can_id, data in [*bus.receive(), *bus.long_frames()]:
             seen[can_id] = (seen.get(can_id, (0, b""))[0] + 1, data)
 

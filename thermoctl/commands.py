@@ -1005,6 +1005,9 @@ def diagnose(args: argparse.Namespace) -> int:
         return diagnose_folders(args)
 
     def record(experiment: Path, recording: Path) -> None:
+        """Run an experiment file on the rig for --resolve and write its recording.
+
+        Raises HardwareError where it ends early, InputError where the user does not confirm it."""
         from thermoctl.calibration.commands import record
 
         record(experiment, recording, args.config, args.rig, args.yes)

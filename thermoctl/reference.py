@@ -251,6 +251,7 @@ def cli() -> str:
     pages: list[str] = []
 
     def walk(p: argparse.ArgumentParser) -> None:
+        """Add the help of a command and of its subcommands to `pages`."""
         kind = cast(type[argparse.HelpFormatter], p.formatter_class)
         p.formatter_class = partial(kind, width=_HELP_WIDTH)  # not the terminal's
         pages.append(f"## {p.prog}\n```text\n{p.format_help().rstrip()}\n```\n")

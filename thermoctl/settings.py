@@ -672,6 +672,7 @@ def _check_together(settings: Settings, root: Node) -> None:
     """Check the conditions between options. Raises InputError."""
 
     def place(section: str, key: str) -> Node:
+        """Return the node of an option, or of its section or the file where it is not given."""
         node: Node = root.value.get(section, root)
         return node.value.get(key, node) if isinstance(node.value, dict) else node
 

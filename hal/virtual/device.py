@@ -88,6 +88,7 @@ class VirtualDevice:
         """Make the verb `<attribute> on|off`."""
 
         def switch(argument: str) -> None:
+            """Set the attribute. Raises InputError unless the argument is 'on' or 'off'."""
             if argument not in ("on", "off"):
                 raise InputError(f"{attribute}: on or off was expected, found '{argument}'")
             setattr(owner, attribute, argument == "on")

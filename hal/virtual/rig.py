@@ -248,6 +248,7 @@ def main(settings: Settings, command: str = "") -> int:
     rig = VirtualRig(settings)
 
     def stop(*_: object) -> None:
+        """End the run after the present period; `run` then disconnects the devices."""
         rig.stopping = True
 
     signal.signal(signal.SIGTERM, stop)

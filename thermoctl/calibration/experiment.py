@@ -91,6 +91,7 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
     done_s = [at_s]
 
     def show(p: experiments.Progress) -> None:
+        """Keep the time reached, s, for --resume; on a terminal also print the progress."""
         done_s[0] = p.done_s
         if sys.stderr.isatty():
             print(f"\r{p.percent:5.1f} %  {p.eta_s:6.0f} s left", end="", file=sys.stderr, flush=True)

@@ -89,6 +89,7 @@ class SimulatedRig:
         simulation = Simulation(with_model(self.settings, model), model)
 
         def stop() -> bool:
+            """Wait while the user pauses the test; return whether he has ended it."""
             while keyboard.pausing():
                 pass
             return keyboard.ended

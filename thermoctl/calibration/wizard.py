@@ -301,6 +301,7 @@ def _progress_line(time_left: Callable[[Progress], tuple[float, float]]) -> Call
     shown = [-1.0]
 
     def show(p: Progress) -> None:
+        """Print the progress of a test, and the time left of it and of all tests."""
         here, everything = time_left(p)
         line = f"   {p.percent:5.1f} %   {span(here)} left of this test, {span(everything)} of all"
         if sys.stderr.isatty():

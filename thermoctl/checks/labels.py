@@ -264,6 +264,7 @@ def _clocks(model: Model, tables: Sequence[Table]) -> Iterator[Hypothesis]:
             continue
 
         def change(table: Table, factor: float = factor) -> Table:
+            """Return the table with its times scaled by `factor`; the first time is unchanged."""
             return replace(table, t=table.t[0] + (table.t - table.t[0]) * factor)
 
         yield Hypothesis(
@@ -307,6 +308,7 @@ def _corrected(
     columns = tuple(i.column for i in items)
 
     def change(table: Table) -> Table:
+        """Return the table with scale * value + offset in the columns."""
         return replace(table, columns=table.columns | {c: scale * table.columns[c] + offset for c in columns})
 
     names = " and ".join(f"'{c}'" for c in columns)
@@ -327,6 +329,7 @@ def _corrected(
 
 def _swapped(a: Input | Output, b: Input | Output) -> Hypothesis:
     def change(table: Table) -> Table:
+        """Return the table with the values of the two columns exchanged."""
         columns = dict(table.columns)
         columns[a.column], columns[b.column] = table.columns[b.column], table.columns[a.column]
         return replace(table, columns=columns)

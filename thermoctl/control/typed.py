@@ -76,6 +76,7 @@ def declarations(text: str, law: ModuleType) -> str:
     made = parts(law)
 
     def write(match: re.Match[str]) -> str:
+        """Return a generated part with its first and last line. Raises KeyError for an unknown title."""
         indent, title = match[1], match[2]
         lines = [line for kind, names in made[title] for line in _lines(kind, names, indent)]
         return "\n".join([f"{indent}# generated: {title}", *lines, f"{indent}# end\n"])

@@ -123,6 +123,7 @@ def _page() -> tuple[bytes, str]:
     text = PAGE.read_text()
 
     def hashes(tag: str) -> str:
+        """Return the policy's sources (SHA-256) of all elements `tag` of the page."""
         found = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)
         digests = (base64.b64encode(hashlib.sha256(part.encode()).digest()).decode() for part in found)
         return " ".join(f"'sha256-{d}'" for d in digests)

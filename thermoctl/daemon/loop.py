@@ -325,6 +325,7 @@ def become_real_time(settings: Settings, warn: Callable[[str], None]) -> list[An
     loop = settings.loop
 
     def attempt(action: Callable[[], Any], what: str, advice: str) -> None:
+        """Call `action`; where the system refuses it, warn with `what` and `advice`."""
         try:
             action()
         except (OSError, PermissionError, ValueError, AttributeError) as e:
@@ -345,6 +346,7 @@ def become_real_time(settings: Settings, warn: Callable[[str], None]) -> list[An
     attempt(_lock_memory, "locked memory", "page faults may delay ticks; raise LimitMEMLOCK")
 
     def hold_latency() -> None:
+        """Request a wake-up latency of 0 us, in force while the file in `kept` is open. Raises OSError."""
         file = os.open("/dev/cpu_dma_latency", os.O_WRONLY)
         os.write(file, (0).to_bytes(4, "little"))
         kept.append(file)

@@ -73,6 +73,7 @@ def _loop_process(settings: Settings, shared: list[Shared], board: Any) -> int:
         guard(rigs, settings.parts)
 
         def warn(text: str) -> None:
+            """Log a warning and count it in the segment of each axis."""
             for s in shared:
                 s.counters[WARNINGS] += 1
             console_log("warning", what=text)
@@ -278,6 +279,7 @@ def make_children(settings: Settings, shared: list[Shared]) -> tuple[Board | Non
     def child(
         name: str, main: Callable[..., int], own: Settings, s: Shared, beat: int | None = None
     ) -> Child:
+        """Return a helper of an axis; `beat`: place of its heartbeat in `s`, None: it is not watched."""
         beats = None if beat is None else partial(s.beats, beat)
         return Child(f"{name} {own.axis}".strip(), main, own, s, board, beats=beats)
 

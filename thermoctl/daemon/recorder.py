@@ -209,6 +209,7 @@ def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) 
     run = datetime.fromtimestamp(float(shared.counters[RUN_S]), UTC).strftime("%Y%m%dT%H%M%SZ")
 
     def open_writer(law: str) -> RecordingWriter:
+        """Return the writer of a new file; `law`: the text of `law_metadata`."""
         metadata = {
             "rig": rig,
             "run": run,

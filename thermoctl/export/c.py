@@ -91,6 +91,7 @@ def _initial(plant: Plant, e: Equations) -> str:
     asked = {o: f"f[{k}]" for k, o in enumerate(first_outputs(plant))}
 
     def read(part: Expr) -> Expr | None:
+        """Return the name for first(NAME): a first reading or an input. None for another operation."""
         return (
             name(f"first {part.value}" if part.value in asked else part.value) if part.op == "first" else None
         )

@@ -125,6 +125,7 @@ def _variables(plant: Plant, e: Equations, numbers: Values, begin: list[float]) 
     def variable(
         name: str, kind: str, unit: str | None = None, start: float | None = None, **more: str
     ) -> str:
+        """Return a variable with the next value reference; `more`: attributes of Real, and `description`."""
         real = "".join(f" {k}={quoteattr(v)}" for k, v in more.items() if k != "description")
         real += f" unit={quoteattr(unit)}" if unit else ""
         real += f' start="{start!r}"' if start is not None else ""

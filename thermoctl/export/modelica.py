@@ -70,6 +70,7 @@ def modelica_source(plant: Plant, numbers: Values, model: str) -> str:
     jumps = [k for k, w in enumerate(numbers.width) if w > 0]
 
     def width(z: Expr) -> str:
+        """Return the half width of the jump at z = 0: a parameter's name, or "0" for a true jump."""
         k = site.get(id(z), -1)
         return f"jump_width_{k}" if k in jumps else "0"
 

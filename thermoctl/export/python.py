@@ -40,6 +40,7 @@ def python_source(plant: Plant, numbers: Values) -> str:
     site = {id(z): k for k, (z, _) in enumerate(e.jumps)}
 
     def text(expr: Expr) -> str:
+        """Return an expression as Python text."""
         return written(
             expr,
             NOTATION,
@@ -49,9 +50,11 @@ def python_source(plant: Plant, numbers: Values) -> str:
         )
 
     def unpack(keys: Sequence[str], array: str) -> str:
+        """Return the line that unpacks `array` into the names of `keys`; no line without keys."""
         return f"    ({', '.join(names[k] for k in keys)},) = {array}\n" if keys else ""
 
     def pairs(delays: dict[str, tuple[Expr, Expr]]) -> str:
+        """Return the text of the list of (signal, seconds) of each delay."""
         return "[" + ", ".join(f"({text(g)}, {text(s)})" for g, s in delays.values()) + "]"
 
     inputs = tuple(plant.inputs)

@@ -45,6 +45,7 @@ def written(
     Raises InputError for a delay that the language lacks."""
 
     def text(e: Expr, outer: int) -> str:
+        """Return `e` as text, in brackets where `outer`, the level of the operator around it, needs them."""
         if e.op == "num":
             number = repr(e.value).removesuffix(".0")
             return f"({number})" if e.value < 0 else number
@@ -89,6 +90,7 @@ def unique(plant: Plant, reserved: Collection[str], flow: str = "flow_{}") -> di
     taken, found = set(reserved), {}
 
     def take(key: str, wanted: str) -> None:
+        """Keep a name for `key`: the wanted one, with `_` added until it is free."""
         while wanted in taken:
             wanted += "_"
         taken.add(wanted)

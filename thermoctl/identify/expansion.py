@@ -120,6 +120,7 @@ def output_error(
     own = 2 * len(many)
 
     def solve(log_tau: float) -> tuple[float, np.ndarray, float]:
+        """Return the cost, um^2, the coefficients and f1 at a time constant, given as ln(tau/s)."""
         f = float(np.exp(-period_s / np.exp(log_tau)))
         blocks = []
         for k, drive in enumerate(drives):

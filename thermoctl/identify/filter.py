@@ -214,6 +214,9 @@ def tune(
     w = np.ones(len(model.c)) if weights is None else weights / np.sqrt(np.mean(weights**2))
 
     def cost(x: np.ndarray) -> float:
+        """Return the weighted mean square error, K^2, times the prior's factor; 1e9 without a steady filter.
+
+        `x`: logarithms of the first variances; those it lacks keep their values in `base`."""
         try:
             f = steady(model, np.exp(np.append(x, base[len(x) :])), r_v, sensors)
         except InputError:
@@ -260,6 +263,7 @@ def choose_sensors(
     out = []
 
     def error(s: tuple[int, ...]) -> float:
+        """Return the position's standard error, um, with sensors `s`. Raises the InputError of `steady`."""
         g = gains_um_k @ model.c
         return float(np.sqrt(max(g @ steady(model, variances, r_v, tuple(sorted(s))).p @ g, 0)))
 

@@ -98,6 +98,7 @@ def thermal(plant: Plant, at_c: float = 25.0, channels: Channels = DEFAULT) -> T
         capacities.append(n.storage)
 
     def values(exprs: list[ex.Expr], where: dict[str, float]) -> np.ndarray:
+        """Return the values of expressions (n,) at the point `where`."""
         return np.array([float(ex.evaluate(e, where)) for e in exprs])
 
     rest = values(slopes, point)

@@ -213,6 +213,9 @@ def _fit(
     lo, hi = np.log(bounds[0]), np.log(bounds[1])
 
     def evaluate(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the weighted sum of squares at x = ln tau, then Q, residues, residual, D and owner.
+
+        D: derivatives of the responses by ln tau; owner: the time constant of each column."""
         F, D, owner = _responses(blocks, np.exp(x), rest)
         F, D = (_whitened(v, blocks, drift_s) * weight[:, None] for v in (F, D))
         Q, theta, r = _project(F, Y, ridge)

@@ -423,6 +423,7 @@ def refine_prediction_error(
     uy = _c(np.hstack([u, y]))
 
     def cost(mod: StateSpace, k: np.ndarray) -> float:
+        """Return the sum of squares of whitened innovations; inf if unstable or a pole is not positive."""
         if (
             not (np.diag(mod.a) > 0).all()
             or np.abs(np.linalg.eigvals(mod.a - k @ mod.c)).max() >= 1

@@ -92,15 +92,18 @@ def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s:
     u, y = u - u[0], np.asarray(y_um, float) - np.mean(y_um)
 
     def model(p: np.ndarray, gain: float = 1.0) -> SecondOrder:
+        """Return the response of p: ln of natural frequency (1/s), damping ratio and dead time (s)."""
         wn, zeta = np.exp(p[0]), np.exp(p[1])
         root = np.sqrt(complex(zeta**2 - 1))
         return SecondOrder(gain, 1 / (wn * (zeta - root)), 1 / (wn * (zeta + root)), float(np.exp(p[2])))
 
     def unit_response(p: np.ndarray) -> np.ndarray:
+        """Return the positions (N,) at gain 1, um, about their mean."""
         x = model(p).response(u, period_s)[at]
         return x - x.mean()
 
     def residual(p: np.ndarray) -> np.ndarray:
+        """Return fitted minus measured position (N,), um, with the gain of least squares."""
         x = unit_response(p)
         return (x @ y) / max(x @ x, 1e-300) * x - y
 

@@ -59,7 +59,10 @@ class Equations:
         self.output_delays: dict[str, tuple[Expr, Expr]] = {}
 
         def named(table: dict[str, tuple[Expr, Expr]], prefix: str) -> Callable[[Expr], Expr | None]:
+            """Return a change for `substitute` that puts names for delays and enters them in `table`."""
+
             def change(e: Expr) -> Expr | None:
+                """Return the name of a delay, one name for equal delays. None for another operation."""
                 if e.op != "delay":
                     return None
                 for key, pair in table.items():
@@ -192,6 +195,7 @@ class Equations:
         number, at = self.fmus.index(path), [0, *map(fmu.argument, names)]
 
         def row(given: list[str], missing: str) -> str:
+            """Return a C array of the FMU's arguments: `given` at their places, else `missing`."""
             known = dict(zip(at, given, strict=True))
             return f"(const double[]){{{', '.join(known.get(j, missing) for j in range(1 + len(fmu.arguments)))}}}"
 

@@ -219,21 +219,25 @@ class _Reader:
         self.tokens, self.at, self.depth = tokens, 0, 0
 
     def peek(self) -> str:
+        """Return the next token's text without consuming it, '' at the end."""
         return self.tokens[self.at][1] if self.at < len(self.tokens) else ""
 
     def take(self, text: str) -> bool:
+        """Consume the operator `text` if it is next; return whether it was."""
         if self.at < len(self.tokens) and self.tokens[self.at] == ("op", text):
             self.at += 1
             return True
         return False
 
     def need(self, text: str) -> None:
+        """Consume the operator `text`. Raises ExpressionError if it is not next."""
         if not self.take(text):
             raise ExpressionError(
                 f"'{text}' was expected" + (f" before '{self.peek()}'" if self.peek() else " at the end")
             )
 
     def comparison(self) -> Expr:
+        """Read a sum, or two sums and a comparison between them. Raises ExpressionError."""
         self.depth += 1
         if self.depth > MAX_DEPTH:
             raise ExpressionError(f"nested deeper than {MAX_DEPTH} levels")
@@ -250,6 +254,7 @@ class _Reader:
         return left
 
     def sum(self) -> Expr:
+        """Read products with + and - between them, from left to right."""
         left = self.product()
         while self.peek() in ("+", "-"):
             op = self.peek()
@@ -259,6 +264,7 @@ class _Reader:
         return left
 
     def product(self) -> Expr:
+        """Read factors with * and / between them, from left to right."""
         left = self.unary()
         while self.peek() in ("*", "/"):
             op = self.peek()
@@ -268,6 +274,7 @@ class _Reader:
         return left
 
     def unary(self) -> Expr:
+        """Read an operand with its signs and its power: -a**b is -(a**b). Raises ExpressionError."""
         self.depth += 1
         if self.depth > MAX_DEPTH:
             raise ExpressionError(f"nested deeper than {MAX_DEPTH} levels")
@@ -282,6 +289,7 @@ class _Reader:
             self.depth -= 1
 
     def atom(self) -> Expr:
+        """Read a number, a name, a call or an expression in brackets. Raises ExpressionError."""
         if self.at >= len(self.tokens):
             raise ExpressionError("the expression ends where a number, a name or '(' was expected")
         kind, text = self.tokens[self.at]
@@ -302,6 +310,7 @@ class _Reader:
         raise ExpressionError(f"'{text}' was not expected here; a number, a name or '(' was")
 
     def call(self, function: str) -> Expr:
+        """Read the arguments of `function`, from the bracket on. Raises ExpressionError."""
         if function not in FUNCTIONS and function not in SPECIAL:
             raise ExpressionError(
                 f"'{function}' is not a function of the language; allowed are "
@@ -352,6 +361,7 @@ class _Reader:
         return make(function, args[0])
 
     def fmu(self) -> Expr:
+        """Read the arguments of fmu(): file, result, and pairs of variable and value."""
         path = self.text("the file of an FMU")
         self.need(",")
         result = self.text("a derivative or an output of the FMU")
@@ -364,6 +374,7 @@ class _Reader:
         return make("fmu", name("t"), *given.values(), value=(path, result, tuple(given)))
 
     def text(self, what: str) -> str:
+        """Read a text in quotes. Raises ExpressionError, in which `what` is the text expected."""
         kind, text = self.tokens[self.at] if self.at < len(self.tokens) else ("", "")
         if kind != "text":
             raise ExpressionError(f'fmu(): {what} was expected in "quotes"')
@@ -371,6 +382,7 @@ class _Reader:
         return text[1:-1]
 
     def list(self) -> list[Expr]:
+        """Read one or more expressions in square brackets."""
         self.need("[")
         items = [self.comparison()]
         while self.take(","):

@@ -34,6 +34,7 @@ def from_plain(data: Mapping[str, Any], file: str = "<plant>") -> Plant:
     """Build and check a plant from plain dicts, which have no line numbers. Raises InputError."""
 
     def node(value: Any) -> yamlfile.Node:
+        """Return plain data as a Node at line 0, column 0; keys become text."""
         if isinstance(value, Mapping):
             value = {str(k): node(v) for k, v in value.items()}
         elif isinstance(value, (list, tuple)):

@@ -87,6 +87,7 @@ class _Plant:
         return {word for text in texts for word in re.findall(r"[A-Za-z_]\w*", text)}
 
     def document(self) -> Node:
+        """Return the plant file; where the map has a key, its value replaces the FMU's."""
         fmu, names = self.fmu, self.names
         inputs = {
             names[n]: self._entry("inputs", n, self._input(v))

@@ -217,6 +217,7 @@ def _sizes(
     dt = np.diff(t)
 
     def integral(values: np.ndarray) -> np.ndarray:
+        """Return the integral over time up to each sample (N,); each value holds until the next sample."""
         return np.concatenate([[0.0], np.cumsum(values[:-1] * dt)])
 
     energy = integral(np.sum(list(heats.values()), axis=0))
@@ -236,6 +237,7 @@ def _heated(t: np.ndarray, power: np.ndarray, sensors: Mapping[str, np.ndarray])
     steps = max(len(t) // 200, 1)
 
     def rise(values: np.ndarray) -> float:
+        """Return the covariance of a temperature's rate and the power, K W/s."""
         rate = np.diff(values[::steps]) / np.diff(t[::steps])
         drive = power[::steps][: len(rate)]
         return float(np.mean((rate - rate.mean()) * (drive - drive.mean())))

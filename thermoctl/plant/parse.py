@@ -285,6 +285,7 @@ def _places(plant: Plant, items: Items) -> list[_Place]:
     everything = nodes | inputs | parameters | {"t"}
 
     def place(section: str, name: str, key: str, e: Expr, names: set[str], *rules: str) -> _Place:
+        """Return an expression's place; `rules`: 'inputs' or 'all' for delay(), 'first' to allow first()."""
         s = items[section][name]
         delays = next((r for r in rules if r in ("inputs", "all")), "no")
         return _Place(s.label(key), e, s.get(key), names, delays, "first" in rules)

@@ -256,6 +256,7 @@ def table(plant: Plant) -> list[Table]:
     """Return the plant as rich tables: inputs, parameters, nodes, flows, outputs."""
 
     def make(title: str, heads: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> Table:
+        """Return a table; floats have 6 significant digits, None is an empty cell."""
         made = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
         for head in heads:
             right = head in ("low", "high", "noise", "step") or (head == "value" and title == "Parameters")

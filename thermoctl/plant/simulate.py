@@ -194,6 +194,7 @@ class Model:
                 def integral(
                     z: np.ndarray, area: np.ndarray = area, s: np.ndarray = s
                 ) -> np.ndarray:  # before the start: the first value
+                    """Return the integral of the held signal from the start to the times z, s."""
                     return np.where(
                         z < excitation.t[0], (z - excitation.t[0]) * s[0], np.interp(z, excitation.t, area)
                     )
@@ -218,6 +219,7 @@ class Model:
         }
 
         def first(key: str) -> float:
+            """Return the first recorded value of `key`. Raises InputError where the recording has none."""
             if key not in excitation.first:
                 raise InputError(
                     f"recording {excitation.name}: first({key}) is asked for, but the recording has no value of it"

@@ -247,6 +247,7 @@ def _csv_rows(data: bytes) -> Iterable[tuple[int, list[str]]]:
     number = 0
 
     def counted() -> Iterable[str]:
+        """Yield the lines of header and rows; `number` then holds the number of the line, from 1."""
         nonlocal number
         for line in lines:
             number += 1

@@ -56,6 +56,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = 
     ]
 
     def line(cells: Sequence[object], tag: str) -> str:
+        """Return a row of the table; `tag`: th in the head, td in the body."""
         return (
             "<tr>"
             + "".join(

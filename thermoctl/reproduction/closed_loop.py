@@ -57,6 +57,7 @@ def scaled_truth(plant_file: str | Path, path: Path) -> Path:
     p = plant.load(plant_file)
 
     def change(data: dict[str, Any]) -> None:
+        """Multiply the expansions in place by their factors in PAPER_SCALE."""
         for k, factor in PAPER_SCALE.items():
             data["parameters"][k]["value"] *= factor
 
@@ -96,6 +97,7 @@ def quasi_static_run(
     rng = np.random.default_rng([seed, n])
 
     def read(y: np.ndarray, name: str) -> np.ndarray:
+        """Return true values (N,) as read by output `name`: with its noise, rounded to its resolution."""
         o = p.outputs[name]
         return np.round((y + o.noise_sd * rng.standard_normal(y.shape)) / (o.resolution or 1e-9)) * (
             o.resolution or 1e-9
@@ -124,6 +126,7 @@ def agreement(full: Recorded, quasi: Recorded) -> dict[str, float]:
     minute = len(full.t) // 60 * 60
 
     def mean(a: np.ndarray) -> np.ndarray:
+        """Return the mean of each whole minute (minutes, columns) of rows at 1 s."""
         return a[:minute].reshape(minute // 60, 60, -1).mean(1)
 
     dt = mean(quasi.true_c) - mean(full.temperatures)
@@ -149,6 +152,7 @@ def run(
     with ProcessPoolExecutor(2) as pool:
 
         def submit(name: str, model: CompensatorModel | None) -> Future[np.ndarray]:
+            """Start a test in the pool; `model`: of the compensator, None: without compensation."""
             return pool.submit(run_test, config, str(truth), name, model, 1000, part)
 
         waiting = {k: submit(k, None) for k in ("test_2", "test_3", "test_4a")}

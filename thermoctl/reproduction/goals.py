@@ -38,9 +38,11 @@ def goals(seeds: Sequence[SeedResult], disturbed: Sequence[SeedResult]) -> list[
     """Measure every goal."""
 
     def two_s(k: str) -> np.ndarray:
+        """Return 2 s of the position of estimator `k` (seeds,), um."""
         return np.array([s.position[k][1] for s in seeds])
 
     def mean(k: str) -> np.ndarray:
+        """Return the absolute mean position of estimator `k` (seeds,), um."""
         return np.abs([s.position[k][0] for s in seeds])
 
     b, p, s, t, y = (two_s(k) for k in ("better", "paper", "siso", "twelve", "bayes"))

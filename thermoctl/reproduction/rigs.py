@@ -274,6 +274,7 @@ class ProvingRig:
         x0 = stepper.x.copy()
 
         def step(dx: np.ndarray, du: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Return states and outputs 1 s after the rest state plus `dx`, with the inputs plus `du`."""
             s = self.model.stepper(1.0, u0, day.parameters)
             s.x[:] = x0 + dx
             y = s.step(u0 + du).copy()

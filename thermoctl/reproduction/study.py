@@ -80,6 +80,7 @@ def _run(plant_file: str, tests_file: str, seeds: int) -> _Runs:
     with ProcessPoolExecutor(2) as pool:
 
         def submit(seed: int, disturbance: str | None = None, keep: bool = False, **ease: float) -> Waiting:
+            """Start a seed in the pool with the arguments of `one_seed`."""
             return pool.submit(one_seed, plant_file, tests_file, seed, disturbance, keep, **ease)
 
         fresh = [submit(k, keep=k == FRESH[0]) for k in FRESH[:seeds]]
@@ -96,6 +97,7 @@ def _run(plant_file: str, tests_file: str, seeds: int) -> _Runs:
         }
 
         def done(waiting: Sequence[Waiting]) -> list[SeedResult]:
+            """Wait for seeds; return their results without the data for the figures."""
             return [f.result()[0] for f in waiting]
 
         kept = fresh[0].result()[1]
