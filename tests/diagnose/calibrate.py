@@ -155,7 +155,7 @@ def names(cases: Sequence[Judged], numbers: Limits) -> tuple[int, int]:
     right = false = 0
     for case in cases:
         found = posterior(case, numbers)
-        likeliest = next(iter(found.hypotheses)) if found.something >= numbers.name else ()
+        likeliest = next((k for k in found.hypotheses if k), ()) if found.something >= numbers.name else ()
         named = {k for k in likeliest if found.effects[k] >= numbers.name}
         right += sum(bool(named & accepted) for accepted in case.truths)
         false += len(named.difference(*case.truths, case.tolerated))

@@ -10,6 +10,7 @@ from tests.diagnose.test_places import TANK, offered
 from thermoctl.cli import main
 from thermoctl.diagnose import unknown_law
 from thermoctl.diagnose.unknown_law import Term, term_of
+from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
@@ -106,3 +107,48 @@ def test_an_outlet_has_a_law_of_its_level_and_a_memory_has_none():
     assert term_of(found["orifice_exponent"]["outflow"]) == Term("rate", {}, "level")
     assert term_of(found["sensor_lag"]["gauge"]) is None
     assert term_of(found["sensor_saturation"]["gauge"]) == Term("value", {}, "y")
+
+
+AXIS = """format: thermoctl-plant/1
+title: An axis on a spring
+inputs: {force: {unit: N}}
+parameters:
+  K: {value: 80, unit: N/m, range: [30, 300]}
+nodes:
+  x: {unit: m, storage: 1, initial: 0}
+  v: {unit: m/s, storage: 2, initial: 0}
+flows:
+  travel: {into: x, rate: v, unit: m/s}
+  drive: {into: v, rate: force, unit: N}
+  spring: {from: v, rate: K * x, unit: N}
+outputs:
+  encoder: {value: x, unit: m, noise: 0.0001}
+"""
+
+
+def test_a_friction_may_follow_the_position_and_keeps_its_sizes_between_the_knots():
+    plant = loads(AXIS)
+    t = np.arange(0.0, 4.0, 0.01)
+    table = Table("run", "run", t, {"force": np.zeros(len(t)), "encoder": np.zeros(len(t))})
+    c = offered(plant, table, "directional_friction")["v"]
+    term = term_of(c)
+    assert term == Term("flow", {"from": "v"}, "v")
+    x, v = np.linspace(-1.0, 1.0, 41), np.linspace(-0.5, 0.5, 41)
+
+    class Path:  # what a trajectory gives
+        def value(self, e, extra):
+            return ex.evaluate(e, {"x": x, "v": v})
+
+    ((signal, follows),) = unknown_law._others(c, term)
+    law = unknown_law._varied(follows, {"W": 0.01, "F": 0.7, "D": 0.0, "H": 0.2}, signal, [Path()])
+    assert signal == "x"
+    names = [p.name for p in law.effect.parameters]
+    assert len(names) == 2 * unknown_law.KNOTS  # D is zero, W is no size
+    w = np.random.default_rng(2).normal(size=len(names))
+    extended = law.extend(dict(zip(names, w.tolist(), strict=True)))
+    (new,) = extended.flows.keys() - plant.flows.keys()
+    values = {"x": x, "v": v, **{q: p.value for q, p in extended.parameters.items()}}
+    knots = np.linspace(-1.0, 1.0, unknown_law.KNOTS)
+    of_f, of_h = (np.interp(x, knots, part) for part in np.split(w, 2))
+    expected = 0.7 * of_f * np.tanh(v / 0.01) + 0.2 * of_h * np.abs(v)
+    np.testing.assert_allclose(ex.evaluate(extended.flows[new].rate, values), expected, atol=1e-12)

@@ -246,7 +246,7 @@ def _parameter(name: str, node: yamlfile.Node) -> EffectParameter:
 def _amplitudes(trial: Expr | None) -> int:
     """Return the number of amplitudes s, or s1, s2, ..., in a trial value."""
     names = ex.names(trial) if trial is not None else ()
-    return max((int(n[1:] or 1) for n in names if re.fullmatch(r"s\d?", n)), default=0)
+    return max((int(n[1:] or 1) for n in names if re.fullmatch(r"s\d*", n)), default=0)
 
 
 def _changes(top: Mapping[str, yamlfile.Node]) -> tuple[tuple[Mapping[str, Any], ...], ...]:

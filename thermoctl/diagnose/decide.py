@@ -18,12 +18,14 @@ Laws = dict[tuple[frozenset[Key], Key], float]  # scores, by effects and the one
 
 @dataclass(frozen=True)
 class Posterior:
-    """Probability of each hypothesis tried (by its effects), of each effect, and of any effect.
+    """Probability of each hypothesis tried (by its effects), and of each effect.
 
-    `laws`: that an unknown law is there, by the effect in whose place it is"""
+    `known`: that some effect is there; `something`: that some effect or an unknown law is. `laws`: that a law
+    is there, by the effect in whose place it is"""
 
     hypotheses: Mapping[frozenset[Key], float]
     effects: Mapping[Key, float]
+    known: float
     something: float
     laws: Mapping[Key, float] = field(default_factory=dict)
 
@@ -32,7 +34,7 @@ class Posterior:
 class Facts:
     """All numbers that a verdict depends on.
 
-    - `something`: probability that some effect is there
+    - `something`: probability that some effect or an unknown law is there; `known`: that some effect is
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
     - `remains`: the largest probability of a remainder at an output
@@ -40,6 +42,7 @@ class Facts:
     - `worth`: held-out error, divided by that of a refit alone; `worse`: probability that it is larger"""
 
     something: float
+    known: float
     named: tuple[Key, ...]
     over_noise: float
     worth: float
@@ -75,19 +78,23 @@ def weigh(
     total = logsumexp(np.array([*scores.values(), *laws.values()]) / limits.temperature)
     of = {keys: float(np.exp(score / limits.temperature - total)) for keys, score in scores.items()}
     unknown: dict[Key, float] = {}
+    of_law: dict[frozenset[Key], float] = {}
     for (keys, at), score in laws.items():
         p = float(np.exp(score / limits.temperature - total))
         of[keys] += p
         unknown[at] = unknown.get(at, 0.0) + p
+        of_law[keys] = of_law.get(keys, 0.0) + p
     order = sorted(of, key=lambda keys: (-of[keys], -scores[keys], sorted(keys)))
     hypotheses = {keys: of[keys] for keys in order}
     effects: dict[Key, float] = {}
-    something = 0.0
+    known = something = 0.0
     for keys, q in hypotheses.items():
-        something += q * max(physics[keys].values(), default=0.0)
+        of_effects, unknown_too = max(physics[keys].values(), default=0.0), of_law.get(keys, 0.0)
+        known += q * of_effects
+        something += (q - unknown_too) * of_effects + unknown_too
         for key in keys:
             effects[key] = effects.get(key, 0.0) + q * physics[keys][key]
-    return Posterior(hypotheses, effects, something, unknown)
+    return Posterior(hypotheses, effects, known, something, unknown)
 
 
 def _only_noise(f: Facts, limits: Limits) -> bool:
@@ -102,6 +109,11 @@ ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
         "consistent",
     ),
     ("nothing is supported and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
+    (
+        "an unknown law is likelier than the effects of the catalogue",
+        lambda f, q: f.something - f.known > f.known,
+        "unexplained",
+    ),
     (
         "the findings predict held-out data worse than a refit alone",
         lambda f, q: f.worse >= q.name,
@@ -118,6 +130,7 @@ def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
     row, verdict = next((text, verdict) for text, holds, verdict in ROWS if holds(facts, limits))
     numbers = {
         "something": facts.something,
+        "known": facts.known,
         "over_noise": facts.over_noise,
         "worth": facts.worth,
         "worse": facts.worse,

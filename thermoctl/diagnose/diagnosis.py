@@ -73,10 +73,10 @@ def _decided(
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
     fits = {keys: w.fitted for keys, w in tried.items()}
-    posterior, laws = weigh_laws(known, tried, physics, numbers)
+    posterior, laws, signals = weigh_laws(known, tried, physics, numbers)
     best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
-    if posterior.something >= numbers.name:
-        likeliest = next(iter(posterior.hypotheses))
+    if posterior.something >= numbers.name and 2 * posterior.known >= posterior.something:
+        likeliest = next(keys for keys in posterior.hypotheses if keys)
         stand = standouts(physics[likeliest])  # the other effects are part of the remainder
         best = with_residuals(known, fits.get(stand, fits[likeliest]))
     reach = reached(known)
@@ -88,19 +88,27 @@ def _decided(
     told = bool(best.hypothesis.effects) and value.reserved
     ratio, worse = (_ratio(value.after, value.refit_only), value.worse) if told else (1.0, 0.0)
     remains = remainder(known, fits[best.hypothesis.keys])
-    unknown = missing_law(posterior, searched.tried)
+    unknown = missing_law(posterior, searched.tried, signals)
     if remains < numbers.name and unknown.probability < numbers.name:
-        unknown = flow_missing(known, fits[best.hypothesis.keys], reach.nodes, numbers)
-    sure = unknown if unknown.probability >= numbers.name else None
-    if sure:
-        after = replace(after, node=sure.node or after.node)
+        flow = flow_missing(known, fits[best.hypothesis.keys], reach.nodes, numbers)
+        unknown = max(unknown, flow, key=lambda missing: missing.probability)
+    if unknown.probability >= numbers.name:
+        after = replace(after, node=unknown.node or after.node)
         before = before if best.hypothesis.effects else after
     facts = Facts(
-        posterior.something, named, max(after.over_noise.values()), ratio, remains, worse, unknown.probability
+        posterior.something,
+        posterior.known,
+        named,
+        max(after.over_noise.values()),
+        ratio,
+        remains,
+        worse,
+        unknown.probability,
     )
     decision = decide(posterior, facts, numbers)
+    doubt = unknown.told(decision.verdict, numbers)
     return Diagnosis(
-        known, searched, posterior, best, null, after, before, value, decision, energy, physics, sure, laws
+        known, searched, posterior, best, null, after, before, value, decision, energy, physics, doubt, laws
     )
 
 

@@ -19,7 +19,6 @@ from thermoctl.diagnose.levels import late
 from thermoctl.diagnose.misfit import Energy, standouts
 from thermoctl.diagnose.search import Searched
 from thermoctl.diagnose.unknown import Left
-from thermoctl.diagnose.unknown_flow import Missing
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit
@@ -45,7 +44,7 @@ class Diagnosis:
     - `energy`: of each hypothesis' residuals
     - `physics`: for hypotheses of which an effect stands out of the misfit that they leave: each effect's
       probability of being physics
-    - `unknown`: something that `best` lacks for certain, though no output shows it alone
+    - `unknown`: a sentence on physics that no output shows alone; empty where it is not likely
     - `laws`: scores of hypotheses with an unknown law in the place of an effect
     - `missing_flow`: rms of the flow into `before.node` that would close the misfit of `null`
     - `law`: a law for the remainder of the outcome"""
@@ -61,7 +60,7 @@ class Diagnosis:
     decision: Decision
     energy: Mapping[frozenset[Key], Energy]
     physics: Mapping[frozenset[Key], Mapping[Key, float]]
-    unknown: Missing | None
+    unknown: str
     laws: Laws
     missing_flow: float | None = None
     law: Law | None = None
@@ -149,7 +148,7 @@ def _notes(d: Diagnosis) -> list[str]:
         *d.case.notes,
         *doubts(d.case, d.final.fit, d.before.noise),
         *late(d.case, d.final),
-        *([d.unknown.sentence] if d.unknown else []),
+        *filter(None, [d.unknown]),
         *(
             f"{effect} at {where} is in the extended plant, but is not sure enough to be a finding "
             f"(probability {d.posterior.effects.get((effect, where), 0.0):.2f})"

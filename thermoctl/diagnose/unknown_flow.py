@@ -45,6 +45,14 @@ class Missing:
     node: str | None = None
     sentence: str = ""
 
+    def told(self, verdict: str, limits: Limits) -> str:
+        """Return the sentence, if it is certain, or beside effects that are not certain either."""
+        if self.probability >= limits.name:
+            return self.sentence
+        if verdict == "ambiguous" and self.probability > 1 - limits.set:
+            return f"or {self.sentence} (probability {self.probability:.2f})"
+        return ""
+
 
 def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Limits) -> Missing:
     """Return the probability that an unknown flow into or between nodes is missing in a fitted hypothesis.

@@ -8,12 +8,21 @@ every hypothesis that holds some of the findings meets one more with an unknown 
 
 h_k: KNOTS straight lines over the range of s. A new flow or reading has its typical size as term. An effect
 whose form is right needs small w beside it, and large ones in its place: then the evidence keeps it. One
-that is as wrong as it is large gains nothing beside the law, and its own prior odds decide against it."""
+that is as wrong as it is large gains nothing beside the law, and its own prior odds decide against it.
+
+Its form may be right, and its size no constant: friction in one zone of the travel. So there are further laws
+in its place. The effect's fitted size follows the position there, or another signal s2 of its form.
+
+    size sum_k w_k h_k(s2).
+
+All laws in the place of an effect share its prior odds. None follows the time: in a run that decays by itself
+it tells as much as any speed or temperature, and the right names were lost."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +46,7 @@ from thermoctl.diagnose.search import Keys, Weighed
 from thermoctl.diagnose.unknown_flow import SHARES, Missing, evidence
 from thermoctl.diagnose.where import typical_flow
 from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.yamlfile import InputError
 
@@ -82,11 +92,12 @@ def term_of(c: Candidate) -> Term | None:
 
 @dataclass(frozen=True)
 class UnknownLaw:
-    """A law beside a hypothesis: its log Bayes factor, and where a refit starts.
+    """A law beside a hypothesis: the signal that it follows, its log Bayes factor, and where a refit starts.
 
     `start`: w; `sd`: the likeliest eta; `average`: log of the mean evidence over eta, less that of `sd`"""
 
     candidate: Candidate
+    signal: str
     gain: float
     start: np.ndarray
     sd: float
@@ -96,15 +107,17 @@ class UnknownLaw:
 
 def weigh_laws(
     case: Case, tried: Mapping[Keys, Weighed], physics: Mapping[Keys, Mapping[Key, float]], limits: Limits
-) -> tuple[Posterior, Laws]:
+) -> tuple[Posterior, Laws, dict[Key, str]]:
     """Return the posterior with unknown laws, and the scores of the hypotheses that hold one.
+
+    Also the signal that the likeliest law in the place of each effect follows.
 
     To first order a law may gain what it cannot: before one leads, it is refitted with the plant. At most as
     many as directions of a screening are."""
     scores = {keys: tried[keys].score for keys in physics}
     posterior = weigh(scores, physics, limits)
     if posterior.something < limits.name:
-        return posterior, Laws()
+        return posterior, Laws(), {}
     laws, odds_of = _found(case, tried, posterior, physics, limits)
 
     def score(at: tuple[Keys, Key]) -> float:
@@ -116,7 +129,8 @@ def weigh_laws(
             break
         laws[lead] = _refitted(case, tried[lead[0]].fitted, laws[lead])
     added = {at: score(at) for at in laws}
-    return weigh(scores, physics, limits, added), added
+    signal = {at[1]: laws[at].signal for at in sorted(laws, key=score)}
+    return weigh(scores, physics, limits, added), added, signal
 
 
 def _found(
@@ -135,8 +149,8 @@ def _found(
     likely = [keys for keys, p in zip(posterior.hypotheses, total, strict=False) if p < limits.set]
     least = limits.name if len(likely) > limits.beam else 0.0
     effects = {
-        e.key: e
-        for keys in likely
+        e.key: (e, tried[keys].fitted.plant)
+        for keys in reversed(likely)  # the likeliest is last, and stays
         for e in tried[keys].fitted.hypothesis.effects
         if e.key in standouts(physics[keys]) and posterior.effects[e.key] >= least and term_of(e.candidate)
     }
@@ -145,27 +159,25 @@ def _found(
         try:
             beside = Linearised(case, tried[keys].fitted)
             for key, e in effects.items():
-                law = beside.law(e.candidate)
+                law = beside.law(*e)
                 if law:
                     laws[keys, key] = law
         except (SimulationError, np.linalg.LinAlgError):
             continue
     where = places(case) if effects else {}
-    return laws, {key: odds((e,), where, limits) + np.log(limits.rare) for key, e in effects.items()}
+    return laws, {key: odds((e,), where, limits) + np.log(limits.rare) for key, (e, _) in effects.items()}
 
 
 def _refitted(case: Case, f: Fitted, law: UnknownLaw) -> UnknownLaw:
     """Return a law with its gain after a refit of the whole plant; minus infinity where that fails."""
-    squares = " + ".join(f"W{k}**2" for k in range(KNOTS))
+    squares = " + ".join(f"{p.name}**2" for p in law.candidate.effect.parameters)
     prior = ex.parse(f"({squares}) / {law.sd**2!r}")
     c = dataclasses.replace(law.candidate, effect=dataclasses.replace(law.candidate.effect, prior=prior))
     names = [p.name for p in c.effect.parameters]
     reach = REACH * law.sd
+    start = np.clip(law.start, -reach, reach).tolist()
     try:
-        plant = c.extend(
-            {n: float(np.clip(v, -reach, reach)) for n, v in zip(names, law.start, strict=True)},
-            dict.fromkeys(names, (-reach, reach)),
-        )
+        plant = c.extend(dict(zip(names, start, strict=True)), dict.fromkeys(names, (-reach, reach)))
         placed = Placed(c, {n: c.own(n) for n in names if c.own(n) in plant.parameters})
         found = fitted(case, plant, (*f.hypothesis.effects, placed), None, None, f)
     except (SimulationError, InputError, np.linalg.LinAlgError):
@@ -173,19 +185,20 @@ def _refitted(case: Case, f: Fitted, law: UnknownLaw) -> UnknownLaw:
     return dataclasses.replace(law, gain=found.log_evidence - f.log_evidence + law.average, refitted=True)
 
 
-def missing_law(posterior: Posterior, tried: Sequence[Weighed]) -> Missing:
-    """Return the probability that an unknown law is there, and where it most likely is."""
+def missing_law(posterior: Posterior, tried: Sequence[Weighed], signals: Mapping[Key, str]) -> Missing:
+    """Return the probability that an unknown law is there, and where it most likely is.
+
+    `signals`: those that laws follow, by the effect in whose place they are."""
     if not posterior.laws:
         return Missing()
     at = max(posterior.laws, key=lambda key: posterior.laws[key])
     c = next(e.candidate for w in tried for e in w.fitted.hypothesis.effects if e.key == at)
-    term, flow = term_of(c), c.rig.physics.flows.get(c.place.flow or "")
-    assert term is not None  # a law has one
+    flow = c.rig.physics.flows.get(c.place.flow or "")
     ends = (*c.place.nodes.values(), *((flow.source, flow.target) if flow else ()))
     return Missing(
         sum(posterior.laws.values()),
         next((n for n in ends if n), None),
-        f"something at {at[1]} depends on {term.signal} in a way that no effect explains",
+        f"something at {at[1]} depends on {signals[at]} in a way that no effect explains",
     )
 
 
@@ -199,56 +212,136 @@ class Linearised:
         self.at = [Trajectory(self.metric, self.rig, r) for r in range(len(self.metric.drives))]
         _, self.weight = self.metric.weighed(self.metric.residual)
 
-    def law(self, of: Candidate) -> UnknownLaw | None:
-        """Return an unknown law in an effect's place; None where it has no signal."""
-        term, place = term_of(of), of.place
+    def law(self, of: Placed, plant: Plant) -> UnknownLaw | None:
+        """Return the unknown law with the largest gain in the place of an effect, as it is in `plant`.
+
+        None where the effect has no signal."""
+        c, place = of.candidate, of.candidate.place
+        term = term_of(c)
         if place.output:  # other effects may have changed the reading
             now = self.rig.plant.outputs[place.output].value
             place = dataclasses.replace(place, symbols={**place.symbols, "y": now})
-        law = term and _law(dataclasses.replace(of, place=place, rig=self.rig), term, self.at)
-        if not law:
+        if term is None:
             return None
+        here = dataclasses.replace(c, place=place, rig=self.rig)
+        sizes = {n: plant.parameters[q].value for n, q in of.own.items()}
+        found = [
+            self._weighed(law, signal)
+            for signal, law in [
+                (term.signal, _law(here, term, self.at)),
+                *((s, _varied(x, sizes, s, self.at)) for s, x in _others(here, term)),
+            ]
+            if law
+        ]
+        if not found:
+            return None
+        best = max(found, key=lambda law: law.gain)
+        return dataclasses.replace(
+            best, gain=best.gain - np.log(len(found)), average=best.average - np.log(len(found))
+        )
+
+    def _weighed(self, law: Candidate, signal: str) -> UnknownLaw:
         (group,) = groups_of(law, self.metric)
-        rows = [rows for _, rows in directions(self.metric, self.at, group.columns())]
-        x = self.metric.project(np.concatenate(rows, axis=1) * self.metric.weight[:, None])
+        rows = np.concatenate([rows for _, rows in directions(self.metric, self.at, group.columns())], axis=1)
+        x = self.metric.project(rows * self.metric.weight[:, None])
         found = [evidence(self.metric, x * share, self.weight) for share in SHARES]
         scores = np.array([score for score, _ in found])
         k = int(np.argmax(scores))
         gain = float(logsumexp(scores) - np.log(len(SHARES)))
-        return UnknownLaw(law, gain, SHARES[k] * found[k][1], float(SHARES[k]), gain - float(scores[k]))
+        average = gain - float(scores[k])
+        return UnknownLaw(law, signal, gain, SHARES[k] * found[k][1], float(SHARES[k]), average)
 
 
 def _law(c: Candidate, term: Term, at: Sequence[Trajectory]) -> Candidate | None:
     """Return an unknown law in the place of an effect, None where its signal does not move."""
-    build = Builder(c, {}, {})
-    signal = np.concatenate([a.value(build.expression(term.signal), {}) for a in at])
-    low, high = float(signal.min()), float(signal.max())
-    if not np.isfinite(high - low) or high <= low:
+    hats = _hats(c, term.signal, at)
+    if hats is None:
         return None
-    width = (high - low) / (KNOTS - 1)
-    hats = " + ".join(
-        f"W{k} * max(1 - abs({term.signal} - ({low + k * width!r})) / {width!r}, 0)" for k in range(KNOTS)
-    )
+    law = _sum(hats)
     if term.kind in OWN:
-        what: Any = f"{OWN[term.kind]} * (1 + {hats})"
+        what: Any = f"{OWN[term.kind]} * (1 + {law})"
     else:
-        size = _size(c, term, build, at)
+        size = _size(c, term, Builder(c, {}, {}), at)
         if size <= 0:
             return None
         old = {"value": "y + ", "drive": "u + "}.get(term.kind, "")
-        what = f"{old}{size!r} * ({hats})"
+        what = f"{old}{size!r} * ({law})"
     if term.kind == "flow":
         what = {**term.ends, "rate": what}
+    return _replaced(c, ({term.kind: what},), KNOTS)
+
+
+def _varied(
+    c: Candidate, sizes: Mapping[str, float], signal: str, at: Sequence[Trajectory]
+) -> Candidate | None:
+    """Return a law by which the `sizes` of an effect follow a signal, None where it does not move."""
+    hats = _hats(c, signal, at)
+    known, count = {}, 0
+    for p in c.effect.parameters:
+        v = sizes.get(p.name, p.null)
+        known[p.name] = repr(v)
+        if hats and p.amplitude and v != p.null:
+            known[p.name] = f"({p.null!r} + {v - p.null!r} * ({_sum(hats, count)}))"
+            count += KNOTS
+    if not count:
+        return None
+    pattern = re.compile(rf"\b({'|'.join(known)})\b")
+
+    def told(what: Any) -> Any:
+        if isinstance(what, Mapping):
+            return {k: told(v) for k, v in what.items()}
+        return pattern.sub(lambda m: known[m[1]], what) if isinstance(what, str) else what
+
+    return _replaced(c, tuple(map(told, c.effect.changes[c.variant])), count)
+
+
+def _others(c: Candidate, term: Term) -> Iterator[tuple[str, Candidate]]:
+    """Yield further signals that the size of an effect may follow, and the effect that knows them."""
+    if term.kind == "rate" and "exponent" in c.effect.changes[c.variant][-1]:
+        return  # it has no size
+    read = set().union(*(ex.names(ex.parse(text)) for text in _texts(c.effect.changes[c.variant])))
+    for text, *needed in SIGNALS:
+        if text != term.signal and read.issuperset(needed):
+            yield text, c
+    v = c.place.nodes.get("v")
+    if v in c.rig.position_of and "x" not in read:
+        x = ex.name(c.rig.position_of[v])
+        yield "x", dataclasses.replace(c, symbols={**c.symbols, "x": x})
+
+
+def _texts(changes: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the forms of changes."""
+    for change in changes:
+        for kind, what in change.items():
+            if isinstance(what, Mapping):
+                yield str(what.get("rate", "0"))
+            elif kind != "straight":
+                yield str(what)
+
+
+def _hats(c: Candidate, signal: str, at: Sequence[Trajectory]) -> list[str] | None:
+    """Return the straight lines over the range of a signal, None where it does not move."""
+    values = np.concatenate([a.value(Builder(c, {}, {}).expression(signal), {}) for a in at])
+    low, high = float(values.min()), float(values.max())
+    if not np.isfinite(high - low) or high <= low:
+        return None
+    width = (high - low) / (KNOTS - 1)
+    return [f"max(1 - abs({signal} - ({low + k * width!r})) / {width!r}, 0)" for k in range(KNOTS)]
+
+
+def _sum(hats: Sequence[str], first: int = 0) -> str:
+    return " + ".join(f"W{first + k} * {hat}" for k, hat in enumerate(hats))
+
+
+def _replaced(c: Candidate, change: tuple[Mapping[str, Any], ...], count: int) -> Candidate:
+    """Return the candidate with another change, whose parameters are `count` amplitudes W0, W1, ..."""
+    trials = (ex.name(f"s{k + 1}" if k else "s") for k in range(count))
     parameters = tuple(
-        EffectParameter(
-            f"W{k}", "1", -np.inf, np.inf, 0.0, ex.name(f"s{k + 1}" if k else "s"), None, False, None, None
-        )
-        for k in range(KNOTS)
+        EffectParameter(f"W{k}", "1", -np.inf, np.inf, 0.0, trial, None, False, None, None)
+        for k, trial in enumerate(trials)
     )
-    dims = tuple(map(tuple, np.eye(KNOTS).tolist()))
-    law = Effect(
-        NAME, "", c.effect.where, c.effect.needs, (({term.kind: what},),), {}, parameters, dims, "", (), ""
-    )
+    dims = tuple(map(tuple, np.eye(count).tolist()))
+    law = Effect(NAME, "", c.effect.where, c.effect.needs, (change,), {}, parameters, dims, "", (), "")
     return dataclasses.replace(c, effect=law, variant=0)
 
 

@@ -222,7 +222,8 @@ def _why(result: Mapping[str, Any]) -> str:
     decision = result["decision"]
     rows = [(k, v) for k, v in decision.items() if k != "row"]
     meanings = {
-        "something": "probability that some effect is missing",
+        "something": "probability that some effect or an unknown law is missing",
+        "known": "probability that some effect is missing",
         "over_noise": "largest residual rms over its sensor's noise",
         "remains": "largest probability of a remainder at an output that does not rest on its rounding's steps",
         "worth": "held-out error with the findings over that of a refit alone (1: not measured)",
