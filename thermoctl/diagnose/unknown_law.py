@@ -15,8 +15,8 @@ in its place. The effect's fitted size follows the position there, or another si
 
     size sum_k w_k h_k(s2).
 
-All laws in the place of an effect share its prior odds. None follows the time: in a run that decays by itself
-it tells as much as any speed or temperature, and the right names were lost."""
+All laws in the place of an effect share its prior odds. None follows the time. In a run that decays by itself
+it tells as much as any speed or temperature does, and right names were lost."""
 
 from __future__ import annotations
 
