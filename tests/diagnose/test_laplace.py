@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp
@@ -49,6 +51,7 @@ PROBLEMS = {
     "linear": (HEATER, None, None, 0.0),
     "gain": (HEATER, "sensor_gain", {"A": 1.03}, 0.0),
     "lag": (HEATER, "sensor_lag", {"TAU": 12.0}, 0.0),
+    "delay": (HEATER, "sensor_delay", {"TD": 12.0}, 0.0),
     "onset": (HEATER, "conductance_step", {"A": 0.2, "T0": 900.0}, 0.0),
     "friction": (AXIS, "coulomb_friction", {"F": 0.3, "W": 0.002}, 0.0),
     "unknown input": (HEATER, "second_ambient", AMBIENT, 0.0),
@@ -114,6 +117,22 @@ def test_laplace_agrees_with_importance_sampling(name):
     # an unknown ambient has a valley, conductance times distance from the air, that is no Gaussian: 2 nats too much
     within = 2.5 if name == "unknown input" else 1.0
     assert found.log_evidence == pytest.approx(sampled, abs=within)
+
+
+def test_a_delay_has_a_size_whatever_the_range_in_which_it_is_looked_for():
+    """Uniform over 5 % of the recording, a delay of a sample had 8 nats less than the lag that fits as well."""
+    plant = loads(HEATER)
+    t = np.arange(0.0, 1800.0, 6.0)
+    inputs = {"heat": np.where(t % 900 < 450, 12.0, 3.0), "air": np.full(len(t), 21.0)}
+    table = _recording(plant, np.zeros(len(t)), 0, 0.0, inputs, t)
+    (model, own), c = _extended(plant, table, "sensor_delay", {"TD": 12.0})
+    table = _recording(plant, compile_plant(model).simulate(table).y[:, 0], 3, 0.0, inputs, t)
+    found = []
+    for high in (60.0, 600.0):
+        delay = dataclasses.replace(model.parameters[own["TD"]], range=(0.0, high))
+        wider = dataclasses.replace(model, parameters={**model.parameters, own["TD"]: delay})
+        found.append(fitted(case(plant, [table], catalogue(), Budget(9)), wider, (Placed(c, own),)))
+    assert found[0].log_evidence == pytest.approx(found[1].log_evidence, abs=0.1)
 
 
 def test_a_prior_of_the_catalogue_is_a_density():

@@ -204,7 +204,7 @@ def _led(posterior: Posterior, parent: float) -> np.ndarray:
     full = problem.start({})
     costs = [_cost(problem, full)]
     plant = posterior.plant.parameters
-    names = {problem.unknowns[k][0]: p for k, (_, p) in posterior.amplitudes.items()}
+    names = {problem.unknowns[k][0]: p for k, (_, p) in posterior.sizes.items() if p.amplitude}
     if costs[0] < parent or not names:
         return full
     small = problem.start({q: p.null + SHARE * (plant[q].value - p.null) for q, p in names.items()})
@@ -373,7 +373,7 @@ def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) ->
     out = posterior.prior(z)
     for precision, ks in ((posterior.precision, gaussian(posterior)), (stated, posterior.believed)):
         out += 0.5 * float(np.linalg.slogdet(precision[np.ix_(ks, ks)] / (2 * np.pi))[1])
-    for k, (_, p) in posterior.amplitudes.items():
+    for k, (_, p) in posterior.sizes.items():
         q = posterior.problem.unknowns[k][0]
         if k not in posterior.shared:
             value = float(values[0, posterior.model.parameters.index(q)])

@@ -128,7 +128,7 @@ class Posterior:
         for d in self.drives:
             self.model.prepare(d)
         self.problem = Problem(self.model, self.drives, case.noise)
-        self.amplitudes, self.mean, precision = _priors(case, self.problem, effects)
+        self.sizes, self.mean, precision = _priors(case, self.problem, effects)
         self.past = case.memory.of(frozenset(e.key for e in effects), plant)
         place = {q: k for k, (q, r) in enumerate(self.problem.unknowns) if r is None}
         self.shared = np.array([place[q] for q in self.past.unknowns], int)
@@ -307,7 +307,9 @@ def bounded_step(
 def _priors(
     case: Case, problem: Problem, effects: Sequence[Placed]
 ) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
-    """Which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian."""
+    """Return which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian.
+
+    A shape without which the effect is absent is a size, too (a delay), unless its range is logarithmic."""
     mean, precision = problem.z_plant.copy(), np.ones(len(problem.unknowns))
     own = {
         e.own[p.name]: (e.candidate, p)
@@ -322,7 +324,7 @@ def _priors(
             c, p = own[q]
             told = c.effect.prior is not None and p.name in ex.names(c.effect.prior)
             mean[k], precision[k] = 0.5, 1e-6 if told else 1e-4
-            if p.amplitude and not told:
+            if p.fades(c.effect.shapes) and not told and not (p.shape and problem.scales[q].log):
                 sizes[k] = own[q]
         elif q in case.plant.parameters:
             mean[k] = problem.scales[q].z(case.plant.parameters[q].value)
