@@ -32,6 +32,7 @@ from thermoctl.diagnose.catalogue import CATALOGUE, catalogue, contained
 from thermoctl.diagnose.decide import Key, Posterior, weigh
 from thermoctl.diagnose.limits import Limits, limits
 from thermoctl.diagnose.misfit import Energy, standing
+from thermoctl.diagnose.mistakes import MISTAKES
 from thermoctl.diagnose.odds import rare
 from thermoctl.plant import load
 from thermoctl.proof.rigs import RIGS, Rig
@@ -69,7 +70,7 @@ class Judged:
 
 def judged(plant: Path, result: Path, used: Limits) -> Judged:
     """Read one result, still without truths; `used`: the numbers that made it."""
-    entries = catalogue((CATALOGUE,))
+    entries = catalogue((CATALOGUE, MISTAKES))
     inputs = load(plant).inputs
     found = json.loads((result / "diagnosis.json").read_text())["hypotheses"]
     keyed = {frozenset(_key(e) for e in h["effects"]): h for h in found}
