@@ -309,7 +309,7 @@ def _priors(
 ) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
     """Return which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian.
 
-    A shape without which the effect is absent is a size, too (a delay), unless its range is logarithmic."""
+    A delay is a size, too."""
     mean, precision = problem.z_plant.copy(), np.ones(len(problem.unknowns))
     own = {
         e.own[p.name]: (e.candidate, p)
@@ -324,7 +324,7 @@ def _priors(
             c, p = own[q]
             told = c.effect.prior is not None and p.name in ex.names(c.effect.prior)
             mean[k], precision[k] = 0.5, 1e-6 if told else 1e-4
-            if p.fades(c.effect.shapes) and not told and not (p.shape and problem.scales[q].log):
+            if (p.amplitude or c.effect.shapes.get(p.shape or "") == "delays") and not told:
                 sizes[k] = own[q]
         elif q in case.plant.parameters:
             mean[k] = problem.scales[q].z(case.plant.parameters[q].value)

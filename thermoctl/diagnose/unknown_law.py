@@ -42,7 +42,7 @@ from thermoctl.diagnose.overlay import Trajectory
 from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.screen import directions, groups_of
 from thermoctl.diagnose.screening import ROWS, Plain, Rows, places
-from thermoctl.diagnose.search import Keys, Weighed
+from thermoctl.diagnose.search import BEATEN, Keys, Weighed
 from thermoctl.diagnose.unknown_flow import SHARES, Missing, evidence
 from thermoctl.diagnose.where import typical_flow
 from thermoctl.plant import expression as ex
@@ -112,8 +112,8 @@ def weigh_laws(
 
     Also the signal that the likeliest law in the place of each effect follows.
 
-    To first order a law may gain what it cannot: before one leads, it is refitted with the plant. At most as
-    many as directions of a screening are."""
+    To first order a law may gain more than it can, or less where it is large. So where one leads, it and those
+    near it are refitted with the plant. At most as many as directions of a screening are."""
     scores = {keys: tried[keys].score for keys in physics}
     posterior = weigh(scores, physics, limits)
     if posterior.something < limits.name:
@@ -125,9 +125,13 @@ def weigh_laws(
 
     for _ in range(limits.shortlist):
         lead = max(laws, key=score, default=None)
-        if lead is None or laws[lead].refitted or score(lead) < max(scores.values()):
+        if lead is None or score(lead) < max(scores.values()):
             break
-        laws[lead] = _refitted(case, tried[lead[0]].fitted, laws[lead])
+        near = [at for at in laws if not laws[at].refitted and score(at) >= score(lead) - BEATEN]
+        if not near:
+            break
+        at = max(near, key=score)
+        laws[at] = _refitted(case, tried[at[0]].fitted, laws[at])
     added = {at: score(at) for at in laws}
     signal = {at[1]: laws[at].signal for at in sorted(laws, key=score)}
     return weigh(scores, physics, limits, added), added, signal
