@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from scipy.optimize import lsq_linear
+from scipy.optimize import least_squares
 
 from tests.concealed import sensors
 from tests.concealed.judge import BANDS, TELL_APART, Judge, beyond, snr
@@ -44,8 +44,7 @@ _PERIOD += "one one pair one none one one none one none one unknown one one none
 KINDS = tuple(_PERIOD.split())
 ATTEMPTS = 24
 STEP = 2e-4  # of a parameter's range, for the derivatives by which a refit is judged
-REFIT = 4  # steps of Gauss and Newton that an honest refit may take
-STRIDES = (1.0, 0.6, 0.3, 0.1)  # lengths of a step that are tried
+CONVERGED = 1e-3  # of an honest refit: relative change of its sum of squares, and of its unknowns
 RESIZED = 3  # times a size is chosen again because a refit from the truth's model leaves another signal than a straight one
 ROOM = 20e6  # numbers that the rivals measured at a time may fill: a large rig's signals are hundreds of megabytes
 FIXED = (
@@ -197,35 +196,18 @@ class Bench:
         walls = np.full((2, free), [[-np.inf], [np.inf]])
         for j, (p, (low, high)) in enumerate(scene.ranges.items()):
             walls[:, j] = (
-                np.array([min(low - scene.theta[p], 0), max(high - scene.theta[p], 0)]) * 4 / (high - low)
+                (low - scene.theta[p]) * 4 / (high - low),
+                (high - scene.theta[p]) * 4 / (high - low),
             )
-        x, slope = np.zeros(free), self.derivatives
-        left = self._whitened(readings, [b[None] for b in self.base])[0]
-        cost = float(snr(left))
-        for _ in range(REFIT):
-            # least squares of  left - slope' step  and of the ridge  x + step,  on the triangle of a QR decomposition
-            wide = np.concatenate(
-                [np.concatenate([slope, -np.eye(free)], axis=1).T, np.append(left, x)[:, None]], axis=1
-            )
-            triangle = np.linalg.qr(wide, mode="r")
-            step = lsq_linear(
-                triangle[:-1, :-1], triangle[:-1, -1], (walls[0] - x - 1e-9, walls[1] - x + 1e-9)
-            ).x
-            hoped = float(np.linalg.norm(triangle[:, -1] - triangle[:, :-1] @ step))
-            trial = [x + a * step for a in STRIDES]
-            rows = self._whitened(readings, self._at(trial))
-            costs = np.nan_to_num(
-                np.hypot(snr(rows), snr(np.array(trial))), nan=np.inf
-            )  # a step may run away
-            best = int(np.argmin(costs))
-            if not costs[best] < cost:
-                break
-            gain, cost = cost - costs[best], float(costs[best])
-            x, left = trial[best], rows[best]
-            if cost < 1.03 * hoped or gain < 0.05 * cost:
-                break
-            _, slope = self.tangents(x)
-        return np.append(left, -x)
+
+        def off(x: np.ndarray) -> np.ndarray:
+            return np.append(self._whitened(readings, self._at([x]))[0], x)
+
+        def slopes(x: np.ndarray) -> np.ndarray:
+            return np.concatenate([-self.tangents(x)[1], np.eye(free)], axis=1).T
+
+        found = least_squares(off, np.zeros(free), slopes, walls, ftol=CONVERGED, xtol=CONVERGED)
+        return np.append(found.fun[:-free], -found.x)
 
     def beyond_rivals(self, signals: list[np.ndarray], onsets: int = 1) -> list[list[tuple[Suspect, float]]]:
         """For each left-over signal (M,): every suspect of the rig at a place, and what it would leave of the signal.

@@ -139,17 +139,30 @@ def test_what_a_refit_leaves_does_not_hang_on_the_step_of_its_derivatives(family
     assert np.allclose(*found, rtol=0.05)
 
 
-@pytest.mark.parametrize("family", ["tanks", "heater"])
-def test_an_honest_refit_leaves_what_scipy_leaves(family):
-    """Of a large effect and moved parameters: the same sigmas as least squares of scipy's own, and never more than the
-    moved parameters themselves are worth where nothing is missing."""
+@pytest.mark.parametrize("family", ["tanks", "heater", "stage"])
+def test_an_honest_refit_finds_parameters_wherever_they_are(family):
+    """Where nothing is missing it leaves no more than the moved parameters themselves are worth.
+
+    Four steps of Gauss and Newton left 1797 sigmas of a heater whose parameters were 1.4 quarters of a range off."""
+    scene = generate.FAMILIES[family].scene(np.random.default_rng(7), "designed", True)
+    bench = generate.Bench(scene, np.random.default_rng(7))
+    bench.measure([])
+    free = len(bench.derivatives)
+    ends = [[(r[i] - scene.theta[p]) * 4 / (r[1] - r[0]) for p, r in scene.ranges.items()] for i in (0, 1)]
+    for seed in range(2):
+        moved = np.random.default_rng(seed).uniform(0.7 * np.array(ends[0]), 0.7 * np.array(ends[1]))
+        moved = np.append(moved, np.zeros(free - len(moved)))
+        left = bench.refit([y[0] for y in bench._at([moved])])
+        assert snr(left) < np.linalg.norm(moved) + 0.05
+
+
+def test_an_honest_refit_leaves_what_least_squares_leave_without_its_slopes(family="tanks"):
+    """Of a large effect and moved parameters: the same sigmas as with derivatives by scipy's own differences."""
     scene = generate.FAMILIES[family].scene(np.random.default_rng(7), "designed", True)
     bench = generate.Bench(scene, np.random.default_rng(7))
     bench.measure([])
     free, n = len(bench.derivatives), len(scene.ranges)
-    moved = np.append(np.full(n, 0.3), np.zeros(free - n))
-    assert snr(bench.refit([y[0] for y in bench._at([moved])])) < np.linalg.norm(moved) + 0.3
-    s = next(x for x in scene.suspects if x.effect in ("orifice_exponent", "radiation"))
+    s = next(x for x in scene.suspects if x.effect == "orifice_exponent")
     readings = bench.readings([(s.effect, s.where, s.make(s.top))])
 
     def residual(x):
