@@ -112,8 +112,8 @@ def weigh_laws(
 
     Also the signal that the likeliest law in the place of each effect follows.
 
-    To first order a law may gain more than it can, or less where it is large. So where one leads, it and
-    those near it are refitted with the plant. At most as many as directions of a screening are."""
+    To first order a law may gain more than it can, or less where it is large. So where one leads, it, those near
+    it, and the same one without its effect are refitted. At most as many as directions of a screening are."""
     scores = {keys: tried[keys].score for keys in physics}
     posterior = weigh(scores, physics, limits)
     if posterior.something < limits.name:
@@ -127,7 +127,12 @@ def weigh_laws(
         lead = max(laws, key=score, default=None)
         if lead is None or score(lead) < max(scores.values()):
             break
-        near = [at for at in laws if not laws[at].refitted and score(at) >= score(lead) - BEATEN]
+        alone = lead[0] - {lead[1]}, lead[1]
+        near = [
+            at
+            for at, law in laws.items()
+            if not law.refitted and (at == alone or score(at) >= score(lead) - BEATEN)
+        ]
         if not near:
             break
         at = max(near, key=score)
