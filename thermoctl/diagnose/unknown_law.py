@@ -113,7 +113,7 @@ def weigh_laws(
     Also the signal that the likeliest law in the place of each effect follows.
 
     To first order a law may gain more than it can, or less where it is large. So where one leads, it, those
-    near it, and the same one without its effect are refitted. At most as many as directions of a screening."""
+    near it, and the same one without its effect are refitted. At most as many as a screening's directions."""
     scores = {keys: tried[keys].score for keys in physics}
     posterior = weigh(scores, physics, limits)
     if posterior.something < limits.name:
