@@ -161,6 +161,7 @@ class Builder:
         """A form of the catalogue with its symbols filled in."""
 
         def change(e: Expr) -> Expr | None:
+            """Return the plant's expression for a symbol of the form."""
             return self.symbols.get(e.value) if e.op == "name" else None
 
         return ex.substitute(_form(text), change)
@@ -223,6 +224,7 @@ class Builder:
             return
 
         def change(e: Expr) -> Expr | None:
+            """Return the changed reading in the place of the recorded input."""
             return new if e.op == "name" and e.value == p.input else None
 
         # The start stays as read: an expression of the first sample knows no node, no time and no delay.
@@ -250,6 +252,7 @@ class Builder:
             spread = spread or self._spread_at_start(source)
 
             def start(e: Expr) -> Expr | None:
+                """Return the start of a node; zero for the time; a delayed signal as it is."""
                 return (
                     self.base.nodes[e.value].initial
                     if e.op == "name" and e.value in self.base.nodes
@@ -286,6 +289,7 @@ class Builder:
         A sensor's lag is short against a sample, and would otherwise be a sample late."""
 
         def change(e: Expr) -> Expr | None:
+            """Return the twin of a held input, which goes on straight lines."""
             i = self.base.inputs.get(e.value) if e.op == "name" else None
             if i is None or i.linear:
                 return None
@@ -338,6 +342,7 @@ class Builder:
         ohms = [q for q, p in self.base.parameters.items() if p.unit and re.search(r"ohm", p.unit, re.I)]
 
         def change(e: Expr) -> Expr | None:
+            """Return the form in the place of a resistance."""
             if e.op == "name" and e.value in ohms:
                 self.symbols["R"] = e
                 return self.expression(form)

@@ -53,6 +53,7 @@ class Candidate(Placement):
             }
 
             def told(e: Expr, known: Mapping[str, Expr] = known) -> Expr | None:
+                """Return the plant's expression for a name of the catalogue's prior."""
                 return known.get(str(e.value)) if e.op == "name" else None
 
             out.append(Prior(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, told))))

@@ -131,6 +131,7 @@ class Effect:
             return None
 
         def told(p: EffectParameter) -> EffectParameter:
+            """Return the parameter with the outlet's exponent as its null value."""
             if p.origin != "exponent" or p.trial is None:
                 return p
             known = {"exponent": ex.num(exponent)}
@@ -168,6 +169,7 @@ def _read(root: yamlfile.Node) -> Effect:
     top = _checked(root)
 
     def plain(key: str, default: Any = ()) -> Any:
+        """Return the value of a key, or the default."""
         return top[key].plain() if key in top else default
 
     shapes = plain("shapes", {})

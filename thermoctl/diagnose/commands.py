@@ -79,6 +79,7 @@ def on_interrupt() -> Iterator[Callable[[], bool]]:
         return
 
     def ask(*_: object) -> None:
+        """Let the search end after the present refit; the next Ctrl-C ends the program."""
         asked.set()
         signal.signal(signal.SIGINT, before)
         print(
@@ -116,6 +117,7 @@ def diagnose(args: argparse.Namespace) -> int:
         )
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
+        """Diagnose the recordings given, and those that the experiments added."""
         added = read_recordings(plant, recordings[len(given) :])  # of --resolve: written by thermoctl
         return _run(args, plant, [*given, *added], held_out)
 

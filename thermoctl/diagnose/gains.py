@@ -177,9 +177,11 @@ def _plausible(
     known = {"first_air": c.rig.first_air(c.rig.drives[0]), "duration": c.rig.duration}
 
     def at(log_size: float) -> np.ndarray:
+        """Return the coefficients (columns,) at a size of the first one."""
         return np.asarray(coefficient + step * (np.exp(log_size) - size) / variance)
 
     def surprise(log_size: float) -> float:
+        """Return -2 log of how likely the amplitudes are at a size, up to a constant."""
         sizes = dims.T @ at(log_size)
         values = {**parameter_values(c, shape, list(sizes)), **known}
         unlikely = float(ex.evaluate(prior, values)) + 2 * (len(sizes) - 1) * log_size

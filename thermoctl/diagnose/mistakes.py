@@ -45,6 +45,7 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
     best = sorted((min(s, key=lambda x: x[0]) for s in starts.values()), key=lambda x: x[0])
 
     def refitted(start: tuple[float, Plant, Placed]) -> Fitted | None:
+        """Return the refit from a start; None where it fails or the search was stopped."""
         _, plant, placed = start
         try:
             return None if case.budget.stopped() else fitted(case, plant, (placed,), parent=null)

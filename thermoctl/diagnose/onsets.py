@@ -34,6 +34,7 @@ def moved(case: Case, plant: Plant, effects: Sequence[Placed], found: Fit) -> Pl
     sample = min(float(np.median(np.diff(d.t))) for d in drives)
 
     def cost(z: np.ndarray) -> float:
+        """Return the cost of the unknowns z; infinite where the simulation fails."""
         try:
             return problem.evaluate(z, False).cost
         except SimulationError:

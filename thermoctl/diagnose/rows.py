@@ -149,6 +149,7 @@ def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse:
     whole = _information(columns, d, np.arange(len(d.t)), 1, prior)
 
     def enough(b: int) -> bool:
+        """Return whether means of b rows keep the information on each unknown."""
         if not _allowed(d, b):
             return False
         return bool((_information(columns, d, _starts(d, b), b, prior) >= whole / WIDER**2).all())

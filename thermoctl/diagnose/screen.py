@@ -191,6 +191,7 @@ def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> 
 
     @cache
     def overlay() -> Overlay:  # of every group: only the values differ
+        """Return the candidate laid over the plant."""
         return Overlay(c.rig.plant, c.extend(_values(c, *sizes[0][0])))
 
     return [Group(c, ("all",) if windowed else (g,), part, overlay) for g, part in enumerate(sizes)]

@@ -47,6 +47,7 @@ def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
     """Return the simpler entries at the same places, to try without an insignificant part."""
 
     def is_simpler(d: Direction, a: Direction) -> bool:
+        """Return whether d is the simpler effect at the place of a."""
         new, old = d.candidate.effect, a.candidate.effect
         fewer = len(new.parameters) < len(old.parameters)
         return d.candidate.place.where == a.candidate.place.where and (fewer or new.name == old.contains)

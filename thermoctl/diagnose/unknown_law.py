@@ -121,6 +121,7 @@ def weigh_laws(
     laws, odds_of = _found(case, tried, posterior, physics, limits)
 
     def score(at: tuple[Keys, Key]) -> float:
+        """Return the log evidence with a law, prior odds included."""
         return float(scores[at[0]] + laws[at].gain + odds_of[at[1]])
 
     for _ in range(limits.shortlist):
@@ -297,6 +298,7 @@ def _varied(
     pattern = re.compile(rf"\b({'|'.join(known)})\b")
 
     def told(what: Any) -> Any:
+        """Return a change with the sizes' laws in the place of their names."""
         if isinstance(what, Mapping):
             return {k: told(v) for k, v in what.items()}
         return pattern.sub(lambda m: known[m[1]], what) if isinstance(what, str) else what

@@ -196,6 +196,7 @@ class _Trial:
 
     @property
     def bits_per_second(self) -> float:
+        """Return the information by time."""
         return self.bits / self.excitation.duration_s
 
 

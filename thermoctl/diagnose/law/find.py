@@ -158,6 +158,7 @@ def _refits(
     gain, ratio, leader, left = 0.0, 1.0, parent, affordable(case, parent)
 
     def wanted(p: Proposal) -> bool:
+        """Return whether a law may still win, and a refit is left for it."""
         nonlocal left
         if not left or case.budget.stopped() or p.cost + gain > HALF * ratio * p.promise:
             return False

@@ -106,6 +106,7 @@ def _energies(case: Case, value: Worth, noise: float = 0.0) -> tuple[float, floa
     sigma = {o.name: case.noise[j].sigma for j, o in enumerate(case.plant.outputs.values())}
 
     def energy(rms: Mapping[str, float]) -> float:
+        """Return the energy beyond the noise, summed over outputs."""
         return sum(max((rms.get(o, np.inf) / sigma[o]) ** 2 - noise, 0.0) for o in value.refit_only)
 
     return energy(value.refit_only), energy(value.after)

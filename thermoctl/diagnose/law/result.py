@@ -191,6 +191,7 @@ def _general(change: Mapping[str, Any], swap: Any, ends: Mapping[str, str]) -> d
     """Return a change of an effect with the symbols of an effect file."""
 
     def told(text: str) -> str:
+        """Return an expression with the names that a reader knows."""
         return str(ex.substitute(ex.parse(text), swap))
 
     ((kind, what),) = change.items()

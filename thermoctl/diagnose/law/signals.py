@@ -89,6 +89,7 @@ def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal
     near = [*place.nodes, *(rig.pairs[n] for n in place.nodes if n in rig.pairs)]
 
     def absolute(n: str, unit: str | None) -> None:
+        """Add a node or an input as a signal."""
         if unit in TEMPERATURE:
             out.append(Signal(n, name(n), "K", kelvin=273.15 - zero_of(unit)))
         else:
@@ -96,6 +97,7 @@ def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal
             out.append(Signal(n, name(n), unit, position=n in positions, drives=own, recorded=n in p.inputs))
 
     def difference(a: str, b: str) -> None:
+        """Add the difference of two nodes as a signal."""
         unit = _difference(p.nodes[a].unit)
         drives = place.part == "flow"
         out.append(Signal(f"{a} - {b}", ex.add(name(a), ex.neg(name(b))), unit, drives=drives))

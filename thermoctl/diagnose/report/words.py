@@ -123,6 +123,7 @@ def _worst(found: Result) -> str | None:
     fit, noise = found["fit"], {o: x["noise"] for o, x in found["outputs"].items()}
 
     def size(o: str) -> float:
+        """Return the squared error that an output loses, over its noise."""
         refit, after = fit["refit_only"].get(o) or 0.0, fit["after"].get(o) or 0.0
         gain = refit**2 - after**2 if found["findings"] else refit**2
         return float(gain / noise[o] ** 2) if noise[o] else 0.0
@@ -134,6 +135,7 @@ def _gain(found: Result, output: str) -> str:
     fit = found["fit"]
 
     def of(key: str) -> str:
+        """Return an error of the output, with its unit."""
         return amount(found, output, fit[key].get(output))
 
     text = (
