@@ -13,8 +13,9 @@ honest linear refit (where nothing is concealed: ALONE sigmas), in the judge's m
     slow reference a sensor answers with a short first-order lag
     bend           a sensor's scale is bent over its range
 
-Three more cannot be scaled and come by chance: a stated noise that is wrong by up to two, a clock that jitters, a
-converter whose steps the plant file does not state.
+Three more come by chance: a stated noise that is wrong by up to two, a converter whose steps the plant file does not
+state, and a clock that jitters. An axis integrates its input over wrong times, so the clock's error is kept below the
+largest share, too.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from tests.concealed.thermal import Variant
 
 SHARE = (0.03, 0.5)  # of the effect's signal; ../shared/design/one_evidence.md, the proof in an open world
 ALONE = (1.5, 15.0)  # sigmas left by the misfits where nothing is concealed
+JITTER = 0.02  # of a sampling period
 TOP = 8.0  # times its typical size that a misfit may have; beyond, it would be the rig's main physics
 STEPS = 8  # times the common size is chosen again, since misfits are not linear in it
 DRIVES = ("drive", "pump", "current")  # a rig's driving input where its heat is not given ready-made
@@ -199,17 +201,34 @@ def open_world(
             o: {**x, "noise": float(f"{x['noise'] * factor[o]:.3g}")} for o, x in plant["outputs"].items()
         }
         plant = {**plant, "outputs": outputs}
-    jitter = float(rng.random() < 0.2) * 0.02
+    jitter = float(rng.random() < 0.2) * JITTER
+    late = _late(scene, bench, jitter, rng) if jitter else 0.0
+    jitter *= min(1.0, high * (signal or 1.0) / max(late, 1e-6))
     coarse = np.where(rng.random(len(scene.outputs)) < 0.2, 1.5 * scene.sd, 0.0)
     told = {
         "misfits": [[m.kind, m.where] for m in chosen],
         "misfit_size": float(f"{size:.4g}"),
         "misfit_snr": round(left, 2),
         "wrong_noise": {o: round(f, 2) for o, f in factor.items()} if wrong_noise else {},
-        "clock_jitter": jitter,
+        "clock_jitter": float(f"{jitter:.4g}"),
+        "clock_snr": round(min(late, high * (signal or 1.0)), 2),
         "hidden_steps": {o: float(f"{s:.4g}") for o, s in zip(scene.outputs, coarse, strict=True) if s},
     }
     return World(world, plant, jitter, np.maximum(coarse, scene.resolution), told)
+
+
+def _late(scene: Scene, bench, share: float, rng: np.random.Generator) -> float:
+    """Sigmas of the readings' error that a refit leaves where the truth runs on the recorded times."""
+    plain, kept = bench.readings([]), [run["t"] for run in scene.runs]
+    try:
+        for run in scene.runs:
+            run["t"] = jittered(run["t"], share, rng)
+        moved = bench.readings([])
+    finally:
+        for run, t in zip(scene.runs, kept, strict=True):
+            run["t"] = t
+    delta = [(a - b)[None] for a, b in zip(moved, plain, strict=True)]
+    return float(snr(bench.judge.left_over(bench.judge.whiten(delta)))[0])
 
 
 def jittered(t: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 
 from tests.concealed.generate import Bench
 from tests.concealed.judge import snr
-from tests.concealed.open_world import TOP, misfits_of, open_world, readings
+from tests.concealed.open_world import JITTER, TOP, _late, misfits_of, open_world, readings
 from tests.concealed.rigs_motion import FreeStage
 from tests.concealed.rigs_thermal import Heater
 
@@ -36,6 +36,21 @@ def test_misfits_leave_the_share_that_was_asked(family, signal):
             np.testing.assert_array_equal(run[key], before[column])
     again = open_world(scene, bench, [], plain, signal, np.random.default_rng(6))
     np.testing.assert_array_equal(world.runs[0], again.runs[0])
+
+
+def test_a_clock_that_jitters_makes_no_larger_misfit_than_was_asked():
+    """2 % of a period at random: an axis integrates its force over wrong times, and errs by hundreds of sigmas."""
+    scene = FreeStage().scene(np.random.default_rng(4), "designed", True)
+    bench = Bench(scene, np.random.default_rng(5))
+    bench.measure([])
+    plain, t = bench.readings([]), scene.runs[0]["t"]
+    late = _late(scene, bench, JITTER, np.random.default_rng(8))
+    assert late > 20.0
+    assert _late(scene, bench, JITTER / 10, np.random.default_rng(8)) == pytest.approx(late / 10, rel=0.2)
+    worlds = (open_world(scene, bench, [], plain, 10.0, np.random.default_rng(seed)) for seed in range(40))
+    world = next(w for w in worlds if w.clock_jitter)
+    assert world.clock_jitter < JITTER and world.told["clock_snr"] == 5.0
+    assert scene.runs[0]["t"] is t
 
 
 def test_every_misfit_of_a_heater_changes_its_readings():
