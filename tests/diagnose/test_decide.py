@@ -8,7 +8,7 @@ import pytest
 
 from thermoctl.diagnose.decide import Facts, decide, weigh
 from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.misfit import Energy, physics, standing
+from thermoctl.diagnose.misfit import Energy, physics, standing, supported
 
 A, B = ("radiation", "block"), ("natural_convection", "block")
 NOTHING, ONE, OTHER, BOTH = frozenset(), frozenset({A}), frozenset({B}), frozenset({A, B})
@@ -103,6 +103,19 @@ def test_an_effect_is_the_simpler_one_that_it_contains_unless_it_stands_out_agai
     assert frozenset({a}) in standing(energy, dims, {}, limits())
     energy[frozenset({a})] = one(2.0, 0.4)
     assert frozenset({a}) in standing(energy, dims, contains, limits())
+
+
+def test_of_two_effects_that_explain_the_same_the_stronger_one_is_supported():
+    c = ("sensor_lag", "block")
+    found = {
+        frozenset({A, B, c}): {A: 0.49, B: 0.21, c: 0.99},
+        frozenset({A, c}): {A: 0.99, c: 0.99},
+        frozenset({c}): {c: 0.65},
+    }
+    assert supported(frozenset({A, B, c}), found) == {A, c}
+    del found[frozenset({A, c})]  # it was not tried
+    assert supported(frozenset({A, B, c}), found) == {c}
+    assert supported(frozenset({c}), found) == {c}
 
 
 def test_without_a_misfit_every_effect_stands():

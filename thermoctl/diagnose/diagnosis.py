@@ -15,7 +15,7 @@ from thermoctl.diagnose.law.smooth import missing_flow
 from thermoctl.diagnose.levels import remainder
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, Memory
-from thermoctl.diagnose.misfit import energies, standing, standouts
+from thermoctl.diagnose.misfit import energies, standing, supported
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.diagnose.search import Searched, search
 from thermoctl.diagnose.threads import one_thread
@@ -77,7 +77,7 @@ def _decided(
     best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
     if posterior.something >= numbers.name and 2 * posterior.known >= posterior.something:
         likeliest = next(keys for keys in posterior.hypotheses if keys)
-        stand = standouts(physics[likeliest])  # the other effects are part of the remainder
+        stand = supported(likeliest, physics)  # the other effects are part of the remainder
         best = with_residuals(known, fits.get(stand, fits[likeliest]))
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)

@@ -98,6 +98,22 @@ def standouts(of: Mapping[Key, float]) -> frozenset[Key]:
     return frozenset(key for key, p in of.items() if p > MISFIT)
 
 
+def supported(
+    likeliest: frozenset[Key], found: Mapping[frozenset[Key], Mapping[Key, float]]
+) -> frozenset[Key]:
+    """Return the effects of a hypothesis without those that are rather a misfit.
+
+    The weakest is left out first. Of two that explain the same, neither stands out beside the other, and the
+    stronger one does without it. `found`: as of `standing`."""
+    keys = likeliest
+    while own := found.get(keys, {}):
+        weakest = min(own, key=lambda key: own[key])
+        if own[weakest] > MISFIT:
+            return keys
+        keys = keys - {weakest}
+    return standouts(found[likeliest])
+
+
 def physics(without: Energy, beside: Energy, share: float) -> float:
     """Return the probability that an effect is physics, from the energies without it and beside it."""
     if not any(beside.misfit):
