@@ -16,7 +16,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -143,11 +143,6 @@ class Bench:
             for row in starts
         ]
 
-    def _at(self, points: list[np.ndarray]) -> list[np.ndarray]:
-        """Noiseless readings (m, N, ny) by run at these parameters and starts."""
-        rows = [self._variants(x) for x in points]
-        return [self.scene.outputs_of(k, [r[k] for r in rows]) for k in range(len(self.scene.runs))]
-
     def tangents(self, x: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
         """Readings (N, ny) by run at x (np,), and their whitened derivatives (np, M) by the parameters and by the starts of
         each run."""
@@ -168,9 +163,9 @@ class Bench:
             )
         return base, np.concatenate(whole)
 
-    def _whitened(self, readings: list[np.ndarray], models: list[np.ndarray]) -> np.ndarray:
-        """Whitened differences (m, M) of readings (N, ny by run) from each of the models' rows (m, N, ny)."""
-        return self.judge.whiten([y - m for y, m in zip(readings, models, strict=True)])
+    def off(self, readings: list[np.ndarray], model: list[np.ndarray]) -> np.ndarray:
+        """Whitened difference (M,) of readings from a model's (both (N, ny) by run)."""
+        return self.judge.whiten([(y - m)[None] for y, m in zip(readings, model, strict=True)])[0]
 
     def measure(self, pool: list[Suspect]) -> None:
         """What a straight refit leaves of each of `pool` at SIZES (`curve`: suspect, sizes, rows)."""
@@ -200,13 +195,20 @@ class Bench:
                 (high - scene.theta[p]) * 4 / (high - low),
             )
 
-        def off(x: np.ndarray) -> np.ndarray:
-            return np.append(self._whitened(readings, self._at([x]))[0], x)
+        @lru_cache(maxsize=1)
+        def at(x: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+            # a truth takes as long for one variant as for thirty: the slopes come with the readings
+            base, slopes = self.tangents(np.array(x))
+            return np.append(self.off(readings, base), x), np.concatenate([-slopes, np.eye(free)], axis=1).T
 
-        def slopes(x: np.ndarray) -> np.ndarray:
-            return np.concatenate([-self.tangents(x)[1], np.eye(free)], axis=1).T
-
-        found = least_squares(off, np.zeros(free), slopes, walls, ftol=CONVERGED, xtol=CONVERGED)
+        found = least_squares(
+            lambda x: at(tuple(x))[0],
+            np.zeros(free),
+            lambda x: at(tuple(x))[1],
+            walls,
+            ftol=CONVERGED,
+            xtol=CONVERGED,
+        )
         return np.append(found.fun[:-free], -found.x)
 
     def beyond_rivals(self, signals: list[np.ndarray], onsets: int = 1) -> list[list[tuple[Suspect, float]]]:

@@ -152,7 +152,7 @@ def test_an_honest_refit_finds_parameters_wherever_they_are(family):
     for seed in range(2):
         moved = np.random.default_rng(seed).uniform(0.7 * np.array(ends[0]), 0.7 * np.array(ends[1]))
         moved = np.append(moved, np.zeros(free - len(moved)))
-        left = bench.refit([y[0] for y in bench._at([moved])])
+        left = bench.refit(bench.tangents(moved)[0])
         assert snr(left) < np.linalg.norm(moved) + 0.05
 
 
@@ -167,7 +167,7 @@ def test_an_honest_refit_leaves_what_least_squares_leave_without_its_slopes(fami
     readings = bench.readings([(s.effect, s.where, s.make(s.top))])
 
     def residual(x):
-        return np.append(bench._whitened(readings, bench._at([x]))[0], x)
+        return np.append(bench.off(readings, bench.tangents(x)[0]), x)
 
     walls = [
         np.array(
