@@ -213,10 +213,11 @@ def friction_suspects(force: float, pace: float, travel: float) -> list[Suspect]
     ]
 
 
-def drive_suspects(force: float, drive: float, period: float, travel: float) -> list[Suspect]:
-    """Faults of the motor and its amplifier at the flow `motor`; `drive` is the usual input."""
+def drive_suspects(drive: float, runs: list[dict], period: float, travel: float) -> list[Suspect]:
+    """Faults of the motor and its amplifier at the flow `motor`; `drive` is the usual input, in `runs` it is recorded."""
+    peak = max(float(np.abs(run["drive"]).max()) for run in runs)
     return [
-        Suspect("actuator_saturation", "motor", lambda s: {"U": drive * max(1.25 - 0.25 * s, 0.3)}, top=3),
+        Suspect("actuator_saturation", "motor", lambda s: {"U": peak * max(1 - 0.25 * s, 0.3)}, top=3),
         Suspect("actuator_dead_zone", "motor", lambda s: {"U": 0.08 * drive * s}, top=5),
         Suspect("actuator_delay", "motor", lambda s: {"TD": 4 * period * s}, top=5),
         Suspect("position_dependent_force_constant", "motor", lambda s: {"A": 0.2 / travel**2 * s}, top=3),
@@ -300,7 +301,7 @@ class FreeStage:
             return out
 
         pace, travel, force = 0.15, 0.3, 32 * size * 1.2
-        suspects = friction_suspects(force, pace, travel) + drive_suspects(force, 1.5, period, travel)
+        suspects = friction_suspects(force, pace, travel) + drive_suspects(1.5, runs, period, travel)
         if not damped:
             suspects = [s for s in suspects if s.effect not in ("directional_friction", "stribeck_friction")]
             suspects.append(Suspect("viscous_friction", "velocity", lambda s: {"B": 60 * size * s}))
@@ -461,7 +462,7 @@ class Flexure:
 
         span = runs[0]["t"][-1]
         force, travel, pace = 12.0, 0.01, 0.08
-        suspects = friction_suspects(force * 0.4, pace, travel) + drive_suspects(force, 1.6, period, travel)
+        suspects = friction_suspects(force * 0.4, pace, travel) + drive_suspects(1.6, runs, period, travel)
         suspects.append(Suspect("creep", "velocity", lambda s: {"K": 120.0 * s, "TAU": 3.0}, top=4))
         suspects.append(Suspect("force_constant_temperature", "motor", lambda s: {"B": 0.0012 * s}, top=6))
         for effect, suspect in {
