@@ -131,7 +131,12 @@ def test_in_the_open_world_strays_count_and_a_partly_explained_name_is_a_name():
     shares = content["open_world"]["shares"]
     assert (shares["named_and_placed"]["k"], shares["named_and_placed"]["n"]) == (1, 2)
     assert shares["nothing_named_where_nothing_is"]["share"] == 1.0
-    assert content["open_world"]["strays_per_diagnosis"] == pytest.approx(1 / 3)
+    assert content["open_world"]["figures"]["strays_per_diagnosis"] == pytest.approx(1 / 3)
+    goals = content["open_world"]["goals"]
+    assert not goals["strays_per_diagnosis"]["reached"] and goals["nothing_named_where_nothing_is"]["reached"]
+    told_as = {line[0]: line[1:] for line in tables.lines(content)}
+    assert told_as["open world: strays per diagnosis"] == ("0.333", "", "3", "≤ 0.1", False)
+    assert told_as["open world: named and placed"][2:] == ("1/2", "≥ 90 %", False)
 
 
 def test_unknown_and_failed():

@@ -30,4 +30,5 @@ def prove(args: argparse.Namespace) -> int:
     )
     console.print(tables.table(content))
     console.print(f"written: {Path(args.out) / 'proof.json'}, {Path(args.out) / 'proof.html'}")
-    return 0 if all(g["reached"] is not False for g in content["goals"].values()) else 1
+    goals = [*content["goals"].values(), *content["open_world"].get("goals", {}).values()]
+    return int(any(g["reached"] is False for g in goals))

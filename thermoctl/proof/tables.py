@@ -50,9 +50,8 @@ _NUMBERS = {
 
 def table(content: Mapping[str, Any]) -> Table:
     """Show the figures of a proof."""
-    t = Table(
-        title=f"{content['figures']['cases']} cases, thermoctl {content['version']} ({content['commit']})"
-    )
+    cases = content["figures"]["cases"] + content["open_world"].get("cases", 0)
+    t = Table(title=f"{cases} cases, thermoctl {content['version']} ({content['commit']})")
     t.add_column("figure")
     for title in ("is", "95 % interval", "of", "goal"):
         t.add_column(title, justify="right")
@@ -63,53 +62,35 @@ def table(content: Mapping[str, Any]) -> Table:
 
 def lines(content: Mapping[str, Any]) -> Iterator[Line]:
     """Yield each measured figure with its interval, its number of cases and its goal."""
-
-    def goal(key: str, percent: bool) -> tuple[str, bool | None]:
-        """Return the goal as text and whether it is reached; ('', None) where there is none."""
-        g = content["goals"].get(key)
-        if g is None:
-            return "", None
-        sign = "≥" if g["at"] == "least" else "≤"
-        return (f"{sign} {100 * g['goal']:.0f} %" if percent else f"{sign} {g['goal']:g}"), g["reached"]
-
-    for key, title in _TITLES.items():
-        s = content["shares"][key]
-        if s["n"]:
-            text, reached = goal(key, True)
-            yield (
-                title,
-                f"{100 * s['share']:.1f} %",
-                f"{100 * s['low']:.0f}–{100 * s['high']:.0f} %",
-                f"{s['k']}/{s['n']}",
-                text,
-                reached,
-            )
+    yield from _shares(content, _TITLES)
     for key, title in _NUMBERS.items():
         value = content["figures"][key]
         if value is not None:
-            text, reached = goal(key, False)
             curve = content["found_by_size"].get(key.removeprefix("half_found_at_"))
             wide, of = (f"{curve['low']:.1f}–{curve['high']:.1f}", str(curve["n"])) if curve else ("", "")
-            yield title, f"{value:.3g}", wide, of, text, reached
-    yield from _open_lines(content["open_world"])
+            yield title, f"{value:.3g}", wide, of, *_goal(content, key, "")
+    if opened := content["open_world"]:
+        yield from _shares(opened, {k: f"open world: {k.replace('_', ' ')}" for k in opened["shares"]})
+        for key, value in opened["figures"].items():
+            if value is not None:
+                title = f"open world: {key.replace('_', ' ')}"
+                yield title, f"{value:.3g}", "", str(opened["cases"]), *_goal(opened, key, "")
 
 
-def _open_lines(found: Mapping[str, Any]) -> Iterator[Line]:
-    """Yield the lines of the cases with small misfits of no known name."""
-    for key, s in found.get("shares", {}).items():
+def _shares(content: Mapping[str, Any], titles: Mapping[str, str]) -> Iterator[Line]:
+    for key, title in titles.items():
+        s = content["shares"][key]
         if s["n"]:
             wide = f"{100 * s['low']:.0f}–{100 * s['high']:.0f} %"
-            yield (
-                f"open world: {key.replace('_', ' ')}",
-                f"{100 * s['share']:.1f} %",
-                wide,
-                f"{s['k']}/{s['n']}",
-                "",
-                None,
-            )
-    for key in ("strays_per_diagnosis", "calibration_error", "gain_median"):
-        if found.get(key) is not None:
-            yield f"open world: {key.replace('_', ' ')}", f"{found[key]:.3g}", "", "", "", None
+            yield title, f"{100 * s['share']:.1f} %", wide, f"{s['k']}/{s['n']}", *_goal(content, key, " %")
+
+
+def _goal(content: Mapping[str, Any], key: str, unit: str) -> tuple[str, bool | None]:
+    """Return the goal as text and whether it is reached; ('', None) where there is none."""
+    g = content["goals"].get(key)
+    if g is None:
+        return "", None
+    return f"{'≥' if g['at'] == 'least' else '≤'} {g['goal'] * (100 if unit else 1):g}{unit}", g["reached"]
 
 
 def real_table(entries: Sequence[Entry]) -> Table:
