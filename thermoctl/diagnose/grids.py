@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import logsumexp
@@ -57,13 +58,13 @@ class Grid:
         """Variance of the stated noise, s^2."""
         return self.sigma**2
 
-    @property
+    @cached_property
     def clock(self) -> float:
         """Variance by the times' median error, over the stated noise's; 0 where it would not be seen."""
         ratio = (CLOCK * self.change / self.sigma) ** 2
         return ratio if ratio * np.exp(2 * CLOCK_SD) > SEEN else 0.0
 
-    @property
+    @cached_property
     def scales(self) -> np.ndarray:
         """Prior sd of log c^2 and, where it is looked for, of log j^2."""
         return np.array([self.known, CLOCK_SD] if self.clock else [self.known])

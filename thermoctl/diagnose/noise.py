@@ -251,17 +251,20 @@ class _Remainder:
         timing = g.variance * g.clock * np.exp(x[first - 1])
         part = g.count * free / g.count.sum()
         v = noise + g.small * (free + FLOOR * part.sum())
-        slope = np.tile(g.small * FLOOR * np.concatenate([np.zeros(first), part]), (len(free), 1))
+        slope = np.empty((len(free), len(x)))
+        slope[:, first:] = g.small * FLOOR * part
         slope[:, 0] = noise
         if first > 1:
             v = v + timing
             slope[:, 1] = timing
-        slope[:, first:] += np.diag(g.small * free)
+        own = np.arange(len(free))
+        slope[own, first + own] += g.small * free
         slope /= v[:, None]
         p, prior = self.power / v, self.precision @ x
         density = -0.5 * float(g.count @ np.log(v) + p.sum() + part.sum() + x @ prior)
         pull = 0.5 * (slope.T @ (g.count - p) + np.concatenate([np.zeros(first), part]))
-        curvature = (slope.T * (p - 0.5 * g.count)) @ slope + self.precision + np.diag(pull)
+        curvature = (slope.T * (p - 0.5 * g.count)) @ slope + self.precision
+        curvature.flat[:: len(x) + 1] += pull
         return _At(x, density, v, slope, pull + prior, curvature)
 
     def start(self) -> np.ndarray:
@@ -289,7 +292,8 @@ def _laplace(d: _Noise | _Remainder, near: np.ndarray | None = None) -> _Found:
     damping = 0.0
     for _ in range(STEPS):
         h = at.curvature
-        factor, indefinite = dpotrf(h + damping * np.diag(np.abs(np.diag(h))), lower=1)
+        damped = h + damping * np.diag(np.abs(np.diag(h))) if damping else h
+        factor, indefinite = dpotrf(damped, lower=1)
         step = dpotrs(factor, at.uphill, lower=1)[0]
         if 0.5 * at.uphill @ step < CLOSE and not indefinite and not (damping and dpotrf(h, lower=1)[1]):
             break
