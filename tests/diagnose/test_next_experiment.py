@@ -78,7 +78,7 @@ def undecided_between(known, searched, hypotheses, verdict="ambiguous"):
     return SimpleNamespace(
         case=known,
         searched=searched,
-        posterior=SimpleNamespace(hypotheses=dict.fromkeys(hypotheses, share)),
+        posterior=SimpleNamespace(hypotheses=dict.fromkeys(hypotheses, share), something=share),
         decision=SimpleNamespace(verdict=verdict),
         law=None,
     )
@@ -172,6 +172,17 @@ def test_decided_diagnoses_ask_for_nothing(undecided):
     assert propose(undecided_between(*again, both[:1])) is None
     with pytest.raises(InputError, match="no such input or output"):
         propose(undecided, limits={"T_blok": (0, 1)})
+
+
+def test_where_an_effect_is_likelier_than_none_an_experiment_tells_it_from_the_plant_as_it_is(undecided):
+    radiation = next(k for k in undecided.posterior.hypotheses if ("radiation", "T") in k)
+    perhaps = undecided_between(undecided.case, undecided.searched, [frozenset(), radiation], "consistent")
+    perhaps.posterior.hypotheses |= {frozenset(): 0.3, radiation: 0.7}
+    assert propose(perhaps) is None  # as likely as not
+    perhaps.posterior.something = 0.7
+    entry, _ = propose(perhaps, limits=LIMITS)
+    assert [x["hypothesis"] for x in entry["separates"]] == ["the plant as it is"]
+    assert entry["separates"][0]["from"] == "radiation at T" and entry["separates"][0]["sigmas"] > 3
 
 
 def test_what_is_written_is_read_by_the_experiment_command(undecided, tmp_path):

@@ -72,6 +72,14 @@ def test_without_findings_every_verdict_says_what_next(verdict, start):
     assert "budget of refits ended the search" in words(found)
 
 
+def test_agreement_with_a_likely_effect_is_not_called_nothing_missing():
+    found = FOUND | {"verdict": "consistent", "findings": [], "remainder": None, "truncated": False}
+    assert "nothing is missing" in words(found) and "Nothing has to be done" in words(found)
+    perhaps = words(found | {"alternatives": [RADIATION | {"probability": 0.72}]})
+    assert "and yet something may be missing: radiation at block (0.72)." in perhaps
+    assert "Record more, with wider steps" in perhaps and "nothing is missing" not in perhaps.lower()
+
+
 def test_the_reasons_of_a_folder_without_a_diagnosis_are_refused(tmp_path, capsys):
     assert main(["diagnose", "--explain", str(tmp_path)]) == 2
     assert "no such file" in capsys.readouterr().err

@@ -164,10 +164,12 @@ def noise_of(case: Case, f: Fitted) -> np.ndarray:
 def survivors(found: Diagnosis) -> list[Standing]:
     """List what is not ruled out, likeliest first: hypotheses with effects, or laws of the remainder.
 
-    Each has its probability and its name. The list is empty where nothing is undecided."""
-    if found.decision.verdict == "ambiguous":
+    Where the recordings agree with the plant and yet an effect is likelier than none, the plant as it is
+    counts, too. Each has its probability and its name. The list is empty where nothing is undecided."""
+    perhaps = found.decision.verdict == "consistent" and found.posterior.something > 0.5
+    if found.decision.verdict == "ambiguous" or perhaps:
         fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
-        likely = [(fits[k], p, _effects(k)) for k, p in found.posterior.hypotheses.items() if k]
+        likely = [(fits[k], p, _effects(k)) for k, p in found.posterior.hypotheses.items() if k or perhaps]
     elif found.law:
         likely = [
             (f, share, described(p, f))
@@ -180,7 +182,7 @@ def survivors(found: Diagnosis) -> list[Standing]:
 
 
 def _effects(keys: Iterable[Key]) -> str:
-    return " and ".join(f"{effect} at {where}" for effect, where in sorted(keys))
+    return " and ".join(f"{effect} at {where}" for effect, where in sorted(keys)) or "the plant as it is"
 
 
 @dataclass(frozen=True)
@@ -265,7 +267,7 @@ def propose(
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
 
     None where nothing is undecided or nothing can be driven. Undecided are the hypotheses of an `ambiguous`
-    verdict, else the laws of the remainder that fit about as well.
+    verdict, whether an effect is there at all that is likelier than none, else the laws of the remainder that fit about as well.
     `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
     case = found.case
     for n in limits:

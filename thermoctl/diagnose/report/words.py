@@ -19,6 +19,8 @@ NEXT = {
     "(--effects DIR) and diagnose again.",
 }
 
+PERHAPS = "Record more, with wider steps, to know whether what may be missing is."
+
 
 def words(found: Result) -> str:
     """Return the findings, their worth, the remainder and the next step."""
@@ -46,7 +48,8 @@ def what_next(found: Result) -> str:
             f"Run the proposed experiment ({proposed['profile']}) and diagnose again with its recording; "
             "`thermoctl diagnose --resolve` does both."
         )
-    text = NEXT[found["verdict"]]
+    perhaps = found["verdict"] == "consistent" and found["alternatives"]
+    text = PERHAPS if perhaps else NEXT[found["verdict"]]
     if found["truncated"]:
         text += " The budget of refits ended the search: more effects may be hidden."
     return text
@@ -87,10 +90,15 @@ def amount(found: Result, output: str, value: float | None) -> str:
 
 def _found(found: Result) -> str:
     names = [f"{name(f)} (probability {chance(f['probability'])})" for f in found["findings"]]
+    others = [f"{name(a)} ({chance(a['probability'])})" for a in found["alternatives"][:3]]
     if found["verdict"] == "consistent":
-        return "The recordings agree with the plant within its sensors' noise: nothing is missing."
+        text = "The recordings agree with the plant within its sensors' noise"
+        return (
+            f"{text}, and yet something may be missing: {', '.join(others)}."
+            if others
+            else f"{text}: nothing is missing."
+        )
     if found["verdict"] == "ambiguous":
-        others = [f"{name(a)} ({chance(a['probability'])})" for a in found["alternatives"][:3]]
         text = "Something is missing, but these recordings do not name it for sure"
         text += f": most likely {listed(names)}" if names else ""
         return text + (f"; also possible: {', '.join(others)}." if others else ".")
