@@ -266,8 +266,7 @@ def propose(
 ) -> tuple[dict[str, Any], Excitation] | None:
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
 
-    None where nothing is undecided or nothing can be driven. Undecided are the hypotheses of an `ambiguous`
-    verdict, whether an effect is there at all that is likelier than none, else the laws of the remainder that fit about as well.
+    None where nothing is undecided (`survivors`) or nothing can be driven.
     `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
     case = found.case
     for n in limits:

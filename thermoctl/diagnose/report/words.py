@@ -92,12 +92,8 @@ def _found(found: Result) -> str:
     names = [f"{name(f)} (probability {chance(f['probability'])})" for f in found["findings"]]
     others = [f"{name(a)} ({chance(a['probability'])})" for a in found["alternatives"][:3]]
     if found["verdict"] == "consistent":
-        text = "The recordings agree with the plant within its sensors' noise"
-        return (
-            f"{text}, and yet something may be missing: {', '.join(others)}."
-            if others
-            else f"{text}: nothing is missing."
-        )
+        perhaps = f", and yet something may be missing: {', '.join(others)}" if others else ""
+        return f"The recordings agree with the plant within its sensors' noise{perhaps or ': nothing is missing'}."
     if found["verdict"] == "ambiguous":
         text = "Something is missing, but these recordings do not name it for sure"
         text += f": most likely {listed(names)}" if names else ""
