@@ -4,7 +4,8 @@
 
 In white noise  sigmas^2 = sum over outputs of n (rms^2 after the refit / rms^2 of the true noise - 1) + free parameters.
 Below it: how many of the small effects an ideal test finds at 4.15 sigmas (a chance of 0.5 % over 150 looks), if it knows
-the noise, and if it has to learn the noise from the same record (`judge.py`).
+the noise, and if it has to learn the noise from the same record (`judge.py`). Then how many small effects, and how many
+plants with nothing missing, would be called incomplete from other probabilities than the present one.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import yaml
 from scipy.stats import norm
 
 THRESHOLD = 4.15
+PROBABILITIES = (0.05, 0.2, 0.5, 0.9)  # that something is missing
 
 
 def left(case: Path, answer: dict, fit: dict[str, float]) -> float:
@@ -40,7 +42,8 @@ def main(argv: list[str]) -> int:
     if len(argv) != 3:
         sys.exit(__doc__)
     cases, answers, result = map(Path, argv)
-    rows = {r["case"]: r for r in json.loads((result / "proof.json").read_text())["rows"]}
+    rows = json.loads((result / "proof.json").read_text())["rows"]
+    rows = {r["case"]: r for r in rows if r["verdict"] != "failed"}
     small = []
     print("white noise, no outliers: case, size, verdict, sigmas by the generator, sigmas after the refit")
     for name, row in rows.items():
@@ -64,6 +67,21 @@ def main(argv: list[str]) -> int:
             f"of the {len(small)} small effects an ideal test finds {known:.0%}, one that has to learn the noise {learnt:.0%}; "
             f"found: {found}"
         )
+    missing = {
+        name: json.loads((result / "cases" / name / "diagnosis.json").read_text())["decision"]["something"]
+        for name in rows
+    }
+    groups = {
+        f"{title}, {world} world": [
+            missing[n] for n, r in rows.items() if r["world"] == world and what in (r["kind"], r["band"])
+        ]
+        for world in ("closed", "open")
+        for title, what in (("nothing missing", "none"), ("small", "small"))
+    }
+    print("something is missing with", *PROBABILITIES)
+    for title, group in groups.items():
+        if group:
+            print(f"{title}, of {len(group)}:", *(sum(p >= q for p in group) for q in PROBABILITIES))
     return 0
 
 
