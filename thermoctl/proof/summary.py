@@ -176,6 +176,7 @@ def open_world(rows: Sequence[Row]) -> dict[str, Any]:
     figures = {
         "strays_per_diagnosis": sum(r.strays for r in rows) / len(rows),
         "calibration_error": reliability(given)[1],
+        "calibration_error_by_chance": by_chance(given),
         "gain_median": quantile((r.gain for r in visible if r.findings), 0.5),
     }
     return {

@@ -39,6 +39,7 @@ _NUMBERS = {
     "half_found_at_coloured": "the same in coloured noise",
     "half_found_at_learnt": "the same in sigmas of an ideal test that has to learn the noise",
     "calibration_error": "calibration error of the probabilities",
+    "calibration_error_by_chance": "the same by chance alone",
     "gain_median": "held-out gain, share of the oracle's, median",
     "gain_worst_tenth": "held-out gain, worst tenth",
     "parameter_error_median": "effect parameter error, median",
