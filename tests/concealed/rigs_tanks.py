@@ -64,8 +64,6 @@ class Tanks:
                     )
             return out
 
-        calm = [outputs_of(k, [Variant()])[0] for k in range(2)]
-        high = float(max(np.quantile(y, 0.97) for y in calm))
         peak = {
             x: float(max(_integrate(names, theta, Variant(), r)[:, names.index(x)].max() for r in runs))
             for x in names
@@ -82,7 +80,7 @@ class Tanks:
         ]
         for x in seen:
             suspects += [
-                s for s in sensor_suspects(f"level_{x}", period, span, 4.0, False, rng, top_value=high)
+                s for s in sensor_suspects(f"level_{x}", period, span, 4.0, False, rng, top_value=peak[x])
             ]
         suspects.append(
             Suspect("actuator_saturation", "pumped", lambda s: {"U": top * max(1.3 - 0.15 * s, 0.5)}, top=4)
