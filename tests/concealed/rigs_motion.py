@@ -8,6 +8,8 @@ take exact or midpoint steps. Four substeps a sample or more; many variants (row
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from tests.concealed.rig import Scene, Suspect, clock, levels, room
@@ -107,6 +109,7 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
     out = {k: np.empty((m, len(t))) for k in ("position", "velocity", "coil")}
     heated = "C_coil" in theta
     delayed = on["actuator_delay.TD"]
+    late = _delayed(run, stays)
     for k in range(len(t)):
         out["position"][:, k], out["velocity"][:, k], out["coil"][:, k] = x, v, coil
         if k == len(t) - 1:
@@ -115,9 +118,9 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
         decay_rate = damping + e["viscous_friction.B"]
         for s in range(substeps):
             x = x + v * (h / 2)
-            now = t[k] + (s + 0.5) * h
             if delayed:
-                drive = _delayed(run, now - e["actuator_delay.TD"], stays)
+                begin = t[k] + s * h - e["actuator_delay.TD"]
+                drive = late(begin, begin + h)
             else:
                 drive = np.full(m, u[k] if stays else u[k] + (u[k + 1] - u[k]) * (s + 0.5) / substeps)
             sent = drive
@@ -182,10 +185,17 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
     return out
 
 
-def _delayed(run: dict, when: np.ndarray, held: bool) -> np.ndarray:
-    if held:
-        return run["drive"][np.maximum(np.searchsorted(run["t"], when, side="right") - 1, 0)]
-    return np.interp(when, run["t"], run["drive"])
+def _delayed(run: dict, held: bool) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Mean of the drive between two times (m,), each row's own; exact where it is held, else that of the middle."""
+    t, u = run["t"], run["drive"]
+    if not held:
+        return lambda begin, end: np.interp((begin + end) / 2, t, u)
+    area = np.concatenate([[0.0], np.cumsum(u[:-1] * np.diff(t))])
+
+    def until(when: np.ndarray) -> np.ndarray:
+        return np.interp(when, t, area) + u[0] * np.minimum(when - t[0], 0.0)
+
+    return lambda begin, end: (until(end) - until(begin)) / (end - begin)
 
 
 def friction_suspects(force: float, pace: float, travel: float) -> list[Suspect]:

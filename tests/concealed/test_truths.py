@@ -86,6 +86,16 @@ def test_damped_stage_follows_the_exponential():
     assert np.allclose(out["velocity"][0], 1.5 * (1 - np.exp(-4 * t)), atol=1e-9)
 
 
+def test_a_delay_is_not_rounded_to_the_truths_steps():
+    """A step of the held drive at 1 s, 13.7 ms late at samples of 10 ms: the exponential from 1.0137 s on."""
+    t = np.arange(500) * 0.01
+    run = {"t": t, "drive": np.where(t < 0.999, 0.0, 1.0), "held": True, "air": np.zeros(500)}
+    theta = {"gain": 3.0, "mass": 0.5, "damping": 2.0, "stiffness": 0.0}
+    out = rigs_motion.simulate(theta, run, [Variant(effects=[("actuator_delay", "motor", {"TD": 0.0137})])])
+    exact = 1.5 * (1 - np.exp(-4 * np.maximum(t - 1.0137, 0.0)))
+    assert np.allclose(out["velocity"][0], exact, atol=2e-5)
+
+
 def test_tank_empties_by_torricelli():
     t = np.arange(0, 60.0, 3.0)
     run = {"t": t, "pump": np.zeros(20), "upper_start": np.full(20, 4.0), "lower_start": np.full(20, 1.0)}
