@@ -26,7 +26,6 @@ DRAWN = 6  # recordings of an output that are drawn: those with the largest erro
 WIDE = 1.96  # standard deviations to either side of a 95 % interval
 MOVED, MOVED_SHARE = 4.0, 0.25  # change of a parameter by a finding that is worth a sentence: sd, share of it
 _COLOURS = {"measured": "#1b1f24", "refit": "#c7621b", "with": "#0b6bcb"}
-_NOTHING = "Nothing is marked: nothing is missing."
 
 
 def write_report(found: Diagnosis, result: Mapping[str, Any], path: str | Path) -> None:
@@ -79,7 +78,7 @@ def _place(found: Diagnosis, result: Mapping[str, Any]) -> str:
     for e in found.shown:
         place = e.candidate.place
         marked |= {place.where, *place.nodes.values(), *(n for n in (place.flow, place.output) if n)}
-    words = "Red: where the findings sit." if marked else _NOTHING
+    words = "Red: where the findings sit." if marked else "Nothing is marked: nothing is named."
     remainder = result["remainder"]
     if not marked and remainder and remainder["node"]:
         marked, words = {remainder["node"]}, "Red: the node where the remainder enters."
