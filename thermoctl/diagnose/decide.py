@@ -104,11 +104,11 @@ def _only_noise(f: Facts, limits: Limits) -> bool:
 
 ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
     (
-        "nothing is supported and the residual is the sensors' noise",
+        "nothing is supported for sure and the residual is the sensors' noise",
         lambda f, q: f.something < q.name and _only_noise(f, q),
         "consistent",
     ),
-    ("nothing is supported and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
+    ("nothing is supported for sure and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
     (
         "an unknown law is likelier than the effects of the catalogue",
         lambda f, q: f.something - f.known > f.known,
