@@ -260,16 +260,14 @@ def _alike(rivals: list[tuple[Suspect, float]], truth: Suspect) -> list[tuple[st
 
 
 def _size_for(curve: tuple, target: float) -> float | None:
-    """The size at which the left-over SNR is `target`; None where the effect cannot be that visible, or that small."""
+    """The size at which the left-over SNR is `target`; None where the effect cannot be that visible."""
     suspect, sizes, left = curve
     s = snr(left)
     if not np.all(np.isfinite(s)) or s.max() < target:
         return None
     k = int(np.argmax(s >= target))
-    if k == 0 and suspect.top <= 1:
-        return float(sizes[0])
-    if k == 0:  # a limit that the drive exceeds even at its loosest does not vanish with its size
-        return None if s[1] < s[0] * np.sqrt(sizes[1] / sizes[0]) else float(sizes[0] * target / s[0])
+    if k == 0:
+        return float(sizes[0] * target / s[0]) if suspect.top > 1 else float(sizes[0])
     x = np.interp(np.log(target), np.log(s[k - 1 : k + 1] + 1e-12), np.log(sizes[k - 1 : k + 1]))
     return float(np.exp(x))
 

@@ -203,7 +203,8 @@ def open_world(
         plant = {**plant, "outputs": outputs}
     jitter = float(rng.random() < 0.2) * JITTER
     late = _late(scene, bench, jitter, rng) if jitter else 0.0
-    jitter *= min(1.0, high * (signal or 1.0) / max(late, 1e-6))
+    most = high * (signal or 1.0)
+    jitter *= min(1.0, most / max(late, 1e-6))
     coarse = np.where(rng.random(len(scene.outputs)) < 0.2, 1.5 * scene.sd, 0.0)
     told = {
         "misfits": [[m.kind, m.where] for m in chosen],
@@ -211,7 +212,7 @@ def open_world(
         "misfit_snr": round(left, 2),
         "wrong_noise": {o: round(f, 2) for o, f in factor.items()} if wrong_noise else {},
         "clock_jitter": float(f"{jitter:.4g}"),
-        "clock_snr": round(min(late, high * (signal or 1.0)), 2),
+        "clock_snr": round(min(late, most), 2),
         "hidden_steps": {o: float(f"{s:.4g}") for o, s in zip(scene.outputs, coarse, strict=True) if s},
     }
     return World(world, plant, jitter, np.maximum(coarse, scene.resolution), told)

@@ -79,9 +79,7 @@ class Tanks:
             Suspect("orifice_exponent", f"{x}_outflow", lambda s: {"N": 0.5 + 0.04 * s}, top=6) for x in names
         ]
         for x in seen:
-            suspects += [
-                s for s in sensor_suspects(f"level_{x}", period, span, 4.0, False, rng, top_value=peak[x])
-            ]
+            suspects += sensor_suspects(f"level_{x}", period, span, 4.0, False, rng, top_value=peak[x])
         suspects.append(
             Suspect("actuator_saturation", "pumped", lambda s: {"U": top * max(1.3 - 0.15 * s, 0.5)}, top=4)
         )

@@ -44,19 +44,16 @@ def matlab_source(plant: Plant, numbers: Values, function: str) -> str:
             "block in its place"
         )
     names = {**unique(plant, _RESERVED | {function}), "t": "t"}
-    site = {id(z): k for k, (z, _) in enumerate(e.jumps)}
+    width = {id(z): f"w({k})" for k, (z, _) in enumerate(e.jumps, 1)}
     asked = first_outputs(plant)
+    first = names | {o: f"first({k})" for k, o in enumerate(asked, 1)}
 
     def text(expr: Expr) -> str:
-        return written(
-            expr,
-            NOTATION,
-            names.__getitem__,
-            lambda z: f"w({site[id(z)] + 1})" if id(z) in site else "0",
-            lambda o: f"first({asked.index(o) + 1})" if o in asked else names[o],
-        )
+        """Return an expression in MATLAB."""
+        return written(expr, NOTATION, names.__getitem__, lambda z: width.get(id(z), "0"), first.__getitem__)
 
     def unpack(keys: Sequence[str], array: str) -> str:
+        """Return the assignments of an array's elements to their names."""
         return "".join(f"{names[k]} = {array}({n});\n" for n, k in enumerate(keys, 1))
 
     get_p, get_x, get_u = unpack(e.parameters, "p"), unpack(e.states, "x"), unpack(tuple(plant.inputs), "u")

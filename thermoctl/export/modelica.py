@@ -74,14 +74,11 @@ def modelica_source(plant: Plant, numbers: Values, model: str) -> str:
         k = site.get(id(z), -1)
         return f"jump_width_{k}" if k in jumps else "0"
 
+    first = names | {o: f"first_{o}" for o in plant.outputs}
+
     def text(expr: Expr) -> str:
-        return written(
-            expr,
-            NOTATION,
-            names.__getitem__,
-            width,
-            lambda o: f"first_{o}" if o in plant.outputs else names[o],
-        )
+        """Return an expression in Modelica."""
+        return written(expr, NOTATION, names.__getitem__, width, first.__getitem__)
 
     lines = []
     for p in plant.parameters.values():

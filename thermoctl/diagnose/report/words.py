@@ -19,7 +19,7 @@ NEXT = {
     "(--effects DIR) and diagnose again.",
 }
 
-PERHAPS = "Record more, with wider steps, to know whether what may be missing is."
+PERHAPS = "Record more, with wider steps. They show whether it is missing."
 
 
 def words(found: Result) -> str:
@@ -92,8 +92,9 @@ def _found(found: Result) -> str:
     names = [f"{name(f)} (probability {chance(f['probability'])})" for f in found["findings"]]
     others = [f"{name(a)} ({chance(a['probability'])})" for a in found["alternatives"][:3]]
     if found["verdict"] == "consistent":
-        perhaps = f", and yet something may be missing: {', '.join(others)}" if others else ""
-        return f"The recordings agree with the plant within its sensors' noise{perhaps or ': nothing is missing'}."
+        text = "The recordings agree with the plant within its sensors' noise"
+        perhaps = f", and yet something may be missing: {', '.join(others)}."
+        return text + (perhaps if others else ": nothing is missing.")
     if found["verdict"] == "ambiguous":
         text = "Something is missing, but these recordings do not name it for sure"
         text += f": most likely {listed(names)}" if names else ""
